@@ -45,12 +45,15 @@ lint: $(SETUP)
 types: lint
 	$(BIN)/mypy
 
-# Compiled once, before the workers of the tests would each do it.
+# Compiled once, before the workers of the tests would each do it; so are the modules of the tests, with what pytest
+# makes of their assertions.
 kernels: lint
 	$(BIN)/python -P tests/compile_kernels.py
+	$(BIN)/python -m pytest --collect-only -qq > /dev/null
 
+# A third of the examples of each property that is costly.
 tests: kernels
-	$(PYTEST)
+	$(PYTEST) --hypothesis-profile=brief
 
 all-tests: kernels
 	$(PYTEST) -m 'not benchmark'
@@ -105,6 +108,11 @@ resume-trials: $(SETUP)
 # Tracking runs on twins, beside those on the plants that they were identified from: durations and errors.
 twin-trials: $(SETUP)
 	$(BIN)/python tests/bench/twin_trials.py
+
+# The dashboard of every protocol on every emulated rig, dark and light, with those of README.md; fails on an empty view.
+pictures: $(SETUP)
+	$(BIN)/python -P tests/pictures.py --out recordings/pictures
+	$(BIN)/python -P tests/pictures.py --out recordings/pictures --studies recordings/pictures/studies --readme --themes dark
 
 clean:
 	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache

@@ -8,13 +8,14 @@ safe state, each independently; the outcome is recorded.
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from bench import fixed_rate
+from bench import by_hand, fixed_rate
 from bench.clock import Pace, PacedClock
 from bench.control.convergence import LimitCycleWatch
 from bench.control.estimators import DriftEstimator, agility_for
@@ -31,11 +32,14 @@ from bench.errors import (
     SettleTimeoutError,
 )
 from bench.interrupts import Interrupts
+from bench.lateness import Lateness
 from bench.past import Resumption, reprime
-from bench.protocol.parameters import ProtocolDefinition, ProtocolParameters
+from bench.protocol.changes import PARAMETER, ParameterChange
+from bench.protocol.parameters import OpenParameters, ProtocolDefinition, ProtocolParameters
 from bench.protocol.plan import EXPECTED, Plan
 from bench.protocol.vocabulary import (
     PROMPT,
+    ByHand,
     Control,
     FixedRate,
     KeptModel,
@@ -46,8 +50,9 @@ from bench.protocol.vocabulary import (
     Reading,
     Step,
 )
+from bench.questions import AT_A_PROMPT, NOBODY, RESUME, Question
 from bench.rig import Look
-from bench.running import NOT_AT_WORK, RESUME, Observer, RunAtHand, RunRecord, traced
+from bench.running import NOT_AT_WORK, Notices, Observer, RunAtHand, RunRecord, traced
 from bench.safety import SAFE
 from bench.settling import Arrived, Dwell, Settle, Settled, UntilSteady
 from bench.station.interface import Station
@@ -73,6 +78,8 @@ class Outcome:
         What ended the run, when it was not completed.
     pace : Pace or None
         How fast the run went, on a paced clock.
+    lateness : mapping of str to mapping
+        How late the samples of loops were, by label; see `bench.lateness`.
     """
 
     status: str
@@ -82,6 +89,7 @@ class Outcome:
     safe_state: Mapping[str, str]
     error: Exception | None
     pace: Pace | None = None
+    lateness: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def is_safe(self) -> bool:
@@ -90,7 +98,15 @@ class Outcome:
 
 
 class Engine:
-    """Carries protocols out at a station; its parameters are those of `RunAtHand`."""
+    """Carries protocols out at a station.
+
+    Parameters
+    ----------
+    station, journal, observers, interrupts, ask, zero, messages
+        As of `RunAtHand`.
+    changes : iterable of ParameterChange
+        Parameters that the run which is repeated had changed, in their order.
+    """
 
     def __init__(
         self,
@@ -98,20 +114,24 @@ class Engine:
         journal: RunRecord,
         observers: Iterable[Observer],
         interrupts: Interrupts,
-        ask: Callable[[str], str] | None = None,
+        ask: Callable[[Question], str] | None = None,
         zero: float | None = None,
+        messages: Notices | None = None,
+        changes: Iterable[ParameterChange] = (),
     ) -> None:
         self._station = station
         self._clock = station.clock
         self._journal = journal
         self._interrupts = interrupts
-        self._run = RunAtHand(station, journal, observers, interrupts, ask, zero)
+        self._run = RunAtHand(station, journal, observers, interrupts, ask, zero, messages)
+        self._changes = deque(changes)
         self._patience = station.description.file.safety.patience
         self._work: dict[type[Message], Callable[[Any], Reading]] = {
             Step: self._step,
             Control: self._control,
             FixedRate: partial(fixed_rate.carry_out, self._run),
             Prompt: self._prompt,
+            ByHand: partial(by_hand.carry_out, self._run),
         }
 
     def warn(self, warnings: Iterable[str]) -> None:
@@ -156,6 +176,7 @@ class Engine:
         run.judge(self._clock.now(), self._station.look(Look.GLANCE))
         slots = self._station.description.slots(definition)
         messages = definition.start(parameters, slots) if past is None else past.fed.messages
+        run.parameters = OpenParameters(definition, parameters, self._station.description.file.roles)
         waiting = None if past is None else past.fed.message
         reading: Reading | None = None
         try:
@@ -164,6 +185,10 @@ class Engine:
                 reprime(run, past, self._settle_or_raise)
             while True:
                 self._station.promise(self._patience, "the protocol computes")
+                while self._changes and self._changes[0].step < run.steps:
+                    change = self._changes.popleft()
+                    definition.change(parameters, change.name, change.value)
+                    run.event("WARN", PARAMETER, str(change))
                 try:
                     # The first `send` of a generator has to be that of None.
                     message = waiting or messages.send(reading)  # type: ignore[arg-type]
@@ -228,10 +253,15 @@ class Engine:
         command: Command | None = None
         watch = LimitCycleWatch(low, high)
         seen: list[float] = []
+        lateness = Lateness(None)
+        due: float | None = None
         try:
             while True:
-                latest += run.pause_if_asked()
+                paused = run.pause_if_asked()
+                latest += paused
                 asked = self._clock.now()
+                if due is not None and not paused:
+                    lateness.add(asked - due)
                 values = run.look(Look.SAMPLE, wanted)
                 now = self._clock.now()
                 ask = message.task.begin if command is None else message.task.update
@@ -270,8 +300,11 @@ class Engine:
                         f"within {message.timeout:g} s"
                     )
                 run.hold_until(end, asked)
+                due = end
         finally:
             run.trace = NOT_AT_WORK
+            if lateness.samples:
+                run.keep_lateness(message.label, lateness)
 
     def _prompt(self, message: Prompt) -> Reading:
         run = self._run
@@ -279,10 +312,13 @@ class Engine:
         started = self._clock.now()
         if self._station.has_operator:
             self._station.operate(message.task, message.value)
-        elif run.ask is None:
-            raise AbortError(f"no operator is present to do it: {message.text}")
-        elif run.await_answer(run.ask, f"{message.text}; then") != RESUME:
-            raise AbortError("ended by the operator at a prompt")
+        else:
+            question = Question(message.text, AT_A_PROMPT, "BY HAND")
+            answer = NOBODY if run.ask is None else run.await_answer(run.ask, question)
+            if answer == NOBODY:
+                raise AbortError(f"no operator is present to do it: {message.text}")
+            if answer != RESUME:
+                raise AbortError("ended by the operator at a prompt")
         # Kept in any case: it shows what was wrong.
         self._station.apply({})
         reading = self._settle_and_read(message.settle, self._clock.now(), started, PROMPT, {})
@@ -351,6 +387,7 @@ class Engine:
             status = "failed"
             reason = str(error) if isinstance(error, BenchError) else f"{type(error).__name__}: {error}"
         finished = self._clock.now() - self._run.zero
+        late = {label: each.to_json() for label, each in self._run.lateness.items()}
         pace = self._clock.pace() if isinstance(self._clock, PacedClock) else None
         try:
             self._journal.make_room()
@@ -363,12 +400,15 @@ class Engine:
             if pace is not None:
                 self._run.event("INFO", "clock", str(pace))
             self._run.event("INFO" if error is None else "WARN", "end", status)
-            self._journal.finish(status=status, reason=reason, finished=finished, safe_state=safe_state)
+            self._run.finish_messages()
+            self._journal.finish(
+                status=status, reason=reason, finished=finished, safe_state=safe_state, lateness=late
+            )
         # A full disk must not hide whether the devices are safe.
         except Exception as failure:
             why = f"the journal could not be finished: {failure}"
             status, reason, error = "failed", f"{reason}; {why}" if reason else why, error or failure
-        return Outcome(status, reason, self._run.steps, finished, safe_state, error, pace)
+        return Outcome(status, reason, self._run.steps, finished, safe_state, error, pace, late)
 
 
 def check_before_moving(description: RigDescription, definition: ProtocolDefinition, expected: Plan) -> None:

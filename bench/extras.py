@@ -9,7 +9,7 @@ from typing import Literal
 
 from bench.errors import ConfigurationError
 
-Extra = Literal["cluster", "dashboard", "report", "spreadsheet"]
+Extra = Literal["cluster", "dashboard", "panel", "report", "spreadsheet"]
 
 
 class MissingExtraError(ConfigurationError):

@@ -21,6 +21,7 @@ import numpy as np
 import numpy.typing as npt
 from rich.console import Console
 
+from bench.clock import VirtualClock, wall_time
 from bench.errors import BenchError, DeviceError
 from bench.model_file import ModelFile, load_model
 from bench.protocol import ProtocolDefinition, find_protocol
@@ -69,7 +70,11 @@ def open_rig(
         If a device cannot be connected; nothing has moved.
     """
     file = load_rig(str(rig), overrides)
-    return Rig(file, clock_for(file, clock or ("virtual" if file.in_process else "wall")), seed)
+    passing = clock_for(file, clock or ("virtual" if file.in_process else "wall"))
+    if isinstance(passing, VirtualClock):
+        # Time stamps that stand beside those of another program, such as bluesky's, count from today.
+        passing.go_on(wall_time(), 0.0)
+    return Rig(file, passing, seed)
 
 
 def run(

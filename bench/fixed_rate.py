@@ -9,6 +9,7 @@ import numpy as np
 
 from bench.control.loops import BlockController, Floats, SampledController
 from bench.errors import ConfigurationError, LimitError
+from bench.lateness import Lateness
 from bench.protocol.vocabulary import LATENESS, FixedRate, Reading
 from bench.rig import Look
 from bench.running import NOT_AT_WORK, RunAtHand, row_of, traced
@@ -59,7 +60,8 @@ def _samples(run: RunAtHand, message: FixedRate, period: float) -> Reading:
     start = clock.now()
     next_tick = start + run.period
     k = taken = 0
-    lateness = latest = 0.0
+    lateness = Lateness(message.rate)
+    note_late = lateness.add
     while True:
         due = start + k * period
         # Between the samples of a slow loop interlocks and watchdogs do not wait for the next one.
@@ -90,8 +92,7 @@ def _samples(run: RunAtHand, message: FixedRate, period: float) -> Reading:
         move(commands)
         values.update(zip(setpoints, commands, strict=False))
         late = now - due
-        if late > 0:
-            lateness, latest = lateness + late, max(latest, late)
+        note_late(late)
         if taken % message.record_every == 0:
             # Without the lateness, which tells the samples from the ticks.
             run.trace = traced(controller.trace)
@@ -107,7 +108,7 @@ def _samples(run: RunAtHand, message: FixedRate, period: float) -> Reading:
         k += 1
         if (reached := math.floor((clock.now() - start) / period)) > k:
             k = min(samples, reached)
-    return _finish(run, message, started, taken, (lateness, latest), commands)
+    return _finish(run, message, started, taken, lateness, commands)
 
 
 def _blocks(run: RunAtHand, message: FixedRate, period: float) -> Reading:
@@ -130,7 +131,7 @@ def _blocks(run: RunAtHand, message: FixedRate, period: float) -> Reading:
     next_tick = start + run.period
     readings: Floats = np.empty((0, len(signals)))
     k = taken = 0
-    lateness = latest = 0.0
+    lateness = Lateness(message.rate)
     while True:
         due = start + k * period
         run.sleep_until(due)
@@ -146,7 +147,7 @@ def _blocks(run: RunAtHand, message: FixedRate, period: float) -> Reading:
         _check_block(message, out)
         late = now - due
         readings = play(out) if play is not None else _sampled(run, message, signals, out, start + times)
-        lateness, latest = lateness + count * late, max(latest, late)
+        lateness.add(late, count)
         run.trace = traced(controller.trace)
         for each in range(-taken % message.record_every, count, message.record_every):
             values.update(run.trace)
@@ -161,7 +162,7 @@ def _blocks(run: RunAtHand, message: FixedRate, period: float) -> Reading:
             run.judge(now, values)
             next_tick = run.tick_after(next_tick)
         k = min(samples, max(k + count, math.floor((now - start) / period)))
-    return _finish(run, message, started, taken, (lateness, latest), out[-1].tolist())
+    return _finish(run, message, started, taken, lateness, out[-1].tolist())
 
 
 def _check_block(message: FixedRate, out: Floats) -> None:
@@ -192,18 +193,19 @@ def _finish(
     message: FixedRate,
     started: float,
     taken: int,
-    lateness: tuple[float, float],
+    lateness: Lateness,
     commands: Sequence[float],
 ) -> Reading:
-    """Tell how a loop went, of which the sum and the largest of all lateness are known, and take the reading."""
+    """Tell how late a loop was, and take the reading."""
     run.trace = NOT_AT_WORK
     samples = message.samples
-    total, latest = lateness
+    lateness.left_out = samples - taken
+    run.keep_lateness(message.label, lateness)
     run.event(
         "INFO",
         "loop",
         f"{taken} samples at {message.rate:g} Hz, {samples - taken} left out; late by "
-        f"{1e3 * total / taken:.3g} ms on average, {1e3 * latest:.3g} ms at most",
+        f"{1e3 * lateness.total / taken:.3g} ms on average, {1e3 * lateness.worst:.3g} ms at most",
     )
     values = run.look(Look.MEASURE)
     run.judge(run.clock.now(), values)

@@ -13,6 +13,7 @@ A rig file has one table an interlock; one table may ask for several things of o
     fastest = 5.0                # K/s, on average over ...
     over = 2.0                   # ... so many seconds
     level = "hold"               # warn, hold, pause, or safe
+    warn = 0.05                  # it warns from 85.5 °C on, 5 % of the limit before it
 
     [[interlocks]]
     signal = "plate_temperature"
@@ -38,7 +39,7 @@ import struct
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
@@ -115,6 +116,12 @@ class Interlock(BaseModel):
     hold_at_most: float = Field(
         default=600.0, gt=0, le=86400, description="longest time that it holds before the run ends, s"
     )
+    warn: float = Field(
+        default=0.05,
+        ge=0,
+        le=0.5,
+        description="width of the warning band before low and before high, as a share of the limit; 0 for none",
+    )
 
     @property
     def label(self) -> str:
@@ -128,6 +135,17 @@ class Interlock(BaseModel):
             self.low if self.resume_low is None else self.resume_low,
             self.high if self.resume_high is None else self.resume_high,
         )
+
+    @property
+    def unwarned(self) -> tuple[float, float]:
+        """Range outside of which it warns before it acts, in the signal's unit; infinite where it does not."""
+        if self.level is Level.WARN:
+            return -math.inf, math.inf
+        low = self.low + self.warn * abs(self.low) if math.isfinite(self.low * self.warn) else -math.inf
+        high = self.high - self.warn * abs(self.high) if math.isfinite(self.high * self.warn) else math.inf
+        # A limit of zero has no share, and a narrow range no room.
+        low, high = (low if low > self.low else -math.inf), (high if high < self.high else math.inf)
+        return (low, high) if low < high else (-math.inf, math.inf)
 
     @property
     def limits_values(self) -> bool:
@@ -181,6 +199,8 @@ class Finding:
         Reading that was looked at, in the signal's unit; the difference of two where two are compared.
     over : bool
         Whether it is over.
+    early : bool
+        Whether the signal has only come near a limit, so that the interlock may act soon.
     """
 
     interlock: Interlock
@@ -189,6 +209,7 @@ class Finding:
     since: float
     value: float
     over: bool = False
+    early: bool = False
 
 
 class InterlockWatch:
@@ -353,6 +374,43 @@ class _Range(_Criterion):
         )
 
 
+class _Near(_Criterion):
+    """Whether the signal is within the warning band before a limit; it is over half a band further inside."""
+
+    def __init__(self, interlock: Interlock, units: Mapping[str, str]) -> None:
+        super().__init__(interlock, units, 0.0)
+        self._low, self._high = low, high = interlock.unwarned
+        half = 0.5 * interlock.warn
+        low += half * abs(interlock.low) if math.isfinite(low) else 0.0
+        high -= half * abs(interlock.high) if math.isfinite(high) else 0.0
+        # Of a narrow range the edges of the bands themselves.
+        self._back = (low, high) if low < high else interlock.unwarned
+
+    def look(self, t: float, value: float, setpoint: float | None) -> None:  # noqa: ARG002 - as of all
+        if self.since is None:
+            # What is beyond the limit acts by itself, if it does so at once.
+            acts = self._interlock.seconds == 0.0 and not self._interlock.low <= value <= self._interlock.high
+            if not acts and (value < self._low or value > self._high):
+                self.since = t
+        elif self._back[0] <= value <= self._back[1]:
+            self.since = None
+
+    def seen(self, t: float, since: float, value: float) -> str:  # noqa: ARG002 - as of all
+        interlock = self._interlock
+        below = value < self._low
+        edge, limit = (self._low, interlock.low) if below else (self._high, interlock.high)
+        return (
+            f"{interlock.label} = {value:.6g} {self._unit} is {'below' if below else 'above'} {edge:g} {self._unit}; "
+            f"the interlock acts at {limit:g} {self._unit} (level {interlock.level})"
+        )
+
+    def back(self, t: float, since: float, value: float) -> str:
+        return (
+            f"{self._interlock.label} = {value:.6g} {self._unit} is far from its interlock again "
+            f"(after {t - since:.1f} s)"
+        )
+
+
 class _Rate(_Criterion):
     """Mean rate from the newest reading that is as old as the window, or older, to the present one."""
 
@@ -513,6 +571,8 @@ class _Course:
         interlock, units = self.interlock, self._units
         # Of any interlock, as nan is outside of an infinite range too.
         criteria: list[_Criterion] = [_Range(interlock, units, interlock.seconds)]
+        if interlock.unwarned != (-math.inf, math.inf):
+            criteria.append(_Near(interlock, units))
         if interlock.fastest is not None:
             criteria.append(_Rate(interlock, units, interlock.fastest))
         if interlock.stale is not None:
@@ -537,7 +597,7 @@ class _Course:
 
     def _settled(self, criterion: _Criterion) -> float:
         """Return from when on a criterion may act."""
-        if self._settling is None or not isinstance(criterion, _Range | _Rate):
+        if self._settling is None or not isinstance(criterion, _Range | _Near | _Rate):
             return -math.inf
         return self._settling.until
 
@@ -587,14 +647,16 @@ class _Course:
             if since is None or t - since < criterion.seconds or t < self._settled(criterion):
                 return
             self._acted[i] = t
-            text = f"interlock: {criterion.seen(t, since, value)}"
-            self.active[i] = Finding(interlock, interlock.level, text, since, value)
+            early = isinstance(criterion, _Near)
+            text = f"{'warning' if early else 'interlock'}: {criterion.seen(t, since, value)}"
+            level = Level.WARN if early else interlock.level
+            self.active[i] = Finding(interlock, level, text, since, value, early=early)
         elif finding.level is Level.SAFE:
             return
         elif since is None:
             self.active[i] = None
-            text = f"interlock: {criterion.back(t, finding.since, value)}"
-            found.append(Finding(interlock, finding.level, text, finding.since, value, over=True))
+            text = f"{'warning' if finding.early else 'interlock'}: {criterion.back(t, finding.since, value)}"
+            found.append(replace(finding, text=text, value=value, over=True))
             return
         elif finding.level is Level.HOLD and t - self._acted[i] >= interlock.hold_at_most:
             text = f"interlock: {criterion.seen(t, since, value)}; it was not back {interlock.hold_at_most:g} s after"

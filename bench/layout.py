@@ -31,7 +31,9 @@ class DashboardLayout(XYPlot):
     """The table `[dashboard]`: the hysteresis loop, the Preisach plane over its input, and further plots."""
 
     input: str = Field(description="signal on the horizontal axis of the loop, and input of the plane")
-    plane: Range = Field(description="ends of both axes of the Preisach plane")
+    plane: Range | None = Field(
+        default=None, description="ends of both axes of the Preisach plane; without it, there is none"
+    )
     levels: int = Field(default=20, ge=2, le=200, description="discretization levels drawn on the plane")
     loops: tuple[XYPlot, ...] = Field(default=(), description="further loops")
 

@@ -21,9 +21,10 @@ from bench.interrupts import Interrupts
 from bench.journal import Event, StepRecord
 from bench.protocol import LATENESS, TRACES, Plan, ProtocolDefinition, ProtocolParameters, plan
 from bench.protocol.plan import LONGEST
+from bench.questions import ABORT, RESUME
 from bench.rig import Rig
 from bench.rig_file import RigFile
-from bench.running import ABORT, RESUME, Observer
+from bench.running import Observer
 from bench.station.local import LocalStation
 
 LONGEST_DAYS = 30.0
@@ -374,7 +375,7 @@ class _Kept:
     def make_room(self) -> None:
         pass
 
-    def finish(self, *, status: str, reason: str, finished: float, safe_state: Mapping[str, str]) -> None:
+    def finish(self, **_: object) -> None:
         pass
 
     def extremes(self, description: RigDescription) -> dict[str, Extremes]:

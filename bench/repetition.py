@@ -14,6 +14,7 @@ from bench.errors import ConfigurationError, DataError
 from bench.interrupts import Interrupts
 from bench.journal import Record
 from bench.protocol import ProtocolDefinition, digest_of, find_protocol
+from bench.protocol.changes import ParameterChange
 from bench.recorded_files import PROTOCOL_NAME, Original, unpack
 from bench.results.run_comparison import RunComparison, compare_runs
 from bench.rig_file import RigFile, rig_of_content
@@ -86,6 +87,7 @@ def repeat(
     """
     with Record(run) as record:
         meta, files = record.meta, record.files()
+        changes = ParameterChange.among((event.kind, event.text) for event in record.events())
     if "protocol_source" not in meta:
         raise DataError(
             f"{run} cannot be repeated: its journal (schema {meta.get('schema')}) does not hold the files that the "
@@ -119,6 +121,7 @@ def repeat(
             interlock_rate=meta["interlock_rate"] if own else None,
             faults=original.faults,
             original=original,
+            changes=changes,
         )
         result = carry_out(asked, console, interrupts)
     with Record(run) as before, Record(result.folder) as now:

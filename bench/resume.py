@@ -46,6 +46,8 @@ class Resume:
         Whether to go on although the specimen is not as the record left it.
     live : bool
         Whether to serve the live view on the loopback interface.
+    notify : tuple of str
+        Who is sent messages; see `bench.notify`.
     """
 
     folder: Path
@@ -55,6 +57,7 @@ class Resume:
     accept_changes: bool = False
     accept_disagreement: bool = False
     live: bool = False
+    notify: tuple[str, ...] = ()
 
 
 def resume(asked: Resume, console: Console, interrupts: Interrupts | None = None) -> RunResult:
@@ -156,5 +159,6 @@ def _run_of(asked: Resume, meta: Mapping[str, Any], files: Mapping[str, bytes], 
         recording=False,
         attach=asked.attach,
         interlock_rate=meta["interlock_rate"],
+        notify=asked.notify,
         original=Original(meta, files, scratch, recorded if recorded is not None and recorded.in_process else None),
     )

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from enum import StrEnum
 from functools import cached_property, partial
 from types import TracebackType
-from typing import Self
+from typing import Any, Self, TypeVar
 
 from bench.binding import check_roles
 from bench.clock import Clock, make_clock
@@ -16,9 +16,12 @@ from bench.description import RigDescription
 from bench.devices import Actuator, Device, DeviceDescription, Signal
 from bench.errors import ConfigurationError, DeviceError
 from bench.journal import check_names
+from bench.readables import ReadableSignal
 from bench.rig_file import Laboratory, RigFile
-from bench.roles import BlockPlayer, Floats, JointReader
+from bench.roles import BlockPlayer, Floats, JointReader, LoadCell
 from bench.safety import SAFE, make_safe
+
+T = TypeVar("T")
 
 
 class Look(StrEnum):
@@ -90,15 +93,35 @@ class Rig:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         try:
-            unsafe = {name: state for name, state in make_safe(self.devices.values()).items() if state != SAFE}
+            self._make_safe(error)
         finally:
             self.close()
+
+    def _make_safe(self, error: BaseException | None) -> None:
+        """Make every device safe; where one is not, raise DeviceError, or note it on an error that is on its way."""
+        unsafe = {name: state for name, state in make_safe(self.devices.values()).items() if state != SAFE}
         if unsafe:
             message = "; ".join(f"NOT in its safe state: {state}" for state in unsafe.values())
             failure = DeviceError(", ".join(unsafe), message)
             if error is None:
                 raise failure
             error.add_note(str(failure))
+
+    def safely(self, plan: Generator[Any, Any, T]) -> Generator[Any, Any, T]:
+        """Return a plan of bluesky that leaves every device safe by whatever way it ends: done, failed, aborted.
+
+        Raises
+        ------
+        DeviceError
+            At the end of the plan, if a device did not confirm its safe state.
+        """
+        try:
+            result = yield from plan
+        except BaseException as error:
+            self._make_safe(error)
+            raise
+        self._make_safe(None)
+        return result
 
     def close(self) -> None:
         """Close every line that can still be closed; each device keeps the state that it is in."""
@@ -113,6 +136,41 @@ class Rig:
         """Return a device that takes a set-point; raises ConfigurationError if there is none of that name."""
         self.description.limits_of(name)
         return self.actuators[name]
+
+    @cached_property
+    def readables(self) -> dict[str, Device | ReadableSignal]:
+        """What bluesky can read, by name: the devices, the set-points and the derived signals of the rig.
+
+        A derived signal measures the devices that it comes from each time it is read.
+        """
+        found: dict[str, Device | ReadableSignal] = dict(self.devices)
+        for name, actuator in self.actuators.items():
+            signal = actuator.setpoint_signal
+            take = partial(getattr, actuator, "setpoint")
+            found[signal.name] = ReadableSignal(signal, self.clock, take, f"{name}:setpoint")
+        for signal in self.signals:
+            if signal.name in self.derived:
+                take = partial(self._derive, signal.name)
+                found[signal.name] = ReadableSignal(signal, self.clock, take, f"derived:{signal.name}")
+        return found
+
+    def _derive(self, name: str) -> float:
+        """Measure what a derived signal comes from, and compute it."""
+        sources = self.sources([name])
+        readings = {}
+        for device_name, device in self.devices.items():
+            own = {signal.name for signal in device.signals} | {self._setpoint_names.get(device_name, "")}
+            if own & sources:
+                readings[device_name] = device.measure()
+        return self.assembled(readings)[name]
+
+    def load_cell(self, name: str) -> LoadCell:
+        """Return a load cell; raises ConfigurationError if there is none of that name."""
+        device = self.devices.get(name)
+        if not isinstance(device, LoadCell):
+            known = ", ".join(name for name, each in self.devices.items() if isinstance(each, LoadCell)) or "none"
+            raise ConfigurationError(f"{name} is not a load cell; there are: {known}")
+        return device
 
     @property
     def setpoints(self) -> dict[str, float]:

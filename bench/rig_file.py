@@ -73,6 +73,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from bench import registry
 from bench.binding import RoleTable
+from bench.calibration import read_calibration
 from bench.clock import Clock
 from bench.configuration_errors import problems
 from bench.derived import DerivedSignal
@@ -368,6 +369,7 @@ def _merged(path: str, text: str, extending: tuple[str, ...], bases: list[str]) 
         raise ConfigurationError(f"{path}: not valid TOML: {error}") from None
     if isinstance(rig := content.get("rig"), dict) and str(rig.get("twin", "")).endswith(".toml"):
         rig["twin"] = str(Path(path).parent / rig["twin"])
+    _inline_calibrations(path, content)
     base, without = content.pop("extends", None), content.pop("without", [])
     if base is None and not without:
         return content
@@ -391,6 +393,14 @@ def _merged(path: str, text: str, extending: tuple[str, ...], bases: list[str]) 
             raise ConfigurationError(f"{path}: without = {key!r}: {base_path} has no such key")
         del table[last]
     return _over(merged, content)
+
+
+def _inline_calibrations(path: str, content: dict[str, Any]) -> None:
+    """Put the content of calibration files, which stand beside the rig file, in the place of their names."""
+    derived = content.get("derived")
+    for table in derived.values() if isinstance(derived, dict) else ():
+        if isinstance(table, dict) and isinstance(name := table.get("calibration"), str):
+            table["calibration"] = read_calibration(Path(path).parent / name).model_dump(mode="json")
 
 
 def _over(base: dict[str, Any], content: Mapping[str, Any]) -> dict[str, Any]:
@@ -423,11 +433,11 @@ def _table(content: Any, parents: Sequence[str]) -> dict[str, Any] | None:  # no
 
 def _override(content: dict[str, Any], key: str, value: str, path: str) -> None:
     *parents, last = key.split(".")
-    if parents in (["telemetry"], ["safety"]):
+    if parents in (["telemetry"], ["safety"]) or (len(parents) == 2 and parents[0] == "emulation"):
         # Tables with defaults for every key, which a file may leave out.
-        content.setdefault(parents[0], {})
-    if parents == ["emulation", "plant"] and isinstance(content.get("emulation"), dict):
-        content["emulation"].setdefault("plant", {})
+        below = content if len(parents) == 1 else content.get("emulation")
+        if isinstance(below, dict):
+            below.setdefault(parents[-1], {})
     table = _table(content, parents)
     if table is None:
         raise ConfigurationError(f"{path}: there is no table {'.'.join(parents)!r} in which {last!r} could be set")

@@ -96,6 +96,7 @@ def metadata(
         Time of day at laboratory time 0.
     """
     file = description.file
+    layout = protocol.views.layout(slots, file.dashboard) if protocol.views else file.dashboard
     return {
         "rig": file.name,
         "rig_title": file.rig.title,
@@ -125,8 +126,9 @@ def metadata(
             **{entry.name: entry.settings.model_dump(mode="json") for entry in file.devices},
             **{name: derived.model_dump(mode="json") for name, derived in file.derived.items()},
         },
-        "dashboard": file.dashboard.model_dump(mode="json") if file.dashboard else None,
-        "operator": _operator(),
+        "dashboard": layout.model_dump(mode="json") if layout else None,
+        "over_time": protocol.views.signals_over_time(slots) if protocol.views else [],
+        "operator": current_user(),
         "command": sys.argv,
         "packages": _versions(),
         "git": _git_state(),
@@ -187,7 +189,8 @@ def make_folder(parent: Path, name: str) -> Path:
     raise ConfigurationError(f"{parent} holds a thousand runs of this second already")
 
 
-def _operator() -> str:
+def current_user() -> str:
+    """Return the name of the user of this process, or `unknown`."""
     try:
         return getpass.getuser()
     except (OSError, KeyError):

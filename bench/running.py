@@ -13,13 +13,13 @@ from bench.devices import Signal
 from bench.errors import AbortError, ConfigurationError
 from bench.interrupts import Interrupts
 from bench.journal import Event, StepRecord
+from bench.lateness import Lateness
+from bench.protocol.changes import PARAMETER, ParameterChange
 from bench.protocol.vocabulary import LATENESS, TRACES, Reading
+from bench.questions import ABORT, AT_A_PAUSE, NOBODY, NOTE, OFF, RESUME, SET, STEP, Question
 from bench.rig import Look
 from bench.settling import Settled
 from bench.station.interface import Station
-
-RESUME = "resume"
-ABORT = "abort"
 
 TRACE_NAMES = tuple(signal.name for signal in TRACES)
 _TRACE_AND_LATENESS = (*TRACE_NAMES, LATENESS.name)
@@ -52,8 +52,16 @@ class RunRecord(Protocol):
     def make_room(self) -> None:
         """Give back the space that is kept for the end of the run."""
 
-    def finish(self, *, status: str, reason: str, finished: float, safe_state: Mapping[str, str]) -> None:
-        """Keep how the run ended."""
+    def finish(
+        self,
+        *,
+        status: str,
+        reason: str,
+        finished: float,
+        safe_state: Mapping[str, str],
+        lateness: Mapping[str, object],
+    ) -> None:
+        """Keep how the run ended, and how late its loops were."""
 
 
 class Observer(Protocol):
@@ -67,6 +75,26 @@ class Observer(Protocol):
 
     def event(self, event: Event) -> None:
         """See something that happened."""
+
+
+class Notices(Protocol):
+    """Sends messages to people; what fails belongs into the record."""
+
+    def take_notices(self) -> list[str]:
+        """Return what has failed since the last call."""
+
+    def finish(self) -> None:
+        """Wait a moment for what is still to be sent."""
+
+
+class ParametersAtHand(Protocol):
+    """The parameters of a protocol that goes on."""
+
+    def changeable(self) -> Mapping[str, str]:
+        """Return those that may be changed, with value, unit and what is allowed."""
+
+    def change(self, step: int, name: str, value: str) -> ParameterChange:
+        """Change one from the reading of a step on; raises ConfigurationError if that is not allowed."""
 
 
 class RunAtHand:
@@ -85,9 +113,12 @@ class RunAtHand:
     interrupts : Interrupts
         What the operator and the system ask for.
     ask : callable, optional
-        Asks the operator a question, and returns `resume` or `abort`. Without it a pause or a prompt aborts the run.
+        Asks the operator a question, and returns one of its answers; any other one is `abort`. Without it a pause or
+        a prompt aborts the run.
     zero : float, optional
         Time of the clock at which the record begins to count, s; now if not given.
+    messages : Notices, optional
+        What sends messages about the run.
 
     Attributes
     ----------
@@ -101,6 +132,10 @@ class RunAtHand:
         What a controller thinks, for the record.
     zero : float
         Time of the clock at which the record begins to count, s.
+    lateness : dict of str to Lateness
+        How late the samples of loops were, by label.
+    parameters : ParametersAtHand or None
+        The parameters of the protocol, for changes at a pause.
     """
 
     def __init__(
@@ -109,8 +144,9 @@ class RunAtHand:
         journal: RunRecord,
         observers: Iterable[Observer],
         interrupts: Interrupts,
-        ask: Callable[[str], str] | None,
+        ask: Callable[[Question], str] | None,
         zero: float | None = None,
+        messages: Notices | None = None,
     ) -> None:
         self.station = station
         self.clock = station.clock
@@ -125,8 +161,20 @@ class RunAtHand:
         self._journal = journal
         self._observers = tuple(observers)
         self._interrupts = interrupts
+        self._messages = messages
+        self.lateness: dict[str, Lateness] = {}
+        self.parameters: ParametersAtHand | None = None
         self._pause_reason = ""
         self._is_demanded = False
+        self._one_step = False
+        self._on_again = -math.inf
+
+    def keep_lateness(self, label: str, lateness: Lateness) -> None:
+        """Add to what the record says of how late the samples of loops were, by their label."""
+        if label in self.lateness:
+            self.lateness[label].merge(lateness)
+        else:
+            self.lateness[label] = lateness
 
     def expect_ticks(self, what: str) -> None:
         """Promise the station a request with each tick."""
@@ -168,6 +216,15 @@ class RunAtHand:
             self.event(news.level, news.kind, news.text)
         for text in self._journal.take_notices():
             self.event("WARN", "journal", text)
+        if self._messages is not None:
+            for text in self._messages.take_notices():
+                self.event("WARN", "notify", text)
+
+    def finish_messages(self) -> None:
+        """Wait a moment for messages that are still to be sent, and record what has failed."""
+        if self._messages is not None:
+            self._messages.finish()
+            self.take_news()
 
     def tick_after(self, tick: float) -> float:
         """Return when the tick after one is due; missed ticks are skipped, not caught up."""
@@ -181,6 +238,9 @@ class RunAtHand:
             self.sleep_until(instant)
             self.tick()
             self.pause_if_asked()
+            if self._on_again > started:
+                # The specimen was without its set-points: it is held for the whole time again.
+                end, started, tick = self._on_again + end - started, self._on_again, 0
             tick = max(tick + 1, math.floor((self.clock.now() - started) / self.period))
         self.sleep_until(end)
 
@@ -227,6 +287,8 @@ class RunAtHand:
         )
         self._journal.step(record)
         self.steps += 1
+        if self._one_step:
+            self._one_step, self._pause_reason, self._is_demanded = False, "one step", True
         self._tell(lambda observer: observer.step(record))
         return Reading(record.step, record.finished, record.settled, values)
 
@@ -257,6 +319,12 @@ class RunAtHand:
         """Whether the operator or an interlock has asked for a pause, or an interlock holds the set-points."""
         return self._interrupts.pause_requested or self._is_demanded
 
+    def take_pause(self) -> tuple[bool, str]:
+        """Return whether the operator or the system asks for a pause, and why an interlock does; each once."""
+        asked, self._interrupts.pause_requested = self._interrupts.pause_requested, False
+        why, self._pause_reason = self._pause_reason, ""
+        return asked, why
+
     def pause_if_asked(self) -> float:
         """Pause if the operator or an interlock has asked for it; return for how long, s.
 
@@ -277,16 +345,69 @@ class RunAtHand:
 
     def _pause(self) -> None:
         why, self._pause_reason = self._pause_reason, ""
+        alone = AbortError(f"ended by {why or 'Ctrl-C'}; no operator is present to resume")
         if self.ask is None:
-            raise AbortError(f"ended by {why or 'Ctrl-C'}; no operator is present to resume")
-        self.event("WARN", "pause", f"paused by {why or 'the operator'}; the set-points stand")
-        answer = self.await_answer(self.ask, "paused:")
+            raise alone
+        text = f"paused by {why or 'the operator'}; the set-points stand"
+        self.event("WARN", "pause", text)
+        off: dict[str, float] = {}
+        problem = ""
+        while True:
+            changeable = {} if self.parameters is None else self.parameters.changeable()
+            answer = self.await_answer(self.ask, Question(text, AT_A_PAUSE, "PAUSED", changeable, problem))
+            command, _, rest = answer.partition(" ")
+            problem = ""
+            if command == NOTE:
+                self.event("INFO", "remark", rest)
+            elif command == SET:
+                problem = self._change(rest)
+            elif command == OFF:
+                off = off or self.switch_off()
+                text = "the outputs are off until the run is resumed"
+            else:
+                break
         self._interrupts.pause_requested = False
-        if answer != RESUME:
+        if command == NOBODY:
+            raise alone
+        if command not in (RESUME, STEP):
             raise AbortError("ended by the operator at a pause")
-        self.event("INFO", "resume", "resumed")
+        if off:
+            self._switch_on(off)
+        self._one_step = command == STEP
+        self.event("INFO", "resume", "resumed for one step" if self._one_step else "resumed")
 
-    def await_answer(self, ask: Callable[[str], str], question: str) -> str:
+    def _change(self, assignment: str) -> str:
+        """Change a parameter of the protocol; return what is wrong with it, empty if it is changed."""
+        if self.parameters is None:
+            return "this protocol has no parameters"
+        name, _, value = assignment.partition("=")
+        try:
+            change = self.parameters.change(self.steps, name.strip(), value.strip())
+        except ConfigurationError as error:
+            return str(error)
+        self.event("WARN", PARAMETER, str(change))
+        return ""
+
+    def switch_off(self) -> dict[str, float]:
+        """Switch every output off; return the set-points that there were."""
+        setpoints = {name: self.station.setpoint(name) for name in self.station.description.limits}
+        self.station.promise(max(self.station.description.devices[name].safe_within for name in setpoints), "rest")
+        self.station.rest()
+        self.expect_ticks("the outputs are off")
+        self.event("WARN", "off", "outputs off: every device is in its safe state until the run is resumed")
+        return {name: value for name, value in setpoints.items() if math.isfinite(value)}
+
+    def _switch_on(self, setpoints: Mapping[str, float]) -> None:
+        self.station.apply(setpoints)
+        self._on_again = self.clock.now()
+        self.event(
+            "WARN",
+            "off",
+            "outputs on again, at the set-points from before: a specimen with memory is no longer where the protocol "
+            "left it",
+        )
+
+    def await_answer(self, ask: Callable[[Question], str], question: Question) -> str:
         """Have the operator asked, with telemetry and interlocks going on; return the answer."""
         self.expect_ticks("the operator is asked")
         answer: list[str] = []

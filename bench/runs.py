@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import threading
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -20,6 +20,7 @@ from bench.clock import Clock, Stopwatch, wall_time
 from bench.description import RigDescription
 from bench.detached_observer import DetachedObserver
 from bench.devices import Signal
+from bench.dialogue import Dialogue
 from bench.emulated_twin import twin_of
 from bench.engine import Engine, Outcome, check_before_moving
 from bench.errors import AbortError, ConfigurationError
@@ -29,10 +30,14 @@ from bench.guardian.remote import GuardedRig, RemoteStation
 from bench.interrupts import Interrupts, say_at_once
 from bench.journal import FILE_NAME, Journal, abandon
 from bench.locks import Holder, Locks
+from bench.mailbox import RunMailbox
 from bench.model_file import models_among
+from bench.notify import Notifier, facts_of
 from bench.past import Interrupted
 from bench.printing import print_plain
 from bench.protocol import LATENESS, TRACES, Plan, ProtocolDefinition, ProtocolParameters, plan
+from bench.protocol.changes import ParameterChange
+from bench.questions import Question
 from bench.recorded_files import RIG_FILE_NAME, Original, given_files
 from bench.rehearsal import Rehearsal, rehearse
 from bench.remaining_time import Expectation
@@ -42,7 +47,7 @@ from bench.run_record import differences, make_folder, metadata, run_name
 from bench.start_checks import check_start, overdue_calibrations
 from bench.station.interface import Station
 from bench.station.local import LocalStation
-from bench.terminal import ProgressDisplay, RehearsalDisplay, ask_operator
+from bench.terminal import ProgressDisplay, RehearsalDisplay
 
 if TYPE_CHECKING:
     from bench.dashboard import Dashboard
@@ -91,6 +96,10 @@ class Run:
     rehearse : bool
         Whether the run is rehearsed on the emulated twin of the rig before anything moves. A run on the virtual clock
         is not, as it would take as long itself.
+    notify : tuple of str
+        Who is sent messages at a pause, a prompt, a warning, a trip and the end; see `bench.notify`.
+    changes : tuple of ParameterChange
+        Parameters that are changed on the way, as in the run that is repeated.
     """
 
     protocol: ProtocolDefinition
@@ -107,6 +116,8 @@ class Run:
     faults: Path | None = None
     original: Original | None = None
     rehearse: bool = True
+    notify: tuple[str, ...] = ()
+    changes: tuple[ParameterChange, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -160,6 +171,7 @@ def carry_out(
     rig_file, stated, parameters = _read(run)
     original = run.original
     faults = () if run.faults is None else read_schedule(run.faults)
+    notifier = Notifier(run.notify) if run.notify else None
     dashboard_class = _dashboard_class(run, console)
     operator_is_there = sys.stdin is not None and sys.stdin.isatty()
     with ExitStack() as stack:
@@ -229,19 +241,40 @@ def carry_out(
             observers.append(dashboard)
             journal.when_short = dashboard.stop_recording
             if run.live:
-                console.print(f"live view: run [bold]rerun {dashboard.uri}[/] in another terminal", highlight=False)
+                _open_view(dashboard, console)
         length = _expectation(rehearsal, planned)
         progress = ProgressDisplay(console, run.protocol.name, signals, _shown(description), length, clock.factor)
         observers.append(stack.enter_context(DetachedObserver(progress)))
-        ask = partial(ask_operator, console) if operator_is_there else None
-        engine = Engine(station, journal, observers, interrupts, ask, zero)
+        if notifier is not None:
+            notifier.signals = tuple(signal.name for signal in signals)
+            notifier.facts = facts_of(meta, folder)
+            observers.append(stack.enter_context(notifier))
+        # A run on the virtual clock is over before anybody could look at it.
+        mailbox = stack.enter_context(RunMailbox(folder, interrupts)) if clock.sleep_waits else None
+        ask: Callable[[Question], str] | None = Dialogue(
+            console, progress, mailbox, at_terminal=operator_is_there
+        ).ask
+        if not operator_is_there and mailbox is None:
+            ask = None
+        engine = Engine(station, journal, observers, interrupts, ask, zero, notifier, run.changes)
         if again is None:
             engine.warn(warnings)
         outcome = engine.run(run.protocol, parameters, resumption)
         if dashboard is not None:
-            dashboard.finish(outcome.status, outcome.reason)
+            dashboard.finish(outcome.status, outcome.reason, outcome.lateness)
     interrupts.finish()
     return RunResult(folder, outcome, stopwatch.seconds())
+
+
+def _open_view(dashboard: Dashboard, console: Console) -> None:
+    """Open the viewer of a live view where there is a display, else say how to."""
+    from bench.dashboard.viewers import has_display, open_viewer
+
+    if dashboard.uri is not None and has_display():
+        open_viewer(dashboard.uri)
+        print_plain(console, f"live view: {dashboard.uri}; bench watch opens it again")
+    else:
+        console.print(f"live view: run [bold]rerun {dashboard.uri}[/] in another terminal", highlight=False)
 
 
 def _checked(

@@ -2,12 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 
 from bench.devices import Device
+from bench.errors import DeviceError
 
 SAFE = "safe"
 """What `make_safe` says of a device that reached its safe state."""
+
+
+def raise_if_unsafe(states: Mapping[str, str]) -> None:
+    """Raise DeviceError if `make_safe` says of a device that it is not in its safe state."""
+    unsafe = {name: state for name, state in states.items() if state != SAFE}
+    if unsafe:
+        raise DeviceError(", ".join(unsafe), "; ".join(f"NOT in its safe state: {each}" for each in unsafe.values()))
 
 
 def make_safe(devices: Iterable[Device]) -> dict[str, str]:

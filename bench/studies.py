@@ -314,7 +314,7 @@ def reproduce(
     except MissingExtraError as error:
         print_plain(console, f"no recordings: {error}")
         recorded = False
-    from bench.results.report import export_run
+    from bench.results.export import export_run
     from bench.workers import Workers
 
     stopwatch = Stopwatch()

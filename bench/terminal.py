@@ -3,24 +3,25 @@
 from __future__ import annotations
 
 import math
-import sys
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from datetime import timedelta
 from types import TracebackType
 from typing import Self
 
 from rich.console import Console
+from rich.control import Control
 from rich.errors import LiveError
-from rich.markup import escape
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn
+from rich.segment import ControlType
+from rich.table import Column
 
 from bench.clock import Stopwatch, wall_time
 from bench.devices import Signal
 from bench.journal import Event, StepRecord
 from bench.printing import print_plain
 from bench.remaining_time import Expectation, RemainingTime
-from bench.running import ABORT, RESUME
 from bench.units import format_duration
 from bench.workers import report
 
@@ -66,22 +67,54 @@ class ProgressDisplay:
         self._shown = [(i, signal) for i, signal in enumerate(signals) if signal.name in shown]
         self._steps = expectation.steps if expectation is not None else 0
         self._remaining = RemainingTime(expectation, factor) if expectation is not None else None
-        self._progress = Progress(
+        self._title = title
+        self._phase = ""
+        self._progress, self._task = self._make_bar()
+        self._is_still = False
+        self.lock = threading.RLock()
+        """Held by whoever writes to the console, as the operator may be asked there."""
+        self.latest = ""
+        """The newest readings."""
+        self.is_over = False
+        """Whether nothing is shown any more."""
+        self.ask_again: Callable[[], None] | None = None
+        """Called after something was printed while the bar stands still: the question has to stay the last line."""
+        self._since_start = Stopwatch()
+        self._since_redraw = Stopwatch()
+
+    def _make_bar(self) -> tuple[Progress, TaskID]:
+        progress = Progress(
             # Names and phases are the protocol's: no markup.
             TextColumn("{task.description}", style="bold", markup=False),
-            TextColumn("{task.fields[phase]}", markup=False),
+            # Wide enough for the word that says that the run stands still.
+            TextColumn("{task.fields[phase]}", markup=False, table_column=Column(min_width=7, no_wrap=True)),
             BarColumn(bar_width=None),
             TextColumn("{task.fields[steps]}", style="green", markup=False),
             TextColumn("{task.fields[times]}", markup=False),
             TextColumn("{task.fields[readings]}", style="cyan", markup=False),
-            console=console,
+            console=self._console,
             transient=False,
-            disable=not console.is_terminal,
+            disable=not self._console.is_terminal,
         )
         total = 1.0 if self._remaining is not None else None
-        self._task: TaskID = self._progress.add_task(title, total=total, phase="", steps="", times="", readings="")
-        self._since_start = Stopwatch()
-        self._since_redraw = Stopwatch()
+        task = progress.add_task(self._title, total=total, phase=self._phase, steps="", times="", readings="")
+        return progress, task
+
+    def stand_still(self, state: str) -> None:
+        """Leave the bar as it stands, under a word for the state of the run, so that the operator can be asked."""
+        with self.lock:
+            if not self._is_still:
+                self._is_still = True
+                self._progress.update(self._task, phase=state)
+                self._progress.stop()
+
+    def go_on(self) -> None:
+        """Draw a new bar below what was printed since the last one stands still."""
+        with self.lock:
+            if self._is_still and not self.is_over:
+                self._progress, self._task = self._make_bar()
+                self._is_still = False
+                self._progress.start()
 
     def __enter__(self) -> Self:
         self._since_start = Stopwatch()
@@ -92,9 +125,11 @@ class ProgressDisplay:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         # The terminal may be gone by now.
-        with suppress(OSError):
-            self._progress.refresh()
-            self._progress.stop()
+        with suppress(OSError), self.lock:
+            self.is_over = True
+            if not self._is_still:
+                self._progress.refresh()
+                self._progress.stop()
 
     def telemetry(self, t: float, step: int, values: Sequence[float]) -> None:
         """Show the readings of a tick, at most ten times a second."""
@@ -117,9 +152,20 @@ class ProgressDisplay:
                 self._remaining.resume(event.t)
             elif event.kind == "prompt":
                 self._remaining.prompt(event.t)
+        with self.lock:
+            self._show_event(event)
+
+    def _show_event(self, event: Event) -> None:
         if event.kind == "phase":
+            self._phase = event.text
             self._progress.update(self._task, phase=event.text)
-        elif event.level != "INFO" or event.kind in ("note", "resume"):
+        elif self._is_still and event.kind in ("pause", "prompt"):
+            pass  # the question says it
+        elif event.level != "INFO" or event.kind in ("note", "remark", "resume"):
+            if self.ask_again is not None and self._console.is_terminal:
+                # Over the prompt, and the line above it that says for how long.
+                erased = ControlType.CARRIAGE_RETURN, (ControlType.ERASE_IN_LINE, 2)
+                self._console.control(Control(*erased, (ControlType.CURSOR_UP, 1), *erased))
             style = {"INFO": "dim", "WARN": "yellow", "ERROR": "bold red"}[event.level]
             self._console.print(
                 f"{format_duration(event.t):>10}  {event.kind}: {event.text}",
@@ -127,6 +173,8 @@ class ProgressDisplay:
                 highlight=False,
                 markup=False,
             )
+            if self.ask_again is not None:
+                self.ask_again()
 
     def _show(self, t: float, steps: int, values: Sequence[float]) -> None:
         self._since_redraw = Stopwatch()
@@ -138,13 +186,16 @@ class ProgressDisplay:
             if math.isfinite(left.at_most):
                 times += f", at most {_time_of_day(left.at_most)}"
         readings = [f"{signal.name} {values[i]:.{signal.precision}f} {signal.unit}" for i, signal in self._shown]
-        self._progress.update(
-            self._task,
-            completed=completed,
-            steps=f"{steps}/{self._steps or '?'}",
-            times=times,
-            readings="  ".join(readings),
-        )
+        self.latest = "  ".join(readings)
+        with self.lock:
+            if not self._is_still:
+                self._progress.update(
+                    self._task,
+                    completed=completed,
+                    steps=f"{steps}/{self._steps or '?'}",
+                    times=times,
+                    readings=self.latest,
+                )
         report(steps, self._steps or None, "  ".join([times, *readings]))
 
 
@@ -211,16 +262,3 @@ def _time_of_day(seconds: float) -> str:
     now = wall_time()
     end = (now + timedelta(seconds=seconds)).astimezone()
     return end.strftime("%H:%M:%S" if end.date() == now.astimezone().date() else "%Y-%m-%d %H:%M")
-
-
-def ask_operator(console: Console, question: str) -> str:
-    """Ask at a pause or a prompt how to go on; return `resume` or `abort`."""
-    console.print(f"{escape(question)} [bold]r[/] resumes, [bold]a[/] ends the run in the safe state (then Enter)")
-    for line in sys.stdin:
-        answer = line.strip().lower()
-        if answer in ("r", RESUME):
-            return RESUME
-        if answer in ("a", ABORT):
-            return ABORT
-        console.print("please answer r (resume) or a (abort)")
-    return ABORT

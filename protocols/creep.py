@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from bench.devices import Actuator, Signal
-from bench.protocol import Dwell, Messages, Note, Phase, Slots, Step, from_slot, parameter, protocol, unit_of
+from bench.protocol import Dwell, Messages, Note, Phase, Slots, Step, Views, from_slot, parameter, protocol, unit_of
 from protocols.preparation import LOAD, LoadedParameters, hang_load
 
 _DRIVE = unit_of("drive")
@@ -30,7 +30,11 @@ class Parameters(LoadedParameters):
     settling: float = parameter(5.0, unit="s", low=0, high=3600, help="time after a step that counts as settling")
 
 
-@protocol(needs={"drive": Actuator, "response": Signal}, may_use=LOAD)
+@protocol(
+    needs={"drive": Actuator, "response": Signal},
+    may_use=LOAD,
+    views=Views((("drive", "response"),), plane=False, over_time=("response", "drive")),
+)
 def creep(parameters: Parameters, slots: Slots) -> Messages:
     """Step the drive up and down, and watch the response at each set-point.
 

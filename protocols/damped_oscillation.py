@@ -6,7 +6,7 @@ from itertools import pairwise
 
 from bench.identification import excitation
 from bench.protocol import Dwell, Messages, Phase, Slots, Step, from_slot, parameter, protocol
-from protocols.preparation import DRIVE, DRIVE_AND_RESPONSE, LOAD, RampParameters, reset
+from protocols.preparation import DRIVE, DRIVE_AND_RESPONSE, LOAD, LOOP, RampParameters, reset
 
 
 class Parameters(RampParameters):
@@ -21,7 +21,7 @@ class Parameters(RampParameters):
     half_cycles: int = parameter(36, unit="1", low=1, high=1000, help="number of half-cycles after the first rise")
 
 
-@protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD)
+@protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD, views=LOOP)
 def damped_oscillation(parameters: Parameters, slots: Slots) -> Messages:
     """Characterize a hysteresis by nested minor loops.
 

@@ -7,7 +7,7 @@ import numpy as np
 from bench.hysteresis import uniform_levels
 from bench.identification import covering_sequence, design
 from bench.protocol import Dwell, Messages, Phase, Slots, Step, from_slot, parameter, protocol
-from protocols.preparation import DRIVE, DRIVE_AND_RESPONSE, LOAD, SweepParameters, reset
+from protocols.preparation import DRIVE, DRIVE_AND_RESPONSE, LOAD, LOOP, SweepParameters, reset
 
 
 class Parameters(SweepParameters):
@@ -19,7 +19,7 @@ class Parameters(SweepParameters):
     per_cell: int = parameter(2, unit="1", low=1, high=20, help="set-points from one level to the next")
 
 
-@protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD)
+@protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD, views=LOOP)
 def covering(parameters: Parameters, slots: Slots) -> Messages:
     """Characterize a hysteresis in the fewest set-points that cover every cell.
 
@@ -31,7 +31,7 @@ def covering(parameters: Parameters, slots: Slots) -> Messages:
     yield from _carry_out(parameters, slots, covering_sequence(*_grid(parameters), per_cell=parameters.per_cell))
 
 
-@protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD)
+@protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD, views=LOOP)
 def first_order_reversals(parameters: Parameters, slots: Slots) -> Messages:
     """Characterize a hysteresis by first-order reversal curves.
 

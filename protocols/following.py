@@ -13,7 +13,7 @@ from bench.controllers import ControllerSetup, controller_names, make_controller
 from bench.protocol import Control, Messages, Phase, Slots, from_slot, parameter, protocol, unit_of
 from bench.results.data import read_columns
 from bench.results.tracking import FOLLOW
-from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, load_checked_model
+from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LOOP, load_checked_model
 from protocols.session import SessionParameters, begin_session, keep_adapted, session_kinds
 
 _DRIVE = unit_of("drive")
@@ -36,7 +36,7 @@ class Parameters(SessionParameters):
     fastest: float = parameter(from_slot("drive", "rate"), unit=f"{_DRIVE}/s", help="what the drive can follow")
 
 
-@protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD, controls="response")
+@protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD, controls="response", views=LOOP)
 def following(parameters: Parameters, slots: Slots) -> Messages:
     """Make the response follow a reference, set-point by set-point at a fixed rate.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Generator, Mapping
-from typing import Any, TypeAlias, TypeVar
+from typing import TypeAlias, TypeVar
 
 from bench.controllers import load_model_for, saturated_below
 from bench.devices import Actuator, Signal
@@ -19,15 +19,20 @@ from bench.protocol import (
     Slot,
     Slots,
     Step,
+    Views,
     from_slot,
     parameter,
     unit_of,
 )
+from bench.tuning_file import Tuning
 
 DRIVE_AND_RESPONSE: Mapping[str, type[Actuator] | type[Signal]] = {"drive": Actuator, "response": Signal}
 """What a characterization needs of a rig."""
 LOAD: Mapping[str, type[Signal]] = {"load": Signal}
 """What it uses if the rig has it: a load that an operator hangs on the specimen."""
+
+LOOP = Views(loops=(("drive", "response"),))
+"""What is worth seeing of it."""
 
 R = TypeVar("R")
 Part: TypeAlias = Generator[Message, Reading, R]
@@ -53,7 +58,12 @@ class SweepParameters(LoadedParameters):
     low: float = parameter(from_slot("drive", "low"), unit=DRIVE, help="lowest set-point, where the memory is reset")
     high: float = parameter(from_slot("drive", "high"), unit=DRIVE, help="highest set-point")
     dwell: float = parameter(
-        from_slot("drive", "dwell"), unit="s", low=0.01, high=3600, help="hold at each set-point before the reading"
+        from_slot("drive", "dwell"),
+        unit="s",
+        low=0.01,
+        high=3600,
+        help="hold at each set-point before the reading",
+        changeable=True,
     )
 
 
@@ -71,8 +81,10 @@ class ControlledParameters(LoadedParameters):
     model: str = parameter(..., unit="", help="model file, as `bench identify` writes it", file=True)
     reset: float = parameter(from_slot("drive", "saturating"), unit=DRIVE, help="where the memory is reset")
     hottest: float = parameter(from_slot("drive", "high"), unit=DRIVE, help="highest set-point allowed")
-    tuning: dict[str, dict[str, Any]] = parameter(
-        {}, unit="", help="numbers of a controller in place of its defaults, as a table of the rig file for each"
+    tuning: Tuning = parameter(
+        {},
+        unit="",
+        help="numbers of controllers in place of their defaults: a tuning file, or tables of the rig file",
     )
 
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from bench.identification import excitation
 from bench.protocol import Dwell, Messages, Phase, Slots, Step, from_slot, parameter, protocol
-from protocols.preparation import DRIVE, DRIVE_AND_RESPONSE, LOAD, RampParameters, reset
+from protocols.preparation import DRIVE, DRIVE_AND_RESPONSE, LOAD, LOOP, RampParameters, reset
 
 
 class Parameters(RampParameters):
@@ -26,7 +26,7 @@ class Parameters(RampParameters):
     sequence_seed: int = parameter(5, unit="1", low=0, help="seed of the sequence, independent of the rig's seed")
 
 
-@protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD)
+@protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD, views=LOOP)
 def random_validation(parameters: Parameters, slots: Slots) -> Messages:
     """Measure along a random sequence of set-points.
 

@@ -9,7 +9,7 @@ import numpy as np
 from bench.errors import DataError
 from bench.protocol import Dwell, Messages, Phase, Slot, Slots, Step, parameter, protocol
 from bench.results.data import read_columns
-from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, SweepParameters, reset
+from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LOOP, SweepParameters, reset
 
 _LONGEST_DWELL = 86400.0
 
@@ -24,7 +24,7 @@ class Parameters(SweepParameters):
     )
 
 
-@protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD)
+@protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD, views=LOOP)
 def sequence(parameters: Parameters, slots: Slots) -> Messages:
     """Measure along a sequence of set-points from a file, such as one of `bench design`.
 
@@ -36,8 +36,8 @@ def sequence(parameters: Parameters, slots: Slots) -> Messages:
     targets, dwells = _read(parameters, drive)
     yield from reset(slots, parameters.low, parameters.dwell, load=parameters.load)
     yield Phase("sequence")
-    for target, dwell in zip(targets, dwells, strict=True):
-        yield Step({drive.device: target}, Dwell(dwell))
+    for i, target in enumerate(targets):
+        yield Step({drive.device: target}, Dwell(dwells[i] if dwells else parameters.dwell))
 
 
 def _read(parameters: Parameters, drive: Slot) -> tuple[list[float], list[float]]:
@@ -46,7 +46,7 @@ def _read(parameters: Parameters, drive: Slot) -> tuple[list[float], list[float]
         names.append(parameters.dwells)
     columns = read_columns(path, names)
     targets = columns.values[parameters.column]
-    dwells = columns.values[parameters.dwells] if parameters.dwells else np.full(targets.size, parameters.dwell)
+    dwells = columns.values[parameters.dwells] if parameters.dwells else np.empty(0)
     for name, expected in zip(names, (drive.unit, "s"), strict=False):
         if columns.units[name] not in ("", expected):
             raise DataError(f"{path}: column {name} is in {columns.units[name]}; expected {expected}")

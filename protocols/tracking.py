@@ -13,7 +13,7 @@ from bench.hysteresis import Policy
 from bench.protocol import Control, Dwell, Messages, Note, Phase, Slots, Step, from_slot, parameter, protocol, unit_of
 from bench.results.data import read_columns
 from bench.results.tracking import REACH, READING
-from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, load_checked_model
+from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LOOP, load_checked_model
 from protocols.session import SessionParameters, begin_session, keep_adapted, session_kinds
 
 _TARGETS_A_NOTE = 10
@@ -36,14 +36,18 @@ class Parameters(SessionParameters):
     )
     count: int = parameter(60, unit="1", low=2, high=10000, help="number of generated targets")
     sequence_seed: int = parameter(1, unit="1", low=0, help="seed of the generated targets")
-    readings: int = parameter(10, unit="1", low=1, high=1000, help="readings at each target once it is reached")
+    readings: int = parameter(
+        10, unit="1", low=1, high=1000, help="readings at each target once it is reached", changeable=True
+    )
     fallback: Fallback = parameter(
         "none", unit="", help="what goes on in place of a controller that does not converge; none ends the run"
     )
-    timeout: float = parameter(300.0, unit="s", low=1, high=86400, help="longest time for one target")
+    timeout: float = parameter(
+        300.0, unit="s", low=1, high=86400, help="longest time for one target", changeable=True
+    )
 
 
-@protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD, controls="response")
+@protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD, controls="response", views=LOOP)
 def tracking(parameters: Parameters, slots: Slots) -> Messages:
     """Bring the response to a sequence of targets.
 

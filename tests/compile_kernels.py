@@ -80,6 +80,7 @@ def element_operators() -> None:
     ):
         each.evaluate(inputs)
         each.regressor(inputs)
+        each.stream().step(0.2)
 
 
 def hybrid_estimate() -> None:

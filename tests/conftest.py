@@ -1,19 +1,26 @@
 """What the tests of several folders share."""
 
+import gc
 import json
 import os
 import select
+import shlex
 import shutil
 import signal
 import sqlite3
 import subprocess
 import sys
+import tempfile
 import threading
 from contextlib import closing, contextmanager
 from itertools import chain, groupby
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+
+sys.path.append(str(Path(__file__).parent))
+from warm_client import start_warm
 
 # Before numpy is loaded, and for the processes of the tests too: two workers, each with a thread of BLAS a core,
 # wait for one another, and a product of small matrices takes ten times as long.
@@ -32,13 +39,38 @@ for _name in ("SIGHUP", "SIGQUIT"):
         signal.signal(getattr(signal, _name), signal.SIG_DFL)
 
 
+# Chosen by `make test`; `make test-all` looks at all examples. Without deadlines, as several folders have it.
+settings.register_profile("brief", deadline=None)
+_BRIEF, _FEWEST = 3, 20
+"""What examples are divided by then, and how few there are at least."""
+_SETTINGS = "_hypothesis_internal_use_settings"
+
+
+def _take_fewer_examples(items):
+    """Divide the examples of each costly property: a profile would not reach those that say their number."""
+    tests = (getattr(item, "obj", None) for item in items if item.get_closest_marker("costly"))
+    for test in {getattr(test, "__func__", test) for test in tests if hasattr(test, "hypothesis")}:
+        own = getattr(test, _SETTINGS, settings.default)
+        fewer = max(own.max_examples // _BRIEF, min(own.max_examples, _FEWEST))
+        setattr(test, _SETTINGS, settings(own, max_examples=fewer))
+
+
+def pytest_collection_finish():
+    """Leave what collecting the tests has made out of each further garbage collection: a million objects."""
+    gc.collect()
+    gc.freeze()
+    gc.set_threshold(10_000, 20, 50)
+
+
 @pytest.hookimpl(trylast=True)
-def pytest_collection_modifyitems(items):
+def pytest_collection_modifyitems(config, items):
     """Spread the whole studies over the first half of the tests.
 
     One that came last would leave all workers but its own idle. Of two workers the second begins in the middle, with
     tests that compile little, and finds in the cache what the first has compiled for its studies.
     """
+    if config.getoption("hypothesis_profile") == "brief":
+        _take_fewer_examples(items)
     studies = [item for item in items if getattr(item, "originalname", "") == "test_campaign"]
     for study in studies:
         # Two minutes on an idle machine; a busy one may take its time.
@@ -98,28 +130,47 @@ def finished_process():
 
 
 @pytest.fixture(scope="session")
-def warm_process(finished_process, tmp_path_factory):
-    """Do as `finished_process` for `python -m` and `python -c`, where a cold start is not what is tested."""
+def warm_start(tmp_path_factory):
+    """Return the socket of a process that starts Python programs as forks of it; None where there is no fork."""
     if not hasattr(os, "fork"):
-        yield finished_process
+        yield None
         return
-    outputs = [str(tmp_path_factory.mktemp("warm") / name) for name in ("stdout", "stderr")]
-    command = [sys.executable, "-P", str(Path(__file__).with_name("warm_start.py"))]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, bufsize=1) as server:
+    path = tmp_path_factory.mktemp("warm") / "socket"
+    command = [sys.executable, "-P", str(Path(__file__).with_name("warm_start.py")), str(path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as server:
+        assert server.stdout.readline() == "ready\n"
+        yield path
 
-        def run(command, folder, environment):
-            assert command[0] == sys.executable
-            request = {
-                "arguments": [str(argument) for argument in command[1:]],
-                "folder": str(folder),
-                "environment": dict(os.environ) if environment is None else environment,
-                "outputs": outputs,
-            }
-            server.stdin.write(json.dumps(request) + "\n")
-            code = int(server.stdout.readline())
-            return subprocess.CompletedProcess(command, code, *(Path(path).read_text() for path in outputs))
 
-        yield run
+@pytest.fixture(scope="session")
+def warm_process(finished_process, warm_start):
+    """Do as `finished_process` for `python -m` and `python -c`, where a cold start is not what is tested."""
+    if warm_start is None:
+        return finished_process
+
+    def run(command, folder, environment):
+        assert command[0] == sys.executable
+        arguments = [str(argument) for argument in command[1:]]
+        environment = dict(os.environ) if environment is None else environment
+        with tempfile.TemporaryFile("w+") as out, tempfile.TemporaryFile("w+") as err:
+            code = start_warm(warm_start, arguments, str(folder), environment, [out.fileno(), err.fileno()])
+            out.seek(0)
+            err.seek(0)
+            return subprocess.CompletedProcess(command, code, out.read(), err.read())
+
+    return run
+
+
+@pytest.fixture(scope="session")
+def warm_commands(warm_start, tmp_path_factory):
+    """Return a folder with commands `bench` and `python`, to be found first: `warm_process` for a shell."""
+    folder = tmp_path_factory.mktemp("commands")
+    if warm_start is not None:
+        for name in ("bench", "python"):
+            command = [sys.executable, "-SE", str(Path(__file__).with_name("warm_client.py")), str(warm_start), name]
+            (folder / name).write_text(f'#!/bin/sh\nexec {shlex.join(command)} "$@"\n')
+            (folder / name).chmod(0o755)
+    return folder
 
 
 @pytest.fixture

@@ -13,10 +13,27 @@ from typing import Any, TypeGuard
 import numpy as np
 
 from bench import registry
-from bench.campaigns.file import REFERENCE, CampaignFile, ModelsTable, RunsTable, as_override, axes, dotted
+from bench.campaigns.file import (
+    REFERENCE,
+    CampaignFile,
+    ComparisonsTable,
+    ModelsTable,
+    RunsTable,
+    as_override,
+    axes,
+    dotted,
+)
 from bench.campaigns.known_rig import KnownRig
 from bench.campaigns.sources import PROGRAMS, code_digest, digest, file_digest
-from bench.campaigns.tasks import SHOWN_DIGITS, ModelTask, RunTask, StudyTask, Task, identification_options
+from bench.campaigns.tasks import (
+    SHOWN_DIGITS,
+    ComparisonTask,
+    ModelTask,
+    RunTask,
+    StudyTask,
+    Task,
+    identification_options,
+)
 from bench.engine import check_before_moving
 from bench.errors import BenchError, ConfigurationError
 from bench.hysteresis import find_model, identifiable_models
@@ -118,6 +135,8 @@ class _Expander:
             for models in [each for each in waiting if each.runs == table.label]:
                 self._add_models(file.where("models", file.models.index(models)), models)
                 waiting.remove(models)
+        for number, comparisons in enumerate(file.comparisons):
+            self._add_comparisons(file.where("comparisons", number), comparisons)
         for number, study in enumerate(file.studies):
             self._add_studies(number, study)
         if len(self._tasks) > 2 * file.most_runs:
@@ -334,9 +353,57 @@ class _Expander:
         if table.input or drive is None or drive.range is None:
             return
         try:
-            check_template(table.model, np.linspace(*drive.range, 100), identification_options(table.options))
+            options = identification_options(table.options)
+            for levels in options.pop("levels_to_try", (None,)):
+                own = options if levels is None else {**options, "levels": levels}
+                check_template(table.model, np.linspace(*drive.range, 100), own)
         except ValueError as error:
             raise ConfigurationError(f"{where}: {error} (rig {known.file.name})") from None
+
+    def _add_comparisons(self, where: str, table: ComparisonsTable) -> None:
+        for key, names, known in (
+            ("runs", (table.runs,), self._runs),
+            ("models", table.models, self._models),
+        ):
+            for name in names:
+                if name not in known:
+                    raise ConfigurationError(
+                        f"{where}: {key} = {name!r}: there is no table of {key} of this name; there are: "
+                        f"{', '.join(known) or 'none'}"
+                    )
+        tables = {models.name: models for models in self._file.models}
+        columns = {(tables[name].input, tables[name].output) for name in table.models}
+        if len(columns) > 1:
+            raise ConfigurationError(f"{where}: models: their columns differ; expected one input and one output")
+        ((input_column, output_column),) = columns
+        for run in self._runs[table.runs]:
+            rig = self._rig_as_given(table.runs, run)
+            found: dict[str, ModelTask] = {}
+            for name in table.models:
+                wanted = run.seed if tables[name].seed is None else tables[name].seed
+                for task in self._models[name].get((rig, wanted or 0), []):
+                    found[task.label] = task
+                if not any(task.table == name for task in found.values()):
+                    raise ConfigurationError(
+                        f"{where}: models = {name!r}: {tables[name].runs} has no run on {rig} with seed {wanted}; "
+                        f"expected the same rigs and seeds there, or `seed` in the table of models"
+                    )
+            content = table.model_dump(exclude={"name", "runs", "models"})
+            identity = digest({"run": run.identity, **content, "models": {k: t.identity for k, t in found.items()}})
+            base = run.name.rpartition("/")[2].rpartition("-")[0]
+            self._add(
+                ComparisonTask(
+                    name=f"{table.name}/{base}{'-' * bool(base)}{identity[:SHOWN_DIGITS]}",
+                    identity=identity,
+                    table=table.name,
+                    source=run.name,
+                    models={label: task.name for label, task in found.items()},
+                    input=input_column,
+                    output=output_column,
+                    recalibrate=table.recalibrate,
+                    recalibrate_rows=table.recalibrate_rows,
+                )
+            )
 
     def _rig_as_given(self, label: str, run: RunTask) -> str:
         table = next(each for each in self._file.runs if each.label == label)

@@ -23,6 +23,11 @@ A campaign file is TOML; `docs/reference/campaign.md` describes each key::
     [runs.parameters]
     model = "@density"                      # that of the same rig and seed
 
+    [[comparisons]]                         # the errors of models on runs that they were not identified from
+    name = "validation"
+    runs = "validate"
+    models = ["density"]
+
     [[studies]]                             # what `bench reproduce` carries out
     name = "my-study"
     seeds = "0..9"
@@ -44,6 +49,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from bench.configuration_errors import problems
 from bench.errors import ConfigurationError
+from bench.results.recalibrations import Session
 
 _NAME = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,60}"
 _RANGE = re.compile(r"(\d+)\.\.(\d+)")
@@ -150,6 +156,29 @@ class ModelsTable(_Table):
         return dict(self.model_extra or {})
 
 
+class ComparisonsTable(_Table):
+    """A table `[[comparisons]]`: the errors of models on each run of a table."""
+
+    name: str = Field(pattern=f"^{_NAME}$", description="its name, before those of the models in the results")
+    runs: str = Field(min_length=1, description="name of a table [[runs]]")
+    models: Names = Field(description="names of tables [[models]]; of each the model of the run's rig and seed")
+    recalibrate: str = Field(
+        default="", description="what is estimated of each session first: some of offset, gain, drift, input-offset"
+    )
+    recalibrate_rows: int | None = Field(default=None, ge=1, description="first rows for that; all if not given")
+
+    @model_validator(mode="after")
+    def _can_be_read(self) -> Self:
+        _each_once(self.models)
+        Session.parse(self.recalibrate or None, self.recalibrate_rows)
+        return self
+
+    @property
+    def session(self) -> Session | None:
+        """What is estimated of each session; None for nothing."""
+        return Session.parse(self.recalibrate or None, self.recalibrate_rows)
+
+
 class StudiesTable(_Table):
     """A table `[[studies]]`: a study with several seeds."""
 
@@ -168,6 +197,7 @@ class _Content(_Table):
     most_runs: int = Field(default=10_000, ge=1, le=1_000_000, description="most runs that the file may ask for")
     runs: tuple[RunsTable, ...] = ()
     models: tuple[ModelsTable, ...] = ()
+    comparisons: tuple[ComparisonsTable, ...] = ()
     studies: tuple[StudiesTable, ...] = ()
 
 
@@ -181,7 +211,7 @@ class CampaignFile:
         Where it was read from.
     most_runs : int
         Most runs that it may ask for.
-    runs, models, studies : tuple
+    runs, models, comparisons, studies : tuple
         Its tables, in their order.
     """
 
@@ -189,11 +219,17 @@ class CampaignFile:
     most_runs: int
     runs: tuple[RunsTable, ...]
     models: tuple[ModelsTable, ...]
+    comparisons: tuple[ComparisonsTable, ...]
     studies: tuple[StudiesTable, ...]
 
     def where(self, kind: str, number: int) -> str:
         """Return the place of a table for messages, such as `night.toml: runs.0 (characterize)`."""
-        tables: Mapping[str, tuple[Any, ...]] = {"runs": self.runs, "models": self.models, "studies": self.studies}
+        tables: Mapping[str, tuple[Any, ...]] = {
+            "runs": self.runs,
+            "models": self.models,
+            "comparisons": self.comparisons,
+            "studies": self.studies,
+        }
         table = tables[kind][number]
         return f"{self.path}: {kind}.{number} ({table.label if isinstance(table, RunsTable) else table.name})"
 
@@ -217,12 +253,13 @@ def read_campaign(path: Path) -> CampaignFile:
         tables = _Content.model_validate(content)
     except ValidationError as error:
         raise ConfigurationError("\n".join(f"{path}: {line}" for line in problems(error, _Content))) from None
-    file = CampaignFile(path, tables.most_runs, tables.runs, tables.models, tables.studies)
+    file = CampaignFile(path, tables.most_runs, tables.runs, tables.models, tables.comparisons, tables.studies)
     if not file.runs and not file.studies:
         raise ConfigurationError(f"{path}: asks for nothing; expected tables [[runs]] or [[studies]]")
     for kind, names in (
         ("runs", [table.label for table in file.runs]),
         ("models", [table.name for table in file.models]),
+        ("comparisons", [table.name for table in file.comparisons]),
         ("studies", [table.name for table in file.studies]),
     ):
         for i, name in enumerate(names):
@@ -247,5 +284,7 @@ def dotted(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def as_override(value: object) -> str:
-    """Return a value of an override as the text of `--override`."""
+    """Return a value of an override as the text of `--override`: TOML, whose scalars and arrays are as in JSON."""
+    if isinstance(value, dict):
+        return f"{{{', '.join(f'{json.dumps(key)} = {as_override(inner)}' for key, inner in value.items())}}}"
     return json.dumps(value, ensure_ascii=False)

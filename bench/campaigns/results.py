@@ -14,7 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from bench.campaigns.expansion import Expansion
-from bench.campaigns.tasks import Done, ModelTask, RunTask, StudyTask
+from bench.campaigns.tasks import ComparisonTask, Done, ModelTask, RunTask, StudyTask
 from bench.extras import MissingExtraError, needed_for
 from bench.printing import print_plain
 from bench.results.data import write_csv
@@ -24,11 +24,12 @@ Cell: TypeAlias = float | int | str | None
 
 MOST_ROWS = 40
 """Rows of a table that are printed; files have all of them."""
-_BY_SEED = ("seed",)
 _NOT_GROUPED = ("steps", "laboratory_time", "wall_time")
 _NOT_SHOWN = ("steps", "wall_time", "folder", "table")
-MEDIAN, WORST = "median", "worst"
+MEDIAN, WORST, SPREAD = "median", "worst", "spread"
 _PLAIN = ("", "1")
+ERRORS = ("max", "rms")
+"""What a comparison gives of each model."""
 
 
 @dataclass(frozen=True)
@@ -129,8 +130,11 @@ def runs_table(expansion: Expansion, done: Mapping[str, Done], table: str) -> Re
 
 
 def over_seeds(table: ResultsTable, varying: Sequence[str]) -> ResultsTable:
-    """Return the median and the worst (the greatest) of each result over the seeds of a table of runs."""
-    keys = [key for key in table.columns if key[0] in varying and key[0] not in _BY_SEED]
+    """Return median, worst (the greatest) and spread of each result over the seeds of a table of runs.
+
+    A parameter that is a seed as well, such as `sequence_seed`, counts as one.
+    """
+    keys = [key for key in table.columns if key[0] in varying and not key[0].endswith("seed")]
     names = [key[0] for key in table.columns]
     results = [
         key
@@ -147,9 +151,40 @@ def over_seeds(table: ResultsTable, varying: Sequence[str]) -> ResultsTable:
         row[("runs", "")] = len(members)
         row[("completed", "")] = sum(table.columns[("status", "")][i] == "completed" for i in members)
         for name, unit in results:
-            values = _numbers(table.columns[(name, unit)][i] for i in members)
-            row[(f"{name} {MEDIAN}", unit)] = statistics.median(values) if values else None
-            row[(f"{name} {WORST}", unit)] = max(values) if values else None
+            row |= _statistics(name, unit, (table.columns[(name, unit)][i] for i in members))
+        rows.append(row)
+    return ResultsTable.of(rows)
+
+
+def comparisons_table(expansion: Expansion, done: Mapping[str, Done]) -> ResultsTable:
+    """Return the errors of each model on each run that it was compared on, a row each."""
+    rows: list[dict[tuple[str, str], Cell]] = []
+    for task in expansion.tasks.values():
+        if not isinstance(task, ComparisonTask) or not (found := done[task.name].results):
+            continue
+        for model in task.models:
+            row: dict[tuple[str, str], Cell] = {("comparison", ""): task.table, ("model", ""): model}
+            row |= {("run", ""): task.source}
+            for what in ERRORS:
+                value, unit = found[f"{model}_{what}"]
+                row[(what, unit)] = value
+            rows.append(row)
+    return ResultsTable.of(rows)
+
+
+def over_runs(comparisons: ResultsTable) -> ResultsTable:
+    """Return median, worst and spread of the errors of each model over the runs of a `comparisons_table`."""
+    groups: dict[tuple[Cell, Cell], list[int]] = {}
+    heads = zip(comparisons.columns[("comparison", "")], comparisons.columns[("model", "")], strict=True)
+    for i, key in enumerate(heads):
+        groups.setdefault(key, []).append(i)
+    rows: list[dict[tuple[str, str], Cell]] = []
+    for (comparison, model), members in groups.items():
+        row: dict[tuple[str, str], Cell] = {("comparison", ""): comparison, ("model", ""): model}
+        row[("runs", "")] = len(members)
+        for name, unit in comparisons.columns:
+            if name in ERRORS:
+                row |= _statistics(name, unit, (comparisons.columns[(name, unit)][i] for i in members))
         rows.append(row)
     return ResultsTable.of(rows)
 
@@ -173,7 +208,7 @@ def in_one_cell(summary: ResultsTable) -> ResultsTable:
         if which == MEDIAN:
             worst = summary.columns[(f"{result} {WORST}", unit)]
             columns[(result, unit)] = [f"{shown(a)} / {shown(b)}" for a, b in zip(cells, worst, strict=True)]
-        elif which != WORST and name != "table":
+        elif which not in (WORST, SPREAD) and name != "table":
             columns[(name, unit)] = cells
     return ResultsTable(columns)
 
@@ -238,6 +273,16 @@ def together(tables: Iterable[ResultsTable]) -> ResultsTable:
     """Return the rows of several tables in one; what varies in one of them is empty in the others."""
     rows = [{key: cells[i] for key, cells in table.columns.items()} for table in tables for i in range(len(table))]
     return ResultsTable.of(rows)
+
+
+def _statistics(name: str, unit: str, cells: Iterable[Cell]) -> dict[tuple[str, str], Cell]:
+    """Return median, worst (the greatest) and spread of cells as columns; None where there is no number."""
+    values = _numbers(cells)
+    return {
+        (f"{name} {MEDIAN}", unit): statistics.median(values) if values else None,
+        (f"{name} {WORST}", unit): max(values) if values else None,
+        (f"{name} {SPREAD}", unit): max(values) - min(values) if values else None,
+    }
 
 
 def _setting(task: RunTask, key: str) -> Cell:

@@ -17,7 +17,8 @@ from bench.campaigns.sources import PROGRAMS, PROGRAMS_AND_RIGS, digest
 from bench.errors import AbortError, BenchError, DataError
 from bench.journal import Record
 from bench.protocol import find_protocol
-from bench.results.models import identify_file
+from bench.results.models import compare_models, identify_file
+from bench.results.recalibrations import Session
 from bench.results.run_folder import RunFolder
 from bench.results.tracking import results_json
 from bench.runs import Run, carry_out
@@ -320,6 +321,69 @@ class ModelTask(Task):
 
 
 @dataclass(frozen=True)
+class ComparisonTask(Task):
+    """The errors of models on a run.
+
+    Attributes
+    ----------
+    table : str
+        Name of the table that asks for it.
+    source : str
+        Name of the run's task.
+    models : mapping of str to str
+        Name of each identification's task by that of its table.
+    input, output : str
+        Columns; empty for the signals of the slots `drive` and `response`.
+    recalibrate : str
+        What is estimated of the session first, with commas; empty for nothing.
+    recalibrate_rows : int, optional
+        First rows for that; they do not count in the errors.
+    """
+
+    table: str
+    source: str
+    models: Mapping[str, str]
+    input: str = ""
+    output: str = ""
+    recalibrate: str = ""
+    recalibrate_rows: int | None = None
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """The run and the identifications."""
+        return (self.source, *self.models.values())
+
+    def describe(self) -> dict[str, Any]:
+        """Return what it is, for programs."""
+        return {
+            "kind": "comparison",
+            **{key: value for key, value in asdict(self).items() if key not in ("name", "identity")},
+        }
+
+    def _work(self, campaign: Path, scratch: Path) -> tuple[Path, Done]:
+        source = RunFolder(campaign / self.source)
+        if source.status != "completed":
+            raise DataError(f"the run {self.source} was not completed")
+        session = Session.parse(self.recalibrate or None, self.recalibrate_rows)
+        results: dict[str, tuple[float, str]] = {}
+        for name, task in self.models.items():
+            found = compare_models(
+                [campaign / task / MODEL_NAME],
+                source.folder,
+                self.input or source.signal_of("drive"),
+                self.output or source.signal_of("response"),
+                session=session,
+            )
+            (compared,) = found.comparisons
+            errors = found.recalibrated(compared) or found.comparisons[compared].raw
+            unit = found.unit or "1"
+            results |= {f"{name}_max": (errors.maximum, unit), f"{name}_rms": (errors.rms, unit)}
+        made = scratch / "made"
+        made.mkdir()
+        return made, Done(self.identity, "completed", "", results)
+
+
+@dataclass(frozen=True)
 class StudyTask(Task):
     """A study with one seed.
 
@@ -352,8 +416,12 @@ class StudyTask(Task):
 
 
 def identification_options(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return options from a file as `identify_file` takes them: ranges are pairs."""
-    return {key: tuple(value) if isinstance(value, list) else value for key, value in options.items()}
+    """Return options from a file as `identify_file` takes them: ranges are pairs, of several levels one is chosen."""
+    found = {key: tuple(value) if isinstance(value, list) else value for key, value in options.items()}
+    if isinstance(levels := found.get("levels"), tuple):
+        del found["levels"]
+        found |= {"levels_to_try": levels, "cross_validated": True}
+    return found
 
 
 def run_results(folder: Path) -> dict[str, tuple[float, str]]:

@@ -20,20 +20,25 @@ from typer.models import CommandInfo
 
 from bench import registry
 from bench.cli import (
+    calibrations,
     campaign,
     comparisons,
     designs,
+    imports,
     journals,
     models,
     new,
+    panel,
     records,
     rehearse,
     repeat,
     resume,
     run_list,
     runs,
+    tune,
     twin,
     upkeep,
+    watch,
 )
 from bench.cli.console import error_console, fail
 from bench.cli.registered import RegisteredCommands, Studies
@@ -46,6 +51,9 @@ _EPILOG = (
     "operator. Try: bench list, and bench run PROTOCOL --rig RIG --clock virtual"
 )
 
+_MID_WAY = ("safe", "recover")
+"""Commands that have devices open without asking for Ctrl-C in between."""
+
 _PARTS = (
     runs.app,
     rehearse.app,
@@ -54,12 +62,17 @@ _PARTS = (
     resume.app,
     run_list.app,
     upkeep.app,
+    panel.app,
     models.app,
     designs.app,
     comparisons.app,
+    calibrations.app,
     records.app,
+    imports.app,
+    watch.app,
     journals.app,
     twin.app,
+    tune.app,
     new.app,
 )
 
@@ -109,4 +122,24 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     except sqlite3.Error as error:
         error_console.print("[bold red]error:[/] the journal cannot be written:", escape(str(error)), highlight=False)
         sys.exit(1)
+    # As typer ends a command at Ctrl-C: without a word.
+    except SystemExit as ended:
+        if _is_by_keyboard(ended):
+            words = sys.argv[1:] if arguments is None else arguments
+            error_console.print(f"[yellow]ended by Ctrl-C:[/] {_state_of_outputs(words)}", highlight=False)
+        raise
     sys.exit(0)
+
+
+def _is_by_keyboard(error: BaseException | None) -> bool:
+    """Return whether Ctrl-C is what an exception comes from; that of a run is heard by its `Interrupts`."""
+    while error is not None and not isinstance(error, KeyboardInterrupt):
+        error = error.__cause__ or error.__context__
+    return error is not None
+
+
+def _state_of_outputs(words: Sequence[str]) -> str:
+    command = next((word for word in words if not word.startswith("-")), "")
+    if command in _MID_WAY:
+        return f"in the middle of {command}; `bench safe RIG` makes sure that every output is off"
+    return "no device was opened, nothing has moved; the outputs are as they were"

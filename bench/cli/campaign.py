@@ -134,10 +134,10 @@ def _saying_how_to_go_on(folder: Path) -> Iterator[None]:
 def _announce(expansion: Expansion, before: dict[str, Done], cores: int) -> None:
     left = [name for name in expansion.tasks if name not in before]
     estimate = expansion.estimate(left)
-    counts = dict.fromkeys(("run", "model", "study"), 0)
+    counts = dict.fromkeys(("run", "model", "comparison", "study"), 0)
     for name in left:
         counts[expansion.tasks[name].describe()["kind"]] += 1
-    plural = {"run": "runs", "model": "models", "study": "studies"}
+    plural = {"run": "runs", "model": "models", "comparison": "comparisons", "study": "studies"}
     text = ", ".join(f"{count} {kind if count == 1 else plural[kind]}" for kind, count in counts.items() if count)
     line = f"{text or 'nothing'} to do" + (f", {len(before)} done before" if before else "")
     if estimate.laboratory_seconds:
@@ -167,7 +167,9 @@ def _show(expansion: Expansion, done: dict[str, Done], folder: Path) -> list[Pat
     """Print the tables and write them to files; return these."""
     from bench.campaigns.results import (
         ResultsTable,
+        comparisons_table,
         in_one_cell,
+        over_runs,
         over_seeds,
         runs_table,
         shown_columns,
@@ -187,6 +189,11 @@ def _show(expansion: Expansion, done: dict[str, Done], folder: Path) -> list[Pat
     files = {"results": together(tables.values())} if tables else {}
     if summaries:
         files["summary"] = together(summaries.values())
+    comparisons = comparisons_table(expansion, done)
+    if len(comparisons):
+        compared = over_runs(comparisons)
+        compared.print("comparisons, over the runs", console)
+        files |= {"comparisons": comparisons, "comparisons-summary": compared}
     studies = studies_table(expansion, done)
     if len(studies):
         studies.print("studies, over the seeds", console, most=200)

@@ -23,7 +23,18 @@ error_console = Console(stderr=True)
 JsonOption = Annotated[
     Path | None, typer.Option("--json", metavar="FILE", help="Write the result as JSON, for programs.")
 ]
-LiveOption = Annotated[bool, typer.Option("--live/--no-live", help="Serve the live view on the loopback interface.")]
+LiveOption = Annotated[
+    bool, typer.Option("--live/--no-live", help="Open the live view, or print its address where there is no display.")
+]
+NotifyOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--notify",
+        metavar="COMMAND",
+        help="Command to start at a pause, a prompt, a warning, a trip and the end, with the facts in BENCH_… "
+        "variables and as JSON on its input; or mailto:ADDRESS, or https://ADDRESS of a webhook. Repeatable.",
+    ),
+]
 SettingsOption = Annotated[
     list[str] | None,
     typer.Option("--set", metavar="KEY=VALUE", help="Set a parameter of the protocol; repeatable."),

@@ -63,6 +63,7 @@ class ExportFormat(StrEnum):
 
     CSV = "csv"
     PARQUET = "parquet"
+    BLUESKY = "bluesky"
     RRD = "rrd"
     PNG = "png"
 
@@ -79,10 +80,11 @@ def export(
 ) -> None:
     """Write a run's readings and telemetry for other programs, or rebuild its recording for the viewer.
 
-    csv and parquet: `readings` (one row a step) and `telemetry` (one row a tick), units in the headers. rrd: the
-    recording, rebuilt from the journal. png: a picture of the dashboard, drawn without a screen.
+    csv and parquet: `readings` (one row a step), `telemetry` (one row a tick) and `events`, units in the headers;
+    metadata in `metadata.json` or the schema. bluesky: `documents.jsonl`, documents of event-model as JSON lines.
+    rrd: the recording, rebuilt from the journal. png: a picture of the dashboard, drawn without a screen.
     """
-    from bench.results.report import export_run
+    from bench.results.export import export_run
 
     paths = export_run(run, format_.value, out)
     for path in paths:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from bench.cli.console import JsonOption, LiveOption, console, show_compilation
+from bench.cli.console import JsonOption, LiveOption, NotifyOption, console, show_compilation
 from bench.cli.runs import print_result
 
 app = typer.Typer()
@@ -40,6 +40,7 @@ def resume(
         Path | None,
         typer.Option(metavar="FILE", help="Endpoints file of `bench emulate --json`, if the run was attached."),
     ] = None,
+    notify: NotifyOption = None,
     live: LiveOption = False,
     json_file: JsonOption = None,
 ) -> None:
@@ -69,6 +70,7 @@ def resume(
         accept_changes=accept_changes,
         accept_disagreement=accept_disagreement,
         live=live,
+        notify=tuple(notify or ()),
     )
     with Interrupts(say_at_once) as interrupts:
         with show_compilation():

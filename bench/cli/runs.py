@@ -14,6 +14,7 @@ from rich.table import Table
 from bench.cli.console import (
     JsonOption,
     LiveOption,
+    NotifyOption,
     SettingsOption,
     console,
     error_console,
@@ -177,6 +178,7 @@ def run(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Only say what the run would do and touch, as `bench rehearse` does.")
     ] = False,
+    notify: NotifyOption = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Parent of the run's folder.")] = Path("recordings"),
     live: LiveOption = False,
     json_file: JsonOption = None,
@@ -224,6 +226,7 @@ def run(
         interlock_rate=interlock_rate,
         faults=faults,
         rehearse=rehearse,
+        notify=tuple(notify or ()),
     )
     if dry_run:
         if not rehearse:

@@ -21,7 +21,7 @@ import math
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Mapping
-from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias, get_args
+from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias, cast, get_args
 
 import numpy as np
 
@@ -212,7 +212,7 @@ class SessionFilter(ModelFilter):
     }
 
     def __init__(self, identified: Operator[Any]) -> None:
-        self._names = tuple(self._NUMBERS)[: None if isinstance(identified, Preisach) else 2]
+        self._names = tuple(self._NUMBERS)[: None if identified.kind == Preisach.kind else 2]
         self._wide: tuple[float, Any] = (1.0, identified)
         super().__init__(identified)
 
@@ -358,9 +358,9 @@ def model_filter(name: AdaptationName, operator: Operator[Any]) -> ModelFilter |
         raise ValueError(f"adaptation {name} needs a model with memory; this one is of the kind {operator.kind}")
     if name == "session":
         return SessionFilter(operator)
-    if not isinstance(operator, Preisach):
+    if operator.kind != Preisach.kind:
         raise ValueError(
             f"adaptation density needs a Preisach model, whose density it changes; this one is of the kind "
             f"{operator.kind}; adaptation = session takes it"
         )
-    return DensityFilter(operator)
+    return DensityFilter(cast("Preisach", operator))

@@ -1,8 +1,11 @@
 """The live view of a run and its .rrd file, both by Rerun, both derived from the content of the journal.
 
 The control thread only puts what happened into a queue. One thread takes it out about once a second and hands it to
-Rerun in columns, which costs a twentieth of logging row by row; the same code rebuilds an .rrd from a journal. A
-viewer connects to a server of this process, bound to the loopback address.
+Rerun in columns, which costs a twentieth of logging row by row; the same code rebuilds an .rrd from a journal, and
+follows one that another process writes. A viewer connects to a server of this process, bound to the loopback address.
+
+Rerun keeps an index of each portion of a file in memory until the file is complete, so the portions grow with the
+run. Views are arranged anew when there is something new to show, or the error has another scale.
 
 File and live view are two streams of one recording, so that a stalled viewer cannot delay the file. Rerun keeps the
 data that such a viewer does not read, some 8 kB for each batch of a quantity, until its channel is full; the live
@@ -16,17 +19,23 @@ What is recorded, on the timelines `t` (laboratory time) and `step`
 --------------------------------------------------------------------
 `/signals/QUANTITY`, `/readings/QUANTITY`
     One vector a unit: quick readings of each tick, and the reading of each step.
+`/signals/QUANTITY/bounds/N`
+    A limit, an interlock or a warning, once the signals are near.
 `/control/tracking`, `/control/error`, `/control/disturbance`
     Of a run under control, one vector each: reference, predicted output and output; output less reference; the
-    estimated disturbance. Each has a band of two standard deviations of that estimate. nan while no controller
-    is at work.
-`/loop/data/path`, `/loop/data/now`
-    Output against input: the line from each point to the next, and the last point. Further plots of the rig are
-    `/loops/0`, `/loops/1` ...
+    estimated disturbance. The latter two have a band of two standard deviations of that estimate. nan while no
+    controller is at work.
+`/control/error/targets`
+    The mean error at each target.
+`/loop/data/path`, `/loop/data/recent`, `/loop/data/now`
+    Output against input: the line from each point to the next, pale under control, when the same is there once more
+    for the last targets; and the last point. Further plots are `/loops/0`, `/loops/1` ...
 `/plane/data/memory`, `/plane/data/input`, `/plane/density`
     The Preisach plane: the memory curve at each point, the input on the diagonal, the model's density.
-`/planes/NAME/density`
-    A density over another input, on a plane of its own, which has no memory curve.
+`/planes/NAME/density`, `/planes/NAME/data/memory`, `/planes/NAME/data/input`
+    The same of a density over another input, on a plane of its own.
+`/numbers`
+    The panel of numbers.
 `/state/phase`, `/state/run`
     Phase and state of the protocol: changes only.
 `/events`, `/card`

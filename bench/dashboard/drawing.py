@@ -7,8 +7,9 @@ a transform places what is logged below `PATH/data` in physical units within a d
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -21,19 +22,23 @@ from bench.devices import Signal
 from bench.layout import XYPlot
 from bench.units import fitting_prefix
 
-Colour = tuple[int, int, int]
+Colour = tuple[int, int, int] | tuple[int, int, int, int]
+"""Red, green and blue, and how opaque it is, 0 to 255."""
 
-INK: Colour = (214, 219, 226)
-FAINT: Colour = (58, 65, 74)
-MARKER: Colour = (150, 248, 228)
-_BACKGROUND: Colour = (17, 20, 24)
+# The viewer's own background is nearly black or nearly white: each colour is legible on both.
+INK: Colour = (124, 132, 142)
+FAINT: Colour = (104, 110, 118)
+MARKER: Colour = (22, 168, 150)
+ALARM: Colour = (214, 58, 56)
+CAUTION: Colour = (206, 142, 20)
+LIMIT: Colour = (136, 116, 206)
 _DENSITY_COLOURS: tuple[tuple[float, Colour], ...] = (
-    (-1.0, (92, 190, 255)),
-    (-0.4, (36, 92, 168)),
-    (0.0, (28, 33, 39)),
-    (0.25, (84, 34, 92)),
-    (0.6, (206, 66, 82)),
-    (1.0, (255, 226, 138)),
+    (-1.0, (36, 128, 232, 255)),
+    (-0.4, (52, 116, 196, 200)),
+    (0.0, (110, 110, 140, 24)),
+    (0.25, (128, 62, 156, 190)),
+    (0.6, (214, 66, 86, 235)),
+    (1.0, (244, 160, 40, 255)),
 )
 
 _WIDTH = 1.15
@@ -64,6 +69,13 @@ class Frame:
         """Return the frame of a Preisach plane over an input in `unit`."""
         factor, shown = fitting_prefix(unit, *extent)
         return cls(extent, extent, f"β [{shown}]", f"α [{shown}]", factor, factor)
+
+    def grown(self, x: tuple[float, float], y: tuple[float, float]) -> Frame:
+        """Return the frame with axes that reach the ends of x and y; the same if they do."""
+        x_range, y_range = _grown(self.x_range, x), _grown(self.y_range, y)
+        if (x_range, y_range) == (self.x_range, self.y_range):
+            return self
+        return replace(self, x_range=x_range, y_range=y_range)
 
     def x(self, value: float) -> float:
         """Return where a value stands on the horizontal axis."""
@@ -105,7 +117,7 @@ class Frame:
         )
 
 
-def lines(strips: Any, colour: Colour, points: float, order: float) -> rr.LineStrips2D:  # noqa: ANN401
+def lines(strips: Any, colour: Colour | Sequence[Colour], points: float, order: float) -> rr.LineStrips2D:  # noqa: ANN401
     """Return lines of a width in points of the screen."""
     return rr.LineStrips2D(strips, colors=colour, radii=rr.Radius.ui_points(points), draw_order=order)
 
@@ -125,16 +137,23 @@ def texts(places: Sequence[tuple[float, float]], labels: Sequence[str]) -> rr.Po
     return rr.Points2D(places, labels=labels, show_labels=True, colors=INK, radii=0.0)
 
 
-def xy_view(path: str, name: str, of_the_past: str = "") -> rrb.Spatial2DView:
-    """Return the view of what a `Frame` frames; of the entity `of_the_past` it shows the whole history."""
-    forever, now = rrb.TimeRangeBoundary.infinite(), rrb.TimeRangeBoundary.cursor_relative()
-    past = [rrb.VisibleTimeRange(timeline, start=forever, end=now) for timeline in ("t", "step")]
+def xy_view(path: str, name: str, past: Mapping[str, float] = MappingProxyType({})) -> rrb.Spatial2DView:
+    """Return the view of what a `Frame` frames; of the entities of `past` it shows so many seconds of history."""
+    now = rrb.TimeRangeBoundary.cursor_relative()
+    overrides: dict[Any, rrb.VisibleTimeRanges] = {}
+    for entity, seconds in past.items():
+        forever = rrb.TimeRangeBoundary.infinite()
+        since = forever if math.isinf(seconds) else rrb.TimeRangeBoundary.cursor_relative(seconds=-seconds)
+        ranges = [
+            rrb.VisibleTimeRange("t", start=since, end=now),
+            rrb.VisibleTimeRange("step", start=forever, end=now),
+        ]
+        overrides[entity] = rrb.VisibleTimeRanges(ranges)
     return rrb.Spatial2DView(
         origin=f"/{path}",
         name=name,
         visual_bounds=rrb.VisualBounds2D(x_range=(-0.2, _WIDTH + 0.08), y_range=(-1.16, 0.2)),
-        background=_BACKGROUND,
-        overrides={of_the_past: rrb.VisibleTimeRanges(past)} if of_the_past else None,
+        overrides=overrides,
     )
 
 
@@ -157,6 +176,14 @@ def whole_run() -> rrb.TimeAxis:
     return rrb.TimeAxis(view_range=rrb.TimeRange(start=forever, end=forever))
 
 
+def _grown(axis: tuple[float, float], ends: tuple[float, float]) -> tuple[float, float]:
+    """Return an axis that is longer by eighths of its length at either end, as many as reach the ends."""
+    low, high = axis
+    part = (high - low) / 8
+    below, above = (max(0, math.ceil(beyond / part)) for beyond in (low - ends[0], ends[1] - high))
+    return low - below * part, high + above * part
+
+
 def _round_values(low: float, high: float) -> list[float]:
     """Return some five round values within a range."""
     rough = (high - low) / 5
@@ -171,5 +198,6 @@ def _coloured(values: Floats) -> npt.NDArray[np.uint8]:
     stops = np.array([stop for stop, _ in _DENSITY_COLOURS])
     colours = np.array([colour for _, colour in _DENSITY_COLOURS], dtype=np.float64)
     known = np.nan_to_num(values)
-    channels = [np.interp(known, stops, colours[:, i]) for i in range(3)]
-    return np.stack([*channels, np.where(np.isnan(values), 0.0, 255.0)], axis=-1).round().astype(np.uint8)
+    channels = [np.interp(known, stops, colours[:, i]) for i in range(4)]
+    channels[3][np.isnan(values)] = 0.0
+    return np.stack(channels, axis=-1).round().astype(np.uint8)

@@ -1,13 +1,16 @@
-"""The .rrd of a run, made from its journal by the code of the live view."""
+"""A run as its journal tells it, by the code of the live view: an .rrd of all of it, or a view that follows it."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
+from types import TracebackType
+from typing import Self
 
 import numpy as np
 
-from bench.dashboard.entries import End, Entry, Tick, densities_of
+from bench.dashboard.entries import End, Entry, ModelDensity, Tick, densities_of
 from bench.dashboard.live import CHUNK_ROWS
 from bench.dashboard.writer import Writer
 from bench.errors import ConfigurationError, DataError
@@ -20,40 +23,144 @@ def rebuild(record: Record, path: Path) -> None:
 
     Raises ConfigurationError if the file exists, and DataError if the journal is damaged.
     """
-    meta = record.meta
+    models = _models_of(record)
+    writer = _writer_of(record, models)
+    writer.open(path, None)
+    try:
+        _write(writer, _Tail().entries(record))
+        writer.write(models)
+        writer.write(_end_of(record))
+        writer.arrange()
+    finally:
+        writer.recording.close()
+
+
+class JournalView:
+    """A view, for viewers that connect, of a run that another process carries out or that is replayed.
+
+    Parameters
+    ----------
+    run : Path
+        Folder of the run, or its journal.
+    port : int
+        Port of the loopback address for viewers; if it is taken, the next free one. 0 takes any.
+
+    Attributes
+    ----------
+    uri : str
+        Address for a viewer.
+
+    Raises
+    ------
+    DataError
+        If there is no journal, or it is damaged.
+    ConfigurationError
+        If no port is free.
+    """
+
+    def __init__(self, run: Path, port: int) -> None:
+        self._run = run
+        self._tail = _Tail()
+        with Record(run) as record:
+            self._models = _models_of(record)
+            self._writer = _writer_of(record, self._models)
+        self._writer.open(None, port)
+        self.uri = str(self._writer.recording.uri)
+        self._writer.write(self._models)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._writer.recording.close()
+
+    def follow(self) -> str:
+        """Show what has come into the journal since the last call; return how the run ended, empty if it goes on.
+
+        The journal is open only meanwhile, so that it can be closed by the process whose it is.
+        """
+        with Record(self._run) as record:
+            # Whether it has ended first: what is read then is all.
+            end = _end_of(record)
+            self._show(self._tail.entries(record))
+        self._show(end)
+        return end[0].status if end else ""
+
+    def entries(self) -> list[tuple[float, Entry]]:
+        """Return all of the run, each entry behind its laboratory time in s, for `show`."""
+        with Record(self._run) as record:
+            entries = [(time_of(entry), entry) for entry in self._tail.entries(record)]
+            return entries + [(entries[-1][0] if entries else 0.0, end) for end in _end_of(record)]
+
+    def show(self, entries: Sequence[Entry]) -> None:
+        """Show entries; viewers get them at once."""
+        self._show(entries)
+
+    def _show(self, entries: Sequence[Entry]) -> None:
+        if entries:
+            _write(self._writer, entries)
+            self._writer.arrange()
+        self._writer.recording.follow_viewer(len(entries))
+
+
+class _Tail:
+    """Reads a journal from where it was read last."""
+
+    def __init__(self) -> None:
+        self._ticks, self._step, self._events = 0, -1, 0
+
+    def entries(self, record: Record) -> list[Entry]:
+        """Return what the engine reported of a run since the last call, in its order."""
+        telemetry = record.telemetry(self._ticks)
+        steps = list(record.step_records(self._step))
+        events = record.events(self._events)
+        rows = np.column_stack([telemetry[signal.name] for signal in record.signals]).tolist()
+        times, numbers = telemetry["t"].tolist(), telemetry["step"].astype(np.int64).tolist()
+        # Of what happened in one instant, the ticks of a step come first, then its end, then what follows from it.
+        dated: list[tuple[tuple[float, float, int], Entry]] = [
+            ((t, step, 0), Tick(t, step, row)) for t, step, row in zip(times, numbers, rows, strict=True)
+        ]
+        dated += [((step.finished, step.step, 1), step) for step in steps]
+        dated += [((event.t, math.inf, 0), event) for event in events]
+        dated.sort(key=lambda entry: entry[0])
+        self._ticks += len(times)
+        self._step = steps[-1].step if steps else self._step
+        self._events += len(events)
+        return [entry for _, entry in dated]
+
+
+def time_of(entry: Entry) -> float:
+    """Return the laboratory time of a tick, a step or an event, s."""
+    return float(getattr(entry, "finished", getattr(entry, "t", 0.0)))
+
+
+def _models_of(record: Record) -> list[ModelDensity]:
     # What was identified from the run comes last, and is what its plane shows.
     identified = (
         parse_model(content, f"{record.path}: model {name}")
         for name, content in record.models().items()
         if is_model(content)
     )
-    models = densities_of([*models_among(record.files(), str(record.path)).values(), *identified])
+    return densities_of([*models_among(record.files(), str(record.path)).values(), *identified])
+
+
+def _writer_of(record: Record, models: list[ModelDensity]) -> Writer:
     try:
-        writer = Writer(record.signals, meta, models)
+        return Writer(record.signals, record.meta, models)
     except (ConfigurationError, KeyError, TypeError) as error:
         raise DataError(f"{record.path}: the metadata of its dashboard is damaged: {error}") from error
-    writer.open(path, None)
-    try:
-        entries = _entries(record)
-        for start in range(0, len(entries), CHUNK_ROWS):
-            writer.write(entries[start : start + CHUNK_ROWS])
-        writer.write(models)
-        if "status" in meta:
-            writer.write([End(str(meta["status"]), str(meta.get("reason", "")))])
-    finally:
-        writer.recording.close()
 
 
-def _entries(record: Record) -> list[Entry]:
-    """Return what the engine reported of a run, in its order."""
-    telemetry = record.telemetry()
-    rows = np.column_stack([telemetry[signal.name] for signal in record.signals]).tolist()
-    times, steps = telemetry["t"].tolist(), telemetry["step"].astype(np.int64).tolist()
-    # Of what happened in one instant, the ticks of a step come first, then its end, then what follows from it.
-    dated: list[tuple[tuple[float, float, int], Entry]] = [
-        ((t, step, 0), Tick(t, step, row)) for t, step, row in zip(times, steps, rows, strict=True)
-    ]
-    dated += [((step.finished, step.step, 1), step) for step in record.step_records()]
-    dated += [((event.t, math.inf, 0), event) for event in record.events()]
-    dated.sort(key=lambda entry: entry[0])
-    return [entry for _, entry in dated]
+def _write(writer: Writer, entries: Sequence[Entry]) -> None:
+    for start in range(0, len(entries), CHUNK_ROWS):
+        writer.write(entries[start : start + CHUNK_ROWS])
+
+
+def _end_of(record: Record) -> list[End]:
+    """Return how the run ended; nothing if it goes on or its process died."""
+    if "status" not in record.meta:
+        return []
+    meta = record.meta
+    return [End(str(meta["status"]), str(meta.get("reason", "")), meta.get("lateness", {}))]

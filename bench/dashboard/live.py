@@ -6,9 +6,10 @@ import queue
 import threading
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import Any, Self
 
+from bench.clock import WallClock
 from bench.dashboard.entries import End, Entry, Tick, densities_of
 from bench.dashboard.writer import Writer
 from bench.devices import Signal
@@ -23,6 +24,10 @@ QUEUED_ENTRIES = 60_000
 
 CHUNK_ROWS = 4096
 """Most rows at once: the more, the faster a recording loads, but the longer it takes to turn them into columns."""
+
+_FILE_SECONDS = 300.0
+_PART_OF_RUN = 0.25
+"""Longest time until entries are in the file, s of wall-clock time, and as a part of the run so far."""
 
 _BATCH_ROWS = 200
 _BATCH_SECONDS = 1.0
@@ -70,10 +75,20 @@ class Dashboard:
         if path is None and not live:
             raise ValueError("a dashboard needs a file or a live view")
         densities = densities_of(models)
-        self._writer = Writer(signals, meta, densities)
-        self._writer.open(path, port if live else None)
-        self.uri = self._writer.recording.uri
+        self._file: Writer | None = None
+        self._view: Writer | None = None
+        if path is not None:
+            self._file = Writer(signals, meta, densities)
+            self._file.open(path, None)
+        if live:
+            self._view = Writer(signals, meta, densities)
+            self._view.open(None, port)
+        self.uri = None if self._view is None else self._view.recording.uri
         """Address for a viewer, None without a live view."""
+        # Each portion of a file costs memory until it is complete: the longer the run, the larger they are.
+        self._for_file: list[Entry] = []
+        self._clock = WallClock()
+        self._written_at = 0.0
         # One counter a thread, as adding is not atomic.
         self._not_queued = self._not_written = self._reported = 0
         self._queue: queue.SimpleQueue[Entry] = queue.SimpleQueue()
@@ -100,9 +115,9 @@ class Dashboard:
         """Write no more into the .rrd file, as the journal needs the space; the live view goes on."""
         self._recording_stops = True
 
-    def finish(self, status: str, reason: str) -> None:
-        """Show how the run ended: `completed`, `aborted` or `failed`, and why."""
-        self._put(End(status, reason), QUEUED_ENTRIES)
+    def finish(self, status: str, reason: str, lateness: Mapping[str, Any] = MappingProxyType({})) -> None:
+        """Show how the run ended: `completed`, `aborted` or `failed`, and why; and how late its loops were."""
+        self._put(End(status, reason, lateness), QUEUED_ENTRIES)
 
     def close(self) -> None:
         """Hand over what is queued and let go of file and viewers; waits a bounded time.
@@ -130,7 +145,7 @@ class Dashboard:
     @property
     def viewer_keeps_up(self) -> bool:
         """Whether there is a live view and no viewer has stalled."""
-        return self._writer.recording.viewer_keeps_up
+        return self._view is not None and self._view.recording.is_written
 
     def _put(self, entry: Entry, most: int) -> None:
         waiting = self._queue.qsize()
@@ -148,21 +163,55 @@ class Dashboard:
             self._hand_over()
         # What came between the last look and the closing.
         self._hand_over()
-        self._writer.recording.close()
+        if self._file is not None:
+            self._complete_file(self._file)
+        if self._view is not None:
+            self._view.recording.close()
 
     def _hand_over(self) -> None:
-        if self._recording_stops:
-            self._writer.recording.stop_file()
         # In portions, so that turning them into columns does not keep the interpreter from other threads.
         while waiting := min(self._queue.qsize(), CHUNK_ROWS):
             entries = [self._queue.get() for _ in range(waiting)]
-            try:
-                if change := self._writer.recording.follow_viewer(len(entries)):
-                    self._writer.warn(change)
-                self._writer.write(entries)
-                if (missing := self.dropped - self._reported) > 0:
-                    self._writer.warn(f"{missing} entries are missing: Rerun did not take them; the journal has them")
-                    self._reported += missing
-            # After any failure in the view, the run goes on, and so does the rest of the view.
-            except Exception:
-                self._not_written += len(entries)
+            if self._view is not None and (change := self._view.recording.follow_viewer(len(entries))):
+                self._warn(change)
+            if self._view is not None:
+                self._write(self._view, entries)
+                self._view.arrange()
+            if self._file is not None and self._file.recording.is_written:
+                self._for_file += entries
+                now = self._clock.now()
+                due = self._written_at + min(_FILE_SECONDS, max(_BATCH_SECONDS, _PART_OF_RUN * now))
+                if len(self._for_file) >= CHUNK_ROWS or now >= due:
+                    self._write_file(self._file)
+            if (missing := self.dropped - self._reported) > 0:
+                self._warn(f"{missing} entries are missing: Rerun did not take them; the journal has them")
+                self._reported += missing
+        if self._recording_stops and self._file is not None:
+            self._complete_file(self._file)
+
+    def _write_file(self, writer: Writer) -> None:
+        entries, self._for_file = self._for_file, []
+        for start in range(0, len(entries), CHUNK_ROWS):
+            self._write(writer, entries[start : start + CHUNK_ROWS])
+        self._written_at = self._clock.now()
+
+    def _complete_file(self, writer: Writer) -> None:
+        if writer.recording.is_written:
+            self._write_file(writer)
+            if (missing := self.dropped - self._reported) > 0:
+                self._warn(f"{missing} entries are missing: Rerun did not take them; the journal has them")
+                self._reported += missing
+            writer.arrange()
+            writer.recording.close()
+
+    def _write(self, writer: Writer, entries: list[Entry]) -> None:
+        try:
+            writer.write(entries)
+        # After any failure in the view, the run goes on, and so does the rest of the view.
+        except Exception:
+            self._not_written += len(entries)
+
+    def _warn(self, text: str) -> None:
+        for writer in (self._file, self._view):
+            if writer is not None:
+                writer.warn(text)

@@ -1,8 +1,8 @@
-"""Preisach planes: the one of the first input, with lattice and memory curve, and those over other inputs."""
+"""Preisach planes with their memory curves: the one of the first input, with a lattice, and those of other inputs."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 import rerun as rr
@@ -10,7 +10,9 @@ import rerun.blueprint as rrb
 
 from bench.dashboard.drawing import FAINT, INK, MARKER, Frame, line_style, lines, point_style, texts, xy_view
 from bench.dashboard.entries import ModelDensity
-from bench.dashboard.recording import Recording
+from bench.dashboard.memories import SignalMemory, StageMemory, memory_of
+from bench.dashboard.recording import Floats, Recording, times
+from bench.dashboard.xy_plots import Point
 from bench.devices import Signal
 from bench.hysteresis.density import density_unit
 from bench.layout import DashboardLayout
@@ -18,24 +20,62 @@ from bench.units import fitting_prefix
 
 
 class Planes:
-    """The planes of a layout with the first input x and output y.
+    """The planes of a layout with the columns x and y of the first input and output.
 
-    Those of `densities`, which are known from the start, that do not fit the first plane get views of their own.
+    Those of `densities`, which are known from the start, that do not fit the first plane get views of their own. A
+    layout without a plane has none of the first input.
     """
 
-    def __init__(self, layout: DashboardLayout, x: Signal, y: Signal, densities: Sequence[ModelDensity]) -> None:
-        self._layout, self._x, self._y = layout, x, y
+    def __init__(
+        self,
+        layout: DashboardLayout,
+        signals: Sequence[Signal],
+        columns: tuple[int, int],
+        densities: Sequence[ModelDensity],
+    ) -> None:
+        self._extent, self._levels = layout.plane, layout.levels
+        self._x, self._y = (signals[column] for column in columns)
         self._others = {path: model for model in densities if (path := self._path_of(model)) != "plane"}
+        self._memories: dict[str, SignalMemory | StageMemory] = {}
+        self._extents: dict[str, tuple[float, float]] = {}
+        if self._extent is not None:
+            self._memories["plane"] = SignalMemory(columns[0])
+            self._extents["plane"] = self._extent
+        for path, model in self._others.items():
+            if (memory := memory_of(model, signals, columns[0])) is not None:
+                self._memories[path] = memory
+                self._extents[path] = (float(model.density.levels[0]), float(model.density.levels[-1]))
 
     def draw(self, recording: Recording) -> None:
         """Draw the first input's plane."""
-        low, high = self._layout.plane
-        _draw_plane(recording, "plane", Frame.of_plane((low, high), self._x.unit))
-        inner = np.linspace(low, high, self._layout.levels + 1)[1:-1]
-        lattice = [[(low, value), (value, value), (value, high)] for value in inner]
-        recording.log("plane/data/lattice", lines(lattice, FAINT, 0.5, -15.0))
-        recording.log("plane/data/memory", line_style(1.75, MARKER))
-        recording.log("plane/data/input", point_style())
+        for path in self._memories:
+            recording.log(f"{path}/data/memory", line_style(1.75, MARKER))
+            recording.log(f"{path}/data/input", point_style())
+        if self._extent is not None:
+            low, high = self._extent
+            _draw_plane(recording, "plane", Frame.of_plane((low, high), self._x.unit))
+            inner = np.linspace(low, high, self._levels + 1)[1:-1]
+            lattice = [[(low, value), (value, value), (value, high)] for value in inner]
+            recording.log("plane/data/lattice", lines(lattice, FAINT, 0.5, -15.0))
+
+    def write(self, recording: Recording, points: Sequence[Point], drawn: Collection[int]) -> None:
+        """Draw the memory curves at the points whose numbers are `drawn`; all points move that of the first input."""
+        shown = frozenset(drawn)
+        curves: dict[str, list[tuple[int, Floats]]] = {path: [] for path in self._memories}
+        for k, (_, _, values, _) in enumerate(points):
+            for path, memory in self._memories.items():
+                # What only a model knows takes long, and a point that is not drawn differs too little.
+                if k in shown or path == "plane":
+                    memory.see(values)
+                if k in shown and memory.curve is not None:
+                    curves[path].append((k, memory.curve.corners(*self._extents[path])))
+        for path, corners in curves.items():
+            if corners:
+                when = times([points[k][0] for k, _ in corners], [points[k][1] for k, _ in corners])
+                strips = [each for _, each in corners]
+                recording.send(f"{path}/data/memory", when, rr.LineStrips2D.columns(strips=strips))
+                ends = [each[-1] for each in strips]
+                recording.send(f"{path}/data/input", when, rr.Points2D.columns(positions=ends))
 
     def draw_density(self, recording: Recording, model: ModelDensity) -> None:
         """Draw a density with its legend, on a plane of its own if it is over another input than the first."""
@@ -43,7 +83,7 @@ class Planes:
         x_unit, y_unit = density.unit or self._x.unit, density.output_unit or self._y.unit
         low, high, cells = float(density.levels[0]), float(density.levels[-1]), len(density.levels) - 1
         if path == "plane":
-            frame = Frame.of_plane(self._layout.plane, self._x.unit)
+            frame = Frame.of_plane(self._extent or (low, high), self._x.unit)
         else:
             frame = Frame.of_plane((low, high), x_unit)
             _draw_plane(recording, path, frame)
@@ -78,12 +118,13 @@ class Planes:
             for path, model in sorted(self._others.items())
         ]
         others = [rrb.Tabs(*views, active_tab=0)] if len(views) > 1 else views
-        return [xy_view("plane", "Preisach plane"), *others]
+        first = [xy_view("plane", "Preisach plane")] if self._extent is not None else []
+        return [*first, *others]
 
     def _path_of(self, model: ModelDensity) -> str:
         """Return the path of the plane on which a density is drawn."""
         density = model.density
-        if density.measured and density.unit in ("", self._x.unit):
+        if self._extent is not None and density.measured and density.unit in ("", self._x.unit):
             return "plane"
         return f"planes/{rr.escape_entity_path_part(density.title or model.name)}"
 

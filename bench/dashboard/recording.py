@@ -1,7 +1,9 @@
-"""A Rerun recording as two streams, to a file and to a live view, so that a stalled viewer cannot delay the file."""
+"""A Rerun recording: one stream to a file, another to viewers, so that a stalled viewer cannot delay the file."""
 
 from __future__ import annotations
 
+import hashlib
+import re
 import socket
 from collections.abc import Iterable, Mapping
 from pathlib import Path
@@ -24,81 +26,60 @@ _PORTS_TRIED = 50
 
 
 class Recording:
-    """One recording, whose streams carry the same `run_id`; used by one thread at a time.
+    """One stream of a recording, into a file or to the viewers that connect; used by one thread at a time.
 
-    Without `path` there is no file, without `port` no live view; a port that is taken gives the next free one, 0 any.
-    Raises a ConfigurationError if the file exists or cannot be made, or no port is free.
+    Streams of one `run_id` are the same recording to a viewer. One with a `path` goes into a file, one with a `port`
+    to viewers; a port that is taken gives the next free one, 0 any. Raises a ConfigurationError if the file exists or
+    cannot be made, or no port is free.
     """
 
-    def __init__(
-        self, run_id: str, title: str, path: Path | None, port: int | None, blueprint: rrb.Blueprint
-    ) -> None:
-        sinks: list[rr.FileSink | rr.GrpcServerSink] = []
+    def __init__(self, run_id: str, title: str, path: Path | None, port: int | None) -> None:
         self.uri: str | None = None
-        """Address for a viewer, None without a live view."""
-        if path is not None:
-            # Rerun would truncate the file.
-            if path.exists():
-                raise ConfigurationError(f"{path} exists already; a recording is never overwritten")
-            if not path.parent.is_dir():
-                raise ConfigurationError(f"{path}: there is no folder {path.parent}")
-            sinks.append(rr.FileSink(path))
-        if port is not None:
-            server = rr.GrpcServerSink(bind_ip=LOOPBACK, port=free_port(port), server_memory_limit="256MiB")
-            self.uri = server.uri
-            sinks.append(server)
-        self._streams: list[rr.RecordingStream] = []
-        for sink in sinks:
-            stream = rr.RecordingStream("bench", recording_id=run_id)
-            try:
-                stream.set_sinks(sink, default_blueprint=blueprint)
-            except RuntimeError as error:
-                raise ConfigurationError(f"the recording cannot be made: {error}") from error
-            stream.send_recording_name(title)
-            self._streams.append(stream)
-        self._live = self._streams[-1] if port is not None else None
-        self._file = self._streams[0] if path is not None else None
+        """Address for a viewer, None for a file."""
+        self._stream = rr.RecordingStream(_application(run_id), recording_id=run_id)
+        try:
+            self._stream.set_sinks(_file(path) if path is not None else self._server(port or 0))
+        except RuntimeError as error:
+            raise ConfigurationError(f"the recording cannot be made: {error}") from error
+        self._stream.send_recording_name(title)
+        self._is_written = True
         self._unseen = 0
 
-    def stop_file(self) -> None:
-        """Complete the file now; the live view goes on."""
-        if self._file in self._streams:
-            self._streams.remove(self._file)
-            self._file.disconnect()
+    def _server(self, port: int) -> rr.GrpcServerSink:
+        server = rr.GrpcServerSink(bind_ip=LOOPBACK, port=free_port(port), server_memory_limit="256MiB")
+        self.uri = server.uri
+        return server
 
     @property
-    def viewer_keeps_up(self) -> bool:
-        """Whether there is a live view and it is not suspended."""
-        return self._live in self._streams
+    def is_written(self) -> bool:
+        """Whether what is sent is taken: the file is not complete, the viewer keeps up."""
+        return self._is_written
 
     def follow_viewer(self, entries: int) -> str:
-        """Suspend the live view for the next `entries` entries if its viewer has stalled; never waits long.
+        """Suspend the stream for the next `entries` entries if its viewer has stalled; never waits long.
 
         Returns what changed, for the log; empty if nothing did.
         """
-        if self._live is None:
-            return ""
-        keeps_up = self.viewer_keeps_up
+        keeps_up = self._is_written
         try:
             # Waits for the server, which holds some thousand batches for each viewer, not for the viewer.
-            self._live.flush(timeout_sec=_FLUSH_SECONDS if keeps_up else 0.05 * _FLUSH_SECONDS)
+            self._stream.flush(timeout_sec=_FLUSH_SECONDS if keeps_up else 0.05 * _FLUSH_SECONDS)
         except RuntimeError:
             self._unseen += entries
             if not keeps_up:
                 return ""
-            self._streams.remove(self._live)
+            self._is_written = False
             return "the viewer has stalled; the live view is suspended until it resumes"
         if keeps_up:
             return ""
-        self._streams.append(self._live)
+        self._is_written = True
         unseen, self._unseen = self._unseen, 0
         return f"the viewer has resumed; {unseen} entries are missing in the live view"
 
     def send(self, path: str, times: list[rr.TimeColumn], columns: Iterable[rr.ComponentColumn]) -> None:
         """Write columns of an entity at their times."""
-        columns = list(columns)
-        for stream in self._streams:
-            stream.send_columns(path, times, columns)
+        if self._is_written:
+            self._stream.send_columns(path, times, columns)
 
     def send_vectors(self, path: str, times: list[rr.TimeColumn], vectors: Floats) -> None:
         """Write one vector a time, shape (times, components)."""
@@ -107,20 +88,38 @@ class Recording:
 
     def log(self, path: str, *what: rr.AsComponents) -> None:
         """Write what holds at all times."""
-        for stream in self._streams:
-            stream.log(path, *what, static=True)
+        if self._is_written:
+            self._stream.log(path, *what, static=True)
+
+    def arrange(self, blueprint: rrb.Blueprint) -> None:
+        """Arrange the views anew."""
+        if self._is_written:
+            self._stream.send_blueprint(blueprint)
 
     def set_property(self, name: str, values: Mapping[str, Any]) -> None:
         """Write plain values that the viewer shows as properties of the recording."""
-        for stream in self._streams:
-            stream.send_property(name, rr.AnyValues(**values))
+        if self._is_written:
+            self._stream.send_property(name, rr.AnyValues(**values))
 
     def close(self) -> None:
-        """Complete the file, then let go of the viewers."""
-        for stream in self._streams:
-            stream.disconnect()
-        if self._live is not None:
-            self._live.disconnect()
+        """Complete the file, or let go of the viewers."""
+        self._is_written = False
+        self._stream.disconnect()
+
+
+def _application(run_id: str) -> str:
+    """Return a name that Rerun takes for an application: of each run, as a viewer keeps one arrangement for each."""
+    digest = hashlib.sha256(run_id.encode()).hexdigest()[:8]
+    return f"bench {re.sub('[^A-Za-z0-9]+', '-', run_id)[:40]} {digest}"
+
+
+def _file(path: Path) -> rr.FileSink:
+    # Rerun would truncate it.
+    if path.exists():
+        raise ConfigurationError(f"{path} exists already; a recording is never overwritten")
+    if not path.parent.is_dir():
+        raise ConfigurationError(f"{path}: there is no folder {path.parent}")
+    return rr.FileSink(path)
 
 
 def times(t: npt.ArrayLike, step: npt.ArrayLike) -> list[rr.TimeColumn]:

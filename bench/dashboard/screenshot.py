@@ -1,81 +1,133 @@
-"""A picture of a recording as a viewer shows it, without a screen."""
+"""Pictures of recordings as a viewer shows them, without a screen."""
 
 from __future__ import annotations
 
-import socket
-import subprocess
+import tempfile
+from collections.abc import Callable
 from pathlib import Path
+from types import TracebackType
+from typing import Self, TypeVar
 
-import rerun_cli
 from rerun.experimental import ViewerClient
 
 from bench.clock import WallClock
 from bench.dashboard.recording import LOOPBACK, free_port
+from bench.dashboard.viewers import start_viewer, wait_until_it_listens
 from bench.errors import ConfigurationError, DataError
 
-_START_SECONDS = 30.0
-_SETTLE_SECONDS = 6.0
+_PATIENCE = 120.0
+"""Wall-clock time within which the viewer of a busy machine answers and has drawn a picture, s."""
+
+_LOOK = 1.5
+"""Wall-clock time between two looks at what it has drawn, s."""
+
+T = TypeVar("T")
 
 
-def picture(rrd: Path, png: Path, *, at: float | None = None, size: tuple[int, int] = (1600, 1000)) -> list[str]:
-    """Draw what a viewer shows of an .rrd file, without a screen; return the errors that the views report.
+class Camera:
+    """A viewer without a screen, which takes pictures of recordings; a context manager.
 
     Parameters
     ----------
-    rrd : Path
-        The recording.
-    png : Path
-        The picture to write.
-    at : float or None
-        Laboratory time in s to put the cursor at; None for the end.
     size : tuple of int
         Width and height, pixels.
 
     Raises
     ------
-    DataError
-        If there is no such recording.
     ConfigurationError
         If the viewer does not start, for lack of a graphics driver for instance.
     """
-    if not rrd.is_file():
-        raise DataError(f"there is no recording {rrd}")
-    port = free_port(0)
-    # The console script is a wrapper that would leave its viewer behind, and a viewer that the SDK spawns
-    # listens to the whole network.
-    command = [Path(rerun_cli.__file__).parent / "rerun", "--headless", "--hide-welcome-screen"]
-    options = ["--bind", LOOPBACK, "--port", str(port), "--window-size", f"{size[0]}x{size[1]}"]
-    viewer = subprocess.Popen(  # noqa: S603 - our own arguments
-        [*map(str, command), *options], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
-    )
-    clock = WallClock()
-    try:
-        while not _listens(port):
-            if viewer.poll() is not None or clock.now() > _START_SECONDS:
-                raise ConfigurationError(
-                    "Rerun's viewer does not start; without a screen it needs a Vulkan driver, such as the "
-                    "one of the packages mesa-vulkan-drivers and libvulkan1"
-                )
-            clock.sleep(0.1)
-        client = ViewerClient.connect(f"rerun+http://{LOOPBACK}:{port}/proxy")
-        client.open(str(rrd.absolute()))
+
+    def __init__(self, size: tuple[int, int] = (1600, 1000)) -> None:
+        port = free_port(0)
+        # A viewer that the SDK spawns listens to the whole network.
+        options = ["--headless", "--hide-welcome-screen", "--bind", LOOPBACK, "--port", str(port)]
+        self._viewer = start_viewer([*options, "--window-size", f"{size[0]}x{size[1]}"])
+        self._clock = WallClock()
+        self._is_used = False
+        try:
+            wait_until_it_listens(
+                self._viewer,
+                port,
+                "Rerun's viewer does not start; without a screen it needs a Vulkan driver, such as the one of the "
+                "packages mesa-vulkan-drivers and libvulkan1",
+            )
+            self._client = self._patiently(lambda: ViewerClient.connect(f"rerun+http://{LOOPBACK}:{port}/proxy"))
+        except BaseException:
+            self.close()
+            raise
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """End the viewer."""
+        self._viewer.terminate()
+        self._viewer.wait()
+
+    def take(self, rrd: Path, png: Path, at: float | None = None) -> list[str]:
+        """Write a picture of a recording at a laboratory time (s), its end if None; return what its views report.
+
+        Raises
+        ------
+        DataError
+            If there is no such recording.
+        ConfigurationError
+            If the viewer does not answer.
+        """
+        if not rrd.is_file():
+            raise DataError(f"there is no recording {rrd}")
+        client = self._client
+        if self._is_used:
+            self._patiently(lambda: client.close("all"))
+        self._is_used = True
+        self._patiently(lambda: client.open(str(rrd.absolute())))
         if at is None:
-            client.set_time("t", play_state="following")
+            self._patiently(lambda: client.set_time("t", play_state="following"))
         else:
-            client.set_time("t", duration=at, play_state="paused")
-        # The viewer draws while data still arrive, and does not say when it has them all.
-        clock.sleep(_SETTLE_SECONDS)
-        client.save_screenshot(str(png.absolute()))
+            self._patiently(lambda: client.set_time("t", duration=at, play_state="paused"))
+        # The viewer draws while data still arrive, and does not say when it has them all: two equal pictures do.
+        before, end = b"", self._clock.now() + _PATIENCE
+        with tempfile.TemporaryDirectory(prefix="bench-picture-") as scratch:
+            look = Path(scratch) / "look.png"
+            while self._clock.now() < end:
+                self._clock.sleep(_LOOK)
+                self._patiently(lambda: client.save_screenshot(str(look)))
+                content = look.read_bytes()
+                if content == before and self._patiently(client.get_state).views:
+                    break
+                before = content
+        png.write_bytes(before)
         return [
             f"{view.name}: {report.severity}: {report.summary}"
-            for view in client.get_state().views
+            for view in self._patiently(client.get_state).views
             for report in view.reports
         ]
-    finally:
-        viewer.terminate()
-        viewer.wait()
+
+    def _patiently(self, ask: Callable[[], T]) -> T:
+        """Ask the viewer, again if it takes too long, as on a busy machine; raises ConfigurationError in the end."""
+        end = self._clock.now() + _PATIENCE
+        while True:
+            try:
+                return ask()
+            # The client waits a few seconds only, and says so in several ways.
+            except (TimeoutError, ConnectionError, RuntimeError) as error:
+                if self._viewer.poll() is not None or self._clock.now() > end:
+                    raise ConfigurationError(f"Rerun's viewer does not answer: {error}") from error
+                self._clock.sleep(0.2)
 
 
-def _listens(port: int) -> bool:
-    with socket.socket() as probe:
-        return probe.connect_ex((LOOPBACK, port)) == 0
+def picture(rrd: Path, png: Path, *, at: float | None = None, size: tuple[int, int] = (1600, 1000)) -> list[str]:
+    """Draw what a viewer shows of an .rrd file, without a screen; return the errors that the views report.
+
+    `at` is the laboratory time in s to put the cursor at, None for the end. Raises as `Camera` does.
+    """
+    if not rrd.is_file():
+        raise DataError(f"there is no recording {rrd}")
+    with Camera(size) as camera:
+        return camera.take(rrd, png, at)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import rerun as rr
 import rerun.blueprint as rrb
@@ -12,19 +13,23 @@ from bench.dashboard.drawing import Colour, time_view
 from bench.dashboard.recording import Floats
 from bench.devices import Signal
 from bench.errors import ConfigurationError
+from bench.interlocks import SETPOINT
 from bench.units import fitting_prefix
 
-_SETPOINT: Colour = (150, 158, 168)
+_SETPOINT_PART = 0.45
+"""Part of a device's colour in that of its set-point, whose broad line lies below the measured one."""
 _PALETTE: tuple[Colour, ...] = (
-    (255, 122, 72),
-    (78, 160, 255),
-    (98, 208, 126),
-    (214, 128, 255),
-    (255, 206, 84),
-    (64, 208, 206),
-    (255, 128, 170),
-    (178, 196, 98),
+    (236, 100, 46),
+    (58, 132, 232),
+    (48, 162, 86),
+    (176, 92, 226),
+    (150, 112, 72),
+    (22, 160, 160),
+    (226, 88, 136),
+    (128, 146, 44),
 )
+_READING = 1.25
+"""Size of the point of a reading; in a hold that is shorter than a tick there is nothing else."""
 _QUANTITIES = {
     "°C": "temperature",
     "K": "temperature difference",
@@ -43,23 +48,23 @@ _QUANTITIES = {
 
 @dataclass(frozen=True)
 class SignalPlot:
-    """The signals of one unit: their columns, the factor to the unit shown, and how the lines look."""
+    """The signals of one unit: their columns, the factor to the unit shown, and how ticks and readings look."""
 
     path: str
     title: str
     columns: list[int]
     factor: float
-    height: int
-    style: rr.SeriesLines
+    styles: Mapping[str, rr.SeriesLines | rr.SeriesPoints]
 
     def series(self, values: Floats) -> Floats:
         """Return what is plotted of values, one row a time, one column a signal."""
         return values[:, self.columns] * self.factor
 
     def view(self) -> rrb.TimeSeriesView:
-        """Return the view of the ticks."""
-        legend = rrb.Corner2D.RightBottom if len(self.columns) > 1 else None
-        return time_view(f"/signals/{self.path}", self.title, legend)
+        """Return the view of the ticks, as lines, and of the readings, as points."""
+        view = time_view(f"/signals/{self.path}", self.title, rrb.Corner2D.LeftBottom)
+        view.contents = ["$origin/**", f"/readings/{self.path}"]
+        return view
 
 
 def plots_by_unit(
@@ -70,19 +75,26 @@ def plots_by_unit(
     plots = []
     for unit in dict.fromkeys(signal.unit for _, signal in shown_signals):
         columns = [i for i, signal in shown_signals if signal.unit == unit]
+        # The set-points first, as what comes last is on top.
+        columns.sort(key=lambda i: not signals[i].name.endswith(SETPOINT))
         members = [signals[i] for i in columns]
         extents = [ranges[signal.name] for signal in members if signal.name in ranges]
         factor, shown = fitting_prefix(unit, *(extents[0] if extents else [likely_magnitude(members[0])]))
         quantity = _QUANTITIES.get(unit, unit)
         title = quantity if len(members) > 1 else members[0].description
-        style = rr.SeriesLines(
-            names=[f"{signal.name} [{shown}]" for signal in members],
-            colors=[_colour(signals[i].name, i) for i in columns],
-            widths=[1.5] * len(members),
-        )
+        look: dict[str, Any] = {
+            "names": [f"{signal.name} [{shown}]" for signal in members],
+            "colors": [_colour(signals, i) for i in columns],
+        }
+        styles: dict[str, rr.SeriesLines | rr.SeriesPoints] = {
+            "readings": rr.SeriesPoints(**look, marker_sizes=[_READING] * len(members), markers="circle"),
+            "signals": rr.SeriesLines(
+                **look, widths=[4.0 if signal.name.endswith(SETPOINT) else 1.5 for signal in members]
+            ),
+        }
         path = rr.escape_entity_path_part(quantity)
         headline = f"{title[:1].upper()}{title[1:]} [{shown}]"
-        plots.append(SignalPlot(path, headline, columns, factor, 2 if extents else 1, style))
+        plots.append(SignalPlot(path, headline, columns, factor, styles))
     return plots
 
 
@@ -99,5 +111,21 @@ def likely_magnitude(signal: Signal) -> float:
     return float(10.0 ** (3 - signal.precision))
 
 
-def _colour(name: str, position: int) -> Colour:
-    return _SETPOINT if name.endswith("_setpoint") else _PALETTE[position % len(_PALETTE)]
+def _colour(signals: Sequence[Signal], column: int) -> Colour:
+    """Return the colour of a signal; a set-point has a paler one of what follows it, the next of its device."""
+    name = signals[column].name
+    if not name.endswith(SETPOINT):
+        return _PALETTE[column % len(_PALETTE)]
+    device, unit = name.removesuffix(SETPOINT), signals[column].unit
+    follower = next(
+        (
+            i
+            for i, signal in enumerate(signals)
+            if i != column and signal.name.startswith(f"{device}_") and signal.unit == unit
+        ),
+        column,
+    )
+    red, green, blue = (
+        round(_SETPOINT_PART * part + (1 - _SETPOINT_PART) * 150) for part in _PALETTE[follower % len(_PALETTE)][:3]
+    )
+    return red, green, blue

@@ -41,7 +41,8 @@ class Timeline:
         self._states: dict[str, str] = {}
         self._phases: list[str] = []
         self._step = 0
-        self._t = 0.0
+        self.t = 0.0
+        """Laboratory time of the last entry, s."""
 
     def draw(self, recording: Recording) -> None:
         """Give the states their colours."""
@@ -60,16 +61,16 @@ class Timeline:
         for entry in entries:
             if isinstance(entry, StepRecord):
                 enter("run", entry.started, entry.step, _NOT_SETTLED if entry.settled.failed else _RUNNING)
-                self._step, self._t = entry.step + 1, entry.finished
+                self._step, self.t = entry.step + 1, entry.finished
             elif isinstance(entry, Event):
                 events.append((self._step, entry))
                 if entry.kind == "phase":
                     self._colour_phase(recording, entry.text)
                     enter("phase", entry.t, self._step, entry.text)
                 enter("run", entry.t, self._step, _state_after(entry))
-                self._t = entry.t
+                self.t = entry.t
             elif isinstance(entry, Tick):
-                self._t = max(self._t, entry.t)
+                self.t = max(self.t, entry.t)
         _write_events(recording, events)
         for lane, changed in changes.items():
             if changed:
@@ -78,7 +79,7 @@ class Timeline:
 
     def warn(self, recording: Recording, text: str) -> None:
         """Report a problem of the dashboard itself in the log."""
-        _write_events(recording, [(self._step, Event(self._t, "WARN", "dashboard", text))])
+        _write_events(recording, [(self._step, Event(self.t, "WARN", "dashboard", text))])
 
     def _colour_phase(self, recording: Recording, phase: str) -> None:
         if phase not in self._phases:

@@ -8,14 +8,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 import rerun as rr
 import rerun.blueprint as rrb
 from pydantic import ValidationError
 
 from bench.configuration_errors import problems
-from bench.dashboard.control import TRACE_NAMES, ControlPlots
-from bench.dashboard.drawing import whole_run
+from bench.dashboard.arrangement import Arranged, blueprint, seldom
+from bench.dashboard.bounds import BoundLines, bounds_of
+from bench.dashboard.control import TRACE_NAMES, ControlPlots, Errors
 from bench.dashboard.entries import End, Entry, ModelDensity, Tick
+from bench.dashboard.numbers import LIVE_SECONDS, Numbers
 from bench.dashboard.planes import Planes
 from bench.dashboard.recording import Recording, times
 from bench.dashboard.signal_plots import plots_by_unit
@@ -24,9 +27,8 @@ from bench.dashboard.xy_plots import Point, XYPlots
 from bench.devices import Signal
 from bench.errors import ConfigurationError
 from bench.journal import StepRecord, run_card
+from bench.lateness import lateness_lines
 from bench.layout import DashboardLayout
-
-_PLOTS_IN_A_ROW = 3
 
 
 class Writer:
@@ -46,31 +48,50 @@ class Writer:
         self._run_id, self._card = str(meta["run"]), run_card(meta)
         self._title = f"{meta['rig_title']}: {meta['protocol']}"
         self._properties = {key: meta[key] for key in ("rig", "protocol", "seed")}
+        bounds = bounds_of(meta, signals)
         self._plots: XYPlots | None = None
         self._planes: Planes | None = None
         if layout is not None:
-            self._plots = XYPlots(layout, signals, meta["rig_title"])
-            x, y = (signals[column] for column in self._plots.columns)
-            self._planes = Planes(layout, x, y, densities)
-        self._control = ControlPlots.of(signals, controls, ranges.get(controls)) if controls else None
+            self._plots = XYPlots(layout, signals, meta["rig_title"], bounds, fades=bool(controls))
+            self._planes = Planes(layout, signals, self._plots.columns, densities)
+        self._control: ControlPlots | None = None
+        self._errors: Errors | None = None
+        if controls:
+            self._control = ControlPlots.of(signals, controls, ranges.get(controls))
+            self._errors = Errors(self._control)
         self._signals = plots_by_unit(signals, ranges, TRACE_NAMES if controls else ())
+        self._bounds = {
+            plot.path: BoundLines(
+                f"signals/{plot.path}", [b for b in bounds if b.column in plot.columns], plot.factor
+            )
+            for plot in self._signals
+        }
+        names = [signal.name for signal in signals]
+        self._over_time = {names.index(name) for name in meta.get("over_time") or () if name in names}
+        shown = [self._control.output] if self._control else list(self._plots.columns[::-1] if self._plots else ())
+        self._numbers = Numbers(meta, signals, shown or sorted(self._over_time)[:2] or [0], bounds, self._errors)
         self._timeline = Timeline()
+        self._filled: set[str] = set()
+        self._arranged: object = None
 
     def open(self, path: Path | None, port: int | None) -> None:
         """Make the recording, see `Recording`, and write everything that does not change."""
-        self.recording = Recording(self._run_id, self._title, path, port, self._blueprint())
+        self.recording = Recording(self._run_id, self._title, path, port)
         self.recording.set_property("bench", self._properties)
         self.recording.log("card", rr.TextDocument(self._card, media_type=rr.MediaType.MARKDOWN))
         for plot in self._signals:
-            for kind in ("signals", "readings"):
-                self.recording.log(f"{kind}/{plot.path}", plot.style)
+            for kind, style in plot.styles.items():
+                self.recording.log(f"{kind}/{plot.path}", style)
         if self._control is not None:
-            for name, style in self._control.styles().items():
-                self.recording.log(f"control/{name}", style)
+            for name, look in self._control.styles().items():
+                self.recording.log(f"control/{name}", look)
         self._timeline.draw(self.recording)
         if self._plots is not None and self._planes is not None:
             self._plots.draw(self.recording)
             self._planes.draw(self.recording)
+        if path is None:
+            self._numbers.interval = LIVE_SECONDS
+            self.arrange()
 
     def write(self, entries: Sequence[Entry]) -> None:
         """Write entries in the order in which they happened."""
@@ -79,13 +100,36 @@ class Writer:
                 self._planes.draw_density(self.recording, entry)
             elif isinstance(entry, End):
                 self.recording.set_property("outcome", {"status": entry.status, "reason": entry.reason})
+                if entry.lateness:
+                    lines = "\n".join(lateness_lines(entry.lateness))
+                    text = f"{self._card}\n\n```text\n{lines}\n```\n"
+                    self.recording.log("card", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+            if self._errors is not None:
+                self._errors.see(entry)
+            self._numbers.see(entry)
         ticks = [entry for entry in entries if isinstance(entry, Tick)]
         self._write_values("signals", ticks)
         readings = [Tick(e.finished, e.step, e.values) for e in entries if isinstance(e, StepRecord)]
         self._write_values("readings", readings)
-        if self._plots is not None:
-            self._plots.write(self.recording, self._points(entries))
+        if self._plots is not None and self._planes is not None:
+            points = list(self._points(entries))
+            self._planes.write(self.recording, points, self._plots.write(self.recording, points))
+        if self._errors is not None:
+            self._errors.write(self.recording)
+        self._numbers.write(self.recording)
         self._timeline.write(self.recording, entries)
+
+    def arrange(self) -> None:
+        """Arrange the views anew if what they have to show has changed."""
+        wanted = (
+            frozenset(self._filled),
+            None if self._errors is None else self._errors.range(),
+            math.inf if self._errors is None else seldom(self._errors.seconds_bright(self._timeline.t)),
+            self._numbers.state,
+        )
+        if wanted != self._arranged:
+            self._arranged = wanted
+            self.recording.arrange(self._blueprint(*wanted))
 
     def warn(self, text: str) -> None:
         """Report a problem of the dashboard itself in the log."""
@@ -98,9 +142,19 @@ class Writer:
         when, table = times(t, step), np.array(values, dtype=np.float64)
         for plot in self._signals:
             self.recording.send_vectors(f"{kind}/{plot.path}", when, plot.series(table))
+            self._note(f"{kind}/{plot.path}", table[:, plot.columns])
+            if kind == "signals":
+                self._bounds[plot.path].write(self.recording, t, step, table[:, plot.columns])
         if self._control is not None and kind == "signals":
             for name, series in self._control.series(table).items():
                 self.recording.send_vectors(f"control/{name}", when, series)
+                # Of the tracking the reference, as there is an output always.
+                self._note(name, np.isfinite(series[:, 0]) if name == "tracking" else series)
+
+    def _note(self, name: str, values: npt.NDArray[Any]) -> None:
+        """Note whether a plot has something to show: numbers that are not all zero."""
+        if name not in self._filled and np.any(np.nan_to_num(values)):
+            self._filled.add(name)
 
     def _points(self, entries: Sequence[Entry]) -> Iterator[Point]:
         """Yield the points of the XY plots: each reading and, under control, each tick."""
@@ -110,41 +164,27 @@ class Writer:
             elif isinstance(entry, Tick) and self._control is not None and self._control.is_at_work(entry.values):
                 yield *entry, False
 
-    def _blueprint(self) -> rrb.Blueprint:
-        series = [plot.view() for plot in self._signals]
-        left = rrb.Vertical(*series, row_shares=[plot.height for plot in self._signals])
-        if self._control is not None:
-            driven = [self._plots is not None and self._plots.columns[0] in plot.columns for plot in self._signals]
-            others = rrb.Tabs(*series, active_tab=driven.index(True) if any(driven) else 0)
-            left = rrb.Vertical(*self._control.views(), others, row_shares=[5, 4, 4, 4])
-        state = rrb.StateTimelineView(origin="/state", name="Protocol", time_view=whole_run())
-        log = rrb.TextLogView(
-            origin="/events",
-            name="Log",
-            columns=rrb.TextLogColumns(
-                timeline_columns=[rrb.encodings.TimelineColumn("t", visible=False)],
-                text_log_columns=["LogLevel", "Body"],
-            ),
-        )
-        card = rrb.TextDocumentView(origin="/card", name="Run card")
-        below = rrb.Vertical(state, rrb.Horizontal(log, card, column_shares=[3, 2]), row_shares=[3, 5])
-        right: rrb.Container = below
-        plots = [] if self._plots is None else self._plots.views()
-        planes = [] if self._planes is None else self._planes.views()
-        if len(plots) == 1:
-            right = rrb.Vertical(rrb.Horizontal(*plots, *planes), below, row_shares=[8, 7])
-        elif plots:
-            right = rrb.Vertical(
-                rrb.Grid(*plots, grid_columns=min(len(plots), _PLOTS_IN_A_ROW)),
-                rrb.Horizontal(*planes, rrb.Tabs(log, card, active_tab=0)),
-                state,
-                row_shares=[5 * math.ceil(len(plots) / _PLOTS_IN_A_ROW), 5, 2],
+    def _blueprint(
+        self, filled: frozenset[str], error_range: float | None, bright: float, state: str
+    ) -> rrb.Blueprint:
+        over_time: list[rrb.TimeSeriesView] = []
+        others: list[rrb.TimeSeriesView] = []
+        for plot in self._signals:
+            if filled and not {f"signals/{plot.path}", f"readings/{plot.path}"} & filled:
+                continue
+            always = not self._over_time or self._over_time & set(plot.columns)
+            (over_time if always else others).append(plot.view())
+        control = [] if self._control is None else self._control.views(filled, error_range)
+        return blueprint(
+            Arranged(
+                control=[view for view, _ in control],
+                control_shares=[share for _, share in control],
+                over_time=over_time,
+                others=others,
+                plots=[] if self._plots is None else self._plots.views(bright),
+                planes=[] if self._planes is None else self._planes.views(),
+                state=state,
             )
-        return rrb.Blueprint(
-            rrb.Horizontal(left, right, column_shares=[2, 3] if len(plots) + len(planes) <= 2 else [1, 2]),
-            rrb.BlueprintPanel(state="hidden"),
-            rrb.SelectionPanel(state="hidden"),
-            rrb.TimePanel(state="collapsed", timeline="t", play_state="following"),
         )
 
 

@@ -1,31 +1,34 @@
-"""Plots of one signal over another, and the memory curve that the first input drives.
+"""Plots of one signal over another.
 
 A point is a reading of a step or, while a controller is at work, a tick. Every tick moves the memory, but a point is
 drawn only if it comes `_REDRAW_SECONDS` after the last one and differs visibly from it; the line to it passes
-through the points left out.
+through the points left out. Under control the lines to old targets are pale, and those to the last ones bright.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 
 import rerun as rr
 import rerun.blueprint as rrb
 
-from bench.dashboard.drawing import Colour, Frame, line_style, point_style, xy_view
+from bench.dashboard.bounds import Bound
+from bench.dashboard.drawing import Colour, Frame, line_style, lines, point_style, xy_view
 from bench.dashboard.recording import Recording, times
 from bench.dashboard.signal_plots import find_column
 from bench.devices import Signal
-from bench.hysteresis import MemoryCurve
-from bench.layout import DashboardLayout, XYPlot
+from bench.layout import DashboardLayout
 
 _REDRAW_SECONDS = 0.1
 _VISIBLE = 0.002
 """Visible part of an axis; a controller at its target moves by less."""
 
-_RISING: Colour = (255, 122, 72)
-_FALLING: Colour = (78, 160, 255)
+_PALE = 0.35
+"""Part of their colour in that of the lines to old targets; the rest is grey."""
+
+_RISING: Colour = (236, 100, 46)
+_FALLING: Colour = (58, 132, 232)
 
 _Line = list[tuple[float, float]]
 
@@ -37,22 +40,32 @@ Point = tuple[float, int, Sequence[float], bool]
 class XYPlots:
     """The plots of a layout, the first of which drives the memory curve.
 
-    A plot that stands alone has the name `title`; several are named after their signals. Raises a
-    ConfigurationError if the layout names a signal that does not exist.
+    A plot that stands alone has the name `title`; several are named after their signals. With `fades` the path is
+    pale, and bright only where it is recent. Raises a ConfigurationError if the layout names a signal that does not
+    exist.
     """
 
-    def __init__(self, layout: DashboardLayout, signals: Sequence[Signal], title: str) -> None:
-        self._plane, self._signals = layout.plane, signals
+    def __init__(
+        self,
+        layout: DashboardLayout,
+        signals: Sequence[Signal],
+        title: str,
+        bounds: Sequence[Bound] = (),
+        *,
+        fades: bool = False,
+    ) -> None:
+        self._fades, self._bounds = fades, bounds
         self._tracks: list[_Track] = []
         for prefix, plot in layout.plots.items():
             x = find_column(signals, f"{prefix}input", plot.input)
             y = find_column(signals, f"{prefix}output", plot.output)
             path = prefix.replace(".", "/").strip("/") or "loop"
+            frame = Frame.of_plot(plot, signals[x], signals[y])
             # What moves the first plot moves the memory curve, too.
-            self._tracks.append(_Track(path, plot, x, y, plot.input_range if prefix else layout.plane))
+            visible = plot.input_range if prefix or layout.plane is None else layout.plane
+            self._tracks.append(_Track(path, frame, x, y, visible))
         names = [f"{plot.output} over {plot.input}" for plot in layout.plots.values()]
         self._names = names if len(names) > 1 else [title]
-        self._memory: MemoryCurve | None = None
 
     @property
     def columns(self) -> tuple[int, int]:
@@ -62,63 +75,86 @@ class XYPlots:
     def draw(self, recording: Recording) -> None:
         """Draw the axes."""
         for track in self._tracks:
-            frame = Frame.of_plot(track.plot, self._signals[track.x], self._signals[track.y])
-            frame.draw(recording, track.path)
-            recording.log(f"{track.path}/data/path", line_style(1.25))
+            self._draw_axes(recording, track)
+            recording.log(f"{track.path}/data/path", line_style(1.0 if self._fades else 1.25))
+            if self._fades:
+                recording.log(f"{track.path}/data/recent", line_style(1.75))
             recording.log(f"{track.path}/data/now", point_style())
 
-    def write(self, recording: Recording, points: Iterable[Point]) -> None:
-        """Draw plots and memory curve to further points."""
-        points = list(points)
-        first = self._tracks[0]
-        memories = self._memories_at(points)
+    def _draw_axes(self, recording: Recording, track: _Track) -> None:
+        frame = track.frame
+        frame.draw(recording, track.path)
+        low_x, high_x = frame.x_range
+        low_y, high_y = frame.y_range
+        strips, colours = [], []
+        for bound in self._bounds:
+            if bound.column == track.x and low_x < bound.value < high_x:
+                strips.append([(bound.value, low_y), (bound.value, high_y)])
+            elif bound.column == track.y and low_y < bound.value < high_y:
+                strips.append([(low_x, bound.value), (high_x, bound.value)])
+            else:
+                continue
+            colours.append(bound.colour)
+        recording.log(f"{track.path}/data/bounds", lines(strips, colours, 1.0, 5.0))
+
+    def write(self, recording: Recording, points: Sequence[Point]) -> list[int]:
+        """Draw the plots to further points; return the numbers of those at which the first was drawn."""
+        drawn: list[int] = []
         for track in self._tracks:
             shown = track.lines(points)
+            if track is self._tracks[0]:
+                drawn = [k for k, _ in shown]
             if not shown:
                 continue
+            if track.reach(shown):
+                self._draw_axes(recording, track)
             when = times([points[k][0] for k, _ in shown], [points[k][1] for k, _ in shown])
             strips = [line for _, line in shown]
             colours = [_RISING if line[-1][0] >= line[0][0] else _FALLING for line in strips]
+            if self._fades:
+                recent = rr.LineStrips2D.columns(strips=strips, colors=colours)
+                recording.send(f"{track.path}/data/recent", when, recent)
+                colours = [_pale(colour) for colour in colours]
             recording.send(f"{track.path}/data/path", when, rr.LineStrips2D.columns(strips=strips, colors=colours))
             ends = [line[-1] for line in strips]
             recording.send(f"{track.path}/data/now", when, rr.Points2D.columns(positions=ends))
-            if track is first:
-                corners = [memory.corners(*self._plane) for k, _ in shown if (memory := memories[k]) is not None]
-                recording.send("plane/data/memory", when, rr.LineStrips2D.columns(strips=corners))
-                inputs = [each[-1] for each in corners]
-                recording.send("plane/data/input", when, rr.Points2D.columns(positions=inputs))
+        return drawn
 
-    def _memories_at(self, points: Sequence[Point]) -> list[MemoryCurve | None]:
-        """Return the memory after each point, which the first plot's input has moved."""
-        memory, column = self._memory, self._tracks[0].x
-        memories = []
-        for _, _, values, _ in points:
-            x = values[column]
-            if math.isfinite(x):
-                memory = memory.step(x) if memory else MemoryCurve.from_negative_saturation(x)
-            memories.append(memory)
-        self._memory = memory
-        return memories
-
-    def views(self) -> list[rrb.Spatial2DView]:
-        """Return a view of each plot."""
+    def views(self, bright: float) -> list[rrb.Spatial2DView]:
+        """Return a view of each plot, whose path is bright for so many seconds."""
         return [
-            xy_view(track.path, name, f"/{track.path}/data/path")
+            xy_view(track.path, name, self._past(track.path, bright))
             for track, name in zip(self._tracks, self._names, strict=True)
         ]
+
+    def _past(self, path: str, bright: float) -> dict[str, float]:
+        past = {f"/{path}/data/path": math.inf}
+        return past | {f"/{path}/data/recent": bright} if self._fades else past
+
+
+def _pale(colour: Colour) -> Colour:
+    red, green, blue = (round(_PALE * part + (1 - _PALE) * 128) for part in colour[:3])
+    return red, green, blue
 
 
 class _Track:
     """One plot of column y over column x below the entity `path`, and the line since the point drawn last.
 
-    `_VISIBLE` is a part of `extent`, a range of the input.
+    `_VISIBLE` is a part of `extent`, a range of the input. The frame grows with the data.
     """
 
-    def __init__(self, path: str, plot: XYPlot, x: int, y: int, extent: tuple[float, float]) -> None:
-        self.path, self.plot, self.x, self.y = path, plot, x, y
-        self._visible = [_VISIBLE * (high - low) for low, high in (extent, plot.output_range)]
+    def __init__(self, path: str, frame: Frame, x: int, y: int, extent: tuple[float, float]) -> None:
+        self.path, self.frame, self.x, self.y = path, frame, x, y
+        self._visible = [_VISIBLE * (high - low) for low, high in (extent, frame.y_range)]
         self._line: _Line = []
         self._drawn = -math.inf
+
+    def reach(self, shown: Sequence[tuple[int, _Line]]) -> bool:
+        """Let the frame grow to lines; return whether it did."""
+        before = self.frame
+        x, y = zip(*(point for _, line in shown for point in line), strict=True)
+        self.frame = before.grown((min(x), max(x)), (min(y), max(y)))
+        return self.frame is not before
 
     def lines(self, points: Sequence[Point]) -> list[tuple[int, _Line]]:
         """Return the points that are drawn, by their numbers, and the line to each from the one before."""

@@ -323,6 +323,24 @@ class Guardian:
 
         self._start(BENCH, calls, done, partial(self._refuse, message))
 
+    def _rest(self, message: Message, left: Sequence[Sequence[str]] | None = None) -> None:
+        """Switch all outputs off for a while, in their order."""
+        now, *later = stages(self._rig) if left is None else left
+        calls = {name: self._rig.devices[name].safe for name in now}
+
+        def done(_: dict[str, Any]) -> None:
+            if later:
+                self._rest(message, later)
+            else:
+                self._reply(message)
+
+        self._start(BENCH, calls, done, partial(self._refuse, message))
+
+    def _tare(self, message: Message) -> None:
+        name = message["device"]
+        calls = {name: self._rig.load_cell(name).tare}
+        self._start(BENCH, calls, lambda _: self._reply(message), partial(self._refuse, message))
+
     def _check(self, message: Message) -> None:
         self._rig.check(message["setpoints"])
         self._reply(message)
@@ -573,6 +591,8 @@ _REQUESTS: Mapping[str, Callable[[Guardian, Message], None]] = {
     "look": Guardian._look,
     "apply": Guardian._apply,
     "check": Guardian._check,
+    "rest": Guardian._rest,
+    "tare": Guardian._tare,
     "arrivals": Guardian._arrivals,
     "can-play": Guardian._can_play,
     "play": Guardian._play,

@@ -215,6 +215,14 @@ class RemoteStation(Station):
         sent = self._ask("apply", setpoints={name: float(value) for name, value in setpoints.items()})
         self._setpoints.update(sent)
 
+    def rest(self) -> None:
+        """Bring every device into its safe state for a while."""
+        self._ask("rest")
+
+    def tare(self, device: str) -> None:
+        """Make the present force of a load cell read zero."""
+        self._ask("tare", device=device)
+
     def setpoint(self, device: str) -> float:
         """Return the set-point that was last sent to a device; nan before the first."""
         return self._setpoints[device]

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bench.hysteresis import _checks
 from bench.hysteresis._checks import Floats
-from bench.hysteresis.elements import ElementOperator, checked_coefficients
+from bench.hysteresis.elements import CompiledStep, ElementOperator, checked_coefficients
 from bench.hysteresis.operator import Shape
 
 
@@ -106,6 +106,10 @@ class BoucWen(ElementOperator):
         )
         elements[0] = z[-1]
         return np.column_stack([inputs - self.origin, z])
+
+    def compiled_step(self) -> CompiledStep:
+        """Return the compiled step; see `ElementOperator.compiled_step`."""
+        return CompiledStep("bouc_wen", (self.scale, self.beta, self.gamma, self.exponent, self.origin))
 
     def shape_parameters(self) -> Shape:
         """Return beta, gamma and exponent with their bounds."""

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bench.hysteresis import _checks
 from bench.hysteresis._checks import Floats
-from bench.hysteresis.elements import ElementOperator, checked_coefficients
+from bench.hysteresis.elements import CompiledStep, ElementOperator, checked_coefficients
 from bench.hysteresis.operator import Shape
 
 
@@ -118,3 +118,7 @@ class Duhem(ElementOperator):
 
         x = self._x(np.append(inputs, present))
         return np.asarray(_element_kernels.duhem(x[:-1], float(x[-1]), self.rate, self.degree, elements))
+
+    def compiled_step(self) -> CompiledStep:
+        """Return the compiled step; see `ElementOperator.compiled_step`."""
+        return CompiledStep("duhem", (*self.input_range, self.rate))

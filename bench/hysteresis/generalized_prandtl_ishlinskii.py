@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from bench.hysteresis import _checks
 from bench.hysteresis._checks import Floats
-from bench.hysteresis.elements import ElementOperator, ElementState, checked_coefficients
+from bench.hysteresis.elements import CompiledStep, ElementOperator, ElementState, checked_coefficients
 from bench.hysteresis.operator import Shape
 
 if TYPE_CHECKING:
@@ -38,18 +38,19 @@ class Envelope(NamedTuple):
     steepness: float
     offset: float
 
-    def _ends(self) -> tuple[float, float]:
+    def ends(self) -> tuple[float, float]:
+        """Return the hyperbolic tangents at -1 and 1."""
         return math.tanh(-self.steepness - self.offset), math.tanh(self.steepness - self.offset)
 
     def __call__(self, x: Floats) -> Floats:
         """Return the map of each value."""
-        low, high = self._ends()
+        low, high = self.ends()
         values = np.tanh(self.steepness * x - self.offset)
         return np.asarray((2.0 * values - low - high) / (high - low))
 
     def inverse(self, drive: float) -> float:
         """Return the value that is mapped to a drive, kept within what the map can reach."""
-        low, high = self._ends()
+        low, high = self.ends()
         value = 0.5 * (drive * (high - low) + low + high)
         edge = 1.0 - 1e-16
         return (math.atanh(min(max(value, -edge), edge)) + self.offset) / self.steepness
@@ -188,6 +189,11 @@ class GeneralizedPrandtlIshlinskii(ElementOperator):
             self.rising(x), self.falling(x), self.thresholds.copy(), elements
         )
         return np.asarray(columns)
+
+    def compiled_step(self) -> CompiledStep:
+        """Return the compiled step; see `ElementOperator.compiled_step`."""
+        envelopes = (number for each in (self.rising, self.falling) for number in (*each, *each.ends()))
+        return CompiledStep("plays", (*self.input_range, *envelopes), (self.thresholds,))
 
     def saturated_state(self, direction: int, value: float | None = None) -> ElementState:
         """Return the state at the low (-1) or high (1) end, or at a value, entered from far beyond the other end.

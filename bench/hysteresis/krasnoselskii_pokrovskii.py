@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from bench.hysteresis import _checks
 from bench.hysteresis._checks import Floats
-from bench.hysteresis.elements import ElementOperator, ElementState, checked_coefficients
+from bench.hysteresis.elements import CompiledStep, ElementOperator, ElementState, checked_coefficients
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,6 +101,10 @@ class KrasnoselskiiPokrovskii(ElementOperator):
         from bench.hysteresis import _element_kernels
 
         return np.asarray(_element_kernels.ramps(inputs, *self._ramps, self.width, elements))
+
+    def compiled_step(self) -> CompiledStep:
+        """Return the compiled step; see `ElementOperator.compiled_step`."""
+        return CompiledStep("ramps", (self.width,), self._ramps)
 
     def saturated_state(self, direction: int, value: float | None = None) -> ElementState:
         """Return the state at the low (-1) or high (1) end, or at a value, entered from beyond the other end.

@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from bench.hysteresis import _checks
 from bench.hysteresis._checks import Floats
-from bench.hysteresis.elements import ElementOperator, ElementState, checked_coefficients
+from bench.hysteresis.elements import CompiledStep, ElementOperator, ElementState, checked_coefficients
 
 if TYPE_CHECKING:
     from bench.hysteresis.branch_inverse import Branch
@@ -103,6 +103,10 @@ class MaxwellSlip(ElementOperator):
 
         columns = _element_kernels.stops(inputs, present, self.slips.copy(), elements)
         return np.column_stack([columns, inputs - self.origin])
+
+    def compiled_step(self) -> CompiledStep:
+        """Return the compiled step; see `ElementOperator.compiled_step`."""
+        return CompiledStep("stops", (self.origin,), (self.slips,))
 
     def saturated_state(self, direction: int, value: float | None = None) -> ElementState:
         """Return the state at the low (-1) or high (1) end, or at a value, entered from far beyond the other end.

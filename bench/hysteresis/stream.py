@@ -93,13 +93,13 @@ class PreisachStream(Stream[MemoryCurve]):
             kernels.QUADRATICS: lattice.quadratics,
         }
         for place, table in self._tables.items():
-            words[place] = _address(table)
+            words[place] = address_of(table)
         words[kernels.LEVEL_COUNT] = lattice.levels.size
         words[kernels.BREAK_COUNT] = lattice.breaks.size
         words[kernels.SATURATION] = state.saturation
         numbers[kernels.INVERSE_STEP] = lattice.inverse_step
         numbers[kernels.OFFSET] = lattice.offset
-        self._address = _address(words)
+        self._address = address_of(words)
         extrema = np.array(state.extrema, dtype=np.float64)
         left, height, _ = state.staircase(*operator.plane)
         self._make_room(max(_FIRST_ROOM, 2 * max(extrema.size, len(left))))
@@ -119,7 +119,7 @@ class PreisachStream(Stream[MemoryCurve]):
             (kernels.PIECES, self._pieces),
             (kernels.INDICES, self._indices),
         ):
-            words[place] = _address(array)
+            words[place] = address_of(array)
         words[kernels.ROOM] = room
 
     def _double_room(self) -> None:
@@ -185,14 +185,14 @@ class PlayStream(Stream["PlayState"]):
             kernels.AFTER: after,
         }
         for place, table in self._tables.items():
-            words[place] = _address(table)
+            words[place] = address_of(table)
         words[kernels.PLAY_COUNT] = operator.thresholds.size
         words[kernels.BEFORE_COUNT] = (before.size - 2) // 3 if before.size else -1
         words[kernels.AFTER_COUNT] = (after.size - 2) // 3 if after.size else -1
         numbers[kernels.ORIGIN] = operator.origin
         numbers[kernels.BIAS] = operator.bias
         numbers[kernels.PLAY_OUTPUT] = operator.value(state)
-        self._address = _address(words)
+        self._address = address_of(words)
 
     def step(self, value: float) -> float:
         """Move the input monotonically to `value` and return the output; see `Stream.step`."""
@@ -220,7 +220,7 @@ def compiled_step(name: str) -> Step:
     return kernels.entry(getattr(kernels, name))
 
 
-def _address(array: np.ndarray[Any, Any]) -> int:
+def address_of(array: np.ndarray[Any, Any]) -> int:
     """Return where the numbers of a contiguous array lie."""
     if not array.flags.c_contiguous:
         raise ValueError("array: expected a contiguous one")

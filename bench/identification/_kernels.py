@@ -232,6 +232,32 @@ def delete_column(upper: Floats, size: int, k: int) -> None:
 
 
 @njit(cache=True, fastmath={"reassoc", "contract"})
+def products_of_rows(upper: Floats, first: Integers, second: Integers) -> Floats:
+    """Return the products of rows first[k] and second[k] of an upper triangular matrix."""
+    result = np.empty(first.size)
+    for k in range(first.size):
+        one, two = upper[first[k]], upper[second[k]]
+        total = 0.0
+        for c in range(max(first[k], second[k]), upper.shape[0]):
+            total += one[c] * two[c]
+        result[k] = total
+    return result
+
+
+@njit(cache=True, fastmath={"reassoc", "contract"})
+def largest_row(gram: Floats, places: Integers) -> float:
+    """Return the greatest sum of magnitudes of a row of the block of a matrix at rows and columns `places`."""
+    result = 0.0
+    for i in places:
+        row = gram[i]
+        total = 0.0
+        for j in places:
+            total += abs(row[j])
+        result = max(result, total)
+    return result
+
+
+@njit(cache=True, fastmath={"reassoc", "contract"})
 def solve_factored(upper: Floats, size: int, right: Floats) -> Floats:
     """Return the solution of UᵀU x = right with U = upper[:size, :size]."""
     x = right.copy()

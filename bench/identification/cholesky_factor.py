@@ -25,18 +25,30 @@ class CholeskyFactor:
 
     @property
     def compact(self) -> Floats:
-        """Lower factor, a copy as LAPACK wants it."""
-        return np.array(self.upper[: self.size, : self.size], order="C").T
+        """Lower factor as LAPACK wants it, in the place of the factor itself."""
+        size, room = self.size, self.upper.shape[1]
+        if room > size:
+            flat = self.upper.reshape(-1)
+            for row in range(1, size):
+                flat[row * size : (row + 1) * size] = flat[row * room : row * room + size]
+            self.upper = flat[: size * size].reshape(size, size)
+        return self.upper.T
+
+    def _make_room(self, size: int) -> None:
+        if size > self.upper.shape[0]:
+            room = max(64, size + size // 4)
+            grown = np.zeros((room, room))
+            grown[: self.size, : self.size] = self.upper[: self.size, : self.size]
+            self.upper = grown
 
     def append(self, cross: Floats, square: Floats) -> Flags | None:
         """Add columns, given their products with the present ones, shape (size, p), and with each other.
 
-        In Fortran's order both are overwritten.
+        In Fortran's order the latter are overwritten.
 
         Return which were added: the others depend on the present ones and those added before them. None if there
         are others among many: nothing is added then, and fewer are to be tried.
         """
-        from scipy.linalg.blas import dsyrk, dtrsm
         from scipy.linalg.lapack import dpotrf
 
         from bench.identification import _kernels
@@ -44,10 +56,12 @@ class CholeskyFactor:
         old, more = cross.shape
         squares = np.diag(square).copy()
         rest = np.asfortranarray(square)
-        side: Floats | None = None
         if old and more:
-            side = dtrsm(1.0, self.compact, np.asfortranarray(cross), lower=1, overwrite_b=1)
-            rest = dsyrk(-1.0, side, beta=1.0, c=rest, trans=1, lower=1, overwrite_c=1)
+            self._make_room(old + more)
+            side = self.upper[:old, old : old + more]
+            side[:] = cross
+            self._solve_lower(side)
+            rest -= side.T @ side
         # Kept for a second try only where that is cheap.
         again = None if more > MANY else rest.copy(order="F")
         block, info = dpotrf(rest, lower=1, clean=1, overwrite_a=1)
@@ -64,19 +78,32 @@ class CholeskyFactor:
         if not old and added > self.upper.shape[0]:
             self.upper = np.ascontiguousarray(block.T)
             return good
-        if self.size > self.upper.shape[0]:
-            room = max(64, self.size + self.size // 2)
-            grown = np.zeros((room, room))
-            grown[:old, :old] = self.upper[:old, :old]
-            self.upper = grown
-        if side is not None:
-            self.upper[:old, old : self.size] = side if added == more else side[:, good]
+        if not old:
+            self.size = 0
+            self._make_room(added)
+            self.size = added
+        elif added < more:
+            self.upper[:old, old : self.size] = side[:, good]
         self.upper[old : self.size, old : self.size] = block.T
         return good
+
+    def _solve_lower(self, right: Floats) -> None:
+        """Replace right sides, shape (size, p), by the x with Uᵀx = right; without a copy of U."""
+        from scipy.linalg.blas import dtrsm
+
+        for first in range(0, self.size, MANY):
+            block = slice(first, min(first + MANY, self.size))
+            if first:
+                right[block] -= self.upper[:first, block].T @ right[:first]
+            corner = np.asfortranarray(self.upper[block, block].T)
+            right[block] = dtrsm(1.0, corner, np.asfortranarray(right[block]), lower=1, overwrite_b=1)
 
     def truncate(self, size: int) -> None:
         """Keep the first columns only."""
         self.size = size
+        if not size:
+            # There is no space for it and its successor.
+            self.upper = np.zeros((0, 0))
 
     def delete(self, places: Indices) -> None:
         """Remove the columns at increasing places."""
@@ -99,13 +126,6 @@ class CholeskyFactor:
         one, two = _kernels.factored_lengths(self.upper, self.size, first, second)
         return float(one), float(two)
 
-    def inverse(self) -> Floats:
-        """Return the lower half of the inverse of the Gram block."""
-        from scipy.linalg.lapack import dpotri
-
-        lower, _ = dpotri(self.compact, lower=1, overwrite_c=1)
-        return np.asarray(lower)
-
     def condition(self, norm: float) -> float:
         """Return the condition number of the columns, given the greatest sum of magnitudes over a Gram row."""
         from scipy.linalg.lapack import dpocon
@@ -114,3 +134,15 @@ class CholeskyFactor:
             return 1.0
         reciprocal, _ = dpocon(self.compact, norm, uplo="L")
         return float(np.sqrt(1.0 / max(reciprocal, 1e-300)))
+
+    def inverse_entries(self, rows: Indices, columns: Indices) -> Floats:
+        """Return entries of the inverse of the Gram block; the factor is used up."""
+        from scipy.linalg.lapack import dtrtri
+
+        from bench.identification import _kernels
+
+        if not self.size:
+            return np.zeros(rows.size)
+        inverse, _ = dtrtri(self.compact, lower=1, overwrite_c=1)
+        self.size = 0
+        return np.asarray(_kernels.products_of_rows(inverse.T, rows, columns))

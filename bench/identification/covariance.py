@@ -199,7 +199,7 @@ def _inverse_root(
         upper = state.factor.upper[: state.factor.size, : state.factor.size]
         root = solve_triangular(upper, np.eye(state.factor.size))[order]
         columns = state.passive[order]
-        freedom = state.effective(state.factor.inverse())
+        _, freedom = state.variances()
     else:
         values, vectors = eigh(state.products_of(chosen, chosen))
         kept = values > _NO_INFORMATION * values[-1]

@@ -20,11 +20,11 @@ Schema, version 3
     start), `devices` (identity by name), `limits` (set-points that each takes), `calibration`, `operator`, `command`,
     `packages` (versions), `git` (commit and whether it was clean), `host` (with the wall-clock time at the start),
     `controls` (the signal under control), `plan` (as far as no reading decides), `rehearsal` (null if there was
-    none), `dashboard`,
-    `rig_given` (name or path of the rig), `laboratory_epoch` (of a served laboratory), `resumes` (what each process
-    was that took the run up after its death), and at the end `status` (`completed`, `aborted`, `failed`), `reason`,
-    `finished` (laboratory s), `safe_state` (outcome by device), `counts` (rows by table). A file without `status` is
-    of a run that is going on or whose process died.
+    none), `dashboard`, `over_time` (signals whose plots over time are always visible), `rig_given` (name or path of
+    the rig), `laboratory_epoch` (of a served laboratory), `resumes` (what each process was that took the run up after
+    its death), and at the end `status` (`completed`, `aborted`, `failed`), `reason`, `finished` (laboratory s),
+    `safe_state` (outcome by device), `counts` (rows by table). A file without `status` is of a run that is going on
+    or whose process died.
 `signals(position, name, unit, description, precision, checksum)`
     One row a signal column of the two tables below.
 `steps(step, started, finished, phase, label, settled, setpoints, "<signal>", …, seen, checksum)`

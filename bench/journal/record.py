@@ -117,9 +117,9 @@ class Record:
         end = 7 + len(self.signals)
         return self._table("steps", names, [(*row[:3], row[5] not in _FAILED, *row[7:end]) for row in rows])
 
-    def step_records(self) -> Iterator[StepRecord]:
-        """Yield the finished steps one by one."""
-        rows = self._rows("steps")
+    def step_records(self, after: int = -1) -> Iterator[StepRecord]:
+        """Yield the finished steps one by one, those with numbers beyond `after`."""
+        rows = self._rows("steps", after)
         self._check("steps", rows)
         end = 7 + len(self.signals)
         for row in rows:
@@ -140,10 +140,16 @@ class Record:
                 raise DataError(f"{self.path} is damaged: step {step}: {error}") from error
             yield record
 
-    def telemetry(self) -> Table:
-        """Return the ticks: columns `t`, `step`, and one a signal."""
+    def newest_ticks(self, count: int) -> list[tuple[float, ...]]:
+        """Return the newest ticks, oldest first, unchecked: laboratory time in s, and one value a signal."""
+        columns = ", ".join(quoted(name) for name in ("t", *(signal.name for signal in self.signals)))
+        rows = self._query(f"SELECT {columns} FROM telemetry ORDER BY tick DESC LIMIT {count:d}")  # noqa: S608 - own names
+        return [tuple(math.nan if value is None else float(value) for value in row) for row in reversed(rows)]
+
+    def telemetry(self, after: int = 0) -> Table:
+        """Return the ticks, those with numbers beyond `after`: columns `t`, `step`, and one a signal."""
         names = ("tick", "t", "step", *(signal.name for signal in self.signals))
-        rows = self._rows("telemetry")
+        rows = self._rows("telemetry", after)
         whole = self._table("telemetry", (*names, "checksum") if self._is_checked else names, rows)
         if self._is_checked and rows:
             numbers = np.column_stack([whole[name] for name in names])
@@ -155,9 +161,9 @@ class Record:
             {name: whole.units[name] for name in names if name != "tick"},
         )
 
-    def events(self) -> list[Event]:
-        """Return what happened, in its order."""
-        rows = self._rows("events")
+    def events(self, after: int = 0) -> list[Event]:
+        """Return what happened, in its order, with numbers beyond `after`."""
+        rows = self._rows("events", after)
         self._check("events", rows)
         return [Event(*row[1:5]) for row in rows]
 
@@ -186,7 +192,7 @@ class Record:
         """Close the file."""
         self._opened.close()
 
-    def _rows(self, table: str) -> list[tuple[Any, ...]]:
+    def _rows(self, table: str, after: int = -1) -> list[tuple[Any, ...]]:
         # Columns by name, as only then a missing one is an error.
         leading = {
             "steps": ("step", "started", "finished", "phase", "label", "settled", "setpoints"),
@@ -197,7 +203,9 @@ class Record:
         seen = ("seen",) if table == "steps" and self._is_checked else ()
         names = (*leading, *signals, *seen, *(("checksum",) if self._is_checked else ()))
         columns = ", ".join(map(quoted, names))
-        return self._query(f"SELECT {columns} FROM {table} ORDER BY 1")  # noqa: S608 - own names
+        # The rows are numbered by their first column, from 0 or 1.
+        first = leading[0]
+        return self._query(f"SELECT {columns} FROM {table} WHERE {first} > {after:d} ORDER BY 1")  # noqa: S608
 
     def _check(self, table: str, rows: Sequence[tuple[Any, ...]]) -> None:
         """Raise DataError for the first row that its checksum, the last column, does not fit."""

@@ -117,7 +117,8 @@ class Event:
     level : str
         `INFO`, `WARN` or `ERROR`.
     kind : str
-        `phase`, `note`, `pause`, `resume`, `resumed` (by another process), `observer`, `suspended`, `interlock`,
+        `phase`, `note`, `pause`, `remark` (of the operator), `parameter` (a change), `off`, `resume`, `resumed` (by
+        another process), `observer`, `notify`, `suspended`, `warning` (near an interlock), `interlock`,
         `error`, `safe-state`, `clock`, `end`.
     text : str
         One sentence.

@@ -26,7 +26,7 @@ from bench.journal.store import Store
 _READERS = 10.0
 """Wall-clock time for which a journal that is made or opened again waits for its readers, s."""
 
-_END = ("status", "reason", "finished", "safe_state", "counts")
+_END = ("status", "reason", "finished", "safe_state", "counts", "lateness")
 """Entries of the metadata that a run has once it has ended."""
 
 
@@ -214,8 +214,16 @@ class Journal:
         self._stop_background()
         self._keeper.make_room()
 
-    def finish(self, *, status: str, reason: str, finished: float, safe_state: Mapping[str, str]) -> None:
-        """Record how the run ended: status, reason, laboratory time in s, safe state by device.
+    def finish(
+        self,
+        *,
+        status: str,
+        reason: str,
+        finished: float,
+        safe_state: Mapping[str, str],
+        lateness: Mapping[str, object] = MappingProxyType({}),
+    ) -> None:
+        """Record how the run ended: status, reason, laboratory time in s, safe state by device, lateness of loops.
 
         Raises RecordError if rows are missing or damaged; the status is `failed` then at best.
         """
@@ -232,6 +240,7 @@ class Journal:
             "finished": finished,
             "safe_state": dict(safe_state),
             "counts": self._counts,
+            **({"lateness": dict(lateness)} if lateness else {}),
         }
         self._keeper.keep([entry("meta", meta_row(key, value)) for key, value in end.items()])
         problem = problem or self._keeper.why

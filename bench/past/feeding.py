@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import NoReturn
 
 import numpy as np
 
+from bench.binding import Slots
 from bench.control.loops import Playback
 from bench.errors import BenchError, ConfigurationError
 from bench.journal import Record, StepRecord, Table
 from bench.past.corners import corners, turning_points
-from bench.protocol.parameters import ProtocolDefinition
+from bench.protocol.changes import ParameterChange
+from bench.protocol.parameters import ProtocolDefinition, ProtocolParameters
 from bench.protocol.vocabulary import (
     PROMPT,
     Control,
@@ -79,6 +82,8 @@ class Past:
         Its finished steps.
     remarks : tuple of (str, str)
         Kind and text of its phases and notes, in their order.
+    changes : tuple of ParameterChange
+        Parameters that were changed at its pauses, in their order.
     names : tuple of str
         The signals of the record.
     units : mapping of str to str
@@ -91,6 +96,7 @@ class Past:
 
     steps: tuple[StepRecord, ...]
     remarks: tuple[tuple[str, str], ...]
+    changes: tuple[ParameterChange, ...]
     names: tuple[str, ...]
     units: Mapping[str, str]
     ticks: Table
@@ -104,6 +110,7 @@ class Past:
         return cls(
             steps=steps,
             remarks=tuple((event.kind, event.text) for event in events if event.kind in _REMARKS),
+            changes=ParameterChange.among((event.kind, event.text) for event in events),
             names=tuple(signal.name for signal in record.signals),
             units={signal.name: signal.unit for signal in record.signals},
             ticks=ticks,
@@ -200,9 +207,10 @@ class Fed:
         return rules[-1] if rules else Dwell(_FEWEST_TICKS * period)
 
 
-def feed(definition: ProtocolDefinition, messages: Messages, past: Past) -> Fed:
-    """Feed a protocol what was recorded of it, up to its last finished step.
+def feed(definition: ProtocolDefinition, parameters: ProtocolParameters, slots: Slots, past: Past) -> Fed:
+    """Start a protocol, and feed it what was recorded of it, up to its last finished step.
 
+    Parameters that were changed at a pause are changed again, each with the reading that it was changed with.
     What it yields on the way has to be what the record says. A finished `Control` is repeated with the readings that
     its controller saw, which brings the controller to where it was; it has to ask for the same set-points. The
     controller of a finished `FixedRate` cannot be rebuilt, as not each sample is recorded; the protocol may not use
@@ -213,8 +221,28 @@ def feed(definition: ProtocolDefinition, messages: Messages, past: Past) -> Fed:
     ConfigurationError
         If the protocol does other than the record says, or fails.
     """
+    fed = _feed(definition, definition.start(parameters, slots), past, partial(_change, definition, parameters))
+    # Those of the step that the run died in are seen with its reading.
+    last = -1 if fed.step is None else fed.step.step
+    _change(definition, parameters, [each for each in past.changes if each.step > last])
+    return fed
+
+
+def _change(
+    definition: ProtocolDefinition, parameters: ProtocolParameters, changes: Sequence[ParameterChange]
+) -> None:
+    for each in changes:
+        definition.change(parameters, each.name, each.value)
+
+
+def _feed(
+    definition: ProtocolDefinition,
+    messages: Messages,
+    past: Past,
+    change: Callable[[Sequence[ParameterChange]], None],
+) -> Fed:
     fed = Fed(messages, past)
-    steps, remarks = deque(past.steps), deque(past.remarks)
+    steps, remarks, changes = deque(past.steps), deque(past.remarks), deque(past.changes)
     reading: Reading | None = None
     while True:
         try:
@@ -257,6 +285,8 @@ def feed(definition: ProtocolDefinition, messages: Messages, past: Past) -> Fed:
             fed.message = message
             return fed
         reading = _Feeding(definition, fed, steps.popleft()).reading_of(message)
+        while changes and changes[0].step <= reading.step:
+            change([changes.popleft()])
 
 
 def _approach(start: Place, own: Place, end: Place, switches: Collection[str]) -> list[dict[str, float]]:

@@ -94,7 +94,7 @@ class Interrupted:
                 f"{self.folder} has the signals {', '.join(missing)}, which rig {description.file.name} does not "
                 "give any more; restore them"
             )
-        fed = feed(definition, definition.start(parameters, slots), self.past)
+        fed = feed(definition, parameters, slots, self.past)
         if fed.step is None:
             raise ConfigurationError(f"{self.folder} has no finished step to go on from; start the run anew")
         if fed.message is not None:

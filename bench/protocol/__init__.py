@@ -12,6 +12,7 @@ from bench.protocol.parameters import (
     unit_of,
 )
 from bench.protocol.plan import Plan, plan
+from bench.protocol.views import Views
 from bench.protocol.vocabulary import (
     LATENESS,
     TRACES,
@@ -53,6 +54,7 @@ __all__ = [
     "Slots",
     "Step",
     "UntilSteady",
+    "Views",
     "digest_of",
     "find_protocol",
     "from_slot",

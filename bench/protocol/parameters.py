@@ -13,6 +13,8 @@ from pydantic_core import PydanticUndefined
 from bench.binding import RoleTable, Slots, rate_unit
 from bench.devices import Device, Signal
 from bench.errors import ConfigurationError
+from bench.protocol.changes import ParameterChange
+from bench.protocol.views import Views
 from bench.protocol.vocabulary import Messages
 
 Needs = Mapping[str, type[Device] | type[Signal]] | Sequence[str]
@@ -74,6 +76,7 @@ def parameter(
     high: float | None = None,
     choices: Callable[[], Sequence[str]] | None = None,
     file: bool = False,
+    changeable: bool = False,
 ) -> Any:  # noqa: ANN401 - stands for a field's default
     """Declare a parameter of a protocol.
 
@@ -92,8 +95,10 @@ def parameter(
     file : bool
         Whether it is the path of a file that the protocol reads; the content is then kept with the run. An empty text
         stands for no file.
+    changeable : bool
+        Whether the operator may change it at a pause. The protocol has to read it from its parameters each time.
     """
-    extra: dict[str, Any] = {"unit": unit, "choices": choices, "file": file}
+    extra: dict[str, Any] = {"unit": unit, "choices": choices, "file": file, "changeable": changeable}
     if isinstance(default, FromSlot):
         extra["default"] = default
         default = ...
@@ -137,6 +142,8 @@ class ProtocolDefinition:
         What can be set.
     generator : callable
         Takes the parameters, and the slots where it asks for some.
+    views : Views or None
+        What the dashboard shows of it; None for all that the rig file lays out.
     """
 
     name: str
@@ -147,6 +154,7 @@ class ProtocolDefinition:
     parameters: type[ProtocolParameters]
     generator: Callable[..., Messages]
     may_use: Mapping[str, type[Device] | type[Signal]] = field(default_factory=dict)
+    views: Views | None = None
 
     @property
     def slots(self) -> Mapping[str, type[Device] | type[Signal]]:
@@ -168,6 +176,43 @@ class ProtocolDefinition:
     def file_parameters(self) -> tuple[str, ...]:
         """The names of the parameters that name files."""
         return tuple(name for name in self.parameters.model_fields if self._extra(name).get("file"))
+
+    @property
+    def changeable(self) -> tuple[str, ...]:
+        """The names of the parameters that may be changed at a pause."""
+        return tuple(name for name in self.parameters.model_fields if self._extra(name).get("changeable"))
+
+    def change(self, parameters: ProtocolParameters, name: str, value: Any) -> Any:  # noqa: ANN401
+        """Change a parameter of a protocol that goes on, which sees it when it reads it next.
+
+        Parameters
+        ----------
+        parameters : ProtocolParameters
+            Those that the protocol was started with.
+        name : str
+            The parameter.
+        value
+            Its new value, also as a text.
+
+        Returns
+        -------
+        any
+            The value as JSON holds it.
+
+        Raises
+        ------
+        ConfigurationError
+            If it may not be changed at a pause, or not to this value; nothing is changed then.
+        """
+        if name not in self.changeable:
+            known = ", ".join(self.changeable) or "none"
+            raise ConfigurationError(
+                f"protocol {self.name}: {name!r} cannot be changed at a pause; parameters that can: {known}"
+            )
+        changed = self.parse({**parameters.model_dump(), name: value})
+        # Of the object that the protocol has; no other way is open to it, as values are frozen.
+        parameters.__dict__[name] = getattr(changed, name)
+        return changed.model_dump(mode="json")[name]
 
     def files(self, parameters: ProtocolParameters) -> dict[str, str]:
         """Return the paths of the files that the parameters name, by the name of the parameter."""
@@ -327,8 +372,46 @@ class ProtocolDefinition:
                 yield f"protocol {self.name}: {problem['msg'].removeprefix('Value error, ')}"
 
 
+@dataclass(frozen=True)
+class OpenParameters:
+    """The parameters of a protocol that goes on, as they may be changed at a pause.
+
+    Attributes
+    ----------
+    definition : ProtocolDefinition
+        The protocol.
+    parameters : ProtocolParameters
+        Those that it was started with.
+    roles : mapping of str to RoleTable
+        The roles that its rig file binds, for units.
+    """
+
+    definition: ProtocolDefinition
+    parameters: ProtocolParameters
+    roles: Mapping[str, RoleTable]
+
+    def changeable(self) -> dict[str, str]:
+        """Return those that may be changed, with value, unit and what is allowed."""
+        found: dict[str, str] = {}
+        for entry in self.definition.help(self.roles):
+            if entry.name in self.definition.changeable:
+                unit = f" {entry.unit}" if entry.unit not in ("", "1") else ""
+                value = getattr(self.parameters, entry.name)
+                found[entry.name] = f"{value}{unit}, {entry.text} ({entry.allowed})"
+        return found
+
+    def change(self, step: int, name: str, value: str) -> ParameterChange:
+        """Change one from the reading of a step on; raises ConfigurationError if that is not allowed."""
+        former = self.parameters.model_dump(mode="json").get(name)
+        return ParameterChange(step, name, self.definition.change(self.parameters, name, value), former)
+
+
 def protocol(
-    *, needs: Needs, may_use: Mapping[str, type[Device] | type[Signal]] | None = None, controls: str = ""
+    *,
+    needs: Needs,
+    may_use: Mapping[str, type[Device] | type[Signal]] | None = None,
+    controls: str = "",
+    views: Views | None = None,
 ) -> Callable[[Callable[..., Messages]], ProtocolDefinition]:
     """Make a generator function a protocol.
 
@@ -345,6 +428,8 @@ def protocol(
     controls : str
         Slot (or signal) that the protocol's controllers control, if it has any: what they think of it (`TRACES`) is
         then recorded beside the rig's signals.
+    views : Views, optional
+        What the dashboard shows of it, by its slots; all that the rig file lays out if not given.
 
     Raises
     ------
@@ -379,6 +464,7 @@ def protocol(
             parameters=hints[0],
             generator=function,
             may_use=dict(may_use or {}),
+            views=views,
         )
 
     return define

@@ -29,6 +29,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from bench.control.loops import BlockController, ControlTask, DelayedController, SampledController
+from bench.desk import Desk
 from bench.devices import Signal
 from bench.settling import Arrived, Dwell, Settle, Settled, UntilSteady, durations
 
@@ -288,6 +289,23 @@ class Prompt(Message):
         shortest, longest = durations(self.settle)
         watched = _watched(self.settle) | {self.signal}
         return Planned(seconds=shortest, at_most=longest, watched=watched, prompts=1, settled=_MET[type(self.settle)])
+
+
+@dataclass(frozen=True, kw_only=True)
+class ByHand(Message):
+    """Let an operator move the rig, command by command, until there are no more; then take a reading.
+
+    Attributes
+    ----------
+    desk : Desk
+        Where the commands come from.
+    """
+
+    desk: Desk
+
+    def plan(self) -> Planned:
+        """Return that nothing is known."""
+        return Planned(at_most=math.inf, settled=Settled.UNRECORDED)
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,7 @@
-"""Tables, figures and exports of a run, made from its journal."""
+"""Tables, figures and the page of a run, made from its journal."""
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,13 +11,12 @@ from rich.console import Console
 from rich.table import Table as Columns
 
 from bench.devices import Signal
-from bench.errors import ConfigurationError, DataError
-from bench.extras import needed_for
 from bench.hysteresis import MemoryCurve
 from bench.journal import Record, Table, expected_steps, run_card
+from bench.lateness import lateness_lines
 from bench.model_file import ModelFile
 from bench.printing import print_plain
-from bench.results.data import write_csv
+from bench.results.export import make_folder
 from bench.results.figures import (
     check_matplotlib,
     plot_coverage,
@@ -35,8 +33,7 @@ from bench.results.prediction_figures import draw_predictions
 from bench.results.predictions import Predictions
 from bench.results.published import Published
 from bench.results.tracking import results_json
-from bench.runs import RECORDING_NAME
-from bench.units import format_numbers, header_with_unit, with_unit
+from bench.units import format_numbers, with_unit
 
 PAGE_NAME = "report.html"
 """Usual file name of the page of a run."""
@@ -83,7 +80,7 @@ def report_run(
 
     check_matplotlib()
     with Record(run) as record:
-        folder = _make_folder(out or record.path.parent / "report")
+        folder = make_folder(out or record.path.parent / "report")
         console.print(Markdown(run_card(record.meta)))
         steps = record.steps()
         if remark := record.remark():
@@ -92,6 +89,8 @@ def report_run(
         extremes = _extremes(record, steps)
         _print_extremes(record, extremes, console)
         _print_events(record, console)
+        for line in lateness_lines(record.meta.get("lateness", {})):
+            print_plain(console, line)
         figures = _draw_run(record, steps, folder, figure_format)
         applied = apply_models(record, steps, [*models_of(record), *models]) if len(steps) else []
         comparison = {
@@ -118,53 +117,16 @@ def report_run(
         "safe_state": record.meta.get("safe_state", {}),
         "extremes": extremes,
         "models": comparison,
+        "lateness": record.meta.get("lateness", {}),
         **control,
         "figures": [str(path) for path in [*figures, *more]],
         "page": None if page is None else str(page),
     }
 
 
-def export_run(run: Path, format_: str, out: Path | None) -> list[Path]:
-    """Write a run's readings and telemetry as `csv` or `parquet`, its `rrd` or a `png`; return the files.
-
-    Raises
-    ------
-    DataError
-        If the run cannot be read or a file cannot be written.
-    ConfigurationError
-        If the format is unknown, a recording exists already, or a library that the format needs is not installed.
-    """
-    with Record(run) as record:
-        folder = _make_folder(out or record.path.parent)
-        if format_ == "rrd":
-            with needed_for("an .rrd file", "dashboard"):
-                from bench.dashboard import rebuild
-
-            path = folder / RECORDING_NAME
-            if path.exists():
-                raise ConfigurationError(f"{path} exists already; choose another folder by --out")
-            rebuild(record, path)
-            return [path]
-        if format_ == "png":
-            return [_picture(record, folder)]
-        tables = {"readings": record.steps(), "telemetry": record.telemetry()}
-        headers = {name: _headers(record, table) for name, table in tables.items()}
-    if format_ not in ("csv", "parquet"):
-        raise ConfigurationError(f"format {format_!r} is unknown; allowed are csv, parquet, rrd and png")
-    paths = []
-    for name, table in tables.items():
-        path = folder / f"{name}.{format_}"
-        if format_ == "csv":
-            write_csv(path, headers[name], list(table.columns.values()))
-        else:
-            _write_parquet(path, headers[name], table)
-        paths.append(path)
-    return paths
-
-
 def draw_comparison(result: ComparedModels, out: Path) -> list[Path]:
     """Draw the residuals of compared models, their outputs and loops; return the files."""
-    folder = _make_folder(out)
+    folder = make_folder(out)
     path = folder / "residuals.png"
     plot_errors(
         path,
@@ -177,26 +139,12 @@ def draw_comparison(result: ComparedModels, out: Path) -> list[Path]:
 
 def draw_predicted(found: Predictions, out: Path) -> list[Path]:
     """Draw the outputs of one model; return the files."""
-    return draw_predictions(found, _make_folder(out), next(iter(found.predicted)))
-
-
-def _picture(record: Record, folder: Path) -> Path:
-    with needed_for("a picture of the dashboard", "dashboard"):
-        from bench.dashboard import picture, rebuild
-
-    path = folder / "dashboard.png"
-    with tempfile.TemporaryDirectory() as scratch:
-        recording = Path(scratch) / RECORDING_NAME
-        rebuild(record, recording)
-        complaints = picture(recording, path)
-    if complaints:
-        raise DataError(f"{path}: the viewer reports: {'; '.join(complaints)}")
-    return path
+    return draw_predictions(found, make_folder(out), next(iter(found.predicted)))
 
 
 def draw_identification(found: IdentifiedFile, out: Path) -> list[Path]:
     """Draw loops, errors and density of an identified model; return the files."""
-    folder = _make_folder(out)
+    folder = make_folder(out)
     operator = found.file.response
     name = found.file.name
     paths = draw_predictions(found.predictions(), folder, name)
@@ -312,29 +260,3 @@ def _print_control(
 
 def _precision(record: Record, name: str) -> int:
     return next((signal.precision for signal in record.signals if signal.name == name), Signal.precision)
-
-
-def _headers(record: Record, table: Table) -> list[str]:
-    units = {"step": "", "settled": "", "t": "s", "started": "s", "finished": "s"}
-    units |= {signal.name: signal.unit for signal in record.signals}
-    return [header_with_unit(name, units[name]) for name in table.columns]
-
-
-def _write_parquet(path: Path, header: Sequence[str], table: Table) -> None:
-    # Takes a fifth of a second to import.
-    with needed_for("a parquet file", "report"):
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-
-    try:
-        pq.write_table(pa.table(dict(zip(header, table.columns.values(), strict=True))), path)
-    except OSError as error:
-        raise DataError(f"{path} cannot be written: {error}") from None
-
-
-def _make_folder(path: Path) -> Path:
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise DataError(f"folder {path} cannot be made: {error.strerror}") from None
-    return path

@@ -10,12 +10,13 @@ from typing import Any
 import numpy as np
 
 from bench.journal import Record, Table
+from bench.protocol.changes import PARAMETER
 from bench.results.run_list import main_result
 from bench.results.tracking import results_json
 from bench.run_record import Difference, differences
 
-_OF_THE_WALL_CLOCK = ("clock", "observer", "suspended")
-"""Kinds of events that say how fast a machine was."""
+_OF_THE_WALL_CLOCK = ("clock", "observer", "suspended", "notify", "pause", "resume", "remark", PARAMETER)
+"""Kinds of events that say how fast a machine was, and when an operator did something."""
 
 
 @dataclass(frozen=True)

@@ -65,7 +65,10 @@ def masked(devices: Iterable[Device]) -> list[News]:
 
 def news_of(findings: Iterable[Finding]) -> list[News]:
     """Return what interlocks below the level `safe` have found, for the record."""
-    return [News("INFO" if each.over else "WARN", "interlock", each.text) for each in findings]
+    return [
+        News("INFO" if each.over else "WARN", "warning" if each.early else "interlock", each.text)
+        for each in findings
+    ]
 
 
 class Station(ABC):
@@ -157,6 +160,25 @@ class Station(ABC):
             If a device does not take its set-point; nothing was sent.
         DeviceError
             If a device refuses.
+        """
+
+    @abstractmethod
+    def rest(self) -> None:
+        """Bring every device into its safe state for a while; the next set-point switches an output on again.
+
+        Raises DeviceError if a device did not reach it.
+        """
+
+    @abstractmethod
+    def tare(self, device: str) -> None:
+        """Make the present force of a load cell read zero.
+
+        Raises
+        ------
+        ConfigurationError
+            If the device is no load cell.
+        DeviceError
+            If it does not take the tare.
         """
 
     @abstractmethod

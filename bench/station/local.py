@@ -13,7 +13,7 @@ from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
 from bench.interlocks import Finding, InterlockWatch
 from bench.rig import Look, Rig
 from bench.roles import Floats
-from bench.safety import make_safe
+from bench.safety import make_safe, raise_if_unsafe
 from bench.station.core import StationCore
 from bench.station.interface import Arrivals, News, Station, masked, news_of
 from bench.station.reconnection import TRIES, longest_away, reconnect
@@ -149,6 +149,15 @@ class LocalStation(Station):
         for name, value in setpoints.items():
             self._statuses.append(self._ask(name, partial(self._rig.actuator(name).set, value)))
 
+    def rest(self) -> None:
+        """Bring every device into its safe state for a while."""
+        self._core.raise_if_over()
+        raise_if_unsafe(self._made_safe())
+
+    def tare(self, device: str) -> None:
+        """Make the present force of a load cell read zero."""
+        self._ask(device, self._rig.load_cell(device).tare)
+
     def setpoint(self, device: str) -> float:
         """Return the set-point that was last sent to a device; nan before the first."""
         return self._rig.actuator(device).setpoint
@@ -192,16 +201,19 @@ class LocalStation(Station):
         """Bring every device into its safe state; return by device `safe`, or what went wrong."""
         self._core.end()
         if self._safe is None:
-            order = self._rig.file.safety.order
-            # A stable sort: those that have no order come after the others, as they stand.
-            ranked = sorted(self._rig.devices, key=lambda name: order.index(name) if name in order else len(order))
-            self._safe = make_safe(self._rig.devices[name] for name in ranked)
+            self._safe = self._made_safe()
             self._news += masked(self._rig.devices.values())
         return self._safe
 
     def close(self) -> None:
         """Release the lines; each device keeps the state that it is in."""
         self._rig.close()
+
+    def _made_safe(self) -> dict[str, str]:
+        order = self._rig.file.safety.order
+        # A stable sort: those that have no order come after the others, as they stand.
+        ranked = sorted(self._rig.devices, key=lambda name: order.index(name) if name in order else len(order))
+        return make_safe(self._rig.devices[name] for name in ranked)
 
     def _ask(self, name: str, call: Callable[[], _T]) -> _T:
         began = self.clock.now()

@@ -13,9 +13,20 @@ from collections.abc import Callable
 import numpy as np
 
 from bench.control.loops import Playback
-from bench.protocol import Dwell, FixedRate, Messages, Phase, ProtocolParameters, Slots, Step, parameter, protocol
+from bench.protocol import (
+    Dwell,
+    FixedRate,
+    Messages,
+    Phase,
+    ProtocolParameters,
+    Slots,
+    Step,
+    Views,
+    parameter,
+    protocol,
+)
 from bench.protocol.number_list import NumberList
-from protocols.hybrid import FINE, SENSORS, THERMAL
+from protocols.hybrid import BOTH_LOOPS, FINE, FINE_OVER_TIME, HEATING, SENSORS, THERMAL
 
 
 def _play(
@@ -50,7 +61,7 @@ class CurrentSineParameters(ProtocolParameters):
     rate: float = parameter(0.5, unit="Hz", low=0.01, high=100, help="samples in a second")
 
 
-@protocol(needs=THERMAL, controls="response")
+@protocol(needs=THERMAL, controls="response", views=HEATING)
 def current_sine(parameters: CurrentSineParameters, slots: Slots) -> Messages:
     """Drive the Peltier element by a slow sine, and watch temperatures and deflection.
 
@@ -81,7 +92,7 @@ class CurrentStepsParameters(ProtocolParameters):
     rate: float = parameter(1.0, unit="Hz", low=0.01, high=100, help="samples in a second")
 
 
-@protocol(needs=THERMAL, controls="response")
+@protocol(needs=THERMAL, controls="response", views=HEATING)
 def current_steps(parameters: CurrentStepsParameters, slots: Slots) -> Messages:
     """Step the current of the Peltier element, and watch temperatures and deflection.
 
@@ -112,10 +123,12 @@ class ThermomechanicalParameters(ProtocolParameters):
     coldest: float = parameter(-0.15, unit="A", low=-1, high=0, help="lowest current, which cools most")
     hottest: float = parameter(0.1, unit="A", low=0, high=1, help="highest current")
     levels: int = parameter(9, unit="1", low=2, high=1000, help="currents on each way")
-    dwell: float = parameter(240.0, unit="s", low=1, high=36000, help="hold at each before the reading")
+    dwell: float = parameter(
+        240.0, unit="s", low=1, high=36000, help="hold at each before the reading", changeable=True
+    )
 
 
-@protocol(needs=THERMAL)
+@protocol(needs=THERMAL, views=HEATING)
 def thermomechanical(parameters: ThermomechanicalParameters, slots: Slots) -> Messages:
     """Measure the static deflection over the temperature of the tip, without voltage.
 
@@ -137,7 +150,9 @@ class PiezoLoopsParameters(ProtocolParameters):
     rate: float = parameter(50.0, unit="Hz", low=1, high=1e5, help="samples in a second")
 
 
-@protocol(needs=FINE | {name: THERMAL[name] for name in SENSORS}, controls="response")
+@protocol(
+    needs=FINE | {name: THERMAL[name] for name in SENSORS}, controls="response", views=Views((("fine", "response"),))
+)
 def piezo_loops(parameters: PiezoLoopsParameters, slots: Slots) -> Messages:
     """Measure the hysteresis of the piezo by a slow sine, with minor loops of decreasing amplitude.
 
@@ -173,7 +188,7 @@ class PiezoStepParameters(ProtocolParameters):
     )
 
 
-@protocol(needs=FINE, controls="response")
+@protocol(needs=FINE, controls="response", views=FINE_OVER_TIME)
 def piezo_step(parameters: PiezoStepParameters, slots: Slots) -> Messages:
     """Measure the deflection after a step of the voltage, fast enough for the resonance.
 
@@ -207,7 +222,7 @@ class ExcitationParameters(ProtocolParameters):
     rate: float = parameter(2.0, unit="Hz", low=0.01, high=1000, help="samples in a second")
 
 
-@protocol(needs=THERMAL | FINE, controls="response")
+@protocol(needs=THERMAL | FINE, controls="response", views=BOTH_LOOPS)
 def hybrid_excitation(parameters: ExcitationParameters, slots: Slots) -> Messages:
     """Drive heat and voltage at once, a sine each, to validate a model of the whole.
 

@@ -11,7 +11,7 @@ from bench.controllers import ControllerSetup, make_controller
 from bench.model_file import load_model
 from bench.protocol import FixedRate, Messages, Phase, ProtocolParameters, Slots, parameter, protocol
 from bench.protocol.number_list import NumberList
-from protocols.hybrid import FINE, SENSORS, THERMAL, WITNESS
+from protocols.hybrid import BOTH_LOOPS, FINE, FINE_OVER_TIME, SENSORS, THERMAL, WITNESS
 
 ControllerName = Literal["hybrid", "hybrid-low-pass", "open-loop", "thermal-feedback"]
 ReferenceName = Literal["moves", "staircase", "ramp", "sine-on-ramp", "hold"]
@@ -44,10 +44,20 @@ class Parameters(ProtocolParameters):
     frequency: float = parameter(1.0, unit="Hz", low=1e-3, high=20, help="frequency of the sine on a ramp")
     rate: float = parameter(200.0, unit="Hz", low=50, high=1000, help="samples in a second")
     record_rate: float = parameter(50.0, unit="Hz", low=0.01, high=1000, help="recorded samples in a second")
+    lateness: float = parameter(
+        0.0, unit="s", low=0, high=0.06, help="time by which the response is read late, as its calibration finds it"
+    )
+    probe: float = parameter(
+        0.1e-6,
+        unit="m",
+        low=0,
+        high=1e-6,
+        help="height of the square wave at the start, by which the lateness is checked; 0 for no check",
+    )
     witness: bool = parameter(False, unit="", help="whether the sensor `witness` beside the loop is recorded too")
 
 
-@protocol(needs=THERMAL | FINE, may_use=WITNESS, controls="response")
+@protocol(needs=THERMAL | FINE, may_use=WITNESS, controls="response", views=BOTH_LOOPS)
 def hybrid_control(parameters: Parameters, slots: Slots) -> Messages:
     """Make the tip follow a reference by the thermal and the piezo part together.
 
@@ -56,7 +66,11 @@ def hybrid_control(parameters: Parameters, slots: Slots) -> Messages:
     a hold at 0. Where the tip rests far from 0, as in a warm room, a smooth move to 0 comes first.
     """
     reference, duration = _reference(parameters)
-    controller = make_controller("hybrid", parameters.controller, _setup(parameters, reference))
+    controller = make_controller(
+        "hybrid",
+        parameters.controller,
+        _setup(parameters, reference, lateness=parameters.lateness, probe=parameters.probe),
+    )
     yield Phase(parameters.controller)
     yield FixedRate(
         controller=controller,
@@ -85,7 +99,7 @@ class StepParameters(ProtocolParameters):
     witness: bool = parameter(False, unit="", help="whether the sensor `witness` beside the loop is recorded too")
 
 
-@protocol(needs=FINE, may_use=WITNESS, controls="response")
+@protocol(needs=FINE, may_use=WITNESS, controls="response", views=FINE_OVER_TIME)
 def fine_step(parameters: StepParameters, slots: Slots) -> Messages:
     """Make the piezo part alone follow a step, at a rate that sees its resonance.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -22,11 +22,14 @@ from bench.protocol import (
     ProtocolParameters,
     Slots,
     Step,
+    Views,
     parameter,
     protocol,
 )
 from bench.results.tracking import REACH, READING
+from bench.tuning_file import Tuning
 from protocols.muscles.parts import (
+    LENGTH_LOOPS,
     ON_STAGE,
     ON_WEIGHTS,
     ResetParameters,
@@ -56,10 +59,8 @@ class Controlled(ProtocolParameters):
     )
     count: int = parameter(40, unit="1", low=1, high=10000, help="number of targets, drawn from the model's range")
     sequence_seed: int = parameter(1, unit="1", low=0, help="seed of the targets")
-    tuning: dict[str, dict[str, Any]] = parameter(
-        {},
-        unit="",
-        help="numbers of a controller in place of those from the model, a table for each",
+    tuning: Tuning = parameter(
+        {}, unit="", help="numbers of controllers in place of those from the model: a tuning file, or tables"
     )
     fallback: Fallback = parameter(
         "none", unit="", help="what goes on in place of a controller that does not converge; none ends the run"
@@ -83,7 +84,7 @@ class ForceParameters(Controlled, StageParameters):
     conditioning: int = parameter(2, unit="1", low=0, high=100, help="voltage cycles at constant length before")
 
 
-@protocol(needs=ON_WEIGHTS, controls="response")
+@protocol(needs=ON_WEIGHTS, controls="response", views=LENGTH_LOOPS)
 def length_control(parameters: LengthParameters, slots: Slots) -> Messages:
     """Bring the length of a muscle under a weight to one target after another.
 
@@ -116,7 +117,7 @@ def length_control(parameters: LengthParameters, slots: Slots) -> Messages:
     yield _summary(parameters.controller, np.array(errors) * 1e3, "mm")
 
 
-@protocol(needs=ON_STAGE, controls="force")
+@protocol(needs=ON_STAGE, controls="force", views=Views((("drive", "force"),)))
 def force_control(parameters: ForceParameters, slots: Slots) -> Messages:
     """Bring the force of a muscle between fixed ends to one target after another.
 

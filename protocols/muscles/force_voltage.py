@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bench.identification.two_stage import voltage_steps
-from bench.protocol import Messages, Phase, Slots, parameter, protocol
+from bench.protocol import Messages, Phase, Slots, Views, parameter, protocol
 from protocols.muscles.parts import ON_STAGE, StageParameters, prepare_on_stage, sample_voltages
 
 
@@ -14,7 +14,7 @@ class Parameters(StageParameters):
     conditioning: int = parameter(2, unit="1", low=0, high=100, help="voltage cycles at constant length before")
 
 
-@protocol(needs=ON_STAGE)
+@protocol(needs=ON_STAGE, views=Views((("drive", "force"),)))
 def force_voltage(parameters: Parameters, slots: Slots) -> Messages:
     """Characterize the force of a muscle over the voltage, with its ends held near its resting length.
 

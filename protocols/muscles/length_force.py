@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bench.protocol import Dwell, Messages, Phase, Slots, Step, parameter, protocol
+from bench.protocol import Dwell, Messages, Phase, Slots, Step, Views, parameter, protocol
 from bench.protocol.number_list import NumberList
 from protocols.muscles.parts import (
     ON_STAGE,
@@ -28,7 +28,7 @@ class Parameters(StageParameters):
     points: int = parameter(12, unit="1", low=2, high=1000, help="forces on the way up; one less on the way down")
 
 
-@protocol(needs=ON_STAGE)
+@protocol(needs=ON_STAGE, views=Views((("force", "response"),)))
 def length_force(parameters: Parameters, slots: Slots) -> Messages:
     """Characterize the length of a muscle over the force, at one constant voltage after another.
 

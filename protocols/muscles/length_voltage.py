@@ -10,6 +10,7 @@ from bench.protocol import Messages, Phase, Slots, parameter, protocol
 from bench.protocol.number_list import NumberList
 from protocols.muscles.force_voltage import scaled_steps
 from protocols.muscles.parts import (
+    LENGTH_LOOPS,
     LOADS,
     ON_WEIGHTS,
     ResetParameters,
@@ -40,7 +41,7 @@ class RandomParameters(Loaded):
     sequence_seed: int = parameter(1, unit="1", low=0, help="seed of the voltages")
 
 
-@protocol(needs=ON_WEIGHTS)
+@protocol(needs=ON_WEIGHTS, views=LENGTH_LOOPS)
 def length_voltage(parameters: Parameters, slots: Slots) -> Messages:
     """Characterize the length of a muscle over the voltage, under one dead load after another.
 
@@ -51,7 +52,7 @@ def length_voltage(parameters: Parameters, slots: Slots) -> Messages:
     yield from _under_loads(parameters, slots, scaled_steps(parameters.highest, parameters.points))
 
 
-@protocol(needs=ON_WEIGHTS)
+@protocol(needs=ON_WEIGHTS, views=LENGTH_LOOPS)
 def length_verification(parameters: RandomParameters, slots: Slots) -> Messages:
     """Verify a model of a muscle by random voltages, the same under one dead load after another.
 

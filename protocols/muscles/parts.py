@@ -22,6 +22,7 @@ from bench.protocol import (
     Reading,
     Slots,
     Step,
+    Views,
     from_slot,
     parameter,
     unit_of,
@@ -34,6 +35,9 @@ SAMPLE = "sample"
 ON_WEIGHTS = {**DRIVE_AND_RESPONSE, "force": Signal, "load": Signal, "cooling": Actuator}
 ON_STAGE = {**DRIVE_AND_RESPONSE, "force": Signal, "stage": Actuator}
 """Needs of a protocol where the muscle carries weights, and where the stage holds it."""
+
+LENGTH_LOOPS = Views((("drive", "response"),), over_time=("response", "drive", "force"))
+"""What is worth seeing where the muscle carries weights."""
 
 LOADS = (0.98, 2.94, 4.90, 6.86, 8.82)
 """Dead loads, N (Zhang and Yip 2017, section II-A)."""
@@ -53,7 +57,12 @@ class ResetParameters(ProtocolParameters):
         from_slot("drive", "high"), unit=unit_of("drive"), help="highest set-point, where the memory is reset"
     )
     dwell: float = parameter(
-        from_slot("drive", "dwell"), unit="s", low=0.5, high=3600, help="hold at each set-point before the reading"
+        from_slot("drive", "dwell"),
+        unit="s",
+        low=0.5,
+        high=3600,
+        help="hold at each set-point before the reading",
+        changeable=True,
     )
     pretension: float = parameter(0.3, unit="N", low=0.05, high=10, help="force under which the memory is reset")
 

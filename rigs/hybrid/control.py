@@ -11,19 +11,20 @@ Source: Allison and Isaksson, "Design and performance of mid-ranging controllers
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from typing import Any, Literal, Self
 
 import numpy as np
 
-from bench.control.loops import SampledController
 from bench.control.notch_loop import NotchLoop, NotchLoopParameters
 from bench.control.play_inverse import PlayInverse
 from bench.control.references import ApproachedReference, Reference
 from bench.control.tracking import Trace, check_positive
-from bench.controllers import ControllerSpec
+from bench.controllers import ControllerSetup, ControllerSpec
+from bench.errors import ConvergenceError
 from rigs.hybrid.estimates import (
     Bending,
     LowPass,
@@ -33,6 +34,7 @@ from rigs.hybrid.estimates import (
     Thermistor,
     UnscentedEstimate,
 )
+from rigs.hybrid.lateness import BEGIN, END, LatenessProbe
 from rigs.hybrid.model import HybridModel
 
 STROKE = 9e-6
@@ -41,6 +43,8 @@ _NEAR = 0.5
 """Part of the stroke within which the piezo part takes the tip to the beginning of the reference at once."""
 _AT_REST = 0.2
 """Difference of base and tip below which the rig counts as having rested before the start, K."""
+_TOLERATED = 0.6
+"""Difference of the lateness that is found to the one that is known, in periods, up to which both are the same."""
 _ROOM = 4
 """Room for the reference that comes, in lengths of the known one."""
 _THERMAL_GAIN = 3e4
@@ -114,9 +118,17 @@ class MidRangingParameters:
     """Greatest deflection of either sign that the piezo part is asked for, m."""
     approach: float = 3e-6
     """Top speed of the move to the beginning of the reference, where that is far from the start, m/s."""
+    lateness: float = 0.0
+    """Time by which the deflection is read late, as the calibration of its sensor finds it, s."""
+    probe: float = 0.0
+    """Height of the square wave by which the lateness is checked while the reference rests, m; 0 for no check."""
 
     def __post_init__(self) -> None:
-        check_positive(self)
+        maybe_none = ("lateness", "probe")
+        check_positive(self, *(each.name for each in fields(self) if each.name not in maybe_none))
+        for name in maybe_none:
+            if not 0.0 <= (value := getattr(self, name)) < math.inf:
+                raise ValueError(f"{name}: expected a number >= 0, got {value}")
         if not 2.0 * self.integral * self.period < 1.0:
             raise ValueError(f"integral: expected less than {0.5 / self.period:g} 1/s, got {self.integral}")
 
@@ -124,6 +136,11 @@ class MidRangingParameters:
     def at_rate(cls, rate: float) -> Self:
         """Return the settings for a number of calls per second, with a new current every 20 ms or call."""
         return cls(period=1.0 / rate, every=max(1, round(0.02 * rate)))
+
+    @property
+    def samples_late(self) -> float:
+        """The lateness in samples."""
+        return self.lateness / self.period
 
     def share(self, period: float) -> float:
         """Return the share of a new value that a low-pass of `filter_time` takes in after a period (s)."""
@@ -156,6 +173,9 @@ class _MidRanging:
         self._inverse = inverse = PlayInverse(model.hysteresis, parameters.stroke) if piezo else None
         self._integral_gain = integral * parameters.period
         self._integral = 0.0
+        self._probe: LatenessProbe | None = None
+        # What the piezo part was asked for, as far back as readings are late, the last one first.
+        self._asked = deque([0.0], maxlen=2 + math.floor(parameters.samples_late))
         self._fed_back = 0.0
         self._start = math.nan
         self._samples = 0
@@ -185,18 +205,40 @@ class _MidRanging:
         # A rig that has rested is as warm as the room. Otherwise the room is that of the model.
         self._prepare(0.5 * (base + tip) if abs(base - tip) < _AT_REST else self._model.reference)
         self._estimate.begin(deflection, base - self._celsius, tip - self._celsius)
+        probe = LatenessProbe(self._p.probe, self._p.period)
+        if self._p.probe and self._integral_gain and probe.fits(self._reference):
+            self._probe = probe
+
+    def _seen_piezo(self) -> float:
+        """Return the part of the piezo in the present reading, which is late, m."""
+        asked = self._asked
+        whole, part = divmod(self._p.samples_late, 1.0)
+        newer = asked[min(int(whole), len(asked) - 1)]
+        return newer + part * (asked[min(int(whole) + 1, len(asked) - 1)] - newer) if part else newer
+
+    def _check_lateness(self, probe: LatenessProbe) -> None:
+        """Raise `ConvergenceError` if readings are later than the controller knows."""
+        p = self._p
+        found = probe.lateness()
+        if abs(found - p.lateness) > _TOLERATED * p.period:
+            raise ConvergenceError(
+                f"the deflection answers the piezo part {1e3 * found:.3g} ms late, the controller was given "
+                f"{1e3 * p.lateness:.3g} ms: moves would be off by their speed times the difference; calibrate the "
+                "sensor (calibration-displacement, bench calibrate) and set the parameter lateness"
+            )
 
     def update(self, t: float, measured: tuple[float, ...]) -> tuple[float, float]:
         """Take deflection (m) and temperatures of base and tip (°C) at a time (s); return current and voltage.
 
-        Raises ValueError if there are not three readings.
+        Raises ValueError if there are not three readings, and `ConvergenceError` if the deflection is read later than
+        the controller knows.
         """
         if len(measured) != 3:
             raise ValueError(f"measured: expected deflection and two temperatures, got {len(measured)} readings")
         deflection, base, tip = measured
         complete = math.isfinite(deflection + base + tip)
         if complete:
-            piezo = 0.0 if self._inverse is None else self._inverse.output
+            piezo = self._seen_piezo()
             if math.isnan(self._start):
                 self._begin(t, deflection - piezo, base, tip)
             self._base, self._tip = base - self._celsius, tip - self._celsius
@@ -212,8 +254,20 @@ class _MidRanging:
             # The voltage aims at the reference at the end of the coming period.
             thermal = self._estimate.value + self._p.period * self._estimate.rate
             feedforward = self._reference(now + self._p.period) - thermal
-            total = feedforward + self._integral + self._integral_gain * (wanted - deflection)
-            self._voltage = self._inverse.input(total)
+            late = self._p.lateness
+            error = (self._reference(now - late) if late else wanted) - deflection
+            if self._probe is not None and now >= BEGIN:
+                # The integral waits.
+                added = self._probe.wave(now)
+                self._voltage = self._inverse.input(feedforward + self._integral + added)
+                self._probe.note(added, -error)
+                if now >= END:
+                    self._check_lateness(self._probe)
+                    self._probe = None
+                self._asked.appendleft(self._inverse.output)
+                return self._current, self._voltage
+            self._voltage = self._inverse.input(feedforward + self._integral + self._integral_gain * error)
+            self._asked.appendleft(self._inverse.output)
             if self._integral_gain:
                 # The part clipped by the stroke is taken back: the integral does not wind up.
                 self._integral = self._inverse.output - feedforward
@@ -282,7 +336,7 @@ class HybridController(_MidRanging):
 
         def estimate(bending: Bending, network: ReducedNetwork) -> ThermalEstimate:
             if estimator == "unscented":
-                return UnscentedEstimate(bending, network, noise or ThermalNoise(), p.period, p.every)
+                return UnscentedEstimate(bending, network, noise or ThermalNoise(), p.period, p.every, p.lateness)
             if estimator == "low-pass":
                 return LowPass(bending, p.share(p.period))
             raise ValueError(f"estimator: expected unscented or low-pass, got {estimator!r}")
@@ -324,19 +378,19 @@ def make_fine(model: HybridModel, reference: Reference, rate: float = 20e3, *, i
     return NotchLoop(model.hysteresis, dynamics.frequency, dynamics.damping, reference, parameters)
 
 
-def _spec(summary: str, make: Callable[[HybridModel, Reference, float], SampledController]) -> ControllerSpec:
-    """Return a controller for the registry; options of its setup: `reference` (callable, m) and `rate` (Hz)."""
-    return ControllerSpec(summary, lambda s: make(s.model.model, s.options["reference"], s.options["rate"]))
-
-
 def _mid_ranging(summary: str, controller: Callable[..., _MidRanging], **settings: Any) -> ControllerSpec:  # noqa: ANN401 - as each field
-    """Return a controller of the class for the registry, with the settings that differ from those of the rate."""
-    return _spec(
-        summary,
-        lambda model, reference, rate: controller(
-            model, reference, replace(MidRangingParameters.at_rate(rate), **settings)
-        ),
-    )
+    """Return a controller of the class for the registry, with the settings that differ from those of the rate.
+
+    Options of its setup: `reference` (callable, m), `rate` (Hz), `lateness` (s) and `probe` (m).
+    """
+
+    def make(setup: ControllerSetup) -> _MidRanging:
+        options = setup.options
+        known = {name: options[name] for name in ("lateness", "probe")}
+        parameters = replace(MidRangingParameters.at_rate(options["rate"]), **known, **settings)
+        return controller(setup.model.model, options["reference"], parameters)
+
+    return ControllerSpec(summary, make)
 
 
 HYBRID = _mid_ranging("mid-ranging of thermal and piezo part, with a Kalman filter", HybridController)

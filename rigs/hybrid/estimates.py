@@ -246,7 +246,13 @@ class UnscentedEstimate(ThermalEstimate):
     """
 
     def __init__(
-        self, bending: Bending, network: ReducedNetwork, noise: ThermalNoise, period: float, every: int
+        self,
+        bending: Bending,
+        network: ReducedNetwork,
+        noise: ThermalNoise,
+        period: float,
+        every: int,
+        lateness: float = 0.0,
     ) -> None:
         from rigs.hybrid import _kernels
 
@@ -254,6 +260,7 @@ class UnscentedEstimate(ThermalEstimate):
         self._predict, self._predict_and_correct = _kernels.predict, _kernels.predict_and_correct
         self._network = network
         self._period = period
+        self._lateness = lateness
         self._step = period * every
         self._noise = noise
         self._numbers, self._filter = _kernels.allocate(len(bending.powers))
@@ -286,8 +293,8 @@ class UnscentedEstimate(ThermalEstimate):
         """Predict, and update with the mean of the deflections since the last thermal sample."""
         constant, slope = self._network.heat_flow(current)
         if self._count:
-            # The mean of the readings is that of half a period before their last.
-            age = 0.5 * (self._count - 1) * self._period
+            # The mean of the readings is that of half a period before their last, which may be late itself.
+            age = 0.5 * (self._count - 1) * self._period + self._lateness
             mean = self._sum / self._count + self.rate * age
             self._sum, self._count = 0.0, 0
             self._predict_and_correct(constant, slope, base, tip, mean, self._numbers)

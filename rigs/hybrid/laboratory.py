@@ -27,6 +27,7 @@ from sim_devices.laboratory import EmulatedLaboratory, TrueValue, compile_loops,
 from sim_devices.plants.hybrid import HybridCantilever
 from sim_devices.plants.hybrid_parameters import HybridParameters
 from sim_devices.transducers.displacement import DisplacementSensor
+from sim_devices.transducers.imperfect import SensorErrors, imperfect, shown
 from sim_devices.transducers.piezo_amplifier import PiezoAmplifier
 from sim_devices.transducers.thermistor import Thermistor
 from sim_devices.wire.mecom import MeComServer
@@ -44,6 +45,8 @@ GAIN = 4.0
 """Of the amplifier, V/V: the LJTick-DAC's 14 bits over ±10 V then make steps of 4.9 mV, 1.4 nm of deflection."""
 SETTLING_TIME = 20e-6
 """Time constant of the amplifier with this piezo, s: short beside the 1.4 ms of a period of the resonance."""
+DISPLACEMENT_RANGE, THERMISTOR_RANGE = (-200e-6, 200e-6), (-40.0, 80.0)
+"""Ranges of the sensors, m and °C: their nonlinearity is a share of them."""
 REACH = 199e-6
 """Displacement of either sign that counts as within range, m; the sensor itself stops at 200 µm."""
 
@@ -82,6 +85,18 @@ class HybridLaboratorySettings(LaboratorySettings):
     )
     current_limit: float = Field(
         default=0.15, gt=0, le=0.4, description="as set in the TEC controller, A; a driver sets its own"
+    )
+    displacement_sensor: SensorErrors = Field(
+        default=SensorErrors(), description="systematic errors of the displacement sensor (m), range ±200 µm"
+    )
+    base_thermistor: SensorErrors = Field(
+        default=SensorErrors(), description="systematic errors of the thermistor at the base (K), range -40 to 80 °C"
+    )
+    tip_thermistor: SensorErrors = Field(
+        default=SensorErrors(), description="systematic errors of the thermistor at the tip (K), range -40 to 80 °C"
+    )
+    reference_sensor: SensorErrors = Field(
+        default=SensorErrors(), description="systematic errors of the interferometer, the witness (m), range ±200 µm"
     )
     fault: FaultName = Field(
         default="none",
@@ -132,13 +147,22 @@ class HybridLaboratory(EmulatedLaboratory):
         self.tec.write_parameter(_COLDEST_PARAMETER, _COLDEST)
         self._beyond = 0.0
         self._stuck: float | None = None
+        self._shown = {
+            name: imperfect(quantity, errors, low, high, self.world)
+            for name, quantity, errors, low, high in (
+                ("displacement", self._seen_deflection, settings.displacement_sensor, *DISPLACEMENT_RANGE),
+                ("base", lambda: self.plant.base_temperature, settings.base_thermistor, *THERMISTOR_RANGE),
+                ("tip", lambda: self.plant.tip_temperature, settings.tip_thermistor, *THERMISTOR_RANGE),
+            )
+        }
+        witness = imperfect(self._deflection, settings.reference_sensor, *DISPLACEMENT_RANGE, self.world)
         sensors = [
             FaultySensor(name, self.world, seen, unit, scale=scale, beyond=beyond, seed=(seed, i))
             for i, (name, seen, unit, scale, beyond) in enumerate(
                 (
-                    ("displacement", lambda: self._deflection() + self._beyond, "m", 5e-6, 1e-3),
-                    ("base", lambda: self.plant.base_temperature, "K", 5.0, 140.0),
-                    ("tip", lambda: self.plant.tip_temperature, "K", 5.0, 140.0),
+                    ("displacement", self._shown["displacement"], "m", 5e-6, 1e-3),
+                    ("base", self._shown["base"], "K", 5.0, 140.0),
+                    ("tip", self._shown["tip"], "K", 5.0, 140.0),
                 ),
                 1,
             )
@@ -166,7 +190,7 @@ class HybridLaboratory(EmulatedLaboratory):
             {
                 "t7": ModbusTcpInstrument(self.t7),
                 "tec": MeComServer(self.tec),
-                "witness": ModbusTcpInstrument(WitnessRegisters(self.world, self._deflection)),
+                "witness": ModbusTcpInstrument(WitnessRegisters(self.world, witness)),
             },
             clock,
             world=self.world,
@@ -218,6 +242,10 @@ class HybridLaboratory(EmulatedLaboratory):
             "sink_temperature": TrueValue(plant.sink_temperature, "°C"),
             "ambient_temperature": TrueValue(plant.ambient_temperature, "°C"),
             "deflection": TrueValue(self._deflection(), "m"),
+            # Beside the true ones what the sensors make of them, without their noise.
+            "displacement_shown": TrueValue(shown(self._shown["displacement"]), "m"),
+            "base_shown": TrueValue(shown(self._shown["base"]), "°C"),
+            "tip_shown": TrueValue(shown(self._shown["tip"]), "°C"),
             "tec_current": TrueValue(plant.current, "A"),
             "tec_voltage": TrueValue(plant.tec_voltage, "V"),
             "tec_output": TrueValue(self.tec.status is DeviceStatus.RUN, is_output=True),
@@ -228,6 +256,9 @@ class HybridLaboratory(EmulatedLaboratory):
 
     def _deflection(self) -> float:
         return self.plant.deflection if self._stuck is None else self._stuck
+
+    def _seen_deflection(self) -> float:
+        return self._deflection() + self._beyond
 
     def _stick(self) -> None:
         self._stuck = self._deflection()

@@ -17,7 +17,8 @@ import numpy.typing as npt
 from bench.identification import measure_errors
 from bench.journal import Record
 from bench.model_file import ModelFile
-from bench.results.figures import Curve, plot_panels, plot_tracking
+from bench.results.figures import plot_fit, plot_tracking
+from bench.results.prediction_figures import errors_text
 from bench.results.published import Published
 from bench.studies import Campaign, ResultTable, Study, StudyResult
 from rigs.hybrid.design import Design
@@ -87,6 +88,11 @@ def _actuator(name: str, bandwidth: str, *papers: str) -> tuple[str, ...]:
     return (name, *(cell for pair in zip(papers, values, strict=True) for cell in pair))
 
 
+_ASSUMED = (
+    "True errors are those of the emulated tip. They assume a displacement sensor with noise and steps of 10 nm each "
+    "and no systematic error: what is shown is repeatability, and accuracy only with a calibrated sensor."
+)
+
 TABLES = (
     ResultTable(
         "the parts",
@@ -136,6 +142,8 @@ TABLES = (
                 "> 110 µm",
             ),
         ),
+        f"The resolution of the thermal part is that of the last {RESOLUTION_TIME:g} s of a hold of "
+        f"{RESOLUTION_HOLD:g} s, without the transient of a move.",
     ),
     ResultTable(
         f"six moves at 3 µm/s over {{control[range_um]:.0f}} µm, true errors in nm; of each hold of {HOLD:g} s the "
@@ -152,6 +160,7 @@ TABLES = (
             )
             for name in CONTROLLERS
         ],
+        _ASSUMED,
     ),
     ResultTable(
         "hybrid controller, true errors in nm",
@@ -405,80 +414,101 @@ def _table_3(
     return {name: dict(zip(keys, row, strict=True)) for name, row in rows.items()}
 
 
-class _Panel(NamedTuple):
-    """One figure of curves: its name, the axis labels, and the curves."""
+class _Fit(NamedTuple):
+    """One figure: its name, what is drawn over what, in which units, and the outputs of models by their titles."""
 
     name: str
-    horizontal: str
-    vertical: str
-    curves: list[Curve]
+    horizontal_label: str
+    quantity: str
+    unit: str
+    horizontal: Floats
+    measured: Floats
+    modelled: Mapping[str, Floats]
 
 
-def _panels(found: HybridIdentification, runs: _Runs) -> Iterator[_Panel]:
+_NAMES = {"linear, from geometry": "linear", "Prandtl-Ishlinskii": "prandtl-ishlinskii", "polynomial": "polynomial"}
+"""Names of models by their titles, which decide the colours."""
+_PERIODS = 12
+"""Periods of the resonance that the figure of the step shows."""
+
+
+def _fits(found: HybridIdentification, runs: _Runs) -> Iterator[_Fit]:
     """Yield the paper's figures."""
-    warmth, bending = "temperature of the base / °C", "deflection / µm"
 
-    def compared(samples: Samples, horizontal: Floats, shown: slice = slice(None)) -> list[Curve]:
+    def compared(name: str, samples: Samples, label: str, horizontal: Floats, shown: slice = slice(None)) -> _Fit:
         """Return measured and simulated temperature of the base, with the air as identified."""
         network = found.network.network
         base = network.simulate(samples[CURRENT], samples.period, found.network.ambient)[:, 2]
-        return [
-            Curve("measured", horizontal[shown], samples[BASE][shown]),
-            Curve("model", horizontal[shown], base[shown]),
-        ]
+        modelled = {"thermal network": base[shown]}
+        return _Fit(name, label, "temperature of the base", "°C", horizontal[shown], samples[BASE][shown], modelled)
 
     around, stepped = read_loop(runs.sine.folder), read_loop(runs.steps.folder)
     second = slice(len(around.table) // 2, None)
-    yield _Panel("figure-12-static-temperature", "current / A", warmth, compared(around, around[CURRENT], second))
-    yield _Panel("figure-13-temperature-steps", "time / s", warmth, compared(stepped, stepped.times))
+    yield compared("figure-12-static-temperature", around, "current / A", around[CURRENT], second)
+    yield compared("figure-13-temperature-steps", stepped, "time / s", stepped.times)
     with Record(runs.static.folder) as record:
         curve, names = record.steps(), signal_names(record)
-    rises, deflections = curve[names[TIP]] - REFERENCE, curve[names[DEFLECTION]] * 1e6
-    ordered = np.sort(rises)
+    rises, deflections = curve[names[TIP]] - REFERENCE, curve[names[DEFLECTION]]
     by_heat, by_voltage = SENSITIVITIES
-    yield _Panel(
+    yield _Fit(
         "figure-14-thermomechanical",
         "temperature of the tip less 22 °C / K",
-        bending,
-        [
-            Curve("measured", rises, deflections),
-            Curve("linear, from geometry", ordered, by_heat * ordered * 1e6),
-            Curve(f"polynomial, order {found.order.order}", ordered, found.model.polynomial.evaluate(ordered) * 1e6),
-        ],
+        "deflection",
+        "µm",
+        rises,
+        deflections * 1e6,
+        {
+            "linear, from geometry": by_heat * rises * 1e6,
+            "polynomial": found.model.polynomial.evaluate(rises) * 1e6,
+        },
     )
     piezo = found.piezo
-    yield _Panel(
+    yield _Fit(
         "figure-15-hysteresis",
         "voltage / V",
-        bending,
-        [
-            Curve("measured", piezo.voltages, piezo.deflections * 1e6),
-            Curve("Prandtl-Ishlinskii", piezo.voltages, piezo.operator.evaluate(piezo.voltages) * 1e6),
-            Curve("linear, from geometry", piezo.voltages, by_voltage * piezo.voltages * 1e6),
-        ],
+        "deflection",
+        "µm",
+        piezo.voltages,
+        piezo.deflections * 1e6,
+        {
+            "Prandtl-Ishlinskii": piezo.operator.evaluate(piezo.voltages) * 1e6,
+            "linear, from geometry": by_voltage * piezo.voltages * 1e6,
+        },
     )
     fast = read_loop(runs.step.folder)
-    yield _Panel(
+    # The ringing of a third of a second would be a solid block.
+    begun = fast.times[int(np.argmax(np.abs(np.diff(fast[VOLTAGE])) > 0.0))]
+    end = begun + _PERIODS * 2.0 * np.pi / found.dynamics.model.frequency
+    shown = (fast.times >= begun - 1e-3) & (fast.times <= end)
+    deflection = fast[DEFLECTION] * 1e6
+    yield _Fit(
         "figure-16-step",
-        "time / ms",
-        bending,
-        [
-            Curve("measured", fast.times * 1e3, fast[DEFLECTION] * 1e6),
-            Curve("D(s)", fast.times * 1e3, (fast[DEFLECTION] - found.dynamics.residuals) * 1e6),
-        ],
+        "time after the step / ms",
+        "deflection",
+        "µm",
+        (fast.times[shown] - begun) * 1e3,
+        deflection[shown],
+        {"D(s)": (deflection - found.dynamics.residuals * 1e6)[shown]},
     )
 
 
 def _draw_models(campaign: Campaign, found: HybridIdentification, runs: _Runs) -> Iterator[Path]:
     """Have the paper's figures drawn; yield their files."""
-    for panel in _panels(found, runs):
+    for fit in _fits(found, runs):
         yield campaign.draw(
-            panel.name,
-            plot_panels,
-            {"": panel.curves},
-            horizontal_label=panel.horizontal,
-            vertical_label=panel.vertical,
-            columns=1,
+            fit.name,
+            plot_fit,
+            fit.horizontal,
+            fit.measured,
+            fit.modelled,
+            horizontal_label=fit.horizontal_label,
+            output_label=f"{fit.quantity} / {fit.unit}",
+            error_label=f"residual / {fit.unit}",
+            titles={
+                title: errors_text(measure_errors(fit.measured, values), fit.unit)
+                for title, values in fit.modelled.items()
+            },
+            names=_NAMES,
         )
 
 

@@ -184,4 +184,5 @@ def plot_lengths(
         horizontal_label="voltage / V" if over_voltage else "force / N",
         vertical_label="length / mm",
         columns=columns,
+        measured=("measured",),
     )

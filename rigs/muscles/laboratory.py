@@ -8,6 +8,7 @@ muscle, a fan blows at it.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from functools import partial
 from typing import ClassVar, Literal, Protocol
 
@@ -28,10 +29,11 @@ from sim_devices.instruments.roboteq import EmulatedRoboteq
 from sim_devices.instruments.roboteq_objects import Fault as SupplyFault
 from sim_devices.laboratory import EmulatedLaboratory, TrueValue, compile_loops
 from sim_devices.plants.coiled_polymer import CoiledPolymerMuscle, CoiledPolymerParameters
-from sim_devices.plants.grid import GRID_TOLERANCE, changed
+from sim_devices.plants.grid import GRID_TOLERANCE, Floats, changed
 from sim_devices.plants.mckibben import McKibbenMuscle, McKibbenParameters
 from sim_devices.plants.muscle import MuscleParameters
 from sim_devices.plants.sma import SMAParameters, SMAWire
+from sim_devices.transducers.imperfect import ImperfectSensor, SensorErrors, imperfect, shown
 from sim_devices.transducers.magnet import RatiometricSensor
 from sim_devices.wire.canopen_slcan import CanopenSlcanServer
 from sim_devices.wire.dynamixel2 import Dynamixel2Server
@@ -39,11 +41,15 @@ from sim_devices.wire.modbus_rtu import ModbusRtuServer
 from sim_devices.wire.modbus_tcp import ModbusTcpInstrument
 from sim_devices.world import World
 
-LOAD, STAGE = "load", "stage"
-"""Tasks of an operator in these laboratories: hang a load (N) on the muscle, or fasten it to the stage."""
+LOAD, STAGE, GAUGE = "load", "stage", "gauge"
+"""Tasks of an operator in these laboratories: hang a load (N) on the muscle, fasten it to the stage, or hold the
+magnet by gauge blocks (m from rest)."""
 
 FAN_LINE = 0
 """Digital line of the T7 that switches the fan: FIO0, on when high."""
+
+FORCE_RANGE, POSITION_RANGE = (0.0, 20.0), 0.035
+"""Range of the load cell, N, and stroke of the position sensor, m: their nonlinearity is a share of them."""
 
 _HEARTBEAT_TIME = 0x1017
 """Object of the supply with the period of its heartbeat, ms; 0 for none."""
@@ -82,9 +88,16 @@ class MusclePlant(Protocol):
     def clamp(self, length_metre: float) -> None:
         """Hold the end at a position, m from rest."""
 
+    def since_point(self) -> float:
+        """Return the time for which it has stood at the last point of its time grid, s."""
+
     @property
     def parameters(self) -> MuscleParameters:
         """Its numbers."""
+
+    @property
+    def forces(self) -> Floats:
+        """The force (N) at the last points of its time grid, in a ring; see `Muscle`."""
 
     @property
     def current(self) -> float:
@@ -110,6 +123,12 @@ class MuscleLaboratorySettings(LaboratorySettings, ABC):
     )
     rest_position: float = Field(
         default=17.5e-3, gt=0, le=35e-3, description="where along its stroke the sensor sees the muscle at rest, m"
+    )
+    force_sensor: SensorErrors = Field(
+        default=SensorErrors(), description="systematic errors of the load cell (N), range 0 to 20 N"
+    )
+    position_sensor: SensorErrors = Field(
+        default=SensorErrors(), description="systematic errors of the position sensor (m), range 0 to 35 mm"
     )
     force_noise: float = Field(default=0.04, ge=0, le=1, description="noise of the load cell, unfiltered, N rms")
     plant: dict[str, float] = Field(
@@ -142,6 +161,8 @@ class Frame:
     ----------
     drum : EmulatedDrum or None
         The stage's drum, once it is there.
+    gauge : float or None
+        Where gauge blocks hold the magnet of the position sensor, m from rest; None if they do not.
     is_broken : bool
         A fault: the muscle is torn, so that no current flows, nothing pulls, and its end lies at the bottom.
     """
@@ -149,6 +170,7 @@ class Frame:
     def __init__(self, muscle: MusclePlant) -> None:
         self.muscle = muscle
         self.drum: EmulatedDrum | None = None
+        self.gauge: float | None = None
         self.is_broken = False
         self._fastened = False
         self._voltage = 0.0
@@ -172,7 +194,9 @@ class Frame:
 
     @property
     def position(self) -> float:
-        """Position of the end, m from rest; of a broken muscle at the bottom."""
+        """Position of the magnet, m from rest: at the end of the muscle, of a broken one at the bottom."""
+        if self.gauge is not None:
+            return self.gauge
         return _BOTTOM if self.is_broken else self.muscle.position
 
     def tear(self, broken: bool = True) -> None:
@@ -210,26 +234,38 @@ class ForceCourse:
     ----------
     frame : Frame
         The muscle's frame.
-    muscle : SMAWire
+    muscle : MusclePlant
         The muscle, which keeps its force.
     sensor : FaultySensor
         What the load cell sees of the force.
+    cell : callable
+        What the load cell makes of the force, without a fault.
     """
 
     tolerance = GRID_TOLERANCE
 
-    def __init__(self, frame: Frame, muscle: SMAWire, sensor: FaultySensor) -> None:
+    def __init__(self, frame: Frame, muscle: MusclePlant, sensor: FaultySensor, cell: Callable[[], float]) -> None:
         self._frame = frame
         self._muscle = muscle
         self._sensor = sensor
-        self.forces = muscle.forces
+        self._imperfect = cell if isinstance(cell, ImperfectSensor) else None
         self.step = muscle.parameters.step
 
     @property
     def is_known(self) -> bool:
         """Whether it goes by what the muscle keeps: a stage on its way moves in pieces, from look to look."""
         frame = self._frame
-        return not frame.is_broken and not frame.is_moving and self._sensor.is_whole
+        is_static = self._imperfect is None or self._imperfect.is_static
+        return is_static and not frame.is_broken and not frame.is_moving and self._sensor.is_whole
+
+    @property
+    def forces(self) -> Floats:
+        """What the load cell makes of the forces that the muscle keeps, N; see `Course.forces`."""
+        kept: Floats = self._muscle.forces
+        if self._imperfect is None:
+            return kept
+        # Behind the ring stands the number of the last one.
+        return np.append(self._imperfect.static_course(kept[:-1]), kept[-1])
 
     def since_point(self) -> float:
         """Return the time for which the muscle has stood at the last grid point, s."""
@@ -269,12 +305,20 @@ class MuscleLaboratory(EmulatedLaboratory):
         self.world = World(self.frame, clock)
         self._load_is_forgotten = False
         self._load_factor = 1.0
+        self._force_shown = imperfect(lambda: self.frame.force, settings.force_sensor, *FORCE_RANGE, self.world)
+        self._position_shown = imperfect(
+            lambda: self.frame.position,
+            settings.position_sensor,
+            -settings.rest_position,
+            POSITION_RANGE - settings.rest_position,
+            self.world,
+        )
         self._force_sensor, self._position_sensor = (
             FaultySensor(name, self.world, seen, unit, scale=scale, beyond=beyond, seed=(seed, i))
             for i, (name, seen, unit, scale, beyond) in enumerate(
                 (
-                    ("force", lambda: self.frame.force, "N", 2.0, _BROKEN_CELL),
-                    ("position", lambda: self.frame.position, "m", 1e-3, _BOTTOM),
+                    ("force", self._force_shown, "N", 2.0, _BROKEN_CELL),
+                    ("position", self._position_shown, "m", 1e-3, _BOTTOM),
                 ),
                 1,
             )
@@ -295,10 +339,7 @@ class MuscleLaboratory(EmulatedLaboratory):
             weight_limits=(-5.0, 50.0),
             zero_tracking=0,
             noise=settings.force_noise,
-            # Of the other muscles it sees the force at each of its own instants.
-            course=ForceCourse(self.frame, self.muscle, self._force_sensor)
-            if isinstance(self.muscle, SMAWire)
-            else None,
+            course=ForceCourse(self.frame, self.muscle, self._force_sensor, self._force_shown),
         )
         self.servo = EmulatedMX28("stage", self.world, position=settings.drum_zero_counts * COUNT)
         self.frame.drum = EmulatedDrum(self.servo, settings.drum_radius, zero_counts=settings.drum_zero_counts)
@@ -324,13 +365,16 @@ class MuscleLaboratory(EmulatedLaboratory):
             self.at(settings.fault_time, partial(self.inject, settings.fault))
 
     def operate(self, task: str, value: float) -> None:
-        """Hang a load of `value` N on the muscle, or fasten its end to the stage.
+        """Hang a load of `value` N on the muscle, fasten its end to the stage, or hold the magnet at `value` m.
 
         Raises ConfigurationError if it is another task, or the muscle does not bear the load.
         """
-        if task not in (LOAD, STAGE):
-            raise ConfigurationError(f"this laboratory cannot carry out {task!r}; it can: {LOAD}, {STAGE}")
+        if task not in (LOAD, STAGE, GAUGE):
+            raise ConfigurationError(f"this laboratory cannot carry out {task!r}; it can: {LOAD}, {STAGE}, {GAUGE}")
         with self.world.at_present():
+            self.frame.gauge = value if task == GAUGE else None
+            if task == GAUGE:
+                return
             if task == STAGE:
                 self.frame.fasten()
             elif not self._load_is_forgotten:
@@ -346,6 +390,9 @@ class MuscleLaboratory(EmulatedLaboratory):
             **self.muscle_truth(),
             "force": TrueValue(self.frame.force, "N"),
             "position": TrueValue(self.frame.position, "m"),
+            # Beside the true ones what the sensors make of them, without their noise.
+            "force_shown": TrueValue(shown(self._force_shown), "N"),
+            "position_shown": TrueValue(shown(self._position_shown), "m"),
             "supply_voltage": TrueValue(self.supply.voltage, "V", is_output=True),
             "supply_current": TrueValue(self.frame.current, "A"),
             "stage_angle": TrueValue(self.servo.position, "rad"),

@@ -60,6 +60,7 @@ def _draw(campaign: Campaign, measured: Characterization) -> list[Path]:
             horizontal_label="voltage / V",
             vertical_label="force / N",
             columns=1,
+            measured=("ends held",),
         )
     ]
     for kind in ("length-voltage", "length-force"):

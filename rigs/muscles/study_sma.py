@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from bench.hysteresis import Density
 from bench.identification.two_stage import predict_series
 from bench.results.figures import (
     Curve,
@@ -178,6 +179,7 @@ def _errors(results: TargetResults, scale: float) -> dict[str, float]:
 def _draw(campaign: Campaign, measured: Characterization) -> list[Path]:
     voltages, forces, _ = measured.resting
     models = {name: found for name, found in measured.models.items() if name in _SHOWN}
+    names = {title: name for name, title in TITLES.items()}
     fitted = {TITLES[name]: forces - models[name].residuals["force-voltage"] for name in ("two-stage", "linear")}
     paths = [
         campaign.draw(
@@ -187,6 +189,8 @@ def _draw(campaign: Campaign, measured: Characterization) -> list[Path]:
             horizontal_label="voltage / V",
             vertical_label="force / N",
             columns=3,
+            measured=("measured",),
+            names=names,
         )
     ]
     for name, kind in (("figure-07-length-voltage", "length-voltage"), ("figure-08-length-force", "length-force")):
@@ -196,11 +200,20 @@ def _draw(campaign: Campaign, measured: Characterization) -> list[Path]:
         }
         lengths = {"measured": [s.lengths for s in chosen], **modelled}
         paths.append(campaign.draw(name, plot_lengths, kind, chosen, lengths))
-    paths.append(campaign.draw("figure-09-densities", plot_densities, models["two-stage"].model.densities()))
+    two_stage = models["two-stage"]
+    densities = two_stage.model.densities()
+    # The columns of each fit begin with the cells of its density.
+    swept = [
+        two_stage.certificates[stage].swept[: _cells(density)]
+        for stage, density in zip(("first", "second"), densities, strict=True)
+    ]
+    paths.append(campaign.draw("figure-09-densities", plot_densities, densities, swept))
     for panel, kind in (("a", "length-voltage"), ("b", "length-force")):
         residuals = {TITLES[which]: found.residuals[kind] * 1e3 for which, found in models.items()}
         paths.append(
-            campaign.draw(f"figure-10{panel}-errors-{kind}", plot_errors, residuals, error_label="error / mm")
+            campaign.draw(
+                f"figure-10{panel}-errors-{kind}", plot_errors, residuals, error_label="error / mm", names=names
+            )
         )
     paths.append(
         campaign.draw(
@@ -216,9 +229,14 @@ def _draw(campaign: Campaign, measured: Characterization) -> list[Path]:
             },
             input_label="voltage / V",
             error_label="error / mm",
+            names=names,
         )
     )
     return paths
+
+
+def _cells(density: Density) -> int:
+    return int(np.count_nonzero(np.isfinite(density.values)))
 
 
 def _draw_control(campaign: Campaign, reached: Mapping[str, Mapping[str, TargetResults]]) -> list[Path]:

@@ -19,10 +19,14 @@ from sim_devices.instruments.meerstetter_tec import EmulatedTEC
 from sim_devices.laboratory import EmulatedLaboratory, TrueValue, compile_loops, tec_faults
 from sim_devices.plants.grid import changed
 from sim_devices.plants.vo2 import VO2Cantilever, VO2Parameters
+from sim_devices.transducers.imperfect import SensorErrors, imperfect, shown
 from sim_devices.transducers.photodetector import NormalisedPSD
 from sim_devices.wire.mecom import MeComServer
 from sim_devices.wire.modbus_tcp import ModbusTcpInstrument
 from sim_devices.world import World
+
+PSD_RANGE = (-100e-6, 100e-6)
+"""Deflections of the tip that the PSD sees, m: its nonlinearity is a share of them."""
 
 _SPOT = 1
 """Beside the seed, for the noise of a faulty sensor; the streams of the laboratory stay as they are."""
@@ -37,6 +41,10 @@ class VO2LaboratorySettings(LaboratorySettings):
     )
     disturbances: bool = Field(default=True, description="whether the film's temperature wanders and drifts")
     ambient_temperature: float = Field(default=22.0, ge=0, le=40, description="temperature of the room, °C")
+    psd: SensorErrors = Field(
+        default=SensorErrors(),
+        description="systematic errors of the PSD with its laser, in deflection of the tip (m), range ±100 µm",
+    )
     psd_noise: float = Field(default=5e-3, ge=0, le=1, description="noise of the PSD in one conversion, V rms")
     plant: dict[str, float] = Field(
         default={},
@@ -80,10 +88,11 @@ class VO2Laboratory(EmulatedLaboratory):
         self.tec = EmulatedTEC("tec", self.world, peltier, rng=tec_stream)
         self._misalignment = 0.0
         self._stuck: tuple[float, float] | None = None
+        self._shown = imperfect(self._spot, settings.psd, *PSD_RANGE, self.world)
         spot = FaultySensor(
             "spot",
             self.world,
-            self._spot,
+            self._shown,
             "m",
             scale=10e-6,
             beyond=1e-3,
@@ -129,6 +138,8 @@ class VO2Laboratory(EmulatedLaboratory):
             "sink_temperature": TrueValue(plant.sink_temperature, "°C"),
             "curvature": TrueValue(curvature, "1/m"),
             "tip_deflection": TrueValue(deflection, "m"),
+            # Beside the true one what the PSD makes of it, without its noise.
+            "deflection_shown": TrueValue(shown(self._shown), "m"),
             "tec_current": TrueValue(plant.current, "A"),
             "tec_voltage": TrueValue(plant.voltage, "V"),
             "tec_output": TrueValue(self.tec.status is DeviceStatus.RUN, is_output=True),

@@ -6,7 +6,7 @@ VO2-Coated Microactuators*, IEEE/ASME Transactions on Mechatronics, 2013; here "
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -17,8 +17,9 @@ from bench.errors import DataError
 from bench.hysteresis import MemoryCurve
 from bench.identification import measure_errors
 from bench.journal import Record, add_model
-from bench.results.figures import plot_densities, plot_errors, plot_loops, plot_sequence_and_errors, plot_tracking
+from bench.results.figures import plot_densities, plot_errors, plot_fit, plot_sequence_and_errors, plot_tracking
 from bench.results.models import IdentifiedFile, errors_json, identify_file, predict
+from bench.results.prediction_figures import errors_text
 from bench.results.published import Published
 from bench.results.tracking import FollowingResult, TargetResults, following_result
 from bench.studies import Campaign, ResultTable, Study, StudyResult, reached_targets
@@ -44,16 +45,16 @@ PERIODS = (60, 200)
 
 
 class PaperModel(NamedTuple):
-    """One of the paper's three models: its title, its name and options here, and the paper's largest errors, 1/m.
+    """One of the models: its title, its name and options here, and the paper's largest errors, 1/m.
 
-    The errors are those of sections IV-B, Figs. 5, 7, 9 and 10.
+    The errors are those of section IV-B, Figs. 5, 7, 9 and 10; None for a model that the paper does not have.
     """
 
     title: str
     model: str
     options: Mapping[str, Any]
-    identification: float
-    validation: float
+    identification: float | None = None
+    validation: float | None = None
 
 
 MODELS = {
@@ -67,6 +68,12 @@ MODELS = {
         {"levels": 20, "plane": (21.0, 84.0), "smoothing": 0.0, "ridge": 0.0},
         80.3,
         108.8,
+    ),
+    # The paper compares cells of 2.0 K with cells of 3.15 K; these are of 2.0 K.
+    "signed_same_cells": PaperModel(
+        "signed Preisach, cells as the proposed model's",
+        "preisach-signed",
+        {"levels": 32, "plane": (20.0, 84.0), "smoothing": 0.0, "ridge": 0.0},
     ),
     "polynomial": PaperModel("polynomial, degree 12", "polynomial", {"degree": 12}, 483.0, 478.1),
 }
@@ -101,7 +108,7 @@ TABLES = (
             [
                 (
                     model.title,
-                    f"{getattr(model, kind):g}",
+                    "–" if (paper := getattr(model, kind)) is None else f"{paper:g}",
                     f"{{{kind}[{key}][max]:.1f}}",
                     f"{{{kind}[{key}][rms]:.1f}}",
                 )
@@ -172,11 +179,12 @@ def carry_out(campaign: Campaign) -> StudyResult:
         session("random-validation", {}, SESSION_OFFSET),
     )
     models: dict[str, IdentifiedFile] = {}
-    for key, (_, name, options, *_) in MODELS.items():
+    for key, model in MODELS.items():
+        name, options = model.model, model.options
         models[key] = identify_file(
             characterization.result().folder, input_column=INPUT, output_column=OUTPUT, model=name, **options
         )
-        models[key].file.save(Path(model_path(name)))
+        models[key].file.save(Path(model_path(key if model.validation is None else name)))
     tracking_runs = {
         key: session(
             "tracking",
@@ -211,8 +219,9 @@ def carry_out(campaign: Campaign) -> StudyResult:
         with Record(run.folder) as record:
             finished = float(record.meta["finished"])
         # The proposed model last: the recording shows the density of the newest.
-        for model in reversed(models.values()):
-            add_model(run.folder, model.file.name, finished, model.file.to_json())
+        for key, found in reversed(models.items()):
+            if MODELS[key].validation is not None:
+                add_model(run.folder, found.file.name, finished, found.file.to_json())
     for controlled in (*tracking_runs.values(), *following_runs.values()):
         add_model(controlled.result().folder, PROPOSED, 0.0, models["nonmonotonic"].file.to_json())
     return StudyResult(
@@ -250,6 +259,7 @@ PUBLISHED = (
             ("damped-oscillation", model.identification, "section IV-B, Figs. 5, 7 and 9"),
             ("random-validation", model.validation, "section IV-B, Fig. 10"),
         )
+        if largest is not None
     ),
     *(
         Published("damped-oscillation", f"proposed model, {name}", value, unit, "section IV-B")
@@ -275,7 +285,8 @@ PUBLISHED = (
 STUDY = Study(
     "vo2",
     "VO2 microactuator: characterization, identification, validation and tracking, beside the paper's tables.",
-    "Runs damped-oscillation, identifies the paper's three models, validates them in a session with an offset, and "
+    "Runs damped-oscillation, identifies the paper's three models and a signed one of equal cells, validates them in "
+    "a session with an offset, and "
     "tracks 60 targets and a modulated sine with each controller. Zhang et al., Modeling and inverse compensation of "
     "nonmonotonic hysteresis in VO2-coated microactuators, 2013.",
     carry_out,
@@ -313,15 +324,20 @@ def _draw_models(
     temperature, curvature, error = "temperature / °C", "curvature / (1/m)", "error / (1/m)"
     proposed = models["nonmonotonic"]
     residuals = {key: model.identification.residuals for key, model in models.items()}
+    names = {model.title: model.model for model in MODELS.values()}
+    title = MODELS["nonmonotonic"].title
     paths = [
         campaign.draw(
             "figure-05a-loops",
-            plot_loops,
+            plot_fit,
             proposed.inputs,
             proposed.outputs,
-            proposed.outputs - residuals["nonmonotonic"],
-            input_label=temperature,
+            {title: proposed.outputs - residuals["nonmonotonic"]},
+            horizontal_label=temperature,
             output_label=curvature,
+            error_label=error,
+            titles={title: errors_text(proposed.identification.errors, "1/m")},
+            names=names,
         )
     ]
     for errors_figure, density_figure, key in (
@@ -330,27 +346,56 @@ def _draw_models(
         ("figure-09-error-polynomial", None, "polynomial"),
     ):
         paths.append(
-            campaign.draw(errors_figure, plot_errors, {MODELS[key].title: residuals[key]}, error_label=error)
+            campaign.draw(
+                errors_figure,
+                plot_errors,
+                {MODELS[key].title: residuals[key]},
+                error_label=error,
+                names=names,
+                published=_published([key], "identification"),
+            )
         )
         if density_figure is not None:
-            paths.append(campaign.draw(density_figure, plot_densities, models[key].file.operator.densities()))
+            swept = models[key].coverage
+            paths.append(
+                campaign.draw(
+                    density_figure,
+                    plot_densities,
+                    models[key].file.operator.densities(),
+                    None if swept is None else swept.swept,
+                )
+            )
     paths.append(
         campaign.draw(
             "figure-10-validation",
             plot_sequence_and_errors,
             inputs,
-            {MODELS[key].title: outputs - predicted for key, predicted in predictions.items()},
+            {
+                MODELS[key].title: outputs - predicted
+                for key, predicted in predictions.items()
+                if MODELS[key].validation is not None
+            },
             input_label=temperature,
             error_label=error,
+            names=names,
+            published=_published(MODELS, "validation"),
         )
     )
     return paths
+
+
+def _published(keys: Iterable[str], kind: str) -> dict[str, float]:
+    """Return the paper's largest errors of its models by their titles, 1/m."""
+    found = {MODELS[key].title: getattr(MODELS[key], kind) for key in keys}
+    return {title: value for title, value in found.items() if value is not None}
 
 
 def _draw_control(
     campaign: Campaign, reached: Mapping[str, TargetResults], followed: Mapping[tuple[int, str], FollowingResult]
 ) -> list[Path]:
     output, error = "curvature / (1/m)", "error / (1/m)"
+    names = {title: key.replace("_", "-") for key, (title, *_) in CONTROLLERS.items()}
+    largest = {title: float(value) for title, value, _ in CONTROLLERS.values() if value != "–"}
     paths = []
     for name, keys in (
         ("figure-12-open-loop", ("open_loop_inverse", "polynomial")),
@@ -358,7 +403,18 @@ def _draw_control(
     ):
         outputs = {CONTROLLERS[key][0]: reached[key].outputs for key in keys}
         targets = reached[keys[0]].targets
-        paths.append(campaign.draw(name, plot_tracking, targets, outputs, output_label=output, error_label=error))
+        paths.append(
+            campaign.draw(
+                name,
+                plot_tracking,
+                targets,
+                outputs,
+                output_label=output,
+                error_label=error,
+                names=names,
+                published=largest,
+            )
+        )
     for period in PERIODS:
         results = {key: followed[period, key] for key in FOLLOWERS}
         times = results["closed_loop_inverse"].times
@@ -372,6 +428,7 @@ def _draw_control(
                 horizontal_label="time / s",
                 output_label=output,
                 error_label=error,
+                names=names,
             )
         )
     return paths

@@ -125,11 +125,13 @@ def _fading(lags: float) -> tuple[float, float, float, float]:
 class Course(Protocol):
     """The course of the force on a cell, as its plant keeps it: one value a step of a time grid."""
 
-    forces: kernels.Floats
-    """Force at the last grid points, N, in a ring, and behind it the number of the last one; see `convert_along`."""
     step: float
     tolerance: float
     """Step of the grid, and how far before a point that counts as reached, s."""
+
+    @property
+    def forces(self) -> kernels.Floats:
+        """Force at the last grid points, N, in a ring, and behind it the number of the last; see `convert_along`."""
 
     @property
     def is_known(self) -> bool:

@@ -29,9 +29,6 @@ if TYPE_CHECKING:
 else:
     kernels = DeferredModule("sim_devices.plants._sma_kernels")
 
-_FORCES = 128
-"""Grid points of which the force is kept."""
-
 _MEGAPASCAL = 1e6
 
 # The smallest transformation width (K), Clausius-Clapeyron slope (MPa/K) and detwinning stress (MPa) of a
@@ -174,11 +171,6 @@ class SMAWire(Muscle[SMAParameters]):
     ----------
     rng : numpy.random.Generator
         The session's randomness: the temperature of the room; see `GridPlant`.
-
-    Attributes
-    ----------
-    forces : ndarray
-        The force (N) at the last grid points, in a ring; see `kernels.advance_steps`.
     """
 
     def __init__(self, parameters: SMAParameters, rng: np.random.Generator) -> None:
@@ -199,8 +191,7 @@ class SMAWire(Muscle[SMAParameters]):
         offset = parameters.ambient_sd * float(self._noise.standard_normal())
         self._state[kernels.AMBIENT_OFFSET] = offset
         self._heat(parameters.ambient_temperature + offset, clamped=False)
-        self.forces = np.zeros(_FORCES + 1)
-        self.forces[0] = self.force
+        self._keep_first_force()
 
     def _take_steps(self, normals: Floats) -> None:
         kernels.advance_steps(normals, self._command, self.forces, self._parts)

@@ -15,7 +15,7 @@ from bench.protocol import (
 
 class Stairs(ProtocolParameters):
     count: int = parameter(4, unit="1", low=1, high=100000, help="how many steps")
-    dwell: float = parameter(2.0, unit="s", low=0, high=3600, help="hold")
+    dwell: float = parameter(2.0, unit="s", low=0, high=3600, help="hold", changeable=True)
     start: float = parameter(30.0, unit="°C", low=-50, high=500, help="first set-point")
     increment: float = parameter(5.0, unit="K", low=-50, high=50, help="from one step to the next")
 

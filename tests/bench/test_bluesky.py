@@ -8,6 +8,7 @@ from heater_protocols import stairs
 from bench.clock import VIRTUAL_EPOCH, VirtualClock
 from bench.engine import check_before_moving
 from bench.errors import DeviceError, LimitError
+from bench.face import open_rig
 from bench.protocol import plan
 from bench.rig import Rig
 from bench.rig_file import load_rig
@@ -96,3 +97,71 @@ class TestFailures:
 def test_the_rig_of_a_scan_runs_protocols_too(rig):
     with pytest.raises(Exception, match="probe_temperature"):
         check_before_moving(rig.description, stairs, plan(stairs, stairs.parameters()))
+
+
+class TestReadables:
+    def test_set_points_and_derived_signals_are_read_as_devices_are(self, engine, rig):
+        readables = rig.readables
+        assert {"psd", "tec", "tec_setpoint", "curvature"} <= readables.keys()
+        documents = run(
+            engine, plans.scan([readables["curvature"], readables["tec_setpoint"]], rig.devices["tec"], 40.0, 60.0, 3)
+        )
+        keys = documents["descriptor"][0]["data_keys"]
+        assert (keys["curvature"]["units"], keys["tec_setpoint"]["units"]) == ("1/m", "°C")
+        data = [event["data"] for event in documents["event"]]
+        assert [entry["tec_setpoint"] for entry in data] == [40.0, 50.0, 60.0]
+        measured = rig.measure()["curvature"]
+        assert data[-1]["curvature"] == pytest.approx(measured, abs=10.0)
+        assert data[0]["curvature"] != data[-1]["curvature"]
+
+    def test_documents_and_readings_have_one_time_base(self, engine):
+        with open_rig("vo2") as rig:
+            documents = run(engine, plans.count([rig.readables["curvature"]], 2))
+        stamps = [event["timestamps"]["curvature"] for event in documents["event"]]
+        # The laboratory's clock has run ahead of the one on the wall by what it jumped over; not by 26 years.
+        assert all(abs(stamp - documents["start"][0]["time"]) < 3600.0 for stamp in stamps)
+        assert stamps == sorted(stamps)
+
+
+class TestSafely:
+    @pytest.fixture
+    def heated(self, rig):
+        def plan():
+            yield from plan_stubs.mv(rig.devices["tec"], 50.0)
+            assert rig.devices["tec"].output_enabled
+            yield from plan_stubs.null()
+
+        return plan
+
+    def test_a_plan_that_ends(self, engine, rig, heated):
+        engine(rig.safely(heated()))
+        assert not rig.devices["tec"].output_enabled
+
+    def test_a_plan_that_fails(self, engine, rig, heated):
+        def failing():
+            yield from heated()
+            raise ValueError("of the plan")
+
+        with pytest.raises(ValueError, match="of the plan"):
+            engine(rig.safely(failing()))
+        assert not rig.devices["tec"].output_enabled
+
+    @pytest.mark.parametrize("end", ["abort", "stop", "halt"])
+    def test_a_plan_that_is_left_at_a_pause(self, engine, rig, heated, end):
+        def pausing():
+            yield from heated()
+            yield from plan_stubs.pause()
+
+        with pytest.raises(Exception, match=r"(?i)paus|interrupt"):
+            engine(rig.safely(pausing()))
+        assert rig.devices["tec"].output_enabled
+        getattr(engine, end)()
+        assert not rig.devices["tec"].output_enabled
+
+    def test_a_device_that_does_not_confirm_it_is_named(self, engine, rig, heated):
+        def unplugged():
+            yield from heated()
+            rig.laboratory.tec.unplug()
+
+        with pytest.raises(DeviceError, match="NOT in its safe state"):
+            engine(rig.safely(unplugged()))

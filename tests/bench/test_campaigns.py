@@ -272,6 +272,44 @@ class TestTasks:
         assert again[0].pop("wall_time") != before[0].pop("wall_time")
         assert again == before
 
+    def test_models_are_compared_on_runs(self, campaign, tmp_path, capsys):
+        compared = CHAIN[: CHAIN.index('[[runs]]\nname = "track"')].replace("levels = 6", "levels = [4, 6]")
+        for name, recalibrate in (("own", ""), ("offset", 'recalibrate = "offset"\nrecalibrate_rows = 20\n')):
+            compared += f'[[comparisons]]\nname = "{name}"\nruns = "characterize"\nmodels = "density"\n{recalibrate}'
+        out = tmp_path / "out"
+        assert start(campaign(compared), "--out", out, "--workers", 1) == 0
+        assert "2 runs, 2 models, 4 comparisons to do" in capsys.readouterr().out
+        found = rows(out / "comparisons.csv")
+        assert [(row["comparison"], row["model"]) for row in found] == [("own", "density")] * 2 + [
+            ("offset", "density")
+        ] * 2
+        # On the runs that they were identified from the errors are those of the identification.
+        identified = rows(out / "results.csv")
+        for mine, its in zip(found, identified, strict=False):
+            assert mine["run"] == its["folder"]
+            assert float(mine["rms [1/m]"]) == pytest.approx(float(its["density_rms [1/m]"]), rel=1e-9)
+        summary = rows(out / "comparisons-summary.csv")
+        largest = [float(row["max [1/m]"]) for row in found[:2]]
+        assert float(summary[0]["max worst [1/m]"]) == max(largest)
+        assert float(summary[0]["max spread [1/m]"]) == pytest.approx(max(largest) - min(largest))
+        assert summary[1]["runs"] == "2"
+
+    @pytest.mark.parametrize(
+        ("table", "said"),
+        [
+            (
+                'runs = "charac"\nmodels = "density"',
+                r"comparisons\.0 \(c\): runs = 'charac': .* there are: characterize",
+            ),
+            ('runs = "track"\nmodels = "densty"', r"models = 'densty': there is no table of models .*density"),
+            ('runs = "track"\nmodels = "density"\nrecalibrate = "of"', "recalibrate"),
+        ],
+    )
+    def test_what_is_compared_has_to_be_there(self, campaign, table, said):
+        path = campaign(CHAIN + f'[[comparisons]]\nname = "c"\n{table}\n')
+        with pytest.raises(ConfigurationError, match=said):
+            expand(read_campaign(path))
+
     def test_a_run_that_an_interlock_ends_is_a_result(self, campaign, tmp_path, capsys):
         path = campaign(STAIRS, ("[5.0, 10.0]", "[5.0, 20.0]\ndwell = 30"), ("[3, 5]", "3"))
         assert start(path, "--out", tmp_path / "out", "--workers", 1) == 0

@@ -15,6 +15,7 @@ import pytest
 from bench.cli import main
 from bench.journal import FILE_NAME, Record
 from bench.model_file import load_model
+from bench.results.data import read_columns
 
 FAST = ["--rig", "vo2", "--clock", "virtual"]
 # On the clock of a busy machine: neither the watchdog of the output nor a late answer ends the run.
@@ -687,10 +688,9 @@ class TestReportAndExport:
         with Record(Path(finished_run["folder"])) as record:
             tables = {"readings": record.steps(), "telemetry": record.telemetry()}
         for name, table in tables.items():
-            columns = read_table(tmp_path / f"{name}.{format_}")
-            assert "tec_temperature [°C]" in columns
-            assert "curvature [1/m]" in columns
-            np.testing.assert_array_equal(columns["curvature [1/m]"], table["curvature"])
+            columns = read_columns(tmp_path / f"{name}.{format_}", ["tec_temperature", "curvature"])
+            assert columns.units == {"tec_temperature": "°C", "curvature": "1/m"}
+            np.testing.assert_array_equal(columns.values["curvature"], table["curvature"])
 
     def test_recording_is_rebuilt_but_never_overwritten(self, bench, tmp_path, finished_run):
         code, _, _ = bench("export", finished_run["folder"], "--format", "rrd", "--out", tmp_path)
@@ -704,17 +704,6 @@ class TestReportAndExport:
         code, _, err = bench("report", tmp_path)
         assert code == 3
         assert "not a run" in err
-
-
-def read_table(path):
-    if path.suffix == ".csv":
-        with path.open() as file:
-            rows = list(csv.reader(file))
-        return {name: np.array([float(row[i]) for row in rows[1:]]) for i, name in enumerate(rows[0])}
-    import pyarrow.parquet as pq
-
-    table = pq.read_table(path)
-    return {name: table[name].to_numpy() for name in table.column_names}
 
 
 def test_the_environment_has_no_say_in_the_exit_code():

@@ -24,6 +24,8 @@ from bench.errors import (
 from bench.interrupts import Interrupts
 from bench.journal import FILE_NAME, Journal, Record
 from bench.journal.store import Store
+from bench.past import Past
+from bench.past.feeding import feed
 from bench.protocol import (
     TRACES,
     Control,
@@ -37,9 +39,10 @@ from bench.protocol import (
     plan,
     protocol,
 )
+from bench.protocol.changes import PARAMETER, ParameterChange
+from bench.questions import ABORT, RESUME
 from bench.rig import Rig
 from bench.rig_file import load_rig
-from bench.running import ABORT, RESUME
 from bench.station.local import LocalStation
 
 
@@ -56,7 +59,7 @@ def define(function):
 class Bench:
     """A rig with its journal and engine; `record` reads back what was written."""
 
-    def __init__(self, folder, path, clock=None, seed=1, observers=(), ask=None, traces=False):
+    def __init__(self, folder, path, clock=None, seed=1, observers=(), ask=None, traces=False, **keys):
         self.folder = folder
         self.clock = clock or VirtualClock()
         self.rig = Rig(load_rig(path), self.clock, seed)
@@ -64,7 +67,8 @@ class Bench:
         self.journal = Journal(folder / FILE_NAME, self.rig.signals + TRACES * traces, {})
         self.interrupts = Interrupts()
         self.watcher = Watcher()
-        self.engine = Engine(LocalStation(self.rig), self.journal, (*observers, self.watcher), self.interrupts, ask)
+        station = LocalStation(self.rig)
+        self.engine = Engine(station, self.journal, (*observers, self.watcher), self.interrupts, ask, **keys)
 
     def run(self, definition, parameters=None):
         try:
@@ -755,7 +759,7 @@ class TestPrompt:
         b = bench(ask=ask)
         laboratory = self.by_hand(b)
         assert b.run(prompt()).status == "completed"
-        assert questions == ["Turn the plate to 33 °C; then"]
+        assert [(each.title, each.text) for each in questions] == [("BY HAND", "Turn the plate to 33 °C")]
 
     def test_an_operator_may_end_the_run(self, bench):
         b = bench(ask=lambda _: ABORT)
@@ -833,6 +837,103 @@ class TestInterrupted:
         kinds = [event.kind for event in b.watcher.events]
         assert kinds.index("pause") < kinds.index("resume")
         assert b.tec.sent == [30.0, 31.0, 32.0]
+
+    def answering(self, *answers):
+        """Return what asks, and answers one after another; and the questions that were asked."""
+        asked, left = [], list(answers)
+
+        def ask(question):
+            asked.append(question)
+            return left.pop(0)
+
+        return ask, asked
+
+    def test_one_step_then_it_pauses_again(self, bench):
+        ask, _ = self.answering("step", RESUME)
+        self.b = b = bench(ask=ask)
+        assert b.run(self.request(pause_requested=True)).status == "completed"
+        pauses = [event.text for event in b.watcher.events if event.kind == "pause"]
+        assert pauses == ["paused by the operator; the set-points stand", "paused by one step; the set-points stand"]
+        steps = [len(each.setpoints) for each in b.record().step_records()]
+        assert len(steps) == 3
+
+    def test_a_note_is_recorded(self, bench):
+        ask, _ = self.answering("note the lamp was on", RESUME)
+        self.b = b = bench(ask=ask)
+        assert b.run(self.request(pause_requested=True)).status == "completed"
+        with b.record() as run:
+            assert [each.text for each in run.events() if each.kind == "remark"] == ["the lamp was on"]
+
+    def test_outputs_off_and_on_again(self, bench):
+        ask, asked = self.answering("off", "off", RESUME)
+        self.b = b = bench(ask=ask)
+        assert b.run(self.request(pause_requested=True)).status == "completed"
+        assert b.tec.safe_times == b.probe.safe_times == 2
+        off = b.tec.calls.index("safe")
+        assert b.tec.calls[off - 1 : off + 2] == ["set", "safe", "set"]
+        assert asked[1].text == "the outputs are off until the run is resumed"
+        with b.record() as run:
+            assert [each.text[:11] for each in run.events() if each.kind == "off"] == ["outputs off", "outputs on "]
+
+    def paused_in_stairs(self, bench, *answers):
+        """Carry the stairs out, with a pause in the middle of the second hold."""
+
+        class Pausing(Watcher):
+            def telemetry(_, __, step, ___):
+                if step == 1 and not self.b.interrupts.pause_requested and not asked:
+                    self.b.interrupts.pause_requested = True
+
+        ask, asked = self.answering(*answers)
+        self.b = b = bench(ask=ask, observers=[Pausing()])
+        outcome = b.run(stairs, stairs.parse({"dwell": 4.0}))
+        assert outcome.status == "completed"
+        return b, asked
+
+    def test_a_changed_parameter_counts_from_the_next_reading_on(self, bench):
+        b, asked = self.paused_in_stairs(bench, "set dwell=2", RESUME)
+        assert asked[0].parameters == {"dwell": "4.0 s, hold (0 to 3600)"}
+        assert asked[1].parameters == {"dwell": "2.0 s, hold (0 to 3600)"}
+        with b.record() as run:
+            assert [step.finished - step.started for step in run.step_records()] == [4.0, 4.0, 2.0, 2.0]
+            (change,) = ParameterChange.among((each.kind, each.text) for each in run.events())
+        assert change == ParameterChange(1, "dwell", 2.0, 4.0)
+
+    @pytest.mark.parametrize(
+        ("answer", "message"),
+        [
+            ("set count=5", "'count' cannot be changed at a pause; parameters that can: dwell"),
+            ("set dwell=-1", "parameter dwell = '-1' is not allowed; allowed: 0 to 3600 s"),
+            ("set dwell", "parameter dwell = '' is not allowed"),
+        ],
+    )
+    def test_a_change_that_is_not_allowed_is_said(self, bench, answer, message):
+        b, asked = self.paused_in_stairs(bench, answer, RESUME)
+        assert message in asked[1].problem
+        with b.record() as run:
+            assert not [each for each in run.events() if each.kind == PARAMETER]
+            assert [step.finished - step.started for step in run.step_records()] == [4.0] * 4
+
+    def test_a_change_is_made_again_where_it_was(self, bench):
+        b, _ = self.paused_in_stairs(bench, "set dwell=2", RESUME)
+        with b.record() as run:
+            expected = list(run.step_records())
+            changes = ParameterChange.among((each.kind, each.text) for each in run.events())
+        again = bench(changes=changes)
+        assert again.run(stairs, stairs.parse({"dwell": 4.0})).status == "completed"
+        with again.record() as run:
+            assert list(run.step_records()) == expected
+
+    def test_a_change_is_fed_back(self, bench):
+        b, _ = self.paused_in_stairs(bench, "set dwell=2", RESUME)
+        with b.record() as run:
+            past = Past.of(run)
+        for count in (1, 2, 3):
+            parameters = stairs.parse({"dwell": 4.0})
+            cut = replace(past, steps=past.steps[:count], remarks=past.remarks[: count + 2])
+            fed = feed(stairs, parameters, {}, cut)
+            # In the message that waits the old one, if the change came with its reading.
+            assert fed.message.settle == Dwell(2.0 if count > 1 else 4.0)
+            assert parameters.dwell == 2.0
 
     @pytest.mark.parametrize("answer", [ABORT, "", "whatever"])
     def test_pause_and_abort(self, bench, answer):

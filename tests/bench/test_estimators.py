@@ -2,7 +2,6 @@ import math
 
 import numpy as np
 import pytest
-from filterpy.kalman import KalmanFilter
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -177,6 +176,8 @@ def test_the_drift_is_that_of_an_independent_kalman_filter():
     noise, agility = 0.013, 0.003
     rng = np.random.default_rng(3)
     estimator = DriftEstimator(noise=noise, agility=agility)
+    from filterpy.kalman import KalmanFilter
+
     reference = KalmanFilter(dim_x=2, dim_z=1)
     reference.H, reference.R = np.array([[1.0, 0.0]]), np.array([[noise**2]])
     times = np.cumsum(rng.choice([0.1, 0.25, 0.5], 500))

@@ -14,7 +14,11 @@ UNITS = {"sink": "°C", "force": "N", "plate_setpoint": "°C", "supply_setpoint"
 
 
 def watch(*interlocks):
-    return InterlockWatch(interlocks, UNITS)
+    """Watch interlocks, with a warning band only where a test gives one."""
+    silent = {"warn": 0.0}
+    return InterlockWatch(
+        (each if "warn" in each.model_fields_set else each.model_copy(update=silent) for each in interlocks), UNITS
+    )
 
 
 class TestInterlock:
@@ -362,6 +366,55 @@ class TestSettle:
         guard.check(10.9, {"sink": 61.0, "plate_setpoint": 25.0})
         with pytest.raises(InterlockError):
             guard.check(11.0, {"sink": 61.0, "plate_setpoint": 25.0})
+
+
+class TestWarning:
+    """The band before a limit, in which an interlock warns and does nothing else."""
+
+    @staticmethod
+    def course(guard, *values):
+        return [
+            [(each.early, each.level.value, each.over) for each in guard.look(float(t), {"sink": value})]
+            for t, value in enumerate(values)
+        ]
+
+    def test_once_a_crossing_and_over_half_a_band_further_inside(self):
+        guard = watch(Interlock(signal="sink", high=60.0, warn=0.05))
+        begun, over, acts = (True, "warn", False), (True, "warn", True), (False, "safe", False)
+        assert self.course(guard, 56.9, 57.1, 57.5, 56.9, 55.6, 55.4, 57.1, 61.0) == [
+            [], [begun], [], [], [], [over], [begun], [acts],
+        ]  # fmt: skip
+
+    def test_the_text_names_the_limit_and_what_happens_there(self):
+        guard = watch(Interlock(signal="sink", low=-20.0, level="pause", warn=0.1))
+        (finding,) = guard.look(0.0, {"sink": -19.0})
+        assert finding.text == "warning: sink = -19 °C is below -18 °C; the interlock acts at -20 °C (level pause)"
+        (finding,) = guard.look(2.0, {"sink": 0.0})
+        assert finding.text == "warning: sink = 0 °C is far from its interlock again (after 2.0 s)"
+
+    def test_what_is_beyond_the_limit_for_a_while_was_warned_of_at_once(self):
+        guard = watch(Interlock(signal="sink", high=60.0, seconds=3.0, warn=0.05))
+        assert [[each.early for each in found] for found in (guard.look(t, {"sink": 70.0}) for t in range(4))] == [
+            [True], [], [], [False],
+        ]  # fmt: skip
+
+    @pytest.mark.parametrize("keys", [{"warn": 0.0}, {"level": "warn"}, {"high": 0.0}, {"low": 59.0, "warn": 0.2}])
+    def test_none_where_there_is_no_room_or_no_wish(self, keys):
+        guard = watch(Interlock(signal="sink", **{"high": 60.0, **keys}))
+        top = keys.get("high", 60.0)
+        assert self.course(guard, math.nextafter(top, -math.inf), top) == [[], []]
+
+    @given(
+        st.floats(-1e6, 1e6), st.floats(1e-3, 1e6), st.floats(0.0, 0.5), st.lists(st.floats(-2e6, 2e6), max_size=20)
+    )
+    def test_it_changes_nothing_of_what_acts(self, low, width, warn, values):
+        interlock = Interlock(signal="sink", low=low, high=low + width, seconds=1.0, level="hold")
+        plain, warned = (watch(interlock.model_copy(update={"warn": share})) for share in (0.0, warn))
+        for t, value in enumerate(values):
+            found = warned.look(float(t), {"sink": value})
+            assert [each.text for each in found if not each.early] == [
+                each.text for each in plain.look(float(t), {"sink": value})
+            ]
 
 
 class TestDifference:

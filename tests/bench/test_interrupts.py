@@ -265,7 +265,7 @@ class TestProcesses:
         process = start(*arguments, terminal=True)
         process.until("step 0 at")
         os.write(process.terminal, b"\x03")
-        process.until("resumes")
+        process.until("PAUSED for")
         return process
 
     def test_at_a_terminal_pause_and_resume(self, start):

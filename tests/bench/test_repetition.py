@@ -1,5 +1,6 @@
 """Repeating a run from its record alone, and what the record holds for that."""
 
+import io
 import json
 import shutil
 import sqlite3
@@ -11,12 +12,19 @@ import numpy as np
 import pytest
 from heater_laboratory import RIG
 from rerun.chunk import RrdReader
+from rich.console import Console
 
 from bench.cli import main
 from bench.hysteresis import Preisach, uniform_levels
+from bench.interrupts import Interrupts
 from bench.journal import FILE_NAME, Record
 from bench.journal.rows import checksum
 from bench.model_file import ModelFile
+from bench.protocol import find_protocol
+from bench.repetition import repeat
+from bench.resume import Resume, resume
+from bench.runs import Run
+from bench.runs import carry_out as carry_out_run
 
 FAULTS = '[[fault]]\nat = 12\nfault = "tec.delay"\nvalues = { seconds = 0.05 }\nduration = 2\n'
 SCRIPT = """
@@ -184,3 +192,49 @@ def test_a_run_at_a_served_laboratory_is_repeated_on_the_rig_that_is_named(bench
     assert code == 0
     assert "not as in the original: clock: attached x1 → wall" in out
     assert "rig_content.interlocks" in out
+
+
+class TestParametersChangedAtAPause:
+    """On the virtual clock, where a repetition is exact."""
+
+    @pytest.fixture
+    def paused(self, tmp_path, rig_file, monkeypatch):
+        """A run that was paused before its first step, where the dwell was changed."""
+
+        class Terminal(io.StringIO):
+            def isatty(self):
+                return True
+
+        monkeypatch.setattr("sys.stdin", Terminal("set dwell=0.5\nnote shorter\nr\n"))
+        interrupts = Interrupts()
+        interrupts.pause_requested = True
+        protocol = find_protocol(f"{Path(__file__).parent / 'heater_protocols.py'}:stairs")
+        run = Run(
+            protocol=protocol, settings={}, rig=rig_file(), folder=tmp_path / "runs", clock="virtual", recording=False
+        )
+        result = carry_out_run(run, Console(quiet=True), interrupts)
+        assert result.outcome.status == "completed"
+        return result.folder
+
+    @staticmethod
+    def durations(folder):
+        with Record(folder) as record:
+            return [step.finished - step.started for step in record.step_records()]
+
+    def test_they_are_changed_again(self, paused, tmp_path):
+        assert self.durations(paused) == [2.0, 0.5, 0.5, 0.5]
+        found = repeat(paused, out=tmp_path / "again", console=Console(quiet=True))
+        assert self.durations(found.result.folder) == [2.0, 0.5, 0.5, 0.5]
+        assert found.is_exact
+        assert found.comparison.equal["steps"]
+        assert found.comparison.equal["telemetry"]
+
+    def test_a_resumed_run_has_them(self, paused):
+        # As if it had died after its second step.
+        with closing(sqlite3.connect(paused / FILE_NAME)) as db, db:
+            db.execute("DELETE FROM steps WHERE step > 1")
+            db.execute("DELETE FROM telemetry WHERE step > 1")
+            db.execute("DELETE FROM events WHERE t > 2.5")
+            db.execute("DELETE FROM meta WHERE key IN ('status', 'reason', 'finished', 'safe_state', 'counts')")
+        resume(Resume(folder=paused), Console(quiet=True))
+        assert self.durations(paused) == [2.0, 0.5, 0.5, 0.5]

@@ -9,15 +9,17 @@ from heater_protocols import Stairs, settle, stairs
 from rich.console import Console
 
 from bench.devices import Signal
+from bench.dialogue import Dialogue
 from bench.errors import ConfigurationError, DeviceConnectionError
 from bench.journal import Event, Record, StepRecord, run_card
 from bench.protocol import Dwell, Step, find_protocol, protocol
+from bench.questions import AT_A_PROMPT, Question
 from bench.recorded_files import RIG_FILE_NAME
 from bench.remaining_time import Expectation
 from bench.rig_file import load_rig
 from bench.runs import Run, carry_out
 from bench.settling import Settled
-from bench.terminal import ProgressDisplay, ask_operator
+from bench.terminal import ProgressDisplay
 
 
 @pytest.fixture
@@ -243,16 +245,74 @@ class TestDisplay:
             file.lost = True
 
 
+class Screen:
+    """A terminal whose display was entered, with a dialogue on it."""
+
+    def __init__(self, **keys):
+        self.console = Console(file=io.StringIO(), width=160, **keys)
+        self.display = ProgressDisplay(self.console, "stairs", SIGNALS, ("tec_temperature",), EXPECTED)
+        self.dialogue = Dialogue(self.console, self.display, None, at_terminal=True)
+
+    @property
+    def shown(self):
+        return self.console.file.getvalue()
+
+
 class TestQuestion:
     @pytest.mark.parametrize(
         ("typed", "answer"),
-        [("r\n", "resume"), ("Resume\n", "resume"), ("a\n", "abort"), ("abort\n", "abort"), ("", "abort")],
+        [
+            ("r\n", "resume"),
+            ("Resume\n", "resume"),
+            ("a\n", "abort"),
+            ("end\n", "abort"),
+            ("", "abort"),
+            ("s\n", "step"),
+            ("n  door opened \n", "note door opened"),
+            ("set dwell=3\n", "set dwell=3"),
+            ("off\n", "off"),
+        ],
     )
-    def test_answers(self, console, monkeypatch, typed, answer):
+    def test_answers(self, monkeypatch, typed, answer):
         monkeypatch.setattr("sys.stdin", io.StringIO(typed))
-        assert ask_operator(console, "paused:") == answer
+        assert Screen().dialogue.ask(Question("paused by the operator")) == answer
 
-    def test_asks_until_it_understands(self, console, monkeypatch):
-        monkeypatch.setattr("sys.stdin", io.StringIO("what\n\n r \n"))
-        assert ask_operator(console, "paused:") == "resume"
-        assert console.file.getvalue().count("please answer") == 2
+    def test_asks_until_it_understands(self, monkeypatch):
+        monkeypatch.setattr("sys.stdin", io.StringIO("what\n\nn\n r \n"))
+        screen = Screen()
+        assert screen.dialogue.ask(Question("paused by the operator")) == "resume"
+        assert screen.shown.count("please answer r (resume), s (step), n (note), set, o (off), a (abort)") == 2
+        assert screen.shown.count("note TEXT: write a note into the record") == 1
+
+    def test_at_a_prompt_there_is_less_to_say(self, monkeypatch):
+        monkeypatch.setattr("sys.stdin", io.StringIO("s\nr\n"))
+        screen = Screen()
+        assert screen.dialogue.ask(Question("Hang 2 N on", AT_A_PROMPT, "BY HAND")) == "resume"
+        assert "BY HAND for 0:00:00" in screen.shown
+        assert "please answer r (resume), a (abort)" in screen.shown
+
+    def test_the_bar_stands_still_until_the_run_goes_on(self, monkeypatch):
+        monkeypatch.setattr("sys.stdin", io.StringIO("note here\nresume\n"))
+        screen = Screen(force_terminal=True)
+        question = Question("paused by the operator", parameters={"dwell": "8 s"})
+        with screen.display as display:
+            display.telemetry(1.0, 0, (20.123, 1.0))
+            assert screen.dialogue.ask(question) == "note here"
+            before = screen.shown
+            display.step(StepRecord(1, 0.0, 8.0, "", "", Settled.DWELL, {}, (20.456, 1.0)))
+            assert screen.shown == before
+            display.event(Event(5.0, "WARN", "warning", "near a limit"))
+            assert "near a limit" in screen.shown
+            assert screen.dialogue.ask(question) == "resume"
+            display.step(StepRecord(1, 0.0, 8.0, "", "", Settled.DWELL, {}, (20.789, 1.0)))
+        assert "\a" in screen.shown
+        assert "PAUSED for 0:00:00  tec_temperature" in screen.shown
+        assert "set dwell=…  now 8 s" in screen.shown
+        # The new bar is below the question.
+        assert screen.shown.rindex("2/2") > screen.shown.rindex("PAUSED for")
+
+    def test_a_display_that_has_ended_ends_the_question(self, monkeypatch):
+        monkeypatch.setattr("sys.stdin", io.StringIO("r\n"))
+        screen = Screen()
+        screen.display.is_over = True
+        assert screen.dialogue.ask(Question("paused")) == "abort"

@@ -55,7 +55,9 @@ def wait(folder):
 
 def run(folder):
     """Carry out a run of hours."""
-    run = Run(find_protocol("damped-oscillation"), {}, "vo2", Path(folder), clock="x1", recording=False)
+    run = Run(
+        find_protocol("damped-oscillation"), {}, "vo2", Path(folder), clock="x1", recording=False, rehearse=False
+    )
     return carry_out(run, task_console())
 
 

@@ -1,4 +1,4 @@
-"""Operators of elements: CPU time of a fit by name, of a sample and of a step. Prints, asserts no time."""
+"""Operators of elements: CPU time of a fit by name, of a sample, of a step and of a stream. Asserts no time."""
 
 import time
 
@@ -40,9 +40,11 @@ def test_fit_evaluate_and_step(capsys, rows):
                 state, _ = operator.step(state, value)
 
         step, _ = cpu(steps)
+        stream = operator.stream()
+        streamed, _ = cpu(lambda stream=stream: [stream.step(value) for value in inputs[:1000].tolist()])
         lines.append(
             f"{name:32s} fit {seconds:6.2f} s, RMS {found.errors.rms_percent:5.2f} %, "
-            f"{1e9 * sample / rows:6.0f} ns a sample, {1e3 * step:5.1f} µs a step"
+            f"{1e9 * sample / rows:6.0f} ns a sample, {1e3 * step:5.1f} µs a step, {1e3 * streamed:5.2f} µs streamed"
         )
         assert found.errors.rms_percent < 10.0
     with capsys.disabled():

@@ -169,6 +169,7 @@ readings = st.one_of(
 
 
 class TestLimits:
+    @pytest.mark.costly
     @pytest.mark.parametrize("limits", [(LOW, HIGH), NARROW, (0.0, 200.0)])
     @pytest.mark.parametrize("name", TARGETS)
     @settings(max_examples=40)

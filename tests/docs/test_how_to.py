@@ -26,10 +26,10 @@ BLOCK = re.compile(r"^```(\w+)(?: file: (\S+))?\n(.*?)^```$", re.MULTILINE | re.
 
 
 @pytest.fixture
-def environment(tmp_path):
+def environment(tmp_path, warm_commands):
     """What a reader has: the bench and pip, which here installs into a folder of its own, offline."""
     site = tmp_path / "site"
-    scripts = Path(sys.executable).parent
+    scripts = f"{warm_commands}{os.pathsep}{Path(sys.executable).parent}"
     return {
         **os.environ,
         "PATH": f"{scripts}{os.pathsep}{os.environ['PATH']}",
@@ -44,7 +44,7 @@ def environment(tmp_path):
 
 
 @pytest.mark.parametrize("path", EXECUTED, ids=lambda path: path.stem)
-def test_page(path, tmp_path, environment, finished_process):
+def test_page(path, tmp_path, environment, finished_process, warm_process):
     page, printed = path.stem, None
     for language, name, text in BLOCK.findall(path.read_text()):
         if name:
@@ -54,8 +54,11 @@ def test_page(path, tmp_path, environment, finished_process):
             for line in filter(None, map(str.strip, text.splitlines())):
                 assert line in printed, f"{page}: {line!r} is not in\n{printed}"
         elif language != "bash":
-            command = {"sh": ["sh", "-e", "-c"], "python": [sys.executable, "-c"]}[language]
-            done = finished_process([*command, text], tmp_path, environment)
+            command, run = {
+                "sh": (["sh", "-e", "-c"], finished_process),
+                "python": ([sys.executable, "-c"], warm_process),
+            }[language]
+            done = run([*command, text], tmp_path, environment)
             printed = done.stdout
             assert done.returncode == 0, f"{page}: {text}\n{printed}{done.stderr}"
 

@@ -2,6 +2,7 @@
 
 import math
 import socket
+from importlib.util import find_spec
 
 import numpy as np
 import pytest
@@ -17,10 +18,7 @@ from sim_devices.instruments.scpi import EmulatedTextInstrument, Meter
 from sim_devices.wire.text import TextServer
 from sim_devices.world import World
 
-pytest.importorskip("pymeasure")
-
-from pymeasure.instruments.keithley import Keithley2260B
-from pymeasure.test import expected_protocol
+pytestmark = pytest.mark.skipif(find_spec("pymeasure") is None, reason="could not import 'pymeasure'")
 
 TABLE = {
     "instrument": "pymeasure.instruments.keithley:Keithley2260B",
@@ -33,6 +31,15 @@ TABLE = {
     "setpoint": {"property": "voltage_setpoint", "unit": "V", "limits": [0.0, 30.0], "resolution": 0.001},
     "signals": {"voltage": {"property": "voltage", "unit": "V"}, "current": {"property": "current", "unit": "A"}},
 }
+
+
+def expected_protocol(exchange):
+    """Return the instrument on PyMeasure's own protocol test."""
+    # Here, as it takes a second to load, and each worker of the tests loads each module.
+    from pymeasure.instruments.keithley import Keithley2260B
+    from pymeasure.test import expected_protocol
+
+    return expected_protocol(Keithley2260B, exchange)
 
 
 def on_protocol(instrument, kind=Adapter, table=TABLE):
@@ -59,7 +66,7 @@ def test_what_is_sent_is_what_pymeasure_expects():
         ("OUTPut 0", None),
         ("OUTPut?", "0"),
     ]
-    with expected_protocol(Keithley2260B, exchange) as instrument:
+    with expected_protocol(exchange) as instrument:
         supply = on_protocol(instrument)
         supply.set(12.5).wait()
         supply.set(3.0).wait()
@@ -81,7 +88,7 @@ def test_what_is_sent_is_what_pymeasure_expects():
 )
 def test_what_is_no_number_is_an_error(exchange, text):
     table = {key: TABLE[key] for key in ("instrument", "signals")}
-    with expected_protocol(Keithley2260B, exchange) as instrument:
+    with expected_protocol(exchange) as instrument:
         meter = on_protocol(instrument, SensorAdapter, table)
         with pytest.raises(DeviceError, match=f"supply: {text}"):
             meter.measure()
@@ -90,7 +97,7 @@ def test_what_is_no_number_is_an_error(exchange, text):
 def test_a_set_point_that_is_not_taken_is_an_error():
     exchange = [("OUTPut 0", None), (":SOUR:CURR 1.5", None), (":SOUR:VOLT 12", None), (":SOUR:VOLT?", "5")]
     with (
-        expected_protocol(Keithley2260B, exchange) as instrument,
+        expected_protocol(exchange) as instrument,
         pytest.raises(DeviceError, match="reads its set-point back as 5 V, not 12 V"),
     ):
         on_protocol(instrument).set(12.0)
@@ -105,16 +112,16 @@ def test_errors_of_the_instrument_are_one_message():
     ]
     table = {"instrument": TABLE["instrument"], "check_errors": True}
     signals = {"voltage": TABLE["signals"]["voltage"]}
-    with expected_protocol(Keithley2260B, exchange) as instrument:
+    with expected_protocol(exchange) as instrument:
         meter = on_protocol(instrument, SensorAdapter, {**table, "signals": signals})
         with pytest.raises(DeviceError, match=r"after measuring: .*System error.*; .*Self-test failed"):
             meter.measure()
 
 
 def test_closing_shuts_the_instrument_down_unless_told_otherwise():
-    with expected_protocol(Keithley2260B, [("OUTPut 0", None)]) as instrument:
+    with expected_protocol([("OUTPut 0", None)]) as instrument:
         on_protocol(instrument).close()
-    with expected_protocol(Keithley2260B, []) as instrument:
+    with expected_protocol([]) as instrument:
         on_protocol(instrument, table={**TABLE, "shutdown": False}).close()
 
 

@@ -103,6 +103,15 @@ class TestRequests:
         with pytest.raises(GuardianError):
             it.apply({"tec": 40.0})
 
+    def test_outputs_off_for_a_while(self, station, vo2):
+        remote = station()
+        remote.rest()
+        assert not is_on(vo2)
+        remote.apply({"tec": 41.0})
+        assert is_on(vo2)
+        assert remote.setpoint("tec") == 41.0
+        assert remote.end() == SAFE
+
     def test_a_rig_that_cannot_be_connected_is_refused_in_the_words_of_its_driver(self, vo2):
         vo2.control.unplug("tec")
         try:

@@ -31,7 +31,7 @@ def kill_both(bench):
 def test_clears_what_the_watchdogs_left_and_goes_on(served, tmp_path, capsys):
     settings = ("increment=31.5", "half_cycles=1", "dwell=2")
     command = ["run", "damped-oscillation", "--rig", "vo2", "--attach", str(served.endpoints_file)]
-    command += ["--out", str(tmp_path), *(f"--set={setting}" for setting in settings)]
+    command += ["--no-rehearse", "--out", str(tmp_path), *(f"--set={setting}" for setting in settings)]
     folder = kill_after(2, tmp_path, *command, kill=kill_both)
     with Record(folder) as record:
         total = record.meta["plan"]["steps"]

@@ -1,6 +1,9 @@
 """Operators of elements against independent oracles: differential equations, definitions written out, brute force."""
 
+import copy
 import json
+import math
+import pickle
 from itertools import pairwise
 
 import numpy as np
@@ -19,6 +22,7 @@ from bench.hysteresis import (
     operator_from_json,
 )
 from bench.hysteresis.branch_inverse import BranchInverse
+from bench.hysteresis.elements import ElementStream
 from bench.hysteresis.inverse import NumericalInverse
 from bench.hysteresis.reach import Reach
 
@@ -82,6 +86,27 @@ class TestEachOperator:
             assert operator.value(state) == pytest.approx(output, abs=1e-12)
         np.testing.assert_allclose(one_by_one, whole, atol=1e-12)
         assert state == pytest.approx(operator.advance(operator.initial_state(), first + second), abs=1e-12)
+
+    @given(some, values, values)
+    def test_a_stream_equals_a_sequence(self, operator, history, inputs):
+        start = operator.advance(operator.initial_state(), history)
+        stream = operator.stream(start)
+        assert type(stream) is ElementStream
+        assert stream.state == start
+        assert stream.value == operator.value(start)
+        outputs = [stream.step(value) for value in inputs]
+        np.testing.assert_allclose(outputs, operator.evaluate(inputs, start), atol=1e-12)
+        assert stream.value == outputs[-1]
+        state = stream.state
+        assert state == pytest.approx(operator.advance(start, inputs), abs=1e-12)
+        # A copy goes on by itself.
+        for again in (pickle.loads(pickle.dumps(stream)), copy.deepcopy(stream)):
+            assert again.state == state
+            again.step(0.3)
+        for value in (math.nan, math.inf):
+            with pytest.raises(ValueError, match="value: expected a finite number"):
+                stream.step(value)
+        assert stream.state == state
 
     @given(some, values, st.integers(2, 30))
     def test_does_not_depend_on_the_rate(self, operator, inputs, pieces):

@@ -124,7 +124,8 @@ def test_campaign(reproduce, seed):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seed", [6, pytest.param(7, marks=pytest.mark.seeds)])
+@pytest.mark.seeds
+@pytest.mark.parametrize("seed", [6, 7])
 def test_the_same_step_by_step(tmp_path, seed):
     """Run, identify, run in another session, predict: what an operator types."""
     columns = ("--input", "tec_temperature", "--output", "curvature")

@@ -42,3 +42,26 @@ def outputs(rig, devices):
         for name, each in truth.items()
         if each.is_output and name.startswith(tuple(devices)) and not math.isclose(each.value, 0.0, abs_tol=1e-6)
     }
+
+
+@pytest.mark.parametrize(
+    ("name", "table", "quantity", "as_shown"),
+    [
+        ("vo2", "psd", "tip_deflection", "deflection_shown"),
+        ("hybrid", "displacement_sensor", "deflection", "displacement_shown"),
+        ("hybrid", "tip_thermistor", "tip_temperature", "tip_shown"),
+        ("sma", "force_sensor", "force", "force_shown"),
+        ("mckibben", "position_sensor", "position", "position_shown"),
+    ],
+)
+def test_it_has_the_true_quantity_beside_the_one_that_a_sensor_shows(name, table, quantity, as_shown):
+    errors = {"gain_error": "0.01", "offset": "1e-6"}
+    rig = Rig(
+        load_rig(name, {f"emulation.{table}.{key}": value for key, value in errors.items()}), VirtualClock(), seed=0
+    )
+    try:
+        truth = rig.laboratory.truth()
+        assert truth[as_shown].value == pytest.approx(1.01 * truth[quantity].value + 1e-6, rel=1e-12)
+        assert truth[as_shown].unit == truth[quantity].unit
+    finally:
+        rig.close()

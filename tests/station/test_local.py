@@ -208,7 +208,8 @@ class TestInterlocks:
         station.apply({"tec": 30.0})
         station.sleep_until(20.0)
         assert not station.is_holding
-        assert [(each.level, each.kind) for each in station.news()] == [("WARN", "interlock"), ("INFO", "interlock")]
+        expected = [("WARN", "warning"), ("WARN", "interlock"), ("INFO", "warning"), ("INFO", "interlock")]
+        assert [(each.level, each.kind) for each in station.news()] == expected
 
     def test_a_pause_is_asked_for_once(self, heater):
         station, _ = heater('[[interlocks]]\nsignal = "tec_temperature"\nhigh = 60.0\nlevel = "pause"\n')

@@ -10,9 +10,13 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.results.figures.canvas import apart, drawn, outline
-from bench.results.figures.colors import series_color
+from bench.results.figures.colors import MEASURED, color_of, series_color
 
 Floats = npt.NDArray[np.float64]
+
+
+_MARKED = 200
+"""Most points that are joined by a thin line."""
 
 
 class Curve(NamedTuple):
@@ -31,20 +35,27 @@ def plot_panels(
     vertical_label: str,
     columns: int = 2,
     measured: Sequence[str] = (),
+    names: Mapping[str, str] | None = None,
 ) -> None:
     """Draw several sets of curves on the same axes, one panel a set, by their titles; `columns` beside each other.
 
-    The panels in `measured` show measurements: points, those of others lines.
+    The panels in `measured` show measurements as points, others lines. A curve that is alone in its panel has the
+    colour of the model that `names` has for the title, or that of measurements.
     """
     rows = -(-len(panels) // columns)
     with drawn(path, (3.3 * columns, 0.4 + 2.6 * rows)) as figure:
         grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
         for i, (axes, (title, curves)) in enumerate(zip(grid.flat, panels.items(), strict=False)):
             for k, curve in enumerate(curves):
-                style: dict[str, Any] = {"color": series_color(k), "label": curve.label}
+                color = series_color(k)
+                if len(curves) == 1 and not curve.label:
+                    color = MEASURED if title in measured else color_of((names or {}).get(title, title))
+                style: dict[str, Any] = {"color": color, "label": curve.label}
                 if title in measured:
                     points = apart(curve.horizontal, curve.vertical)
-                    axes.plot(*points, ".", markersize=2.2, markeredgewidth=0.0, **style)
+                    axes.plot(*points, ".", markersize=3.0, markeredgewidth=0.0, **style)
+                    if curve.horizontal.size <= _MARKED:
+                        axes.plot(curve.horizontal, curve.vertical, color=color, linewidth=0.3, alpha=0.6)
                 else:
                     axes.plot(curve.horizontal, curve.vertical, "-", linewidth=0.8, **style)
             axes.set_title(title, fontsize=9, loc="left")

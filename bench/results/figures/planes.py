@@ -33,8 +33,8 @@ def plot_densities(
 ) -> None:
     """Draw Preisach densities on their planes, side by side, under their titles.
 
-    A cell whose density is zero is light grey; one that the excitation never swept, of which nothing is known, is
-    hatched.
+    A cell whose density is zero is light grey; one that the excitation never swept is hatched: a density there
+    does not come from the data.
 
     Parameters
     ----------
@@ -69,7 +69,10 @@ def _draw_density(
     flat = values.size > _MOST_CELLS
     style: dict[str, Any] = {"rasterized": flat, "edgecolors": "none"}
     levels = density.levels
-    zero = np.ma.masked_where(~(values == 0.0), values)
+    is_zero = values == 0.0
+    if swept is not None:
+        is_zero[np.tril_indices(len(values))] &= swept
+    zero = np.ma.masked_where(~is_zero, values)
     if not zero.mask.all():
         axes.pcolormesh(levels, levels, zero, cmap=ListedColormap([_ZERO]), **style)
     image = axes.pcolormesh(
@@ -83,7 +86,7 @@ def _draw_density(
     )
     notes = [] if zero.mask.all() else ["light grey: zero"]
     if swept is not None and not swept.all():
-        _hatch(axes, levels, ~swept[: np.tril_indices(len(values))[0].size], len(values))
+        _hatch(axes, levels, ~swept, len(values))
         notes.append(f"hatched: never swept ({np.mean(~swept):.0%})")
     _frame_plane(axes, density)
     axes.figure.colorbar(image, ax=axes, label=with_unit(label, unit))
@@ -98,7 +101,7 @@ def _hatch(axes: Axes, levels: Floats, unknown: npt.NDArray[np.bool_], size: int
     left, right, low, high = levels[columns], levels[columns + 1], levels[rows], levels[rows + 1]
     corners = np.stack([np.stack(pair, 1) for pair in ((left, low), (right, low), (right, high), (left, high))], 1)
     axes.add_collection(
-        PolyCollection(list(corners), facecolors="white", edgecolors="#9a9a9a", linewidths=0.0, hatch="////")
+        PolyCollection(list(corners), facecolors="none", edgecolors="#9a9a9a", linewidths=0.0, hatch="////")
     )
 
 

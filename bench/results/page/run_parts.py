@@ -315,6 +315,8 @@ def _count(number: int, noun: str) -> str:
 def _plain(value: Any) -> str:  # noqa: ANN401 - anything that JSON can hold
     if isinstance(value, bool):
         return "yes" if value else "no"
+    if value is None:
+        return "none"
     if isinstance(value, float):
         return f"{value:g}"
     if isinstance(value, list):

@@ -14,7 +14,7 @@ from short_runs import all_messages
 
 from bench.clock import VirtualClock
 from bench.engine import check_before_moving
-from bench.errors import ConfigurationError, DataError
+from bench.errors import ConfigurationError, ConvergenceError, DataError
 from bench.hysteresis import Polynomial, PrandtlIshlinskii
 from bench.journal import Record
 from bench.model_file import ModelFile
@@ -453,6 +453,31 @@ class TestRuns:
         assert samples.times[-1] == pytest.approx(REST + 10.0 + 5.0 + approach, abs=0.1)
         # The model is made up; with a measured one it is 20 nm.
         assert np.abs(samples[WITNESS] - samples["reference"]).max() < 500e-9
+
+    @pytest.mark.parametrize(("known", "status"), [("0", "failed"), ("0.02", "completed")])
+    def test_a_lateness_that_the_controller_does_not_know_ends_the_run(self, files, tmp_path, known, status):
+        run = Run(
+            protocol=find_protocol("hybrid-control"), rig=PLAIN, seed=1,
+            settings={"model": str(files["hybrid"]), "reference": "hold", "hold": "1", "lateness": known},
+            overrides={"emulation.displacement_sensor.latency": "0.02"}, folder=tmp_path, clock="virtual",
+            recording=False,
+        )  # fmt: skip
+        outcome = carry_out(run, Console(file=io.StringIO(), width=200)).outcome
+        assert (outcome.status, outcome.is_safe) == (status, True)
+        if status == "failed":
+            assert "the deflection answers the piezo part 20 ms late" in outcome.reason
+
+    @pytest.mark.parametrize("late", ["lag", "latency"])
+    def test_a_fine_step_with_a_sensor_that_is_late_ends_with_a_message(self, files, tmp_path, late):
+        run = Run(
+            protocol=find_protocol("fine-step"), settings={"model": str(files["hybrid"])}, rig=PLAIN, seed=1,
+            overrides={f"emulation.displacement_sensor.{late}": "1e-3"}, folder=tmp_path, clock="virtual",
+            recording=False,
+        )  # fmt: skip
+        outcome = carry_out(run, Console(file=io.StringIO(), width=200)).outcome
+        assert (outcome.status, outcome.is_safe) == ("failed", True)
+        assert isinstance(outcome.error, ConvergenceError)
+        assert "the sensor lags or the line delays" in outcome.reason
 
     @pytest.mark.parametrize("step", [5e-6, -3e-6])
     def test_a_fine_step_has_every_sample(self, files, tmp_path, step):

@@ -4,17 +4,25 @@ import numpy as np
 import pytest
 
 from bench.clock import VirtualClock
-from rigs.muscles.laboratory import LOAD, STAGE, ForceCourse, SMALaboratory, SMALaboratorySettings
+from rigs.muscles.laboratory import (
+    LOAD,
+    STAGE,
+    CoiledPolymerLaboratory,
+    ForceCourse,
+    McKibbenLaboratory,
+    SMALaboratory,
+)
 
+LABORATORIES = (SMALaboratory, McKibbenLaboratory, CoiledPolymerLaboratory)
 FAULTS = ("force.drifting", "force.noisy", "force.stuck", "broken-muscle", "load_cell.freeze")
 WEIGHT, FILTER = 0x3500, 0x2106
 
 
-def readings(seed, steps=120):
+def readings(kind, seed, steps=120):
     """Return what a script of random acts, at random instants, reads of weight and status."""
     script = np.random.default_rng(seed)
     clock = VirtualClock()
-    laboratory = SMALaboratory(SMALaboratorySettings(), clock, seed)
+    laboratory = kind(kind.Settings(), clock, seed)
     cell = laboratory.load_cell
     read = []
     laboratory.operate(LOAD, 4.9)
@@ -45,18 +53,20 @@ def readings(seed, steps=120):
     return read
 
 
+@pytest.mark.parametrize("kind", LABORATORIES)
 @pytest.mark.parametrize("seed", range(4))
-def test_conversions_that_wait_are_those_made_at_their_instants(seed, monkeypatch):
-    waited = readings(seed)
+def test_conversions_that_wait_are_those_made_at_their_instants(kind, seed, monkeypatch):
+    waited = readings(kind, seed)
     monkeypatch.setattr(ForceCourse, "is_known", property(lambda _: False))
-    assert readings(seed) == waited
+    assert readings(kind, seed) == waited
     assert len({row[1:] for row in waited}) > 10
 
 
-def test_many_readings_of_others_lose_none(monkeypatch):
+@pytest.mark.parametrize("kind", LABORATORIES)
+def test_many_readings_of_others_lose_none(kind, monkeypatch):
     def weights():
         clock = VirtualClock()
-        laboratory = SMALaboratory(SMALaboratorySettings(), clock, 1)
+        laboratory = kind(kind.Settings(), clock, 1)
         laboratory.operate(LOAD, 4.9)
         read = []
         for number in range(1500):

@@ -12,8 +12,8 @@ from bench.results.run_folder import RunFolder
 
 CREEP = ["--set", "hot=70", "--set", "cool=50", "--set", "duration=10"]
 PATIENT = ["--override", "devices.tec.watchdog=300", "--override", "devices.tec.timeout=10",
-           "--override", "devices.psd.timeout=30"]  # fmt: skip
-"""A busy machine keeps the client waiting by the wall clock."""
+           "--override", "devices.psd.timeout=30", "--no-rehearse"]  # fmt: skip
+"""A busy machine keeps the client waiting by the wall clock; a rehearsal is not what is tested."""
 
 
 def readings(folder):
@@ -27,7 +27,9 @@ def test_creep_gives_what_it_gives_in_process(bench, emulate, tmp_path):
     with emulate("vo2", "--clock", "x10"):
         ports = tmp_path / "endpoints.json"
         served, inside = tmp_path / "served", tmp_path / "inside"
-        code, out, err = bench("run", "creep", "--rig", "vo2", "--attach", ports, *CREEP, *PATIENT, "--out", served)
+        code, out, err = bench(
+            "run", "creep", "--rig", "vo2", "--attach", ports, "--no-rehearse", *CREEP, *PATIENT, "--out", served
+        )
         assert (code, err) == (0, "")
         assert "completed: 43 steps" in out
     assert bench("run", "creep", "--rig", "vo2", "--clock", "virtual", *CREEP, "--out", inside)[0] == 0
@@ -46,7 +48,8 @@ def test_creep_gives_what_it_gives_in_process(bench, emulate, tmp_path):
 def test_a_prompt_is_carried_out_by_the_server(bench, emulate, tmp_path):
     with emulate("sma", "--clock", "x10"):
         code, _, err = bench(
-            "run", "creep", "--rig", "sma", "--attach", tmp_path / "endpoints.json", "--out", tmp_path / "runs",
+            "run", "creep", "--rig", "sma", "--attach", tmp_path / "endpoints.json", "--no-rehearse",
+            "--out", tmp_path / "runs",
             "--set", "load=4.9", "--set", "hot=1", "--set", "cool=0", "--set", "duration=1", "--set", "settling=0",
             "--override", "devices.stage.watchdog=0", "--override", "devices.fan.watchdog=100",
         )  # fmt: skip
@@ -86,7 +89,8 @@ def test_a_schedule_of_faults_happens_in_the_server_and_stands_in_its_log(bench,
 def test_a_run_ends_when_its_server_is_killed(emulate, tmp_path):
     with emulate("vo2", "--clock", "x10") as (server, endpoints):
         command = [sys.executable, "-P", "-m", "bench", "run", "creep", "--rig", "vo2", "--set", "duration=3000",
-                   "--attach", str(tmp_path / "endpoints.json"), "--out", str(tmp_path / "runs")]  # fmt: skip
+                   "--attach", str(tmp_path / "endpoints.json"), "--no-rehearse",
+                   "--out", str(tmp_path / "runs")]  # fmt: skip
         run = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
         with ControlClient(endpoints["control"]) as control:
             while not control.state()["tec_output"]:

@@ -1,0 +1,132 @@
+"""The bounds of signals: limits of set-points, interlocks and warnings, drawn where the data come near."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import rerun as rr
+
+from bench.dashboard.drawing import ALARM, CAUTION, LIMIT, Colour
+from bench.dashboard.recording import Floats, Recording, times
+from bench.devices import Signal
+from bench.interlocks import SETPOINT, Interlock, Level
+
+_NEAR = 1.0
+"""Spans of the data within which a bound is drawn over time; one that is farther away would flatten them."""
+
+_LAG = 0.01
+"""Part of the time shown by which the end of a drawn bound may stay behind the data."""
+
+
+@dataclass(frozen=True)
+class Bound:
+    """What a signal may not pass.
+
+    Attributes
+    ----------
+    column : int
+        The signal's.
+    value : float
+        In its unit.
+    is_high : bool
+        Whether the signal has to stay below.
+    span : float
+        Distance to the bound on the other side, or the size of the value where there is none; the signal's unit.
+    name : str
+        Signal and value, in words.
+    kind : str
+        `limit` of a set-point, `interlock`, or `warning`, for legends.
+    colour : Colour
+        Red where an interlock acts, amber for a warning, violet for the limit of a set-point.
+    """
+
+    column: int
+    value: float
+    is_high: bool
+    span: float
+    name: str
+    kind: str
+    colour: Colour
+
+    def margin(self, value: float) -> float:
+        """Return how far a value is from the bound, in its unit; negative beyond it."""
+        return self.value - value if self.is_high else value - self.value
+
+
+def bounds_of(meta: Mapping[str, Any], signals: Sequence[Signal]) -> tuple[Bound, ...]:
+    """Return the bounds that the metadata of a run know of."""
+    columns = {signal.name: i for i, signal in enumerate(signals)}
+    found: list[Bound] = []
+    for device, (low, high) in (meta.get("limits") or {}).items():
+        if (column := columns.get(f"{device}{SETPOINT}")) is not None:
+            found += _pair(column, signals[column], low, high, "limit", LIMIT)
+    for table in (meta.get("rig_content") or {}).get("interlocks", ()):
+        interlock = Interlock.model_validate(table)
+        if interlock.minus or (column := columns.get(interlock.signal)) is None:
+            continue
+        kind, colour = ("warning", CAUTION) if interlock.level is Level.WARN else ("interlock", ALARM)
+        found += _pair(column, signals[column], interlock.low, interlock.high, kind, colour)
+        found += _pair(column, signals[column], *interlock.unwarned, "warning", CAUTION)
+    return tuple(found)
+
+
+def _pair(column: int, signal: Signal, low: float, high: float, kind: str, colour: Colour) -> Iterator[Bound]:
+    for value, is_high in ((low, False), (high, True)):
+        if math.isfinite(value):
+            span = high - low if math.isfinite(high - low) else abs(value) or 1.0
+            name = f"{signal.name} {'<' if is_high else '>'} {value:g} {signal.unit}"
+            yield Bound(column, value, is_high, span, name, kind, colour)
+
+
+def nearest(bounds: Sequence[Bound], values: Sequence[float]) -> Bound | None:
+    """Return the interlock's bound that values are nearest to, in parts of its span; None if there is none."""
+    known = [bound for bound in bounds if bound.kind == "interlock" and math.isfinite(values[bound.column])]
+    return min(known, key=lambda bound: bound.margin(values[bound.column]) / bound.span, default=None)
+
+
+class BoundLines:
+    """Draws the bounds of some signals over time, as lines below the entity `path`, once the data are near.
+
+    Parameters
+    ----------
+    path : str
+        Of the plot.
+    bounds : sequence of Bound
+        Of the signals in the plot.
+    factor : float
+        From their unit to that of the plot.
+    """
+
+    def __init__(self, path: str, bounds: Sequence[Bound], factor: float) -> None:
+        self._path, self._factor = path, factor
+        # The same for several signals, such as a set-point and its reading, is one line.
+        self._bounds = list({(bound.value, bound.colour): bound for bound in bounds}.values())
+        self._low, self._high = math.inf, -math.inf
+        self._since: float | None = None
+        self._drawn: dict[int, float] = {}
+
+    def write(self, recording: Recording, t: Sequence[float], step: Sequence[int], values: Floats) -> None:
+        """Draw what is near to values, shape (times, signals), in the unit of the signals."""
+        if not self._bounds or not np.isfinite(values).any():
+            return
+        since = self._since = t[0] if self._since is None else self._since
+        self._low, self._high = min(self._low, np.nanmin(values)), max(self._high, np.nanmax(values))
+        reach = _NEAR * (self._high - self._low)
+        for i, bound in enumerate(self._bounds):
+            path = f"{self._path}/bounds/{i}"
+            if i not in self._drawn:
+                if not self._low - reach <= bound.value <= self._high + reach or reach == 0.0:
+                    continue
+                recording.log(path, rr.SeriesLines(names=bound.kind, colors=bound.colour, widths=1.0))
+                self._line(recording, path, since, 0, bound)
+                self._drawn[i] = since
+            if t[-1] - self._drawn[i] > _LAG * (t[-1] - since):
+                self._line(recording, path, float(t[-1]), step[-1], bound)
+                self._drawn[i] = float(t[-1])
+
+    def _line(self, recording: Recording, path: str, t: float, step: int, bound: Bound) -> None:
+        recording.send_vectors(path, times([t], [step]), np.array([[self._factor * bound.value]]))

@@ -1,0 +1,84 @@
+"""The memory curves on the planes: driven by a signal, or by what only a model knows of the readings."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, cast
+
+from bench.dashboard.entries import ModelDensity
+from bench.devices import Signal
+from bench.hysteresis import MemoryCurve
+from bench.hysteresis.two_stage import Coupled
+from bench.interlocks import SETPOINT
+
+
+class SignalMemory:
+    """The memory curve of a signal, in a column of the values."""
+
+    def __init__(self, column: int) -> None:
+        self._column = column
+        self.curve: MemoryCurve | None = None
+        """None before the first reading."""
+
+    def see(self, values: Sequence[float]) -> None:
+        """Let the signal move the memory."""
+        x = values[self._column]
+        if math.isfinite(x):
+            self.curve = self.curve.step(x) if self.curve else MemoryCurve.from_negative_saturation(x)
+
+
+class StageMemory:
+    """The memory curve of the second stage of a model, whose input is no signal: the model follows the readings.
+
+    Parameters
+    ----------
+    model : Coupled
+        Of voltage and force; starts as after a reset.
+    columns : tuple of int
+        Columns of its voltage and its force.
+    """
+
+    def __init__(self, model: Coupled[Any], columns: tuple[int, int]) -> None:
+        self._model, self._columns = model, columns
+        self._state: Any = model.initial_state()
+        self.curve: MemoryCurve | None = None
+        """None before the first reading, and for operators without one."""
+
+    def see(self, values: Sequence[float]) -> None:
+        """Let the model follow a reading."""
+        voltage, force = (values[column] for column in self._columns)
+        if math.isfinite(voltage) and math.isfinite(force):
+            self._state, _ = self._model.step(self._state, voltage, force)
+            second = getattr(self._state, "second", None)
+            self.curve = second if isinstance(second, MemoryCurve) else None
+
+
+def memory_of(model: ModelDensity, signals: Sequence[Signal], drive: int) -> SignalMemory | StageMemory | None:
+    """Return what follows the memory on the plane of a density that is not over the first input; None if nothing can.
+
+    Parameters
+    ----------
+    model : ModelDensity
+        The density.
+    signals : sequence of Signal
+        What is measured.
+    drive : int
+        Column of the first input.
+    """
+
+    def column(unit: str) -> int | None:
+        if signals[drive].unit == unit:
+            return drive
+        return next((i for i, s in enumerate(signals) if s.unit == unit and not s.name.endswith(SETPOINT)), None)
+
+    if model.density.measured:
+        found = column(model.density.unit)
+        return None if found is None else SignalMemory(found)
+    # A model of several stages has a force beside its voltage.
+    if getattr(model.model, "force_unit", None) is not None:
+        stages = cast("Coupled[Any]", model.model)
+        voltage, force = column(stages.voltage_unit), column(stages.force_unit)
+        if voltage is not None and force is not None:
+            return StageMemory(stages, (voltage, force))
+    return None

@@ -1,0 +1,170 @@
+"""The panel of big numbers: phase, output, error, margin to the nearest interlock, and when the run ends."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import datetime, timedelta
+from typing import Any
+
+import rerun as rr
+
+from bench.dashboard.bounds import Bound, nearest
+from bench.dashboard.control import Errors
+from bench.dashboard.entries import End, Entry, Tick
+from bench.dashboard.recording import Recording, times
+from bench.dashboard.signal_plots import likely_magnitude
+from bench.devices import Signal
+from bench.journal import Event, StepRecord, expected_steps
+from bench.remaining_time import Expectation
+from bench.units import fitting_prefix, format_duration, format_numbers
+
+_SHORT = 10.0
+"""Durations below are shown in s."""
+
+LIVE_SECONDS = 1.0
+FILE_SECONDS = 10.0
+"""Laboratory time between two panels for viewers, and in the file."""
+
+
+class Numbers:
+    """Writes the panel of numbers at the entity `numbers`.
+
+    Parameters
+    ----------
+    meta : mapping
+        The run's metadata.
+    signals : sequence of Signal
+        What is measured.
+    shown : sequence of int
+        Columns of the signals whose values are shown, the most important first.
+    bounds : sequence of Bound
+        Of the signals.
+    errors : Errors or None
+        Of a run under control.
+    """
+
+    def __init__(
+        self,
+        meta: Mapping[str, Any],
+        signals: Sequence[Signal],
+        shown: Sequence[int],
+        bounds: Sequence[Bound],
+        errors: Errors | None,
+    ) -> None:
+        self._signals, self._shown, self._bounds, self._errors = signals, shown, bounds, errors
+        self._epoch = datetime.fromisoformat(meta["epoch"]) if meta.get("epoch") else None
+        self._is_dated = meta.get("clock") == "wall"
+        self._steps_expected = expected_steps(meta)
+        self._expected = _expectation(meta)
+        self._state, self._phase, self._steps, self._reason = "running", "", 0, ""
+        self._values: Sequence[float] = ()
+        self._t, self._step = 0.0, 0
+        self.interval = FILE_SECONDS
+        """Laboratory time between two panels, s."""
+        self._last = -math.inf
+        self._pending: list[tuple[float, int, str]] = []
+
+    @property
+    def state(self) -> str:
+        """What the run is doing, or how it ended."""
+        return self._state
+
+    def see(self, entry: Entry) -> None:
+        """Take an entry into account, and keep the panel of its time where it is due."""
+        if isinstance(entry, Tick):
+            self._t, self._step, self._values = entry
+        elif isinstance(entry, StepRecord):
+            self._t, self._step, self._values = entry.finished, entry.step, entry.values
+            self._steps = entry.step + 1
+        elif isinstance(entry, Event):
+            self._t = max(self._t, entry.t)
+            if entry.kind == "phase":
+                self._phase = entry.text
+            elif entry.kind in ("pause", "resume"):
+                self._state = "paused" if entry.kind == "pause" else "running"
+        elif isinstance(entry, End):
+            self._state, self._reason = entry.status, entry.reason
+            self._last = -math.inf
+        else:
+            return
+        if self._t - self._last >= self.interval:
+            self._last = self._t
+            self._pending.append((self._t, self._step, self._text()))
+
+    def write(self, recording: Recording) -> None:
+        """Write the panels that were kept."""
+        if self._pending:
+            t, step, text = zip(*self._pending, strict=True)
+            columns = rr.TextDocument.columns(text=text, media_type=[rr.MediaType.MARKDOWN] * len(text))
+            recording.send("numbers", times(t, step), columns)
+            self._pending.clear()
+
+    def _text(self) -> str:
+        done = f"step {self._steps}" + (f" of {self._steps_expected}" if self._steps_expected else "")
+        is_over = self._state not in ("running", "paused")
+        lines = [f"# {self._state if is_over or self._state == 'paused' else self._phase or self._state}"]
+        phase = [self._phase] if is_over and self._phase else []
+        lines.append(" · ".join([*phase, done, _duration(self._t)]))
+        if self._reason:
+            lines.append(self._reason)
+        for name, number in self._numbers():
+            lines += [f"# {number}", name]
+        lines.append("---")
+        lines += [f"**{value}** {name}" for name, value in self._rest(is_over=is_over)]
+        return "\n\n".join(lines)
+
+    def _numbers(self) -> Iterator[tuple[str, str]]:
+        if not self._values:
+            return
+        for column in self._shown:
+            yield self._signals[column].name, self._show(self._values[column], column)
+        if self._errors is not None and math.isfinite(self._errors.now):
+            column = self._errors.output
+            unit = self._signals[column].unit
+            yield f"error now, target {self._show(self._errors.target, column)}", _small(self._errors.now, unit)
+            name, rms = self._errors.rms()
+            yield name, _small(rms, unit)
+
+    def _rest(self, *, is_over: bool) -> Iterator[tuple[str, str]]:
+        if self._values and (bound := nearest(self._bounds, self._values)) is not None:
+            margin = bound.margin(self._values[bound.column])
+            yield f"to the interlock {bound.name}", self._show(margin, bound.column)
+        if is_over:
+            yield "in all", _duration(self._t)
+        elif self._expected is not None:
+            left = max(self._expected.seconds - self._expected.end_of(self._steps), 0.0)
+            at = max(self._expected.seconds - self._t, 0.0) if self._steps == 0 else left
+            yield "left", format_duration(at)
+            if self._epoch is not None and self._is_dated:
+                end = self._epoch + timedelta(seconds=self._t + at)
+                yield "end", end.astimezone().strftime("%a %H:%M")
+
+    def _show(self, value: float, column: int) -> str:
+        signal = self._signals[column]
+        if not math.isfinite(value):
+            return "–"
+        # Near zero with the prefix of what is usual, not with one of its own.
+        number, unit = format_numbers([value, likely_magnitude(signal)], signal.unit, signal.precision)[::2]
+        return f"{number} {unit}".rstrip().replace("-", "−")
+
+
+def _small(value: float, unit: str) -> str:
+    """Return an error with its unit, to three digits."""
+    factor, shown = fitting_prefix(unit, value)
+    return f"{f'{factor * value:#.3g}'.removesuffix('.')} {shown}".replace("-", "−")
+
+
+def _duration(seconds: float) -> str:
+    return format_duration(seconds) if seconds >= _SHORT else f"{seconds:.3g} s"
+
+
+def _expectation(meta: Mapping[str, Any]) -> Expectation | None:
+    """Return when the steps of a run end, as it was rehearsed or planned; None if that is not known."""
+    rehearsal, plan = meta.get("rehearsal"), meta.get("plan") or {}
+    if rehearsal:
+        marks = tuple((int(steps), float(seconds)) for steps, seconds in rehearsal["marks"])
+        return Expectation(marks, float(rehearsal["seconds"]))
+    if plan.get("complete") and plan.get("steps"):
+        return Expectation(((int(plan["steps"]), float(plan["seconds"])),), float(plan["seconds"]))
+    return None

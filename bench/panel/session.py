@@ -1,0 +1,70 @@
+"""Hands on a rig, as a run: with its lock, limits, interlocks, journal and safe state."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from pathlib import Path
+
+from rich.console import Console
+
+from bench.desk import Desk
+from bench.interrupts import Interrupts
+from bench.protocol import Messages, ProtocolDefinition, ProtocolParameters, protocol
+from bench.protocol.vocabulary import ByHand
+from bench.runs import Run, RunResult, carry_out
+
+
+class _Log(io.StringIO):
+    """Takes what a run prints for the log of the panel."""
+
+    def __init__(self, desk: Desk) -> None:
+        super().__init__()
+        self._desk = desk
+
+    def write(self, text: str) -> int:
+        for line in text.splitlines():
+            if line.strip():
+                self._desk.say(line.rstrip())
+        return len(text)
+
+
+def protocol_of(desk: Desk) -> ProtocolDefinition:
+    """Return the protocol that takes the commands of a desk."""
+
+    @protocol(needs=())
+    def by_hand(parameters: ProtocolParameters) -> Messages:  # noqa: ARG001 - of this form
+        """Let an operator move the rig by hand."""
+        yield ByHand(desk=desk)
+
+    return by_hand
+
+
+def carry_out_by_hand(
+    desk: Desk,
+    *,
+    rig: str,
+    overrides: Mapping[str, str],
+    seed: int,
+    clock: str,
+    attach: Path | None,
+    folder: Path,
+    interrupts: Interrupts,
+) -> RunResult:
+    """Connect a rig, carry the commands of a desk out, and leave every device in its safe state.
+
+    Raises what `bench.runs.carry_out` does before anything moves.
+    """
+    run = Run(
+        protocol=protocol_of(desk),
+        settings={},
+        rig=rig,
+        folder=folder,
+        overrides=overrides,
+        seed=seed,
+        clock=clock,
+        recording=False,
+        attach=attach,
+        rehearse=False,
+    )
+    return carry_out(run, Console(file=_Log(desk), width=200), interrupts)

@@ -1,0 +1,125 @@
+"""`bench panel` at a terminal, in front of instruments in another process, whose own state is looked at."""
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+from benches import is_on, seconds_until
+
+from bench.journal import Record
+from bench.locks import Holder, Locks
+from bench.rig_file import load_rig
+
+pexpect = pytest.importorskip("pexpect")
+pytest.importorskip("textual")
+
+pytestmark = [
+    pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="terminals of POSIX"),
+    pytest.mark.timeout(240),
+]
+
+
+@pytest.fixture
+def panel(vo2, tmp_path):
+    """Start the panel of the served rig, or of a copy of its file."""
+    started = []
+
+    def begin(rig="vo2"):
+        arguments = ["-m", "bench", "panel", str(rig), "--attach", str(vo2.endpoints_file), "--out", str(tmp_path)]
+        child = pexpect.spawn(
+            sys.executable,
+            arguments,
+            env={**os.environ, "TERM": "xterm"},
+            encoding="utf-8",
+            timeout=90,
+            dimensions=(40, 150),
+        )
+        started.append(child)
+        return child
+
+    yield begin
+    for child in started:
+        child.close(force=True)
+
+
+def record_in(folder):
+    (run,) = (each for each in folder.iterdir() if each.is_dir())
+    return Record(run)
+
+
+def exit_code(child):
+    child.expect(pexpect.EOF)
+    child.close()
+    return child.exitstatus
+
+
+def temperature(vo2):
+    return vo2.control.state()["plate_temperature"]
+
+
+def test_set_40_degrees_then_the_terminal_hangs_up(panel, vo2, tmp_path):
+    child = panel()
+    child.expect("tec_temperature")
+    child.send("set tec 40\r")
+    seconds_until(lambda: is_on(vo2) and temperature(vo2) > 39.0)
+    # As a closed window does, and nothing more: no signal of pexpect's own.
+    child.ptyproc.fileobj.close()
+    child.ptyproc.closed = child.closed = True
+    seconds_until(lambda: not is_on(vo2))
+    seconds_until(lambda: not child.isalive())
+
+    def ended():
+        with record_in(tmp_path) as record:
+            return record.status == "aborted"
+
+    seconds_until(ended)
+    with record_in(tmp_path) as record:
+        assert record.meta["reason"] == "ended by SIGHUP"
+        assert set(record.meta["safe_state"].values()) == {"safe"}
+        assert [dict(each.setpoints) for each in record.step_records()] == [{"tec": 40.0}]
+
+
+def test_an_interlock_trips_and_is_said(panel, vo2, tmp_path):
+    file = tmp_path / "vo2.toml"
+    file.write_text(load_rig("vo2").text.replace("high = 100.0", "high = 45.0"), encoding="utf-8")
+    child = panel(file)
+    child.expect("tec_temperature")
+    child.send("set tec 60\r")
+    child.expect("over: failed: interlock")
+    assert not is_on(vo2)
+    child.send("quit\r")
+    child.expect("outside of 5 to 45 °C")
+    assert exit_code(child) == 5
+    with record_in(tmp_path) as record:
+        assert [each.level for each in record.events() if each.kind == "warning"] == ["WARN"]
+
+
+def test_ctrl_c_leaves_in_the_safe_state(panel, vo2):
+    child = panel()
+    child.expect("tec_temperature")
+    child.send("set tec 40\r")
+    seconds_until(lambda: is_on(vo2))
+    child.send("\x03")
+    child.expect("completed: 2 steps")
+    assert exit_code(child) == 0
+    assert not is_on(vo2)
+
+
+def test_a_rig_in_use_is_one_message(vo2, tmp_path):
+    holder = Holder.of_this_process("vo2", "a test that is at work")
+    with Locks(holder) as locks:
+        locks.take_lines(endpoint.port for endpoint in vo2.instruments.values())
+        done = subprocess.run(
+            [sys.executable, "-m", "bench", "panel", "vo2", "--attach", vo2.endpoints_file, "--out", tmp_path],
+            capture_output=True,
+            text=True,
+            timeout=120,
+            check=False,
+        )
+    assert done.returncode == 2
+    assert not done.stdout
+    (message,) = done.stderr.strip().splitlines()
+    assert "a test that is at work" in message
+    assert not [*tmp_path.iterdir()]
