@@ -45,7 +45,7 @@ def task_of(file: ModelFile, controller: str, protocol: str | None) -> Task:
 
     Raises ConfigurationError if the protocol has no such controllers.
     """
-    offered = ("length-control", "force-control") if isinstance(file.model, TwoStage) else ("tracking",)
+    offered = ("length-control", "force-control") if file.model.kind == TwoStage.kind else ("tracking",)
     chosen = protocol or offered[0]
     if chosen not in offered:
         raise ConfigurationError(f"--protocol {chosen}: a model {file.name} is controlled by {' or '.join(offered)}")

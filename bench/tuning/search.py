@@ -75,7 +75,7 @@ def perturbed_models(file: ModelFile) -> dict[str, ModelFile]:
 
 
 def _scaled(model: Any, gain: float) -> Any:  # noqa: ANN401 - a model of the kind of the first
-    if isinstance(model, TwoStage):
+    if model.kind == TwoStage.kind:
         return replace(model, second=_scaled(model.second, gain))
     assert isinstance(model, Operator)
     low, high = model.output_range()

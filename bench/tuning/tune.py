@@ -113,7 +113,7 @@ def tune(
         if not equals:
             raise ConfigurationError(f"--set {setting}: expected KEY=VALUE")
         given[key] = value
-    low, high = file.model.first.input_range if isinstance(file.model, TwoStage) else file.operator.input_range
+    low, high = file.model.first.input_range if file.model.kind == TwoStage.kind else file.operator.input_range
     setup = ControllerSetup(
         name=controller, model=file, limits=(low, high), options={"duration": float(given.get("duration", 20.0))}
     )
