@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from bench.control.dynamics import IdentifiedDynamics
 from bench.controllers import ControllerSetup, controller_names, make_controller
 from bench.hysteresis import Polynomial, Preisach, QuadraticTerm, Reach, uniform_levels
 from bench.model_file import ModelFile
@@ -58,7 +59,8 @@ def test_a_reference_is_followed_as_with_the_opposite_output(name):
     reference = 0.5 * (low + high) + 0.3 * (high - low) * np.sin(2.0 * np.pi * times / 100.0)
     for sign in (1, -1):
         plant = actuator(sign)
-        controller = make_controller("follow", name, ControllerSetup(model=ModelFile("m", plant), limits=LIMITS))
+        model = ModelFile("m", plant, dynamics=IdentifiedDynamics())
+        controller = make_controller("follow", name, ControllerSetup(model=model, limits=LIMITS))
         state, rows = plant.initial_state(), []
         for t, wanted in zip(times.tolist(), reference.tolist(), strict=True):
             output = plant.value(state) + sign * 0.05
