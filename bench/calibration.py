@@ -8,8 +8,8 @@ derived signal, whose value is the calibrated one::
 
     [derived.displacement]
     kind = "calibrated"
-    source = "displacement_position"
-    calibration = "displacement.json"   # beside the rig file
+    source = "probe_position"
+    calibration = "probe.json"   # beside the rig file
 
 Sources: JCGM 100:2008 (GUM), 4 and 5, for uncertainties; JCGM 200:2012 (VIM), 2.13 accuracy, 2.21 repeatability, 2.39
 calibration.

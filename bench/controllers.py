@@ -123,6 +123,10 @@ class ControllerSpec:
     summary: str
     make: Callable[[ControllerSetup], Any]
     adapts: bool = False
+    numbers: Callable[[ControllerSetup], Any] | None = None
+    """Returns the numbers of the controller, a dataclass, for `bench tune`."""
+    tunable: tuple[str, ...] = ()
+    """Those of them that it may change, all positive; one of a table as `TABLE.NAME`."""
 
 
 def controller_names(task: str) -> tuple[str, ...]:
@@ -141,17 +145,26 @@ def make_controller(task: str, name: str, setup: ControllerSetup) -> Any:  # noq
     DataError
         If the model is not of the kind that the controller needs.
     """
-    if name not in controller_names(task):
-        known = ", ".join(controller_names(task)) or "none"
-        raise ConfigurationError(f"there is no controller {name!r} for the task {task}; there are: {known}")
-    spec = registry.load("controllers", f"{task}.{name}")
+    spec = controller_spec(task, name)
     if setup.adaptation != "off" and not spec.adapts:
-        others = [each for each in controller_names(task) if registry.load("controllers", f"{task}.{each}").adapts]
+        others = [each for each in controller_names(task) if controller_spec(task, each).adapts]
         raise ConfigurationError(
             f"controller {name} does not adapt a model (adaptation = {setup.adaptation}); these do: "
             f"{', '.join(others) or 'none'}"
         )
     return spec.make(replace(setup, name=name))
+
+
+def controller_spec(task: str, name: str) -> ControllerSpec:
+    """Return the entry of a controller.
+
+    Raises ConfigurationError if there is none of this name for the task.
+    """
+    if name not in controller_names(task):
+        known = ", ".join(controller_names(task)) or "none"
+        raise ConfigurationError(f"there is no controller {name!r} for the task {task}; there are: {known}")
+    spec: ControllerSpec = registry.load("controllers", f"{task}.{name}")
+    return spec
 
 
 Fallback = Literal["none", "open-loop"]
@@ -261,6 +274,8 @@ OPEN_LOOP_INVERSE = ControllerSpec(
     "the inverse of the model, without feedback",
     lambda s: OpenLoopInverse(s.inverse(), s.start, s.limits, wait=_wait(s), adaptation=s.model_filter()),
     adapts=True,
+    numbers=lambda _: _Settling(),
+    tunable=("wait",),
 )
 CLOSED_LOOP_INVERSE = ControllerSpec(
     "the inverse of the model, corrected by the measured disturbance",
@@ -268,10 +283,22 @@ CLOSED_LOOP_INVERSE = ControllerSpec(
         s.inverse(), s.start, s.limits, s.tuned(CorrectionParameters.scaled), s.model_filter()
     ),
     adapts=True,
+    numbers=lambda s: CorrectionParameters.scaled(s.spans),
+    tunable=("close_enough", "walk_variance", "arrival.tolerance", "arrival.hold"),
 )
-LATCHED = ControllerSpec("backs off at the target, where the hysteresis holds the output", _latched)
+LATCHED = ControllerSpec(
+    "backs off at the target, where the hysteresis holds the output",
+    _latched,
+    numbers=lambda s: LatchParameters.scaled(s.spans),
+    tunable=("approach", "creep_gain", "creep_until", "fine_period"),
+)
 POLYNOMIAL = ControllerSpec("the look-up table of a model without memory", _look_up)
-INTEGRAL = ControllerSpec("integral action without a model", lambda s: IntegralControl(s.limits, _integral(s)))
+INTEGRAL = ControllerSpec(
+    "integral action without a model",
+    lambda s: IntegralControl(s.limits, _integral(s)),
+    numbers=lambda s: _integral(replace(s, options={})),
+    tunable=("gain", "period"),
+)
 OPEN_LOOP_FOLLOWER = ControllerSpec(
     "the inverse of the model, without feedback",
     lambda s: OpenLoopFollower(s.inverse(), s.start, s.limits, s.tuned(FollowingParameters.scaled), s.model_filter()),

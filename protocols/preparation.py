@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Generator, Mapping
-from typing import Any, TypeAlias, TypeVar
+from typing import TypeAlias, TypeVar
 
 from bench.controllers import load_model_for, saturated_below
 from bench.devices import Actuator, Signal
@@ -24,6 +24,7 @@ from bench.protocol import (
     parameter,
     unit_of,
 )
+from bench.tuning_file import Tuning
 
 DRIVE_AND_RESPONSE: Mapping[str, type[Actuator] | type[Signal]] = {"drive": Actuator, "response": Signal}
 """What a characterization needs of a rig."""
@@ -80,8 +81,10 @@ class ControlledParameters(LoadedParameters):
     model: str = parameter(..., unit="", help="model file, as `bench identify` writes it", file=True)
     reset: float = parameter(from_slot("drive", "saturating"), unit=DRIVE, help="where the memory is reset")
     hottest: float = parameter(from_slot("drive", "high"), unit=DRIVE, help="highest set-point allowed")
-    tuning: dict[str, dict[str, Any]] = parameter(
-        {}, unit="", help="numbers of a controller in place of its defaults, as a table of the rig file for each"
+    tuning: Tuning = parameter(
+        {},
+        unit="",
+        help="numbers of controllers in place of their defaults: a tuning file, or tables of the rig file",
     )
 
 

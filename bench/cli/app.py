@@ -35,6 +35,7 @@ from bench.cli import (
     resume,
     run_list,
     runs,
+    tune,
     twin,
     upkeep,
     watch,
@@ -71,6 +72,7 @@ _PARTS = (
     watch.app,
     journals.app,
     twin.app,
+    tune.app,
     new.app,
 )
 

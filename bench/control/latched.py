@@ -22,6 +22,9 @@ from bench.hysteresis.inverse import PreisachInverse
 
 Direction = Literal[-1, 1]
 
+_UNLOCKED = 3
+"""Targets in a row at which no lock held, after which it is not to be expected."""
+
 
 @dataclass(frozen=True)
 class LatchParameters:
@@ -174,8 +177,19 @@ class Latched(Correcting):
         self._direction: Direction = 1
         self.tries = 0
         """Number of approaches to the present target."""
+        self._unlocked = 0
         self.locked = False
         """Whether the present target is held by the lock."""
+
+    @property
+    def doubt(self) -> str:
+        """Why it does not do what it should on this specimen; empty if it does."""
+        if self._unlocked < _UNLOCKED:
+            return ""
+        return (
+            f"its lock held at none of the last {self._unlocked} targets after {self._parameters.tries} approaches "
+            "each, as behind a reversal the specimen does not move as its model says"
+        )
 
     def _observe(self, measured_input: float) -> bool:
         known = super()._observe(measured_input)
@@ -197,6 +211,7 @@ class Latched(Correcting):
                     break
                 self.extreme = None
                 self._direction = 1 if self._direction < 0 else -1
+            self._unlocked = 0 if self.locked else self._unlocked + 1
         if not self.locked:
             yield from self._correct(target)
         yield from self._hold(self._poll)

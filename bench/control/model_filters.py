@@ -7,6 +7,7 @@ together: the covariance before the first reading says how they do.
 
 Both have in common:
 
+* How far a reading may be from any model of the family is learnt too, within bounds, by how surprising they are.
 * What was learnt long ago is forgotten: the covariance grows with each reading.
 * A reading far from what the model can explain is refused, as that of a sensor that jumped is. While readings are
   refused nothing is forgotten, so that a sensor that stays wrong is not believed after a while.
@@ -20,7 +21,7 @@ import math
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Mapping
-from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias, get_args
+from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias, cast, get_args
 
 import numpy as np
 
@@ -33,7 +34,9 @@ AdaptationName: TypeAlias = Literal["off", "session", "density"]
 ADAPTATIONS: tuple[AdaptationName, ...] = get_args(AdaptationName)
 
 MODEL_ERROR = 5e-3
-"""Standard deviation of what neither estimate explains in one reading, in spans of the output."""
+"""Standard deviation of what no estimate explains in one reading, in spans of the output, at the least."""
+WORST, _SHARE = 16.0, 0.03
+"""Most that its variance grows by where readings are surprising, and the weight of each reading in that."""
 INPUT_ERROR = 5e-4
 """Standard deviation of what the specimen's input differs unseen from the measured one, in spans of the input."""
 GATE = 4.0
@@ -94,6 +97,7 @@ class ModelFilter(ABC):
         self._lately: deque[tuple[float, float] | None] = deque(maxlen=_LATELY)
         self._values, self._first = self._prior()
         self._covariance = self._first
+        self._excess = 1.0
         self._start = self._values
 
     @abstractmethod
@@ -129,7 +133,10 @@ class ModelFilter(ABC):
         step = 2.0 * INPUT_ERROR * self._spans.input
         slope = (self.model.step(state, value + step)[1] - self.model.step(state, value - step)[1]) / (2.0 * step)
         noise = (MODEL_ERROR * self._spans.output) ** 2 + (INPUT_ERROR * self._spans.input * slope) ** 2
+        noise *= self._excess
         error = output - self.model.value(state)
+        surprise = min(error**2 / (explained + noise), GATE**2)
+        self._excess = min(max(self._excess * (1.0 + _SHARE * (surprise - 1.0)), 1.0), WORST)
         if abs(error) > GATE * math.sqrt(explained + noise):
             return self._refuse(error, output - self.identified.value(state))
         self._lately.append(None)
@@ -205,7 +212,7 @@ class SessionFilter(ModelFilter):
     }
 
     def __init__(self, identified: Operator[Any]) -> None:
-        self._names = tuple(self._NUMBERS)[: None if isinstance(identified, Preisach) else 2]
+        self._names = tuple(self._NUMBERS)[: None if identified.kind == Preisach.kind else 2]
         self._wide: tuple[float, Any] = (1.0, identified)
         super().__init__(identified)
 
@@ -351,9 +358,9 @@ def model_filter(name: AdaptationName, operator: Operator[Any]) -> ModelFilter |
         raise ValueError(f"adaptation {name} needs a model with memory; this one is of the kind {operator.kind}")
     if name == "session":
         return SessionFilter(operator)
-    if not isinstance(operator, Preisach):
+    if operator.kind != Preisach.kind:
         raise ValueError(
             f"adaptation density needs a Preisach model, whose density it changes; this one is of the kind "
             f"{operator.kind}; adaptation = session takes it"
         )
-    return DensityFilter(operator)
+    return DensityFilter(cast("Preisach", operator))

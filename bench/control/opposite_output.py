@@ -44,6 +44,11 @@ class OppositeOutput:
         return self._controller.state
 
     @property
+    def doubt(self) -> str:
+        """Why the controller inside does not do what it should on this specimen; empty if it does."""
+        return str(getattr(self._controller, "doubt", ""))
+
+    @property
     def reach(self) -> Reach:
         """Whether the present target can be met."""
         return OPPOSITE[self._controller.reach]

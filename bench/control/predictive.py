@@ -3,7 +3,7 @@
 In each period the set-points of a horizon are chosen by least squares of the output's predicted error: the drive
 moves as its identified dynamics say (delay, second order, fastest change), the specimen sees it behind its lag, and
 the output is that of the operator from a copy of its memory, with the disturbance as it is now. The first set-point
-is sent. The search begins with the better of two plans, the inverse of the reference ahead by the dynamics' delay and
+is sent. The search begins with the best of some plans, the inverse of the reference ahead by the dynamics' delay and
 what is left of the last plan, and improves it by Gauss-Newton steps within the limits (Rawlings, Mayne, Diehl, *Model
 Predictive Control*, 2017, chapter 8), each by bounded linear least squares.
 """
@@ -155,7 +155,8 @@ class PredictiveFollower(ControllerBase):
         ends = (np.arange(self.horizon * _PARTS) + 0.5) / _PARTS - actuator.delay / p.period
         self._before = max(1, -math.floor(ends[0])) + 1
         self._source = np.floor(ends).astype(np.int64) + self._before
-        self._ahead = dynamics.time_constant + 0.5 * p.period
+        # What is held for a period stands for its middle, of an actuator that follows at once for its end.
+        self._ahead = [dynamics.time_constant + part * p.period for part in (0.5, 1.0)]
         self._take(inverse, self.state)
         self._sent = np.full(self._before, self._through(self._setpoint))
         self._plan: Floats = np.full(self.horizon, self._setpoint)
@@ -277,8 +278,8 @@ class PredictiveFollower(ControllerBase):
         weights = np.tile(np.append(np.full(_PARTS - 1, _BETWEEN), 1.0), self.horizon)
         followed = self._inverse.follow(references[1:], state)
         self._reach = _reach(bool(followed.met[0]), references[1], float(followed.outputs[0]))
-        inverse = np.interp(ends[:-1] + self._ahead, ends[1:], followed.setpoints)
-        plans = np.clip([inverse, np.append(self._plan[1:], self._plan[-1])], self._low, self._high)
+        inverses = [np.interp(ends[:-1] + ahead, ends[1:], followed.setpoints) for ahead in self._ahead]
+        plans = np.clip([*inverses, np.append(self._plan[1:], self._plan[-1])], self._low, self._high)
 
         def residuals(rows: Floats) -> Floats:
             previous = np.full((rows.shape[0], 1), self._setpoint)

@@ -18,8 +18,10 @@ from bench.hysteresis import Reach
 
 TARGETS = 5
 """Number of targets in a row over which errors are judged."""
-_TOLERANCE = 0.01
+_TOLERANCE = 0.02
 """Part of the range of the targets within which no error is judged."""
+_LEFT = 0.5
+"""Part of the model's error that feedback has to take away at least."""
 _SWINGS = MOST_SWINGS - 2
 """Swings at one target after which its controller is given up: fewer than those that end the run."""
 
@@ -28,9 +30,9 @@ class Supervised:
     """A target controller that is given up when it does not converge: a `Reaching`.
 
     It does not if it sends the actuator to and fro between the ends of its range at one target, or if over several
-    targets its errors are greater than what its model errs by at the same places: then the model alone, without
-    feedback, would have been the better controller. Targets that cannot be met do not count, and a controller
-    that does not say what its model errs by is judged by the swings alone.
+    targets it leaves more than half of what its model errs by at the same places: then the model alone, without
+    feedback, would have been about as good, or better; or if it says so itself (`doubt`). Targets that cannot be met
+    do not count, and a controller that does not say what its model errs by is judged by the swings alone.
 
     Parameters
     ----------
@@ -134,6 +136,8 @@ class Supervised:
         """Judge how the last target was met; return why the controller does not converge, or nothing."""
         if not self._compares or self.gave_up or not self._finished or self.reach is not Reach.MET:
             return ""
+        if doubt := getattr(self._controller, "doubt", ""):
+            return str(doubt)
         error, without = self._output - self._target, self.trace.disturbance
         if not math.isfinite(without):
             return ""
@@ -141,7 +145,7 @@ class Supervised:
         if len(self._judged) < TARGETS:
             return ""
         errors, opened = np.sqrt(np.mean(np.square(self._judged), axis=0)).tolist()
-        if errors <= max(opened, self._tolerance):
+        if errors <= max(_LEFT * opened, self._tolerance):
             return ""
         return (
             f"over {TARGETS} targets its error is {errors:.3g} RMS, and that of its model alone, without feedback, "

@@ -551,7 +551,7 @@ class CorrectionParameters:
     walk_variance: float
     reading_variance: float
     arrival: Arrival
-    corrections: int = 3
+    corrections: int = 4
 
     def __post_init__(self) -> None:
         check_positive(self, "close_enough", "walk_variance", "reading_variance")

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
-from bench.dashboard.drawing import ALARM, CAUTION, Colour
+from bench.dashboard.drawing import ALARM, CAUTION, LIMIT, Colour
 from bench.dashboard.recording import Floats, Recording, times
 from bench.devices import Signal
 from bench.interlocks import SETPOINT, Interlock, Level
@@ -41,7 +41,7 @@ class Bound:
     kind : str
         `limit` of a set-point, `interlock`, or `warning`, for legends.
     colour : Colour
-        Red where the run would end, amber for a warning and for the limit of a set-point.
+        Red where an interlock acts, amber for a warning, violet for the limit of a set-point.
     """
 
     column: int
@@ -63,7 +63,7 @@ def bounds_of(meta: Mapping[str, Any], signals: Sequence[Signal]) -> tuple[Bound
     found: list[Bound] = []
     for device, (low, high) in (meta.get("limits") or {}).items():
         if (column := columns.get(f"{device}{SETPOINT}")) is not None:
-            found += _pair(column, signals[column], low, high, "limit", CAUTION)
+            found += _pair(column, signals[column], low, high, "limit", LIMIT)
     for table in (meta.get("rig_content") or {}).get("interlocks", ()):
         interlock = Interlock.model_validate(table)
         if interlock.minus or (column := columns.get(interlock.signal)) is None:

@@ -31,6 +31,7 @@ FAINT: Colour = (104, 110, 118)
 MARKER: Colour = (22, 168, 150)
 ALARM: Colour = (214, 58, 56)
 CAUTION: Colour = (206, 142, 20)
+LIMIT: Colour = (136, 116, 206)
 _DENSITY_COLOURS: tuple[tuple[float, Colour], ...] = (
     (-1.0, (36, 128, 232, 255)),
     (-0.4, (52, 116, 196, 200)),

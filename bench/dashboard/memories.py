@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 from bench.dashboard.entries import ModelDensity
 from bench.devices import Signal
-from bench.hysteresis import MemoryCurve, TwoStage
+from bench.hysteresis import MemoryCurve
+from bench.hysteresis.two_stage import Coupled
 from bench.interlocks import SETPOINT
 
 
@@ -32,13 +33,13 @@ class StageMemory:
 
     Parameters
     ----------
-    model : TwoStage
-        Starts as after a reset.
+    model : Coupled
+        Of voltage and force; starts as after a reset.
     columns : tuple of int
         Columns of its voltage and its force.
     """
 
-    def __init__(self, model: TwoStage, columns: tuple[int, int]) -> None:
+    def __init__(self, model: Coupled[Any], columns: tuple[int, int]) -> None:
         self._model, self._columns = model, columns
         self._state: Any = model.initial_state()
         self.curve: MemoryCurve | None = None
@@ -49,7 +50,8 @@ class StageMemory:
         voltage, force = (values[column] for column in self._columns)
         if math.isfinite(voltage) and math.isfinite(force):
             self._state, _ = self._model.step(self._state, voltage, force)
-            self.curve = self._state.second if isinstance(self._state.second, MemoryCurve) else None
+            second = getattr(self._state, "second", None)
+            self.curve = second if isinstance(second, MemoryCurve) else None
 
 
 def memory_of(model: ModelDensity, signals: Sequence[Signal], drive: int) -> SignalMemory | StageMemory | None:
@@ -73,8 +75,10 @@ def memory_of(model: ModelDensity, signals: Sequence[Signal], drive: int) -> Sig
     if model.density.measured:
         found = column(model.density.unit)
         return None if found is None else SignalMemory(found)
-    if isinstance(model.model, TwoStage):
-        voltage, force = column(model.model.voltage_unit), column(model.model.force_unit)
+    # A model of several stages has a force beside its voltage.
+    if getattr(model.model, "force_unit", None) is not None:
+        stages = cast("Coupled[Any]", model.model)
+        voltage, force = column(stages.voltage_unit), column(stages.force_unit)
         if voltage is not None and force is not None:
-            return StageMemory(model.model, (voltage, force))
+            return StageMemory(stages, (voltage, force))
     return None

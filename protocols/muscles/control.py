@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -27,6 +27,7 @@ from bench.protocol import (
     protocol,
 )
 from bench.results.tracking import REACH, READING
+from bench.tuning_file import Tuning
 from protocols.muscles.parts import (
     LENGTH_LOOPS,
     ON_STAGE,
@@ -58,10 +59,8 @@ class Controlled(ProtocolParameters):
     )
     count: int = parameter(40, unit="1", low=1, high=10000, help="number of targets, drawn from the model's range")
     sequence_seed: int = parameter(1, unit="1", low=0, help="seed of the targets")
-    tuning: dict[str, dict[str, Any]] = parameter(
-        {},
-        unit="",
-        help="numbers of a controller in place of those from the model, a table for each",
+    tuning: Tuning = parameter(
+        {}, unit="", help="numbers of controllers in place of those from the model: a tuning file, or tables"
     )
     fallback: Fallback = parameter(
         "none", unit="", help="what goes on in place of a controller that does not converge; none ends the run"

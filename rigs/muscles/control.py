@@ -67,13 +67,15 @@ class InverseControlParameters:
     """Time within which the closed loop would bring the muscle to its new state, s."""
     power: float = 2.0
     """Power of the voltage that is lagged: 2 for heat, 1 for a pressure."""
+    caution: float = 1.0
+    """Factor of the slopes that are believed: the larger, the shorter are the moves of the closed loop."""
     duration: float = 20.0
     """Time for each target, s."""
     search: LagSearch = field(default_factory=LagSearch)
     """How other time constants are tried in closed loop."""
 
     def __post_init__(self) -> None:
-        check_positive(self, "period", "horizon", "duration")
+        check_positive(self, "period", "horizon", "caution", "duration")
         Lag(self.time_constant)
         if self.power not in (1.0, 2.0):
             raise ValueError(f"power: expected 1 or 2, got {self.power}")
@@ -83,7 +85,7 @@ class InverseControlParameters:
         """Return parameters for a muscle whose dynamics were identified."""
         lag = dynamics.response.lag
         period = max(lag / _READINGS_A_LAG, _UNSEEN * dynamics.fastest, _SHORTEST_PERIOD)
-        return cls(lag, period, _LEAD * period, dynamics.response.power, duration)
+        return cls(lag, period, _LEAD * period, dynamics.response.power, duration=duration)
 
 
 class MuscleController(ControllerBase, ABC):
@@ -297,7 +299,7 @@ class MuscleClosedLoop(_Modelled):
         lag = self._believed.lag
         present = lag.voltage
         error = wanted - self._modelled()
-        least, greatest = sorted(error / slope for slope in self._task.slopes)
+        least, greatest = sorted(error / (self._parameters.caution * slope) for slope in self._task.slopes)
         move = min(max(self._steady(wanted) - present, least), greatest)
         noise = _NOISES * math.sqrt(self._task.reading_variance)
         if first:
@@ -434,7 +436,12 @@ def _task(setup: ControllerSetup, kind: type[Task]) -> Task:
 
 
 def _with_inverse(summary: str, controller: Callable[..., MuscleController], kind: type[Task]) -> ControllerSpec:
-    return ControllerSpec(summary, lambda s: controller(_task(s, kind), _timing(s), s.state, s.limits))
+    return ControllerSpec(
+        summary,
+        lambda s: controller(_task(s, kind), _timing(s), s.state, s.limits),
+        numbers=_timing,
+        tunable=("caution", "horizon", "period") if controller is MuscleClosedLoop else (),
+    )
 
 
 def _without_inverse(kind: type[Task]) -> ControllerSpec:

@@ -156,7 +156,7 @@ def muscle_file(
     sources = [force_run, *length_runs]
     under_weights = [run for run in length_runs if protocol_of(run) == "length-voltage"]
     dynamics = None
-    if isinstance(found.model, TwoStage):
+    if found.model.kind == TwoStage.kind:
         dynamics = identify_muscle_dynamics(found.model, force_run, next(iter(under_weights), None))
     return ModelFile(
         name,

@@ -22,6 +22,7 @@ _SUPPLY = """
 [devices.supply{i}]
 driver = "scpi-voltage-supply"
 port = "emulated://supply{i}"
+baudrate = 115200
 identity = "EXAMPLE,PS-3005,{{any}}"
 
 [devices.supply{i}.setpoint]

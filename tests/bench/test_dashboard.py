@@ -100,6 +100,7 @@ META = {
     "git": "0123456789ab",
 }
 CONTROL_COLOURS = {"output": (236, 100, 46), "error": (150, 156, 166), "disturbance": (30, 170, 170)}
+_STYLE = ("radii", "colors", "draw_order", "names", "widths", "values", "markers", "marker_sizes")
 VULKAN = Path("/usr/share/vulkan/icd.d")
 # Stopping a thread of Rerun takes long only when a viewer hangs.
 PATIENCE = 60.0
@@ -642,7 +643,7 @@ def test_live_and_rebuilt_recordings_are_equal(tmp_path: Path, request: pytest.F
             continue
         assert live[path].keys() == again[path].keys(), path
         for component in live[path]:
-            if "t" in live[path] and component not in ("radii", "colors", "draw_order", "names", "widths", "values"):
+            if "t" in live[path] and component not in _STYLE:
                 mine, theirs = table(live[path], component), table(again[path], component)
                 np.testing.assert_array_equal(mine[0], theirs[0])
                 np.testing.assert_array_equal(mine[1], theirs[1])

@@ -107,6 +107,15 @@ class TestBoth:
         assert np.abs(moved).max() < 0.8 * SPAN
         assert (adaptation.model.density >= 0.0).all()
 
+    def test_readings_that_err_ten_times_as_much_as_expected_hardly_move_the_model(self, identified, name):
+        rng = np.random.default_rng(7)
+        adaptation = model_filter(name, identified)
+        found = readings(identified, 100)
+        learnt(adaptation, [(state, output + 0.05 * SPAN * rng.normal()) for state, output in found])
+        moved = [adaptation.model.value(state) - identified.value(state) for state, _ in found]
+        assert rms(moved) < 0.015 * SPAN
+        assert adaptation.refused < 20
+
     def test_readings_that_are_missing_or_next_to_the_last_are_not_taken(self, identified, name):
         adaptation = model_filter(name, identified)
         state = identified.initial_state().step(5.0)

@@ -129,3 +129,12 @@ def test_a_controller_that_converges_is_left_alone(gain, offset):
     assert controller.state.input == specimen.state.input
     assert controller.reach is Reach.MET
     assert controller.trace.reference == gain * TARGETS_WITHIN[-1] + offset
+
+
+def test_a_controller_may_doubt_itself():
+    inner = Contrary()
+    inner.doubt = "its lock held nowhere"
+    controller = Supervised(inner, LIMITS, 1.0)
+    controller.aim(0.0, 0.0, 0.0, 0.0)
+    with pytest.raises(ConvergenceError, match="its lock held nowhere"):
+        controller.aim(0.0, 1.0, 0.0, 0.0)

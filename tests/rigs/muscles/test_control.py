@@ -612,7 +612,7 @@ def test_no_number_of_a_specimen_stands_in_the_controllers():
 def test_what_nothing_says_has_no_default():
     for kind in (InverseControlParameters, ProportionalIntegralParameters, ForceTask, LengthTask):
         defaults = {each.name for each in fields(kind) if each.default is not MISSING}
-        assert defaults <= {"power", "duration", "rise"}
+        assert defaults <= {"power", "duration", "rise", "caution"}
 
 
 def test_a_model_without_dynamics_is_refused_unless_the_rig_file_gives_them(inverse):

@@ -1,0 +1,167 @@
+"""The runs behind the cost of a controller's numbers, on an emulated rig or a twin."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from bench.errors import BenchError, ConfigurationError
+from bench.hysteresis import TwoStage
+from bench.model_file import ModelFile
+from bench.results.tracking import TargetResults
+from bench.rig_file import load_rig
+from bench.studies import Campaign, reached_targets
+from bench.tuning.search import Numbers, Trial, cost_of, perturbed_models
+
+if TYPE_CHECKING:
+    from bench.runs import RunResult
+    from bench.workers import Pending, Workers
+
+_AS_IDENTIFIED = "as-identified"
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a controller is tuned for: its protocol, its name there, and the slot of the rig that it controls."""
+
+    protocol: str
+    controller: str
+    slot: str
+
+    @property
+    def kind(self) -> str:
+        """The task of the controller in `bench.controllers`."""
+        return {"length-control": "coupled-length", "force-control": "coupled-force"}.get(self.protocol, "target")
+
+
+def task_of(file: ModelFile, controller: str, protocol: str | None) -> Task:
+    """Return what a controller of a model is tuned for; by a protocol, if one is given.
+
+    Raises ConfigurationError if the protocol has no such controllers.
+    """
+    offered = ("length-control", "force-control") if file.model.kind == TwoStage.kind else ("tracking",)
+    chosen = protocol or offered[0]
+    if chosen not in offered:
+        raise ConfigurationError(f"--protocol {chosen}: a model {file.name} is controlled by {' or '.join(offered)}")
+    return Task(chosen, controller, "force" if chosen == "force-control" else "response")
+
+
+@dataclass
+class TuningRuns:
+    """Carries out trials of a controller's numbers.
+
+    Parameters
+    ----------
+    task : Task
+        What is tuned.
+    rig : str
+        The emulated rig, or a twin.
+    file : ModelFile
+        The identified model.
+    folder : Path
+        Where the runs go.
+    workers : Workers
+        Who carries them out.
+    settings : mapping of str to str
+        Further parameters of the protocol.
+    seeds : int
+        Sessions of each run.
+    """
+
+    task: Task
+    rig: str
+    file: ModelFile
+    folder: Path
+    workers: Workers
+    settings: Mapping[str, str]
+    seeds: int = 1
+    failures: list[str] = field(default_factory=list)
+    _count: int = 0
+
+    def __post_init__(self) -> None:
+        self.folder.mkdir(parents=True, exist_ok=True)
+        role = load_rig(self.rig).roles.get(self.task.slot)
+        if role is None:
+            raise ConfigurationError(f"rig {self.rig} does not bind [roles.{self.task.slot}]")
+        self._signal = role.signal or role.reading
+        self._models = {}
+        for name, model in {_AS_IDENTIFIED: self.file, **perturbed_models(self.file)}.items():
+            self._models[name] = self.folder / f"{name}.json"
+            model.save(self._models[name])
+
+    def __call__(self, candidates: Sequence[Numbers]) -> list[Trial]:
+        """Return trials of some numbers; their runs go on beside each other."""
+        started = [(numbers, self._start(numbers)) for numbers in candidates]
+        return [self._trial(numbers, runs) for numbers, runs in started]
+
+    def _start(self, numbers: Numbers) -> dict[tuple[str, int], Pending[RunResult]]:
+        self._count += 1
+        tuning = json.dumps({self.task.controller: numbers})
+        found = {}
+        for seed in range(self.seeds):
+            for name, path in self._models.items():
+                # The same noise and the same targets for all candidates.
+                campaign = Campaign(
+                    self.rig, self.folder / f"{self._count:03}" / name, seed, live=False, workers=self.workers
+                )
+                settings = {"model": str(path), "controller": self.task.controller, "sequence_seed": str(seed + 1)}
+                found[name, seed] = campaign.start(
+                    self.task.protocol, {**self.settings, **settings, "tuning": tuning}
+                )
+        return found
+
+    def _trial(self, numbers: Numbers, runs: Mapping[tuple[str, int], Pending[RunResult]]) -> Trial:
+        reached: dict[tuple[str, int], TargetResults | None] = {}
+        for key, run in runs.items():
+            try:
+                reached[key] = reached_targets(run.result(), self._signal)
+            except BenchError as error:
+                self.failures.append(f"{key[0]}, {dict(numbers)}: {error}")
+                reached[key] = None
+        scores: dict[str, list[tuple[float, float, float]]] = {}
+        for (name, seed), results in reached.items():
+            scores.setdefault(name, []).append(_score(results, reached[_AS_IDENTIFIED, seed]))
+        means = {name: np.mean(each, axis=0).tolist() for name, each in scores.items()}
+        cost, rms, seconds = means.pop(_AS_IDENTIFIED)
+        return Trial(
+            numbers,
+            0.5 * (cost + max(each[0] for each in means.values())),
+            rms,
+            seconds,
+            max(each[1] for each in means.values()),
+        )
+
+
+def _score(results: TargetResults | None, nominal: TargetResults | None) -> tuple[float, float, float]:
+    """Return cost, RMS error and seconds a target of a run, by the targets that the specimen can reach.
+
+    Another model may draw targets beyond them: the range is that of the run with the model as it is.
+    """
+    if results is None or nominal is None:
+        return math.inf, math.inf, math.nan
+    low, high = float(nominal.targets.min()), float(nominal.targets.max())
+    within = (results.targets >= low) & (results.targets <= high)
+    rms = float(np.sqrt(np.mean((results.outputs - results.targets)[within] ** 2)))
+    seconds = float(results.seconds[within].mean())
+    return cost_of(rms, seconds, high - low), rms, seconds
+
+
+def start_of(task: Task, rig: str, numbers: Any, tunable: Sequence[str]) -> Numbers:  # noqa: ANN401 - a dataclass
+    """Return the numbers from which the search begins: those of the rig file over those of the controller."""
+    table = dict((load_rig(rig).protocols.get(task.protocol) or {}).get("tuning", {}).get(task.controller, {}))
+    found: dict[str, Any] = dict(table)
+    for name in tunable:
+        outer, _, inner = name.rpartition(".")
+        if outer:
+            within = dict(found.get(outer, {}))
+            within.setdefault(inner, getattr(getattr(numbers, outer), inner))
+            found[outer] = within
+        else:
+            found.setdefault(name, getattr(numbers, name))
+    return found

@@ -1,0 +1,137 @@
+"""The search for the numbers of a controller: one after another, by the cost of runs on an emulated rig.
+
+The cost of numbers is `error + TIME_WEIGHT * seconds`: the RMS error in percent of the range of the targets, and the
+seconds at each target. It is the mean of that with the model as it is, and of the worst of that with models by which
+the specimen has another gain, by the factor `MARGIN` to either side, and another time constant of its response. So
+numbers that are best on the specimen as identified but fail beside it, by too little margin of stability, are not
+chosen. A controller that does not converge, or reaches no target in its time, has no cost at all.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+from bench.control.dynamics import IdentifiedDynamics
+from bench.hysteresis import Operator, TwoStage
+from bench.model_file import ModelFile
+
+MARGIN = 1.25
+"""Factor of the gain, and of the time constant, by which the specimen may differ from its model."""
+TIME_WEIGHT = 0.02
+"""Percent of the range of the targets that a second at each target costs."""
+FACTOR = 1.7
+"""By how much a number is raised and lowered at first."""
+_ENOUGH = 0.99
+"""Part of the cost below which a change is taken, as two runs of one controller differ a little."""
+
+Numbers = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What runs of a controller with some numbers gave.
+
+    Attributes
+    ----------
+    numbers : mapping
+        The numbers, as in a tuning file.
+    cost : float
+        See the module; infinite if a run failed.
+    rms : float
+        With the model as it is, output units.
+    seconds : float
+        At each target, s.
+    worst : float
+        RMS with the worst of the other models, output units.
+    """
+
+    numbers: Numbers
+    cost: float
+    rms: float
+    seconds: float
+    worst: float
+
+
+Evaluate = Callable[[Sequence[Numbers]], list[Trial]]
+"""Carries out the runs of several candidates beside each other."""
+
+
+def perturbed_models(file: ModelFile) -> dict[str, ModelFile]:
+    """Return models from which the specimen differs, by name: in its gain, and in its lag if it has one.
+
+    The gain of an operator turns about the middle of its output; that of a two-stage model is that of its lengths.
+    """
+    found = {}
+    for name, gain in (("gain-high", MARGIN), ("gain-low", 1.0 / MARGIN)):
+        found[name] = replace(file, model=_scaled(file.model, gain), memory=None, initial=None, band=None)
+    known = file.dynamics
+    if known is not None and known.response.lag > 0.0:
+        for name, factor in (("lag-high", MARGIN), ("lag-low", 1.0 / MARGIN)):
+            found[name] = replace(file, dynamics=_slower(known, factor))
+    return found
+
+
+def _scaled(model: Any, gain: float) -> Any:  # noqa: ANN401 - a model of the kind of the first
+    if model.kind == TwoStage.kind:
+        return replace(model, second=_scaled(model.second, gain))
+    assert isinstance(model, Operator)
+    low, high = model.output_range()
+    middle = 0.0 if low <= 0.0 <= high and min(-low, high) < 0.1 * (high - low) else 0.5 * (low + high)
+    return model.with_coefficients(gain * model.coefficients, gain * (model.bias - middle) + middle)
+
+
+def _slower(dynamics: IdentifiedDynamics, factor: float) -> IdentifiedDynamics:
+    return replace(dynamics, response=replace(dynamics.response, lag=factor * dynamics.response.lag))
+
+
+def cost_of(rms: float, seconds: float, span: float) -> float:
+    """Return the cost of one run: RMS error and range of the targets in output units, s at each target."""
+    return 100.0 * rms / span + TIME_WEIGHT * seconds
+
+
+def search(
+    start: Numbers, names: Sequence[str], evaluate: Evaluate, tell: Callable[[Trial], None], rounds: int = 2
+) -> Trial:
+    """Return the best numbers that are found by changing one after another.
+
+    Parameters
+    ----------
+    start : mapping
+        Numbers to begin with, tables within as mappings.
+    names : sequence of str
+        Those that may change; one in a table by `TABLE.NAME`. All are positive.
+    evaluate : callable
+        Carries out trials.
+    tell : callable
+        Is told of each.
+    rounds : int
+        How often each number is changed, by a smaller factor each time.
+    """
+    (best,) = evaluate([start])
+    tell(best)
+    for number in range(rounds):
+        factor = FACTOR ** (1.0 / (number + 1))
+        for name in names:
+            present = get(best.numbers, name)
+            candidates = [put(best.numbers, name, present * each) for each in (factor, 1.0 / factor)]
+            for trial in evaluate(candidates):
+                tell(trial)
+                if trial.cost < _ENOUGH * best.cost:
+                    best = trial
+    return best
+
+
+def get(numbers: Numbers, name: str) -> float:
+    """Return a number by its name, `TABLE.NAME` for one in a table."""
+    table, _, last = name.rpartition(".")
+    return float((numbers[table] if table else numbers)[last])
+
+
+def put(numbers: Numbers, name: str, value: float) -> Numbers:
+    """Return numbers with one of them replaced, rounded to four digits."""
+    table, _, last = name.rpartition(".")
+    rounded = float(f"{value:.4g}") if math.isfinite(value) else value
+    return {**numbers, table: {**numbers[table], last: rounded}} if table else {**numbers, last: rounded}

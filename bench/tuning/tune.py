@@ -1,0 +1,152 @@
+"""From a model and a rig to a tuning file."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from hashlib import sha256
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+
+from bench.clock import wall_time
+from bench.controllers import ControllerSetup, controller_spec
+from bench.errors import BenchError, ConfigurationError
+from bench.hysteresis import TwoStage
+from bench.model_file import load_model
+from bench.rig_file import load_rig
+from bench.tuning.runs import Task, TuningRuns, start_of, task_of
+from bench.tuning.search import MARGIN, TIME_WEIGHT, Trial, search
+from bench.tuning_file import tuning_text
+
+
+@dataclass(frozen=True)
+class Tuned:
+    """Numbers that were found for a controller.
+
+    Attributes
+    ----------
+    task : Task
+        What they are for.
+    twin : str
+        The emulated rig on which they were found.
+    first, best : Trial
+        The numbers before and after.
+    trials : int
+        Number of trials.
+    others : dict
+        Tables of the rig file for the other controllers of the protocol.
+    provenance : dict
+        What the tuning file says of where they come from.
+    """
+
+    task: Task
+    twin: str
+    first: Trial
+    best: Trial
+    trials: int
+    others: dict[str, Any]
+    provenance: dict[str, str | float]
+
+    def text(self) -> str:
+        """Return the tuning file."""
+        return tuning_text({**self.others, self.task.controller: self.best.numbers}, self.provenance)
+
+    def rows(self) -> list[tuple[str, str]]:
+        """Return what was found, for people."""
+        rows = [
+            (name, f"cost {t.cost:.4g}, RMS {t.rms:.4g}, worst margin {t.worst:.4g}, {t.seconds:.1f} s a target")
+            for name, t in (("before", self.first), ("after", self.best))
+        ]
+        return [*rows, ("trials", str(self.trials)), ("numbers", str(dict(self.best.numbers)))]
+
+    def summary(self) -> dict[str, Any]:
+        """Return what was found, for programs."""
+        return {"before": asdict(self.first), "after": asdict(self.best), "trials": self.trials, **self.provenance}
+
+
+def tune(
+    model: Path,
+    rig: str,
+    *,
+    twin: str | None = None,
+    controller: str = "closed-loop-inverse",
+    protocol: str | None = None,
+    settings: Sequence[str] = (),
+    seeds: int = 1,
+    rounds: int = 2,
+    workers: int | None = None,
+    folder: Path = Path("recordings/tuning"),
+    console: Console | None = None,
+) -> Tuned:
+    """Tune a controller; parameters as the options of `bench tune`.
+
+    Raises
+    ------
+    ConfigurationError
+        If the controller has no numbers to tune, or the rig no emulated twin.
+    DataError
+        If the model cannot be used.
+    BenchError
+        If the runs fail with the numbers to begin with.
+    """
+    from bench.workers import Workers
+
+    shown = console or Console(quiet=True)
+    file = load_model(model)
+    task = task_of(file, controller, protocol)
+    on = twin or rig
+    if not load_rig(on).in_process:
+        raise ConfigurationError(
+            f"rig {on} is not emulated: give --twin, such as a rig file that bench twin has made"
+        )
+    tables = (load_rig(rig).protocols.get(task.protocol) or {}).get("tuning", {})
+    spec = controller_spec(task.kind, controller)
+    if spec.numbers is None:
+        raise ConfigurationError(f"controller {controller} has no numbers that could be tuned")
+    given: dict[str, str] = {}
+    for setting in settings:
+        key, equals, value = setting.partition("=")
+        if not equals:
+            raise ConfigurationError(f"--set {setting}: expected KEY=VALUE")
+        given[key] = value
+    low, high = file.model.first.input_range if file.model.kind == TwoStage.kind else file.operator.input_range
+    setup = ControllerSetup(
+        name=controller, model=file, limits=(low, high), options={"duration": float(given.get("duration", 20.0))}
+    )
+    begin = start_of(task, rig, spec.numbers(setup), spec.tunable)
+    trials: list[Trial] = []
+
+    def tell(trial: Trial) -> None:
+        trials.append(trial)
+        text = f"{len(trials):3}  cost {trial.cost:.4g}  RMS {trial.rms:.4g}  {dict(trial.numbers)}"
+        shown.print(text, highlight=False, markup=False)
+
+    # What each of many runs says of itself would hide what the search says.
+    with Workers(workers, title=f"tune {controller}") as pool:
+        runs = TuningRuns(task, on, file, folder, pool, given, seeds)
+        best = search(begin, spec.tunable, runs, tell, rounds)
+    if not math.isfinite(best.cost):
+        raise BenchError(f"the controller fails with all numbers that were tried: {runs.failures[0]}")
+    provenance: dict[str, str | float] = {
+        "model": model.name,
+        "model_sha256": sha256(model.read_bytes()).hexdigest(),
+        "rig": rig,
+        "twin": on,
+        "protocol": task.protocol,
+        "settings": ", ".join(settings),
+        "cost": f"0.5 (as identified + worst margin) of RMS in % of the range + {TIME_WEIGHT:g} s a target; "
+        f"margins: gain and time constant by {MARGIN:g} to either side",
+        "cost_before": trials[0].cost,
+        "cost_after": best.cost,
+        "rms_before": trials[0].rms,
+        "rms_after": best.rms,
+        "trials": len(trials),
+        "seeds": seeds,
+        "made": wall_time().isoformat(timespec="seconds"),
+        "bench": importlib.metadata.version("actuator-bench"),
+    }
+    return Tuned(task, on, trials[0], best, len(trials), dict(tables), provenance)

@@ -1,0 +1,136 @@
+"""`bench tune`: the search and its cost, the models beside the specimen, and the file that runs take."""
+
+import math
+import tomllib
+
+import numpy as np
+import pytest
+
+from bench.cli import main
+from bench.control.dynamics import IdentifiedDynamics, ResponseDynamics
+from bench.errors import ConfigurationError
+from bench.hysteresis import Preisach, TwoStage, uniform_levels
+from bench.model_file import ModelFile
+from bench.protocol import find_protocol
+from bench.rig_file import load_rig
+from bench.tuning.search import MARGIN, Trial, cost_of, get, perturbed_models, put, search
+from bench.tuning_file import load_tuning, tuning_text
+
+FILM = Preisach(uniform_levels(30.0, 70.0, 4), np.ones(10), 20.0, None, (21.0, 84.0), "°C", "1/m")
+NUMBERS = {"wait": 8.0, "arrival": {"hold": 0.4}}
+
+
+def evaluate(candidates):
+    """A bowl about wait = 3 and hold = 1, and a cliff below wait = 2.5."""
+    found = []
+    for numbers in candidates:
+        wait, hold = get(numbers, "wait"), get(numbers, "arrival.hold")
+        cost = math.log(wait / 3.0) ** 2 + math.log(hold) ** 2 + 1.0
+        found.append(Trial(numbers, math.inf if wait < 2.5 else cost, cost, 1.0, cost))
+    return found
+
+
+def test_the_search_comes_near_the_best_numbers_and_keeps_off_those_that_fail():
+    seen = []
+    best = search(NUMBERS, ("wait", "arrival.hold"), evaluate, seen.append, rounds=4)
+    assert get(best.numbers, "wait") == pytest.approx(3.0, rel=0.25)
+    assert get(best.numbers, "wait") >= 2.5
+    assert get(best.numbers, "arrival.hold") == pytest.approx(1.0, rel=0.25)
+    assert best.cost == min(trial.cost for trial in seen)
+    assert len(seen) == 1 + 4 * 2 * 2
+    assert NUMBERS == {"wait": 8.0, "arrival": {"hold": 0.4}}
+
+
+def test_the_cost_is_the_error_in_percent_and_the_time():
+    assert cost_of(2.0, 10.0, 100.0) == pytest.approx(2.0 + 0.02 * 10.0)
+    assert put(NUMBERS, "arrival.hold", 1.23456)["arrival"] == {"hold": 1.235}
+
+
+def test_other_gains_turn_about_the_middle_of_the_output():
+    found = perturbed_models(ModelFile("preisach", FILM))
+    assert list(found) == ["gain-high", "gain-low"]
+    low, high = FILM.output_range()
+    for name, gain in (("gain-high", MARGIN), ("gain-low", 1.0 / MARGIN)):
+        least, greatest = found[name].operator.output_range()
+        assert greatest - least == pytest.approx(gain * (high - low))
+        assert least + greatest == pytest.approx(low + high)
+
+
+def test_a_muscle_has_other_lengths_and_other_time_constants():
+    rising = Preisach(uniform_levels(0.0, 3.0, 4), np.ones(10), 0.0, None, (0.0, 3.0), "V", "N")
+    second = Preisach(uniform_levels(-20.0, 20.0, 4), np.full(10, 1e-5), 0.0, None, (-20.0, 20.0), "N", "m")
+    dynamics = IdentifiedDynamics(response=ResponseDynamics(4.0, 2.0))
+    found = perturbed_models(ModelFile("two-stage", TwoStage(rising, second, 0.3), dynamics=dynamics))
+    assert [*found] == ["gain-high", "gain-low", "lag-high", "lag-low"]
+    np.testing.assert_allclose(found["gain-high"].model.second.density, MARGIN * second.density)
+    assert found["gain-high"].model.first == rising
+    assert [found[name].dynamics.response.lag for name in ("lag-high", "lag-low")] == [4.0 * MARGIN, 4.0 / MARGIN]
+
+
+def test_a_tuning_file_is_read_by_the_parameter_of_a_protocol(tmp_path):
+    path = tmp_path / "tuning.toml"
+    path.write_text(tuning_text({"closed-loop-inverse": NUMBERS}, {"model": 'a "model".json', "trials": 3}))
+    assert load_tuning(path) == {"closed-loop-inverse": NUMBERS}
+    assert tomllib.loads(path.read_text())["provenance"] == {"model": 'a "model".json', "trials": 3}
+    file = load_rig("vo2")
+    for text in (str(path), '{"closed-loop-inverse": {"wait": 8.0, "arrival": {"hold": 0.4}}}'):
+        given = {"model": "model.json", "tuning": text}
+        parameters = find_protocol("tracking").parse(given, file.roles, file.protocols.get("tracking"))
+        assert parameters.tuning == {"closed-loop-inverse": NUMBERS}
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [("[tuning", "not TOML"), ("[rig]\na = 1\n", r"expected tables \[tuning.CONTROLLER\]"), (None, "cannot be read")],
+)
+def test_what_is_no_tuning_file_is_refused(tmp_path, content, said):
+    path = tmp_path / "tuning.toml"
+    if content is not None:
+        path.write_text(content)
+    with pytest.raises(ConfigurationError, match=said):
+        load_tuning(path)
+    with pytest.raises(ConfigurationError, match="tuning"):
+        find_protocol("tracking").parse({"model": "model.json", "tuning": str(path)})
+
+
+def fails(capsys, *arguments):
+    with pytest.raises(SystemExit) as stopped:
+        main(["tune", *map(str, arguments)])
+    return stopped.value.code, " ".join(capsys.readouterr().err.split())
+
+
+def test_what_cannot_be_tuned_is_refused_before_a_run(tmp_path, capsys):
+    model, out = tmp_path / "model.json", ["--out", tmp_path / "tuning.toml", "--runs", tmp_path / "runs"]
+    ModelFile("preisach", FILM).save(model)
+    for arguments, said in (
+        (["--rig", "vo2-hardware"], "is not emulated: give --twin"),
+        (["--rig", "vo2", "--controller", "polynomial"], "no numbers that could be tuned"),
+        (["--rig", "vo2", "--protocol", "length-control"], "is controlled by tracking"),
+        (["--rig", "vo2", "--set", "count"], "expected KEY=VALUE"),
+    ):
+        code, text = fails(capsys, model, *arguments, *out)
+        assert code == 2
+        assert said in text
+    assert not (tmp_path / "runs").exists()
+
+
+@pytest.mark.slow
+def test_a_controller_is_tuned_on_the_emulated_rig(tmp_path):
+    model, out = tmp_path / "model.json", tmp_path / "tuning.toml"
+    ModelFile("preisach", FILM).save(model)
+    with pytest.raises(SystemExit) as stopped:
+        main(
+            [
+                *("tune", str(model), "--rig", "vo2", "--controller", "integral", "--rounds", "1", "--workers", "1"),
+                *("--set", "count=4", "--set", "low=500", "--set", "high=1200"),
+                *("--runs", str(tmp_path / "runs"), "--out", str(out)),
+            ]
+        )
+    assert not stopped.value.code
+    content = tomllib.loads(out.read_text(encoding="utf-8"))
+    provenance = content["provenance"]
+    assert provenance["cost_after"] <= provenance["cost_before"]
+    assert provenance["trials"] == 5
+    assert {"gain", "period"} <= content["tuning"]["integral"].keys()
+    # The other controllers keep what the rig file has for them.
+    assert "latched" in content["tuning"]
