@@ -29,10 +29,9 @@ BLOCK = re.compile(r"^```(\w+)(?: file: (\S+))?\n(.*?)^```$", re.MULTILINE | re.
 def environment(tmp_path, warm_commands):
     """What a reader has: the bench and pip, which here installs into a folder of its own, offline."""
     site = tmp_path / "site"
-    scripts = f"{warm_commands}{os.pathsep}{Path(sys.executable).parent}"
     return {
         **os.environ,
-        "PATH": f"{scripts}{os.pathsep}{os.environ['PATH']}",
+        "PATH": os.pathsep.join([str(warm_commands), str(Path(sys.executable).parent), os.environ["PATH"]]),
         "PYTHONPATH": str(site),
         "PIP_TARGET": str(site),
         "PIP_NO_INDEX": "1",
@@ -58,7 +57,11 @@ def test_page(path, tmp_path, environment, finished_process, warm_process):
                 "sh": (["sh", "-e", "-c"], finished_process),
                 "python": ([sys.executable, "-c"], warm_process),
             }[language]
-            done = run([*command, text], tmp_path, environment)
+            chosen = environment
+            if "$!" in text:
+                # Who is to be killed has to be the process that was started.
+                chosen = {**environment, "PATH": environment["PATH"].partition(os.pathsep)[2]}
+            done = run([*command, text], tmp_path, chosen)
             printed = done.stdout
             assert done.returncode == 0, f"{page}: {text}\n{printed}{done.stderr}"
 
