@@ -145,29 +145,20 @@ def test_the_start_is_kept_and_can_be_chosen(bench, tmp_path, data):
 
 
 def test_figures_say_the_errors_of_the_text(monkeypatch, tmp_path, data):
-    from bench.results import figures
+    from matplotlib.figure import Figure
+
     from bench.results.prediction_figures import errors_text
     from bench.results.report import draw_identification
 
     titles = []
-    before = figures._figure
+    save = Figure.savefig
 
-    def noted(path, size, **options):
-        context = before(path, size, **options)
+    def noted(figure, *arguments, **options):
+        legends = [axes.get_legend() for axes in figure.axes if axes.get_legend()]
+        titles.extend(text.get_text() for legend in legends for text in legend.get_texts())
+        save(figure, *arguments, **options)
 
-        class Noted:
-            def __enter__(self):
-                self.figure = context.__enter__()
-                return self.figure
-
-            def __exit__(self, *error):
-                legends = [axes.get_legend() for axes in self.figure.axes if axes.get_legend()]
-                titles.extend(text.get_text() for legend in legends for text in legend.get_texts())
-                return context.__exit__(*error)
-
-        return Noted()
-
-    monkeypatch.setattr(figures, "_figure", noted)
+    monkeypatch.setattr(Figure, "savefig", noted)
     found = identify_file(
         data[1], input_column="voltage", output_column="displacement", model="preisach", initial="skip", levels=6
     )
