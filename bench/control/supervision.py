@@ -20,8 +20,6 @@ TARGETS = 5
 """Number of targets in a row over which errors are judged."""
 _TOLERANCE = 0.02
 """Part of the range of the targets within which no error is judged."""
-_LEFT = 0.5
-"""Part of the model's error that feedback has to take away at least."""
 _SWINGS = MOST_SWINGS - 2
 """Swings at one target after which its controller is given up: fewer than those that end the run."""
 
@@ -30,8 +28,8 @@ class Supervised:
     """A target controller that is given up when it does not converge: a `Reaching`.
 
     It does not if it sends the actuator to and fro between the ends of its range at one target, or if over several
-    targets it leaves more than half of what its model errs by at the same places: then the model alone, without
-    feedback, would have been about as good, or better; or if it says so itself (`doubt`). Targets that cannot be met
+    targets it errs by more than its model does at the same places: then the model alone, without feedback, would
+    have been better; or if it says so itself (`doubt`). Targets that cannot be met
     do not count, and a controller that does not say what its model errs by is judged by the swings alone.
 
     Parameters
@@ -145,7 +143,7 @@ class Supervised:
         if len(self._judged) < TARGETS:
             return ""
         errors, opened = np.sqrt(np.mean(np.square(self._judged), axis=0)).tolist()
-        if errors <= max(_LEFT * opened, self._tolerance):
+        if errors <= max(opened, self._tolerance):
             return ""
         return (
             f"over {TARGETS} targets its error is {errors:.3g} RMS, and that of its model alone, without feedback, "

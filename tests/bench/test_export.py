@@ -88,12 +88,13 @@ def test_csv_says_what_numbers_and_words_are(run, tmp_path, bench):
     assert json.loads((tmp_path / "metadata.json").read_text())["seed"] == 3
 
 
-class TestDocuments:
-    @pytest.fixture(scope="class")
-    def found(self, run):
-        with Record(run) as record:
-            return list(documents(record))
+@pytest.fixture(scope="module")
+def found(run):
+    with Record(run) as record:
+        return list(documents(record))
 
+
+class TestDocuments:
     def test_event_model_takes_them(self, found):
         event_model = pytest.importorskip("event_model")
         for name, document in found:

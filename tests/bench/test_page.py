@@ -65,13 +65,14 @@ def reported(tmp_path_factory):
     return folder, result
 
 
-class TestPageOfARun:
-    @pytest.fixture(scope="class")
-    def page(self, reported, opened):
-        sections, page = opened(reported[0] / PAGE_NAME)
-        yield sections, page
-        page.close()
+@pytest.fixture(scope="module")
+def page(reported, opened):
+    sections, page = opened(reported[0] / PAGE_NAME)
+    yield sections, page
+    page.close()
 
+
+class TestPageOfARun:
     def test_it_is_small(self, reported):
         assert Path(reported[1]["page"]).stat().st_size < 2_000_000
 

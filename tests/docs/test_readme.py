@@ -7,7 +7,6 @@ from pathlib import Path
 import pytest
 from typer.main import get_command
 
-import bench
 from bench.cli.app import app
 
 ROOT = Path(__file__).parents[2]
@@ -75,14 +74,3 @@ def test_the_script_runs(tmp_path, monkeypatch):
     names = {}
     exec(compile(script, "README.md", "exec"), names)
     assert len(names["setpoints"]) == 2
-
-
-@pytest.mark.parametrize("rig", ["vo2", "hybrid"])
-def test_the_protocol_runs_on_every_rig(tmp_path, rig):
-    (text,) = (block for block in blocks("python") if "@protocol" in block)
-    (tmp_path / "soak.py").write_text(text)
-    parameters = {"target": 70} if rig == "vo2" else {}
-    found = bench.run(str(tmp_path / "soak.py"), rig, out=tmp_path / "runs", **parameters)
-    assert found.status == "completed"
-    if rig == "vo2":
-        assert found.readings["tec_temperature"][0] == pytest.approx(70.0, abs=0.5)
