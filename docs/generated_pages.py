@@ -137,22 +137,23 @@ def instruments() -> Iterator[str]:
     """Yield the lines of the page about drivers."""
     yield "# Instruments\n"
     yield "Drivers that are registered, with their keys in a table `[devices.NAME]` of a rig file.\n"
-    for name, entry in registry.entries("devices").items():
-        driver = entry.load()
-        yield f"## `{name}`\n"
-        yield f'`driver = "{name}"`, or `"{entry.reference}"`. {_first_paragraph(driver)}\n'
-        yield from _fields(driver.Settings)
+    yield from _registered("devices", "driver")
 
 
 def laboratories() -> Iterator[str]:
     """Yield the lines of the page about emulated laboratories."""
     yield "# Laboratories\n"
     yield "Emulated laboratories that are registered, with their keys in the table `[emulation]` of a rig file.\n"
-    for name, entry in registry.entries("laboratories").items():
-        laboratory = entry.load()
+    yield from _registered("laboratories", "laboratory")
+
+
+def _registered(group: registry.Group, key: str) -> Iterator[str]:
+    """Yield a section for each part of a group that a rig file names by `key`: how, what it is, and its settings."""
+    for name, entry in registry.entries(group).items():
+        part = entry.load()
         yield f"## `{name}`\n"
-        yield f'`laboratory = "{name}"`. {_first_paragraph(laboratory)}\n'
-        yield from _fields(laboratory.Settings)
+        yield f'`{key} = "{name}"`, or `"{entry.reference}"`. {_first_paragraph(part)}\n'
+        yield from _fields(part.Settings)
 
 
 def protocols() -> Iterator[str]:

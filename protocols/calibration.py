@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from bench.devices import Signal
-from bench.protocol import Dwell, Messages, Phase, Prompt, ProtocolParameters, Slot, Slots, Step, parameter, protocol
+from bench.protocol import Dwell, Messages, Phase, ProtocolParameters, Slot, Slots, Step, parameter, protocol
 from bench.protocol.number_list import NumberList
-from protocols.preparation import SETTLE_LOAD
+from protocols.preparation import prompt_for
 
 
 class CommonParameters(ProtocolParameters):
@@ -61,14 +61,6 @@ def _compare(slot: Slot, values: NumberList, tolerance: float, parameters: Commo
     """Prompt for one value after another, and read each; the label of a reading is its value."""
     for value in values:
         yield Phase(f"{value:g} {slot.unit}")
-        yield Prompt(
-            text=slot.table.prompt.format(value=value, unit=slot.unit),
-            task=slot.table.task or slot.name,
-            value=value,
-            settle=SETTLE_LOAD,
-            signal=slot.signal,
-            low=value - tolerance,
-            high=value + tolerance,
-        )
+        yield from prompt_for(slot, value, tolerance)
         for _ in range(parameters.readings):
             yield Step({}, Dwell(parameters.dwell), label=repr(float(value)))

@@ -106,19 +106,19 @@ def load_checked_model(parameters: ControlledParameters, slots: Slots) -> ModelF
 def hang_load(slots: Slots, load: float) -> Part[None]:
     """Have a load hung on the specimen, if the rig has such a slot, and check by its signal that this was done."""
     if "load" in slots and load:
-        yield from prompt_for_load(slots["load"], load, slots["load"].table.tolerance_of(load))
+        yield from prompt_for(slots["load"], load, slots["load"].table.tolerance_of(load))
 
 
-def prompt_for_load(slot: Slot, load: float, tolerance: float) -> Part[Reading]:
-    """Prompt for a load on the specimen, and verify by its signal, within a tolerance, that this was done."""
+def prompt_for(slot: Slot, value: float, tolerance: float) -> Part[Reading]:
+    """Prompt for a value set up by hand, and verify by the slot's signal, within a tolerance, that this was done."""
     reading = yield Prompt(
-        text=slot.table.prompt.format(value=load, unit=slot.unit),
+        text=slot.table.prompt.format(value=value, unit=slot.unit),
         task=slot.table.task or slot.name,
-        value=load,
+        value=value,
         settle=SETTLE_LOAD,
         signal=slot.signal,
-        low=load - tolerance,
-        high=load + tolerance,
+        low=value - tolerance,
+        high=value + tolerance,
     )
     return reading
 

@@ -174,6 +174,32 @@ def warm_commands(warm_start, tmp_path_factory):
 
 
 @pytest.fixture
+def terminal():
+    """Start `bench` with arguments at a terminal of 40 lines; what is left is ended with the test."""
+    pexpect = pytest.importorskip("pexpect")
+    started = []
+
+    def begin(*arguments, columns, env, **settings):
+        # These overrule the size of the terminal, and some shells export them.
+        env = {name: value for name, value in env.items() if name not in {"COLUMNS", "LINES"}}
+        child = pexpect.spawn(
+            sys.executable,
+            ["-m", "bench", *map(str, arguments)],
+            encoding="utf-8",
+            timeout=90,
+            dimensions=(40, columns),
+            env=env,
+            **settings,
+        )
+        started.append(child)
+        return child
+
+    yield begin
+    for child in started:
+        child.close(force=True)
+
+
+@pytest.fixture
 def bench(capsys):
     """Run a command in this process; return exit code, standard output and standard error.
 

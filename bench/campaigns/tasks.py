@@ -233,10 +233,7 @@ class RunTask(Task):
 
     def describe(self) -> dict[str, Any]:
         """Return what it is, for programs."""
-        return {
-            "kind": "run",
-            **{key: value for key, value in asdict(self).items() if key not in ("name", "identity")},
-        }
+        return {"kind": "run", **_own_fields(self)}
 
     def _work(self, campaign: Path, scratch: Path) -> tuple[Path, Done]:
         result = carry_out(self.run(campaign, scratch), Console(quiet=True))
@@ -301,9 +298,7 @@ class ModelTask(Task):
         }
 
     def _work(self, campaign: Path, scratch: Path) -> tuple[Path, Done]:
-        source = RunFolder(campaign / self.source)
-        if source.status != "completed":
-            raise DataError(f"the run {self.source} was not completed")
+        source = completed_run(campaign, self.source)
         found = identify_file(
             source.folder,
             input_column=self.input or source.signal_of("drive"),
@@ -355,15 +350,10 @@ class ComparisonTask(Task):
 
     def describe(self) -> dict[str, Any]:
         """Return what it is, for programs."""
-        return {
-            "kind": "comparison",
-            **{key: value for key, value in asdict(self).items() if key not in ("name", "identity")},
-        }
+        return {"kind": "comparison", **_own_fields(self)}
 
     def _work(self, campaign: Path, scratch: Path) -> tuple[Path, Done]:
-        source = RunFolder(campaign / self.source)
-        if source.status != "completed":
-            raise DataError(f"the run {self.source} was not completed")
+        source = completed_run(campaign, self.source)
         session = Session.parse(self.recalibrate or None, self.recalibrate_rows)
         results: dict[str, tuple[float, str]] = {}
         for name, task in self.models.items():
@@ -413,6 +403,19 @@ class StudyTask(Task):
         with Workers(1) as workers:
             found = study.carry_out(Campaign(self.rig or study.rig or "", made, self.seed, False, workers))
         return made, Done(self.identity, "completed", "", dict(flat_numbers(found.values)))
+
+
+def completed_run(campaign: Path, name: str) -> RunFolder:
+    """Return the run of a task; raises DataError if it was not completed."""
+    run = RunFolder(campaign / name)
+    if run.status != "completed":
+        raise DataError(f"the run {name} was not completed")
+    return run
+
+
+def _own_fields(task: RunTask | ComparisonTask) -> dict[str, Any]:
+    """Return the fields of a task but those that all tasks have."""
+    return {key: value for key, value in asdict(task).items() if key not in ("name", "identity")}
 
 
 def identification_options(options: Mapping[str, Any]) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from bench.hysteresis import _checks
 from bench.hysteresis._checks import Floats
 from bench.hysteresis.operator import Operator
 from bench.hysteresis.regressor import Regressor
-from bench.hysteresis.stream import Stream, address_of
+from bench.hysteresis.stream import AddressedStream, Stream, address_of
 
 if TYPE_CHECKING:
     from bench.hysteresis._stream_kernels import Step
@@ -151,7 +151,7 @@ class ElementOperator(Operator[ElementState]):
         return True if (values >= 0.0).all() else False if (values <= 0.0).all() else None
 
 
-class ElementStream(Stream[ElementState]):
+class ElementStream(AddressedStream[ElementState]):
     """An operator of elements, changed in place; equal to `ElementOperator.step` but for the rounding of a sum.
 
     Parameters
@@ -183,13 +183,6 @@ class ElementStream(Stream[ElementState]):
             self._words[place] = address_of(array)
         self._words[kernels.COUNT] = self._elements.size
         self._address = address_of(self._words)
-
-    def step(self, value: float) -> float:
-        """Move the input monotonically to `value` and return the output; see `Stream.step`."""
-        output = self._step(self._address, value)
-        if output != output and not math.isfinite(value):
-            raise ValueError(f"value: expected a finite number, got {value}")
-        return output
 
     @property
     def value(self) -> float:

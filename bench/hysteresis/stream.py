@@ -160,7 +160,21 @@ class PreisachStream(Stream[MemoryCurve]):
         return trusted_curve(tuple(extrema.tolist()), self._numbers.item(kernels.INPUT), saturation)
 
 
-class PlayStream(Stream["PlayState"]):
+class AddressedStream(Stream[S]):
+    """A stream whose compiled step takes the address of its numbers; it returns nan where the input is not finite."""
+
+    _step: Step
+    _address: int
+
+    def step(self, value: float) -> float:
+        """Move the input monotonically to `value` and return the output; see `Stream.step`."""
+        output = self._step(self._address, value)
+        if output != output and not math.isfinite(value):
+            raise ValueError(f"value: expected a finite number, got {value}")
+        return output
+
+
+class PlayStream(AddressedStream["PlayState"]):
     """A Prandtl-Ishlinskii operator and its plays on arrays; equal to `evaluate` to the last bit."""
 
     operator: PrandtlIshlinskii
@@ -193,13 +207,6 @@ class PlayStream(Stream["PlayState"]):
         numbers[kernels.BIAS] = operator.bias
         numbers[kernels.PLAY_OUTPUT] = operator.value(state)
         self._address = address_of(words)
-
-    def step(self, value: float) -> float:
-        """Move the input monotonically to `value` and return the output; see `Stream.step`."""
-        output = self._step(self._address, value)
-        if output != output and not math.isfinite(value):
-            raise ValueError(f"value: expected a finite number, got {value}")
-        return output
 
     @property
     def value(self) -> float:

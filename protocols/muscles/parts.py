@@ -27,7 +27,7 @@ from bench.protocol import (
     parameter,
     unit_of,
 )
-from protocols.preparation import DRIVE_AND_RESPONSE, SETTLE_LOAD, Part, prompt_for_load
+from protocols.preparation import DRIVE_AND_RESPONSE, SETTLE_LOAD, Part, prompt_for
 
 SAMPLE = "sample"
 """Label of the readings that count."""
@@ -82,7 +82,7 @@ def drive_to(slots: Slots, value: float, seconds: float, label: str) -> Step:
 
 def hang(slots: Slots, load: float) -> Part[Reading]:
     """Prompt for a load (N) on the muscle, and verify it with the load cell."""
-    return (yield from prompt_for_load(slots["load"], load, 0.15 + 0.02 * load))
+    return (yield from prompt_for(slots["load"], load, 0.15 + 0.02 * load))
 
 
 def reset_under_weights(parameters: ResetParameters, slots: Slots) -> Part[Reading]:

@@ -3,6 +3,7 @@
 import json
 import os
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -17,30 +18,13 @@ HERE = Path(__file__).parent
 
 
 @pytest.fixture
-def start(tmp_path):
-    """Start `bench` with arguments at a terminal; the fixture ends what is left."""
-    started = []
-
-    def begin(*arguments):
-        environment = {
-            **os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), str(HERE.parents[1])]), "TERM": "xterm",
-            "NO_COLOR": "1",
-        }  # fmt: skip
-        child = pexpect.spawn(
-            sys.executable,
-            ["-m", "bench", *arguments],
-            cwd=tmp_path,
-            env=environment,
-            encoding="utf-8",
-            timeout=90,
-            dimensions=(40, 160),
-        )
-        started.append(child)
-        return child
-
-    yield begin
-    for child in started:
-        child.close(force=True)
+def start(terminal, tmp_path):
+    """Start `bench` with arguments at a terminal, where the rigs of the tests are found."""
+    environment = {
+        **os.environ, "PYTHONPATH": os.pathsep.join([str(HERE), str(HERE.parents[1])]), "TERM": "xterm",
+        "NO_COLOR": "1",
+    }  # fmt: skip
+    return partial(terminal, columns=160, cwd=tmp_path, env=environment)
 
 
 def run_of(tmp_path):

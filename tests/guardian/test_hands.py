@@ -22,26 +22,14 @@ pytestmark = [
 
 
 @pytest.fixture
-def panel(vo2, tmp_path):
+def panel(terminal, vo2, tmp_path):
     """Start the panel of the served rig, or of a copy of its file."""
-    started = []
 
     def begin(rig="vo2"):
-        arguments = ["-m", "bench", "panel", str(rig), "--attach", str(vo2.endpoints_file), "--out", str(tmp_path)]
-        child = pexpect.spawn(
-            sys.executable,
-            arguments,
-            env={**os.environ, "TERM": "xterm"},
-            encoding="utf-8",
-            timeout=90,
-            dimensions=(40, 150),
-        )
-        started.append(child)
-        return child
+        arguments = ["panel", rig, "--attach", vo2.endpoints_file, "--out", tmp_path]
+        return terminal(*arguments, columns=150, env={**os.environ, "TERM": "xterm"})
 
-    yield begin
-    for child in started:
-        child.close(force=True)
+    return begin
 
 
 def record_in(folder):

@@ -46,8 +46,9 @@ def test_clears_what_the_watchdogs_left_and_goes_on(served, tmp_path, capsys):
     again = ["resume", str(folder), "--attach", str(served.endpoints_file), "--accept-disagreement"]
     with pytest.raises(SystemExit) as ended:
         main(again)
-    said = " ".join(capsys.readouterr().out.split())
-    assert not ended.value.code
+    printed = capsys.readouterr()
+    said = " ".join(printed.out.split())
+    assert not ended.value.code, printed.err
     assert "tec: cleared: error 183 (communication watchdog" in said
     assert not is_on(served)
     with Record(folder) as record:
