@@ -87,13 +87,16 @@ def identify_correction(
         input_unit=model.input_unit,
         output_unit=model.output_unit,
     )
-    rows = np.concatenate([template.regressor(each).dense() for each in inputs])[chosen]
     nodes, roughness = _smooth_densities(levels)
-    columns = np.column_stack([nodes.T.dot(rows.T).T, np.ones(rows.shape[0])])
+    parts = []
+    for each, kept in zip(inputs, np.split(chosen, np.cumsum([each.size for each in inputs])[:-1]), strict=True):
+        cells = template.regressor(each).dense()[kept]
+        parts.append(np.column_stack([nodes.T.dot(cells.T).T, np.ones(cells.shape[0]), cells @ own]))
+    columns, taken = np.split(np.concatenate(parts), [-1], axis=1)
     target = errors[chosen]
     # Beside the density of the model, and in place of it if it has one.
     replaced = [np.zeros(own.size), *([own] if own.any() else [])]
-    targets = np.column_stack([target + rows @ each for each in replaced])
+    targets = np.column_stack([target, target + taken[:, 0]])[:, : len(replaced)]
     penalty = np.zeros((columns.shape[1],) * 2)
     penalty[:-1, :-1] = roughness * (float(np.mean(columns[:, :-1] ** 2)) * target.size or 1.0)
     # Of matrices of this size, threads that wait for each other cost more than they save.

@@ -1,6 +1,6 @@
 """Trials of twins: tracking runs on a twin, beside those on the emulated plant that it was identified from.
 
-    python tests/bench/twin_trials.py [--rig vo2 ...] [--specimens 3] [--real 5] [--twin 5] [--out FOLDER]
+    python tests/bench/twin_trials.py [--rig vo2 ...] [--specimens 3] [--sessions 12] [--out FOLDER]
 
 The plants of the packaged rigs are built differently from any twin. Each specimen is characterized once (creep,
 damped-oscillation, random-validation), in sessions of its own; the second run identifies the model of the controller,
@@ -33,6 +33,8 @@ MODELS: Mapping[str, Mapping[str, Any]] = {
     "sma": {"model": "preisach-signed"},
     "hybrid": {"model": "prandtl-ishlinskii"},
 }
+SESSIONS = {"vo2": 12, "sma": 4, "hybrid": 4}
+"""Sessions of each plant and twin: on vo2 durations differ by 6 % from one to another."""
 SEEDED = {"vo2", "sma"}
 """Rigs whose specimens differ by a seed; of others it is the sessions alone that differ."""
 GOALS = {"duration, s": 0.02, "RMS error, base unit": 0.3}
@@ -58,9 +60,7 @@ def tracked(run: Path) -> tuple[float, float]:
     return steps[-1].finished, float(np.sqrt(np.mean(np.square(means))))
 
 
-def trial(
-    rig: str, specimen: int, folder: Path, real: int, twins: int
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def trial(rig: str, specimen: int, folder: Path, sessions: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return duration and RMS on a plant and on its twin, a row each session."""
     # The first specimen is the packaged one.
     other = {"emulation.specimen_seed": str(specimen)} if specimen and rig in SEEDED else {}
@@ -72,9 +72,9 @@ def trial(
     bench.identify(loops, **MODELS[rig]).file.save(model)
     write_twin([creep.folder, loops.folder, validation.folder], rig, twin, model)
     found = []
-    for on, seed, count, overrides in ((rig, 11, real, other), (str(twin), 101, twins, {})):
+    for on, seed, overrides in ((rig, 11, other), (str(twin), 101, {})):
         rows: list[tuple[float, float]] = []
-        while len(rows) < count:
+        while len(rows) < sessions:
             try:
                 run = bench.run("tracking", on, out=folder, seed=seed, overrides=overrides, model=str(model))
                 rows.append(tracked(run.folder))
@@ -95,8 +95,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rig", nargs="+", choices=[*MODELS], default=[*MODELS])
     parser.add_argument("--specimens", type=int, default=3)
-    parser.add_argument("--real", type=int, default=5)
-    parser.add_argument("--twin", type=int, default=5)
+    parser.add_argument("--sessions", type=int, help="of each plant and twin; default: " + str(dict(SESSIONS)))
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
     table = Table("rig", "", "specimen", "plant", "twin", "of the medians")
@@ -106,7 +105,7 @@ def main() -> None:
             changes: dict[str, list[float]] = {name: [] for name in GOALS}
             for specimen in range(arguments.specimens):
                 folder = (arguments.out or Path(temporary)) / f"{rig}-{specimen}"
-                plant, twin = trial(rig, specimen, folder, arguments.real, arguments.twin)
+                plant, twin = trial(rig, specimen, folder, arguments.sessions or SESSIONS[rig])
                 for column, name in enumerate(GOALS):
                     change = float(np.median(twin[:, column]) / np.median(plant[:, column])) - 1.0
                     changes[name].append(change)
