@@ -140,8 +140,11 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
         if not self.is_open or not self._socket.taken:
             self._check()
         self._hear()
-        data = bytes(self._received)
-        self._received.clear()
+        received = self._received
+        if not received:
+            return b""
+        data = bytes(received)
+        received.clear()
         return data
 
     def _wait_for(self, size: int) -> None:
@@ -209,23 +212,38 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
             except (FramingError, ConnectionError) as error:
                 raise self._ended(error) from None
             return len(sent)
-        clock = self._clock
+        answer = self._answer(sent)
+        if answer:
+            self._received += answer
+        return len(sent)
+
+    def _answer(self, sent: bytes) -> bytes:
+        """Let the bytes pass on a serial line; return the answer, for which the time has passed as well."""
+        clock, stream = self._clock, self._stream
         clock.sleep(len(sent) * _BITS_PER_BYTE / self._baudrate)
-        self._hear()
-        answer = self._stream.receive(sent)
+        heard = stream.unsolicited()
+        if heard:
+            self._received += heard
+        answer = stream.receive(sent)
         if answer:
             clock.sleep(len(answer) * _BITS_PER_BYTE / self._baudrate)
-        self._received += answer
-        return len(sent)
+        return answer
 
     def exchange(self, data: bytes) -> bytes:
         """Send bytes and return what was received then; as `write` and `read_all` do, but sooner."""
-        if self._connection is not None and self.is_open and self._socket.taken and not self._received:
-            try:
-                return self._connection.receive(data)
-            except (FramingError, ConnectionError) as error:
-                raise self._ended(error) from None
-        self.write(data)
+        if not self._received and self.is_open and self._socket.taken:
+            if self._connection is not None:
+                try:
+                    return self._connection.receive(data)
+                except (FramingError, ConnectionError) as error:
+                    raise self._ended(error) from None
+            answer = self._answer(data)
+            heard = self._stream.unsolicited()
+            if not self._received:
+                return answer + heard if heard else answer
+            self._received += answer + heard
+        else:
+            self.write(data)
         return self.read_all()
 
     def _ended(self, error: Exception) -> SerialException:

@@ -269,6 +269,7 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
     def __init__(self, name: str, settings: MX28SettingsT, clock: Clock, line: ServoLine) -> None:
         super().__init__(name, settings, clock, line)
         self._names = [signal.name for signal in self.signals]
+        self._per_radian = settings.per_radian
         self._goal: int | None = 0
         self._on = self._restarted = False
         self._tick = -1
@@ -316,7 +317,7 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
         """Measure position, velocity and inferred load (1), in one round trip."""
         found = self._feedback()
         direction = self._settings.direction
-        velocity = direction * found.velocity * _VELOCITY_UNIT * self._settings.per_radian
+        velocity = direction * found.velocity * _VELOCITY_UNIT * self._per_radian
         values = (self._position(found.position), velocity, direction * found.load * 1e-3)
         return dict(zip(self._names, values, strict=True))
 
@@ -525,7 +526,7 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
 
     def _position(self, counts: int) -> float:
         settings = self._settings
-        return settings.direction * (counts - settings.zero_counts) * _COUNT * settings.per_radian
+        return settings.direction * (counts - settings.zero_counts) * _COUNT * self._per_radian
 
     def _text(self, counts: int) -> str:
         return f"{self._position(counts):.{self._DIGITS}g} {self.limits.unit}"

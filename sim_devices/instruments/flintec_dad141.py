@@ -35,10 +35,9 @@ Assumptions, where these say nothing:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from operator import attrgetter
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -49,7 +48,7 @@ from bench.errors import DeviceError
 from bench.roles import LoadCell
 from sim_devices.instruments.emulated import EmulatedDevice, LineFaults
 from sim_devices.instruments.registers import Register, RegisterInstrument
-from sim_devices.wire.modbus import DEVICE_FAILURE, ILLEGAL_VALUE, RegisterError
+from sim_devices.wire.modbus import DEVICE_FAILURE, ILLEGAL_VALUE, Frame, Packet, RegisterError
 from sim_devices.world import World
 
 if TYPE_CHECKING:
@@ -87,7 +86,7 @@ _MOST_TRACKING = 255
 _FINE_LAGS = 0.5  # time constants between two looks at the force
 _FEW_LOOKS = 4  # looks that are not put off
 _MOST_ASKED = 256  # readings whose conversions wait
-_NORMALS = 256  # random numbers drawn at once
+_NORMALS = 2048  # random numbers drawn at once
 _STILL_POLL = 0.05
 _STILL_TIMEOUT = 10.0
 _SET_UP_REGISTERS = frozenset((0x2106, 0x2110))
@@ -99,10 +98,6 @@ _TRACKING_BAND = 0.5  # d for each unit of ZT (10.2.8)
 _TRACKING_RATE = 0.4  # d in a second
 _TRACKING_LOOK = 0.1  # s
 _FIRST_ACCESS_CODE = 17
-# The state of the converter, in the order of the kernels; the zero is not theirs to change.
-_CONTINUOUS = ("_converted", "_input", "_first", "_second", "_noise_first", "_noise_second", "_still_since")
-_DIGITS = ("_reference", "_digits", "_gross", "_peak")
-_STATE_OF = attrgetter(*_CONTINUOUS, *_DIGITS, "_zero")
 
 
 def time_constant(setting: int) -> float:
@@ -299,7 +294,7 @@ class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
         if self.frozen:
             return math.inf
         now = self._now()
-        if self._course is not None:
+        if self._course is not None and (self._asked or now - self._converted > self._near):
             if self._may_wait(self._course, now):
                 return math.inf
             if self._asked:
@@ -307,15 +302,15 @@ class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
                 self._asked.clear()
         if self._tracking:
             return self._converted + _TRACKING_LOOK
+        if now - self._converted <= self._near:
+            # As a rule, and what the kernel says of it.
+            return self._converted + self._fine
         due: float = kernels.next_look.py_func(self._converted, now, self._conversion)
         return due
 
     def _may_wait(self, course: Course, now: float) -> bool:
         """Return whether the conversions for a reading at the present can wait, and note that they do."""
         asked = self._asked
-        if not asked and now - self._converted <= _FEW_LOOKS * self._conversion.fine:
-            # Sooner made than put off.
-            return False
         # Zero tracking leaves the zero between two digits.
         if self._tracking or not course.is_known or not self._zero.is_integer():
             return False
@@ -339,7 +334,24 @@ class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
 
     def _convert_along(self, course: Course) -> None:
         until = self.world.time
-        state = np.array(_STATE_OF(self), dtype=np.float64)
+        # In the order of the kernels; the zero is not theirs to change.
+        state = np.array(
+            (
+                self._converted,
+                self._input,
+                self._first,
+                self._second,
+                self._noise_first,
+                self._noise_second,
+                self._still_since,
+                self._reference,
+                self._digits,
+                self._gross,
+                self._peak,
+                self._zero,
+            ),
+            dtype=np.float64,
+        )
         point = until - course.since_point()
         done = 0
         while True:
@@ -361,11 +373,21 @@ class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
                 break
             self._draw_more()
         del self._asked[:done]
-        values = state.tolist()
-        for name, value in zip(_CONTINUOUS, values, strict=False):
-            setattr(self, name, value)
-        for name, digits in zip(_DIGITS, values[len(_CONTINUOUS) :], strict=False):
-            setattr(self, name, int(digits))
+        (
+            self._converted,
+            self._input,
+            self._first,
+            self._second,
+            self._noise_first,
+            self._noise_second,
+            self._still_since,
+            reference,
+            digits,
+            gross,
+            peak,
+            _,
+        ) = state.tolist()
+        self._reference, self._digits, self._gross, self._peak = int(reference), int(digits), int(gross), int(peak)
 
     def _draw_more(self) -> None:
         self._block = np.concatenate((self._block[self._used :], self._rng.standard_normal(_NORMALS)))
@@ -394,11 +416,13 @@ class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
         self._motion_time = set_up.motion_time / 1000
         # How long before a reading the force matters to it.
         self._memory = _MEMORY_LAGS * self._lag + self._motion_time + 2 * kernels.COARSE
+        self._fine = _FINE_LAGS * self._lag
+        self._near = _FEW_LOOKS * self._fine
         self._conversion = kernels.SetUp(
             self._lag,
             self._spread,
             self._memory,
-            _FINE_LAGS * self._lag,
+            self._fine,
             _MEMORY_LAGS * self._lag + kernels.COARSE,
             float(set_up.motion_range),
             self._span,
@@ -511,6 +535,23 @@ class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
                 )
         return super().read_registers(address, count)
 
+    def prepare(self, frames: Sequence[Frame], heads: Sequence[int]) -> Packet | None:
+        """Return what carries a packet that reads neighbouring registers out; None of any other."""
+        packet = super().prepare(frames, heads)
+        if packet is None or len(frames) > 1 or frames[0].writes:
+            return None
+        if frames[0].address not in _SET_UP_REGISTERS:
+            return packet
+        reads = self._reads(frames[0].address, frames[0].number)
+
+        def read_set_up(request: bytes) -> bytes:
+            if self._written:
+                return packet(request)
+            with self.world.lock:
+                return reads.values.pack(*[read() for read in reads.read])
+
+        return read_set_up
+
     def write_registers(self, address: int, values: list[int]) -> None:
         """Write registers from `address` on, in whole values; errors are those of the base class."""
         super().write_registers(address, values)
@@ -519,8 +560,9 @@ class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
     def _begin(self) -> None:
         self.world.lock.acquire()
         try:
-            self.world.advance()
-            self._catch_up()
+            self.world.advance_locked()
+            if self._asked:
+                self._catch_up()
             self._convert()
             self._written = False
         except BaseException:
