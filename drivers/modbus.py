@@ -49,6 +49,7 @@ _MBAP = struct.Struct(">HHHB")  # transaction, protocol (0), bytes that follow, 
 _TRANSACTIONS = 0x10000
 _REFUSED = 0x80
 _KNOWN_FRAMES = 64  # that are kept; a host asks the same few again and again
+_KNOWN_REPLIES = 1024  # whose CRC is kept; what is at rest gives the same few readings
 
 
 class RefusedError(Exception):
@@ -220,6 +221,7 @@ def _crc_table() -> tuple[int, ...]:
 _CRC = _crc_table()
 
 
+@lru_cache(_KNOWN_REPLIES)
 def crc16(data: bytes) -> bytes:
     """Return the CRC of a Modbus RTU frame as it follows on the line, low byte first."""
     crc = 0xFFFF
@@ -280,7 +282,7 @@ class RtuClient(_PortClient):
     Parameters
     ----------
     port : serial.SerialBase
-        The open port, with an `exchange` of its own.
+        The open port, with an `ask` of its own.
     unit : int
         Address of the instrument, 1 to 247.
     """
@@ -294,10 +296,7 @@ class RtuClient(_PortClient):
 
         Raises `NoReplyError` or `UnexpectedReplyError`, besides what the base class says.
         """
-        port = self._port
-        if port.in_waiting:
-            port.reset_input_buffer()
-        reply: bytes = port.exchange(_framed(self._unit, request))
+        reply: bytes = self._port.ask(_framed(self._unit, request))
         if len(reply) != expected + 3 or reply[0] != self._unit or reply[1] != request[0]:
             reply = self._reply_among(reply, request, expected)
         elif crc16(reply[:-2]) != reply[-2:]:

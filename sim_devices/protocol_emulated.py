@@ -231,20 +231,28 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
 
     def exchange(self, data: bytes) -> bytes:
         """Send bytes and return what was received then; as `write` and `read_all` do, but sooner."""
-        if not self._received and self.is_open and self._socket.taken:
-            if self._connection is not None:
-                try:
-                    return self._connection.receive(data)
-                except (FramingError, ConnectionError) as error:
-                    raise self._ended(error) from None
-            answer = self._answer(data)
-            heard = self._stream.unsolicited()
-            if not self._received:
-                return answer + heard if heard else answer
-            self._received += answer + heard
-        else:
-            self.write(data)
+        if self._connection is not None and self.is_open and self._socket.taken and not self._received:
+            try:
+                return self._connection.receive(data)
+            except (FramingError, ConnectionError) as error:
+                raise self._ended(error) from None
+        self.write(data)
         return self.read_all()
+
+    def ask(self, data: bytes) -> bytes:
+        """Forget what was received and not read, send bytes on a serial line, and return what was received then."""
+        if not self.is_open or not self._socket.taken:
+            self._check()
+        received, stream = self._received, self._stream
+        # What comes while the bytes pass is received after all.
+        stream.unsolicited()
+        received.clear()
+        answer = self._answer(data)
+        answer += stream.unsolicited()
+        if received:
+            answer = bytes(received) + answer
+            received.clear()
+        return answer
 
     def _ended(self, error: Exception) -> SerialException:
         return SerialException(f"{_SCHEME}{self._name} ended the connection: {error}")

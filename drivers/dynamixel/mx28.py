@@ -104,7 +104,8 @@ _VOLTAGE = _Item(144, 2, "input voltage")
 _TEMPERATURE = _Item(146, 1, "temperature")
 
 _TICK, _MOVING, _LOAD, _VELOCITY = 120, 122, 126, 128
-_FEEDBACK = struct.Struct("<BBBbiHBhii")
+# What changes in most readings comes last: the line keeps the CRC of what is before it.
+_FEEDBACK = struct.Struct("<BBBbiBhiiH")
 _FEEDBACK_BYTES = tuple(
     address + offset
     for address, size in (
@@ -113,11 +114,11 @@ _FEEDBACK_BYTES = tuple(
         (_HARDWARE_ERROR.address, 1),
         (_WATCHDOG.address, 1),
         (_GOAL.address, 4),
-        (_TICK, 2),
         (_MOVING, 1),
         (_LOAD, 2),
         (_VELOCITY, 4),
         (_POSITION.address, 4),
+        (_TICK, 2),
     )
     for offset in range(size)
 )
@@ -133,11 +134,11 @@ class _Feedback(NamedTuple):
     hardware_error: int
     watchdog: int
     goal: int
-    tick: int
     moving: int
     load: int
     velocity: int
     position: int
+    tick: int
 
 
 HARDWARE_ERRORS: Mapping[int, tuple[str, str]] = {

@@ -32,6 +32,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Sequence
+from operator import itemgetter
 from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
@@ -85,8 +86,8 @@ class _Report(NamedTuple):
 
     sources: list[tuple[Callable[..., Any], int]]
     """Each reading, with its subindex."""
-    places: list[int]
-    """Which of the readings the frames carry, in their order."""
+    carried: Callable[[Sequence[int]], tuple[int, ...]]
+    """Returns what the frames carry of the readings, in their order."""
     form: struct.Struct
     """Form of the data of all frames."""
     frames: tuple[tuple[int, int], ...]
@@ -345,7 +346,7 @@ class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
         with self.world.lock:
             self.world.advance_locked()
             values = [read(sub) for read, sub in report.sources]
-        return report.frames, report.form.pack(*[values[place] for place in report.places])
+        return report.frames, report.form.pack(*report.carried(values))
 
     def next_process_data(self) -> float:
         """Return when the next TPDO is due by its send rate, s; infinity if none is."""
@@ -372,7 +373,7 @@ class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
         keys = [*dict.fromkeys(carried)]
         return _Report(
             [(self._readings[index], sub) for index, sub in keys],
-            [keys.index(key) for key in carried],
+            itemgetter(*map(keys.index, carried)) if len(carried) > 1 else tuple,
             self._form(carried),
             tuple((identifier, self._form(objects).size) for identifier, objects in pdos),
         )

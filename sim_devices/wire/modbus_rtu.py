@@ -16,6 +16,7 @@ broadcast), 2.5.1 (RTU framing) and 6.2.2 (CRC); MODBUS Application Protocol Spe
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import lru_cache
 from typing import NamedTuple
 
 from sim_devices.instruments.emulated import LineFaults
@@ -59,6 +60,10 @@ def crc16(data: bytes | bytearray | memoryview) -> bytes:
     for byte in data:
         crc = crc >> 8 ^ _TABLE[(crc ^ byte) & 0xFF]
     return crc.to_bytes(2, "little")
+
+
+_crc_of_reply = lru_cache(maxsize=1024)(crc16)
+"""What is at rest gives the same few readings."""
 
 
 class _Known(NamedTuple):
@@ -177,7 +182,7 @@ class ModbusRtuServer(WireServer):
         return b"" if address == BROADCAST else self._sealed(reply)
 
     def _sealed(self, reply: bytes) -> bytes:
-        sealed = reply + crc16(reply)
+        sealed = reply + _crc_of_reply(reply)
         return sealed if self._line is None else self._line.transmit(sealed)
 
 
