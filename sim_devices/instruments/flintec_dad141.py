@@ -38,7 +38,8 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Protocol
+from operator import attrgetter
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -98,6 +99,13 @@ _TRACKING_BAND = 0.5  # d for each unit of ZT (10.2.8)
 _TRACKING_RATE = 0.4  # d in a second
 _TRACKING_LOOK = 0.1  # s
 _FIRST_ACCESS_CODE = 17
+# The state of the converter, in the order of the kernels, and where its digits stand there.
+_STATE = (
+    *("_converted", "_input", "_first", "_second", "_noise_first", "_noise_second", "_still_since"),
+    *("_reference", "_digits", "_gross", "_peak", "_zero"),
+)
+_DIGITS = slice(7, 11)
+_STATE_OF = attrgetter(*_STATE)
 
 
 def time_constant(setting: int) -> float:
@@ -115,25 +123,6 @@ def _fading(lags: float) -> tuple[float, float, float, float]:
     """Return `kernels.fading`; kept, as the instrument mostly converts at even intervals."""
     found: tuple[float, float, float, float] = kernels.fading.py_func(lags)
     return found
-
-
-class Course(Protocol):
-    """The course of the force on a cell, as its plant keeps it: one value a step of a time grid."""
-
-    step: float
-    tolerance: float
-    """Step of the grid, and how far before a point that counts as reached, s."""
-
-    @property
-    def forces(self) -> kernels.Floats:
-        """Force at the last grid points, N, in a ring, and behind it the number of the last; see `convert_along`."""
-
-    @property
-    def is_known(self) -> bool:
-        """Whether the force goes by these values alone, whatever the instruments do until the next request."""
-
-    def since_point(self) -> float:
-        """Return the time for which the plant has stood at the last grid point, s."""
 
 
 @dataclass(frozen=True)
@@ -156,7 +145,7 @@ class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
     ----------
     force : callable
         The force on the cell in N, positive in tension, from the plant.
-    course : Course, optional
+    course : sim_devices.instruments._flintec_kernels.Course, optional
         The same force over time: with it conversions wait until the instrument is asked.
     newtons_per_unit : float
         How the instrument was calibrated: N for each unit that it displays, not 0; 9.80665 for kg.
@@ -198,7 +187,7 @@ class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
         step: int = 1,
         zero_tracking: int = 1,
         noise: float = 5e-4,
-        course: Course | None = None,
+        course: kernels.Course | None = None,
         samples: int = 5,
         serial_number: int = 1410237,
         firmware: tuple[int, int] = (1, 10),
@@ -308,7 +297,7 @@ class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
         due: float = kernels.next_look.py_func(self._converted, now, self._conversion)
         return due
 
-    def _may_wait(self, course: Course, now: float) -> bool:
+    def _may_wait(self, course: kernels.Course, now: float) -> bool:
         """Return whether the conversions for a reading at the present can wait, and note that they do."""
         asked = self._asked
         # Zero tracking leaves the zero between two digits.
@@ -332,26 +321,9 @@ class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
         if self._asked and self._course is not None:
             self._convert_along(self._course)
 
-    def _convert_along(self, course: Course) -> None:
+    def _convert_along(self, course: kernels.Course) -> None:
         until = self.world.time
-        # In the order of the kernels; the zero is not theirs to change.
-        state = np.array(
-            (
-                self._converted,
-                self._input,
-                self._first,
-                self._second,
-                self._noise_first,
-                self._noise_second,
-                self._still_since,
-                self._reference,
-                self._digits,
-                self._gross,
-                self._peak,
-                self._zero,
-            ),
-            dtype=np.float64,
-        )
+        state = np.array(_STATE_OF(self), dtype=np.float64)
         point = until - course.since_point()
         done = 0
         while True:
@@ -373,21 +345,9 @@ class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
                 break
             self._draw_more()
         del self._asked[:done]
-        (
-            self._converted,
-            self._input,
-            self._first,
-            self._second,
-            self._noise_first,
-            self._noise_second,
-            self._still_since,
-            reference,
-            digits,
-            gross,
-            peak,
-            _,
-        ) = state.tolist()
-        self._reference, self._digits, self._gross, self._peak = int(reference), int(digits), int(gross), int(peak)
+        values = state.tolist()
+        values[_DIGITS] = map(int, values[_DIGITS])
+        vars(self).update(zip(_STATE, values, strict=True))
 
     def _draw_more(self) -> None:
         self._block = np.concatenate((self._block[self._used :], self._rng.standard_normal(_NORMALS)))
