@@ -252,8 +252,8 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
     That is all it does by itself: the torque stays on after the death of its host, so `watchdog` is None, and only
     `safe` switches the torque off.
 
-    A reading is one block of indirect data (addresses 168 to 251): torque, bus watchdog, goal, realtime tick, motion,
-    load, velocity, position, and the status return level. The indirect addresses live in RAM: after a restart the
+    A reading is one block of indirect data (addresses 168 to 251): status return level, torque, bus watchdog, goal,
+    motion, load, velocity, position, and realtime tick. The indirect addresses live in RAM: after a restart the
     level is 0 there instead of 2. So the next reading finds the restart before it believes a position, which may be
     off by whole turns; from then on every reading and every set-point is a `DeviceRestartedError`, until the servo is
     connected again with its `zero_counts` checked. A goal or a torque that is not the one that was sent is a

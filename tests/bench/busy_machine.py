@@ -34,7 +34,6 @@ PROCESSES, RUNS_EACH = 4, 5
 process."""
 LONG_HOLD = 300.0
 """Time of either hold of the run at a scaled clock, s: seconds at x100."""
-STUDY_LOOPS = 4
 LOCAL = ("wall_seconds", "folder", "figures", "recordings")
 """What two studies with the same numbers do not share."""
 CARRY_OUT = """
@@ -129,7 +128,7 @@ def try_study(folder: Path, options: argparse.Namespace) -> str:
     """Return what is wrong with a study of the lowest priority beside busy processes; nothing if its numbers hold."""
     alone = _study(options.study, folder / "alone", {})
     nice = [] if os.name == "nt" else ["nice", "-n", "19"]
-    with busy(STUDY_LOOPS):
+    with busy(options.loops):
         beside = _study(options.study, folder / "beside", {"NUMBA_CACHE_DIR": str(folder / "cache")}, *nice)
     different = sorted(name for name in alone.keys() | beside.keys() if alone.get(name) != beside.get(name))
     return f"other than alone: {', '.join(different)}" if different else ""
@@ -160,6 +159,7 @@ def main() -> None:
     parser.add_argument("--busy", type=int, default=16, help="busy processes beside the runs")
     parser.add_argument("--clock", default="x100", help="clock of the trial `clock`")
     parser.add_argument("--study", default="hybrid", help="study of the trial `study`")
+    parser.add_argument("--loops", type=int, default=4, help="busy processes beside that study")
     options = parser.parse_args()
     failed = []
     for name in options.trial:
