@@ -61,7 +61,8 @@ SHORT: dict[str, dict[str, Any]] = {
     "length-control": {"count": 12},
     "force-control": {"count": 12},
     "hybrid-control": {"hold": 10.0},
-    "tracking": {"count": 12, "controller": "closed-loop-inverse"},
+    # A model of few samples may be worse than none.
+    "tracking": {"count": 12, "controller": "closed-loop-inverse", "fallback": "open-loop"},
     "following": {"duration": 200.0, "period": 100.0, "controller": "open-loop-inverse"},
 }
 """Parameters of the protocols that no study carries out on a rig."""
