@@ -149,7 +149,8 @@ class Characteristic:
         """Return what it makes of a value, in its unit and without noise."""
         value = self._gain * quantity + self._offset
         if self._wave:
-            value += self._wave * math.sin(min(max(self._scale * (quantity - self._middle), -_WAVE), _WAVE))
+            angle = self._scale * (quantity - self._middle)
+            value += self._wave * math.sin(-_WAVE if angle < -_WAVE else _WAVE if angle > _WAVE else angle)
         return round(value / self._resolution) * self._resolution if self._resolution else value
 
     def course(self, quantities: Floats) -> Floats:
@@ -198,14 +199,15 @@ class ImperfectSensor:
         self._late = _Late(quantity, errors.lag, errors.latency, world) if errors.lag or errors.latency else None
         self._quantity = quantity
         self.characteristic = Characteristic(errors, low, high)
+        self._value = self.characteristic.value
 
     def __call__(self) -> float:
         """Return what the sensor makes of the quantity at this instant, in its unit and without noise."""
-        return self.characteristic.value(self._quantity() if self._late is None else self._late())
+        return self._value(self._quantity() if self._late is None else self._late())
 
     def peek(self) -> float:
         """Return the same, and change nothing."""
-        return self.characteristic.value(self._quantity() if self._late is None else self._late.peek())
+        return self._value(self._quantity() if self._late is None else self._late.peek())
 
     @property
     def is_static(self) -> bool:
