@@ -1,8 +1,8 @@
 """What data sheets state of the sensors in the packaged laboratories.
 
-Lags and latencies are zero where they are shorter than the time between two samples of any loop: of the PSD (rise
-time 3 µs), the displacement sensor (20 µs a conversion) and the position sensor. The low-pass filter of the load
-cell is that of its amplifier, `sim_devices.instruments.flintec_dad141`.
+Lags and latencies are 0: those of PSD (rise time 3 µs), displacement and position sensor are shorter than the time
+between two samples of any loop; that of a thermistor is part of the heat capacity at its place in the plant; the
+filter of the load cell is that of its amplifier, `sim_devices.instruments.flintec_dad141`.
 """
 
 from __future__ import annotations
