@@ -20,6 +20,7 @@ import pytest
 from hypothesis import settings
 
 sys.path.append(str(Path(__file__).parent))
+from regression_bands import RECORDED_SEED, beyond_the_bands
 from warm_client import start_warm
 
 # Before numpy is loaded, and for the processes of the tests too: two workers, each with a thread of BLAS a core,
@@ -232,6 +233,8 @@ def reproduce(bench, tmp_path):
         campaign = json.loads(result.read_text())
         assert campaign["seed"] == seed
         assert all(Path(path).stat().st_size > 1000 for path in campaign["figures"] + campaign["recordings"])
+        if seed == RECORDED_SEED:
+            assert not beyond_the_bands(study, campaign)
         return out, campaign
 
     return run
