@@ -26,6 +26,8 @@ from bench.runs import carry_out
 from bench.studies import Study, StudyResult
 from bench.workers import Workers
 
+pytestmark = pytest.mark.usefixtures("warm_popen")
+
 PROTOCOLS = Path(__file__).parent / "heater_protocols.py"
 STAIRS = f'''
 [[runs]]

@@ -22,6 +22,8 @@ from bench.locks import Holder, Locks
 from bench.past.corners import corners, turning_points
 from bench.resume import Resume, resume
 
+pytestmark = pytest.mark.usefixtures("warm_popen")
+
 OSCILLATION = {
     "vo2": {"increment": 3.0, "half_cycles": 12},
     "sma": {"increment": 0.5, "half_cycles": 10, "dwell": 10.0},
