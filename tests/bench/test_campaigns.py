@@ -418,6 +418,8 @@ def test_no_other_scheduler_is_trusted(address, campaign, tmp_path, capsys):
         assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
+@pytest.mark.seeds
 def test_a_cluster_gives_the_same(campaign, tmp_path, rig_file):
     distributed = pytest.importorskip("distributed")
     program = tmp_path / "mine.py"
