@@ -255,7 +255,7 @@ class TestResume:
         assert [step.step for step in steps_of(folder)] == list(range(6))
 
 
-@pytest.mark.parametrize("rig", OSCILLATION)
+@pytest.mark.parametrize("rig", [pytest.param("vo2", marks=pytest.mark.seeds), "sma", "hybrid"])
 def test_a_killed_run_is_resumed_to_the_model_of_an_uninterrupted_one(rig, tmp_path, capsys):
     settings = OSCILLATION[rig]
     whole = bench.run("damped-oscillation", rig, out=tmp_path / "whole", **settings)
