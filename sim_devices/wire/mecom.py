@@ -104,7 +104,8 @@ class MeComServer(WireServer):
 
     def _serve(self, frame: bytes) -> bytes:
         device = self._device
-        frame = frame[max(frame.rfind(b"#"), 0) :]
+        if (begin := frame.rfind(b"#")) > 0:
+            frame = frame[begin:]
         if not _SHORTEST_FRAME <= len(frame) <= LONGEST_FRAME or not device.plugged_in:
             return b""
         body, crc = frame[:-4], frame[-4:]
