@@ -459,6 +459,7 @@ class _Stale(_Criterion):
     def __init__(self, interlock: Interlock, units: Mapping[str, str], stale: float) -> None:
         super().__init__(interlock, units, stale)
         self._last: float | None = None
+        self._first = math.nan
 
     def look(self, t: float, value: float, setpoint: float | None) -> None:  # noqa: ARG002 - as of all
         last = self._last

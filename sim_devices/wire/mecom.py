@@ -112,7 +112,7 @@ class MeComServer(WireServer):
         if crc != b"%04X" % crc_hqx(body, 0) or not _PREAMBLE.match(body):
             return b""
         number = int(body[1:3], 16)
-        if number not in (_BROADCAST, _SILENT, device.address):
+        if number != device.address and number not in (_BROADCAST, _SILENT):
             return b""
         device.attend()
         head = b"!" + body[1:7]
