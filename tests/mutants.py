@@ -256,6 +256,8 @@ def main() -> None:
     parser.add_argument("--survivors", type=Path, help="file for the list of mutants that survived")
     given = parser.parse_args()
     os.chdir(ROOT)
+    # The folders of the tests have the names of the packages that they test.
+    sys.path[0] = str(ROOT)
     files = sorted(
         str(path)
         for module in given.modules

@@ -626,6 +626,14 @@ class TestControl:
         assert outcome.laboratory_seconds <= 100.0
         b.assert_safe()
 
+    @pytest.mark.parametrize("wait", [0.0, -1.0, math.nan])
+    def test_one_that_would_not_let_time_pass_is_refused(self, bench, wait):
+        b = bench()
+        outcome = b.run(control(Integrator(50.0, wait=wait)))
+        assert isinstance(outcome.error, ConfigurationError)
+        assert f"the controller of probe_temperature asked to wait {wait} s" in outcome.reason
+        b.assert_safe()
+
     def test_one_that_does_not_converge_is_stopped(self, bench):
         class Cycling(Integrator):
             def update(self, t, measured_input, output):

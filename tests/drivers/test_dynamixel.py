@@ -330,7 +330,10 @@ def test_homing_offset_is_refused_with_the_watchdog(script, clock, offset):
     connect(clock, watchdog=0)
 
 
-def test_wrong_device(script, clock):
+def test_wrong_device(script, clock, monkeypatch):
+    closed = []
+    close = ServoLine.close
+    monkeypatch.setattr(ServoLine, "close", lambda line: (closed.append(line), close(line)))
     script.values[0] = 29
     with pytest.raises(DeviceConnectionError, match=r"expected a Dynamixel MX-28 .* id 1, found model 29"):
         connect(clock)
@@ -338,6 +341,8 @@ def test_wrong_device(script, clock):
     with pytest.raises(DeviceConnectionError, match=r"firmware 38, expected 39 or newer"):
         connect(clock)
     assert script.orders() == []
+    # A line that stayed open would keep the port from the next one who tries.
+    assert len({id(line) for line in closed}) == 2
 
 
 def test_settings_beyond_the_limits_of_the_servo_are_told_by_their_key(script, clock):
@@ -548,6 +553,17 @@ def test_motion_that_does_not_end(script, servo, clock):
     with pytest.raises(DeviceError, match="did not arrive within"):
         status.wait()
     assert 5.0 < clock.now() - begin < 9.0
+
+
+def test_a_slow_motion_is_given_the_time_that_it_takes(script, clock):
+    servo = connect(clock, profile_velocity=0.1)
+    # From 1000 counts.
+    status = servo.set(1000 * COUNT + 1.0)
+    script.values[122] = 1
+    begin = clock.now()
+    with pytest.raises(DeviceError, match="did not arrive within"):
+        status.wait()
+    assert 10.0 < clock.now() - begin < 25.0
 
 
 def test_torque_that_goes_off_by_itself_fails_the_status(script, servo):

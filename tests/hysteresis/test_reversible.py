@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from bench.hysteresis import PolynomialTerm, Preisach, reversible_from_json, uniform_levels
+from bench.hysteresis import PolynomialTerm, Preisach, ThermalExpansion, reversible_from_json, uniform_levels
 from bench.identification import damped_oscillation, identify
 
 
@@ -69,3 +69,24 @@ def test_it_is_identified_beside_a_density():
 def test_wrong_arguments_are_named(arguments, word):
     with pytest.raises(ValueError, match=word):
         PolynomialTerm(*arguments)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "word"),
+    [
+        ((1.0, 2.0, 30.0, 30.0, 20.0), "low: expected a value below high = 30"),
+        ((1.0, 2.0, 30.0, np.inf, 20.0), "high"),
+        ((np.nan, 2.0, 30.0, 70.0, 20.0), "k0"),
+        ((1.0, np.nan, 30.0, 70.0, 20.0), "k1"),
+        ((1.0, 2.0, 30.0, 70.0, np.nan), "reference"),
+    ],
+)
+def test_wrong_numbers_of_a_thermal_expansion_are_named(numbers, word):
+    with pytest.raises(ValueError, match=word):
+        ThermalExpansion(*numbers)
+
+
+@pytest.mark.parametrize("coefficients", [[1.0], [1.0, 2.0, 3.0]])
+def test_a_thermal_expansion_has_two_coefficients(coefficients):
+    with pytest.raises(ValueError, match="expected k0 and k1"):
+        ThermalExpansion(1.0, 2.0, 30.0, 70.0, 20.0).with_coefficients(coefficients)

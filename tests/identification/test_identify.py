@@ -79,6 +79,14 @@ def test_reversible_part_of_either_sign(kind, term):
     assert identify("preisach", inputs, outputs, levels=6).errors.maximum > 0.01
 
 
+def test_the_thresholds_of_plays_spread_up_to_the_maximum():
+    inputs = ramps([0.0, 8.0, 1.0, 6.0, 2.0], 0.5)
+    found = identify("prandtl-ishlinskii", inputs, inputs, plays=4, maximum=3.0)
+    assert found.model.thresholds.tolist() == [0.0, 0.75, 1.5, 2.25]
+    single = identify("prandtl-ishlinskii", inputs, inputs, plays=1, maximum=3.0)
+    assert single.model.thresholds.tolist() == [0.0]
+
+
 def test_skip_removes_the_effect_of_an_unknown_start():
     specimen, inputs, _ = film()
     truth = specimen.evaluate(inputs, specimen.initial_state().advance([84.0, 55.0]))

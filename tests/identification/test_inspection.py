@@ -204,6 +204,7 @@ def test_dead_zones_catch_saturation_and_asymmetry():
     [
         ({"plays": 0}, "plays: expected at least 1"),
         ({"maximum": -1.0}, "maximum: expected a positive"),
+        ({"maximum": 0.0}, "maximum: expected a positive"),
         ({"dead_zones": -1}, "dead_zones: expected an integer >= 0"),
         ({"dead_zones": 1.5}, "dead_zones: expected an integer, got 1.5"),
         ({"degree": 3}, "options of prandtl-ishlinskii"),
