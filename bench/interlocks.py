@@ -690,7 +690,6 @@ def _of_difference(unit: str) -> str:
 
 
 _bits = struct.Struct("<d").pack
-"""Returns a number as bytes."""
 
 
 def _first_instant(since: float, seconds: float) -> float:

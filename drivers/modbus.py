@@ -51,6 +51,8 @@ _pack_header = _MBAP.pack
 _pack_reply_head = struct.Struct(">HHHBB").pack  # the same, and the function
 _LAST_TRANSACTION = 0xFFFF
 _REFUSED = 0x80
+_KNOWN_FRAMES = 64  # that are kept; a host asks the same few again and again
+_KNOWN_REPLIES = 1024  # whose CRC is kept; what is at rest gives the same few readings
 
 
 class RefusedError(Exception):
@@ -67,6 +69,7 @@ class RefusedError(Exception):
         self.code = code
 
 
+@lru_cache(_KNOWN_FRAMES)
 def read_request(address: int, count: int, function: int = READ) -> bytes:
     """Return the request for `count` registers from `address` on; its reply has 2 bytes more than their values."""
     return _READ.pack(function, address, count)
@@ -220,6 +223,7 @@ def _crc_table() -> tuple[int, ...]:
 _CRC = _crc_table()
 
 
+@lru_cache(_KNOWN_REPLIES)
 def crc16(data: bytes) -> bytes:
     """Return the CRC of a Modbus RTU frame as it follows on the line, low byte first."""
     crc = 0xFFFF
@@ -249,7 +253,6 @@ LONGEST_REPLY = 256
 
 _WRITE_REPLY = 8
 _MOST_STRAY_REPLIES = 8
-_KNOWN_FRAMES = 64
 
 
 def reply_length(head: bytes) -> int:
@@ -269,7 +272,6 @@ def is_reply_to(request: bytes, expected: int, frame: bytes) -> bool:
 
 @lru_cache(_KNOWN_FRAMES)
 def _framed(unit: int, request: bytes) -> bytes:
-    # A host asks the same few again and again.
     frame = bytes((unit,)) + request
     return frame + crc16(frame)
 
@@ -282,7 +284,7 @@ class RtuClient(_PortClient):
     Parameters
     ----------
     port : serial.SerialBase
-        The open port.
+        The open port, with an `ask` of its own.
     unit : int
         Address of the instrument, 1 to 247.
     """
@@ -296,11 +298,7 @@ class RtuClient(_PortClient):
 
         Raises `NoReplyError` or `UnexpectedReplyError`, besides what the base class says.
         """
-        port = self._port
-        if port.in_waiting:
-            port.reset_input_buffer()
-        port.write(_framed(self._unit, request))
-        reply: bytes = port.read_all()
+        reply: bytes = self._port.ask(_framed(self._unit, request))
         if len(reply) != expected + 3 or reply[0] != self._unit or reply[1] != request[0]:
             reply = self._reply_among(reply, request, expected)
         elif crc16(reply[:-2]) != reply[-2:]:
