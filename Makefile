@@ -115,8 +115,7 @@ twin-trials: $(SETUP)
 
 # The dashboard of every protocol on every emulated rig, dark and light, with those of README.md; fails on an empty view.
 pictures: $(SETUP)
-	$(BIN)/python -P tests/pictures.py --out recordings/pictures
-	$(BIN)/python -P tests/pictures.py --out recordings/pictures --studies recordings/pictures/studies --readme --themes dark
+	$(BIN)/python -P tests/pictures.py --out recordings/pictures --docs
 
 clean:
 	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache
