@@ -262,8 +262,10 @@ class ForceCourse:
         kept: Floats = self._muscle.forces
         if self._imperfect is None:
             return kept
+        shown = kept.copy()
         # Behind the ring stands the number of the last one.
-        return np.append(self._imperfect.characteristic.course(kept[:-1]), kept[-1])
+        self._imperfect.characteristic.show(shown[:-1])
+        return shown
 
     def since_point(self) -> float:
         """Return the time for which the muscle has stood at the last grid point, s."""

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
+from sim_devices.transducers import _imperfect_kernels as kernels
 from sim_devices.world import World
 
 Floats = NDArray[np.float64]
@@ -144,6 +145,8 @@ class Characteristic:
         self._wave = errors.nonlinearity * (high - low)
         self._middle, self._scale = 0.5 * (low + high), 2.0 * _WAVE / (high - low)
         self._resolution = errors.resolution
+        # Compiled when a laboratory opens.
+        self.show(np.empty(0))
 
     def value(self, quantity: float) -> float:
         """Return what it makes of a value, in its unit and without noise."""
@@ -154,9 +157,16 @@ class Characteristic:
         return round(value / self._resolution) * self._resolution if self._resolution else value
 
     def course(self, quantities: Floats) -> Floats:
-        """Return `value` of each of the values of a course."""
-        values = self._smooth(quantities)
-        return np.round(values / self._resolution) * self._resolution if self._resolution else values
+        """Return `value` of each of the values of a course, shape (N,)."""
+        values = np.array(quantities, dtype=np.float64)
+        self.show(values)
+        return values
+
+    def show(self, quantities: Floats) -> None:
+        """Replace quantities, shape (N,), by the `value` of each."""
+        kernels.show(
+            quantities, self._gain, self._offset, self._wave, self._scale, self._middle, _WAVE, self._resolution
+        )
 
     def quantities(self, values: Floats) -> Floats:
         """Return of what it makes each of some values, but for its steps: the quantities themselves."""

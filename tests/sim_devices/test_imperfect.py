@@ -125,3 +125,13 @@ def test_looking_at_the_truth_changes_nothing():
         before = shown(looked[2])
         assert shown(looked[2]) == before
         assert looked[2]() == other[2]() == pytest.approx(before, abs=1e-9)
+
+
+@pytest.mark.parametrize("resolution", [0.0, 0.03])
+def test_a_course_is_shown_as_each_of_its_values(resolution):
+    errors = SensorErrors(gain_error=0.01, offset=0.2, nonlinearity=0.02, resolution=resolution)
+    characteristic = Characteristic(errors, -1.0, 3.0)
+    quantities = np.random.default_rng(1).uniform(-2.0, 4.0, 500)
+    shown = quantities.copy()
+    characteristic.show(shown)
+    assert shown.tolist() == [characteristic.value(quantity) for quantity in quantities.tolist()]

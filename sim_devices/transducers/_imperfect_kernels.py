@@ -1,0 +1,33 @@
+"""Compiled inner loop of sensors with systematic errors."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float64]
+
+
+@njit(cache=True)
+def show(
+    values: Floats,
+    gain: float,
+    offset: float,
+    wave: float,
+    scale: float,
+    middle: float,
+    most: float,
+    resolution: float,
+) -> None:
+    """Replace quantities by what `Characteristic.value` makes of them, to the last bit."""
+    for i in range(values.size):
+        quantity = values[i]
+        value = gain * quantity + offset
+        if wave:
+            value += wave * math.sin(min(max(scale * (quantity - middle), -most), most))
+        if resolution:
+            value = np.round(value / resolution) * resolution
+        values[i] = value
