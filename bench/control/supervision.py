@@ -20,6 +20,8 @@ TARGETS = 5
 """Number of targets in a row over which errors are judged."""
 _TOLERANCE = 0.02
 """Part of the range of the targets within which no error is judged."""
+_BEYOND = 2.25
+"""Ratio of two RMS errors over five targets that chance exceeds in 5 % of cases: the root of F(5, 5) = 5.05."""
 _SWINGS = MOST_SWINGS - 2
 """Swings at one target after which its controller is given up: fewer than those that end the run."""
 
@@ -27,10 +29,10 @@ _SWINGS = MOST_SWINGS - 2
 class Supervised:
     """A target controller that is given up when it does not converge: a `Reaching`.
 
-    It does not if it sends the actuator to and fro between the ends of its range at one target, or if over several
-    targets it errs by more than its model does at the same places: then the model alone, without feedback, would
-    have been better; or if it says so itself (`doubt`). Targets that cannot be met
-    do not count, and a controller that does not say what its model errs by is judged by the swings alone.
+    It does not if it sends the actuator to and fro between the ends of its range at one target; or if over several
+    targets it errs by more than its model does at the same places, and more than by chance: then the model alone,
+    without feedback, would have been better; or if it says so itself (`doubt`). Targets that cannot be met do not
+    count, and a controller that does not say what its model errs by is judged by the swings alone.
 
     Parameters
     ----------
@@ -143,7 +145,7 @@ class Supervised:
         if len(self._judged) < TARGETS:
             return ""
         errors, opened = np.sqrt(np.mean(np.square(self._judged), axis=0)).tolist()
-        if errors <= max(opened, self._tolerance):
+        if errors <= max(_BEYOND * opened, self._tolerance):
             return ""
         return (
             f"over {TARGETS} targets its error is {errors:.3g} RMS, and that of its model alone, without feedback, "
