@@ -70,16 +70,26 @@ class Lateness:
         }
 
 
+def headline_of(label: str, recorded: Mapping[str, Any]) -> str:
+    """Return a histogram in one line, see `Lateness.to_json`, behind the label of its loop."""
+    rate = f" at {recorded['rate']:g} Hz" if recorded["rate"] is not None else ""
+    return (
+        f"{label or 'the loop'}: {recorded['samples']} samples{rate}, {recorded['left_out']} left out; "
+        f"mean {1e3 * recorded['mean']:.3g} ms, worst {1e3 * recorded['worst']:.3g} ms"
+    )
+
+
+def bins_of(recorded: Mapping[str, Any]) -> list[tuple[str, int]]:
+    """Return the bins of a histogram, see `Lateness.to_json`, up to the last that is not empty: name and count."""
+    names = [f"≤ {1e3 * edge:g} ms" for edge in recorded["edges"]] + [f"> {1e3 * recorded['edges'][-1]:g} ms"]
+    last = max((i for i, count in enumerate(recorded["counts"]) if count), default=0)
+    return list(zip(names[: last + 1], recorded["counts"], strict=False))
+
+
 def lateness_lines(recorded: Mapping[str, Mapping[str, Any]]) -> Iterator[str]:
     """Yield the histograms of a run as text, by the label of the loop; see `Lateness.to_json`."""
     for label, each in recorded.items():
-        rate = f" at {each['rate']:g} Hz" if each["rate"] is not None else ""
-        yield (
-            f"lateness of {label or 'the loop'}: {each['samples']} samples{rate}, {each['left_out']} left out; "
-            f"mean {1e3 * each['mean']:.3g} ms, worst {1e3 * each['worst']:.3g} ms"
-        )
+        yield f"lateness of {headline_of(label, each)}"
         most = max(each["counts"])
-        names = [f"≤ {1e3 * edge:g} ms" for edge in each["edges"]] + [f"> {1e3 * each['edges'][-1]:g} ms"]
-        last = max((i for i, count in enumerate(each["counts"]) if count), default=0)
-        for name, count in zip(names[: last + 1], each["counts"], strict=False):
+        for name, count in bins_of(each):
             yield f"  {name:>10} {count:>9}  {'█' * round(_BAR * count / most) if most else ''}".rstrip()

@@ -32,6 +32,8 @@ class Arranged:
         Further ones, in tabs.
     plots, planes : sequence
         Loops, and Preisach planes.
+    lateness : Spatial2DView or None
+        How late the samples of loops were.
     state : str
         What the run is doing, or how it ended.
     """
@@ -42,6 +44,7 @@ class Arranged:
     others: Sequence[rrb.TimeSeriesView]
     plots: Sequence[rrb.Spatial2DView]
     planes: Sequence[View]
+    lateness: rrb.Spatial2DView | None
     state: str
 
 
@@ -70,7 +73,10 @@ def blueprint(views: Arranged) -> rrb.Blueprint:
     if drawn:
         columns.append(rrb.Grid(*drawn, grid_columns=1 if len(drawn) <= 2 else 2))
     numbers = rrb.TextDocumentView(origin="/numbers", name=f"Now: {views.state}")
-    columns.append(rrb.Vertical(numbers, below, row_shares=[2, 1]))
+    if views.lateness is None:
+        columns.append(rrb.Vertical(numbers, below, row_shares=[2, 1]))
+    else:
+        columns.append(rrb.Vertical(numbers, views.lateness, below, row_shares=[4, 3, 3]))
     state = rrb.StateTimelineView(origin="/state", name=f"Protocol: {views.state}", time_view=whole_run())
     widths = [4, 3 if len(drawn) <= 2 else 5, 3][-len(columns) :] if len(columns) == 3 else [3, 2]
     return rrb.Blueprint(

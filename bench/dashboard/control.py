@@ -21,6 +21,9 @@ from bench.protocol import TRACES
 from bench.settling import Settled
 from bench.units import fitting_prefix
 
+WITNESS = "witness"
+"""Slot of a sensor of the controlled quantity that the controller does not use: it tells error from noise."""
+
 TRACE_NAMES = tuple(signal.name for signal in TRACES)
 
 LAST_TARGETS = 10
@@ -43,6 +46,7 @@ _PREDICTED: Colour = (150, 110, 190)
 _REFERENCE: Colour = (112, 168, 226)
 _ERROR: Colour = (150, 156, 166)
 _AT_TARGET: Colour = (236, 100, 46)
+_WITNESSED: Colour = (30, 170, 170)
 _DISTURBANCE: Colour = (30, 170, 170)
 _BAND: Colour = (132, 142, 158)
 
@@ -63,6 +67,8 @@ class ControlPlots:
         Of outputs.
     error_factor, error_unit
         Of errors, which are smaller.
+    witness : int or None
+        Column of a further sensor of the controlled quantity.
     """
 
     output: int
@@ -72,10 +78,13 @@ class ControlPlots:
     unit: str
     error_factor: float
     error_unit: str
+    witness: int | None = None
 
     @classmethod
-    def of(cls, signals: Sequence[Signal], controls: str, extent: tuple[float, float] | None) -> ControlPlots:
-        """Return the plots of a run whose controllers control the signal `controls`."""
+    def of(
+        cls, signals: Sequence[Signal], controls: str, extent: tuple[float, float] | None, witness: str = ""
+    ) -> ControlPlots:
+        """Return the plots of a run whose controllers control the signal `controls`, which `witness` sees as well."""
         output, *traces = (find_column(signals, "controls", name) for name in (controls, *TRACE_NAMES))
         signal = signals[output]
         unit = fitting_prefix(signal.unit, *(extent or [likely_magnitude(signal)]))
@@ -83,7 +92,8 @@ class ControlPlots:
         error_unit = fitting_prefix(
             signal.unit, 1e-3 * (extent[1] - extent[0]) if extent else 10.0 ** (1 - signal.precision)
         )
-        return cls(output, tuple(traces), extent, *unit, *error_unit)
+        beside = find_column(signals, WITNESS, witness) if witness else None
+        return cls(output, tuple(traces), extent, *unit, *error_unit, witness=beside)
 
     def is_at_work(self, values: Sequence[float]) -> bool:
         """Return whether a controller was at work when a tick was taken."""
@@ -98,9 +108,12 @@ class ControlPlots:
             # Before the first estimate, the uncertainty only bounds the size of any disturbance.
             band[band > self.extent[1] - self.extent[0]] = np.nan
         around = np.where(np.isfinite(reference), 0.0, np.nan)
+        errors = [around - band, around + band, output - reference]
+        if self.witness is not None:
+            errors.append(values[:, self.witness] - reference)
         return {
             "tracking": self.factor * np.column_stack([reference, predicted, output]),
-            "error": self.error_factor * np.column_stack([around - band, around + band, output - reference]),
+            "error": self.error_factor * np.column_stack(errors),
             "disturbance": self.factor * np.column_stack([disturbance - band, disturbance + band, disturbance]),
         }
 
@@ -120,6 +133,8 @@ class ControlPlots:
                 ("disturbance", _DISTURBANCE, 1.75),
             ],
         }
+        if self.witness is not None:
+            looks["error"].append((WITNESS, _WITNESSED, 1.25))
         styles: dict[str, rr.SeriesLines | rr.SeriesPoints] = {}
         for name, look in looks.items():
             names, colours, widths = zip(*look, strict=True)
@@ -141,6 +156,8 @@ class ControlPlots:
             y = None if error_range is None else (-error_range, error_range)
             # A legend would hide a quarter of it.
             title = f"Error [{self.error_unit}]: each tick within ± 2σ, mean at each target (points)"
+            if self.witness is not None:
+                title = f"Error [{self.error_unit}]: each tick within ± 2σ, and of the witness (green)"
             views.append((time_view("/control/error", title, y=y), 6))
         if "disturbance" in shown:
             views.append((time_view("/control/disturbance", f"Disturbance ± 2σ [{self.unit}]"), 3))
@@ -170,6 +187,7 @@ class Errors:
         self._at_targets: deque[tuple[float, int, float]] = deque(maxlen=LAST_TARGETS)
         self._not_written: list[tuple[float, int, float]] = []
         self._recent: deque[float] = deque(maxlen=_RECENT_TICKS)
+        self._witnessed: deque[float] = deque(maxlen=_RECENT_TICKS)
         self._readings: list[float] = []
         self._read_at = (0.0, 0)
         self._range: float | None = None
@@ -184,6 +202,8 @@ class Errors:
                 if math.isfinite(output):
                     self.now = output - reference
                     self._recent.append(self.now)
+                if self._plots.witness is not None and math.isfinite(seen := entry.values[self._plots.witness]):
+                    self._witnessed.append(seen - reference)
             elif isinstance(entry, StepRecord) and entry.settled is not Settled.CONTROLLED:
                 if not (math.isfinite(self.target) and math.isfinite(output)):
                     return
@@ -218,7 +238,11 @@ class Errors:
             name = f"RMS of the last {len(errors)} targets"
         else:
             errors, name = list(self._recent), "RMS of the error of late"
-        return name, math.sqrt(sum(error * error for error in errors) / len(errors)) if errors else math.nan
+        return name, _rms(errors)
+
+    def rms_of_witness(self) -> float:
+        """Return the RMS of the errors of late that the witness sees; nan if there is none."""
+        return _rms(list(self._witnessed))
 
     def range(self) -> float | None:
         """Return what the plot of the error shows to either side of zero, in its unit; None before it is known.
@@ -241,6 +265,10 @@ class Errors:
         """Return for how long back from a time (s) the last targets reach, s; inf if there were no more."""
         full = len(self._at_targets) == LAST_TARGETS
         return now - self._at_targets[0][0] if full else math.inf
+
+
+def _rms(errors: Sequence[float]) -> float:
+    return math.sqrt(sum(error * error for error in errors) / len(errors)) if errors else math.nan
 
 
 def _round_up(value: float) -> float:

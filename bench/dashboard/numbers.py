@@ -125,6 +125,8 @@ class Numbers:
             yield f"error now, target {self._show(self._errors.target, column)}", _small(self._errors.now, unit)
             name, rms = self._errors.rms()
             yield name, _small(rms, unit)
+            if math.isfinite(witnessed := self._errors.rms_of_witness()):
+                yield "RMS of the error of late, by the witness", _small(witnessed, unit)
 
     def _rest(self, *, is_over: bool) -> Iterator[tuple[str, str]]:
         if self._values and (bound := nearest(self._bounds, self._values)) is not None:

@@ -16,8 +16,9 @@ from pydantic import ValidationError
 from bench.configuration_errors import problems
 from bench.dashboard.arrangement import Arranged, blueprint, seldom
 from bench.dashboard.bounds import BoundLines, bounds_of
-from bench.dashboard.control import TRACE_NAMES, ControlPlots, Errors
+from bench.dashboard.control import TRACE_NAMES, WITNESS, ControlPlots, Errors
 from bench.dashboard.entries import End, Entry, ModelDensity, Tick
+from bench.dashboard.lateness_plot import LatenessPlot
 from bench.dashboard.numbers import LIVE_SECONDS, Numbers
 from bench.dashboard.planes import Planes
 from bench.dashboard.recording import Recording, times
@@ -57,7 +58,8 @@ class Writer:
         self._control: ControlPlots | None = None
         self._errors: Errors | None = None
         if controls:
-            self._control = ControlPlots.of(signals, controls, ranges.get(controls))
+            witness = (meta.get("slots") or {}).get(WITNESS, {}).get("signal", "")
+            self._control = ControlPlots.of(signals, controls, ranges.get(controls), witness)
             self._errors = Errors(self._control)
         self._signals = plots_by_unit(signals, ranges, TRACE_NAMES if controls else ())
         self._bounds = {
@@ -71,6 +73,7 @@ class Writer:
         shown = [self._control.output] if self._control else list(self._plots.columns[::-1] if self._plots else ())
         self._numbers = Numbers(meta, signals, shown or sorted(self._over_time)[:2] or [0], bounds, self._errors)
         self._timeline = Timeline()
+        self._lateness = LatenessPlot(meta)
         self._filled: set[str] = set()
         self._arranged: object = None
 
@@ -100,6 +103,7 @@ class Writer:
                 self._planes.draw_density(self.recording, entry)
             elif isinstance(entry, End):
                 self.recording.set_property("outcome", {"status": entry.status, "reason": entry.reason})
+                self._lateness.draw(self.recording, entry.lateness)
                 if entry.lateness:
                     lines = "\n".join(lateness_lines(entry.lateness))
                     text = f"{self._card}\n\n```text\n{lines}\n```\n"
@@ -183,6 +187,7 @@ class Writer:
                 others=others,
                 plots=[] if self._plots is None else self._plots.views(bright),
                 planes=[] if self._planes is None else self._planes.views(),
+                lateness=self._lateness.view(),
                 state=state,
             )
         )

@@ -226,7 +226,7 @@ class Frame:
 
 
 class ForceCourse:
-    """The force of a muscle over time: a `sim_devices.instruments.flintec_dad141.Course`.
+    """The force of a muscle over time: a `sim_devices.instruments._flintec_kernels.Course`.
 
     Parameters
     ----------

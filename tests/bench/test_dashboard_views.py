@@ -16,6 +16,7 @@ from bench.dashboard.entries import End, Tick
 from bench.dashboard.writer import Writer
 from bench.devices import Signal
 from bench.journal import Event, StepRecord
+from bench.lateness import Lateness
 from bench.layout import DashboardLayout
 from bench.protocol import TRACES, Views, find_protocol
 from bench.settling import Settled
@@ -205,3 +206,54 @@ def test_a_frame_grows_with_the_data() -> None:
     assert frame.grown((0.0, 8.0), (0.2, 0.8)) is frame
     grown = frame.grown((-0.5, 8.0), (0.0, 1.3))
     assert (grown.x_range, grown.y_range) == ((-1.0, 8.0), (0.0, 1.375))
+
+
+@pytest.mark.parametrize(("clock", "is_shown"), [("wall", True), ("x10", True), ("virtual", False)])
+def test_how_late_loops_were_is_a_view_where_time_passes(tmp_path: Path, clock: str, *, is_shown: bool) -> None:
+    late = Lateness(100.0)
+    late.add(3e-4, count=20)
+    late.add(2e-3, count=5)
+    path = tmp_path / "late.rrd"
+    end = End("completed", "", {"sine": late.to_json()})
+    origins, _ = written(path, [*targets([1.0]), end], {**META, "clock": clock})
+    assert ("/lateness" in origins) is is_shown
+    labels = [
+        label
+        for chunk in RrdReader(path).stream()
+        if str(chunk.entity_path) in ("/lateness/names", "/lateness/counts")
+        for label in chunk.to_record_batch().column("Points2D:labels").to_pylist()[0]
+    ]
+    bins = ["≤ 0.1 ms", "≤ 0.2 ms", "≤ 0.5 ms", "≤ 1 ms", "≤ 2 ms"]
+    assert sorted(labels) == (sorted([*bins, "0", "0", "20", "0", "5"]) if is_shown else [])
+
+
+def test_the_error_that_a_witness_sees_is_told_from_the_noise_of_the_sensor(tmp_path: Path) -> None:
+    signals = (*SIGNALS, Signal("witness_curvature", "1/m", "curvature", precision=2))
+    noisy, true = (30.0, -30.0) * 50, (3.0, -3.0) * 50
+    entries = [
+        Tick(float(i), 0, (60.0, 60.1, 500.0 + noise, 500.0, math.nan, math.nan, math.nan, 500.0 + error))
+        for i, (noise, error) in enumerate(zip(noisy, true, strict=True))
+    ]
+    errors = Errors(ControlPlots.of(signals, "curvature", None, "witness_curvature"))
+    for entry in entries:
+        errors.see(entry)
+    assert errors.rms()[1] == pytest.approx(30.0)
+    assert errors.rms_of_witness() == pytest.approx(3.0)
+    meta = {**META, "controls": "curvature", "slots": {"witness": {"device": "", "signal": "witness_curvature"}}}
+    writer = Writer(signals, meta)
+    writer.open(tmp_path / "witnessed.rrd", None)
+    writer.write(entries)
+    writer.write([End("completed", "")])
+    writer.recording.close()
+    chunks = list(RrdReader(tmp_path / "witnessed.rrd").stream())
+    (error,) = [chunk for chunk in chunks if str(chunk.entity_path) == "/control/error" and not chunk.is_static]
+    shown = np.array(error.to_record_batch().column("Scalars:scalars").to_pylist())
+    assert shown[:, 3] == pytest.approx(true)
+    texts = [
+        text
+        for chunk in chunks
+        if str(chunk.entity_path) == "/numbers"
+        for row in chunk.to_record_batch().column("TextDocument:text").to_pylist()
+        for text in row
+    ]
+    assert "# 3.00 1/m\n\nRMS of the error of late, by the witness" in texts[-1]
