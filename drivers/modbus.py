@@ -301,10 +301,10 @@ class RtuClient(_PortClient):
         reply: bytes = self._port.ask(_framed(self._unit, request))
         if len(reply) != expected + 3 or reply[0] != self._unit or reply[1] != request[0]:
             reply = self._reply_among(reply, request, expected)
+            if reply[1] == request[0] | _REFUSED:
+                raise RefusedError(reply[2])
         elif crc16(reply[:-2]) != reply[-2:]:
             raise NoReplyError("damaged reply")
-        if reply[1] == request[0] | _REFUSED:
-            raise RefusedError(reply[2])
         return reply[1:-2]
 
     def settle(self, silence: float) -> None:
