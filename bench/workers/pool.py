@@ -74,6 +74,10 @@ class Pending(Generic[T]):
         self._was_asked |= self._is_done
         return self._error
 
+    def hurry(self) -> None:
+        """Have the task begun before all others that wait, as others depend on its result."""
+        self._workers._put_first(self)
+
     def result(self) -> T:
         """Wait for the task; return what it returned, raise what it raised.
 
@@ -207,6 +211,12 @@ class Workers:
                 if isinstance(task.error, AbortError):
                     raise task.error
                 yield task
+
+    def _put_first(self, task: Pending[Any]) -> None:
+        with self._changed:
+            if task in self._queue:
+                self._queue.remove(task)
+                self._queue.appendleft(task)
 
     def _wait_for(self, task: Pending[Any]) -> None:
         if self.in_process:

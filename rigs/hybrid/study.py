@@ -272,11 +272,14 @@ def _carry_out(campaign: Campaign) -> StudyResult:
         for offset in RESONANCES
     }
     sweep_run = campaign.start("calibration-displacement", {"sweeps": "1"}, rig=WITNESSED)
+    # A long run needs its result; left to the end, it would go on alone.
+    sweep_run.hurry()
     runs = _Runs(*(run.result() for run in started))
     figures = list(_draw_models(campaign, found, runs))
     calibration = _calibrated(sweep_run.result().folder)
     calibrated = calibrated_rig(campaign.folder, calibration, WITNESSED)
     calibrated_run = _start(campaign, model, {"controller": "hybrid", "hold": f"{HOLD:g}"}, rig=calibrated)
+    calibrated_run.hurry()
     sensor = displacement_characteristic(WITNESSED)
     moves = {name: tracked(run.result().folder, sensor) for name, run in tracking_runs.items()}
     figures += _draw_control(campaign, moves)

@@ -54,6 +54,19 @@ def workers(text):
         yield workers
 
 
+def test_a_task_in_a_hurry_is_begun_before_all_that_wait(text):
+    begun = []
+    with Workers(1, Console(file=text)) as alone:
+        first, second, third = (alone.submit(begun.append, name) for name in ("first", "second", "third"))
+        third.hurry()
+        first.result()
+        assert begun == ["third", "first"]
+        # Too late for those that are finished.
+        third.hurry()
+        second.result()
+    assert begun == ["third", "first", "second"]
+
+
 def test_results_come_in_the_order_in_which_they_are_taken_from_processes_that_go_on(workers):
     tasks = [workers.submit(worker_tasks.process, value) for value in range(20)]
     results = [task.result() for task in tasks]
