@@ -13,7 +13,7 @@ MAKEFLAGS += --jobs=2
 unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: demo demo-sma demo-muscles demo-hybrid test-quick test test-all check lint types
-.PHONY: kernels tests all-tests benchmark busy kill-safe interlock-times fault-matrix journal-faults journal-kills
+.PHONY: kernels tests all-tests benchmark busy busy-study kill-safe interlock-times fault-matrix journal-faults journal-kills
 .PHONY: docs mutants studies resume-trials twin-trials clean
 
 # The emulated VO2 laboratory: characterization, identification and validation, on the virtual clock.
@@ -71,9 +71,13 @@ docs: $(SETUP)
 mutants: $(SETUP)
 	$(BIN)/python tests/mutants.py --sample 300
 
-# 50 virtual runs beside 16 busy processes, compared to the last bit.
+# 50 virtual runs beside 16 busy processes, compared to the last bit, and a run at x100 beside them.
 busy: $(SETUP)
-	$(BIN)/python tests/bench/test_busy_machine.py --runs 50 --busy 16
+	$(BIN)/python tests/bench/busy_machine.py --trial runs clock --runs 50 --busy 16
+
+# A study of the lowest priority beside four busy processes, without compiled kernels, compared with the same alone.
+busy-study: $(SETUP)
+	$(BIN)/python tests/bench/busy_machine.py --trial study --study hybrid
 
 # The studies with the seeds 0 to 9: median, worst and spread of each number.
 studies: $(SETUP)

@@ -22,6 +22,7 @@ from bench.errors import ConfigurationError
 VIRTUAL_EPOCH = datetime(2000, 1, 1, tzinfo=UTC)
 """Where every virtual clock begins, so that runs with one seed carry the same time stamps."""
 
+_FOREVER = math.inf
 _LONGEST_NAP = 0.2
 """Longest single wait in seconds, so that a signal to the process is noticed soon."""
 
@@ -228,11 +229,11 @@ class VirtualClock(Clock):
 
     def sleep(self, seconds: float) -> None:
         """Jump ahead."""
-        if not -math.inf < seconds < math.inf:
-            _check_finite(seconds)
-        if seconds > 0:
+        if 0.0 < seconds < _FOREVER:
             with self._lock:
                 self._now += seconds
+        else:
+            _check_finite(seconds)
 
     def sleep_until(self, instant: float) -> None:
         """Jump to `instant` exactly, free of the rounding that adding up differences would bring."""

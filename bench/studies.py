@@ -13,6 +13,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec
 
+import numpy as np
+import numpy.typing as npt
 from rich.console import Console
 from rich.table import Table
 
@@ -353,6 +355,11 @@ def reached_targets(run: RunResult, signal: str) -> TargetResults:
     if results is None:
         raise DataError(f"{run.folder}: has no targets")
     return results
+
+
+def true_errors(errors: npt.NDArray[np.float64]) -> dict[str, float]:
+    """Return `true_max` and `true_rms` of errors against a true quantity, in its unit."""
+    return {"true_max": float(np.abs(errors).max()), "true_rms": float(np.sqrt(np.mean(errors**2)))}
 
 
 def _print_end(values: Mapping[str, Any], console: Console) -> None:

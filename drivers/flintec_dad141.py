@@ -93,7 +93,7 @@ _POLL = 0.05
 _CONVERSIONS = 5  # looked at by the check of the instrument itself
 
 _BLOCK = struct.Struct(">ffH")
-_READING_BLOCK = f"reading register 0x{_COMBINED:04X}"
+_READING, _WRITING, _COMMANDING = "reading register 0x{:04X}", "writing register 0x{:04X}", "command 0x{:02X}"
 _ECHO_REGISTERS = (6, 8)  # numbers that no other request reads
 _LATEST = 3.0  # time-outs after a request by which even a reply that others overtook has come
 _QUIET = 0.25  # time-outs of silence after which a damaged reply is over
@@ -224,21 +224,20 @@ class _Line:
 
     def read(self, address: int, count: int) -> list[int]:
         """Get `count` registers from `address` on, each 0 to 65535."""
-        data = self._read(f"reading register 0x{address:04X}", address, count)
-        return list(struct.unpack(f">{count}H", data))
+        return list(struct.unpack(f">{count}H", self._read(address, count)))
 
     def read_integer(self, address: int) -> int:
         """Get a 32-bit integer."""
-        return _integer(self.read(address, 2))
+        return int.from_bytes(self._read(address, 2), "big", signed=True)
 
     def read_block(self) -> _Block:
         """Get the combined registers."""
-        return _Block(*_BLOCK.unpack(self._read(_READING_BLOCK, _COMBINED, 5)))
+        return _Block(*_BLOCK.unpack(self._read(_COMBINED, 5)))
 
     def set_integer(self, title: str, address: int, value: int) -> None:
         """Set a 32-bit integer and read it back; `title` is its name for messages."""
         data = struct.pack(">i", value)
-        self._exchange(f"writing register 0x{address:04X}", lambda: self._client.write(address, data))
+        self._exchange(_WRITING, address, lambda: self._client.write(address, data))
         actual = self.read_integer(address)
         if actual != value:
             raise DeviceError(
@@ -248,13 +247,13 @@ class _Line:
 
     def command(self, value: int) -> None:
         """Give a command of register 0x2061."""
-        self._exchange(f"command 0x{value:02X}", lambda: self._client.write_one(_COMMAND, value))
+        self._exchange(_COMMANDING, value, lambda: self._client.write_one(_COMMAND, value))
 
-    def _read(self, doing: str, address: int, count: int) -> bytes:
-        self._function = READ_INPUT if self._function == READ else READ
-        return self._exchange(doing, lambda: self._client.read(address, count, self._function))
+    def _read(self, address: int, count: int) -> bytes:
+        function = self._function = READ_INPUT if self._function == READ else READ
+        return self._exchange(_READING, address, lambda: self._client.read(address, count, function))
 
-    def _exchange(self, doing: str, request: Callable[[], T]) -> T:
+    def _exchange(self, doing: str, number: int, request: Callable[[], T]) -> T:
         if not self._is_open:
             raise DeviceConnectionError(
                 self._name, f"the line {self._settings.port} is closed; connect again, so that the set-up is checked"
@@ -273,7 +272,7 @@ class _Line:
                     problem = problem or error
                     self._in_step = False
         except RefusedError as error:
-            raise _RefusalError(self._name, error.code, doing) from error
+            raise _RefusalError(self._name, error.code, doing.format(number)) from error
         except OSError as error:
             self.lost = True
             raise lost_line(self._name, self._settings, error, ", then connect again") from error
@@ -354,6 +353,7 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
 
     def __init__(self, name: str, settings: DAD141Settings, clock: Clock, line: _Line) -> None:
         super().__init__(name, settings, clock, line)
+        self._signal = f"{name}_force"
         self._tared = False
         self._tare = math.nan
         self._restart = ""
@@ -407,11 +407,11 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
         for sample in range(self._settings.samples):
             self._clock.sleep_until(begin + sample * self._interval)
             forces.append(self._force())
-        return {f"{self.name}_force": math.fsum(forces) / len(forces)}
+        return {self._signal: math.fsum(forces) / len(forces)}
 
     def glance(self) -> dict[str, float]:
         """Measure the force in N by one reading; raises what `measure` does."""
-        return {f"{self.name}_force": self._force()}
+        return {self._signal: self._force()}
 
     def tare(self) -> None:
         """Make the present force read zero from now on, as soon as the instrument finds the signal still.

@@ -48,6 +48,8 @@ _FRAME_READ, _FRAME_WRITE = 0, 1
 _MBAP = struct.Struct(">HHHB")  # transaction, protocol (0), bytes that follow, unit
 _TRANSACTIONS = 0x10000
 _REFUSED = 0x80
+_KNOWN_FRAMES = 64  # that are kept; a host asks the same few again and again
+_KNOWN_REPLIES = 1024  # whose CRC is kept; what is at rest gives the same few readings
 
 
 class RefusedError(Exception):
@@ -64,6 +66,7 @@ class RefusedError(Exception):
         self.code = code
 
 
+@lru_cache(_KNOWN_FRAMES)
 def read_request(address: int, count: int, function: int = READ) -> bytes:
     """Return the request for `count` registers from `address` on; its reply has 2 bytes more than their values."""
     return _READ.pack(function, address, count)
@@ -218,6 +221,7 @@ def _crc_table() -> tuple[int, ...]:
 _CRC = _crc_table()
 
 
+@lru_cache(_KNOWN_REPLIES)
 def crc16(data: bytes) -> bytes:
     """Return the CRC of a Modbus RTU frame as it follows on the line, low byte first."""
     crc = 0xFFFF
@@ -247,7 +251,6 @@ LONGEST_REPLY = 256
 
 _WRITE_REPLY = 8
 _MOST_STRAY_REPLIES = 8
-_KNOWN_FRAMES = 64
 
 
 def reply_length(head: bytes) -> int:
@@ -267,7 +270,6 @@ def is_reply_to(request: bytes, expected: int, frame: bytes) -> bool:
 
 @lru_cache(_KNOWN_FRAMES)
 def _framed(unit: int, request: bytes) -> bytes:
-    # A host asks the same few again and again.
     frame = bytes((unit,)) + request
     return frame + crc16(frame)
 
@@ -280,7 +282,7 @@ class RtuClient(_PortClient):
     Parameters
     ----------
     port : serial.SerialBase
-        The open port.
+        The open port, with an `ask` of its own.
     unit : int
         Address of the instrument, 1 to 247.
     """
@@ -294,11 +296,7 @@ class RtuClient(_PortClient):
 
         Raises `NoReplyError` or `UnexpectedReplyError`, besides what the base class says.
         """
-        port = self._port
-        if port.in_waiting:
-            port.reset_input_buffer()
-        port.write(_framed(self._unit, request))
-        reply: bytes = port.read_all()
+        reply: bytes = self._port.ask(_framed(self._unit, request))
         if len(reply) != expected + 3 or reply[0] != self._unit or reply[1] != request[0]:
             reply = self._reply_among(reply, request, expected)
         elif crc16(reply[:-2]) != reply[-2:]:

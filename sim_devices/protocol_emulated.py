@@ -140,8 +140,11 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
         if not self.is_open or not self._socket.taken:
             self._check()
         self._hear()
-        data = bytes(self._received)
-        self._received.clear()
+        received = self._received
+        if not received:
+            return b""
+        data = bytes(received)
+        received.clear()
         return data
 
     def _wait_for(self, size: int) -> None:
@@ -209,14 +212,22 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
             except (FramingError, ConnectionError) as error:
                 raise self._ended(error) from None
             return len(sent)
-        clock = self._clock
+        answer = self._answer(sent)
+        if answer:
+            self._received += answer
+        return len(sent)
+
+    def _answer(self, sent: bytes) -> bytes:
+        """Let the bytes pass on a serial line; return the answer, for which the time has passed as well."""
+        clock, stream = self._clock, self._stream
         clock.sleep(len(sent) * _BITS_PER_BYTE / self._baudrate)
-        self._hear()
-        answer = self._stream.receive(sent)
+        heard = stream.unsolicited()
+        if heard:
+            self._received += heard
+        answer = stream.receive(sent)
         if answer:
             clock.sleep(len(answer) * _BITS_PER_BYTE / self._baudrate)
-        self._received += answer
-        return len(sent)
+        return answer
 
     def exchange(self, data: bytes) -> bytes:
         """Send bytes and return what was received then; as `write` and `read_all` do, but sooner."""
@@ -227,6 +238,21 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
                 raise self._ended(error) from None
         self.write(data)
         return self.read_all()
+
+    def ask(self, data: bytes) -> bytes:
+        """Forget what was received and not read, send bytes on a serial line, and return what was received then."""
+        if not self.is_open or not self._socket.taken:
+            self._check()
+        received, stream = self._received, self._stream
+        # What comes while the bytes pass is received after all.
+        stream.unsolicited()
+        received.clear()
+        answer = self._answer(data)
+        answer += stream.unsolicited()
+        if received:
+            answer = bytes(received) + answer
+            received.clear()
+        return answer
 
     def _ended(self, error: Exception) -> SerialException:
         return SerialException(f"{_SCHEME}{self._name} ended the connection: {error}")

@@ -26,7 +26,10 @@ def _layout(
     skip_lines: Annotated[int, typer.Option(metavar="LINES", help="First lines of the file that are left out.")] = 0,
     table: Annotated[
         str | None,
-        typer.Option(metavar="TABLE", help="Table of a file of several: number from 1; name of a sheet or variable."),
+        typer.Option(
+            metavar="TABLE",
+            help="Table of a file of several: number from 1; name of a sheet or variable; of a run: telemetry.",
+        ),
     ] = None,
 ) -> ReadingOptions:
     """Return the options of the layout of a file; its signature is that of the options."""

@@ -151,8 +151,9 @@ def identify_(
 
     Columns are named as in the header; a unit at the end, as in `force [N]`, may be left out and goes into the
     model. A number, such as `--input 1`, chooses a column by its place. The layout of a file is found from it and
-    printed; `--delimiter`, `--decimal`, `--encoding`, `--skip-lines` and `--table` set it. Of a run, the readings are
-    taken: `bench identify RUN --input voltage --output displacement --model preisach --out model.json`.
+    printed; `--delimiter`, `--decimal`, `--encoding`, `--skip-lines` and `--table` set it. Of a run, the readings of
+    its steps are taken: `bench identify RUN --input voltage --output displacement --model preisach --out model.json`;
+    `--table telemetry` takes those within its steps, as of a fast loop.
     """
     from bench.results.bands import predict_band
     from bench.results.models import certificate_lines, identify_file

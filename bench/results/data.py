@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from bench.errors import DataError
+from bench.errors import ConfigurationError, DataError
 from bench.journal import Record
 from bench.results.reading.matlab import HDF5, read_matlab
 from bench.results.reading.options import ReadingOptions
@@ -24,6 +24,8 @@ FEWEST_ROWS = 10
 """Fewer samples than this identify nothing."""
 
 _OLD_SPREADSHEET = b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1"
+
+_STEPS, _TELEMETRY = "steps", "telemetry"
 
 _LONGEST_PLATEAU = 0.5
 """Share of the samples that may repeat the one before without a word."""
@@ -62,7 +64,8 @@ def read_columns(
     ----------
     path : Path
         A table of text, which may be compressed by gzip, a MATLAB file, a spreadsheet or a Parquet file; or the
-        folder or the journal of a run.
+        folder or the journal of a run, of which the option `table` takes the readings of its steps (`steps`, the
+        default) or what was read while it held and controlled (`telemetry`).
     names : sequence of str
         Columns, as the header has them; a unit at the end, as in `force [N]`, may be left out. Or their numbers,
         from 1.
@@ -82,8 +85,8 @@ def read_columns(
     """
     options = options or ReadingOptions()
     if path.is_dir() or path.suffix == ".sqlite":
-        options.check_only(path, "a run")
-        columns = _from_run(path, names)
+        options.check_only(path, "a run", "table")
+        columns = _from_run(path, names, options.table or _STEPS, at_least)
     else:
         found = _reader(path)(path, names, options)
         values = dict(zip(names, found.values, strict=True))
@@ -156,17 +159,26 @@ def _reader(path: Path) -> Callable[[Path, Sequence[str], ReadingOptions], ReadC
     return read_text
 
 
-def _from_run(path: Path, names: Sequence[str]) -> Columns:
+def _from_run(path: Path, names: Sequence[str], chosen: str, at_least: int) -> Columns:
     with Record(path) as record:
-        table = record.steps()
-        known = ("step", "started", "finished", *(signal.name for signal in record.signals))
+        if chosen not in (_STEPS, _TELEMETRY):
+            raise ConfigurationError(f"--table {chosen!r}: {path} is a run; expected {_STEPS} or {_TELEMETRY}")
+        table = record.steps() if chosen == _STEPS else record.telemetry()
+        known = [name for name in table.columns if name != "settled"]
         for name in names:
             if name not in known:
                 raise DataError(f"{path}: has no column {name!r}; it has: {', '.join(known)}")
         values = {name: table[name] for name in names}
         units = {name: record.unit(name) for name in names}
+        rows = len(next(iter(values.values())))
+        if chosen == _STEPS and rows < at_least <= (ticks := len(record.telemetry())):
+            raise DataError(
+                f"{path}: has {rows} rows of data; at least {at_least} are needed; "
+                f"--table {_TELEMETRY} takes the {ticks} readings within its steps"
+            )
     for name, column in values.items():
         bad = np.flatnonzero(~np.isfinite(column))
         if bad.size:
-            raise DataError(f"{path}: step {bad[0]}, column {name}: there is no value")
+            row = "step" if chosen == _STEPS else "reading"
+            raise DataError(f"{path}: {row} {bad[0]}, column {name}: there is no value")
     return Columns(str(path), values, units)

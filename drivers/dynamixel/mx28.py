@@ -104,7 +104,8 @@ _VOLTAGE = _Item(144, 2, "input voltage")
 _TEMPERATURE = _Item(146, 1, "temperature")
 
 _TICK, _MOVING, _LOAD, _VELOCITY = 120, 122, 126, 128
-_FEEDBACK = struct.Struct("<BBBbiHBhii")
+# What changes in most readings comes last: the line keeps the CRC of what is before it.
+_FEEDBACK = struct.Struct("<BBBbiBhiiH")
 _FEEDBACK_BYTES = tuple(
     address + offset
     for address, size in (
@@ -113,11 +114,11 @@ _FEEDBACK_BYTES = tuple(
         (_HARDWARE_ERROR.address, 1),
         (_WATCHDOG.address, 1),
         (_GOAL.address, 4),
-        (_TICK, 2),
         (_MOVING, 1),
         (_LOAD, 2),
         (_VELOCITY, 4),
         (_POSITION.address, 4),
+        (_TICK, 2),
     )
     for offset in range(size)
 )
@@ -133,11 +134,11 @@ class _Feedback(NamedTuple):
     hardware_error: int
     watchdog: int
     goal: int
-    tick: int
     moving: int
     load: int
     velocity: int
     position: int
+    tick: int
 
 
 HARDWARE_ERRORS: Mapping[int, tuple[str, str]] = {
@@ -251,8 +252,8 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
     That is all it does by itself: the torque stays on after the death of its host, so `watchdog` is None, and only
     `safe` switches the torque off.
 
-    A reading is one block of indirect data (addresses 168 to 251): torque, bus watchdog, goal, realtime tick, motion,
-    load, velocity, position, and the status return level. The indirect addresses live in RAM: after a restart the
+    A reading is one block of indirect data (addresses 168 to 251): status return level, torque, bus watchdog, goal,
+    motion, load, velocity, position, and realtime tick. The indirect addresses live in RAM: after a restart the
     level is 0 there instead of 2. So the next reading finds the restart before it believes a position, which may be
     off by whole turns; from then on every reading and every set-point is a `DeviceRestartedError`, until the servo is
     connected again with its `zero_counts` checked. A goal or a torque that is not the one that was sent is a
@@ -269,6 +270,7 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
     def __init__(self, name: str, settings: MX28SettingsT, clock: Clock, line: ServoLine) -> None:
         super().__init__(name, settings, clock, line)
         self._names = [signal.name for signal in self.signals]
+        self._per_radian = settings.per_radian
         self._goal: int | None = 0
         self._on = self._restarted = False
         self._tick = -1
@@ -316,7 +318,7 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
         """Measure position, velocity and inferred load (1), in one round trip."""
         found = self._feedback()
         direction = self._settings.direction
-        velocity = direction * found.velocity * _VELOCITY_UNIT * self._settings.per_radian
+        velocity = direction * found.velocity * _VELOCITY_UNIT * self._per_radian
         values = (self._position(found.position), velocity, direction * found.load * 1e-3)
         return dict(zip(self._names, values, strict=True))
 
@@ -525,7 +527,7 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
 
     def _position(self, counts: int) -> float:
         settings = self._settings
-        return settings.direction * (counts - settings.zero_counts) * _COUNT * settings.per_radian
+        return settings.direction * (counts - settings.zero_counts) * _COUNT * self._per_radian
 
     def _text(self, counts: int) -> str:
         return f"{self._position(counts):.{self._DIGITS}g} {self.limits.unit}"

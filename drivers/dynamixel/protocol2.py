@@ -234,9 +234,7 @@ def _crc_of_byte(index: int) -> int:
 
 
 _CRC_OF_BYTE = tuple(_crc_of_byte(index) for index in range(256))
-_BEGINNING = (
-    17  # bytes that seldom change from one answer to the next: head, error, and what comes first in a reading
-)
+_BEGINNING = 28  # bytes that a servo at rest often repeats: head, error, and all of a reading but its tick
 
 
 def crc(data: bytes) -> int:

@@ -357,7 +357,8 @@ class NodeLine:
 
     def _hear(self) -> None:
         """Take note of what has come, which answers nothing."""
-        for line in self._adapter.lines():
+        # Of several heartbeats that have come since, one says as much.
+        for line in dict.fromkeys(self._adapter.lines()):
             self._notice(line)
 
     def _answer(self, multiplexer: bytes, sent_at: float) -> bytes | None:

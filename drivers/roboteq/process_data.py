@@ -14,7 +14,7 @@ The configuration lies in RAM. TPDOs that were set up for other listeners are ta
 from __future__ import annotations
 
 import struct
-from binascii import unhexlify
+from binascii import hexlify, unhexlify
 from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -67,6 +67,7 @@ class ProcessData:
         self._node = node
         self._mark = 0
         self._mark_digits = b""
+        self._mark_head = b"t%03X4" % (_LAST_RPDO + node)
         electrical = (0x2102, channel, 16), (0x210D, 2, 16), (0x2100, channel, 16), (0x2112, 0, 16)
         flags = (0x2122, channel, 32)
         self._mappings: tuple[_Mapping, ...] = (
@@ -102,8 +103,8 @@ class ProcessData:
     def next_mark(self) -> bytes:
         """Return the line that writes the mark that the next process data have to carry."""
         self._mark = self._mark % _HIGHEST_MARK + 1
-        self._mark_digits = self._mark.to_bytes(4, "little").hex().upper().encode("ascii")
-        return b"t%03X4%s\r" % (_LAST_RPDO + self._node, self._mark_digits)
+        self._mark_digits = hexlify(self._mark.to_bytes(4, "little")).upper()
+        return b"%b%b\r" % (self._mark_head, self._mark_digits)
 
     def is_marked(self, line: NodeLine) -> bool:
         """Return whether the controller has a mark, which it loses in a restart.

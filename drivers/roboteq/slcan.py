@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import re
 from collections import deque
+from collections.abc import Callable
 from contextlib import suppress
 
 import serial
@@ -31,7 +32,11 @@ class SlcanAdapter(slcanBus):
     ----------
     refusals : int
         How often the adapter has answered with BEL since it was opened.
+    transmit : callable
+        Sends a line, which has its end.
     """
+
+    transmit: Callable[[bytes], object]
 
     def __init__(self, settings: SerialSettings, bitrate: int) -> None:
         self.refusals = 0
@@ -47,13 +52,10 @@ class SlcanAdapter(slcanBus):
             )
             self._port = self.serialPortOrig
             self._port.write_timeout = settings.timeout
+            self.transmit = self._port.write
         except BaseException:
             self._abandon()
             raise
-
-    def transmit(self, line: bytes) -> None:
-        """Send a line, which has its end."""
-        self._port.write(line)
 
     def line(self) -> bytes | None:
         """Return the next line with a standard data frame, without its end; None after silence for the timeout."""

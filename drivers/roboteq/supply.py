@@ -507,11 +507,12 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
             raise self._reported(report.faults, report.channel_flags)
         if self._line.restarted:
             raise self._found_restarted()
-        if self._line.heartbeat_age() > self._settings.heartbeat:
+        allowed = self._settings.heartbeat
+        if self._line.heartbeat_age() > allowed:
             # After a loss of the line the next one is under way.
-            self._line.await_heartbeat(_HEARTBEAT_SHARE * self._settings.heartbeat)
-        if self._line.heartbeat_age() > self._settings.heartbeat:
-            raise self._no_heartbeat()
+            self._line.await_heartbeat(_HEARTBEAT_SHARE * allowed)
+            if self._line.heartbeat_age() > allowed:
+                raise self._no_heartbeat()
         return report
 
     def _no_heartbeat(self) -> DeviceConnectionError:

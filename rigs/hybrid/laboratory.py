@@ -15,7 +15,6 @@ import numpy as np
 from pydantic import Field
 
 from bench.clock import Clock
-from bench.rig_file import LaboratorySettings
 from rigs.hybrid.witness import WitnessRegisters
 from sim_devices.faults.fault import Fault, Quantity
 from sim_devices.faults.sensor import FaultySensor
@@ -26,9 +25,11 @@ from sim_devices.instruments.meerstetter_tec import EmulatedTEC
 from sim_devices.laboratory import EmulatedLaboratory, TrueValue, compile_loops, tec_faults
 from sim_devices.plants.hybrid import HybridCantilever
 from sim_devices.plants.hybrid_parameters import HybridParameters
+from sim_devices.transducers.data_sheets import DISPLACEMENT, THERMISTOR
 from sim_devices.transducers.displacement import DisplacementSensor
 from sim_devices.transducers.imperfect import SensorErrors, imperfect, shown
 from sim_devices.transducers.piezo_amplifier import PiezoAmplifier
+from sim_devices.transducers.specimens import SensorSettings
 from sim_devices.transducers.thermistor import Thermistor
 from sim_devices.wire.mecom import MeComServer
 from sim_devices.wire.modbus_tcp import ModbusTcpInstrument
@@ -45,8 +46,6 @@ GAIN = 4.0
 """Of the amplifier, V/V: the LJTick-DAC's 14 bits over ±10 V then make steps of 4.9 mV, 1.4 nm of deflection."""
 SETTLING_TIME = 20e-6
 """Time constant of the amplifier with this piezo, s: short beside the 1.4 ms of a period of the resonance."""
-DISPLACEMENT_RANGE, THERMISTOR_RANGE = (-200e-6, 200e-6), (-40.0, 80.0)
-"""Ranges of the sensors, m and °C: their nonlinearity is a share of them."""
 REACH = 199e-6
 """Displacement of either sign that counts as within range, m; the sensor itself stops at 200 µm."""
 
@@ -66,7 +65,7 @@ FaultName = Literal[
 ]
 
 
-class HybridLaboratorySettings(LaboratorySettings):
+class HybridLaboratorySettings(SensorSettings):
     """Settings of this laboratory in a rig file."""
 
     ambient: float = Field(
@@ -148,14 +147,14 @@ class HybridLaboratory(EmulatedLaboratory):
         self._beyond = 0.0
         self._stuck: float | None = None
         self._shown = {
-            name: imperfect(quantity, errors, low, high, self.world)
-            for name, quantity, errors, low, high in (
-                ("displacement", self._seen_deflection, settings.displacement_sensor, *DISPLACEMENT_RANGE),
-                ("base", lambda: self.plant.base_temperature, settings.base_thermistor, *THERMISTOR_RANGE),
-                ("tip", lambda: self.plant.tip_temperature, settings.tip_thermistor, *THERMISTOR_RANGE),
+            name: imperfect(quantity, settings.errors_of(table, sheet), *sheet.range, self.world)
+            for name, quantity, table, sheet in (
+                ("displacement", self._seen_deflection, "displacement_sensor", DISPLACEMENT),
+                ("base", lambda: self.plant.base_temperature, "base_thermistor", THERMISTOR),
+                ("tip", lambda: self.plant.tip_temperature, "tip_thermistor", THERMISTOR),
             )
         }
-        witness = imperfect(self._deflection, settings.reference_sensor, *DISPLACEMENT_RANGE, self.world)
+        witness = imperfect(self._deflection, settings.reference_sensor, *DISPLACEMENT.range, self.world)
         sensors = [
             FaultySensor(name, self.world, seen, unit, scale=scale, beyond=beyond, seed=(seed, i))
             for i, (name, seen, unit, scale, beyond) in enumerate(

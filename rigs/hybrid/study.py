@@ -7,7 +7,6 @@ IEEE Transactions on Robotics 26(6), 2010. The paper leaves the controller as fu
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -17,11 +16,21 @@ import numpy.typing as npt
 from bench.identification import measure_errors
 from bench.journal import Record
 from bench.model_file import ModelFile
+from bench.results.calibrations import calibrate_run
 from bench.results.figures import plot_fit, plot_tracking
 from bench.results.prediction_figures import errors_text
 from bench.results.published import Published
 from bench.studies import Campaign, ResultTable, Study, StudyResult
 from rigs.hybrid.design import Design
+from rigs.hybrid.evaluation import (
+    HELD,
+    HOLD,
+    Tracked,
+    calibrated_rig,
+    displacement_characteristic,
+    fine_step,
+    tracked,
+)
 from rigs.hybrid.identification import (
     BASE,
     CURRENT,
@@ -42,6 +51,7 @@ from rigs.hybrid.identification import (
 from rigs.hybrid.model import PUBLISHED_DYNAMICS
 
 if TYPE_CHECKING:
+    from bench.calibration import Calibration
     from bench.runs import RunResult
     from bench.workers import Pending
 
@@ -58,10 +68,6 @@ CONTROLLERS = ("hybrid", "hybrid-low-pass", "thermal-feedback", "open-loop")
 REFERENCES = ("staircase", "ramp", "sine-on-ramp")
 SETTLING = 5.0
 """Time from the start from which a reference counts, s."""
-HOLD = 30.0
-"""Length of each hold between the moves, s, for all controllers alike."""
-HELD = 15.0
-"""Time at the end of each hold that counts as held, s."""
 RESOLUTION_HOLD = 180.0
 """Length of the one hold that the resolution of the thermal part is taken from, s."""
 RESOLUTION_TIME = 60.0
@@ -72,8 +78,6 @@ ROOM_STEP = 5.0
 """Step of the room temperature, K."""
 ROOM_STEP_TIME = 30.0
 """Its time, s."""
-BAND = 0.02
-"""Band within which a step counts as settled, as a share of the step."""
 
 SENSITIVITIES = Design().thermal_sensitivity, Design().piezo_sensitivity
 """Deflection per rise (m/K) and per voltage (m/V), from geometry."""
@@ -88,10 +92,15 @@ def _actuator(name: str, bandwidth: str, *papers: str) -> tuple[str, ...]:
     return (name, *(cell for pair in zip(papers, values, strict=True) for cell in pair))
 
 
-_ASSUMED = (
-    "True errors are those of the emulated tip. They assume a displacement sensor with noise and steps of 10 nm each "
-    "and no systematic error: what is shown is repeatability, and accuracy only with a calibrated sensor."
-)
+REFERENCE_UNCERTAINTY = 1e-9
+"""Standard uncertainty of the interferometer, m."""
+
+_PARTS = tuple((part, what) for part in ("hold", "move") for what in ("RMS", "max"))
+
+
+def _errors_row(title: str, entry: str, true: str = "") -> tuple[str, ...]:
+    return (title, *(f"{{{entry}[{true}{part}_{what.lower()}_nm]:.1f}}" for part, what in _PARTS))
+
 
 TABLES = (
     ResultTable(
@@ -146,85 +155,60 @@ TABLES = (
         f"{RESOLUTION_HOLD:g} s, without the transient of a move.",
     ),
     ResultTable(
-        f"six moves at 3 µm/s over {{control[range_um]:.0f}} µm, true errors in nm; of each hold of {HOLD:g} s the "
+        f"six moves at 3 µm/s over {{control[range_um]:.0f}} µm, errors in nm; of each hold of {HOLD:g} s the "
         f"last {HELD:g} s",
-        ("controller", "hold RMS", "hold max", "move RMS", "move max"),
-        [
-            (
-                name,
-                *(
-                    f"{{controllers[{name}][{part}_{what}_nm]:.1f}}"
-                    for part in ("hold", "move")
-                    for what in ("rms", "max")
-                ),
-            )
-            for name in CONTROLLERS
-        ],
-        _ASSUMED,
+        ("controller", *(f"{part} {what}" for part, what in _PARTS)),
+        [_errors_row(name, f"controllers[{name}]") for name in CONTROLLERS],
+        "Errors are those of what the sensor shows, without its noise: repeatability.",
     ),
     ResultTable(
-        "hybrid controller, true errors in nm",
-        ("reference", "RMS", "max"),
+        "true errors of the same in nm: accuracy",
+        ("controller", *(f"{part} {what}" for part, what in _PARTS)),
         [
-            *((name, *(f"{{references[{name}][{what}_nm]:.1f}}" for what in ("rms", "max"))) for name in REFERENCES),
-            (f"hold, room steps by {ROOM_STEP:g} K", "–", "{room_step_nm:.1f}"),
+            *(_errors_row(name, f"controllers[{name}]", "true_") for name in CONTROLLERS),
+            _errors_row("hybrid, sensor calibrated", "calibrated", "true_"),
+        ],
+        "They are those of the tip, with a sensor that has the systematic errors of its data sheet "
+        "(docs/reference/sensors.md). Calibrated against an interferometer it is accurate to "
+        "{calibration[accuracy_nm]:.1f} nm.",
+    ),
+    ResultTable(
+        "hybrid controller, errors in nm",
+        ("reference", "RMS", "max", "true RMS", "true max"),
+        [
+            *(
+                (name, *(f"{{references[{name}][{what}_nm]:.1f}}" for what in ("rms", "max", "true_rms", "true_max")))
+                for name in REFERENCES
+            ),
+            (f"hold, room steps by {ROOM_STEP:g} K", "–", "{room_step_nm:.1f}", "–", "{true_room_step_nm:.1f}"),
         ],
     ),
     ResultTable(
         "fine step of 5 µm at 20 kHz",
-        ("resonance off by", "settling (2 %) / ms", "overshoot / %", "RMS afterwards / nm"),
+        (
+            "resonance off by",
+            "settling (2 %) / ms",
+            "overshoot / %",
+            "RMS afterwards / nm",
+            "true RMS / nm",
+        ),
         [
             (
                 f"{offset:+.0%}",
                 *(
                     f"{{fine_steps[{offset:+.0%}][{what}]:{digits}}}"
-                    for what, digits in (("settling_ms", ".2f"), ("overshoot_percent", ".2f"), ("rms_nm", ".1f"))
+                    for what, digits in (
+                        ("settling_ms", ".2f"),
+                        ("overshoot_percent", ".2f"),
+                        ("rms_nm", ".1f"),
+                        ("true_rms_nm", ".1f"),
+                    )
                 ),
             )
             for offset in RESONANCES
         ],
     ),
 )
-
-
-@dataclass(frozen=True)
-class Tracking:
-    """Result of a reference: times (s), reference and true deflection (m), each of shape (N,)."""
-
-    times: Floats
-    reference: Floats
-    deflection: Floats
-
-    @property
-    def errors(self) -> Floats:
-        """Deflection less reference, m."""
-        return self.deflection - self.reference
-
-    @property
-    def moving(self) -> npt.NDArray[np.bool_]:
-        """Where the reference moves."""
-        return np.abs(np.gradient(self.reference, self.times)) > 1e-12
-
-    @property
-    def held(self) -> npt.NDArray[np.bool_]:
-        """The last `HELD` seconds of each hold of `HOLD`, but for the rest at the beginning."""
-        moving = self.moving
-        last = np.maximum.accumulate(np.where(moving, self.times, -np.inf))
-        return ~moving & np.isfinite(last) & (self.times - last >= HOLD - HELD)
-
-    def measures(self, chosen: npt.NDArray[np.bool_]) -> dict[str, float]:
-        """Return RMS and greatest error (nm) of the chosen samples; nan if there is none."""
-        errors = self.errors[chosen] * 1e9
-        if not errors.size:
-            return {"rms_nm": float("nan"), "max_nm": float("nan")}
-        return {"rms_nm": float(np.sqrt(np.mean(errors**2))), "max_nm": float(np.abs(errors).max())}
-
-    def summary(self) -> dict[str, float]:
-        """Return RMS and greatest error in holds and moves, nm; nan where there is none."""
-        parts = {"hold": self.held, "move": self.moving}
-        return {
-            f"{part}_{key}": value for part, chosen in parts.items() for key, value in self.measures(chosen).items()
-        }
 
 
 class _Runs(NamedTuple):
@@ -286,13 +270,18 @@ def _carry_out(campaign: Campaign) -> StudyResult:
         )
         for offset in RESONANCES
     }
+    sweep_run = campaign.start("calibration-displacement", {"sweeps": "1"}, rig=WITNESSED)
     figures = list(_draw_models(campaign, found, runs))
-    tracked = {name: _tracked(run) for name, run in tracking_runs.items()}
-    figures += _draw_control(campaign, tracked)
-    references = {name: _tracked(run) for name, run in reference_runs.items()}
-    thermal = _tracked(thermal_run)
-    room = _tracked(room_run)
-    fine = {name: _fine_step(run) for name, run in fine_runs.items()}
+    calibration = _calibrated(sweep_run.result().folder)
+    calibrated = calibrated_rig(campaign.folder, calibration, WITNESSED)
+    calibrated_run = _start(campaign, model, {"controller": "hybrid", "hold": f"{HOLD:g}"}, rig=calibrated)
+    sensor = displacement_characteristic(WITNESSED)
+    moves = {name: tracked(run.result().folder, sensor) for name, run in tracking_runs.items()}
+    figures += _draw_control(campaign, moves)
+    references = {name: tracked(run.result().folder, sensor) for name, run in reference_runs.items()}
+    thermal = tracked(thermal_run.result().folder, sensor).shown
+    room = tracked(room_run.result().folder, sensor).measures(after=ROOM_STEP_TIME)
+    fine = {name: fine_step(run.result().folder, sensor) for name, run in fine_runs.items()}
 
     values: dict[str, Any] = {
         "geometry": dict(
@@ -310,10 +299,17 @@ def _carry_out(campaign: Campaign) -> StudyResult:
             "bandwidth_mHz": found.model.bandwidth() * 1e3,
         },
         "whole": _validate(found, runs.whole),
-        "control": _control(tracked["hybrid"], fine),
-        "controllers": {name: tracking.summary() for name, tracking in tracked.items()},
-        "references": {name: tracking.measures(tracking.times > SETTLING) for name, tracking in references.items()},
-        "room_step_nm": room.measures(room.times > ROOM_STEP_TIME)["max_nm"],
+        "control": _control(moves["hybrid"], fine),
+        "controllers": {name: each.summary() for name, each in moves.items()},
+        "calibrated": tracked(calibrated_run.result().folder, sensor, calibration).summary(),
+        "calibration": {
+            "accuracy_nm": calibration.uncertainty * 1e9,
+            "repeatability_nm": calibration.repeatability * 1e9,
+            "coefficients": len(calibration.coefficients),
+        },
+        "references": {name: each.measures(after=SETTLING) for name, each in references.items()},
+        "room_step_nm": room["max_nm"],
+        "true_room_step_nm": room["true_max_nm"],
         "fine_steps": fine,
     }
     resolution = thermal.measures(thermal.times >= thermal.times[-1] - RESOLUTION_TIME)["rms_nm"]
@@ -322,37 +318,31 @@ def _carry_out(campaign: Campaign) -> StudyResult:
 
 
 def _start(
-    campaign: Campaign, model: Path, settings: Mapping[str, str], overrides: Mapping[str, str] | None = None
+    campaign: Campaign,
+    model: Path,
+    settings: Mapping[str, str],
+    overrides: Mapping[str, str] | None = None,
+    rig: str = WITNESSED,
 ) -> Pending[RunResult]:
-    return campaign.start(
-        "hybrid-control", {"model": str(model), "witness": "true", **settings}, overrides, rig=WITNESSED
+    return campaign.start("hybrid-control", {"model": str(model), "witness": "true", **settings}, overrides, rig=rig)
+
+
+def _calibrated(sweep: Path) -> Calibration:
+    """Return the calibration of the displacement sensor from a sweep beside the witness."""
+    with Record(sweep) as record:
+        names = signal_names(record)
+    return calibrate_run(
+        sweep,
+        names[DEFLECTION],
+        names[WITNESS],
+        reference_name="interferometer",
+        reference_uncertainty=REFERENCE_UNCERTAINTY,
     )
 
 
-def _tracked(run: Pending[RunResult]) -> Tracking:
-    samples = read_loop(run.result().folder)
-    return Tracking(samples.times, samples["reference"], samples[WITNESS])
-
-
-def _fine_step(run: Pending[RunResult]) -> dict[str, float]:
-    """Evaluate a fine step; return settling time (ms), overshoot (%) and the RMS error afterwards (nm)."""
-    samples = read_loop(run.result().folder)
-    reference, deflection = samples["reference"], samples[WITNESS]
-    height = float(reference[-1] - reference[0])
-    start = int(np.flatnonzero(reference != reference[0])[0])
-    errors = (deflection - reference[-1])[start:] / height
-    outside = np.flatnonzero(np.abs(errors) > BAND)
-    settled = int(outside[-1]) + 1 if outside.size else 0
-    return {
-        "settling_ms": settled * samples.period * 1e3,
-        "overshoot_percent": max(0.0, float(errors.max()) * 100.0),
-        "rms_nm": float(np.sqrt(np.mean((errors[len(errors) // 2 :] * height) ** 2)) * 1e9),
-    }
-
-
-def _control(tracking: Tracking, fine: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
+def _control(moves: Tracked, fine: Mapping[str, Mapping[str, float]]) -> dict[str, float]:
     """Return the results of the hybrid controller; of the fine steps the worst."""
-    summary = tracking.summary()
+    summary, tracking = moves.summary(), moves.shown
     return {
         **{key: summary[key] for key in ("hold_rms_nm", "hold_max_nm", "move_rms_nm")},
         "range_um": float(np.ptp(tracking.reference[tracking.held]) * 1e6),
@@ -512,9 +502,10 @@ def _draw_models(campaign: Campaign, found: HybridIdentification, runs: _Runs) -
         )
 
 
-def _draw_control(campaign: Campaign, tracked: Mapping[str, Tracking]) -> Iterator[Path]:
+def _draw_control(campaign: Campaign, moves: Mapping[str, Tracked]) -> Iterator[Path]:
     """Have each controller's moves drawn; yield the files."""
-    for name, tracking in tracked.items():
+    for name, each in moves.items():
+        tracking = each.true
         # Without the first seconds, in which the controller finds the start.
         shown = tracking.times > SETTLING
         yield campaign.draw(

@@ -17,7 +17,6 @@ from pydantic import Field
 
 from bench.clock import Clock
 from bench.errors import ConfigurationError
-from bench.rig_file import LaboratorySettings
 from sim_devices.faults.fault import Fault, Quantity
 from sim_devices.faults.sensor import FaultySensor
 from sim_devices.instruments.dynamixel import EmulatedMX28
@@ -33,8 +32,10 @@ from sim_devices.plants.grid import GRID_TOLERANCE, Floats, changed
 from sim_devices.plants.mckibben import McKibbenMuscle, McKibbenParameters
 from sim_devices.plants.muscle import MuscleParameters
 from sim_devices.plants.sma import SMAParameters, SMAWire
+from sim_devices.transducers.data_sheets import LOAD_CELL, POSITION
 from sim_devices.transducers.imperfect import ImperfectSensor, SensorErrors, imperfect, shown
 from sim_devices.transducers.magnet import RatiometricSensor
+from sim_devices.transducers.specimens import SensorSettings
 from sim_devices.wire.canopen_slcan import CanopenSlcanServer
 from sim_devices.wire.dynamixel2 import Dynamixel2Server
 from sim_devices.wire.modbus_rtu import ModbusRtuServer
@@ -47,9 +48,6 @@ magnet by gauge blocks (m from rest)."""
 
 FAN_LINE = 0
 """Digital line of the T7 that switches the fan: FIO0, on when high."""
-
-FORCE_RANGE, POSITION_RANGE = (0.0, 20.0), 0.035
-"""Range of the load cell, N, and stroke of the position sensor, m: their nonlinearity is a share of them."""
 
 _HEARTBEAT_TIME = 0x1017
 """Object of the supply with the period of its heartbeat, ms; 0 for none."""
@@ -112,7 +110,7 @@ class MusclePlant(Protocol):
         """Position of the end, m from rest."""
 
 
-class MuscleLaboratorySettings(LaboratorySettings, ABC):
+class MuscleLaboratorySettings(SensorSettings, ABC):
     """Keys of the table `[emulation]` that all these laboratories have."""
 
     battery_voltage: float = Field(default=10.0, gt=0, le=60, description="voltage behind the PWM supply, V")
@@ -228,7 +226,7 @@ class Frame:
 
 
 class ForceCourse:
-    """The force of a muscle over time: a `sim_devices.instruments.flintec_dad141.Course`.
+    """The force of a muscle over time: a `sim_devices.instruments._flintec_kernels.Course`.
 
     Parameters
     ----------
@@ -265,7 +263,7 @@ class ForceCourse:
         if self._imperfect is None:
             return kept
         # Behind the ring stands the number of the last one.
-        return np.append(self._imperfect.static_course(kept[:-1]), kept[-1])
+        return np.append(self._imperfect.characteristic.course(kept[:-1]), kept[-1])
 
     def since_point(self) -> float:
         """Return the time for which the muscle has stood at the last grid point, s."""
@@ -305,12 +303,14 @@ class MuscleLaboratory(EmulatedLaboratory):
         self.world = World(self.frame, clock)
         self._load_is_forgotten = False
         self._load_factor = 1.0
-        self._force_shown = imperfect(lambda: self.frame.force, settings.force_sensor, *FORCE_RANGE, self.world)
+        self._force_shown = imperfect(
+            lambda: self.frame.force, settings.errors_of("force_sensor", LOAD_CELL), *LOAD_CELL.range, self.world
+        )
         self._position_shown = imperfect(
             lambda: self.frame.position,
-            settings.position_sensor,
-            -settings.rest_position,
-            POSITION_RANGE - settings.rest_position,
+            settings.errors_of("position_sensor", POSITION),
+            POSITION.range[0] - settings.rest_position,
+            POSITION.range[1] - settings.rest_position,
             self.world,
         )
         self._force_sensor, self._position_sensor = (

@@ -5,11 +5,12 @@ Follows Zhang and Yip 2017, see `rigs.muscles.characterization`; the control is 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from bench.hysteresis import Density
 from bench.identification.two_stage import predict_series
@@ -23,7 +24,8 @@ from bench.results.figures import (
 )
 from bench.results.published import Published
 from bench.results.tracking import TargetResults
-from bench.studies import Campaign, ResultTable, Study, StudyResult, reached_targets
+from bench.rig_file import load_rig
+from bench.studies import Campaign, ResultTable, Study, StudyResult, reached_targets, true_errors
 from rigs.muscles.characterization import (
     KINDS,
     PAPER,
@@ -36,6 +38,8 @@ from rigs.muscles.characterization import (
     start_runs,
 )
 from rigs.muscles.identification import FORCE, LENGTH
+
+Floats = npt.NDArray[np.float64]
 
 CONTROLLERS = ("open-loop-inverse", "proportional-integral", "closed-loop-inverse")
 LOAD_CHANGE = 1.96
@@ -97,6 +101,24 @@ TABLES = (
             for controller in CONTROLLERS
         ],
     ),
+    ResultTable(
+        "true errors of the same, max / RMS: accuracy",
+        ("", *(controller.removesuffix("-inverse") for controller in CONTROLLERS)),
+        [
+            (
+                f"{session.title}, {session.controlled.unit}",
+                *(
+                    " / ".join(
+                        f"{{control[{key}][{json_key(controller)}][true_{what}]:.3f}}" for what in ("max", "rms")
+                    )
+                    for controller in CONTROLLERS
+                ),
+            )
+            for key, session in CONTROL.items()
+        ],
+        "The errors above are those of the readings: repeatability. These are those of length and force behind the "
+        "readings, of sensors with the systematic errors of their data sheets (docs/reference/sensors.md).",
+    ),
 )
 
 
@@ -126,6 +148,7 @@ def carry_out(campaign: Campaign) -> StudyResult:
         for key, entry in runs.items()
     }
     figures += _draw_control(campaign, reached)
+    truth = true_quantities(campaign.rig)
     measured.keep_model(campaign)
     return StudyResult(
         {
@@ -136,7 +159,7 @@ def carry_out(campaign: Campaign) -> StudyResult:
             },
             "control": {
                 key: {
-                    json_key(controller): _errors(results, CONTROL[key].controlled.scale)
+                    json_key(controller): _errors(results, CONTROL[key].controlled, truth)
                     for controller, results in entry.items()
                 }
                 for key, entry in reached.items()
@@ -171,9 +194,35 @@ STUDY = Study(
 )
 
 
-def _errors(results: TargetResults, scale: float) -> dict[str, float]:
+def true_quantities(rig: str) -> Mapping[str, Callable[[Floats], Floats]]:
+    """Return by signals what gives the quantities behind readings of an emulated rig, but for noise.
+
+    There is none for a rig with another laboratory.
+    """
+    # Here, as `bench list` reads the names of the studies.
+    from rigs.muscles.laboratory import MuscleLaboratorySettings
+    from sim_devices.transducers.data_sheets import LOAD_CELL, POSITION
+
+    settings = load_rig(rig).laboratory_settings
+    if not isinstance(settings, MuscleLaboratorySettings):
+        return {}
+    return {
+        LENGTH: settings.characteristic_of("position_sensor", POSITION, settings.rest_position).quantities,
+        FORCE: settings.characteristic_of("force_sensor", LOAD_CELL).quantities,
+    }
+
+
+def _errors(
+    results: TargetResults, controlled: Quantity, truth: Mapping[str, Callable[[Floats], Floats]]
+) -> dict[str, float]:
     summary = results.summary()
-    return {key: summary[key] * scale for key in ("max", "rms", "median")}
+    behind = truth.get(controlled.signal)
+    true = np.full_like(results.outputs, np.nan) if behind is None else behind(results.outputs)
+    found = {
+        **{key: summary[key] for key in ("max", "rms", "median")},
+        **true_errors(true - results.targets),
+    }
+    return {key: value * controlled.scale for key, value in found.items()}
 
 
 def _draw(campaign: Campaign, measured: Characterization) -> list[Path]:

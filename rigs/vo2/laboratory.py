@@ -9,7 +9,6 @@ import numpy as np
 from pydantic import Field
 
 from bench.clock import Clock
-from bench.rig_file import LaboratorySettings
 from sim_devices.faults.fault import Fault, Quantity
 from sim_devices.faults.sensor import FaultySensor
 from sim_devices.faults.supply import ClippedPeltier
@@ -19,20 +18,19 @@ from sim_devices.instruments.meerstetter_tec import EmulatedTEC
 from sim_devices.laboratory import EmulatedLaboratory, TrueValue, compile_loops, tec_faults
 from sim_devices.plants.grid import changed
 from sim_devices.plants.vo2 import VO2Cantilever, VO2Parameters
+from sim_devices.transducers.data_sheets import PSD
 from sim_devices.transducers.imperfect import SensorErrors, imperfect, shown
 from sim_devices.transducers.photodetector import NormalisedPSD
+from sim_devices.transducers.specimens import SensorSettings
 from sim_devices.wire.mecom import MeComServer
 from sim_devices.wire.modbus_tcp import ModbusTcpInstrument
 from sim_devices.world import World
-
-PSD_RANGE = (-100e-6, 100e-6)
-"""Deflections of the tip that the PSD sees, m: its nonlinearity is a share of them."""
 
 _SPOT = 1
 """Beside the seed, for the noise of a faulty sensor; the streams of the laboratory stay as they are."""
 
 
-class VO2LaboratorySettings(LaboratorySettings):
+class VO2LaboratorySettings(SensorSettings):
     """Keys of the table `[emulation]`."""
 
     specimen_seed: int = Field(default=VO2Parameters.specimen_seed, ge=0, description="seed of the specimen")
@@ -88,7 +86,7 @@ class VO2Laboratory(EmulatedLaboratory):
         self.tec = EmulatedTEC("tec", self.world, peltier, rng=tec_stream)
         self._misalignment = 0.0
         self._stuck: tuple[float, float] | None = None
-        self._shown = imperfect(self._spot, settings.psd, *PSD_RANGE, self.world)
+        self._shown = imperfect(self._spot, settings.errors_of("psd", PSD), *PSD.range, self.world)
         spot = FaultySensor(
             "spot",
             self.world,

@@ -6,7 +6,7 @@ VO2-Coated Microactuators*, IEEE/ASME Transactions on Mechatronics, 2013; here "
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -22,7 +22,9 @@ from bench.results.models import IdentifiedFile, errors_json, identify_file, pre
 from bench.results.prediction_figures import errors_text
 from bench.results.published import Published
 from bench.results.tracking import FollowingResult, TargetResults, following_result
-from bench.studies import Campaign, ResultTable, Study, StudyResult, reached_targets
+from bench.rig_file import load_rig
+from bench.studies import Campaign, ResultTable, Study, StudyResult, reached_targets, true_errors
+from rigs.vo2.curvature import CantileverCurvature, curvature_to_deflection, deflection_to_curvature
 
 if TYPE_CHECKING:
     from bench.runs import RunResult
@@ -157,6 +159,23 @@ TABLES = (
             for key in FOLLOWERS
         ],
     ),
+    ResultTable(
+        "true errors of both in 1/m: accuracy",
+        ("controller", "targets, max", "targets, RMS", *(f"sine of {period} s, RMS" for period in PERIODS)),
+        [
+            (
+                title,
+                *(f"{{tracking[{key}][true_{what}]:.1f}}" for what in ("max", "rms")),
+                *(
+                    f"{{continuous[period_{period}][{key}][true_rms]:.1f}}" if key in FOLLOWERS else "–"
+                    for period in PERIODS
+                ),
+            )
+            for key, (title, *_) in CONTROLLERS.items()
+        ],
+        "The errors above are those of the readings: repeatability. These are those of the curvature behind the "
+        "readings, of a PSD with the systematic errors of its data sheet (docs/reference/sensors.md).",
+    ),
 )
 
 
@@ -214,6 +233,7 @@ def carry_out(campaign: Campaign) -> StudyResult:
     reached = {key: reached_targets(run.result(), OUTPUT) for key, run in tracking_runs.items()}
     followed = {key: _followed(run.result()) for key, run in following_runs.items()}
     figures += _draw_control(campaign, reached, followed)
+    truth = true_curvatures(campaign.rig)
 
     for run in (characterization.result(), validation.result()):
         with Record(run.folder) as record:
@@ -234,9 +254,17 @@ def carry_out(campaign: Campaign) -> StudyResult:
             },
             "kkt": {key: model.identification.certificate.kkt_residual for key, model in models.items()},
             "parameters": _parameters(models["nonmonotonic"].file.operator),
-            "tracking": {key: results.summary() for key, results in reached.items()},
+            "tracking": {
+                key: {**results.summary(), **true_errors(truth(results.outputs) - results.targets)}
+                for key, results in reached.items()
+            },
             "continuous": {
-                f"period_{period}": {key: followed[period, key].summary() for key in FOLLOWERS} for period in PERIODS
+                f"period_{period}": {
+                    key: {**result.summary(), **true_errors(truth(result.output) - result.reference)}
+                    for key in FOLLOWERS
+                    for result in (followed[period, key],)
+                }
+                for period in PERIODS
             },
         },
         TABLES,
@@ -300,6 +328,24 @@ def _followed(run: RunResult) -> FollowingResult:
     if result is None:
         raise DataError(f"{run.folder}: has no reference")
     return result
+
+
+def true_curvatures(rig: str) -> Callable[[Floats], Floats]:
+    """Return what gives the curvatures behind readings of an emulated rig, but for noise; nan of any other rig."""
+    # Here, as `bench list` reads the names of the studies.
+    from rigs.vo2.laboratory import VO2LaboratorySettings
+    from sim_devices.transducers.data_sheets import PSD
+
+    loaded = load_rig(rig)
+    settings, derived = loaded.laboratory_settings, loaded.derived.get(OUTPUT)
+    if not isinstance(settings, VO2LaboratorySettings) or not isinstance(derived, CantileverCurvature):
+        return lambda readings: np.full_like(readings, np.nan)
+    beam, sensor = (derived.length, derived.residual_curvature), settings.characteristic_of("psd", PSD)
+
+    def truth(readings: Floats) -> Floats:
+        return deflection_to_curvature(sensor.quantities(curvature_to_deflection(readings, *beam)), *beam)
+
+    return truth
 
 
 def _parameters(operator: Any) -> dict[str, float]:  # noqa: ANN401 - the non-monotonic model

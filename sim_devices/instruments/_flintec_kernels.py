@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
 from numba import njit
@@ -21,6 +21,25 @@ COARSE = 0.05
 # weight, peak, and zero (all in digits).
 CONVERTED, INPUT, FIRST, SECOND, NOISE_FIRST, NOISE_SECOND, STILL_SINCE = range(7)
 REFERENCE, DIGITS, GROSS, PEAK, ZERO = range(7, 12)
+
+
+class Course(Protocol):
+    """The course of the force on a cell, as its plant keeps it: one value a step of a time grid."""
+
+    step: float
+    tolerance: float
+    """Step of the grid, and how far before a point that counts as reached, s."""
+
+    @property
+    def forces(self) -> Floats:
+        """Force at the last grid points, N, in a ring, and behind it the number of the last; see `convert_along`."""
+
+    @property
+    def is_known(self) -> bool:
+        """Whether the force goes by these values alone, whatever the instruments do until the next request."""
+
+    def since_point(self) -> float:
+        """Return the time for which the plant has stood at the last grid point, s."""
 
 
 class SetUp(NamedTuple):

@@ -232,10 +232,14 @@ class EmulatedMX28(FreezingReadings, EmulatedInstrument, Servo):
             return self._reachable
 
     def hear(self) -> bool:
-        """Take note of an instruction packet on the bus, for whichever servo; return whether it got here."""
-        self.world.advance()
-        if self._reachable:
-            self._attend_at(self._clock.now())
+        """Take note of an instruction packet on the bus, for whichever servo; return whether it got here.
+
+        The caller holds the lock of the world.
+        """
+        self.world.advance_locked()
+        if not self._reachable:
+            return False
+        self._attend_at(self._clock.now())
         return self._reachable
 
     def attend(self) -> None:

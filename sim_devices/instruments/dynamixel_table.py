@@ -194,8 +194,8 @@ _FORMATS = {
 """How an item is carried, by its size and whether it is signed."""
 
 
-_Block = tuple[struct.Struct, list[tuple[int, Callable[[], float] | None, int, int]]]
-"""Whole items: their form, and address, reading, lowest and highest value of each."""
+_Block = tuple[struct.Struct, list[tuple[int, Callable[[], float] | None]], list[tuple[int, int]]]
+"""Whole items: their form, and of each address and reading, and its lowest and highest value."""
 
 
 class ControlTable:
@@ -292,16 +292,18 @@ class ControlTable:
 
     def _block_of(self, items: Sequence[Item]) -> _Block:
         form = struct.Struct("<" + "".join(_FORMATS[item.size, item.signed][1:] for item in items))
-        return form, [(item.address, self._readings.get(item.address), *_range(item)) for item in items]
+        sources = [(item.address, self._readings.get(item.address)) for item in items]
+        return form, sources, [_range(item) for item in items]
 
     def _measured(self, block: _Block) -> bytes:
         """Return the bytes of whole items."""
-        form, sources = block
-        kept, values = self._values, []
-        for address, reading, low, high in sources:
-            value = kept[address] if reading is None else round(reading())
-            values.append(low if value < low else high if value > high else value)
-        return form.pack(*values)
+        form, sources, ranges = block
+        kept = self._values
+        values = [kept[address] if reading is None else round(reading()) for address, reading in sources]
+        try:
+            return form.pack(*values)
+        except struct.error:
+            return form.pack(*[min(max(value, low), high) for value, (low, high) in zip(values, ranges, strict=True)])
 
 
 def _range(item: Item) -> tuple[int, int]:

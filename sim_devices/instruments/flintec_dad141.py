@@ -35,11 +35,11 @@ Assumptions, where these say nothing:
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from operator import attrgetter
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -49,7 +49,7 @@ from bench.errors import DeviceError
 from bench.roles import LoadCell
 from sim_devices.instruments.emulated import EmulatedDevice, LineFaults
 from sim_devices.instruments.registers import Register, RegisterInstrument
-from sim_devices.wire.modbus import DEVICE_FAILURE, ILLEGAL_VALUE, RegisterError
+from sim_devices.wire.modbus import DEVICE_FAILURE, ILLEGAL_VALUE, Frame, Packet, RegisterError
 from sim_devices.world import World
 
 if TYPE_CHECKING:
@@ -87,7 +87,7 @@ _MOST_TRACKING = 255
 _FINE_LAGS = 0.5  # time constants between two looks at the force
 _FEW_LOOKS = 4  # looks that are not put off
 _MOST_ASKED = 256  # readings whose conversions wait
-_NORMALS = 256  # random numbers drawn at once
+_NORMALS = 2048  # random numbers drawn at once
 _STILL_POLL = 0.05
 _STILL_TIMEOUT = 10.0
 _SET_UP_REGISTERS = frozenset((0x2106, 0x2110))
@@ -99,10 +99,13 @@ _TRACKING_BAND = 0.5  # d for each unit of ZT (10.2.8)
 _TRACKING_RATE = 0.4  # d in a second
 _TRACKING_LOOK = 0.1  # s
 _FIRST_ACCESS_CODE = 17
-# The state of the converter, in the order of the kernels; the zero is not theirs to change.
-_CONTINUOUS = ("_converted", "_input", "_first", "_second", "_noise_first", "_noise_second", "_still_since")
-_DIGITS = ("_reference", "_digits", "_gross", "_peak")
-_STATE_OF = attrgetter(*_CONTINUOUS, *_DIGITS, "_zero")
+# The state of the converter, in the order of the kernels, and where its digits stand there.
+_STATE = (
+    *("_converted", "_input", "_first", "_second", "_noise_first", "_noise_second", "_still_since"),
+    *("_reference", "_digits", "_gross", "_peak", "_zero"),
+)
+_DIGITS = slice(7, 11)
+_STATE_OF = attrgetter(*_STATE)
 
 
 def time_constant(setting: int) -> float:
@@ -120,25 +123,6 @@ def _fading(lags: float) -> tuple[float, float, float, float]:
     """Return `kernels.fading`; kept, as the instrument mostly converts at even intervals."""
     found: tuple[float, float, float, float] = kernels.fading.py_func(lags)
     return found
-
-
-class Course(Protocol):
-    """The course of the force on a cell, as its plant keeps it: one value a step of a time grid."""
-
-    step: float
-    tolerance: float
-    """Step of the grid, and how far before a point that counts as reached, s."""
-
-    @property
-    def forces(self) -> kernels.Floats:
-        """Force at the last grid points, N, in a ring, and behind it the number of the last; see `convert_along`."""
-
-    @property
-    def is_known(self) -> bool:
-        """Whether the force goes by these values alone, whatever the instruments do until the next request."""
-
-    def since_point(self) -> float:
-        """Return the time for which the plant has stood at the last grid point, s."""
 
 
 @dataclass(frozen=True)
@@ -161,7 +145,7 @@ class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
     ----------
     force : callable
         The force on the cell in N, positive in tension, from the plant.
-    course : Course, optional
+    course : sim_devices.instruments._flintec_kernels.Course, optional
         The same force over time: with it conversions wait until the instrument is asked.
     newtons_per_unit : float
         How the instrument was calibrated: N for each unit that it displays, not 0; 9.80665 for kg.
@@ -203,7 +187,7 @@ class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
         step: int = 1,
         zero_tracking: int = 1,
         noise: float = 5e-4,
-        course: Course | None = None,
+        course: kernels.Course | None = None,
         samples: int = 5,
         serial_number: int = 1410237,
         firmware: tuple[int, int] = (1, 10),
@@ -299,7 +283,7 @@ class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
         if self.frozen:
             return math.inf
         now = self._now()
-        if self._course is not None:
+        if self._course is not None and (self._asked or now - self._converted > self._near):
             if self._may_wait(self._course, now):
                 return math.inf
             if self._asked:
@@ -307,15 +291,15 @@ class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
                 self._asked.clear()
         if self._tracking:
             return self._converted + _TRACKING_LOOK
+        if now - self._converted <= self._near:
+            # As a rule, and what the kernel says of it.
+            return self._converted + self._fine
         due: float = kernels.next_look.py_func(self._converted, now, self._conversion)
         return due
 
-    def _may_wait(self, course: Course, now: float) -> bool:
+    def _may_wait(self, course: kernels.Course, now: float) -> bool:
         """Return whether the conversions for a reading at the present can wait, and note that they do."""
         asked = self._asked
-        if not asked and now - self._converted <= _FEW_LOOKS * self._conversion.fine:
-            # Sooner made than put off.
-            return False
         # Zero tracking leaves the zero between two digits.
         if self._tracking or not course.is_known or not self._zero.is_integer():
             return False
@@ -337,7 +321,7 @@ class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
         if self._asked and self._course is not None:
             self._convert_along(self._course)
 
-    def _convert_along(self, course: Course) -> None:
+    def _convert_along(self, course: kernels.Course) -> None:
         until = self.world.time
         state = np.array(_STATE_OF(self), dtype=np.float64)
         point = until - course.since_point()
@@ -362,10 +346,8 @@ class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
             self._draw_more()
         del self._asked[:done]
         values = state.tolist()
-        for name, value in zip(_CONTINUOUS, values, strict=False):
-            setattr(self, name, value)
-        for name, digits in zip(_DIGITS, values[len(_CONTINUOUS) :], strict=False):
-            setattr(self, name, int(digits))
+        values[_DIGITS] = map(int, values[_DIGITS])
+        vars(self).update(zip(_STATE, values, strict=True))
 
     def _draw_more(self) -> None:
         self._block = np.concatenate((self._block[self._used :], self._rng.standard_normal(_NORMALS)))
@@ -394,11 +376,13 @@ class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
         self._motion_time = set_up.motion_time / 1000
         # How long before a reading the force matters to it.
         self._memory = _MEMORY_LAGS * self._lag + self._motion_time + 2 * kernels.COARSE
+        self._fine = _FINE_LAGS * self._lag
+        self._near = _FEW_LOOKS * self._fine
         self._conversion = kernels.SetUp(
             self._lag,
             self._spread,
             self._memory,
-            _FINE_LAGS * self._lag,
+            self._fine,
             _MEMORY_LAGS * self._lag + kernels.COARSE,
             float(set_up.motion_range),
             self._span,
@@ -511,6 +495,23 @@ class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
                 )
         return super().read_registers(address, count)
 
+    def prepare(self, frames: Sequence[Frame], heads: Sequence[int]) -> Packet | None:
+        """Return what carries a packet that reads neighbouring registers out; None of any other."""
+        packet = super().prepare(frames, heads)
+        if packet is None or len(frames) > 1 or frames[0].writes:
+            return None
+        if frames[0].address not in _SET_UP_REGISTERS:
+            return packet
+        reads = self._reads(frames[0].address, frames[0].number)
+
+        def read_set_up(request: bytes) -> bytes:
+            if self._written:
+                return packet(request)
+            with self.world.lock:
+                return reads.values.pack(*[read() for read in reads.read])
+
+        return read_set_up
+
     def write_registers(self, address: int, values: list[int]) -> None:
         """Write registers from `address` on, in whole values; errors are those of the base class."""
         super().write_registers(address, values)
@@ -519,8 +520,9 @@ class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
     def _begin(self) -> None:
         self.world.lock.acquire()
         try:
-            self.world.advance()
-            self._catch_up()
+            self.world.advance_locked()
+            if self._asked:
+                self._catch_up()
             self._convert()
             self._written = False
         except BaseException:

@@ -32,7 +32,7 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Sequence
-from itertools import accumulate
+from operator import itemgetter
 from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
@@ -73,6 +73,7 @@ HIGHEST_BATTERY_VOLTAGE = 60.0
 """Battery voltage above which the device reports over-voltage, V."""
 
 _FIRST_COMMAND = 0x2000
+_WITHOUT_EFFECT = frozenset((0x2003, 0x2005))  # commands that only feed the watchdog
 _FULL = 1000  # command and power of a duty cycle of 1
 _INTERNAL_VOLTAGE = 118  # 0.1 V
 _FIVE_VOLTS = 5000  # mV
@@ -85,12 +86,12 @@ class _Report(NamedTuple):
 
     sources: list[tuple[Callable[..., Any], int]]
     """Each reading, with its subindex."""
-    places: list[int]
-    """Which of the readings the frames carry, in their order."""
+    carried: Callable[[Sequence[int]], tuple[int, ...]]
+    """Returns what the frames carry of the readings, in their order."""
     form: struct.Struct
     """Form of the data of all frames."""
-    frames: list[tuple[int, int, int]]
-    """Identifier of each frame, and beginning and end of its data."""
+    frames: tuple[tuple[int, int], ...]
+    """Identifier of each frame, and how many bytes it has."""
 
 
 class HeatingLoad(Protocol):
@@ -241,7 +242,7 @@ class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
         """
         with self.world.lock:
             row = self.entry(index, sub)
-            self.world.advance()
+            self.world.advance_locked()
             if not row.readable:
                 raise RequestRefusedError(AbortCode.WRITE_ONLY)
             if row.kind == "text":
@@ -257,7 +258,7 @@ class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
         """
         with self.world.lock:
             row = self.entry(index, sub)
-            self.world.advance()
+            self.world.advance_locked()
             if not row.writable:
                 raise RequestRefusedError(AbortCode.READ_ONLY)
             if index >= _FIRST_COMMAND:
@@ -328,19 +329,24 @@ class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
             except RequestRefusedError:
                 continue
 
-    def process_data(self, *, synchronous: bool) -> list[tuple[int, bytes]]:
-        """Take identifier and data of the TPDOs that a SYNC asks for, or that are due by their send rates."""
+    def process_data(self, *, synchronous: bool) -> tuple[tuple[tuple[int, int], ...], bytes]:
+        """Take the TPDOs that a SYNC asks for, or that are due by their send rates.
+
+        Returns
+        -------
+        tuple
+            Identifier and number of bytes of each frame, and the data of all of them.
+        """
         pdos = self._pdos.take_synchronous() if synchronous else self._pdos.take_due(self._clock.now())
         if not pdos or self._state is not NodeState.OPERATIONAL or not self.plugged_in:
-            return []
+            return (), b""
         if pdos is not self._reported:
             self._reported, self._report = pdos, self._report_of(pdos)
         report = self._report
         with self.world.lock:
             self.world.advance_locked()
             values = [read(sub) for read, sub in report.sources]
-        data = report.form.pack(*[values[place] for place in report.places])
-        return [(identifier, data[begin:end]) for identifier, begin, end in report.frames]
+        return report.frames, report.form.pack(*report.carried(values))
 
     def next_process_data(self) -> float:
         """Return when the next TPDO is due by its send rate, s; infinity if none is."""
@@ -365,12 +371,11 @@ class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
         """Return what frames carry; each object is measured once, however many of them carry it."""
         carried = tuple(key for _, objects in pdos for key in objects)
         keys = [*dict.fromkeys(carried)]
-        ends = [*accumulate(self._form(objects).size for _, objects in pdos)]
         return _Report(
             [(self._readings[index], sub) for index, sub in keys],
-            [keys.index(key) for key in carried],
+            itemgetter(*map(keys.index, carried)) if len(carried) > 1 else tuple,
             self._form(carried),
-            [(identifier, begin, end) for (identifier, _), begin, end in zip(pdos, [0, *ends], ends, strict=False)],
+            tuple((identifier, self._form(objects).size) for identifier, objects in pdos),
         )
 
     def _readings_changed(self) -> None:
@@ -512,9 +517,10 @@ class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
             self._trips &= ~Fault.EMERGENCY_STOP
         elif 1 <= value <= CHANNELS:
             self._commands[value - 1] = 0
-        self._held = False
+        resumes, self._held = self._held, False
         self._watchdog_due = self.world.time + self._watchdog if self._watchdog > 0.0 else math.inf
-        self._apply()
+        if resumes or index not in _WITHOUT_EFFECT:
+            self._apply()
 
     def _restart(self, *, power: bool) -> None:
         if power:

@@ -132,12 +132,13 @@ class GridPlant(ABC, Generic[P]):
         ValueError
             If `dt` is negative or not finite.
         """
-        if not 0.0 <= dt < math.inf:
-            raise ValueError(f"dt must be finite and not negative, not {dt} s")
         pending = self._pending + dt
-        if pending + GRID_TOLERANCE < self._step:
+        if dt >= 0.0 and pending + GRID_TOLERANCE < self._step:
+            # As a rule: an instrument is asked more often than the plant takes a step.
             self._pending = pending
             return
+        if not 0.0 <= dt < math.inf:
+            raise ValueError(f"dt must be finite and not negative, not {dt} s")
         due = math.floor((pending + GRID_TOLERANCE) / self._step)
         self._pending = pending - due * self._step
         while due > 0:

@@ -26,10 +26,12 @@ _MEMORY = 10
 """Lags after which a sensor has forgotten what was before."""
 _SHORTEST = 20e-6
 """Least time between two samples, s."""
+_ITERATIONS = 24
+"""Steps to the quantity behind a reading; each leaves the part of the error that the nonlinearity's slope is."""
 
 
 class SensorErrors(BaseModel):
-    """Systematic errors of a sensor, a table in `[emulation]`; 0 for none, all 0 for an ideal sensor.
+    """Systematic errors of a sensor, a table in `[emulation]`; all 0 for an ideal sensor.
 
     Lengths are in m, temperatures in K, forces in N: "unit" is that of the quantity.
     """
@@ -125,6 +127,52 @@ class _Late:
         return low
 
 
+class Characteristic:
+    """What a sensor with systematic errors makes of a quantity that has stood for long.
+
+    Parameters
+    ----------
+    errors : SensorErrors
+        Its errors.
+    low, high : float
+        Range of the sensor, unit of the quantity: that of the nonlinearity, one and a half waves over it.
+    """
+
+    def __init__(self, errors: SensorErrors, low: float, high: float) -> None:
+        self._gain = 1.0 + errors.gain_error
+        self._offset = errors.offset
+        self._wave = errors.nonlinearity * (high - low)
+        self._middle, self._scale = 0.5 * (low + high), 2.0 * _WAVE / (high - low)
+        self._resolution = errors.resolution
+
+    def value(self, quantity: float) -> float:
+        """Return what it makes of a value, in its unit and without noise."""
+        value = self._gain * quantity + self._offset
+        if self._wave:
+            angle = self._scale * (quantity - self._middle)
+            value += self._wave * math.sin(-_WAVE if angle < -_WAVE else _WAVE if angle > _WAVE else angle)
+        return round(value / self._resolution) * self._resolution if self._resolution else value
+
+    def course(self, quantities: Floats) -> Floats:
+        """Return `value` of each of the values of a course."""
+        values = self._smooth(quantities)
+        return np.round(values / self._resolution) * self._resolution if self._resolution else values
+
+    def quantities(self, values: Floats) -> Floats:
+        """Return of what it makes each of some values, but for its steps: the quantities themselves."""
+        found = np.asarray(values, dtype=np.float64)
+        # A sensor of a few percent is met to the last bit.
+        for _ in range(_ITERATIONS):
+            found = found + (values - self._smooth(found)) / self._gain
+        return found
+
+    def _smooth(self, quantities: Floats) -> Floats:
+        values = self._gain * quantities + self._offset
+        if self._wave:
+            values += self._wave * np.sin(np.clip(self._scale * (quantities - self._middle), -_WAVE, _WAVE))
+        return values
+
+
 class ImperfectSensor:
     """What a sensor with systematic errors makes of a quantity.
 
@@ -135,9 +183,14 @@ class ImperfectSensor:
     errors : SensorErrors
         Its errors.
     low, high : float
-        Range of the sensor, unit of the quantity: that of the nonlinearity, one and a half waves over it.
+        Range of the sensor, unit of the quantity; see `Characteristic`.
     world : World
         The laboratory's time, for lag and latency.
+
+    Attributes
+    ----------
+    characteristic : Characteristic
+        What it makes of a value that has stood for long.
     """
 
     def __init__(
@@ -145,38 +198,21 @@ class ImperfectSensor:
     ) -> None:
         self._late = _Late(quantity, errors.lag, errors.latency, world) if errors.lag or errors.latency else None
         self._quantity = quantity
-        self._gain = 1.0 + errors.gain_error
-        self._offset = errors.offset
-        self._wave = errors.nonlinearity * (high - low)
-        self._middle, self._scale = 0.5 * (low + high), 2.0 * _WAVE / (high - low)
-        self._resolution = errors.resolution
+        self.characteristic = Characteristic(errors, low, high)
+        self._value = self.characteristic.value
 
     def __call__(self) -> float:
         """Return what the sensor makes of the quantity at this instant, in its unit and without noise."""
-        return self.static(self._quantity() if self._late is None else self._late())
+        return self._value(self._quantity() if self._late is None else self._late())
 
     def peek(self) -> float:
         """Return the same, and change nothing."""
-        return self.static(self._quantity() if self._late is None else self._late.peek())
+        return self._value(self._quantity() if self._late is None else self._late.peek())
 
     @property
     def is_static(self) -> bool:
         """Whether it has neither lag nor latency."""
         return self._late is None
-
-    def static(self, seen: float) -> float:
-        """Return what it makes of a value that has stood for long."""
-        value = self._gain * seen + self._offset
-        if self._wave:
-            value += self._wave * math.sin(min(max(self._scale * (seen - self._middle), -_WAVE), _WAVE))
-        return round(value / self._resolution) * self._resolution if self._resolution else value
-
-    def static_course(self, seen: Floats) -> Floats:
-        """Return `static` of each of the values of a course."""
-        values = self._gain * seen + self._offset
-        if self._wave:
-            values += self._wave * np.sin(np.clip(self._scale * (seen - self._middle), -_WAVE, _WAVE))
-        return np.round(values / self._resolution) * self._resolution if self._resolution else values
 
 
 def imperfect(

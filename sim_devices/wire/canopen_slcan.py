@@ -20,7 +20,8 @@ from __future__ import annotations
 import math
 import re
 import struct
-from binascii import hexlify
+from binascii import hexlify, unhexlify
+from collections.abc import Callable
 from functools import lru_cache
 
 from sim_devices.instruments.emulated import RequestRefusedError
@@ -46,10 +47,14 @@ BITRATES = {
 
 _OK = b"\r"
 _REFUSED = b"\a"
-_FRAME = re.compile(rb"(?:([tr])([0-7][0-9A-Fa-f]{2})|([TR])([01][0-9A-Fa-f]{7}))([0-8])((?:[0-9A-Fa-f]{2}){0,8})")
+_STANDARD = re.compile(rb"t([0-7][0-9A-Fa-f]{2})([0-8])")
+_UNANSWERED = re.compile(
+    rb"(?:r[0-7][0-9A-Fa-f]{2}|R[01][0-9A-Fa-f]{7})[0-8]|T[01][0-9A-Fa-f]{7}([0-8])((?:[0-9A-Fa-f]{2}){0,8})"
+)
 _NMT, _SYNC = 0x000, 0x080
 _SDO_REQUEST, _SDO_ANSWER, _HEARTBEAT = 0x600, 0x580, 0x700
 _SEGMENT = 7  # bytes in a segment
+_HEAD = 5  # characters of a standard frame before its data
 _FRAMES = frozenset((b"t", b"T", b"r", b"R"))
 
 
@@ -61,7 +66,7 @@ class CanopenSlcanServer(WireServer):
     def __init__(self, device: EmulatedRoboteq) -> None:
         self._device = device
         self._node = SdoServer(device)
-        self._answer_head = _line(_SDO_ANSWER + device.node, bytes(8))[:5]
+        self._answer_head = b"t%03X8" % (_SDO_ANSWER + device.node)
         self._now = device.world.clock.now
         self._received = b""
         self._overrun = False
@@ -85,7 +90,7 @@ class CanopenSlcanServer(WireServer):
             if b"\n" in received:
                 received = received.replace(b"\n", b"")
             *lines, rest = received.split(b"\r")
-            sent = self._sent_by_itself()
+            sent = self._sent_by_itself() if self._now() >= self._device.quiet_until else b""
             for line in lines:
                 sent += self._obey(line) if not self._overrun and len(line) <= LONGEST_LINE else _REFUSED
                 self._overrun = False
@@ -111,16 +116,15 @@ class CanopenSlcanServer(WireServer):
             return device.next_message()
 
     def _sent_by_itself(self) -> bytes:
+        """Return what the node has sent since it was last quiet."""
         device = self._device
-        if self._now() < device.quiet_until:
-            return b""
         states = device.heartbeats()
-        frames = device.process_data(synchronous=False)
+        frames, data = device.process_data(synchronous=False)
         device.next_message()
         if not (states or frames) or not self._on_the_bus():
             return b""
-        sent = b"".join(_line(_HEARTBEAT + device.node, bytes((state,))) for state in states)
-        return sent + b"".join(_line(*frame) for frame in frames)
+        heartbeats = ((_HEARTBEAT + device.node, 1),) * len(states)
+        return _lines(heartbeats + frames, bytes(states) + data)
 
     def _on_the_bus(self) -> bool:
         return self._open and self._bitrate == self._device.bitrate
@@ -168,7 +172,7 @@ class CanopenSlcanServer(WireServer):
                 if answer:
                     return device.transmit(b"%s%s\r" % (self._answer_head, hexlify(answer).upper()))
         elif identifier == _SYNC:
-            return b"".join(_line(*frame) for frame in device.process_data(synchronous=True))
+            return _lines(*device.process_data(synchronous=True))
         elif identifier != _NMT:
             device.receive_process_data(identifier, data)
         elif len(data) == 2 and data[1] in (0, device.node):
@@ -303,26 +307,37 @@ class SdoServer:
         return bytes((head,)) + part.ljust(_SEGMENT, b"\0")
 
 
-@lru_cache(maxsize=256)
 def _frame(line: bytes) -> tuple[int, bytes | None] | None:
     """Return identifier and data of a line; no data for frames that nobody answers, None if it makes no sense."""
-    match = _FRAME.fullmatch(line)
-    if match is None:
+    identifier, size = _head(line[:_HEAD])
+    if size:
+        try:
+            return (identifier, unhexlify(line[_HEAD:])) if len(line) == size else None
+        except ValueError:
+            return None
+    match = _UNANSWERED.fullmatch(line)
+    if match is None or len(match[2] or b"") != 2 * int(match[1] or b"0"):
         return None
-    short, identifier, long, _, length, data = match.groups()
-    remote = (short or long) in (b"r", b"R")
-    if len(data) != (0 if remote else 2 * int(length)):
-        return None
-    if long or remote:
-        return 0, None
-    return int(identifier, 16), bytes.fromhex(data.decode("ascii"))
-
-
-def _line(identifier: int, data: bytes) -> bytes:
-    return b"%s%s\r" % (_head(identifier, len(data)), hexlify(data).upper())
+    return 0, None
 
 
 @lru_cache(maxsize=256)
-def _head(identifier: int, size: int) -> bytes:
-    """Return the beginning of a line."""
-    return b"t%03X%d" % (identifier, size)
+def _head(head: bytes) -> tuple[int, int]:
+    """Return identifier and characters of the line of a standard data frame; 0 of other frames."""
+    match = _STANDARD.fullmatch(head)
+    return (0, 0) if match is None else (int(match[1], 16), _HEAD + 2 * int(match[2]))
+
+
+def _lines(frames: tuple[tuple[int, int], ...], data: bytes) -> bytes:
+    """Return the lines of some frames, of identifier and number of bytes, with their data one behind the other."""
+    if not frames:
+        return b""
+    text, divide = _text_of(frames)
+    return text % divide(hexlify(data).upper())
+
+
+@lru_cache(maxsize=64)
+def _text_of(frames: tuple[tuple[int, int], ...]) -> tuple[bytes, Callable[[bytes], tuple[bytes, ...]]]:
+    """Return the lines without their data, and what divides the digits of these among them."""
+    text = b"".join(b"t%03X%d%%b\r" % frame for frame in frames)
+    return text, struct.Struct("".join(f"{2 * size}s" for _, size in frames)).unpack

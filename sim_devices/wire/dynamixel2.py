@@ -83,7 +83,7 @@ def _crc_of_byte(index: int) -> int:
 
 _CRC_OF_BYTE = [_crc_of_byte(index) for index in range(256)]
 
-_BEGINNING = 17  # bytes of a packet that seldom change from one to the next
+_BEGINNING = 28  # bytes of a packet that a host or a servo at rest often repeats
 
 
 def crc16(data: bytes) -> int:

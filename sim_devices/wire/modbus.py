@@ -24,6 +24,8 @@ _MOST_READ = 125  # registers in one read, Application Protocol 6.3
 _MOST_WRITTEN = 123  # registers in one write, Application Protocol 6.12
 _REGISTERS = 0x10000
 _FUNCTIONS = frozenset((_READ_HOLDING, _READ_INPUT, _WRITE_ONE, _WRITE_MANY))
+READS = (_READ_HOLDING, _READ_INPUT)
+"""Functions that read registers."""
 _BODY = struct.Struct(">BHH")  # function, address, and value or number of registers
 _WRITE_HEAD = _BODY.size + 1  # and the number of bytes of the values
 _WORDS = tuple(struct.Struct(f">{number}H") for number in range(256))
@@ -143,7 +145,7 @@ def prepare(bank: RegisterBank, request: bytes, before: int) -> Prepared | None:
         frames = [Frame(function == _WRITE_MANY, address, number)]
         if number == 0 or address + number > _REGISTERS:
             return None
-        if function == _READ_HOLDING and size == _BODY.size and number <= _MOST_READ:
+        if function in READS and size == _BODY.size and number <= _MOST_READ:
             same, heads, head = size, [0], bytes((function, 2 * number))
         elif (
             function == _WRITE_MANY

@@ -1,68 +1,13 @@
-"""Runs on an emulated rig do not depend on how busy the machine is.
+"""Runs on an emulated rig do not depend on how busy the machine is; `make busy` shows more of it."""
 
-`python tests/bench/test_busy_machine.py --runs 50 --busy 16`, or `make busy`, carries many virtual runs out beside
-many busy processes, compares their journals bit by bit, and shows the pace of a run at x100. The tests do less.
-"""
-
-import argparse
-import hashlib
-import json
-import os
-import struct
 import subprocess
 import sys
-import tempfile
-from contextlib import ExitStack, contextmanager
-from pathlib import Path
 
 import pytest
+from busy_machine import busy, fingerprint, run
 
 from bench.compilation_display import MESSAGE
 from bench.journal import Record
-
-SHORT = ["--set", "hot=70", "--set", "cool=50", "--set", "duration=8"]
-
-
-@contextmanager
-def busy(processes):
-    """Keep the processors busy."""
-    with ExitStack() as stack:
-        for _ in range(processes):
-            loop = stack.enter_context(subprocess.Popen([sys.executable, "-S", "-c", "while True: pass"]))
-            stack.callback(loop.kill)
-        yield
-
-
-def run(rig, clock, folder, cache=None):
-    """Carry a short run out in a process of its own; return the folder of its record and what it printed."""
-    folder.mkdir(parents=True)
-    command = ["run", "creep", "--rig", rig, "--clock", clock, *SHORT, "--seed", "3", "--out", str(folder)]
-    result = subprocess.run(
-        [sys.executable, "-c", f"from bench.cli import main; main({command!r})"],
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        timeout=280,
-        env=os.environ | ({"NUMBA_CACHE_DIR": str(cache)} if cache else {}),
-        check=False,
-    )
-    assert result.returncode == 0, result.stdout + result.stderr
-    (record,) = folder.iterdir()
-    return record, result.stdout, result.stderr
-
-
-def fingerprint(folder):
-    """Return a hash of every bit of the readings and set-points of a run, and of their times."""
-    digest = hashlib.sha256()
-    with Record(folder) as record:
-        assert record.status == "completed"
-        for table in (record.steps(), record.telemetry()):
-            assert len(table) > 0
-            for name, column in table.columns.items():
-                digest.update(name.encode() + column.tobytes())
-        for step in record.step_records():
-            digest.update(json.dumps(dict(step.setpoints)).encode() + struct.pack("<dd", step.started, step.finished))
-    return digest.hexdigest()
 
 
 @pytest.mark.slow
@@ -117,29 +62,3 @@ print("done")
 """
     result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=280, check=False)
     assert result.stdout == "done\n", result.stderr
-
-
-def main():
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--rig", default="vo2")
-    parser.add_argument("--runs", type=int, default=50)
-    parser.add_argument("--busy", type=int, default=16, help="busy processes")
-    parser.add_argument("--clock", default="x100", help="clock of the last run")
-    arguments = parser.parse_args()
-    with tempfile.TemporaryDirectory() as folder:
-        first = None
-        with busy(arguments.busy):
-            for n in range(arguments.runs):
-                found = fingerprint(run(arguments.rig, "virtual", Path(folder, str(n)))[0])
-                first = first or found
-                print(f"run {n + 1} of {arguments.runs}: {found[:16]}", flush=True)
-                if found != first:
-                    sys.exit("the runs differ")
-            record, _, _ = run(arguments.rig, arguments.clock, Path(folder, "paced"))
-        with Record(record) as journal:
-            print("clock:", next(event.text for event in journal.events() if event.kind == "clock"))
-    print(f"{arguments.runs} runs beside {arguments.busy} busy processes are equal to the last bit")
-
-
-if __name__ == "__main__":
-    main()

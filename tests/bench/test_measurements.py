@@ -4,10 +4,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from bench.devices import Signal
-from bench.errors import DataError
+from bench.errors import ConfigurationError, DataError
 from bench.journal import FILE_NAME, Journal, StepRecord
 from bench.results.data import Columns, check_excitation, read_columns, write_csv
 from bench.results.reading.heads import split_unit
+from bench.results.reading.options import ReadingOptions
 from bench.settling import Settled
 
 
@@ -180,6 +181,8 @@ class TestRuns:
             signals = (Signal("tec_temperature", "°C", "t"), Signal("curvature", "1/m", "c"))
             journal = Journal(tmp_path / FILE_NAME, signals, {})
             for step, row in enumerate(rows):
+                for tick in range(5):
+                    journal.telemetry(step * 8.0 + tick, step, (row[0] + tick, row[1]))
                 journal.step(StepRecord(step, step * 8.0, step * 8.0 + 8.0, "", "", Settled.DWELL, {}, row))
             journal.close()
             return tmp_path
@@ -200,6 +203,28 @@ class TestRuns:
             DataError, match="has no column 'force'; it has: step, started, finished, tec_temperature"
         ):
             read_columns(path, ["force"])
+
+    def test_what_was_read_within_the_steps(self, run):
+        path, names = run((21.0, 0.0), (22.0, -3.0)), ["tec_temperature", "t"]
+        with pytest.raises(DataError, match=r"has 2 rows of data; .* --table telemetry takes the 10 readings"):
+            read_columns(path, names[:1], at_least=4)
+        with pytest.raises(ConfigurationError, match=r"--table 'ticks': .* is a run; expected steps or telemetry"):
+            read_columns(path, names, options=ReadingOptions(table="ticks"))
+        columns = read_columns(path, names, at_least=4, options=ReadingOptions(table="telemetry"))
+        assert columns.values["tec_temperature"].tolist() == [
+            21.0,
+            22.0,
+            23.0,
+            24.0,
+            25.0,
+            22.0,
+            23.0,
+            24.0,
+            25.0,
+            26.0,
+        ]
+        assert columns.values["t"].tolist() == [*range(5), *range(8, 13)]
+        assert columns.units == {"tec_temperature": "°C", "t": "s"}
 
     def test_a_gap(self, run):
         path = run((21.0, 0.0), (22.0, float("nan")), (23.0, float("nan")))

@@ -23,13 +23,14 @@ SPECIMENS = {
     "transition 10 % larger": {"transition_curvature": 1.1 * 2034.0},
 }
 COUNT = 120
+IDEAL = {"emulation.sensors": "ideal"}
 
 
 def main(sessions: int) -> None:
     """Print the table."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        run = bench.run("damped-oscillation", "vo2", out=folder, clock="virtual")
+        run = bench.run("damped-oscillation", "vo2", out=folder, clock="virtual", overrides=IDEAL)
         found = identify_file(
             run.folder, input_column="tec_temperature", output_column="curvature", model="preisach-nonmonotonic",
             levels=20, plane=(30.0, 70.0), reference=20.0,
@@ -48,7 +49,7 @@ def main(sessions: int) -> None:
 
 def tracked(folder: Path, changes: dict[str, float], adaptation: str, seed: int) -> np.ndarray:
     """Return the errors of a session, 1/m."""
-    overrides = {f"emulation.plant.{name}": str(value) for name, value in changes.items()}
+    overrides = IDEAL | {f"emulation.plant.{name}": str(value) for name, value in changes.items()}
     overrides["emulation.session_offset"] = "0.12" if seed % 2 == 0 else "-0.12"
     run = bench.run(
         "tracking", "vo2", out=folder, clock="virtual", seed=seed, overrides=overrides,

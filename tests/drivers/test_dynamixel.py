@@ -58,7 +58,7 @@ def packet(servo_id, instruction, parameters=b""):
     return head + crc(head)
 
 
-FEEDBACK_BYTES = [68, 64, 70, 98, *range(116, 123), *range(126, 136)]
+FEEDBACK_BYTES = [68, 64, 70, 98, *range(116, 120), 122, *range(126, 136), 120, 121]
 
 
 class Script(WireServer):

@@ -600,7 +600,7 @@ def test_a_line_that_does_not_fall_silent(bench):
     cell = bench.cell()
     port = bench.line(cell)
     port.read = lambda size: b"\xa5" * size
-    port.read_all = lambda: b"\xa5" * 5
+    port.ask = lambda _: b"\xa5" * 5
     with pytest.raises(DeviceConnectionError, match="does not fall silent"):
         cell.glance()
 

@@ -44,18 +44,30 @@ def outputs(rig, devices):
     }
 
 
-@pytest.mark.parametrize(
-    ("name", "table", "quantity", "as_shown"),
-    [
-        ("vo2", "psd", "tip_deflection", "deflection_shown"),
-        ("hybrid", "displacement_sensor", "deflection", "displacement_shown"),
-        ("hybrid", "tip_thermistor", "tip_temperature", "tip_shown"),
-        ("sma", "force_sensor", "force", "force_shown"),
-        ("mckibben", "position_sensor", "position", "position_shown"),
-    ],
-)
+SENSORS = [
+    ("vo2", "psd", "tip_deflection", "deflection_shown"),
+    ("hybrid", "displacement_sensor", "deflection", "displacement_shown"),
+    ("hybrid", "tip_thermistor", "tip_temperature", "tip_shown"),
+    ("sma", "force_sensor", "force", "force_shown"),
+    ("mckibben", "position_sensor", "position", "position_shown"),
+    ("coiled-polymer", "position_sensor", "position", "position_shown"),
+]
+
+
+@pytest.mark.parametrize(("name", "table", "quantity", "as_shown"), SENSORS)
+@pytest.mark.parametrize("sensors", ["data-sheet", "ideal"])
+def test_sensors_have_the_errors_of_their_data_sheets_or_none(name, table, quantity, as_shown, sensors):
+    rig = Rig(load_rig(name, {"emulation.sensors": sensors}), VirtualClock(), seed=0)
+    try:
+        truth = rig.laboratory.truth()
+        assert (truth[as_shown].value == truth[quantity].value) == (sensors == "ideal")
+    finally:
+        rig.close()
+
+
+@pytest.mark.parametrize(("name", "table", "quantity", "as_shown"), SENSORS)
 def test_it_has_the_true_quantity_beside_the_one_that_a_sensor_shows(name, table, quantity, as_shown):
-    errors = {"gain_error": "0.01", "offset": "1e-6"}
+    errors = {"gain_error": "0.01", "offset": "1e-6", "nonlinearity": "0"}
     rig = Rig(
         load_rig(name, {f"emulation.{table}.{key}": value for key, value in errors.items()}), VirtualClock(), seed=0
     )

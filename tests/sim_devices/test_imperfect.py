@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bench.clock import VirtualClock
-from sim_devices.transducers.imperfect import ImperfectSensor, SensorErrors, imperfect, shown
+from sim_devices.transducers.imperfect import Characteristic, ImperfectSensor, SensorErrors, imperfect, shown
 from sim_devices.world import World
 
 
@@ -67,9 +67,15 @@ def test_resolution():
 
 def test_a_course_is_what_its_values_are():
     errors = SensorErrors(gain_error=0.01, offset=0.2, nonlinearity=1e-3, resolution=0.01)
-    sensor = ImperfectSensor(float, errors, -10.0, 10.0, World(Ramp(), VirtualClock()))
+    sensor = Characteristic(errors, -10.0, 10.0)
     values = np.linspace(-12.0, 12.0, 49)
-    assert sensor.static_course(values) == pytest.approx([sensor.static(each) for each in values], abs=1e-12)
+    assert sensor.course(values) == pytest.approx([sensor.value(each) for each in values], abs=1e-12)
+
+
+def test_the_quantity_is_found_behind_what_is_made_of_it():
+    sensor = Characteristic(SensorErrors(gain_error=0.01, offset=0.2, nonlinearity=4e-3), -10.0, 10.0)
+    values = np.linspace(-12.0, 12.0, 49)
+    assert sensor.quantities(sensor.course(values)) == pytest.approx(values, abs=1e-12)
 
 
 def test_a_lag_is_that_of_the_first_order():

@@ -27,7 +27,8 @@ class ReadingOptions:
     skip_lines : int
         Number of first lines that are left out before anything is looked for.
     table : str, optional
-        Number of the table in a file of several, from 1; name of a sheet or of a MATLAB variable.
+        Number of the table in a file of several, from 1; name of a sheet or of a MATLAB variable; of a run `steps` or
+        `telemetry`.
 
     Raises
     ------

@@ -50,7 +50,7 @@ def look(rig, until):
 
 class TestWitnessed:
     def drive(self, name, seed=3):
-        with rig(name, seed) as bench:
+        with rig(name, seed, sensors="ideal") as bench:
             bench.clock.sleep_until(1.0)
             bench.devices["tec"].set(0.08)
             bench.devices["piezo"].set(20.0)
@@ -390,7 +390,7 @@ class TestWitness:
         assert reply == bytes([0, 1, 0, 0, 0, 3, 1, body[0] | 0x80, 2])
 
     def test_the_witness_sees_the_deflection_itself(self):
-        with rig(WITNESSED) as bench:
+        with rig(WITNESSED, sensors="ideal") as bench:
             witness, sensor, plant = bench.devices["witness"], bench.devices["displacement"], bench.laboratory.plant
             bench.devices["tec"].set(-0.1)
             bench.devices["piezo"].set(20.0)

@@ -8,8 +8,9 @@ import pytest
 
 from bench.journal import Record
 from bench.model_file import load_model
+from rigs.hybrid.evaluation import displacement_characteristic, tracked
 from rigs.hybrid.identification import CURRENT, DEFLECTION, VOLTAGE, WITNESS, read_loop
-from rigs.hybrid.study import CONTROLLERS, RESONANCES, Tracking
+from rigs.hybrid.study import CONTROLLERS, RESONANCES
 
 RUNS = {
     "current-sine": 2,
@@ -18,7 +19,8 @@ RUNS = {
     "piezo-loops": 1,
     "piezo-step": 1,
     "hybrid-excitation": 1,
-    "hybrid-control": 9,
+    "hybrid-control": 10,
+    "calibration-displacement": 1,
     "fine-step": 3,
 }
 DEVICES = ("tec", "displacement", "base", "tip", "piezo")
@@ -76,6 +78,16 @@ def the_hybrid_holds_and_moves_to_nanometres_over_its_range(campaign):
     assert control["move_rms_nm"] <= 30
 
 
+def a_calibrated_sensor_makes_it_accurate(campaign):
+    uncalibrated, calibrated = campaign["controllers"]["hybrid"], campaign["calibrated"]
+    # The sensor's 0.05 % of its range, and its gain.
+    assert 100 < uncalibrated["true_hold_rms_nm"] < 400
+    assert uncalibrated["hold_rms_nm"] < 0.1 * uncalibrated["true_hold_rms_nm"]
+    assert calibrated["true_hold_rms_nm"] <= 12
+    assert calibrated["true_hold_max_nm"] <= 50
+    assert campaign["calibration"]["accuracy_nm"] < 5
+
+
 def each_controller_is_better_than_the_one_before(campaign):
     assert set(campaign["controllers"]) == set(CONTROLLERS)
     holds = {name: campaign["controllers"][name]["hold_rms_nm"] for name in CONTROLLERS}
@@ -131,7 +143,7 @@ def every_run_is_complete_and_safe(campaign):
     for folder in folders:
         with Record(folder) as record:
             assert record.status == "completed"
-            devices = (*DEVICES, "witness") if record.meta["rig"] == "hybrid-witness" else DEVICES
+            devices = DEVICES if record.meta["rig"] == "hybrid" else (*DEVICES, "witness")
             assert record.meta["safe_state"] == dict.fromkeys(devices, "safe")
             found.append(record.meta["protocol"])
             loops = [event.text for event in record.events() if event.kind == "loop"]
@@ -144,18 +156,18 @@ def every_run_is_complete_and_safe(campaign):
 
 def the_tables_say_what_the_runs_say(campaign):
     """Once more from the journals: the errors of the controllers, and the noise of the sensor beside them."""
-    found = {}
+    found, sensor = {}, displacement_characteristic("hybrid-witness")
     for folder in Path(campaign["folder"]).glob("hybrid-witness-hybrid-control-*"):
         with Record(folder) as record:
             parameters = record.meta["parameters"]
         if parameters["reference"] != "moves":
             continue
         samples = read_loop(folder)
-        found[parameters["controller"]] = Tracking(samples.times, samples["reference"], samples[WITNESS]).summary()
+        found[parameters["controller"]] = tracked(folder, sensor).summary()
         # Set-points stay within what the rig allows.
         assert np.abs(samples[CURRENT]).max() <= 0.15
         assert np.abs(samples[VOLTAGE]).max() <= 40.0
-        assert 5e-9 < np.std(samples[DEFLECTION] - samples[WITNESS]) < 30e-9
+        assert 5e-9 < np.std(samples[DEFLECTION] - sensor.course(samples[WITNESS])) < 30e-9
     assert found == {name: pytest.approx(errors, rel=1e-12) for name, errors in campaign["controllers"].items()}
 
 
@@ -194,6 +206,7 @@ def test_campaign(reproduce, seed):
     the_models_of_the_parts_fit(campaign)
     the_whole_model_simulates_what_it_was_not_fitted_to(campaign)
     the_hybrid_holds_and_moves_to_nanometres_over_its_range(campaign)
+    a_calibrated_sensor_makes_it_accurate(campaign)
     each_controller_is_better_than_the_one_before(campaign)
     other_references_are_followed_too(campaign)
     a_step_of_the_room_moves_it_little(campaign)

@@ -7,7 +7,7 @@ import pytest
 
 from bench.calibration import Calibration
 
-ERRORS = {"gain_error": 0.01, "offset": 5e-4}
+ERRORS = {"gain_error": 0.01, "offset": 5e-4, "nonlinearity": 0.0}
 
 
 @pytest.mark.parametrize(
