@@ -51,7 +51,7 @@ kernels: lint
 	$(BIN)/python -P tests/compile_kernels.py
 	-$(BIN)/python -m pytest --collect-only -qq > /dev/null
 
-# A third of the examples of each property that is costly.
+# A sixth of the examples of each property that is costly.
 tests: kernels
 	$(PYTEST) --hypothesis-profile=brief
 

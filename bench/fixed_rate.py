@@ -51,7 +51,9 @@ def _samples(run: RunAtHand, message: FixedRate, period: float) -> Reading:
     clock, update = run.clock, controller.update
     setpoints = [f"{name}_setpoint" for name in message.actuators]
     limits = list(zip(message.actuators, message.limits, strict=False))
-    read = run.station.quick_reader((*inputs, *message.watched))
+    read = run.station.quick_reader(inputs)
+    # What is watched is for the record alone.
+    read_recorded = run.station.quick_reader((*inputs, *message.watched)) if message.watched else read
     measured = row_of(inputs)
     move = run.station.mover(message.actuators)
     samples = message.samples
@@ -79,7 +81,8 @@ def _samples(run: RunAtHand, message: FixedRate, period: float) -> Reading:
             due = start + k * period
             run.station.promise(_GRACE + _PERIODS_OF_GRACE * period, f"a loop at {message.rate:g} Hz")
         now = clock.now()
-        values.update(read())
+        is_recorded = taken % message.record_every == 0
+        values.update(read_recorded() if is_recorded else read())
         commands = update(now - start, measured(values))
         if len(commands) != len(setpoints):
             raise ConfigurationError(
@@ -93,7 +96,7 @@ def _samples(run: RunAtHand, message: FixedRate, period: float) -> Reading:
         values.update(zip(setpoints, commands, strict=False))
         late = now - due
         note_late(late)
-        if taken % message.record_every == 0:
+        if is_recorded:
             # Without the lateness, which tells the samples from the ticks.
             run.trace = traced(controller.trace)
             values.update(run.trace)

@@ -299,9 +299,12 @@ class InterlockWatch:
             )
         self._latest = t = max(t, self._latest)
         found: list[Finding] = []
+        restless: list[_Course] = []
         for course in self._courses:
             course.look(t, values, setpoints, found)
-        self._restless = [course for course in self._courses if course.restless]
+            if course.restless:
+                restless.append(course)
+        self._restless = restless
         if found and self._tripped is None:
             self._tripped = next((finding for finding in found if finding.level is Level.SAFE), None)
         return tuple(found)
@@ -455,15 +458,17 @@ class _Rate(_Criterion):
 class _Stale(_Criterion):
     def __init__(self, interlock: Interlock, units: Mapping[str, str], stale: float) -> None:
         super().__init__(interlock, units, stale)
-        self._bits = b""
+        self._last: float | None = None
+        self._first = math.nan
 
     def look(self, t: float, value: float, setpoint: float | None) -> None:  # noqa: ARG002 - as of all
-        bits = struct.pack("<d", value)
-        if bits != self._bits:
-            # From its first reading on; the next one has to be equal before it counts.
-            self._bits, self._first, self.since = bits, t, None
-        else:
+        last = self._last
+        # Readings that compare as different are; zeros and what is not a number have to be seen as bits.
+        if last is not None and (value == last or value != value) and _bits(value) == _bits(last):
             self.since = self._first
+        else:
+            # From its first reading on; the next one has to be equal before it counts.
+            self._last, self._first, self.since = value, t, None
 
     def seen(self, t: float, since: float, value: float) -> str:
         return (
@@ -620,7 +625,7 @@ class _Course:
             value = None if other is None else value - other
         if value is None:
             return
-        if math.isnan(value) and self._is_off(values, setpoints):
+        if value != value and self._is_off(values, setpoints):
             self._criteria = self._make_criteria()
         else:
             for criterion in self._criteria:
@@ -682,6 +687,9 @@ def _reading(name: str, values: Mapping[str, float], setpoints: Mapping[str, flo
 def _of_difference(unit: str) -> str:
     """Return the unit of a difference of two values."""
     return "K" if unit == "°C" else unit
+
+
+_bits = struct.Struct("<d").pack
 
 
 def _first_instant(since: float, seconds: float) -> float:

@@ -81,7 +81,7 @@ class Rig:
             self.derived: dict[str, Derived] = {}
             self.signals = self._bind_signals()
             self._setpoint_names = {name: f"{name}_setpoint" for name in self.actuators}
-            self._read_before: dict[tuple[Look, frozenset[str]], list[tuple[str, Device, bool]]] = {}
+            self._read_before: dict[tuple[Look, frozenset[str]], dict[str, Callable[[], dict[str, float]]]] = {}
             self.description = RigDescription(file, self._describe_devices(), self.signals)
             self._check_references()
             self._stack = stack.pop_all()
@@ -205,18 +205,17 @@ class Rig:
         read = self._read_before.get(key)
         if read is None:
             # The same few looks are taken again and again.
-            read = self._read_before[key] = self._devices_to_read(*key)
-        return {name: device.measure if best else device.glance for name, device, best in read}
+            read = self._read_before[key] = self._make_readers(*key)
+        return read
 
-    def _devices_to_read(self, look: Look, wanted: Collection[str]) -> list[tuple[str, Device, bool]]:
-        """Return which devices a look reads, and whether it takes the best reading."""
+    def _make_readers(self, look: Look, wanted: Collection[str]) -> dict[str, Callable[[], dict[str, float]]]:
         sources = self.sources(wanted)
-        read = []
+        read = {}
         for name, device in self.devices.items():
             is_wanted = bool(sources) and any(signal.name in sources for signal in device.signals)
             best = look is Look.MEASURE or (look is Look.SAMPLE and is_wanted)
             if best or is_wanted or look is not Look.PART:
-                read.append((name, device, best))
+                read[name] = device.measure if best else device.glance
         return read
 
     def quick_reader(self, wanted: Collection[str]) -> Callable[[], dict[str, float]]:
@@ -228,6 +227,8 @@ class Rig:
         names = self.readers(Look.PART, wanted)
         readers = _quick_readers([self.devices[name] for name in names])
         derived = [(name, each.compute) for name, each in self.derived.items() if name in sources]
+        if len(readers) == 1 and not derived:
+            return readers[0]
 
         def read() -> dict[str, float]:
             values: dict[str, float] = {}

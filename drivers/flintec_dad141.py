@@ -291,7 +291,8 @@ class _Line:
         ) from problem
 
     def _once(self, request: Callable[[], T]) -> T:
-        self._clock.sleep_until(self._silent_since + self._pause)
+        if self._pause:
+            self._clock.sleep_until(self._silent_since + self._pause)
         sent_at = self._clock.now()
         try:
             reply = request()

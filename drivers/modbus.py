@@ -46,7 +46,10 @@ _WRITE = struct.Struct(">BHHB")  # the same, and number of bytes
 _FRAME = struct.Struct(">BHB")  # of function 76: kind, address, number of registers
 _FRAME_READ, _FRAME_WRITE = 0, 1
 _MBAP = struct.Struct(">HHHB")  # transaction, protocol (0), bytes that follow, unit
-_TRANSACTIONS = 0x10000
+_HEADER_SIZE = _MBAP.size
+_pack_header = _MBAP.pack
+_pack_reply_head = struct.Struct(">HHHBB").pack  # the same, and the function
+_LAST_TRANSACTION = 0xFFFF
 _REFUSED = 0x80
 _KNOWN_FRAMES = 64  # that are kept; a host asks the same few again and again
 _KNOWN_REPLIES = 1024  # whose CRC is kept; what is at rest gives the same few readings
@@ -189,24 +192,23 @@ class TcpClient(_PortClient):
 
     def request(self, request: bytes, expected: int) -> bytes:
         """Send a request, from its function on, and return its reply, of an `expected` number of bytes."""
-        transaction = self._transaction = (self._transaction + 1) % _TRANSACTIONS
-        reply: bytes = self._exchange(_MBAP.pack(transaction, 0, len(request) + 1, self._unit) + request)
-        size = _MBAP.size + expected
-        if len(reply) == size and reply.startswith(
-            _MBAP.pack(transaction, 0, expected + 1, self._unit) + request[:1]
-        ):
-            return reply[_MBAP.size :]
+        transaction = self._transaction = (self._transaction + 1) & _LAST_TRANSACTION
+        unit = self._unit
+        reply: bytes = self._exchange(_pack_header(transaction, 0, len(request) + 1, unit) + request)
+        size = _HEADER_SIZE + expected
+        if len(reply) == size and reply.startswith(_pack_reply_head(transaction, 0, expected + 1, unit, request[0])):
+            return reply[_HEADER_SIZE:]
         # The shortest reply is a refusal, a function and a code.
-        reply = self._receive(reply, _MBAP.size + min(expected, 2))
-        answered, protocol, length, unit = _MBAP.unpack_from(reply)
-        function = reply[_MBAP.size]
-        if answered != transaction or protocol != 0 or unit != self._unit or function & ~_REFUSED != request[0]:
+        reply = self._receive(reply, _HEADER_SIZE + min(expected, 2))
+        answered, protocol, length, answering = _MBAP.unpack_from(reply)
+        function = reply[_HEADER_SIZE]
+        if answered != transaction or protocol != 0 or answering != unit or function & ~_REFUSED != request[0]:
             raise OSError(f"the answer {reply.hex(' ')} belongs to another request")
         if function & _REFUSED:
-            raise RefusedError(self._receive(reply, _MBAP.size + 2)[-1])
+            raise RefusedError(self._receive(reply, _HEADER_SIZE + 2)[-1])
         if length != expected + 1:
             raise OSError(f"the answer has {length - 1} bytes where {expected} were expected")
-        return self._receive(reply, size)[_MBAP.size : size]
+        return self._receive(reply, size)[_HEADER_SIZE:size]
 
 
 def _crc_table() -> tuple[int, ...]:
@@ -299,10 +301,10 @@ class RtuClient(_PortClient):
         reply: bytes = self._port.ask(_framed(self._unit, request))
         if len(reply) != expected + 3 or reply[0] != self._unit or reply[1] != request[0]:
             reply = self._reply_among(reply, request, expected)
+            if reply[1] == request[0] | _REFUSED:
+                raise RefusedError(reply[2])
         elif crc16(reply[:-2]) != reply[-2:]:
             raise NoReplyError("damaged reply")
-        if reply[1] == request[0] | _REFUSED:
-            raise RefusedError(reply[2])
         return reply[1:-2]
 
     def settle(self, silence: float) -> None:

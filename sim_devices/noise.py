@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from itertools import chain, repeat
 
 import numpy as np
 
@@ -10,9 +11,9 @@ _BLOCK = 256
 
 
 def normals(rng: np.random.Generator) -> Iterator[float]:
-    """Yield numbers of the standard normal distribution, those that `rng` gives one by one, but sooner.
+    """Return numbers of the standard normal distribution, those that `rng` gives one by one, but sooner.
 
     They are drawn in blocks, so nothing else may draw from `rng`.
     """
-    while True:
-        yield from rng.standard_normal(_BLOCK).tolist()
+    # Without a frame of Python for each number.
+    return chain.from_iterable(rng.standard_normal(size).tolist() for size in repeat(_BLOCK))

@@ -45,27 +45,24 @@ class World:
     ----------
     lock : threading.RLock
         Held by a wire server for the whole of a request, as servers of TCP ports have threads.
+    time : float
+        Laboratory time (s) at which plant and instruments stand; read it only.
     """
 
     def __init__(self, plant: Plant, clock: Clock) -> None:
         self.clock = clock
         self.lock = threading.RLock()
         self._plant = plant
-        self._time = clock.now()
+        self.time = clock.now()
         self._now = clock.now
-        self._timed: list[tuple[Callable[[], float], Timed]] = []
+        self.timed: list[tuple[Callable[[], float], Timed]] = []
         self._deadlines: list[Callable[[], float]] = []
         self._late: list[Callable[[], None]] = []
         self._advancing = False
 
-    @property
-    def time(self) -> float:
-        """Laboratory time (s) at which plant and instruments stand."""
-        return self._time
-
     def add(self, timed: Timed, *, catch_up: Callable[[], None] | None = None) -> None:
         """Keep the deadlines of an instrument; `catch_up` does what it has put off, before anybody interferes."""
-        self._timed.append((timed.deadline, timed))
+        self.timed.append((timed.deadline, timed))
         self._deadlines.append(timed.deadline)
         if catch_up is not None:
             self._late.append(catch_up)
@@ -103,10 +100,10 @@ class World:
             if deadline() <= target:
                 break
         else:
-            before = self._time
+            before = self.time
             if target > before:
                 self._plant.advance(target - before)
-                self._time = target
+                self.time = target
             return
         self._advancing = True
         try:
@@ -117,16 +114,16 @@ class World:
     def _advance_to(self, target: float) -> None:
         while True:
             due, first = math.inf, None
-            for deadline, timed in self._timed:
+            for deadline, timed in self.timed:
                 instant = deadline()
                 if instant < due:
                     due, first = instant, timed
             if first is None or due > target:
                 break
-            if due > self._time:
-                self._plant.advance(due - self._time)
-                self._time = due
+            if due > self.time:
+                self._plant.advance(due - self.time)
+                self.time = due
             first.expire()
-        if target > self._time:
-            self._plant.advance(target - self._time)
-            self._time = target
+        if target > self.time:
+            self._plant.advance(target - self.time)
+            self.time = target

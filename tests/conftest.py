@@ -10,7 +10,6 @@ import signal
 import sqlite3
 import subprocess
 import sys
-import tempfile
 import threading
 from contextlib import closing, contextmanager
 from itertools import chain, groupby
@@ -20,7 +19,8 @@ import pytest
 from hypothesis import settings
 
 sys.path.append(str(Path(__file__).parent))
-from warm_client import start_warm
+from regression_bands import RECORDED_SEED, beyond_the_bands
+from warm_popen import WarmPopen
 
 # Before numpy is loaded, and for the processes of the tests too: two workers, each with a thread of BLAS a core,
 # wait for one another, and a product of small matrices takes ten times as long.
@@ -41,7 +41,7 @@ for _name in ("SIGHUP", "SIGQUIT"):
 
 # Chosen by `make test`; `make test-all` looks at all examples. Without deadlines, as several folders have it.
 settings.register_profile("brief", deadline=None)
-_BRIEF, _FEWEST = 3, 20
+_BRIEF, _FEWEST = 6, 10
 """What examples are divided by then, and how few there are at least."""
 _SETTINGS = "_hypothesis_internal_use_settings"
 
@@ -53,6 +53,11 @@ def _take_fewer_examples(items):
         own = getattr(test, _SETTINGS, settings.default)
         fewer = max(own.max_examples // _BRIEF, min(own.max_examples, _FEWEST))
         setattr(test, _SETTINGS, settings(own, max_examples=fewer))
+
+
+def pytest_make_parametrize_id(val):
+    """Name long texts by their beginning: each worker sends all names, and one was of 600 kB."""
+    return ascii(val[:60]) if isinstance(val, str | bytes) and len(val) > 200 else None
 
 
 def pytest_collection_finish():
@@ -131,8 +136,8 @@ def finished_process():
 
 @pytest.fixture(scope="session")
 def warm_start(tmp_path_factory):
-    """Return the socket of a process that starts Python programs as forks of it; None where there is no fork."""
-    if not hasattr(os, "fork"):
+    """Return the socket of a process that starts Python programs as forks of it; None where it cannot watch them."""
+    if not (hasattr(os, "fork") and hasattr(os, "pidfd_open")):
         yield None
         return
     path = tmp_path_factory.mktemp("warm") / "socket"
@@ -142,23 +147,20 @@ def warm_start(tmp_path_factory):
         yield path
 
 
-@pytest.fixture(scope="session")
-def warm_process(finished_process, warm_start):
-    """Do as `finished_process` for `python -m` and `python -c`, where a cold start is not what is tested."""
-    if warm_start is None:
-        return finished_process
+@pytest.fixture(scope="module")
+def warm_popen(warm_start):
+    """Start the Python programs of this process as forks, where a cold start is not what is tested."""
+    with pytest.MonkeyPatch.context() as patch:
+        if warm_start is not None:
+            patch.setattr(WarmPopen, "server", warm_start)
+            patch.setattr(subprocess, "Popen", WarmPopen)
+        yield
 
-    def run(command, folder, environment):
-        assert command[0] == sys.executable
-        arguments = [str(argument) for argument in command[1:]]
-        environment = dict(os.environ) if environment is None else environment
-        with tempfile.TemporaryFile("w+") as out, tempfile.TemporaryFile("w+") as err:
-            code = start_warm(warm_start, arguments, str(folder), environment, [out.fileno(), err.fileno()])
-            out.seek(0)
-            err.seek(0)
-            return subprocess.CompletedProcess(command, code, out.read(), err.read())
 
-    return run
+@pytest.fixture
+def warm_process(finished_process, warm_popen):
+    """Do as `finished_process`, warm."""
+    return finished_process
 
 
 @pytest.fixture(scope="session")
@@ -232,6 +234,8 @@ def reproduce(bench, tmp_path):
         campaign = json.loads(result.read_text())
         assert campaign["seed"] == seed
         assert all(Path(path).stat().st_size > 1000 for path in campaign["figures"] + campaign["recordings"])
+        if seed == RECORDED_SEED:
+            assert not beyond_the_bands(study, campaign)
         return out, campaign
 
     return run

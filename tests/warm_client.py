@@ -1,4 +1,4 @@
-"""A command in the place of `bench` or `python`: has `warm_start` start it.
+"""Has `warm_start` start Python programs: as a command in the place of `bench` or `python`, or as `WarmPopen`.
 
     python warm_client.py SOCKET bench|python ARGUMENT...
 
@@ -11,23 +11,29 @@ import socket
 import sys
 
 
-def start_warm(path, arguments, folder, environment, outputs):
-    """Start `python` with arguments, and wait for its end; return the exit code.
+def start_warm(path, request, descriptors):
+    """Start `python` with arguments; return its process id, and the connection from which `exit_code` reads.
 
     Parameters
     ----------
     path : path-like
         The socket of `warm_start`.
-    outputs : list of int
-        Descriptors of standard output and standard error.
+    request : dict
+        `arguments`, `folder`, `environment`, and perhaps `new_session` and `group`, as for `subprocess.Popen`.
+    descriptors : list of int
+        Descriptors of standard input, output and error.
     """
-    request = {"arguments": arguments, "folder": folder, "environment": environment}
-    with socket.socket(socket.AF_UNIX) as connection:
-        connection.connect(str(path))
-        content = json.dumps(request).encode() + b"\n"
-        sent = socket.send_fds(connection, [content], outputs)
-        connection.sendall(content[sent:])
-        return int(connection.recv(16))
+    connection = socket.socket(socket.AF_UNIX)
+    connection.connect(str(path))
+    content = json.dumps(request).encode() + b"\n"
+    sent = socket.send_fds(connection, [content], descriptors)
+    connection.sendall(content[sent:])
+    return int(connection.recv(16)), connection
+
+
+def exit_code(connection):
+    """Wait for the end of a process; return its exit code, or the negative number of the signal that ended it."""
+    return int(connection.recv(16))
 
 
 def main():
@@ -38,7 +44,8 @@ def main():
         arguments = ["-P", "-m", "bench", *arguments]
     elif arguments[:1] != ["-m"]:
         os.execv(sys.executable, [sys.executable, *arguments])
-    sys.exit(start_warm(path, arguments, os.getcwd(), dict(os.environ), [1, 2]) & 0xFF)  # noqa: PTH109
+    request = {"arguments": arguments, "folder": os.getcwd(), "environment": dict(os.environ)}  # noqa: PTH109
+    sys.exit(exit_code(start_warm(path, request, [0, 1, 2])[1]) & 0xFF)
 
 
 if __name__ == "__main__":

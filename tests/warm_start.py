@@ -1,8 +1,9 @@
 """Starts Python programs as forks of this process, which has imported the libraries: 30 ms, not two seconds.
 
-A request is a connection to the Unix socket that the first argument names: arguments of `python`, folder and
-environment as a line of JSON, with the descriptors of standard output and standard error. The answer is the exit
-code. It ends with its standard input.
+A request is a connection to the Unix socket that the first argument names: arguments of `python`, folder,
+environment, and the session or group of processes that it gets as a line of JSON, with the descriptors of its
+standard streams.
+The answers are the process id, and at its end the exit code. The server ends with its standard input.
 """
 
 import atexit
@@ -15,6 +16,7 @@ import select
 import socket
 import sys
 import traceback
+from contextlib import suppress
 from pathlib import Path
 
 from bench import registry
@@ -23,6 +25,8 @@ from bench import registry
 LIBRARIES = (
     "matplotlib.figure",
     "numba",
+    # Rerun loads it.
+    "pandas",
     "pydantic",
     "pymodbus.client",
     "pytest",
@@ -31,7 +35,9 @@ LIBRARIES = (
     "scipy.linalg",
     "scipy.optimize",
     "scipy.sparse",
+    "scipy.special",
     "sqlite3",
+    "bench.dashboard",
     "bench.results.report",
     "bench.runs",
 )
@@ -39,33 +45,45 @@ LIBRARIES = (
 
 def receive(connection):
     """Return a request, and the descriptors that came with it."""
-    content, descriptors, _, _ = socket.recv_fds(connection, 1 << 16, 2)
+    content, descriptors, _, _ = socket.recv_fds(connection, 1 << 16, 3)
     while not content.endswith(b"\n"):
         content += connection.recv(1 << 16)
     return json.loads(content), descriptors
 
 
-def begin(request, outputs):
+def begin(request, streams):
     """Make this process what `python` is at its start."""
-    for number, opened in enumerate([os.open(os.devnull, os.O_RDONLY), *outputs]):
+    for number, opened in enumerate(streams):
         os.dup2(opened, number)
         os.close(opened)
+    if request.get("new_session"):
+        os.setsid()
+    if request.get("group", -1) >= 0:
+        os.setpgid(0, request["group"])
     os.chdir(request["folder"])
     os.environ.clear()
     os.environ.update(request["environment"])
     sys.path[:0] = filter(None, os.environ.get("PYTHONPATH", "").split(os.pathsep))
-    if request["arguments"][0] == "-P":
-        del request["arguments"][0]
-    else:
+    program = request["arguments"]
+    if program[0] == "-P":
+        del program[0]
+    elif program[0] in ("-m", "-c"):
         sys.path.insert(0, str(Path.cwd()))
+    else:
+        sys.path.insert(0, str(Path(program[0]).parent))
     importlib.invalidate_caches()
     registry.forget()
 
 
-def carry_out(option, program, *rest):
-    """Run `python -m` or `python -c`; return the exit code."""
-    sys.argv = [option, *rest]
+def carry_out(option, *rest):
+    """Run `python -m`, `python -c` or a script; return the exit code."""
     try:
+        if option not in ("-m", "-c"):
+            sys.argv = [option, *rest]
+            runpy.run_path(option, run_name="__main__")
+            return 0
+        program, *rest = rest
+        sys.argv = [option, *rest]
         if option == "-m":
             runpy.run_module(program, run_name="__main__", alter_sys=True)
         else:
@@ -81,6 +99,29 @@ def carry_out(option, program, *rest):
     return 0
 
 
+def start(request, streams, sockets, descriptors):
+    """Fork for a request; return the process id. The new process leaves the sockets and descriptors of this one."""
+    process = os.fork()
+    if process == 0:
+        code = 1
+        try:
+            for each in sockets:
+                each.close()
+            for each in descriptors:
+                os.close(each)
+            begin(request, streams)
+            code = carry_out(*request["arguments"])
+            atexit._run_exitfuncs()
+            sys.stdout.flush()
+            sys.stderr.flush()
+        finally:
+            # To take all libraries down would take as long as to import them.
+            os._exit(code)
+    for each in streams:
+        os.close(each)
+    return process
+
+
 def main():
     """Fork for each request."""
     for name in LIBRARIES:
@@ -93,25 +134,23 @@ def main():
     server.bind(sys.argv[1])
     server.listen()
     print("ready", flush=True)
-    while sys.stdin not in select.select([sys.stdin, server], [], [])[0]:
-        connection, _ = server.accept()
-        request, outputs = receive(connection)
-        child = os.fork()
-        if child == 0:
-            server.close()
-            connection.close()
-            begin(request, outputs)
-            code = carry_out(*request["arguments"])
-            atexit._run_exitfuncs()
-            sys.stdout.flush()
-            sys.stderr.flush()
-            # To take all libraries down would take as long as to import them.
-            os._exit(code)
-        for each in outputs:
-            os.close(each)
-        _, status = os.waitpid(child, 0)
-        connection.sendall(b"%d" % os.waitstatus_to_exitcode(status))
-        connection.close()
+    running = {}
+    while sys.stdin not in (ready := select.select([sys.stdin, server, *running], [], [])[0]):
+        for each in ready:
+            if each is server:
+                connection, _ = server.accept()
+                request, streams = receive(connection)
+                beside = [each for _, each in running.values()]
+                process = start(request, streams, [server, connection, *beside], running)
+                connection.sendall(b"%d" % process)
+                running[os.pidfd_open(process)] = process, connection
+            else:
+                process, connection = running.pop(each)
+                os.close(each)
+                _, status = os.waitpid(process, 0)
+                # Nobody may have waited for it.
+                with suppress(OSError), connection:
+                    connection.sendall(b"%d" % os.waitstatus_to_exitcode(status))
 
 
 if __name__ == "__main__":

@@ -187,7 +187,7 @@ class FixedRate(Message):
     limits : tuple of (float, float)
         Set-points that the controller may ask for, for each actuator, in its unit; empty for all that they take.
     watched : tuple of str
-        Further signals that are read with each sample, for the record alone.
+        Further signals that are read with each recorded sample, for the record alone; in blocks with each sample.
     record_every : int
         Of so many samples one is recorded.
     label : str

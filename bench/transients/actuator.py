@@ -35,6 +35,8 @@ _INSTANT = 0.03
 """Standard uncertainty of the instant at which a reading saw the drive, s."""
 _ON_TIME = 1e-9
 """Difference of times that are equal, s."""
+_OVERDAMPED = 3.0
+"""Greatest damping of a second-order actuator; its poles are a factor of 34 apart, and one of first order fits."""
 _EARLY = 0.1
 """Time by which a change of the set-point may come before its record says so, s."""
 
@@ -135,10 +137,8 @@ def identify_actuator(recordings: Sequence[Recording], longest: float = LONGEST_
             low = [
                 -_EARLY / slow if name == "delay" else value - 3.0 for name, value in zip(names, values, strict=True)
             ]
-            high = [
-                values[0] + 10.0 if name == "delay" else value + 3.0
-                for name, value in zip(names, values, strict=True)
-            ]
+            highest = {"delay": values[0] + 10.0, "damping": math.log(_OVERDAMPED)}
+            high = [highest.get(name, value + 3.0) for name, value in zip(names, values, strict=True)]
             solved = least_squares(
                 partial(left_over, names),
                 values,

@@ -165,20 +165,27 @@ class T7InputDevice(T7Device[InputSettingsT]):
         spans: list[Span] = []
         parts = []
         begin = 0
+        limit = math.inf
         for device in (self, *others):
             assert isinstance(device, T7InputDevice)
             spans += device.conversions
             end = begin + len(device._settings.channels)
-            parts.append((slice(begin, end), device._taken))
-            begin = end
+            parts.append((slice(begin, end), device._taken, device._values))
+            begin, limit = end, min(limit, device._limit)
         packet = Packet.of(spans)
 
         def glance() -> dict[str, float]:
             # Over the line of the moment, as it may have been renewed.
             voltages = self._line.read_packet(packet)
             values: dict[str, float] = {}
-            for part, taken in parts:
-                values.update(taken(voltages[part]))
+            for volts in voltages:
+                if not -limit < volts < limit:
+                    # Each device knows its own limit.
+                    for part, taken, _ in parts:
+                        values.update(taken(voltages[part]))
+                    return values
+            for part, _, converted in parts:
+                values.update(converted(*voltages[part]))
             return values
 
         return glance

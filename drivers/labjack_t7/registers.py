@@ -437,10 +437,11 @@ class LabJackT7:
                 reply = self._client.request(packet.request, packet.size)
         except (RefusedError, OSError) as error:
             reply = self._again(error, packet.name, lambda client: client.request(packet.request, packet.size))
-        *values, owner = packet.reply.unpack(reply)
+        values = packet.reply.unpack(reply)
+        owner = values[-1]
         if owner != self._owner and self._owner and not self._unchecked:
             self._check_owner(owner)
-        return tuple(values)
+        return values[:-1]
 
     def read_spans(self, spans: Sequence[Span], *writes: tuple[int, bytes]) -> list[list[float]]:
         """Get the values of several spans in one request; what is to be written at addresses goes first in it.

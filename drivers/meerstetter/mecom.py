@@ -83,6 +83,7 @@ class TECLine:
     def __init__(self, device: str, settings: TECLineSettings) -> None:
         self._device = device
         self._settings = settings
+        self._address = settings.address
         self._sequence = 0
         self._most_resends = RESENDS
         self.repeats = 0
@@ -132,18 +133,18 @@ class TECLine:
         self._exchange(request, 0, resends)
 
     def _exchange(self, request: str, digits: int, resends: int = RESENDS) -> bytes:
-        self._sequence = (self._sequence + 1) & 0xFFFF
-        head = b"%02X%04X" % (self._settings.address, self._sequence)
-        body = b"#" + head + request.encode("ascii")
+        sequence = self._sequence = (self._sequence + 1) & 0xFFFF
+        body = b"#%02X%04X%b" % (self._address, sequence, request.encode("ascii"))
         crc = b"%04X" % crc_hqx(body, 0)
-        frame = body + crc + b"\r"
+        frame = b"%b%b\r" % (body, crc)
+        head = b"!" + body[1:7]
         resends = min(resends, self._most_resends)
         try:
             for attempt in range(1 + resends):
                 self.repeats += attempt > 0
                 self._port.write(frame)
-                problem, content = self._answer(b"!" + head, crc, digits)
-                if problem == "":
+                problem, content = self._answer(head, crc, digits)
+                if not problem:
                     return content
                 if content[:1] == b"+":
                     raise RefusedError(int(content[1:3], 16))
@@ -161,8 +162,9 @@ class TECLine:
             answer = self._read_answer(_ACKNOWLEDGE_LENGTH + digits)
             if answer is None:
                 return self._silence, b""
-            answer = answer[max(answer.rfind(b"!"), 0) :]
-            if answer[:7] != head:
+            if (begin := answer.rfind(b"!")) > 0:
+                answer = answer[begin:]
+            if not answer.startswith(head):
                 continue
             content, received_crc = answer[7:-4], answer[-4:]
             # An acknowledge carries the CRC of the request.

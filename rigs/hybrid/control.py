@@ -175,7 +175,9 @@ class _MidRanging:
         self._integral = 0.0
         self._probe: LatenessProbe | None = None
         # What the piezo part was asked for, as far back as readings are late, the last one first.
-        self._asked = deque([0.0], maxlen=2 + math.floor(parameters.samples_late))
+        whole, self._late_part = divmod(parameters.samples_late, 1.0)
+        self._late_whole = int(whole)
+        self._asked = deque([0.0], maxlen=2 + self._late_whole)
         self._fed_back = 0.0
         self._start = math.nan
         self._samples = 0
@@ -211,10 +213,10 @@ class _MidRanging:
 
     def _seen_piezo(self) -> float:
         """Return the part of the piezo in the present reading, which is late, m."""
-        asked = self._asked
-        whole, part = divmod(self._p.samples_late, 1.0)
-        newer = asked[min(int(whole), len(asked) - 1)]
-        return newer + part * (asked[min(int(whole) + 1, len(asked) - 1)] - newer) if part else newer
+        asked, whole, part = self._asked, self._late_whole, self._late_part
+        last = len(asked) - 1
+        newer = asked[min(whole, last)]
+        return newer + part * (asked[min(whole + 1, last)] - newer) if part else newer
 
     def _check_lateness(self, probe: LatenessProbe) -> None:
         """Raise `ConvergenceError` if readings are later than the controller knows."""

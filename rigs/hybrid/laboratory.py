@@ -108,6 +108,7 @@ class HybridLaboratorySettings(SensorSettings):
 def _use(plant: HybridCantilever) -> float:
     plant.advance(plant.parameters.step)
     plant.apply(1.0)
+    plant.terminals()
     return plant.deflection
 
 
@@ -257,7 +258,7 @@ class HybridLaboratory(EmulatedLaboratory):
         return self.plant.deflection if self._stuck is None else self._stuck
 
     def _seen_deflection(self) -> float:
-        return self._deflection() + self._beyond
+        return (self.plant.deflection if self._stuck is None else self._stuck) + self._beyond
 
     def _stick(self) -> None:
         self._stuck = self._deflection()

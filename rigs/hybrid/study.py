@@ -238,8 +238,9 @@ def _carry_out(campaign: Campaign) -> StudyResult:
             ("current-sine", sweep),
         )
     ]
-    runs = _Runs(*(run.result() for run in started))
-    sources = [run.folder for run in (runs.steps, runs.static, runs.loops, runs.step)]
+    # Identified beside the runs that it does not need.
+    _, steps, static, loops, step, _, _ = started
+    sources = [run.result().folder for run in (steps, static, loops, step)]
     found = identify_hybrid(*sources)
     model = campaign.folder / "hybrid.json"
     ModelFile("hybrid", found.model, provenance={"sources": [folder.name for folder in sources]}).save(model)
@@ -271,6 +272,7 @@ def _carry_out(campaign: Campaign) -> StudyResult:
         for offset in RESONANCES
     }
     sweep_run = campaign.start("calibration-displacement", {"sweeps": "1"}, rig=WITNESSED)
+    runs = _Runs(*(run.result() for run in started))
     figures = list(_draw_models(campaign, found, runs))
     calibration = _calibrated(sweep_run.result().folder)
     calibrated = calibrated_rig(campaign.folder, calibration, WITNESSED)

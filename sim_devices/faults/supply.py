@@ -16,6 +16,7 @@ class ClippedPeltier:
         self._load = load
         self._highest = math.inf
         self._repeat: Callable[[], None] = load.release
+        self.terminals = load.terminals
 
     def fault(self, amperes: float) -> Fault:
         """Return the fault, with the highest current (A) where none is chosen."""

@@ -216,9 +216,8 @@ class EmulatedT7(LineFaults, RegisterInstrument):
         self.serial_number = serial_number
         self.firmware = firmware
         self._sources = {channel: inputs.get(channel, _ground) for channel in range(CHANNELS)}
-        self._normals = normals(rng)
+        self._draw = normals(rng).__next__
         self._held: dict[int, float] | None = None
-        self._touched = False
         self._watchdog = _Watchdog()
         self._expired_at: float | None = None
         self._followers: list[Callable[[], None]] = []
@@ -341,10 +340,6 @@ class EmulatedT7(LineFaults, RegisterInstrument):
         finally:
             self.world.lock.release()
 
-    def _after_frame(self) -> None:
-        if self._touched:
-            self._lead()
-
     def _wait(self, microseconds: float) -> None:
         if microseconds > _LONGEST_WAIT:
             raise RegisterError(DEVICE_FAILURE, f"WAIT_US_BLOCKING: {microseconds:g} is not 0 to {_LONGEST_WAIT}")
@@ -456,7 +451,7 @@ class EmulatedT7(LineFaults, RegisterInstrument):
         if settings.negative != SINGLE_ENDED:
             volts -= self._sources[settings.negative]()
         noise, step, lowest, highest = scale or settings.scale
-        volts = round((volts + noise * next(self._normals)) / step) * step
+        volts = round((volts + noise * self._draw()) / step) * step
         if not lowest <= volts <= highest:
             volts = min(max(volts, lowest), highest)
         if held is not None:

@@ -94,6 +94,9 @@ class PeltierLoad(Protocol):
     def voltage(self) -> float:
         """Voltage across the Peltier element, V."""
 
+    def terminals(self) -> tuple[float, float, float, float]:
+        """Return the temperatures of plate and sink (°C), current (A) and voltage (V) of this instant, at once."""
+
     def regulate(self, target_celsius: float, current_limit: float = math.inf) -> None:
         """Close the temperature loop, with a current of at most `current_limit` A of either sign."""
 
@@ -498,7 +501,7 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
         """Check the protections and follow the stability of the temperature."""
         values = self._values
         elapsed = now - self._supervised_at
-        plate, sink = self._load.plate_temperature, self._load.sink_temperature
+        plate, sink, current, voltage = self._load.terminals()
         # A slope over less than this would see the steps of the plant's own time grid.
         if elapsed >= 0.5 * SUPERVISION_INTERVAL:
             if abs(plate - self._last_object) > values[4012] * elapsed:
@@ -515,11 +518,10 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
         elif sink > values[5011]:
             self._trip(143, 5011)
         if self._status is DeviceStatus.RUN:
-            self._supervise_output(now, plate)
+            self._supervise_output(now, plate, current, voltage)
 
-    def _supervise_output(self, now: float, plate: float) -> None:
+    def _supervise_output(self, now: float, plate: float, current: float, voltage: float) -> None:
         values = self._values
-        current, voltage = self._load.current, self._load.voltage
         if abs(current) > values[2032]:
             self._trip(100 if self._polarity * current > 0 else 101, 2032)
         elif abs(voltage) > values[2033]:

@@ -114,6 +114,9 @@ class Service:
 class RegisterInstrument(ABC):
     """A bank of registers with names; a `sim_devices.wire.modbus.RegisterBank`."""
 
+    _touched = False
+    """Whether an output may have changed since `_lead`."""
+
     def _set_map_up(self, rows: Iterable[Register]) -> None:
         registers = [register for row in rows for register in row.each()]
         self._named = {register.name: register for register in registers}
@@ -191,7 +194,7 @@ class RegisterInstrument(ABC):
                 return self._writer(registers[0], unpack)
         if not writing:
             return self._frame_reader([readers for readers, _ in parts], pack)
-        begin, end, after_frame, isfinite = self._begin, self._end, self._after_frame, math.isfinite
+        begin, end, lead, isfinite = self._begin, self._end, self._lead, math.isfinite
 
         def carry_out(packet: bytes) -> bytes:
             given = iter(unpack(packet))
@@ -207,7 +210,8 @@ class RegisterInstrument(ABC):
                             self._take(register, value)
                         else:
                             register.write(value)
-                    after_frame()
+                    if self._touched:
+                        lead()
                 answer = pack(*values)
             except BaseException as error:
                 end(error)
@@ -248,7 +252,7 @@ class RegisterInstrument(ABC):
 
     def _frame_reader(self, frames: Sequence[Sequence[Callable[[], float]]], pack: Callable[..., bytes]) -> Packet:
         """Return what reads several frames, between which outputs may be followed."""
-        begin, end, after_frame = self._begin, self._end, self._after_frame
+        begin, end, lead = self._begin, self._end, self._lead
 
         def read_frames(packet: bytes) -> bytes:  # noqa: ARG001
             values: list[float] = []
@@ -257,7 +261,8 @@ class RegisterInstrument(ABC):
                 for readers in frames:
                     for read in readers:
                         values.append(read())
-                    after_frame()
+                    if self._touched:
+                        lead()
                 answer = pack(*values)
             except BaseException as error:
                 end(error)
@@ -295,8 +300,9 @@ class RegisterInstrument(ABC):
         if register.write is not None:
             register.write(value)
 
-    def _after_frame(self) -> None:  # noqa: B027 - most have no outputs
-        """Let what depends on the outputs follow, between two frames of a packet."""
+    def _lead(self) -> None:
+        """Let what depends on the outputs follow; most have none."""
+        self._touched = False
 
     def _reads(self, address: int, count: int) -> _Reads:
         registers = list(dict.fromkeys(self._at(each) for each in range(address, address + count)))

@@ -282,6 +282,20 @@ def bending(fraction: float, plant: Floats) -> tuple[float, float]:
 
 
 @njit(cache=True)
+def terminals(fraction: float, ambient: float, plant: Floats) -> tuple[float, float, float, float]:
+    """Return the temperatures of face and block's front (°C), current (A) and voltage (V) of the cooler.
+
+    As a TEC controller sees them after a fraction of the step under way, with the mean temperature of the room (°C).
+    """
+    rise, increment, state, _, c, _, _ = _thermal(plant)
+    face = ambient + (rise[FACE] + fraction * increment[FACE])
+    back = ambient + (rise[BACK] + fraction * increment[BACK])
+    front = ambient + (rise[BLOCK_FRONT] + fraction * increment[BLOCK_FRONT])
+    current = state[CURRENT]
+    return face, front, current, c.seebeck * (face - back) + c.resistance * current
+
+
+@njit(cache=True)
 def heat_to_air(fraction: float, plant: Floats) -> float:
     """Add up the heat flow from all nodes to the air."""
     rise, increment, state, _, _, nodes, _ = _thermal(plant)

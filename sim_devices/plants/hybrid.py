@@ -235,9 +235,13 @@ class HybridCantilever(CooledPlant[HybridParameters]):
     @property
     def tec_voltage(self) -> float:
         """Voltage across the cooler, V: Seebeck and ohmic part, of the sign of a heating current."""
-        p = self._parameters
-        difference = self._temperature(kernels.FACE) - self._temperature(kernels.BACK)
-        return p.seebeck * difference + p.resistance * self.current
+        return self.terminals()[3]
+
+    def terminals(self) -> tuple[float, float, float, float]:
+        """Return the temperatures of base and block's front (°C), current (A) and voltage (V) of the cooler."""
+        # In one call, as a TEC controller looks with each request.
+        seen: tuple[float, float, float, float] = kernels.terminals(self._fraction, self._ambient, self._numbers)
+        return seen
 
     @property
     def peltier(self) -> PeltierTerminals:
@@ -289,6 +293,7 @@ class PeltierTerminals:
     def __init__(self, plant: HybridCantilever) -> None:
         self._plant = plant
         self._rating = plant.parameters.maximum_current
+        self.terminals = plant.terminals
         self.regulate = plant.regulate
         self.release = plant.release
 

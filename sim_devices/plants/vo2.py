@@ -271,6 +271,10 @@ class VO2Cantilever(CooledPlant[VO2Parameters]):
         p = self._parameters
         return p.seebeck * (self.plate_temperature - self.sink_temperature) + p.resistance * self.current
 
+    def terminals(self) -> tuple[float, float, float, float]:
+        """Return the temperatures of plate and sink (°C), current (A) and voltage (V) of this instant."""
+        return self.plate_temperature, self.sink_temperature, self.current, self.voltage
+
     @property
     def r_fraction(self) -> float:
         """Share of the film in the R (hot) phase, in [0, 1]."""

@@ -104,14 +104,15 @@ class MeComServer(WireServer):
 
     def _serve(self, frame: bytes) -> bytes:
         device = self._device
-        frame = frame[max(frame.rfind(b"#"), 0) :]
+        if (begin := frame.rfind(b"#")) > 0:
+            frame = frame[begin:]
         if not _SHORTEST_FRAME <= len(frame) <= LONGEST_FRAME or not device.plugged_in:
             return b""
         body, crc = frame[:-4], frame[-4:]
         if crc != b"%04X" % crc_hqx(body, 0) or not _PREAMBLE.match(body):
             return b""
         number = int(body[1:3], 16)
-        if number not in (_BROADCAST, _SILENT, device.address):
+        if number != device.address and number not in (_BROADCAST, _SILENT):
             return b""
         device.attend()
         head = b"!" + body[1:7]

@@ -12,6 +12,7 @@ from bench.journal import Record
 
 @pytest.mark.slow
 class TestBusyMachine:
+    @pytest.mark.seeds
     def test_virtual_runs_are_equal_to_the_last_bit(self, tmp_path):
         """The first of them compiles, in the middle of the load, and says so."""
         with busy(1):

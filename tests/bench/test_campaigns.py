@@ -26,6 +26,8 @@ from bench.runs import carry_out
 from bench.studies import Study, StudyResult
 from bench.workers import Workers
 
+pytestmark = pytest.mark.usefixtures("warm_popen")
+
 PROTOCOLS = Path(__file__).parent / "heater_protocols.py"
 STAIRS = f'''
 [[runs]]
@@ -416,6 +418,8 @@ def test_no_other_scheduler_is_trusted(address, campaign, tmp_path, capsys):
         assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
+@pytest.mark.seeds
 def test_a_cluster_gives_the_same(campaign, tmp_path, rig_file):
     distributed = pytest.importorskip("distributed")
     program = tmp_path / "mine.py"

@@ -160,6 +160,7 @@ class TestList:
         assert "vo2" in err
 
 
+@pytest.mark.usefixtures("warm_popen")
 class TestRun:
     def test_leaves_a_record_and_a_recording(self, finished_run):
         folder = Path(finished_run["folder"])

@@ -354,6 +354,15 @@ class TestInputs:
         # The noise of each reading is another.
         assert len(set(b.samples()["tec_temperature"])) == 20
 
+    def test_what_is_watched_is_read_with_the_recorded_samples_alone(self, bench):
+        b = bench()
+        probe, tec = count_readings(b.devices["probe"]), count_readings(b.devices["tec"])
+        b.run(loop(Controller(), 10.0, 2.0, watched=("tec_temperature",), record_every=4))
+        assert len(probe) == 20 + 5
+        assert len(tec) == 5 + 5
+        assert {0.4, 0.8, 1.2, 1.6} <= {round(instant, 6) for instant in tec}
+        assert len(set(b.samples()["tec_temperature"])) == 5
+
     def test_what_is_not_watched_stands_as_at_the_last_tick(self, bench):
         b = bench()
         b.run(loop(Controller(), 10.0, 2.0))

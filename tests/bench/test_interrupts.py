@@ -13,6 +13,8 @@ from bench.errors import DataError
 from bench.interrupts import Interrupts
 from bench.journal import Record
 
+pytestmark = pytest.mark.usefixtures("warm_popen")
+
 HERE = Path(__file__).parent
 PROTOCOLS = str(HERE / "heater_protocols.py")
 

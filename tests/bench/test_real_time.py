@@ -12,6 +12,8 @@ from bench.journal import Record
 from bench.runs import Run, carry_out
 from sim_devices.serving.process import serve
 
+pytestmark = pytest.mark.usefixtures("warm_popen")
+
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs pseudo-terminals")
 @pytest.mark.timeout(240)

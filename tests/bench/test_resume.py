@@ -22,6 +22,8 @@ from bench.locks import Holder, Locks
 from bench.past.corners import corners, turning_points
 from bench.resume import Resume, resume
 
+pytestmark = pytest.mark.usefixtures("warm_popen")
+
 OSCILLATION = {
     "vo2": {"increment": 3.0, "half_cycles": 12},
     "sma": {"increment": 0.5, "half_cycles": 10, "dwell": 10.0},
@@ -253,7 +255,7 @@ class TestResume:
         assert [step.step for step in steps_of(folder)] == list(range(6))
 
 
-@pytest.mark.parametrize("rig", OSCILLATION)
+@pytest.mark.parametrize("rig", [pytest.param("vo2", marks=pytest.mark.seeds), "sma", "hybrid"])
 def test_a_killed_run_is_resumed_to_the_model_of_an_uninterrupted_one(rig, tmp_path, capsys):
     settings = OSCILLATION[rig]
     whole = bench.run("damped-oscillation", rig, out=tmp_path / "whole", **settings)

@@ -16,7 +16,7 @@ def new(*arguments):
 
 
 @pytest.mark.timeout(600)
-def test_the_tests_of_all_skeletons_pass(tmp_path, monkeypatch, capsys, finished_process):
+def test_the_tests_of_all_skeletons_pass(tmp_path, monkeypatch, capsys, warm_process):
     monkeypatch.chdir(tmp_path)
     for part in PARTS:
         assert new(part, f"my-own-{part}") == 0
@@ -33,16 +33,16 @@ def test_the_tests_of_all_skeletons_pass(tmp_path, monkeypatch, capsys, finished
         "PIP_NO_BUILD_ISOLATION": "0",
     }
     folders = [f"./my-own-{part}" for part in PARTS]
-    installed = finished_process([sys.executable, "-m", "pip", "install", "-q", *folders], tmp_path, environment)
+    installed = warm_process([sys.executable, "-m", "pip", "install", "-q", *folders], tmp_path, environment)
     assert installed.returncode == 0, installed.stderr
-    tested = finished_process(
+    tested = warm_process(
         [sys.executable, "-m", "pytest", "-q", "-W", "error", "-p", "no:cacheprovider", *folders],
         tmp_path,
         environment,
     )
     assert tested.returncode == 0, tested.stdout
     assert " passed" in tested.stdout
-    listed = finished_process([sys.executable, "-m", "bench", "list"], tmp_path, environment)
+    listed = warm_process([sys.executable, "-m", "bench", "list"], tmp_path, environment)
     assert all(f"my-own-{part}" in listed.stdout for part in ("protocol", "model", "rig"))
 
 

@@ -14,6 +14,8 @@ from bench.studies import reproduce
 sys.path.append(str(Path(__file__).parent))
 import small_study
 
+pytestmark = pytest.mark.usefixtures("warm_popen")
+
 
 @pytest.fixture
 def carried_out(tmp_path):

@@ -2,6 +2,7 @@
 
 import json
 import math
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -11,12 +12,13 @@ import bench
 from bench.cli import main
 from bench.control.dynamics import ActuatorDynamics
 from bench.errors import ConfigurationError, DataError
-from bench.hysteresis import PrandtlIshlinskii
+from bench.hysteresis import PrandtlIshlinskii, Preisach, uniform_levels
 from bench.journal import Record
 from bench.rig_file import load_rig
 from bench.transients import _kernels
 from bench.transients.actuator import identify_actuator
 from bench.transients.recording import Recording
+from bench.twin.correction import identify_correction
 from bench.twin.disturbances import noise_of
 from bench.twin.specimen import Dynamics, Specimen, Unevenness, Wander
 from bench.twin.write import write_twin
@@ -239,3 +241,28 @@ def test_how_calls_divide_the_time_does_not_matter():
         return specimen.drive, specimen.response
 
     assert ends(1) == pytest.approx(ends(7), rel=1e-12)
+
+
+def test_the_answer_to_short_reversals_is_found_from_the_readings_after_turning_points():
+    """The specimen has no hysterons of a width below 1.5, which the cells of the model cannot say."""
+    levels = uniform_levels(0.0, 40.0, 80)
+    upper, lower = np.tril_indices(80)
+    specimen = Preisach(levels, np.where(upper - lower > 3, 1.0, 0.0))
+    coarse = uniform_levels(0.0, 40.0, 20)
+    up, down = np.tril_indices(20)
+    # The mean of each cell of four by four finer ones: by how many of them the gap is wider than the cell.
+    model = Preisach(coarse, np.where(up == down, 0.0, np.where(up - down == 1, 0.625, 1.0)))
+    swings = 20.0 + 20.0 * (-1.0) ** np.arange(26) * np.linspace(1.0, 0.0, 26)
+    inputs = np.concatenate([np.arange(a, b, math.copysign(0.35, b - a)) for a, b in pairwise(swings.tolist())])
+    noise = np.random.default_rng(3).normal(0.0, 0.1, inputs.size)
+    errors = specimen.evaluate(inputs) + noise - model.evaluate(inputs)
+    found = identify_correction(model, [inputs], errors, np.ones(inputs.size, dtype=bool))
+    assert found.operator is not None
+    ends = np.arange(10.3, 32.0, 1.9)
+    answers = []
+    for operators in ((specimen,), (model,), (model, found.operator)):
+        turns = [sum(each.evaluate([end, end - 1.5]) for each in operators) for end in ends.tolist()]
+        answers.append(np.diff(turns)[:, 0])
+    real, modelled, corrected = answers
+    assert np.abs(real).max() < 1e-9
+    assert np.sqrt(np.mean(corrected**2)) < 0.3 * np.sqrt(np.mean(modelled**2))

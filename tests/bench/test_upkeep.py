@@ -12,6 +12,8 @@ from bench.clock import Stopwatch
 from bench.upkeep.rescue import rescue_by_another_process
 from sim_devices.serving.process import serve
 
+pytestmark = pytest.mark.usefixtures("warm_popen")
+
 CLIENT = """
 import sys
 from pathlib import Path

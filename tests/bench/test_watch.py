@@ -195,6 +195,8 @@ def test_the_viewer_for_browsers_is_not_reachable_from_outside(ended: Path) -> N
 
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("chromium") is None, reason="needs the package chromium")
+@pytest.mark.slow
+@pytest.mark.seeds
 def test_a_browser_shows_a_replay(ended: Path, tmp_path: Path) -> None:
     sync_api = pytest.importorskip("playwright.sync_api")
     with JournalView(ended, 0) as view, web_viewer(view.uri) as address:

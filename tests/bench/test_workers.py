@@ -22,6 +22,8 @@ from bench.workers.display import TasksDisplay
 sys.path.append(str(Path(__file__).parent))
 import worker_tasks
 
+pytestmark = pytest.mark.usefixtures("warm_popen")
+
 POSIX = pytest.mark.skipif(sys.platform == "win32", reason="asks the system for processes by their number")
 
 

@@ -1,11 +1,12 @@
 """Trials of twins: tracking runs on a twin, beside those on the emulated plant that it was identified from.
 
-    python tests/bench/twin_trials.py [--rig vo2 ...] [--real 3] [--twin 5] [--out FOLDER]
+    python tests/bench/twin_trials.py [--rig vo2 ...] [--specimens 3] [--sessions 12] [--out FOLDER]
 
-The plants of the packaged rigs are built differently from any twin. Each rig is characterized once (creep,
-damped-oscillation, random-validation); the second run identifies the model of the controller, and all three the
-twin. Then `tracking` runs with that model on both, with other seeds. The table has medians over the seeds with the
-range; the last line says how many goals were reached: the duration within 2 %, the RMS of the error within 30 %.
+The plants of the packaged rigs are built differently from any twin. Each specimen is characterized once (creep,
+damped-oscillation, random-validation), in sessions of its own; the second run identifies the model of the controller,
+and all three the twin. Then `tracking` runs with that model on both, with other seeds. The table has the medians over
+the sessions of each specimen with their range, and by how much that of the twin is off. The goals are for the median
+over the specimens: the duration within 2 %, the RMS of the error within 30 %.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from rich.console import Console
 from rich.table import Table
 
 import bench
+from bench.errors import ConvergenceError
 from bench.journal import Record
 from bench.twin.write import write_twin
 
@@ -31,7 +33,14 @@ MODELS: Mapping[str, Mapping[str, Any]] = {
     "sma": {"model": "preisach-signed"},
     "hybrid": {"model": "prandtl-ishlinskii"},
 }
-GOALS = (0.02, 0.3)
+SETTINGS: Mapping[str, Mapping[str, Any]] = {"sma": {"adaptation": "session"}}
+"""Of tracking: on sma the model of one characterization alone errs less than it does with feedback, so that the
+controller would be given up after a number of targets that is up to chance."""
+SESSIONS = {"vo2": 12, "sma": 4, "hybrid": 4}
+"""Sessions of each plant and twin: on vo2 durations differ by 6 % from one to another."""
+SEEDED = {"vo2", "sma"}
+"""Rigs whose specimens differ by a seed; of others it is the sessions alone that differ."""
+GOALS = {"duration, s": 0.02, "RMS error, base unit": 0.3}
 """Of duration and RMS, as a share of the plant's."""
 
 
@@ -54,18 +63,29 @@ def tracked(run: Path) -> tuple[float, float]:
     return steps[-1].finished, float(np.sqrt(np.mean(np.square(means))))
 
 
-def trial(rig: str, folder: Path, real: int, twins: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return duration and RMS on the plant and on its twin, a row each seed."""
-    creep = bench.run("creep", rig, out=folder, seed=1)
-    loops = bench.run("damped-oscillation", rig, out=folder, seed=1)
-    other = bench.run("random-validation", rig, out=folder, seed=2)
+def trial(rig: str, specimen: int, folder: Path, sessions: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return duration and RMS on a plant and on its twin, a row each session."""
+    # The first specimen is the packaged one.
+    other = {"emulation.specimen_seed": str(specimen)} if specimen and rig in SEEDED else {}
+    first = 10 * specimen
+    creep = bench.run("creep", rig, out=folder, seed=first + 1, overrides=other)
+    loops = bench.run("damped-oscillation", rig, out=folder, seed=first + 1, overrides=other)
+    validation = bench.run("random-validation", rig, out=folder, seed=first + 2, overrides=other)
     model, twin = folder / "model.json", folder / "twin.toml"
     bench.identify(loops, **MODELS[rig]).file.save(model)
-    write_twin([creep.folder, loops.folder, other.folder], rig, twin, model)
+    write_twin([creep.folder, loops.folder, validation.folder], rig, twin, model)
     found = []
-    for on, seeds in ((rig, range(11, 11 + real)), (str(twin), range(101, 101 + twins))):
-        runs = [bench.run("tracking", on, out=folder, seed=seed, model=str(model)) for seed in seeds]
-        found.append(np.array([tracked(run.folder) for run in runs]))
+    for on, seed, overrides in ((rig, 11, other), (str(twin), 101, {})):
+        rows: list[tuple[float, float]] = []
+        while len(rows) < sessions:
+            try:
+                settings = {"model": str(model), **SETTINGS.get(rig, {})}
+                run = bench.run("tracking", on, out=folder, seed=seed, overrides=overrides, **settings)
+                rows.append(tracked(run.folder))
+            except ConvergenceError as error:
+                print(f"{on}, seed {seed}: {error}", file=sys.stderr)
+            seed += 1
+        found.append(np.array(rows))
     return found[0], found[1]
 
 
@@ -78,31 +98,37 @@ def main() -> None:
     """Make the trials, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rig", nargs="+", choices=[*MODELS], default=[*MODELS])
-    parser.add_argument("--real", type=int, default=3)
-    parser.add_argument("--twin", type=int, default=5)
+    parser.add_argument("--specimens", type=int, default=3)
+    parser.add_argument("--sessions", type=int, help="of each plant and twin; default: " + str(dict(SESSIONS)))
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
-    table = Table("rig", "", "plant", "twin", "of the medians", "goal")
-    reached = []
+    table = Table("rig", "", "specimen", "plant", "twin", "of the medians")
+    verdicts = []
     with tempfile.TemporaryDirectory() as temporary:
         for rig in arguments.rig:
-            folder = (arguments.out or Path(temporary)) / rig
-            plant, twin = trial(rig, folder, arguments.real, arguments.twin)
-            for column, name in enumerate(("duration, s", "RMS error, base unit")):
-                change = float(np.median(twin[:, column]) / np.median(plant[:, column])) - 1.0
-                reached.append(abs(change) <= GOALS[column])
-                table.add_row(
-                    rig,
-                    name,
-                    _text(plant[:, column]),
-                    _text(twin[:, column]),
-                    f"{100.0 * change:+.1f} %",
-                    f"{100.0 * GOALS[column]:g} %{'' if reached[-1] else ', missed'}",
-                )
+            changes: dict[str, list[float]] = {name: [] for name in GOALS}
+            for specimen in range(arguments.specimens):
+                folder = (arguments.out or Path(temporary)) / f"{rig}-{specimen}"
+                plant, twin = trial(rig, specimen, folder, arguments.sessions or SESSIONS[rig])
+                for column, name in enumerate(GOALS):
+                    change = float(np.median(twin[:, column]) / np.median(plant[:, column])) - 1.0
+                    changes[name].append(change)
+                    both = _text(plant[:, column]), _text(twin[:, column])
+                    table.add_row(rig, name, str(specimen), *both, f"{100.0 * change:+.1f} %")
+            verdicts += [(rig, name, each) for name, each in changes.items()]
     console = Console(width=118)
     console.print(table)
-    console.print(f"{sum(reached)} of {len(reached)} goals reached")
-    sys.exit(not all(reached))
+    reached = 0
+    for rig, name, found in verdicts:
+        middle, worst = float(np.median(found)), max(found, key=abs)
+        met = abs(middle) <= GOALS[name]
+        reached += met
+        console.print(
+            f"{rig}, {name}: {100.0 * middle:+.1f} % (worst specimen {100.0 * worst:+.1f} %), "
+            f"goal {100.0 * GOALS[name]:g} %{'' if met else ', missed'}"
+        )
+    console.print(f"{reached} of {len(verdicts)} goals reached")
+    sys.exit(reached < len(verdicts))
 
 
 if __name__ == "__main__":

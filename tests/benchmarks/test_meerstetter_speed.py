@@ -43,6 +43,9 @@ class Block:
     def regulate(self, target_celsius: float, current_limit: float = 4.0) -> None:
         pass
 
+    def terminals(self) -> tuple[float, float, float, float]:
+        return self.plate_temperature, self.sink_temperature, self.current, self.voltage
+
     def drive(self, current_ampere: float) -> None:
         pass
 

@@ -87,6 +87,9 @@ class Peltier:
     def plate_temperature(self):
         return 25.0 + 10.0 * self.current
 
+    def terminals(self):
+        return self.plate_temperature, self.sink_temperature, self.current, self.voltage
+
     def drive(self, current_ampere):
         self.current = current_ampere
 

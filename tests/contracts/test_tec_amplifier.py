@@ -37,6 +37,9 @@ class RecordingPlant:
         self.commands.append((self.world.time, "regulate", target_celsius))
         self.plant.regulate(target_celsius, current_limit)
 
+    def terminals(self):
+        return self.plate_temperature, self.sink_temperature, self.current, self.voltage
+
     def drive(self, current_ampere):
         self.commands.append((self.world.time, "drive", current_ampere))
         self.plant.drive(current_ampere)

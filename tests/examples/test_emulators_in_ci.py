@@ -22,7 +22,11 @@ def commands():
     return [line.split() for line in re.findall(r"- run: python (.*)", workflow) if "pip install" not in line]
 
 
-@pytest.mark.parametrize("command", commands(), ids=" ".join)
+@pytest.mark.parametrize(
+    "command",
+    [pytest.param(each, marks=pytest.mark.seeds if "--numprocesses" in each else []) for each in commands()],
+    ids=" ".join,
+)
 def test_the_workflow_passes(project, finished_process, command):
     # A folder of the project that has the name of one of the bench's packages is not mistaken for it.
     (project / "drivers").mkdir()

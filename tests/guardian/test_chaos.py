@@ -14,7 +14,11 @@ from bench.rig_file import load_rig
 
 RECONNECT = load_rig("vo2").safety.reconnect
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(sys.platform == "win32", reason="it forks")]
+pytestmark = [
+    pytest.mark.usefixtures("warm_popen"),
+    pytest.mark.slow,
+    pytest.mark.skipif(sys.platform == "win32", reason="it forks"),
+]
 
 
 PART = list(METHODS)[3::6]

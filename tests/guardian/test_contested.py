@@ -13,6 +13,8 @@ import pytest
 from bench.clock import Stopwatch, WallClock
 from bench.journal import Record
 
+pytestmark = pytest.mark.usefixtures("warm_popen")
+
 PROTOCOL = f"{Path(__file__).with_name('hanging_protocols.py')}:cycle"
 OVERRIDES = {"emulation.disturbances": "false"}
 LONGEST = 200.0

@@ -26,6 +26,7 @@ from bench.rig import Look, Rig
 from bench.rig_file import load_rig
 
 pytestmark = [
+    pytest.mark.usefixtures("warm_popen"),
     pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="signals of POSIX"),
     pytest.mark.timeout(240),
 ]

@@ -10,6 +10,7 @@ from kill_safe import SETPOINTS, TRIALS, harm_bench, harm_guardian
 from sim_devices.serving.process import serve
 
 pytestmark = [
+    pytest.mark.usefixtures("warm_popen"),
     pytest.mark.slow,
     pytest.mark.timeout(300),
     pytest.mark.skipif(not sys.platform.startswith("linux"), reason="it looks for processes as on Linux"),

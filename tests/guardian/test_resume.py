@@ -13,6 +13,8 @@ from bench.upkeep.opening import opened
 from bench.upkeep.recovery import clear_expired_watchdogs
 from sim_devices.serving.process import serve
 
+pytestmark = pytest.mark.usefixtures("warm_popen")
+
 
 @pytest.fixture
 def served():

@@ -19,7 +19,9 @@ def units(file):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", RIGS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=[] if name in ("vo2", "sma", "hybrid") else pytest.mark.seeds) for name in RIGS]
+)
 def test_none_acts_in_hours_without_a_fault(name):
     file = load_rig(name)
     clock = VirtualClock()

@@ -25,6 +25,9 @@ class Block:
     def regulate(self, target_celsius, current_limit=4.0):
         pass
 
+    def terminals(self):
+        return self.plate_temperature, self.sink_temperature, self.current, self.voltage
+
     def drive(self, current_ampere):
         pass
 

@@ -38,6 +38,9 @@ class Plate:
         self.calls.append((self.time, "regulate", target_celsius, current_limit))
         self.target, self.limit = target_celsius, current_limit
 
+    def terminals(self):
+        return self.plate_temperature, self.sink_temperature, self.current, self.voltage
+
     def drive(self, current_ampere):
         self.calls.append((self.time, "drive", current_ampere))
         self.target, self.current = None, current_ampere

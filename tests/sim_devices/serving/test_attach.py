@@ -10,6 +10,8 @@ import pytest
 from bench.attachment import ControlClient
 from bench.results.run_folder import RunFolder
 
+pytestmark = pytest.mark.usefixtures("warm_popen")
+
 CREEP = ["--set", "hot=70", "--set", "cool=50", "--set", "duration=10"]
 PATIENT = ["--override", "devices.tec.watchdog=300", "--override", "devices.tec.timeout=10",
            "--override", "devices.psd.timeout=30", "--no-rehearse"]  # fmt: skip

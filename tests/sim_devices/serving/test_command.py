@@ -10,6 +10,8 @@ import pytest
 
 from bench.attachment import ControlClient
 
+pytestmark = pytest.mark.usefixtures("warm_popen")
+
 
 def state_lines(file):
     return [json.loads(line) for line in file.read_text().splitlines()]

@@ -12,6 +12,8 @@ from sim_devices.serving.clock import LONGEST_STEP, ServedClock, make_served_clo
 from sim_devices.serving.process import serve
 from sim_devices.serving.requests import REQUESTS, parse_request
 
+pytestmark = pytest.mark.usefixtures("warm_popen")
+
 IDENTIFY = b"#0115AA?IF257D\r"
 IDENTITY = b"!0115AA8065-TEC SW"
 

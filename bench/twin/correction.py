@@ -1,0 +1,200 @@
+"""What of the model's error repeats: a Preisach density on a plane finer than the model's, smooth along it.
+
+A model of few cells has the mean density of each, and answers a reversal that is shorter than a cell as if hysterons
+of every width down to none switched back. How the specimen answers shows in the few readings after each turning point
+of a characterization, and what holds at one of them nearly holds at the next. So the density is taken as smooth, more
+so along the diagonal, from turning point to turning point, than across it, from short reversals to long ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.hysteresis import Operator, Preisach, uniform_levels
+from bench.hysteresis._checks import Floats
+from bench.identification.least_squares import one_thread
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
+_LEVELS = 80
+"""Least levels of the plane."""
+_CENTRES = 40
+"""Intervals between the nodes of the density along the diagonal."""
+_WIDTHS = np.array([0, 1, 2, 3, 4, 5, 6, 8, 10, 12, 16, 20, 26, 34, 44, 60, 80]) / 80.0
+"""Nodes of the density across the diagonal: α - β, as a share of the plane."""
+_ALONG = 10.0
+"""Weight of the roughness along the diagonal, against that across it."""
+_SIZE = 1e-3
+"""Weight of the size of the density, against its roughness."""
+_PENALTIES = 10.0 ** np.arange(-7.0, 1.0)
+"""Penalties that cross-validation tries, relative to the mean square of the columns."""
+_FOLDS = 5
+_BLOCK = 40
+"""Folds of the cross-validation, and rows that stay together in it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Correction:
+    """What is added to a model.
+
+    Attributes
+    ----------
+    operator : Operator or None
+        Gives what of the errors repeats; None if nothing does.
+    rms : float
+        Error that is left, output units.
+    unknown : ndarray
+        The error at each reading, of a correction that was made without it, output units.
+    """
+
+    operator: Operator[Any] | None
+    rms: float
+    unknown: Floats
+
+
+def identify_correction(
+    model: Operator[Any], inputs: Sequence[Floats], errors: Floats, chosen: NDArray[np.bool_]
+) -> Correction:
+    """Identify what of the errors of a model repeats.
+
+    Where the model is a Preisach operator, the smooth density takes the place of the model's, or is added to it;
+    cross-validation decides between both, and how smooth it is.
+
+    Parameters
+    ----------
+    model : Operator
+        The model.
+    inputs : sequence of ndarray
+        What the specimen saw of the drive at the rows of each run, input units.
+    errors : ndarray
+        Measured less modelled response at the rows of all runs, output units.
+    chosen : ndarray of bool
+        Which of the rows count.
+    """
+    low, high = min(each.min() for each in inputs), max(each.max() for each in inputs)
+    plane = model.plane or (float(low), float(high))
+    levels, own = _refined(model, plane)
+    template = Preisach(
+        levels,
+        np.zeros(own.size),
+        input_range=(min(plane[0], float(low)), max(plane[1], float(high))),
+        input_unit=model.input_unit,
+        output_unit=model.output_unit,
+    )
+    nodes, roughness = _smooth_densities(levels)
+    parts = []
+    for each, kept in zip(inputs, np.split(chosen, np.cumsum([each.size for each in inputs])[:-1]), strict=True):
+        cells = template.regressor(each).dense()[kept]
+        parts.append(np.column_stack([nodes.T.dot(cells.T).T, np.ones(cells.shape[0]), cells @ own]))
+    columns, taken = np.split(np.concatenate(parts), [-1], axis=1)
+    target = errors[chosen]
+    # Beside the density of the model, and in place of it if it has one.
+    replaced = [np.zeros(own.size), *([own] if own.any() else [])]
+    targets = np.column_stack([target, target + taken[:, 0]])[:, : len(replaced)]
+    penalty = np.zeros((columns.shape[1],) * 2)
+    penalty[:-1, :-1] = roughness * (float(np.mean(columns[:, :-1] ** 2)) * target.size or 1.0)
+    # Of matrices of this size, threads that wait for each other cost more than they save.
+    with one_thread():
+        unknown = _held_out(columns, targets, penalty)
+    losses = np.sum(unknown**2, axis=1)
+    weight, which = (int(each) for each in np.unravel_index(np.argmin(losses), losses.shape))
+    if losses[weight, which] >= float(target @ target):
+        return Correction(None, float(np.sqrt(np.mean(target**2))), target)
+    gram, right = columns.T @ columns + _PENALTIES[weight] * penalty, columns.T @ targets[:, which]
+    # What takes the place of a density that is nowhere negative is so too.
+    bounded = which == 1 and own.min() >= 0.0
+    solution = _not_negative(gram, right) if bounded else np.asarray(np.linalg.solve(gram, right))
+    left = targets[:, which] - columns @ solution
+    operator = template.with_coefficients(nodes @ solution[:-1] - replaced[which], float(solution[-1]))
+    return Correction(operator, float(np.sqrt(np.mean(left**2))), unknown[weight, :, which])
+
+
+def _held_out(columns: Floats, targets: Floats, penalty: Floats) -> Floats:
+    """Return the errors of cross-validation, by penalty, row and target."""
+    from scipy.linalg import solve
+
+    gram, right = columns.T @ columns, columns.T @ targets
+    folds = (np.arange(targets.shape[0]) // _BLOCK) % _FOLDS
+    unknown = np.zeros((_PENALTIES.size, *targets.shape))
+    for fold in range(_FOLDS):
+        out = folds == fold
+        held = columns[out]
+        kept, sums = gram - held.T @ held, right - held.T @ targets[out]
+        for number, weight in enumerate(_PENALTIES):
+            unknown[number, out] = targets[out] - held @ solve(kept + weight * penalty, sums, assume_a="pos")
+    return unknown
+
+
+def _not_negative(gram: Floats, right: Floats) -> Floats:
+    """Return the solution of normal equations of which only the last unknown, a constant, may be negative."""
+    from scipy.linalg import cholesky, solve_triangular
+    from scipy.optimize import nnls
+
+    count, sums = gram[-1, -1], gram[:-1, -1]
+    root = cholesky(gram[:-1, :-1] - np.outer(sums, sums) / count, lower=True)
+    part = right[:-1] - sums * right[-1] / count
+    found, _ = nnls(root.T, solve_triangular(root, part, lower=True), maxiter=20 * part.size)
+    return np.append(found, (right[-1] - sums @ found) / count)
+
+
+def _refined(model: Operator[Any], plane: tuple[float, float]) -> tuple[Floats, Floats]:
+    """Return levels, fine enough, and the density of the model on them, zeros if it has none."""
+    if not isinstance(model, Preisach):
+        return uniform_levels(*plane, _LEVELS), np.zeros(_LEVELS * (_LEVELS + 1) // 2)
+    parts = -(-_LEVELS // model.order)
+    order = parts * model.order
+    levels = np.interp(np.arange(order + 1) / parts, np.arange(model.order + 1), model.levels)
+    whole = np.zeros((model.order, model.order))
+    whole[np.tril_indices(model.order)] = model.density
+    upper, lower = np.tril_indices(order)
+    return levels, whole[upper // parts, lower // parts]
+
+
+def _smooth_densities(levels: Floats) -> tuple[csr_array, Floats]:
+    """Return what each node adds to the density of each cell, and the roughness of the nodes.
+
+    Nodes stand on a lattice of centres and widths, and between them the density is bilinear. Shapes (K, P), (P, P).
+    """
+    from scipy.sparse import csr_array
+
+    low, span = float(levels[0]), float(levels[-1] - levels[0])
+    upper, lower = np.tril_indices(levels.size - 1)
+    middles = 0.5 * (levels[1:] + levels[:-1])
+    widths = np.where(upper == lower, np.diff(levels)[upper] / 3.0, middles[upper] - middles[lower]) / span
+    centres = (0.5 * (middles[upper] + middles[lower]) - low) / span
+    nodes = np.linspace(0.0, 1.0, _CENTRES + 1)
+    first, second = _shares(centres, nodes), _shares(widths, _WIDTHS)
+    cells = np.arange(upper.size)
+    entries = [
+        (share * other, cells, place * _WIDTHS.size + beside) for place, share in first for beside, other in second
+    ]
+    values, rows, columns = (np.concatenate(each) for each in zip(*entries, strict=True))
+    size = nodes.size * _WIDTHS.size
+    densities = csr_array((values, (rows, columns)), shape=(upper.size, size))
+    along, across = _bends(np.arange(nodes.size, dtype=np.float64)), _bends(_CENTRES * 2.0 * _WIDTHS)
+    roughness = _ALONG * np.kron(along, np.eye(_WIDTHS.size)) + np.kron(np.eye(nodes.size), across)
+    return densities, roughness + _SIZE * np.eye(size)
+
+
+def _shares(places: Floats, nodes: Floats) -> list[tuple[NDArray[np.int64], Floats]]:
+    """Return the two nodes that each place lies between, and the share of each."""
+    before = np.clip(np.searchsorted(nodes, places) - 1, 0, nodes.size - 2)
+    share = np.clip((places - nodes[before]) / (nodes[before + 1] - nodes[before]), 0.0, 1.0)
+    return [(before, 1.0 - share), (before + 1, share)]
+
+
+def _bends(nodes: Floats) -> Floats:
+    """Return the matrix of the sum of the squared bends of a piecewise linear function at its inner nodes."""
+    gaps = np.diff(nodes)
+    bends = np.zeros((nodes.size - 2, nodes.size))
+    inner = np.arange(nodes.size - 2)
+    bends[inner, inner], bends[inner, inner + 2] = 1.0 / gaps[:-1], 1.0 / gaps[1:]
+    bends[inner, inner + 1] = -1.0 / gaps[:-1] - 1.0 / gaps[1:]
+    bends *= np.sqrt(gaps[:-1] * gaps[1:])[:, None]
+    return np.asarray(bends.T @ bends)

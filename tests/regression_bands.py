@@ -1,0 +1,48 @@
+"""Bands of the studies' errors: none may be half as much again as what was recorded.
+
+The goals of a study leave room; a controller could lose most of its accuracy and still meet them. The numbers
+recorded are those of seed 0:
+
+    bench reproduce vo2 --out recordings --json result.json
+    python tests/regression_bands.py vo2 result.json
+"""
+
+import json
+import sys
+from pathlib import Path
+
+RECORDED = Path(__file__).parent / "reproduce" / "recorded"
+ERRORS = {"rms", "max", "median", "average", "settling", "seconds"}
+BAND = 1.5
+RECORDED_SEED = 0
+
+
+def errors_of(result):
+    """Return the errors among the numbers of a study by their dotted names."""
+    # Imported late: most tests do not need it.
+    from bench.campaigns.tasks import flat_numbers
+
+    return {
+        name: value
+        for name, (value, _) in flat_numbers(result)
+        if ERRORS & set(name.rpartition(".")[2].split("_")) and not name.endswith("_seconds")
+    }
+
+
+def beyond_the_bands(study, result):
+    """Return a line for each error that is missing, or beyond its band."""
+    found, recorded = errors_of(result), json.loads((RECORDED / f"{study}.json").read_text(encoding="utf-8"))
+    return [
+        f"{name}: {found.get(name)}, recorded {value:g}"
+        for name, value in recorded.items()
+        if name not in found or not found[name] <= BAND * value
+    ]
+
+
+if __name__ == "__main__":
+    study, file = sys.argv[1:]
+    errors = errors_of(json.loads(Path(file).read_text(encoding="utf-8")))
+    rounded = {name: float(f"{value:.3g}") for name, value in errors.items() if value}
+    RECORDED.mkdir(exist_ok=True)
+    (RECORDED / f"{study}.json").write_text(json.dumps(rounded, indent=1) + "\n", encoding="utf-8")
+    print(f"{len(rounded)} errors in {RECORDED / study}.json")
