@@ -276,7 +276,20 @@ class AttachedClock(Clock):
         """
         if not math.isfinite(seconds):
             raise ValueError(f"seconds: expected a finite number, got {seconds}")
-        end = self.now() + seconds
+        self._wait_until(self.now() + seconds)
+
+    def sleep_until(self, instant: float) -> None:
+        """Wait until the server's time is `instant`, s; ends early when `interrupted`.
+
+        The server is not asked for the time before: it is no earlier than it was last.
+
+        Raises `ValueError` if the instant is not finite.
+        """
+        if not math.isfinite(instant):
+            raise ValueError(f"instant: expected a finite number, got {instant}")
+        self._wait_until(instant)
+
+    def _wait_until(self, end: float) -> None:
         while (now := self._last) < end and not self.interrupted():
             until = min(end, now + _LONGEST_NAP * self.factor)
             if self._alone is None:

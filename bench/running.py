@@ -363,7 +363,11 @@ class RunAtHand:
                 problem = self._change(rest)
             elif command == OFF:
                 off = off or self.switch_off()
-                text = "the outputs are off until the run is resumed"
+                text = (
+                    "the outputs are off until the run is resumed, which sends the set-points from before again; a "
+                    "specimen with memory is not where it was then: to have it brought back first, end the run and "
+                    "use `bench resume`"
+                )
             else:
                 break
         self._interrupts.pause_requested = False

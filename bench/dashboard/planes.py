@@ -38,6 +38,7 @@ class Planes:
         self._others = {path: model for model in densities if (path := self._path_of(model)) != "plane"}
         self._memories: dict[str, SignalMemory | StageMemory] = {}
         self._extents: dict[str, tuple[float, float]] = {}
+        self._has_density = len(self._others) < len(densities)
         if self._extent is not None:
             self._memories["plane"] = SignalMemory(columns[0])
             self._extents["plane"] = self._extent
@@ -80,6 +81,7 @@ class Planes:
     def draw_density(self, recording: Recording, model: ModelDensity) -> None:
         """Draw a density with its legend, on a plane of its own if it is over another input than the first."""
         density, path = model.density, self._path_of(model)
+        self._has_density |= path == "plane"
         x_unit, y_unit = density.unit or self._x.unit, density.output_unit or self._y.unit
         low, high, cells = float(density.levels[0]), float(density.levels[-1]), len(density.levels) - 1
         if path == "plane":
@@ -111,14 +113,18 @@ class Planes:
             f"{path}/legend/title", texts([(middle, above - 0.23), (middle, above - 0.16)], [model.name, title])
         )
 
-    def views(self) -> list[rrb.Spatial2DView | rrb.Tabs]:
-        """Return the view of the first input's plane, and those of the others in tabs."""
+    def views(self, *, has_moved: bool) -> list[rrb.Spatial2DView | rrb.Tabs]:
+        """Return the view of the first input's plane, if there is a density or a memory, and the others in tabs."""
         views = [
             xy_view(path, f"Preisach plane of {model.density.title or model.name}")
             for path, model in sorted(self._others.items())
         ]
         others = [rrb.Tabs(*views, active_tab=0)] if len(views) > 1 else views
-        first = [xy_view("plane", "Preisach plane")] if self._extent is not None else []
+        first = (
+            [xy_view("plane", "Preisach plane")]
+            if self._extent is not None and (has_moved or self._has_density)
+            else []
+        )
         return [*first, *others]
 
     def _path_of(self, model: ModelDensity) -> str:

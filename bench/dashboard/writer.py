@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -27,9 +27,11 @@ from bench.dashboard.timeline import Timeline
 from bench.dashboard.xy_plots import Point, XYPlots
 from bench.devices import Signal
 from bench.errors import ConfigurationError
+from bench.interlocks import SETPOINT
 from bench.journal import StepRecord, run_card
 from bench.lateness import lateness_lines
 from bench.layout import DashboardLayout
+from bench.protocol.vocabulary import LATENESS
 
 
 class Writer:
@@ -69,6 +71,8 @@ class Writer:
             for plot in self._signals
         }
         names = [signal.name for signal in signals]
+        self._lateness_column = names.index(LATENESS.name) if LATENESS.name in names else None
+        self._commanded = {} if self._plots is None else _commanded(signals, self._plots.inputs)
         self._over_time = {names.index(name) for name in meta.get("over_time") or () if name in names}
         shown = [self._control.output] if self._control else list(self._plots.columns[::-1] if self._plots else ())
         self._numbers = Numbers(meta, signals, shown or sorted(self._over_time)[:2] or [0], bounds, self._errors)
@@ -130,10 +134,11 @@ class Writer:
             None if self._errors is None else self._errors.range(),
             math.inf if self._errors is None else seldom(self._errors.seconds_bright(self._timeline.t)),
             self._numbers.state,
+            frozenset() if self._plots is None else self._plots.moved,
         )
         if wanted != self._arranged:
             self._arranged = wanted
-            self.recording.arrange(self._blueprint(*wanted))
+            self.recording.arrange(self._blueprint(*wanted[:4]))
 
     def warn(self, text: str) -> None:
         """Report a problem of the dashboard itself in the log."""
@@ -161,12 +166,23 @@ class Writer:
             self._filled.add(name)
 
     def _points(self, entries: Sequence[Entry]) -> Iterator[Point]:
-        """Yield the points of the XY plots: each reading and, under control, each tick."""
+        """Yield the points of the XY plots: each reading and, under control and in a fast loop, each tick."""
         for entry in entries:
             if isinstance(entry, StepRecord):
                 yield entry.finished, entry.step, entry.values, True
-            elif isinstance(entry, Tick) and self._control is not None and self._control.is_at_work(entry.values):
-                yield *entry, False
+            elif isinstance(entry, Tick):
+                if self._lateness_column is not None and math.isfinite(entry.values[self._lateness_column]):
+                    yield entry.t, entry.step, self._with_commands(entry.values), False
+                elif self._control is not None and self._control.is_at_work(entry.values):
+                    yield *entry, False
+
+    def _with_commands(self, values: Sequence[float]) -> Sequence[float]:
+        """Return values of a sample of a fast loop, which reads no actuator, with what the actuators were set to."""
+        with_commands = list(values)
+        for column, setpoint in self._commanded.items():
+            if math.isfinite(values[setpoint]):
+                with_commands[column] = values[setpoint]
+        return with_commands
 
     def _blueprint(
         self, filled: frozenset[str], error_range: float | None, bright: float, state: str
@@ -186,11 +202,26 @@ class Writer:
                 over_time=over_time,
                 others=others,
                 plots=[] if self._plots is None else self._plots.views(bright),
-                planes=[] if self._planes is None else self._planes.views(),
+                planes=[]
+                if self._planes is None
+                else self._planes.views(has_moved=self._plots is not None and self._plots.has_first_moved),
                 lateness=self._lateness.view(),
                 state=state,
             )
         )
+
+
+def _commanded(signals: Sequence[Signal], columns: Collection[int]) -> dict[int, int]:
+    """Return the columns of the set-points that signals of actuators follow, by the columns of these."""
+    setpoints = {
+        signal.name.removesuffix(SETPOINT): i for i, signal in enumerate(signals) if signal.name.endswith(SETPOINT)
+    }
+    return {
+        column: setpoint
+        for column in columns
+        for device, setpoint in setpoints.items()
+        if signals[column].name.startswith(f"{device}_") and signals[column].unit == signals[setpoint].unit
+    }
 
 
 def _layout_of(meta: Mapping[str, Any]) -> DashboardLayout | None:

@@ -1,8 +1,9 @@
 """Plots of one signal over another.
 
-A point is a reading of a step or, while a controller is at work, a tick. Every tick moves the memory, but a point is
-drawn only if it comes `_REDRAW_SECONDS` after the last one and differs visibly from it; the line to it passes
-through the points left out. Under control the lines to old targets are pale, and those to the last ones bright.
+A point is a reading of a step or, while a controller or a fast loop is at work, a tick. Every tick moves the memory,
+but a point is drawn only if it comes `_REDRAW_SECONDS` after the last one and differs visibly from it; the line to it
+passes through the points left out. Under control the lines to old targets are pale, those to the last ones bright.
+A plot is shown once its input has moved.
 """
 
 from __future__ import annotations
@@ -23,6 +24,9 @@ from bench.layout import DashboardLayout
 _REDRAW_SECONDS = 0.1
 _VISIBLE = 0.002
 """Visible part of an axis; a controller at its target moves by less."""
+
+_MOVED = 0.01
+"""Part of its axis by which the input of a plot has to move for the plot to be shown."""
 
 _PALE = 0.35
 """Part of their colour in that of the lines to old targets; the rest is grey."""
@@ -71,6 +75,21 @@ class XYPlots:
     def columns(self) -> tuple[int, int]:
         """Columns of the first plot's input and output."""
         return self._tracks[0].x, self._tracks[0].y
+
+    @property
+    def inputs(self) -> set[int]:
+        """Columns of the inputs of all plots."""
+        return {track.x for track in self._tracks}
+
+    @property
+    def moved(self) -> frozenset[str]:
+        """Paths of the plots whose inputs have moved."""
+        return frozenset(track.path for track in self._tracks if track.has_moved)
+
+    @property
+    def has_first_moved(self) -> bool:
+        """Whether the input of the first plot has moved."""
+        return self._tracks[0].has_moved
 
     def draw(self, recording: Recording) -> None:
         """Draw the axes."""
@@ -121,10 +140,11 @@ class XYPlots:
         return drawn
 
     def views(self, bright: float) -> list[rrb.Spatial2DView]:
-        """Return a view of each plot, whose path is bright for so many seconds."""
+        """Return a view of each plot whose input has moved; its path is bright for so many seconds."""
         return [
             xy_view(track.path, name, self._past(track.path, bright))
             for track, name in zip(self._tracks, self._names, strict=True)
+            if track.has_moved
         ]
 
     def _past(self, path: str, bright: float) -> dict[str, float]:
@@ -148,11 +168,20 @@ class _Track:
         self._visible = [_VISIBLE * (high - low) for low, high in (extent, frame.y_range)]
         self._line: _Line = []
         self._drawn = -math.inf
+        self._ends = math.inf, -math.inf
+        self._least_move = _MOVED * (frame.x_range[1] - frame.x_range[0])
+
+    @property
+    def has_moved(self) -> bool:
+        """Whether the input has moved."""
+        low, high = self._ends
+        return high - low > self._least_move
 
     def reach(self, shown: Sequence[tuple[int, _Line]]) -> bool:
         """Let the frame grow to lines; return whether it did."""
         before = self.frame
         x, y = zip(*(point for _, line in shown for point in line), strict=True)
+        self._ends = min(self._ends[0], *x), max(self._ends[1], *x)
         self.frame = before.grown((min(x), max(x)), (min(y), max(y)))
         return self.frame is not before
 

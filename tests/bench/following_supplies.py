@@ -1,6 +1,7 @@
 """A rig of any number of bench supplies, and a loop that makes their outputs follow a sine."""
 
 import math
+from collections.abc import Mapping
 
 from bench.control.tracking import Trace
 from bench.protocol import FixedRate, Messages, ProtocolParameters, parameter, protocol
@@ -14,14 +15,15 @@ period = 1.0
 
 [safety]
 unattended = false
-
+"""
+_EMULATION = """
 [emulation]
 laboratory = "scpi"
 """
 _SUPPLY = """
 [devices.supply{i}]
 driver = "scpi-voltage-supply"
-port = "emulated://supply{i}"
+port = "{port}"
 baudrate = 115200
 identity = "EXAMPLE,PS-3005,{{any}}"
 
@@ -42,7 +44,8 @@ unit = "V"
 [devices.supply{i}.signals.current]
 query = "MEAS:CURR?"
 unit = "A"
-
+"""
+_EMULATED = """
 [emulation.signals.supply{i}_voltage]
 time_constant = 0.01
 
@@ -53,8 +56,14 @@ constants = {{ resistance = "10 ohm" }}
 
 
 def rig_of(count: int) -> str:
-    """Return the rig file of so many supplies."""
-    return _HEAD + "".join(_SUPPLY.format(i=i) for i in range(count))
+    """Return the rig file of so many emulated supplies."""
+    supplies = "".join(_SUPPLY.format(i=i, port=f"emulated://supply{i}") for i in range(count))
+    return _HEAD + supplies + _EMULATION + "".join(_EMULATED.format(i=i) for i in range(count))
+
+
+def hardware_of(count: int, ports: Mapping[str, str]) -> str:
+    """Return the rig file of so many supplies at serial ports, by their names."""
+    return _HEAD + "".join(_SUPPLY.format(i=i, port=ports[f"supply{i}"]) for i in range(count))
 
 
 class Follower:

@@ -19,6 +19,7 @@ from bench.journal import Event, StepRecord
 from bench.lateness import Lateness
 from bench.layout import DashboardLayout
 from bench.protocol import TRACES, Views, find_protocol
+from bench.protocol.vocabulary import LATENESS
 from bench.settling import Settled
 
 SIGNALS = (
@@ -81,9 +82,11 @@ def seen(entries: list[object]) -> Errors:
     return errors
 
 
-def written(path: Path, entries: list[object], meta: dict[str, object]) -> tuple[set[str], dict[str, list[object]]]:
-    """Return the origins of the views of a recording, and its last panel of numbers."""
-    writer = Writer(SIGNALS, meta)
+def written(
+    path: Path, entries: list[object], meta: dict[str, object], signals: tuple[Signal, ...] = SIGNALS
+) -> tuple[set[str], dict[str, list[object]]]:
+    """Return the origins of the views of a recording, and what changes in it."""
+    writer = Writer(signals, meta)
     writer.open(path, None)
     writer.write(entries)  # type: ignore[arg-type]
     writer.arrange()
@@ -257,3 +260,34 @@ def test_the_error_that_a_witness_sees_is_told_from_the_noise_of_the_sensor(tmp_
         for text in row
     ]
     assert "# 3.00 1/m\n\nRMS of the error of late, by the witness" in texts[-1]
+
+
+LOOP = DashboardLayout(
+    input="tec_temperature", output="curvature", input_range=(20.0, 90.0), output_range=(0.0, 2e3), plane=(30.0, 70.0)
+)
+
+
+def fast_loop(temperature: float, spread: float) -> list[object]:
+    """Return the samples of a fast loop, which reads no actuator: the temperature is an old one."""
+    return [
+        Tick(0.2 * i, 0, (50.0 + spread * math.sin(i / 8), temperature, 500.0 + i, *NOTHING, 0.0)) for i in range(100)
+    ]
+
+
+def drawn(path: Path, entries: list[object]) -> tuple[set[str], list[float]]:
+    """Return the origins of the views, and the inputs at which the points of the loop stand."""
+    signals, meta = (*SIGNALS, LATENESS), {**META, "controls": "", "dashboard": LOOP.model_dump(mode="json")}
+    origins, values = written(path, entries, meta, signals)
+    return origins, [position[0] for row in values.get("/loop/data/now positions", []) for position in row]
+
+
+def test_a_loop_is_shown_once_its_input_has_moved(tmp_path: Path) -> None:
+    still, _ = drawn(tmp_path / "still.rrd", fast_loop(55.0, 0.01))
+    moved, _ = drawn(tmp_path / "moved.rrd", fast_loop(55.0, 10.0))
+    assert moved - still == {"/loop", "/plane"}
+
+
+def test_the_loop_of_a_fast_loop_is_over_the_set_point(tmp_path: Path) -> None:
+    _, inputs = drawn(tmp_path / "fast.rrd", fast_loop(55.0, 10.0))
+    assert min(inputs) == pytest.approx(40.0, abs=0.5)
+    assert max(inputs) == pytest.approx(60.0, abs=0.5)

@@ -879,7 +879,8 @@ class TestInterrupted:
         assert b.tec.safe_times == b.probe.safe_times == 2
         off = b.tec.calls.index("safe")
         assert b.tec.calls[off - 1 : off + 2] == ["set", "safe", "set"]
-        assert asked[1].text == "the outputs are off until the run is resumed"
+        assert asked[1].text.startswith("the outputs are off until the run is resumed")
+        assert "bench resume" in asked[1].text
         with b.record() as run:
             assert [each.text[:11] for each in run.events() if each.kind == "off"] == ["outputs off", "outputs on "]
 

@@ -6,7 +6,7 @@ from contextlib import suppress
 
 import pytest
 
-from bench.attachment import ControlClient
+from bench.attachment import AttachedClock, ControlClient
 from bench.errors import ConfigurationError, DeviceConnectionError
 from sim_devices.serving.clock import LONGEST_STEP, ServedClock, make_served_clock
 from sim_devices.serving.process import serve
@@ -293,6 +293,36 @@ def test_the_wall_clock_is_not_advanced(emulate):
         control.request("stop")
         assert process.wait(60) == 0
         control.close()
+
+
+class CountingClient:
+    """A control connection to a clock that stands where it was waited for; counts what it is asked."""
+
+    def __init__(self):
+        self.at, self.asked = 5.0, []
+
+    def request(self, do, **_keys):
+        self.asked.append(do)
+        return {"time": self.at, "factor": 1.0, "epoch": "2026-01-01T00:00:00+00:00"}
+
+    def time(self):
+        return self.request("time")["time"]
+
+    def wait(self, until):
+        self.at = max(self.at, until)
+        return self.request("wait")["time"]
+
+
+def test_an_instant_that_has_passed_is_not_asked_for():
+    client = CountingClient()
+    clock = AttachedClock(lambda: client, "vo2")
+    clock.sleep_until(4.0)
+    assert client.asked == ["time"]
+    clock.sleep_until(5.05)
+    assert client.asked == ["time", "wait"]
+    assert clock.now() == 5.05
+    with pytest.raises(ValueError, match="instant: expected a finite number, got inf"):
+        clock.sleep_until(float("inf"))
 
 
 def test_a_stalled_server_loses_time_and_says_so():
