@@ -220,7 +220,6 @@ def _leaves(key: str, value: Any) -> Iterator[tuple[str, Any]]:  # noqa: ANN401 
         yield key, value
 
 
-@cache
 def _versions() -> Mapping[str, str]:
     """Return the versions of the packages that compute, talk to instruments, or register parts."""
     packages = set(_PACKAGES)
@@ -231,6 +230,7 @@ def _versions() -> Mapping[str, str]:
     return {package: version_of(package) for package in sorted(packages)}
 
 
+@cache
 def version_of(package: str) -> str:
     """Return the version of a distribution, or `not installed`."""
     try:

@@ -54,6 +54,8 @@ class Campaign:
         Whether to serve the live view.
     workers : Workers
         Who carries the runs out, and draws the figures.
+    figure_format : {"png", "pdf", "svg"}
+        Of the figures.
     started : list of Pending
         The runs that were started so far, in the parts of this campaign as well.
     """
@@ -63,6 +65,7 @@ class Campaign:
     seed: int
     live: bool
     workers: Workers
+    figure_format: str = "png"
     started: list[Pending[RunResult]] = field(default_factory=list)
     _seeds: Iterator[int] = field(init=False)
     _whole: Campaign | None = None
@@ -73,7 +76,7 @@ class Campaign:
 
     def part(self, name: str, rig: str) -> Campaign:
         """Return a campaign on another rig, in a folder of its own below this one."""
-        return Campaign(rig, self.folder / name, self.seed, self.live, self.workers, _whole=self)
+        return Campaign(rig, self.folder / name, self.seed, self.live, self.workers, self.figure_format, _whole=self)
 
     @property
     def runs(self) -> list[RunResult]:
@@ -128,7 +131,7 @@ class Campaign:
         given, named
             Its other arguments; can be pickled.
         """
-        path = self.folder / "figures" / f"{name}.png"
+        path = self.folder / "figures" / f"{name}.{self.figure_format}"
         self.workers.submit_as(f"figure {name}", plot, path, *given, **named)
         return path
 
@@ -271,6 +274,7 @@ def reproduce(
     live: bool,
     console: Console,
     workers: int | None = None,
+    figure_format: str = "png",
 ) -> dict[str, Any]:
     """Carry out a study, export the recordings of its runs, and print its tables.
 
@@ -296,6 +300,8 @@ def reproduce(
     workers : int, optional
         How many runs, figures and recordings are worked at beside each other; as many as there are cores if not
         given. The values do not depend on it.
+    figure_format : {"png", "pdf", "svg"}
+        Of the figures.
 
     Raises
     ------
@@ -322,7 +328,7 @@ def reproduce(
     stopwatch = Stopwatch()
     folder = out / f"reproduce-{name}-seed-{seed}"
     with Workers(1 if live else workers, console, name) as pool:
-        campaign = Campaign(rig or study.rig or "", folder, seed, live, pool)
+        campaign = Campaign(rig or study.rig or "", folder, seed, live, pool, figure_format)
         found = study.carry_out(campaign)
         exports = [
             pool.submit_as(f"recording of {run.folder.name}", export_run, run.folder, "rrd", None)

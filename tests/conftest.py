@@ -157,7 +157,7 @@ def warm_popen(warm_start):
         yield
 
 
-@pytest.fixture
+@pytest.fixture(scope="module")
 def warm_process(finished_process, warm_popen):
     """Do as `finished_process`, warm."""
     return finished_process

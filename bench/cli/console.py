@@ -7,6 +7,7 @@ import os
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
@@ -19,6 +20,19 @@ from bench.errors import BenchError, ConfigurationError, DataError
 
 console = Console()
 error_console = Console(stderr=True)
+
+
+class FigureFormat(StrEnum):
+    """Formats of figures."""
+
+    PNG = "png"
+    PDF = "pdf"
+    SVG = "svg"
+
+
+FigureFormatOption = Annotated[
+    FigureFormat, typer.Option("--figures", help="Format of the figures; pdf and svg for papers.")
+]
 
 JsonOption = Annotated[
     Path | None, typer.Option("--json", metavar="FILE", help="Write the result as JSON, for programs.")

@@ -8,18 +8,10 @@ from typing import Annotated
 
 import typer
 
-from bench.cli.console import JsonOption, console, show_compilation, write_json
+from bench.cli.console import FigureFormat, FigureFormatOption, JsonOption, console, show_compilation, write_json
 from bench.printing import print_plain
 
 app = typer.Typer()
-
-
-class FigureFormat(StrEnum):
-    """Formats of figures."""
-
-    PNG = "png"
-    PDF = "pdf"
-    SVG = "svg"
 
 
 @app.command()
@@ -37,9 +29,7 @@ def report(
             help="Folder for figures and page; if not given, `report` and `report.html` in the folder of the run.",
         ),
     ] = None,
-    figures: Annotated[
-        FigureFormat, typer.Option(help="Format of the figures; pdf and svg for papers.")
-    ] = FigureFormat.PNG,
+    figures: FigureFormatOption = FigureFormat.PNG,
     json_file: JsonOption = None,
 ) -> None:
     """Tables, figures and a page of a run: what happened, extremes, margins, and how models do on it.

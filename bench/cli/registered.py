@@ -12,7 +12,15 @@ from typer.core import TyperGroup
 from typer.models import CommandInfo
 
 from bench import registry
-from bench.cli.console import JsonOption, LiveOption, console, show_compilation, write_json
+from bench.cli.console import (
+    FigureFormat,
+    FigureFormatOption,
+    JsonOption,
+    LiveOption,
+    console,
+    show_compilation,
+    write_json,
+)
 from bench.errors import ConfigurationError
 
 
@@ -87,11 +95,22 @@ class Studies(RegisteredCommands):
                     min=1, help="Runs that go on beside each other; as many as there are cores if not given."
                 ),
             ] = None,
+            figures: FigureFormatOption = FigureFormat.PNG,
             json_file: JsonOption = None,
         ) -> None:
             from bench.studies import reproduce
 
-            result = reproduce(name, part, rig=rig, seed=seed, out=out, live=live, console=console, workers=workers)
+            result = reproduce(
+                name,
+                part,
+                rig=rig,
+                seed=seed,
+                out=out,
+                live=live,
+                console=console,
+                workers=workers,
+                figure_format=figures.value,
+            )
             write_json(json_file, result)
 
         carry_out_study.__doc__ = f"{part.summary}\n\n{part.description}"

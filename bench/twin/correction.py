@@ -145,13 +145,13 @@ def _not_negative(gram: Floats, right: Floats) -> Floats:
 
 def _refined(model: Operator[Any], plane: tuple[float, float]) -> tuple[Floats, Floats]:
     """Return levels, fine enough, and the density of the model on them, zeros if it has none."""
-    if not isinstance(model, Preisach):
+    found = model.densities()
+    if not found:
         return uniform_levels(*plane, _LEVELS), np.zeros(_LEVELS * (_LEVELS + 1) // 2)
-    parts = -(-_LEVELS // model.order)
-    order = parts * model.order
-    levels = np.interp(np.arange(order + 1) / parts, np.arange(model.order + 1), model.levels)
-    whole = np.zeros((model.order, model.order))
-    whole[np.tril_indices(model.order)] = model.density
+    coarse, whole = found[0].levels, found[0].values
+    parts = -(-_LEVELS // whole.shape[0])
+    order = parts * whole.shape[0]
+    levels = np.interp(np.arange(order + 1) / parts, np.arange(coarse.size), coarse)
     upper, lower = np.tril_indices(order)
     return levels, whole[upper // parts, lower // parts]
 

@@ -33,8 +33,9 @@ def carried_out(tmp_path):
 
 def test_a_study_gives_the_same_to_the_last_bit_with_one_worker_and_with_two(carried_out, tmp_path):
     results = {}
-    for workers in (1, 2):
-        result, text = carried_out(small_study.STUDY, workers)
+    for workers, figure_format in ((1, "png"), (2, "svg")):
+        result, text = carried_out(small_study.STUDY, workers, figure_format=figure_format)
+        assert {Path(path).suffix for path in result["figures"]} == {f".{figure_format}"}
         assert "runs" in text
         assert all(Path(path).stat().st_size > 1000 for path in result["figures"] + result["recordings"])
         assert len(result["recordings"]) == 4

@@ -84,7 +84,7 @@ def test_from_characterization_to_report(bench, tmp_path, rig):
     )
     assert code == 0, err
 
-    _, validation = run("random-validation", count=4, **dwell)
+    _, validation = run("random-validation", count=10, **dwell)
     assert len(validation) >= 4
 
     tracking, steps = run("tracking", model=model, controller="closed-loop-inverse", count=5)
