@@ -5,7 +5,8 @@
 - `runs`: virtual runs beside busy processes, whose records have to be equal to the last bit.
 - `clock`: a run at a scaled clock beside them, which has to complete; shows the factor that it reached.
 - `study`: a study of the lowest priority beside four of them, which also has to compile every kernel: its numbers
-  have to be those of the same without them. It takes as long as the scheduler lets it, up to hours.
+  have to be those of the same without them. It takes as long as the scheduler lets it: minutes on Linux, where
+  sessions share the processors, up to hours where it does not (`kernel.sched_autogroup_enabled=0`).
 """
 
 from __future__ import annotations
@@ -53,7 +54,10 @@ def busy(processes: int) -> Iterator[None]:
     """Keep the processors busy."""
     with ExitStack() as stack:
         for _ in range(processes):
-            loop = stack.enter_context(subprocess.Popen([sys.executable, "-S", "-c", "while True: pass"]))
+            # Sessions of their own, as of other terminals: Linux shares the processors among these, and a low
+            # priority counts within one only.
+            command = [sys.executable, "-S", "-c", "while True: pass"]
+            loop = stack.enter_context(subprocess.Popen(command, start_new_session=True))
             stack.callback(loop.kill)
         yield
 
