@@ -37,7 +37,7 @@ from bench.dashboard.screenshot import Camera
 from bench.dashboard.viewers import start_viewer, wait_until_it_listens
 from bench.errors import DataError
 from bench.journal import FILE_NAME, Record
-from bench.model_file import load_model
+from bench.model_file import FORMAT, load_model
 from bench.protocol import find_protocol
 from bench.rig_file import load_rig
 
@@ -161,7 +161,8 @@ def study_model(runs: dict[tuple[str, str], list[Path]], rig: str, kind: str) ->
     of_family = sorted(key for key in runs if key[0].split("-")[0] == family)
     folders = {run.parent: None for key in sorted(of_family, key=lambda key: key[0] != rig) for run in runs[key]}
     for path in (path for folder in folders for path in sorted(folder.glob("*.json"))):
-        if load_model(path).model.kind == kind:
+        # Calibration files stand beside them.
+        if json.loads(path.read_text(encoding="utf-8"))["format"] == FORMAT and load_model(path).model.kind == kind:
             return path
     raise DataError(f"the studies have no model {kind} of {rig}")
 
