@@ -55,14 +55,14 @@ class World:
         self._plant = plant
         self.time = clock.now()
         self._now = clock.now
-        self.timed: list[tuple[Callable[[], float], Timed]] = []
+        self._timed: list[tuple[Callable[[], float], Timed]] = []
         self._deadlines: list[Callable[[], float]] = []
         self._late: list[Callable[[], None]] = []
         self._advancing = False
 
     def add(self, timed: Timed, *, catch_up: Callable[[], None] | None = None) -> None:
         """Keep the deadlines of an instrument; `catch_up` does what it has put off, before anybody interferes."""
-        self.timed.append((timed.deadline, timed))
+        self._timed.append((timed.deadline, timed))
         self._deadlines.append(timed.deadline)
         if catch_up is not None:
             self._late.append(catch_up)
@@ -114,7 +114,7 @@ class World:
     def _advance_to(self, target: float) -> None:
         while True:
             due, first = math.inf, None
-            for deadline, timed in self.timed:
+            for deadline, timed in self._timed:
                 instant = deadline()
                 if instant < due:
                     due, first = instant, timed

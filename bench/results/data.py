@@ -91,10 +91,13 @@ def read_columns(
         found = _reader(path)(path, names, options)
         values = dict(zip(names, found.values, strict=True))
         columns = Columns(str(path), values, dict(zip(names, found.units, strict=True)), ", ".join(found.notes))
-    rows = len(next(iter(columns.values.values())))
-    if rows < at_least:
-        raise DataError(f"{path}: has {rows} rows of data; at least {at_least} are needed")
+    _check_rows(path, len(next(iter(columns.values.values()))), at_least)
     return columns
+
+
+def _check_rows(path: Path, rows: int, at_least: int, otherwise: str = "") -> None:
+    if rows < at_least:
+        raise DataError(f"{path}: has {rows} rows of data; at least {at_least} are needed{otherwise}")
 
 
 def check_excitation(columns: Columns, name: str) -> list[str]:
@@ -160,9 +163,9 @@ def _reader(path: Path) -> Callable[[Path, Sequence[str], ReadingOptions], ReadC
 
 
 def _from_run(path: Path, names: Sequence[str], chosen: str, at_least: int) -> Columns:
+    if chosen not in (_STEPS, _TELEMETRY):
+        raise ConfigurationError(f"--table {chosen!r}: {path} is a run; expected {_STEPS} or {_TELEMETRY}")
     with Record(path) as record:
-        if chosen not in (_STEPS, _TELEMETRY):
-            raise ConfigurationError(f"--table {chosen!r}: {path} is a run; expected {_STEPS} or {_TELEMETRY}")
         table = record.steps() if chosen == _STEPS else record.telemetry()
         known = [name for name in table.columns if name != "settled"]
         for name in names:
@@ -170,12 +173,9 @@ def _from_run(path: Path, names: Sequence[str], chosen: str, at_least: int) -> C
                 raise DataError(f"{path}: has no column {name!r}; it has: {', '.join(known)}")
         values = {name: table[name] for name in names}
         units = {name: record.unit(name) for name in names}
-        rows = len(next(iter(values.values())))
-        if chosen == _STEPS and rows < at_least <= (ticks := len(record.telemetry())):
-            raise DataError(
-                f"{path}: has {rows} rows of data; at least {at_least} are needed; "
-                f"--table {_TELEMETRY} takes the {ticks} readings within its steps"
-            )
+        if chosen == _STEPS and len(table) < at_least and (ticks := len(record.telemetry())) >= at_least:
+            other = f"; --table {_TELEMETRY} takes the {ticks} readings within its steps"
+            _check_rows(path, len(table), at_least, other)
     for name, column in values.items():
         bad = np.flatnonzero(~np.isfinite(column))
         if bad.size:

@@ -258,7 +258,7 @@ class HybridLaboratory(EmulatedLaboratory):
         return self.plant.deflection if self._stuck is None else self._stuck
 
     def _seen_deflection(self) -> float:
-        return (self.plant.deflection if self._stuck is None else self._stuck) + self._beyond
+        return self._deflection() + self._beyond
 
     def _stick(self) -> None:
         self._stuck = self._deflection()

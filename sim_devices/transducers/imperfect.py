@@ -164,23 +164,20 @@ class Characteristic:
 
     def show(self, quantities: Floats) -> None:
         """Replace quantities, shape (N,), by the `value` of each."""
-        kernels.show(
-            quantities, self._gain, self._offset, self._wave, self._scale, self._middle, _WAVE, self._resolution
-        )
+        self._replace(quantities, self._resolution)
 
     def quantities(self, values: Floats) -> Floats:
         """Return of what it makes each of some values, but for its steps: the quantities themselves."""
-        found = np.asarray(values, dtype=np.float64)
+        found = np.array(values, dtype=np.float64)
         # A sensor of a few percent is met to the last bit.
         for _ in range(_ITERATIONS):
-            found = found + (values - self._smooth(found)) / self._gain
+            smooth = found.copy()
+            self._replace(smooth, 0.0)
+            found += (values - smooth) / self._gain
         return found
 
-    def _smooth(self, quantities: Floats) -> Floats:
-        values = self._gain * quantities + self._offset
-        if self._wave:
-            values += self._wave * np.sin(np.clip(self._scale * (quantities - self._middle), -_WAVE, _WAVE))
-        return values
+    def _replace(self, quantities: Floats, resolution: float) -> None:
+        kernels.show(quantities, self._gain, self._offset, self._wave, self._scale, self._middle, _WAVE, resolution)
 
 
 class ImperfectSensor:
