@@ -28,10 +28,10 @@ _STYLE: dict[Any, Any] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.formatter.limits": (-4, 5),
-    "axes.formatter.use_mathtext": True,
     "axes.formatter.useoffset": False,
     "legend.frameon": False,
     "figure.dpi": 150.0,
+    "savefig.bbox": "tight",
     "path.simplify_threshold": 0.25,
     # A line of a million points in one piece is more than the renderer takes.
     "agg.path.chunksize": 20000,
@@ -63,31 +63,22 @@ def drawn(path: Path, size: tuple[float, float], *, grid: bool = True) -> Iterat
     check_matplotlib()
     import matplotlib as mpl
     from matplotlib.figure import Figure
+    from matplotlib.ticker import ScalarFormatter
+
+    from bench.results.figures.ticks import PlainTicks
 
     # By its name, so that a figure comes out the same each time, and two on one page share no identifier.
     with mpl.rc_context({**_STYLE, "axes.grid": grid, "svg.hashsalt": path.stem}):
         figure = Figure(figsize=size, layout="constrained")
         yield figure
-        _write_ticks_plainly(figure)
+        for axis in (axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)):
+            if type(axis.get_major_formatter()) is ScalarFormatter:
+                axis.set_major_formatter(PlainTicks())
         undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(path.suffix.lstrip("."))
         try:
             figure.savefig(path, metadata=undated)
         except OSError as error:
             raise DataError(f"figure {path} cannot be written: {error.strerror or error}") from None
-
-
-def _write_ticks_plainly(figure: Figure) -> None:
-    """Have the numbers of linear axes set as texts, not as formulas: to parse those took half of the time."""
-    from matplotlib.ticker import ScalarFormatter
-
-    class PlainFormatter(ScalarFormatter):
-        def __call__(self, x: float, pos: int | None = None) -> str:
-            return super().__call__(x, pos).removeprefix(r"$\mathdefault{").removesuffix("}$")
-
-    for axes in figure.axes:
-        for axis in (axes.xaxis, axes.yaxis):
-            if type(axis.get_major_formatter()) is ScalarFormatter:
-                axis.set_major_formatter(PlainFormatter())
 
 
 def outline(horizontal: Floats, vertical: Floats) -> tuple[Floats, Floats]:
