@@ -31,7 +31,6 @@ _STYLE: dict[Any, Any] = {
     "axes.formatter.useoffset": False,
     "legend.frameon": False,
     "figure.dpi": 150.0,
-    "savefig.bbox": "tight",
     "path.simplify_threshold": 0.25,
     # A line of a million points in one piece is more than the renderer takes.
     "agg.path.chunksize": 20000,
