@@ -18,7 +18,7 @@ from bench.hysteresis import MemoryCurve
 from bench.identification import measure_errors
 from bench.journal import Record, add_model
 from bench.results.figures import plot_densities, plot_errors, plot_fit, plot_sequence_and_errors, plot_tracking
-from bench.results.models import IdentifiedFile, errors_json, identify_file, predict
+from bench.results.models import IdentifiedFile, errors_json, identify_file, predict, transients_of
 from bench.results.prediction_figures import errors_text
 from bench.results.published import Published
 from bench.results.tracking import FollowingResult, TargetResults, following_result
@@ -197,13 +197,24 @@ def carry_out(campaign: Campaign) -> StudyResult:
         session("damped-oscillation", {}, 0.0),
         session("random-validation", {}, SESSION_OFFSET),
     )
-    models: dict[str, IdentifiedFile] = {}
-    for key, model in MODELS.items():
-        name, options = model.model, model.options
-        models[key] = identify_file(
-            characterization.result().folder, input_column=INPUT, output_column=OUTPUT, model=name, **options
+    characterized = characterization.result().folder
+    transients = transients_of([characterized], INPUT, OUTPUT)
+
+    def identified(key: str) -> IdentifiedFile:
+        name, options = MODELS[key].model, MODELS[key].options
+        found = identify_file(
+            characterized,
+            input_column=INPUT,
+            output_column=OUTPUT,
+            model=name,
+            transients=transients,
+            **options,
         )
-        models[key].file.save(Path(model_path(key if model.validation is None else name)))
+        found.file.save(Path(model_path(key if MODELS[key].validation is None else name)))
+        return found
+
+    # The sessions wait for these; the others are identified beside them.
+    needed = {key: identified(key) for key in ("nonmonotonic", "polynomial")}
     tracking_runs = {
         key: session(
             "tracking",
@@ -225,6 +236,8 @@ def carry_out(campaign: Campaign) -> StudyResult:
         for period in PERIODS
         for key in FOLLOWERS
     }
+    models = {key: needed.get(key) or identified(key) for key in MODELS}
+    truth = true_curvatures(campaign.rig)
     with Record(validation.result().folder) as record:
         steps = record.steps()
         inputs, outputs = steps[INPUT], steps[OUTPUT]
@@ -233,7 +246,6 @@ def carry_out(campaign: Campaign) -> StudyResult:
     reached = {key: reached_targets(run.result(), OUTPUT) for key, run in tracking_runs.items()}
     followed = {key: _followed(run.result()) for key, run in following_runs.items()}
     figures += _draw_control(campaign, reached, followed)
-    truth = true_curvatures(campaign.rig)
 
     for run in (characterization.result(), validation.result()):
         with Record(run.folder) as record:
