@@ -251,6 +251,7 @@ class _Search:
         self.done: dict[_Kind, list[Evaluation]] = {kind: [] for kind in self.kinds}
         self.given_up: list[Evaluation] = []
         self._has_plane: dict[_Kind, bool] = {}
+        self._with_shape: set[str] = set()
         self._has_one_kind = has_one_kind(measured.inputs, measured.tested)
         turns = turning_points(measured.inputs, _LEAST_MOVE * float(np.ptp(measured.inputs)))
         self._reversals = max(turns.size - 2, 0)
@@ -362,9 +363,14 @@ class _Search:
         ]
 
     def remember(self) -> None:
-        """Try the other initial memories on the best, which were compared at the coarsest order only."""
+        """Try the other initial memories on the best, which were compared at the coarsest order only.
+
+        Of models with a shape not all were; of these they are tried on all near the best.
+        """
         best = sorted((each.rms, self.kinds.index(kind)) for kind in self.kinds if (each := self._best(kind)))
         chosen = [self.kinds[index] for _, index in best[:_REMEMBERED]]
+        near = [self.kinds[index] for rms, index in best[_REMEMBERED:] if rms <= _NEAR * best[0][0]]
+        chosen += [kind for kind in near if kind.model in self._with_shape]
         tasks = []
         for kind in chosen:
             one = self._best(kind)
@@ -484,17 +490,12 @@ class _Search:
             return determined
         simplest = _simplest_near_best(bounded)[1]
         return bounded + [
-            each for each in determined if each not in bounded and each.free < simplest.free and self._has_shape(each)
+            each
+            for each in determined
+            if each not in bounded
+            and each.free < simplest.free
+            and each.candidate.options.get("static", each.candidate.model) in self._with_shape
         ]
-
-    def _has_shape(self, each: Evaluation) -> bool:
-        """Return whether shape parameters say how the output answers, not coefficients alone."""
-        options = {
-            name: value for name, value in each.candidate.options.items() if name not in ("static", "dynamics")
-        }
-        template = find_model(each.candidate.options.get("static", each.candidate.model)).template
-        assert template is not None
-        return bool(template(self.measured.inputs, **options).shape_parameters().names)
 
     def _is_bounded(self, each: Evaluation) -> bool:
         """Return whether signs bound the answer to other inputs, or it has no memory."""
@@ -557,9 +558,11 @@ class _Search:
             estimated: tuple[Initial, ...] = ("estimate",) if spec.estimate_state is not None else ()
             memories = (None, "positive", *estimated, "skip") if self.given.initial is None else (self.given.initial,)
         self._memories[kind] = memories
-        if template.shape_parameters().names and self.given.initial is None:
-            # Each set-up is a search for the shape; the others are tried on the best only.
-            memories = (None, "skip")
+        if template.shape_parameters().names:
+            self._with_shape.add(kind.model)
+            if self.given.initial is None:
+                # Each set-up is a search for the shape; the others are tried on those near the best only.
+                memories = (None, "skip")
         weight: float | None = 0.0
         if self._has_plane[kind]:
             weight = 0.0 if self.given.smoothing is None and spec.constrained else self.given.smoothing
