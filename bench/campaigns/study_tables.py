@@ -16,6 +16,8 @@ from bench.studies import ResultTable, StudyResult
 
 FILE_NAME = "study.json"
 """In the folder of a study: its values and tables."""
+MARKDOWN_NAME = "studies.md"
+"""In the folder of a campaign: the tables of its studies."""
 
 
 @dataclass(frozen=True)
@@ -45,13 +47,19 @@ def write_study(found: StudyResult, folder: Path) -> None:
     (folder / FILE_NAME).write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
-def print_over_seeds(name: str, folders: Sequence[Path], console: Console) -> None:
-    """Print the tables of a study over the folders of its seeds, as `bench reproduce` prints those of one."""
+def print_over_seeds(name: str, folders: Sequence[Path], console: Console) -> str:
+    """Print the tables of a study over the folders of its seeds, as `bench reproduce` prints those of one.
+
+    Returns them as Markdown.
+    """
     contents = [json.loads((folder / FILE_NAME).read_text(encoding="utf-8")) for folder in folders]
     values = over_seeds([content["values"] for content in contents])
-    console.print(f"{name}, {len(folders)} seeds: median (least–greatest)", highlight=False)
-    for table in contents[0]["tables"]:
-        ResultTable(**table).print(values, console)
+    head = f"{name}, {len(folders)} seeds: median (least–greatest)"
+    console.print(head, highlight=False)
+    tables = [ResultTable(**table) for table in contents[0]["tables"]]
+    for table in tables:
+        table.print(values, console)
+    return "\n\n".join([f"## {head}", *(table.markdown(values) for table in tables)])
 
 
 def over_seeds(values: Sequence[Any]) -> Any:  # noqa: ANN401 - as JSON holds it
