@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -11,14 +12,14 @@ from numpy.typing import ArrayLike
 
 from bench.hysteresis import Regressor
 from bench.hysteresis._checks import Floats
-from bench.identification.by_name import FitProblem, Initial, set_up_problem
+from bench.identification.by_name import Initial, set_up_problem
 from bench.identification.cell_layout import CellLayout, Indices
 from bench.identification.folds import fold_numbers
-from bench.identification.least_squares import Fit, fit_cells
+from bench.identification.least_squares import Fit, counted_weights, fit_cells
 from bench.identification.orientation import Orientation
 
-Fitted = Callable[[float, Floats], Fit]
-"""Returns a fit with a weight of the roughness penalty and the weights of the samples, shape (N,)."""
+Fitted = Callable[[Floats], Fit]
+"""Returns a fit with weights of the samples, shape (N,)."""
 
 
 @dataclass(frozen=True)
@@ -136,10 +137,7 @@ def cross_validate(
             raise ValueError(f"blocks: expected at most {used}, one for each sample used, got {blocks}")
         fold = np.concatenate([np.full(problem.skip, -1), fold_numbers(used, folds, blocks)])
         for weight in smoothing:
-
-            def fitted(weight: float, weights: Floats, problem: FitProblem = problem) -> Fit:
-                return problem.fit(weight, weights, ridge)
-
+            fitted = partial(problem.fit, weight, ridge=ridge)
             trials.append(
                 _trial(float(weight), order, fitted, problem.regressor, problem.outputs, problem.weights, fold)
             )
@@ -172,28 +170,25 @@ def choose_smoothing(
     smoothing : sequence of float
         Weights to try; of equal errors the first is the best.
     folds, blocks : int
-        Number of folds, >= 2, and of blocks, >= folds.
+        Number of folds, >= 2, and of blocks, >= folds; with fewer samples than blocks each sample is one.
 
     Raises
     ------
     ValueError
-        If there is nothing to try, or a fold has no sample that counts.
+        If there is nothing to try, a weight is wrong, or a fold has no sample that counts.
     """
     if not len(smoothing):
         raise ValueError("smoothing: expected at least one weight, got none")
-    counted = weights > 0.0
+    counted = counted_weights(regressor.shape[0], weights, 0) > 0.0
+    used = int(counted.sum())
     fold = np.full(weights.size, -1)
-    fold[counted] = fold_numbers(int(counted.sum()), folds, blocks)
-
-    def fitted(weight: float, used: Floats) -> Fit:
-        return fit_cells(layout, regressor, outputs, weights=used, smoothing=weight)
-
-    return CrossValidation(
-        tuple(
-            _trial(weight, None, fitted, regressor, outputs, weights, fold, np.where(counted, 1.0, 0.0))
-            for weight in smoothing
-        )
-    )
+    fold[counted] = fold_numbers(used, folds, min(blocks, used))
+    counts = np.where(counted, 1.0, 0.0)
+    trials = []
+    for weight in smoothing:
+        fitted = partial(fit_cells, layout, regressor, outputs, True, smoothing=weight)
+        trials.append(_trial(weight, None, fitted, regressor, outputs, weights, fold, counts))
+    return CrossValidation(tuple(trials))
 
 
 def _trial(
@@ -215,7 +210,7 @@ def _trial(
     squares, training = np.zeros(outputs.size), []
     for k in numbers:
         left_out = fold == k
-        found = fitted(smoothing, np.where(left_out, 0.0, weights))
+        found = fitted(np.where(left_out, 0.0, weights))
         error = outputs - found.bias - regressor.product(found.coefficients)
         squares[left_out] = error[left_out] ** 2
         training.append(_rms(error**2, np.where(left_out | (fold < 0), 0.0, counts)))
