@@ -209,10 +209,10 @@ def carry_out(campaign: Campaign) -> StudyResult:
     )
     characterized = characterization.result().folder
     transients = transients_of([characterized], INPUT, OUTPUT)
-    models: dict[str, IdentifiedFile] = {}
-    for key, model in MODELS.items():
-        name, options = model.model, model.options
-        models[key] = identify_file(
+
+    def identified(key: str) -> IdentifiedFile:
+        name, options = MODELS[key].model, MODELS[key].options
+        found = identify_file(
             characterized,
             input_column=INPUT,
             output_column=OUTPUT,
@@ -220,7 +220,8 @@ def carry_out(campaign: Campaign) -> StudyResult:
             transients=transients,
             **options,
         )
-        models[key].file.save(Path(model_path(key if model.validation is None else name)))
+        found.file.save(Path(model_path(key if MODELS[key].validation is None else name)))
+        return found
 
     def tracking(key: str, tuning: Mapping[str, str] | None = None) -> Pending[RunResult]:
         controller = "integral" if key == EQUAL_TIME else key.replace("_", "-")
@@ -228,6 +229,8 @@ def carry_out(campaign: Campaign) -> StudyResult:
         settings = {"model": model, "controller": controller, "sequence_seed": str(campaign.seed + 1)}
         return session("tracking", settings, TRACKING_OFFSET, tuning)
 
+    # The sessions wait for these; the others are identified beside them.
+    needed = {key: identified(key) for key in ("nonmonotonic", "polynomial")}
     tracking_runs = {key: tracking(key) for key in CONTROLLERS if key != EQUAL_TIME}
     following_runs = {
         (period, key): session(
@@ -240,6 +243,8 @@ def carry_out(campaign: Campaign) -> StudyResult:
     }
     # The last run waits for this one.
     tracking_runs["latched"].hurry()
+    models = {key: needed.get(key) or identified(key) for key in MODELS}
+    truth = true_curvatures(campaign.rig)
     with Record(validation.result().folder) as record:
         steps = record.steps()
         inputs, outputs = steps[INPUT], steps[OUTPUT]
@@ -252,7 +257,6 @@ def carry_out(campaign: Campaign) -> StudyResult:
     reached = {key: reached_targets(run.result(), OUTPUT) for key, run in tracking_runs.items()}
     followed = {key: _followed(run.result()) for key, run in following_runs.items()}
     figures += _draw_control(campaign, reached, followed)
-    truth = true_curvatures(campaign.rig)
 
     for run in (characterization.result(), validation.result()):
         with Record(run.folder) as record:
