@@ -30,7 +30,8 @@ from bench.identification.two_stage import (
 from bench.journal import Record
 from bench.model_file import ModelFile
 from bench.transients.identification import identify_dynamics, noise_of, read_transients
-from protocols.muscles.parts import SAMPLE
+from bench.transients.recording import Recording
+from protocols.muscles.parts import CONDITIONING, SAMPLE
 
 Floats = npt.NDArray[np.float64]
 
@@ -134,19 +135,27 @@ def identify_muscle_dynamics(
 ) -> IdentifiedDynamics | None:
     """Identify how a muscle follows its voltage, from the transients of a run with held ends.
 
-    There the force has least error of the model. A run under weights tells the noise of the length. None if the run
-    has no quick readings between its steps.
+    There the force has least error of the model. The cycles of the voltage before the samples tell whether it is heat
+    or a pressure that lags. A run under weights tells the noise of the length. None if the run has no quick readings
+    between its steps.
     """
     recording = read_transients(force_run, VOLTAGE_READING, FORCE)
     if recording is None:
         return None
-    samples = [step for step in recording.steps if step.label == SAMPLE]
-    part = recording.within(samples[0].started, samples[-1].finished)
-    found = identify_dynamics([part], [model.first.evaluate], ("voltage", "force"))
+    samples, cycles = (_part(recording, label) for label in (SAMPLE, CONDITIONING))
+    assert samples is not None  # from which the model was identified
+    swings = [] if cycles is None else [cycles]
+    found = identify_dynamics([samples], [model.first.evaluate], ("voltage", "force"), swings)
     lengths = None if length_run is None else read_transients(length_run, VOLTAGE_READING, LENGTH)
     if lengths is None:
         return found
     return replace(found, noise={**found.noise, "length": noise_of(lengths, lengths.responded)})
+
+
+def _part(recording: Recording, label: str) -> Recording | None:
+    """Return the part of a recording from the first to the last step of a label, None if it has none."""
+    steps = [step for step in recording.steps if step.label == label]
+    return recording.within(steps[0].started, steps[-1].finished) if steps else None
 
 
 def muscle_file(
