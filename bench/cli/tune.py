@@ -22,7 +22,7 @@ def tune_(
     twin: Annotated[
         str | None,
         typer.Option(
-            "--twin", metavar="RIG", help="Emulated rig on which it is tuned; that of the rig if not given."
+            "--twin", metavar="RIG", help="Emulated rig on which it is tuned; if not given, the twin of the rig."
         ),
     ] = None,
     controller: Annotated[

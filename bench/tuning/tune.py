@@ -102,7 +102,7 @@ def tune(
     shown = console or Console(quiet=True)
     file = load_model(model)
     task = task_of(file, controller, protocol)
-    on = twin or rig
+    on = twin or load_rig(rig).rig.twin or rig
     if not load_rig(on).in_process:
         raise ConfigurationError(
             f"rig {on} is not emulated: give --twin, such as a rig file that bench twin has made"

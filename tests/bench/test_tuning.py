@@ -110,7 +110,10 @@ def fails(capsys, *arguments):
 def test_what_cannot_be_tuned_is_refused_before_a_run(tmp_path, capsys):
     model, out = tmp_path / "model.json", ["--out", tmp_path / "tuning.toml", "--runs", tmp_path / "runs"]
     ModelFile("preisach", FILM).save(model)
+    twinned = tmp_path / "twinned.toml"
+    twinned.write_text('extends = "vo2-hardware"\n[rig]\ntwin = "vo2"\n')
     for arguments, said in (
+        (["--rig", twinned, "--controller", "polynomial"], "no numbers that could be tuned"),
         (["--rig", "vo2-hardware"], "is not emulated: give --twin"),
         (["--rig", "vo2", "--controller", "polynomial"], "no numbers that could be tuned"),
         (["--rig", "vo2", "--protocol", "length-control"], "is controlled by tracking"),
