@@ -31,6 +31,8 @@ from rigs.muscles.identification import FORCE, LENGTH, identify_muscle, muscle_f
 
 UNSEEN = 1000
 """Seed of the first session that no tuning has seen."""
+SEARCHED = ("count=20",)
+"""Settings of the runs of the search: fewer targets than in a session, for the sake of time."""
 LOOPS: Mapping[str, Mapping[str, Any]] = {
     "vo2": {"model": "preisach-nonmonotonic", "levels": 20, "plane": (30.0, 70.0)},
     "hybrid": {"model": "preisach", "levels": 20},
@@ -122,7 +124,7 @@ def main() -> int:
             if not tuning.exists():
                 found = tune(
                     model, case.rig, controller=case.controller, protocol=case.protocol, workers=given.workers,
-                    folder=folder / "search", console=shown,
+                    settings=SEARCHED, folder=folder / "search", console=shown,
                 )  # fmt: skip
                 tuning.write_text(found.text(), encoding="utf-8")
                 (folder / "numbers.json").write_text(json.dumps(found.summary()), encoding="utf-8")
