@@ -44,7 +44,8 @@ def identify_muscle(
     rows += [(f"KKT residual, {stage}", f"{fit.kkt_residual:.1e}") for stage, fit in found.certificates.items()]
     print_rows(f"{model} from {len(series)} series of lengths", rows)
     if out is not None:
-        muscle.muscle_file(model, found, force_run, length_runs).save(out)
+        dynamics = muscle.identify_muscle_dynamics(found.model, force_run, length_runs)
+        muscle.muscle_file(model, found, [force_run, *length_runs], dynamics).save(out)
         print_plain(console, f"model: {out}")
     write_json(
         json_file,

@@ -18,7 +18,7 @@ import numpy.typing as npt
 
 from bench.control.dynamics import IdentifiedDynamics
 from bench.errors import DataError
-from bench.hysteresis import PrandtlIshlinskii, TwoStage
+from bench.hysteresis import Model, PrandtlIshlinskii, TwoStage
 from bench.identification import Errors
 from bench.identification.two_stage import (
     CoupledIdentification,
@@ -29,7 +29,7 @@ from bench.identification.two_stage import (
 )
 from bench.journal import Record
 from bench.model_file import ModelFile
-from bench.transients.identification import identify_dynamics, noise_of, read_transients
+from bench.transients.identification import identify_dynamics, identify_transients, noise_of, read_transients
 from bench.transients.recording import Recording
 from protocols.muscles.parts import CONDITIONING, SAMPLE
 
@@ -130,43 +130,40 @@ def identify_muscle(name: ModelName, resting: Resting, series: Sequence[Series])
         raise DataError(f"model {name} cannot be identified: {error}") from error
 
 
-def identify_muscle_dynamics(
-    model: TwoStage, force_run: Path, length_run: Path | None = None
-) -> IdentifiedDynamics | None:
+def identify_muscle_dynamics(model: Model, force_run: Path, length_runs: Sequence[Path]) -> IdentifiedDynamics | None:
     """Identify how a muscle follows its voltage, from the transients of a run with held ends.
 
-    There the force has least error of the model. The cycles of the voltage before the samples tell whether it is heat
-    or a pressure that lags. A run under weights tells the noise of the length. None if the run has no quick readings
-    between its steps.
+    There the force has least error of the model: its first stage alone counts. A run under weights tells the noise of
+    the length, and the cycles of the voltage before the samples whether it is heat or a pressure that lags. None of a
+    model that is not of two stages, or if the run has no quick readings between its steps.
     """
+    if not isinstance(model, TwoStage):
+        return None
     recording = read_transients(force_run, VOLTAGE_READING, FORCE)
     if recording is None:
         return None
-    samples, cycles = (_part(recording, label) for label in (SAMPLE, CONDITIONING))
-    assert samples is not None  # from which the model was identified
-    swings = [] if cycles is None else [cycles]
-    found = identify_dynamics([samples], [model.first.evaluate], ("voltage", "force"), swings)
-    lengths = None if length_run is None else read_transients(length_run, VOLTAGE_READING, LENGTH)
+    samples, swings = _parts(recording, SAMPLE), _parts(recording, CONDITIONING)
+    found = identify_dynamics(identify_transients(samples), [model.first.evaluate], ("voltage", "force"), swings)
+    under_weights = next((run for run in length_runs if protocol_of(run) == "length-voltage"), None)
+    lengths = None if under_weights is None else read_transients(under_weights, VOLTAGE_READING, LENGTH)
     if lengths is None:
         return found
     return replace(found, noise={**found.noise, "length": noise_of(lengths, lengths.responded)})
 
 
-def _part(recording: Recording, label: str) -> Recording | None:
-    """Return the part of a recording from the first to the last step of a label, None if it has none."""
+def _parts(recording: Recording, label: str) -> list[Recording]:
+    """Return the part of a recording from the first to the last step of a label, or none."""
     steps = [step for step in recording.steps if step.label == label]
-    return recording.within(steps[0].started, steps[-1].finished) if steps else None
+    return [recording.within(steps[0].started, steps[-1].finished)] if steps else []
 
 
 def muscle_file(
-    name: ModelName, found: CoupledIdentification[Any], force_run: Path, length_runs: Sequence[Path]
+    name: ModelName,
+    found: CoupledIdentification[Any],
+    sources: Sequence[Path],
+    dynamics: IdentifiedDynamics | None,
 ) -> ModelFile:
-    """Return the model file of an identification from runs, with the dynamics if the model is of two stages."""
-    sources = [force_run, *length_runs]
-    under_weights = [run for run in length_runs if protocol_of(run) == "length-voltage"]
-    dynamics = None
-    if found.model.kind == TwoStage.kind:
-        dynamics = identify_muscle_dynamics(found.model, force_run, next(iter(under_weights), None))
+    """Return the model file of an identification from runs."""
     return ModelFile(
         name,
         found.model,

@@ -18,7 +18,7 @@ from bench.hysteresis import MemoryCurve
 from bench.identification import measure_errors
 from bench.journal import Record, add_model
 from bench.results.figures import plot_densities, plot_errors, plot_fit, plot_sequence_and_errors, plot_tracking
-from bench.results.models import IdentifiedFile, errors_json, identify_file, predict
+from bench.results.models import IdentifiedFile, errors_json, identify_file, predict, transients_of
 from bench.results.prediction_figures import errors_text
 from bench.results.published import Published
 from bench.results.tracking import FollowingResult, TargetResults, following_result
@@ -197,11 +197,18 @@ def carry_out(campaign: Campaign) -> StudyResult:
         session("damped-oscillation", {}, 0.0),
         session("random-validation", {}, SESSION_OFFSET),
     )
+    characterized = characterization.result().folder
+    transients = transients_of([characterized], INPUT, OUTPUT)
     models: dict[str, IdentifiedFile] = {}
     for key, model in MODELS.items():
         name, options = model.model, model.options
         models[key] = identify_file(
-            characterization.result().folder, input_column=INPUT, output_column=OUTPUT, model=name, **options
+            characterized,
+            input_column=INPUT,
+            output_column=OUTPUT,
+            model=name,
+            transients=transients,
+            **options,
         )
         models[key].file.save(Path(model_path(key if model.validation is None else name)))
     tracking_runs = {

@@ -27,7 +27,15 @@ from bench.studies import Campaign, reached_targets
 from bench.tuning.search import cost_of
 from bench.tuning.tune import tune
 from bench.workers import Workers
-from rigs.muscles.identification import FORCE, LENGTH, identify_muscle, muscle_file, read_resting, read_series
+from rigs.muscles.identification import (
+    FORCE,
+    LENGTH,
+    identify_muscle,
+    identify_muscle_dynamics,
+    muscle_file,
+    read_resting,
+    read_series,
+)
 
 UNSEEN = 1000
 """Seed of the first session that no tuning has seen."""
@@ -83,7 +91,9 @@ def characterized(rig: str, folder: Path) -> Path:
             for protocol in ("force-voltage", "length-voltage", "length-force")
         )
         series = [one for run in lengths for one in read_series(run)]
-        found = muscle_file("two-stage", identify_muscle("two-stage", read_resting(force), series), force, lengths)
+        muscle = identify_muscle("two-stage", read_resting(force), series)
+        dynamics = identify_muscle_dynamics(muscle.model, force, lengths)
+        found = muscle_file("two-stage", muscle, [force, *lengths], dynamics)
     found.save(model)
     return model
 

@@ -61,6 +61,7 @@ def counting(clock):
     [*(((kind,), False) for kind in KINDS), (KINDS, False), (("drop", "corrupt", "delay"), True)],
     ids=[*KINDS, "all", "overtaking"],
 )
+@pytest.mark.slow
 def test_a_reading_was_taken_during_its_call(counting, clock, kinds, overtaking):
     line = FaultyLine(
         ModbusRtuServer(counting),

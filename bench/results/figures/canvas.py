@@ -28,7 +28,6 @@ _STYLE: dict[Any, Any] = {
     "axes.spines.top": False,
     "axes.spines.right": False,
     "axes.formatter.limits": (-4, 5),
-    "axes.formatter.use_mathtext": True,
     "axes.formatter.useoffset": False,
     "legend.frameon": False,
     "figure.dpi": 150.0,
@@ -64,11 +63,17 @@ def drawn(path: Path, size: tuple[float, float], *, grid: bool = True) -> Iterat
     check_matplotlib()
     import matplotlib as mpl
     from matplotlib.figure import Figure
+    from matplotlib.ticker import ScalarFormatter
+
+    from bench.results.figures.ticks import PlainTicks
 
     # By its name, so that a figure comes out the same each time, and two on one page share no identifier.
     with mpl.rc_context({**_STYLE, "axes.grid": grid, "svg.hashsalt": path.stem}):
         figure = Figure(figsize=size, layout="constrained")
         yield figure
+        for axis in (axis for axes in figure.axes for axis in (axes.xaxis, axes.yaxis)):
+            if type(axis.get_major_formatter()) is ScalarFormatter:
+                axis.set_major_formatter(PlainTicks())
         undated = {"svg": {"Date": None}, "pdf": {"CreationDate": None}}.get(path.suffix.lstrip("."))
         try:
             figure.savefig(path, metadata=undated)

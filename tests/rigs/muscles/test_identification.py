@@ -166,7 +166,7 @@ class TestIdentifying:
         assert all(certificate.kkt_residual < 1e-10 for certificate in found.certificates.values())
         assert found.model.pretension == resting.pretension == 0.3
 
-        file = muscle_file(name, found, runs["force-voltage"], [runs["length-voltage"]])
+        file = muscle_file(name, found, [runs["force-voltage"], runs["length-voltage"]], None)
         file.save(tmp_path / "model.json")
         again = load_model(tmp_path / "model.json")
         assert again.name == name
