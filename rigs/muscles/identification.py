@@ -31,7 +31,8 @@ from bench.identification.two_stage import (
 from bench.journal import Record
 from bench.model_file import ModelFile
 from bench.transients.identification import identify_dynamics, identify_transients, noise_of, read_transients
-from protocols.muscles.parts import SAMPLE
+from bench.transients.recording import Recording
+from protocols.muscles.parts import CONDITIONING, SAMPLE
 
 Floats = npt.NDArray[np.float64]
 
@@ -134,21 +135,27 @@ def identify_muscle_dynamics(model: Model, force_run: Path, length_runs: Sequenc
     """Identify how a muscle follows its voltage, from the transients of a run with held ends.
 
     There the force has least error of the model: its first stage alone counts. A run under weights tells the noise of
-    the length. None of a model that is not of two stages, or if the run has no quick readings between its steps.
+    the length, and the cycles of the voltage before the samples whether it is heat or a pressure that lags. None of a
+    model that is not of two stages, or if the run has no quick readings between its steps.
     """
     if not isinstance(model, TwoStage):
         return None
     recording = read_transients(force_run, VOLTAGE_READING, FORCE)
     if recording is None:
         return None
-    samples = [step for step in recording.steps if step.label == SAMPLE]
-    part = recording.within(samples[0].started, samples[-1].finished)
-    found = identify_dynamics(identify_transients([part]), [model.first.evaluate], ("voltage", "force"))
+    samples, swings = _parts(recording, SAMPLE), _parts(recording, CONDITIONING)
+    found = identify_dynamics(identify_transients(samples), [model.first.evaluate], ("voltage", "force"), swings)
     under_weights = next((run for run in length_runs if protocol_of(run) == "length-voltage"), None)
     lengths = None if under_weights is None else read_transients(under_weights, VOLTAGE_READING, LENGTH)
     if lengths is None:
         return found
     return replace(found, noise={**found.noise, "length": noise_of(lengths, lengths.responded)})
+
+
+def _parts(recording: Recording, label: str) -> list[Recording]:
+    """Return the part of a recording from the first to the last step of a label, or none."""
+    steps = [step for step in recording.steps if step.label == label]
+    return [recording.within(steps[0].started, steps[-1].finished)] if steps else []
 
 
 def muscle_file(
