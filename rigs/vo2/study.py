@@ -197,6 +197,8 @@ def carry_out(campaign: Campaign) -> StudyResult:
         session("damped-oscillation", {}, 0.0),
         session("random-validation", {}, SESSION_OFFSET),
     )
+    # Loaded while they run.
+    truth = true_curvatures(campaign.rig)
     characterized = characterization.result().folder
     transients = transients_of([characterized], INPUT, OUTPUT)
 
@@ -237,7 +239,6 @@ def carry_out(campaign: Campaign) -> StudyResult:
         for key in FOLLOWERS
     }
     models = {key: needed.get(key) or identified(key) for key in MODELS}
-    truth = true_curvatures(campaign.rig)
     with Record(validation.result().folder) as record:
         steps = record.steps()
         inputs, outputs = steps[INPUT], steps[OUTPUT]
