@@ -291,8 +291,8 @@ class EmulatedT7(LineFaults, RegisterInstrument):
         """Undo `freeze`."""
         self._held = None
 
-    def scan_by(self, scan: Scan) -> None:
-        """Convert the first inputs in one call wherever a packet reads all of them first."""
+    def scan_by(self, scan: Scan | None) -> None:
+        """Convert the first inputs in one call wherever a packet reads all of them first; None for one by one."""
         self._scan = scan
 
     def on_restart(self, follow: Callable[[], None]) -> None:

@@ -65,6 +65,7 @@ OBJECT_NOISE = 0.002
 SUPPLY_VOLTAGE = 24.0
 """Input voltage, V; the output stage saturates there."""
 
+_READY, _RUN = DeviceStatus.READY, DeviceStatus.RUN  # sooner than by the class
 _OBJECT_RESOLUTION = 128.0 / 2**23  # K: a converter of 23 bits, with the range of an NTC set-up
 _SINK_RESOLUTION = 128.0 / 2**12  # K: 12 bits
 _OUTPUT_RESOLUTION = 1e-3  # A and V
@@ -426,8 +427,8 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
         return 2 if self.world.time - self._in_window_since >= self._values[4041] else 1
 
     def _feed(self, now: float) -> None:
-        watched = self._values[2060] > 0.0 and self._status in (DeviceStatus.READY, DeviceStatus.RUN)
-        self._watchdog_due = now + self._values[2060] if watched else math.inf
+        watchdog, status = self._values[2060], self._status
+        self._watchdog_due = now + watchdog if watchdog > 0.0 and (status is _RUN or status is _READY) else math.inf
 
     def _trip(self, error_number: int, parameter: int = 0) -> None:
         if self._status not in (DeviceStatus.READY, DeviceStatus.RUN):
@@ -465,7 +466,7 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
         values = self._values
         enable = values[2010]
         wanted = enable == ENABLE_ON or (enable == ENABLE_LIVE and values[50000] == 1)
-        on = wanted and self._status in (DeviceStatus.READY, DeviceStatus.RUN)
+        on = wanted and (self._status is _RUN or self._status is _READY)
         output: tuple[str, float, float] | None = None
         if on:
             limit = values[2030]
@@ -492,7 +493,7 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
             self._load.regulate(value, limit)
         else:
             self._load.drive(value)
-        self._status = DeviceStatus.RUN
+        self._status = _RUN
         if not was_on:
             self._supervision_due = now + SUPERVISION_INTERVAL
         self._supervise(now)
@@ -517,7 +518,7 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
             self._trip(142, 5010)
         elif sink > values[5011]:
             self._trip(143, 5011)
-        if self._status is DeviceStatus.RUN:
+        if self._status is _RUN:
             self._supervise_output(now, plate, current, voltage)
 
     def _supervise_output(self, now: float, plate: float, current: float, voltage: float) -> None:
@@ -532,7 +533,7 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
             self._saturated_since = now
         elif 0 <= values[6320] < 1e3 * (now - self._saturated_since):
             self._trip(108, 6320)
-        if self._status is not DeviceStatus.RUN or values[2000] != CONTROLLER:
+        if values[2000] != CONTROLLER or self._status is not _RUN:
             return
         if abs(plate - self._target()) > values[4040]:
             self._in_window_since = math.nan

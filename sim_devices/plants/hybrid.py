@@ -249,7 +249,9 @@ class HybridCantilever(CooledPlant[HybridParameters]):
     def terminals(self) -> tuple[float, float, float, float]:
         """Return the temperatures of base and block's front (°C), current (A) and voltage (V) of the cooler."""
         # In one call, as a TEC controller looks with each request.
-        seen: tuple[float, float, float, float] = kernels.terminals(self._fraction, self._ambient, self._numbers)
+        seen: tuple[float, float, float, float] = kernels.terminals(
+            self._pending / self._step if self._ahead else 0.0, self._ambient, self._numbers
+        )
         return seen
 
     @property
