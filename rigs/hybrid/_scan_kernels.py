@@ -16,8 +16,9 @@ THERMISTOR_SIZE = 5
 _BASE = 1 + CHARACTERISTIC_SIZE + DISPLACEMENT_SIZE
 _TIP = _BASE + CHARACTERISTIC_SIZE + THERMISTOR_SIZE
 SIZE = _TIP + CHARACTERISTIC_SIZE + THERMISTOR_SIZE
-"""Numbers that `scan` takes: mean temperature of the room (°C); what `shown` and `displacement_volts` take of the
-displacement, and its noise first; what `shown` and `divider_volts` take of either thermistor, with its noise first."""
+"""Numbers that `scan` takes: mean temperature of the room (°C); what `shown` takes of the displacement, its noise,
+and what `displacement_volts` takes; then of either thermistor what `shown` takes, its noise, and what `divider_volts`
+takes."""
 
 
 @njit(cache=True)
@@ -28,7 +29,9 @@ def _shown(quantity: float, numbers: Floats, at: int) -> float:
 
 
 @njit(cache=True)
-def _divided(node: int, fraction: float, excitation: float, normal: float, plant: Floats, n: Floats, at: int) -> float:
+def _divided(
+    node: int, fraction: float, excitation: float, normal: float, plant: Floats, n: Floats, at: int
+) -> float:
     celsius = _shown(n[0] + (plant[node] + fraction * plant[INCREMENT + node]), n, at)
     at += CHARACTERISTIC_SIZE
     volts: float = divider_volts(celsius + n[at] * normal, excitation, n[at + 1], n[at + 2], n[at + 3], n[at + 4])

@@ -1,4 +1,4 @@
-"""The sensors at the first inputs of the T7 in one compiled call, as a fast loop reads all of them with each sample."""
+"""The sensors at the first inputs of the T7 in one compiled call: a fast loop reads all of them with each sample."""
 
 from __future__ import annotations
 

@@ -168,7 +168,7 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
         self._supervised_at = world.time
         self._last_object, self._last_sink = load.plate_temperature, load.sink_temperature
         self._started_at = self._in_window_since = self._saturated_since = math.nan
-        world.add(self)
+        world.add(self, announces=True)
 
     # Parameters and commands.
 
@@ -265,6 +265,7 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
             self.attend()
             self._shut_down()
             self._restart_due = self.world.time + RESET_DELAY
+            self.world.announce(self._restart_due)
 
     # Faults.
 
@@ -428,7 +429,10 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
 
     def _feed(self, now: float) -> None:
         watchdog, status = self._values[2060], self._status
-        self._watchdog_due = now + watchdog if watchdog > 0.0 and (status is _RUN or status is _READY) else math.inf
+        due = now + watchdog if watchdog > 0.0 and (status is _RUN or status is _READY) else math.inf
+        if due < self._watchdog_due:
+            self.world.announce(due)
+        self._watchdog_due = due
 
     def _trip(self, error_number: int, parameter: int = 0) -> None:
         if self._status not in (DeviceStatus.READY, DeviceStatus.RUN):
@@ -439,6 +443,7 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
         if self._values[6310] > 0.0:
             # No sooner than a reset: otherwise a cause that stays would trip and restart it within one instant.
             self._recovery_due = self.world.time + max(self._values[6310], RESET_DELAY)
+            self.world.announce(self._recovery_due)
         self._apply()
 
     def _shut_down(self) -> None:
@@ -496,6 +501,7 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
         self._status = _RUN
         if not was_on:
             self._supervision_due = now + SUPERVISION_INTERVAL
+            self.world.announce(self._supervision_due)
         self._supervise(now)
 
     def _supervise(self, now: float) -> None:
