@@ -21,6 +21,7 @@ from bench.results.models import compare_models, identify_file
 from bench.results.recalibrations import Session
 from bench.results.run_folder import RunFolder
 from bench.results.tracking import results_json
+from bench.results.whole_models import whole_identification
 from bench.runs import Run, carry_out
 from bench.studies import Campaign, Study
 from bench.workers import Workers
@@ -256,14 +257,14 @@ class RunTask(Task):
 
 @dataclass(frozen=True)
 class ModelTask(Task):
-    """The identification of a model from a run.
+    """The identification of a model from a run, or from several together.
 
     Attributes
     ----------
     table : str
         Name of the table that asks for it.
-    source : str
-        Name of the run's task.
+    sources : tuple of str
+        Names of the tasks of the runs; several for a model that needs them.
     model : str
         Name of a registered model.
     input, output : str
@@ -275,7 +276,7 @@ class ModelTask(Task):
     """
 
     table: str
-    source: str
+    sources: tuple[str, ...]
     model: str
     input: str = ""
     output: str = ""
@@ -284,21 +285,28 @@ class ModelTask(Task):
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """The run."""
-        return (self.source,)
+        """The runs."""
+        return self.sources
 
     def describe(self) -> dict[str, Any]:
         """Return what it is, for programs."""
         return {
             "kind": "model",
             "table": self.table,
-            "source": self.source,
+            "sources": self.sources,
             "model": self.model,
             "options": self.options,
         }
 
     def _work(self, campaign: Path, scratch: Path) -> tuple[Path, Done]:
-        source = completed_run(campaign, self.source)
+        made = scratch / "made"
+        made.mkdir()
+        runs = [completed_run(campaign, name) for name in self.sources]
+        whole = whole_identification(self.model)
+        if whole is not None:
+            whole.identify({str(run.meta["protocol"]): run.folder for run in runs}).save(made / MODEL_NAME)
+            return made, Done(self.identity, "completed")
+        (source,) = runs
         found = identify_file(
             source.folder,
             input_column=self.input or source.signal_of("drive"),
@@ -306,8 +314,6 @@ class ModelTask(Task):
             model=self.model,
             **identification_options(self.options),
         )
-        made = scratch / "made"
-        made.mkdir()
         found.file.save(made / MODEL_NAME)
         summary, unit = found.summary(), found.file.operator.output_unit or "1"
         units = {"max": unit, "rms": unit, "rms_percent": "%"}

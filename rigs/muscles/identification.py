@@ -7,7 +7,7 @@ Everything is in V, N and m.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -29,6 +29,7 @@ from bench.identification.two_stage import (
 )
 from bench.journal import Record
 from bench.model_file import ModelFile
+from bench.results.whole_models import WholeIdentification
 from bench.transients.identification import identify_dynamics, noise_of, read_transients
 from protocols.muscles.parts import SAMPLE
 
@@ -168,6 +169,21 @@ def muscle_file(
             "kkt": {stage: certificate.kkt_residual for stage, certificate in found.certificates.items()},
         },
     )
+
+
+def identify_runs(runs: Mapping[str, Path]) -> ModelFile:
+    """Return the two-stage model of a muscle from its runs by protocol.
+
+    Raises DataError if one was not completed, or they do not determine the model.
+    """
+    force_run = runs["force-voltage"]
+    length_runs = [runs[name] for name in ("length-voltage", "length-force")]
+    series = [one for run in length_runs for one in read_series(run)]
+    found = identify_muscle("two-stage", read_resting(force_run), series)
+    return muscle_file("two-stage", found, force_run, length_runs)
+
+
+FROM_RUNS = WholeIdentification(("force-voltage", "length-voltage", "length-force"), identify_runs)
 
 
 def protocol_of(run: Path) -> str:
