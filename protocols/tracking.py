@@ -8,6 +8,7 @@ import numpy as np
 
 from bench.control.loops import ReachTarget
 from bench.control.references import tracking_targets
+from bench.control.supervision import Supervised
 from bench.controllers import ControllerSetup, Fallback, controller_names, make_supervised
 from bench.hysteresis import Policy
 from bench.protocol import Control, Dwell, Messages, Note, Phase, Slots, Step, from_slot, parameter, protocol, unit_of
@@ -40,7 +41,7 @@ class Parameters(SessionParameters):
         10, unit="1", low=1, high=1000, help="readings at each target once it is reached", changeable=True
     )
     fallback: Fallback = parameter(
-        "none", unit="", help="what goes on in place of a controller that does not converge; none ends the run"
+        "none", unit="", help="what goes on in place of a controller that is given up; none ends the run"
     )
     timeout: float = parameter(
         300.0, unit="s", low=1, high=86400, help="longest time for one target", changeable=True
@@ -79,6 +80,7 @@ def tracking(parameters: Parameters, slots: Slots) -> Messages:
         adaptation=parameters.adaptation,
     )
     controller = make_supervised(
+        Supervised,
         "target",
         parameters.controller,
         setup,

@@ -63,7 +63,7 @@ class Controlled(ProtocolParameters):
         {}, unit="", help="numbers of controllers in place of those from the model: a tuning file, or tables"
     )
     fallback: Fallback = parameter(
-        "none", unit="", help="what goes on in place of a controller that does not converge; none ends the run"
+        "none", unit="", help="what goes on in place of a controller that is given up; none ends the run"
     )
     duration: float = parameter(20.0, unit="s", low=2, high=3600, help="time for each target")
     readings: int = parameter(5, unit="1", low=1, high=1000, help="readings at each target after that time")
@@ -163,7 +163,13 @@ def _make_controller(
     )
     opened = common | parameters.tuning.get("open-loop-inverse", {})
     return make_supervised(
-        f"coupled-{output}", parameters.controller, setup, span=span, fallback=parameters.fallback, **opened
+        Supervised,
+        f"coupled-{output}",
+        parameters.controller,
+        setup,
+        span=span,
+        fallback=parameters.fallback,
+        **opened,
     )
 
 

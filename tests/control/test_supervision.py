@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from bench.control.supervision import TARGETS, Supervised
+from bench.control.following import ClosedLoopFollower, OpenLoopFollower
+from bench.control.supervision import TARGETS, Supervised, SupervisedFollower
 from bench.control.tracking import ClosedLoopInverse, Command, CorrectionParameters, OpenLoopInverse, Trace
 from bench.control.tuning import Spans
 from bench.errors import ConvergenceError
@@ -138,3 +139,102 @@ def test_a_controller_may_doubt_itself():
     controller.aim(0.0, 0.0, 0.0, 0.0)
     with pytest.raises(ConvergenceError, match="its lock held nowhere"):
         controller.aim(0.0, 1.0, 0.0, 0.0)
+
+
+def opened(offset, *, holds=0.1, fallback=None):
+    """Return the errors of an open loop on a specimen of an offset, in parts of the range, and its supervision."""
+    span = HIGH - LOW
+    inner = OpenLoopInverse(MODEL.inverse(), wait=1.0)
+    controller = Supervised(inner, LIMITS, span, fallback, holds=holds * span)
+    specimen = Specimen(offset=offset * span)
+    return [specimen.reach(controller, target) / span for target in TARGETS_WITHIN], controller
+
+
+def test_an_open_loop_whose_model_does_not_hold_is_stopped_with_what_to_do():
+    with pytest.raises(ConvergenceError, match=r"the model does not hold .* over 5 targets .* adaptation=session"):
+        opened(0.15)
+
+
+def test_an_open_loop_whose_model_holds_is_left_alone():
+    errors, controller = opened(0.05)
+    assert max(map(abs, errors)) > 0.03
+    assert not controller.gave_up
+
+
+def test_an_open_loop_goes_on_where_that_is_asked_for():
+    errors, controller = opened(0.15, fallback=lambda state: OpenLoopInverse(MODEL.inverse(), state, wait=1.0))
+    assert len(errors) == len(TARGETS_WITHIN)
+    assert controller.gave_up
+    assert "the model does not hold" in controller.take_notice()
+
+
+PERIOD = 0.5
+
+
+def follow(follower, specimen, seconds, *, high=0.8):
+    """Follow a sine; return the RMS error in parts of the range."""
+    errors = []
+    for k in range(round(seconds / PERIOD)):
+        wanted = LOW + (HIGH - LOW) * (0.5 - 0.3 * math.cos(2.0 * math.pi * k * PERIOD / 60.0)) * high / 0.8
+        t, measured, output = specimen.read()
+        specimen.state = specimen.state.step(follower.update(t, measured, output, wanted))
+        specimen.t += PERIOD
+        errors.append((specimen.read()[2] - wanted) / (HIGH - LOW))
+    return math.sqrt(sum(error**2 for error in errors) / len(errors))
+
+
+def supervised_follower(inner, *, holds=math.nan, fallback=None):
+    return SupervisedFollower(inner, LIMITS, HIGH - LOW, fallback, holds=holds * (HIGH - LOW))
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.05])
+def test_a_follower_that_follows_is_left_alone(offset):
+    span = HIGH - LOW
+    controller = supervised_follower(ClosedLoopFollower(MODEL.inverse()))
+    assert follow(controller, Specimen(offset=offset * span), 300.0) < 0.06
+    assert not controller.gave_up
+    controller = supervised_follower(OpenLoopFollower(MODEL.inverse()), holds=0.1)
+    follow(controller, Specimen(offset=offset * span), 300.0)
+    assert not controller.gave_up
+
+
+def test_an_open_loop_follower_whose_model_does_not_hold_is_stopped():
+    specimen = Specimen(offset=0.2 * (HIGH - LOW))
+    with pytest.raises(ConvergenceError, match=r"the model does not hold .* over 200 samples"):
+        follow(supervised_follower(OpenLoopFollower(MODEL.inverse()), holds=0.1), specimen, 300.0)
+
+
+class Runaway(ClosedLoopFollower):
+    """Corrects twice as far as it should, and the wrong way."""
+
+    def _inverted(self, step, disturbance):
+        return super()._inverted(step, -2.0 * disturbance)
+
+
+def test_a_follower_that_errs_by_more_than_its_model_is_stopped_or_replaced():
+    offset = 0.1 * (HIGH - LOW)
+    with pytest.raises(ConvergenceError, match=r"does not converge: over 200 samples .* without feedback"):
+        follow(supervised_follower(Runaway(MODEL.inverse())), Specimen(offset=offset), 300.0)
+    replaced = supervised_follower(
+        Runaway(MODEL.inverse()), fallback=lambda state: OpenLoopFollower(MODEL.inverse(), state)
+    )
+    specimen = Specimen(offset=offset)
+    follow(replaced, specimen, 300.0)
+    assert replaced.gave_up
+    assert follow(replaced, specimen, 300.0) < 0.15
+
+
+def test_a_follower_that_foresees_goes_on_doing_so_and_others_need_not():
+    class Foreseer(OpenLoopFollower):
+        horizon = 3
+        seen = None
+
+        def foresee(self, references):
+            self.seen = references
+
+    inner = Foreseer(MODEL.inverse())
+    controller = supervised_follower(inner)
+    assert controller.horizon == 3
+    controller.foresee(np.arange(3.0))
+    assert inner.seen.tolist() == [0.0, 1.0, 2.0]
+    assert supervised_follower(OpenLoopFollower(MODEL.inverse())).horizon == 0
