@@ -130,6 +130,8 @@ class ControllerSpec:
     """Those of them that it may change, all positive; one of a table as `TABLE.NAME`."""
     holds: Callable[[ControllerSetup], float] | None = None
     """Of a controller without feedback: returns the greatest RMS error of a model that still holds, output units."""
+    misses: bool = False
+    """Whether it may miss targets by design, as one for comparison; its errors then are not judged."""
 
 
 def controller_names(task: str) -> tuple[str, ...]:
@@ -193,7 +195,7 @@ def make_supervised(
     task, name, setup
         As in `make_controller`.
     span : float
-        Range of the targets or of the reference, output units.
+        Range of the output by the model, output units.
     fallback : {"none", "open-loop"}
         See `Fallback`.
     options
@@ -205,10 +207,10 @@ def make_supervised(
         As `make_controller`, for the controller or for its fallback.
     """
     controller = make_controller(task, name, setup)
-    holds = controller_spec(task, name).holds
+    spec = controller_spec(task, name)
     judged: dict[str, Any] = {
-        "compares": setup.adaptation == "off",
-        "holds": math.nan if holds is None else holds(setup),
+        "judges": setup.adaptation == "off" and not spec.misses,
+        "holds": math.nan if spec.holds is None else spec.holds(setup),
     }
     if fallback == "none":
         return kind(controller, setup.limits, span, **judged)
@@ -323,12 +325,13 @@ LATCHED = ControllerSpec(
     numbers=lambda s: LatchParameters.scaled(s.spans),
     tunable=("approach", "creep_gain", "creep_until", "fine_period"),
 )
-POLYNOMIAL = ControllerSpec("the look-up table of a model without memory", _look_up)
+POLYNOMIAL = ControllerSpec("the look-up table of a model without memory", _look_up, misses=True)
 INTEGRAL = ControllerSpec(
     "integral action without a model",
     lambda s: IntegralControl(s.limits, _integral(s)),
     numbers=lambda s: _integral(replace(s, options={})),
     tunable=("gain", "period"),
+    misses=True,
 )
 OPEN_LOOP_FOLLOWER = ControllerSpec(
     "the inverse of the model, without feedback",
@@ -347,7 +350,7 @@ PREDICTIVE_FOLLOWER = ControllerSpec(
     "set-points of a horizon by model, dynamics and coming reference, within the limits", _predictive, adapts=True
 )
 INTEGRAL_FOLLOWER = ControllerSpec(
-    "integral action without a model", lambda s: IntegralFollower(s.limits, _integral(s))
+    "integral action without a model", lambda s: IntegralFollower(s.limits, _integral(s)), misses=True
 )
 
 

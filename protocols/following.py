@@ -11,7 +11,7 @@ from bench.control.loops import FollowReference
 from bench.control.references import fastest_slope, modulated_sine
 from bench.control.supervision import SupervisedFollower
 from bench.controllers import ControllerSetup, Fallback, controller_names, make_supervised
-from bench.protocol import Control, Messages, Note, Phase, Slots, from_slot, parameter, protocol, unit_of
+from bench.protocol import Caution, Control, Messages, Phase, Slots, from_slot, parameter, protocol, unit_of
 from bench.results.data import read_columns
 from bench.results.tracking import FOLLOW
 from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LOOP, load_checked_model
@@ -80,7 +80,7 @@ def following(parameters: Parameters, slots: Slots) -> Messages:
         "follow",
         parameters.controller,
         setup,
-        span=float(np.ptp(values)) or 1.0,
+        span=setup.spans.output,
         fallback=parameters.fallback,
         **parameters.tuning.get("open-loop-inverse", {}),
     )
@@ -102,7 +102,7 @@ def following(parameters: Parameters, slots: Slots) -> Messages:
     yield Phase(f"follow, {parameters.controller}")
     yield follow(lambda t: float(np.interp(t, times, values)), duration, duration + 60.0, FOLLOW)
     if notice := follower.take_notice():
-        yield Note(notice)
+        yield Caution(notice)
     yield from keep_adapted(follower, model)
 
 

@@ -11,7 +11,20 @@ from bench.control.references import tracking_targets
 from bench.control.supervision import Supervised
 from bench.controllers import ControllerSetup, Fallback, controller_names, make_supervised
 from bench.hysteresis import Policy
-from bench.protocol import Control, Dwell, Messages, Note, Phase, Slots, Step, from_slot, parameter, protocol, unit_of
+from bench.protocol import (
+    Caution,
+    Control,
+    Dwell,
+    Messages,
+    Note,
+    Phase,
+    Slots,
+    Step,
+    from_slot,
+    parameter,
+    protocol,
+    unit_of,
+)
 from bench.results.data import read_columns
 from bench.results.tracking import REACH, READING
 from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LOOP, load_checked_model
@@ -84,7 +97,7 @@ def tracking(parameters: Parameters, slots: Slots) -> Messages:
         "target",
         parameters.controller,
         setup,
-        span=float(np.ptp(targets)) or 1.0,
+        span=setup.spans.output,
         fallback=parameters.fallback,
         **parameters.tuning.get("open-loop-inverse", {}),
     )
@@ -104,7 +117,7 @@ def tracking(parameters: Parameters, slots: Slots) -> Messages:
         )
         seconds.append(reading.time - start)
         if notice := controller.take_notice():
-            yield Note(notice)
+            yield Caution(notice)
         outputs: list[float] = []
         for _ in range(parameters.readings):
             reading = yield Step({}, Dwell(0.1), label=READING)

@@ -51,7 +51,7 @@ class Done:
         `completed`, or how a run ended: `failed`, `unsafe` if the safe state was not confirmed; `refused` if it could
         not start, `crashed` if it ended by a defect of a program.
     reason : str
-        Why, empty where it was completed.
+        Why, and what the run warned of; empty where it was completed without a warning.
     results : mapping of str to (float, str)
         Value and unit by name.
     """
@@ -251,7 +251,7 @@ class RunTask(Task):
             **run_results(result.folder),
         }
         unsafe = "" if outcome.is_safe else f"NOT in the safe state: {dict(outcome.safe_state)}"
-        reason = "; ".join(filter(None, (outcome.reason, unsafe)))
+        reason = "; ".join(filter(None, (outcome.reason, unsafe, *warnings_of(result.folder))))
         return result.folder, Done(self.identity, outcome.status if outcome.is_safe else "unsafe", reason, results)
 
 
@@ -444,6 +444,12 @@ def run_results(folder: Path) -> dict[str, tuple[float, str]]:
         for kind, values in found.items()
         for name, value in values.items()
     }
+
+
+def warnings_of(folder: Path) -> list[str]:
+    """Return the warnings that the protocol of a run noted."""
+    with Record(folder) as record:
+        return [event.text for event in record.events() if event.kind == "note" and event.level == "WARN"]
 
 
 def flat_numbers(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, tuple[float, str]]]:

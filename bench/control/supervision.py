@@ -24,7 +24,9 @@ SAMPLES = 200
 CHANCE = 2.25
 """Ratio of two RMS errors over five targets that chance exceeds in 5 % of cases: the root of F(5, 5) = 5.05."""
 _TOLERANCE = 0.02
-"""Part of the range of the targets within which no error is judged."""
+"""Part of the output's range beyond which feedback does not do what it is for."""
+_WARNED = 0.01
+"""The same part from which on there is a warning at targets."""
 _MOVING = 1.5
 """How much more a model may err where the reference moves: the actuator's lag is no part of its error at rest."""
 _SWINGS = MOST_SWINGS - 2
@@ -41,13 +43,13 @@ class _Supervision:
     limits : (float, float)
         Set-points that it may ask for, input units.
     span : float
-        Range of the targets or of the reference, output units, > 0.
+        Range of the output by the model, output units, > 0.
     fallback : callable or None
         Makes the controller that goes on, from the memory of the one that is given up. Without it a
         `ConvergenceError` ends the run in the safe state.
-    compares : bool
-        Whether errors are compared with those of the model. Not of a controller that corrects its model: what that
-        errs by at present is the same.
+    judges : bool
+        Whether errors are judged. Not of a controller that corrects its model, which takes its time, nor of one that
+        may miss targets by design.
     holds : float
         Of a controller without feedback: greatest RMS error of a model that still holds, output units. nan for one
         with feedback, whose model may err by more.
@@ -55,6 +57,8 @@ class _Supervision:
 
     _window = TARGETS
     _over = "targets"
+    _strict = True
+    """Whether an error beyond the tolerance ends the run, also where the model alone would err by more."""
 
     def __init__(
         self,
@@ -63,17 +67,18 @@ class _Supervision:
         span: float,
         fallback: Callable[[Any], Any] | None = None,
         *,
-        compares: bool = True,
+        judges: bool = True,
         holds: float = math.nan,
     ) -> None:
         self._controller: Any = controller
         self._limits = limits
-        self._tolerance = _TOLERANCE * span
+        self._span = span
         self._fallback = fallback
-        self._compares = compares
+        self._judges = judges
         self._holds = holds
         self._judged: deque[tuple[float, float]] = deque(maxlen=self._window)
         self._notice = ""
+        self._warned = False
         self.gave_up = False
         """Whether the fallback is at work."""
 
@@ -101,26 +106,37 @@ class _Supervision:
         return reach
 
     def take_notice(self) -> str:
-        """Return why the controller was given up, once; empty if it was not."""
+        """Return why the controller was given up, or what error it leaves, once; empty if there is nothing to say."""
         notice, self._notice = self._notice, ""
         return notice
 
-    def _judge(self, error: float) -> str:
-        """Take the error of a target or sample, output units; return why the controller does no good, or nothing."""
-        opened = not math.isnan(self._holds)
-        without = 0.0 if opened else self.trace.disturbance
-        if not math.isfinite(error) or not math.isfinite(without):
-            return ""
+    def _judge(self, error: float) -> None:
+        """Take the error of a target or sample, output units; give the controller up if it does no good.
+
+        Raises ConvergenceError if nothing goes on in its place.
+        """
+        without = self.trace.disturbance
+        if not math.isfinite(error):
+            return
         self._judged.append((error, without))
         if len(self._judged) < self._window:
-            return ""
+            return
+        # Of a controller that does not say what its model errs by, that is not known.
         errors, without = np.sqrt(np.mean(np.square(self._judged), axis=0)).tolist()
         over = f"over {self._window} {self._over} its error is {errors:.3g} RMS"
-        if opened:
-            return f"{over}, and that of a model that holds at most {self._holds:.3g}" if errors > self._holds else ""
-        if errors <= max(CHANCE * without, self._tolerance):
-            return ""
-        return f"{over}, and that of its model alone, without feedback, {without:.3g}"
+        if not math.isnan(self._holds):
+            if errors > self._holds:
+                self._give_up(f"{over}, and that of a model that holds at most {self._holds:.3g}")
+            return
+        part = errors / self._span
+        text = f"{over}, {100.0 * part:.2g} % of the range"
+        known = f"{text}, and that of its model alone, without feedback, {without:.3g}"
+        if part > _TOLERANCE and errors > CHANCE * without:
+            self._give_up(known)
+        elif part > _TOLERANCE and self._strict and self._fallback is None:
+            self._give_up(text if math.isnan(without) else known)
+        elif part > (_WARNED if self._strict else _TOLERANCE) and not self._warned:
+            self._notice, self._warned = f"the controller leaves an error: {text}", True
 
     def _give_up(self, why: str) -> None:
         if math.isnan(self._holds):
@@ -142,10 +158,10 @@ class Supervised(_Supervision):
     """A target controller that is given up when it does not converge: a `Reaching`.
 
     It does not if it sends the actuator to and fro between the ends of its range at one target; or if over several
-    targets it errs by more than its model does at the same places, and more than by chance: then the model alone,
-    without feedback, would have been better; or if it says so itself (`doubt`). One without feedback is given up
-    where its model does not hold. Targets that cannot be met do not count, and a controller that does not say what
-    its model errs by is judged by the swings alone. Parameters as `_Supervision`.
+    targets it errs by more than 2 % of the range; or if it says so itself (`doubt`). A fallback takes its place only
+    if it errs by more than its model does at the same places, and more than by chance: then the model alone, without
+    feedback, would have been better. One without feedback is given up where its model does not hold. From 1 % of the
+    range on there is a warning. Targets that cannot be met do not count. Parameters as `_Supervision`.
     """
 
     def __init__(
@@ -155,18 +171,17 @@ class Supervised(_Supervision):
         span: float,
         fallback: Callable[[Any], Reaching] | None = None,
         *,
-        compares: bool = True,
+        judges: bool = True,
         holds: float = math.nan,
     ) -> None:
-        super().__init__(controller, limits, span, fallback, compares=compares, holds=holds)
+        super().__init__(controller, limits, span, fallback, judges=judges, holds=holds)
         self._watch = LimitCycleWatch(*limits)
         self._target = self._output = math.nan
         self._finished = False
 
     def aim(self, target: float, t: float, measured_input: float, output: float, *others: float) -> Command:
         """Aim at the next target; see `Reaching`. Raises ConvergenceError if the controller does not converge."""
-        if why := self._judge_target():
-            self._give_up(why)
+        self._judge_target()
         self._target, self._output, self._finished = target, output, False
         command: Command = self._controller.aim(target, t, measured_input, output, *others)
         return self._watched(command, t, measured_input, output, others)
@@ -195,22 +210,27 @@ class Supervised(_Supervision):
         again: Command = self._controller.aim(self._target, t, measured_input, output, *others)
         return again
 
-    def _judge_target(self) -> str:
-        """Judge how the last target was met; return why the controller does no good, or nothing."""
-        if not self._compares or self.gave_up or not self._finished or self.reach is not Reach.MET:
-            return ""
-        return getattr(self._controller, "doubt", "") or self._judge(self._output - self._target)
+    def _judge_target(self) -> None:
+        """Judge how the last target was met."""
+        if not self._judges or self.gave_up or not self._finished or self.reach is not Reach.MET:
+            return
+        if doubt := getattr(self._controller, "doubt", ""):
+            self._give_up(str(doubt))
+        else:
+            self._judge(self._output - self._target)
 
 
 class SupervisedFollower(_Supervision):
     """A follower that is given up where it errs by more than its model, and more than by chance: a `Follower`.
 
-    One without feedback is given up where its model does not hold. Samples at which the reference stands, as on the
-    way to its beginning, or cannot be met, do not count. Parameters as `_Supervision`.
+    That is judged from 2 % of the range on, where there is a warning. One without feedback is given up where its
+    model does not hold. Samples at which the reference stands, as on the way to its beginning, or cannot be met, do
+    not count. Parameters as `_Supervision`.
     """
 
     _window = SAMPLES
     _over = "samples"
+    _strict = False
 
     def __init__(
         self,
@@ -219,10 +239,10 @@ class SupervisedFollower(_Supervision):
         span: float,
         fallback: Callable[[Any], Follower] | None = None,
         *,
-        compares: bool = True,
+        judges: bool = True,
         holds: float = math.nan,
     ) -> None:
-        super().__init__(controller, limits, span, fallback, compares=compares, holds=_MOVING * holds)
+        super().__init__(controller, limits, span, fallback, judges=judges, holds=_MOVING * holds)
         self._reference = math.nan
 
     @property
@@ -239,10 +259,8 @@ class SupervisedFollower(_Supervision):
         """Take in a reading; see `Follower`. Raises ConvergenceError if the follower does no good."""
         # The last reference is that of now.
         moves = reference != self._reference
-        if moves and self._compares and not self.gave_up and self.reach is Reach.MET:
-            why = self._judge(output - self._reference)
-            if why:
-                self._give_up(why)
+        if moves and self._judges and not self.gave_up and self.reach is Reach.MET:
+            self._judge(output - self._reference)
         self._reference = reference
         setpoint: float = self._controller.update(t, measured_input, output, reference)
         return setpoint

@@ -21,7 +21,7 @@ FOLLOW = "follow"
 WITNESS = "witness"
 """Slot of a sensor beside the loop, which sees what is controlled as it is."""
 _HELD = 0.5
-"""Part at the end of each rest of a reference that counts as held."""
+"""Part of its longest rest for which a reference has rested where it counts as held."""
 
 
 @dataclass(frozen=True)
@@ -84,14 +84,13 @@ class LoopResult:
     def summary(self) -> dict[str, float]:
         """Return greatest and RMS error where the reference is held and where it moves, as far as it does so.
 
-        Held is the second half of each of its rests, but for the one before it first moves.
+        Held is where it has rested for half of its longest rest, but for the one before it first moves.
         """
         moves = np.append(False, np.diff(self.reference) != 0.0)
-        held = np.zeros_like(moves)
-        ends = np.flatnonzero(np.diff(moves))
-        rests = [part for part in np.split(np.arange(moves.size), ends + 1) if not moves[part[0]]]
-        for part in rests if len(rests) == 1 or moves[0] else rests[1:]:
-            held[part[round((1.0 - _HELD) * part.size) :]] = True
+        rested = np.arange(moves.size) - np.maximum.accumulate(np.where(moves, np.arange(moves.size), 0))
+        if moves.any():
+            rested[: int(moves.argmax())] = 0
+        held = rested > _HELD * rested.max()
         # A step moves at a single sample.
         moving = moves & np.append(False, moves[:-1])
         error = self.output - self.reference

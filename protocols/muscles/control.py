@@ -14,6 +14,7 @@ from bench.errors import DataError
 from bench.hysteresis import TwoStage, TwoStageState
 from bench.model_file import ModelFile, load_model
 from bench.protocol import (
+    Caution,
     Control,
     Dwell,
     Messages,
@@ -220,7 +221,7 @@ def _reach(
         others=tuple(slots[name].signal for name in others),
     )
     if notice := controller.take_notice():
-        yield Note(notice)
+        yield Caution(notice)
     outputs = []
     for _ in range(parameters.readings):
         reading = yield Step({}, Dwell(0.1), label=READING)

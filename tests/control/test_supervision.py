@@ -99,18 +99,45 @@ class Contrary(Swinging):
         return Command(0.0, 1.0, done=True)
 
 
-@pytest.mark.parametrize("disturbance", [0.02, math.nan])
-def test_errors_beyond_those_of_the_model_alone_over_several_targets(disturbance):
+def judged(error, disturbance, fallback=None):
+    """Have a controller miss several targets, in parts of the range; return its supervision."""
     inner = Contrary()
     inner.trace = Trace(disturbance=disturbance)
-    controller = Supervised(inner, LIMITS, 1.0)
-    for n in range(TARGETS):
-        controller.aim(0.1, float(n), 0.0, 0.0)
-    if math.isnan(disturbance):
-        controller.aim(0.1, 9.0, 0.0, 0.0)
-    else:
-        with pytest.raises(ConvergenceError, match=r"error is 0\.1 RMS, and that of its model alone.* 0\.02"):
-            controller.aim(0.1, 9.0, 0.0, 0.0)
+    controller = Supervised(inner, LIMITS, 1.0, fallback)
+    for n in range(TARGETS + 1):
+        controller.aim(error, float(n), 0.0, 0.0)
+    return controller
+
+
+@pytest.mark.parametrize(
+    ("disturbance", "said"),
+    [
+        (0.02, r"error is 0\.1 RMS, 10 % of the range, and that of its model alone.* 0\.02;"),
+        (math.nan, r"10 % of the"),
+    ],
+)
+def test_errors_beyond_two_percent_over_several_targets_end_the_run(disturbance, said):
+    with pytest.raises(ConvergenceError, match=said):
+        judged(0.1, disturbance)
+
+
+@pytest.mark.parametrize(("error", "notice"), [(0.008, ""), (0.012, "1.2 % of the range")])
+def test_an_error_that_is_left_is_said_once(error, notice):
+    controller = judged(error, 0.02)
+    found = controller.take_notice()
+    assert (notice in found) if notice else not found
+    controller.aim(error, 9.0, 0.0, 0.0)
+    assert not controller.take_notice()
+
+
+def test_the_open_loop_goes_on_only_where_it_would_have_been_better():
+    def fallback(state):
+        return OpenLoopInverse(MODEL.inverse(), wait=1.0)
+
+    assert judged(0.1, 0.02, fallback).gave_up
+    kept = judged(0.1, 0.08, fallback)
+    assert not kept.gave_up
+    assert "leaves an error" in kept.take_notice()
 
 
 def test_targets_that_cannot_be_met_do_not_count():
