@@ -239,7 +239,9 @@ def judge(mutant: Mutant, known: dict, folder: Path) -> str:
     def run() -> int:
         sys.meta_path.insert(0, Loader(mutant))
         os.environ["PYTEST_DEBUG_TEMPROOT"] = str(folder)
-        return pytest.main(["-x", "-q", "-p", "no:cacheprovider", "-p", "no:xdist", "--timeout=60", *tests])
+        # pytest would load the packages itself, as one of its plugins is among them, to rewrite their assertions.
+        options = ["-x", "-q", "--assert=plain", "-p", "no:cacheprovider", "-p", "no:xdist", "--timeout=60"]
+        return pytest.main([*options, *tests])
 
     status = forked(run, 60.0 + 10.0 * total)
     return "survived" if status == 0 else "killed"
