@@ -19,7 +19,7 @@ from bench.control.following import ClosedLoopFollower, FollowingParameters, Int
 from bench.control.latched import Latched, LatchParameters
 from bench.control.model_filters import AdaptationName, ModelFilter, model_filter
 from bench.control.opposite_output import OppositeOutput
-from bench.control.supervision import CHANCE, Supervised, SupervisedFollower
+from bench.control.supervision import CHANCE, HOLDS, Supervised, SupervisedFollower
 from bench.control.tracking import ClosedLoopInverse, CorrectionParameters, OpenLoopInverse
 from bench.control.tuning import Spans, tuned
 from bench.errors import ConfigurationError, DataError
@@ -236,11 +236,9 @@ def greatest_error(own: float, span: float) -> float:
     span : float
         Width of its range, output units.
     """
-    return max(CHANCE * own, _HOLDS * span)
+    return max(CHANCE * own, HOLDS * span)
 
 
-_HOLDS = 0.03
-"""Part of a model's output range that is tolerated of one that fits its own data well: sessions differ."""
 _OPEN = "open-loop-inverse"
 
 

@@ -23,8 +23,11 @@ SAMPLES = 200
 """Number of samples of a moving reference over which they are judged."""
 CHANCE = 2.25
 """Ratio of two RMS errors over five targets that chance exceeds in 5 % of cases: the root of F(5, 5) = 5.05."""
+HOLDS = 0.03
+"""Part of the output's range that a model may err by that fits its own data well: sessions differ. Feedback that errs
+by more does not do what it is for."""
 _TOLERANCE = 0.02
-"""Part of the output's range beyond which feedback does not do what it is for."""
+"""Part of the range within which the model alone is not taken for better."""
 _WARNED = 0.01
 """The same part from which on there is a warning at targets."""
 _MOVING = 1.5
@@ -133,7 +136,7 @@ class _Supervision:
         known = f"{text}, and that of its model alone, without feedback, {without:.3g}"
         if part > _TOLERANCE and errors > CHANCE * without:
             self._give_up(known)
-        elif part > _TOLERANCE and self._strict and self._fallback is None:
+        elif part > HOLDS and self._strict and self._fallback is None:
             self._give_up(text if math.isnan(without) else known)
         elif part > (_WARNED if self._strict else _TOLERANCE) and not self._warned:
             self._notice, self._warned = f"the controller leaves an error: {text}", True
@@ -158,10 +161,10 @@ class Supervised(_Supervision):
     """A target controller that is given up when it does not converge: a `Reaching`.
 
     It does not if it sends the actuator to and fro between the ends of its range at one target; or if over several
-    targets it errs by more than 2 % of the range; or if it says so itself (`doubt`). A fallback takes its place only
-    if it errs by more than its model does at the same places, and more than by chance: then the model alone, without
-    feedback, would have been better. One without feedback is given up where its model does not hold. From 1 % of the
-    range on there is a warning. Targets that cannot be met do not count. Parameters as `_Supervision`.
+    targets it errs by more than its model does at the same places, and more than by chance: then the model alone,
+    without feedback, would have been better; or if it says so itself (`doubt`); or, without a fallback, if it errs by
+    more than 3 % of the range. One without feedback is given up where its model does not hold. From 1 % of the range
+    on there is a warning. Targets that cannot be met do not count. Parameters as `_Supervision`.
     """
 
     def __init__(

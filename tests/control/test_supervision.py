@@ -116,7 +116,7 @@ def judged(error, disturbance, fallback=None):
         (math.nan, r"10 % of the"),
     ],
 )
-def test_errors_beyond_two_percent_over_several_targets_end_the_run(disturbance, said):
+def test_errors_beyond_three_percent_over_several_targets_end_the_run(disturbance, said):
     with pytest.raises(ConvergenceError, match=said):
         judged(0.1, disturbance)
 
