@@ -213,6 +213,15 @@ def in_one_cell(summary: ResultsTable) -> ResultsTable:
     return ResultsTable(columns)
 
 
+def studies_of(expansion: Expansion, done: Mapping[str, Done]) -> dict[str, list[str]]:
+    """Return the names of the tasks of each study that were completed, by study and rig."""
+    found: dict[str, list[str]] = {}
+    for task in expansion.tasks.values():
+        if isinstance(task, StudyTask) and done[task.name].status == "completed":
+            found.setdefault(" on ".join(filter(None, (task.study, Path(task.rig).stem))), []).append(task.name)
+    return found
+
+
 def studies_table(expansion: Expansion, done: Mapping[str, Done]) -> ResultsTable:
     """Return each number of each study over its seeds: median, worst (of the greatest magnitude), and spread."""
     found: dict[tuple[str, str, str], list[float]] = {}

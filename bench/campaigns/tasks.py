@@ -14,6 +14,7 @@ from rich.console import Console
 
 from bench import registry
 from bench.campaigns.sources import PROGRAMS, PROGRAMS_AND_RIGS, digest
+from bench.campaigns.study_tables import write_study
 from bench.errors import AbortError, BenchError, DataError
 from bench.journal import Record
 from bench.protocol import find_protocol
@@ -408,6 +409,7 @@ class StudyTask(Task):
         # The cores are shared by the tasks of the campaign.
         with Workers(1) as workers:
             found = study.carry_out(Campaign(self.rig or study.rig or "", made, self.seed, False, workers))
+        write_study(found, made)
         return made, Done(self.identity, "completed", "", dict(flat_numbers(found.values)))
 
 

@@ -73,6 +73,8 @@ class TuningRuns:
         Further parameters of the protocol.
     seeds : int
         Sessions of each run.
+    first_seed : int
+        Seed of the first session; the others follow.
     """
 
     task: Task
@@ -82,6 +84,7 @@ class TuningRuns:
     workers: Workers
     settings: Mapping[str, str]
     seeds: int = 1
+    first_seed: int = 0
     failures: list[str] = field(default_factory=list)
     _count: int = 0
 
@@ -106,7 +109,7 @@ class TuningRuns:
         self._count += 1
         tuning = json.dumps({self.task.controller: numbers})
         found = {}
-        for seed in range(self.seeds):
+        for seed in range(self.first_seed, self.first_seed + self.seeds):
             for name, path in self._models.items():
                 # The same noise and the same targets for all candidates.
                 campaign = Campaign(

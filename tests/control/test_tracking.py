@@ -423,6 +423,8 @@ class TestClosedLoop:
             replace(CORRECTION, walk_variance=math.nan)
         with pytest.raises(ValueError, match="lead"):
             FollowingParameters(30.0, 1.0, lead=-1.0)
+        with pytest.raises(ValueError, match="walk_variance: expected a positive number"):
+            FollowingParameters(0.0, 1.0)
 
 
 class TestLatched:
