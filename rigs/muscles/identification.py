@@ -188,7 +188,8 @@ def identify_runs(runs: Mapping[str, Path]) -> ModelFile:
     length_runs = [runs[name] for name in ("length-voltage", "length-force")]
     series = [one for run in length_runs for one in read_series(run)]
     found = identify_muscle("two-stage", read_resting(force_run), series)
-    return muscle_file("two-stage", found, force_run, length_runs)
+    dynamics = identify_muscle_dynamics(found.model, force_run, length_runs)
+    return muscle_file("two-stage", found, [force_run, *length_runs], dynamics)
 
 
 FROM_RUNS = WholeIdentification(("force-voltage", "length-voltage", "length-force"), identify_runs)
