@@ -15,7 +15,7 @@ from bench.hysteresis._checks import Floats
 from bench.journal import Record
 from bench.transients.actuator import IdentifiedActuator, identify_actuator
 from bench.transients.recording import Recording, recording_of
-from bench.transients.response import Model, identify_lag, refine_lag
+from bench.transients.response import POWERS, Model, identify_lag, refine_lag
 
 _FEWEST = 10
 """Fewer changes of the set-point, or rows between them, show no dynamics."""
@@ -93,7 +93,10 @@ def identify_transients(recordings: Sequence[Recording]) -> Transients:
 
 
 def identify_dynamics(
-    transients: Transients, models: Sequence[Model], names: tuple[str, str] = ("input", "output")
+    transients: Transients,
+    models: Sequence[Model],
+    names: tuple[str, str] = ("input", "output"),
+    swings: Sequence[Recording] = (),
 ) -> IdentifiedDynamics:
     """Identify the dynamics of a response beside those of its drive.
 
@@ -105,6 +108,9 @@ def identify_dynamics(
         For each of the runs what comes of the drive at rest.
     names : (str, str)
         What drive and response are called.
+    swings : sequence of Recording
+        Moves over the whole range of the drive, a recording for each model, if there are any. They tell the power of
+        the drive that lags: small steps are nearly the same by either.
     """
     recordings, actuator = transients.recordings, transients.actuator
     response, uncertainty = identify_lag(recordings, actuator.dynamics, models, _LONGEST)
@@ -112,7 +118,10 @@ def identify_dynamics(
     # Late parts are in part what the model errs by at rest, and a controller learns of that by measuring.
     if response.lag:
         response = ResponseDynamics(response.lag, response.power)
-        response, uncertainty = refine_lag(recordings, actuator.dynamics, models, response, _LONGEST)
+        powers: Sequence[float] = POWERS
+        if swings:
+            powers = (refine_lag(swings, actuator.dynamics, models, response, _LONGEST)[0].power,)
+        response, uncertainty = refine_lag(recordings, actuator.dynamics, models, response, _LONGEST, powers)
         uncertainties["lag"] = uncertainty
     else:
         response = ResponseDynamics()

@@ -26,6 +26,8 @@ else:
 
 _INSTANT = 0.03
 """Standard uncertainty of the instant of a reading, s."""
+POWERS = (1.0, 2.0)
+"""Powers of the drive that may lag: of a pressure or position, and of heat."""
 _LATE = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 """Time constants of late parts that are tried, s."""
 
@@ -136,7 +138,7 @@ def identify_lag(
         return fitted(columns_of(ResponseDynamics(math.exp(logarithm), power), ()), True)[0]
 
     candidates = [(score(fitted(columns_of(ResponseDynamics(), ()), True)[0], 0), ResponseDynamics())]
-    for power in (1.0, 2.0):
+    for power in POWERS:
         best = minimize_scalar(
             squares_of,
             args=(power,),
@@ -168,11 +170,12 @@ def refine_lag(
     models: Sequence[Model],
     found: ResponseDynamics,
     longest: float = LONGEST_PART,
+    powers: Sequence[float] = POWERS,
 ) -> tuple[ResponseDynamics, float]:
     """Return dynamics with a lag that goes by the shape of the transients alone, and its standard uncertainty, s.
 
     Within each hold the model may be off by an offset and a factor of its own, so that its error at rest, which is
-    another from hold to hold, is not taken for a lag. Parameters as in `identify_lag`.
+    another from hold to hold, is not taken for a lag. Parameters as in `identify_lag`, and the powers that are tried.
     """
     from scipy.optimize import minimize_scalar
 
@@ -196,7 +199,7 @@ def refine_lag(
 
     middle = math.log(found.lag)
     trials = []
-    for power in (1.0, 2.0):
+    for power in powers:
         best = minimize_scalar(
             squares_of,
             args=(power,),

@@ -22,19 +22,21 @@ QUIET = 1e-3
 """Noise of drive and response, in their units."""
 
 
-def recording(lag, power, *, period=1.0, hold=20.0, error=0.0):
+SINE = np.abs(3.0 * np.sin(1.3 * np.arange(1, 31)))
+
+
+def recording(lag, power, *, period=1.0, hold=20.0, error=0.0, setpoints=SINE):
     """A drive that follows its set-point at once, and the lagged response of a specimen beside `MODEL`."""
     rng = np.random.default_rng(1)
-    setpoints = np.abs(3.0 * np.sin(1.3 * np.arange(1, 31)))
-    changes = hold * np.arange(30.0)
-    grid = 0.01 * np.arange(1, round(30 * hold / 0.01) + 1)
+    changes = hold * np.arange(float(len(setpoints)))
+    grid = 0.01 * np.arange(1, round(len(setpoints) * hold / 0.01) + 1)
     drive = setpoints[np.searchsorted(changes, grid - 1e-9, side="right") - 1]
     held, level = np.empty(grid.size), 0.0
     remains = math.exp(-0.01 / lag) if lag else 0.0
     for k, value in enumerate((drive**power).tolist()):
         held[k] = level = value + (level - value) * remains
     # At rest the specimen is off by an amount of its own in each hold.
-    off = error * rng.standard_normal(30)
+    off = error * rng.standard_normal(len(setpoints))
     response = MODEL.evaluate(held ** (1.0 / power)) + off[np.searchsorted(changes, grid - 1e-9, side="right") - 1]
     rows = np.arange(round(period / 0.01), grid.size, round(period / 0.01)) - 1
     noise = QUIET * rng.standard_normal((2, rows.size))
@@ -52,6 +54,18 @@ def test_a_lag_and_its_power_are_found_beside_errors_at_rest(power):
     assert found.response.power == power
     assert found.response.lag == pytest.approx(4.0, rel=0.05)
     assert 0.0 < found.uncertainties["lag"] < 0.2
+
+
+@pytest.mark.parametrize("power", [1.0, 2.0])
+def test_moves_over_the_whole_range_tell_the_power_that_lags(power):
+    # The small steps speak for the other power, as those of a specimen that relaxes may do.
+    small = recording(4.0, 3.0 - power, setpoints=2.0 + 0.2 * SINE)
+    swings = recording(4.0, power, setpoints=np.array([3.0, 0.0, 3.0, 0.0]))
+    transients = identify_transients([small])
+    assert identify_dynamics(transients, [MODEL.evaluate]).response.power == 3.0 - power
+    found = identify_dynamics(transients, [MODEL.evaluate], swings=[swings])
+    assert found.response.power == power
+    assert found.response.lag == pytest.approx(4.0, rel=0.15)
 
 
 def test_a_lag_that_no_reading_shows_is_none_and_said_to_be_short():
