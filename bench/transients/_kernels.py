@@ -138,7 +138,7 @@ def lag_behind(outputs: Floats, step: float, times: Floats, late: Floats) -> Non
 
 
 @njit(cache=True)
-def hold(changes: Floats, levels: Floats, step: float, means: Floats) -> None:
+def step_means(changes: Floats, levels: Floats, step: float, means: Floats) -> None:
     """Write the mean of a quantity over each step of a grid of time to `means`.
 
     It is `levels[0]` at first and `levels[i + 1]` from `changes[i]` on, s.
@@ -160,7 +160,7 @@ def hold(changes: Floats, levels: Floats, step: float, means: Floats) -> None:
 def find_holds(
     changes: Floats, levels: Floats, step: float, count: int, starts: NDArray[np.int64], means: Floats
 ) -> int:
-    """Find the steps of a grid over which the mean of a quantity, as for `hold`, is the same; return their number.
+    """Find the steps of a grid over which the mean of a quantity, as for `step_means`, is the same; return their number.
 
     It is `means[i]` from step `starts[i]` on; of `count` steps.
     """
