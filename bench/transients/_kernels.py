@@ -160,9 +160,9 @@ def step_means(changes: Floats, levels: Floats, step: float, means: Floats) -> N
 def find_holds(
     changes: Floats, levels: Floats, step: float, count: int, starts: NDArray[np.int64], means: Floats
 ) -> int:
-    """Find the steps of a grid over which the mean of a quantity, as for `step_means`, is the same; return their number.
+    """Find between which of `count` steps of a grid the mean of a quantity changes; return how often it stands.
 
-    It is `means[i]` from step `starts[i]` on; of `count` steps.
+    It is `means[i]` from step `starts[i]` on. The quantity is given as for `step_means`.
     """
     found, at, k = 0, 0, 0
     while k < count:
