@@ -43,6 +43,7 @@ from rigs.hybrid.identification import (
     Samples,
     bandwidth_of,
     identify_hybrid,
+    network_of,
     read_loop,
     read_loops,
     signal_names,
@@ -240,8 +241,9 @@ def _carry_out(campaign: Campaign) -> StudyResult:
     ]
     # Identified beside the runs that it does not need.
     _, steps, static, loops, step, _, _ = started
+    network = network_of(steps.result().folder)
     sources = [run.result().folder for run in (steps, static, loops, step)]
-    found = identify_hybrid(*sources)
+    found = identify_hybrid(*sources, network=network)
     model = campaign.folder / "hybrid.json"
     ModelFile("hybrid", found.model, provenance={"sources": [folder.name for folder in sources]}).save(model)
 
