@@ -4,10 +4,11 @@ PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
 SETUP := $(VENV)/.set-up
+COLLECTED := $(VENV)/.collected
 # Many tests wait for another process: one worker more than cores.
 WORKERS ?= $(shell expr $$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2) + 1)
-PYTEST := $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal
-# mypy keeps one core busy: it runs beside the compilation of the kernels and the tests.
+PYTEST := $(BIN)/python -m pytest --ignore tests/benchmarks --numprocesses $(WORKERS) --dist worksteal
+# Beside the compilation of the kernels runs mypy, and then the first collection of the tests.
 MAKEFLAGS += --jobs=2
 # Without files of byte code each worker and each process of the tests compiles every module again.
 unexport PYTHONDONTWRITEBYTECODE
@@ -26,8 +27,8 @@ demo-sma demo-muscles demo-hybrid: demo-%: $(SETUP)
 
 # Under a minute: numbers, contracts and drivers.
 test-quick: lint
-	$(PYTEST) -m 'not benchmark and not slow' tests/hysteresis tests/identification tests/control \
-		tests/contracts tests/drivers
+	$(PYTEST) --hypothesis-profile=brief -m 'not benchmark and not seeds and not slow' \
+		tests/hysteresis tests/identification tests/control tests/contracts tests/drivers
 
 # Everything, the first seed of each study.
 test: check tests
@@ -45,17 +46,21 @@ lint: $(SETUP)
 types: lint
 	$(BIN)/mypy
 
-# Compiled once, before the workers of the tests would each do it; so are the modules of the tests, with what pytest
-# makes of their assertions; what is wrong with one of them is said when the tests run.
+# Compiled once, before the workers of the tests would each do it.
 kernels: lint
 	$(BIN)/python -P tests/compile_kernels.py
-	-$(BIN)/python -m pytest --collect-only -qq > /dev/null
 
-# A sixth of the examples of each property that is costly.
-tests: kernels
+# So are the modules of the tests, with what pytest makes of their assertions; what is wrong with one of them is said
+# when the tests run.
+$(COLLECTED): $(shell find tests -name '*.py') | lint
+	-$(BIN)/python -m pytest --collect-only -qq > /dev/null
+	touch $@
+
+# A quarter of the examples of each property.
+tests: kernels $(COLLECTED)
 	$(PYTEST) --hypothesis-profile=brief
 
-all-tests: kernels
+all-tests: kernels $(COLLECTED)
 	$(PYTEST) -m 'not benchmark'
 
 # Side-by-side speed comparisons; run them on an idle machine.

@@ -11,8 +11,9 @@ import sqlite3
 import subprocess
 import sys
 import threading
+from bisect import bisect_left
 from contextlib import closing, contextmanager
-from itertools import chain, groupby
+from itertools import accumulate, chain, groupby
 from pathlib import Path
 
 import pytest
@@ -41,14 +42,14 @@ for _name in ("SIGHUP", "SIGQUIT"):
 
 # Chosen by `make test`; `make test-all` looks at all examples. Without deadlines, as several folders have it.
 settings.register_profile("brief", deadline=None)
-_BRIEF, _FEWEST = 6, 10
+_BRIEF, _FEWEST = 4, 10
 """What examples are divided by then, and how few there are at least."""
 _SETTINGS = "_hypothesis_internal_use_settings"
 
 
 def _take_fewer_examples(items):
-    """Divide the examples of each costly property: a profile would not reach those that say their number."""
-    tests = (getattr(item, "obj", None) for item in items if item.get_closest_marker("costly"))
+    """Divide the examples of each property: a profile would not reach those that say their number."""
+    tests = (getattr(item, "obj", None) for item in items)
     for test in {getattr(test, "__func__", test) for test in tests if hasattr(test, "hypothesis")}:
         own = getattr(test, _SETTINGS, settings.default)
         fewer = max(own.max_examples // _BRIEF, min(own.max_examples, _FEWEST))
@@ -69,10 +70,9 @@ def pytest_collection_finish():
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config, items):
-    """Spread the whole studies over the first half of the tests.
+    """Let each worker begin with whole studies: one that came last would leave all workers but its own idle.
 
-    One that came last would leave all workers but its own idle. Of two workers the second begins in the middle, with
-    tests that compile little, and finds in the cache what the first has compiled for its studies.
+    At first, each worker has an equal part of the tests, in their order.
     """
     if config.getoption("hypothesis_profile") == "brief":
         _take_fewer_examples(items)
@@ -80,10 +80,13 @@ def pytest_collection_modifyitems(config, items):
     for study in studies:
         # Two minutes on an idle machine; a busy one may take its time.
         study.add_marker(pytest.mark.timeout(1800))
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     modules = [list(group) for _, group in groupby((i for i in items if i not in studies), lambda i: i.path)]
+    ends = list(accumulate(map(len, modules)))
     # Between two modules, so that the fixtures of a module are made once.
-    for place, study in reversed(list(enumerate(studies))):
-        modules.insert(place * len(modules) // (2 * len(studies)), [study])
+    places = [bisect_left(ends, worker * len(items) / workers) for worker in range(workers)]
+    for worker in reversed(range(workers)):
+        modules.insert(places[worker] + (worker > 0), studies[worker::workers])
     items[:] = chain.from_iterable(modules)
 
 

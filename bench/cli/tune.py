@@ -22,7 +22,7 @@ def tune_(
     twin: Annotated[
         str | None,
         typer.Option(
-            "--twin", metavar="RIG", help="Emulated rig on which it is tuned; that of the rig if not given."
+            "--twin", metavar="RIG", help="Emulated rig on which it is tuned; if not given, the twin of the rig."
         ),
     ] = None,
     controller: Annotated[
@@ -36,6 +36,9 @@ def tune_(
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Parameter of the protocol; repeatable.")
     ] = None,
     seeds: Annotated[int, typer.Option(min=1, max=100, help="Sessions of each run.")] = 1,
+    checks: Annotated[
+        int, typer.Option(min=1, max=100, help="Further sessions, in which the result has to be better as well.")
+    ] = 2,
     rounds: Annotated[int, typer.Option(min=1, max=10, help="How often each number is changed.")] = 2,
     workers: Annotated[
         int | None, typer.Option(min=1, help="Worker processes; as many as cores if not given.")
@@ -47,7 +50,8 @@ def tune_(
 
     The numbers of the controller are changed one after another. What counts is the RMS error in percent of the range
     of the targets, and the time at each; half by the model as it is, half by the worst of models by which the
-    specimen has another gain or time constant, so that what is chosen has margins of stability. Use the file by
+    specimen has another gain or time constant, so that what is chosen has margins of stability. If it is not better
+    in sessions that the search has not seen, the numbers stay as they are. Use the file by
     `bench run ... --set tuning=FILE`.
     """
     from bench.tuning.tune import tune
@@ -55,7 +59,7 @@ def tune_(
     check_outputs(out=out, json_file=json_file, read=[model])
     found = tune(
         model, rig, twin=twin, controller=controller, protocol=protocol, settings=settings or [], seeds=seeds,
-        rounds=rounds, workers=workers, folder=runs, console=console,
+        checks=checks, rounds=rounds, workers=workers, folder=runs, console=console,
     )  # fmt: skip
     out.write_text(found.text(), encoding="utf-8")
     print_rows(f"{controller} on {found.twin}", found.rows())

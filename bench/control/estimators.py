@@ -128,7 +128,7 @@ class DriftEstimator:
 
     def is_steady(self, limit: float) -> bool:
         """Return whether drift and uncertainty together are within `limit` (units/s)."""
-        return self._readings >= 2 and abs(self.drift) + self.uncertainty <= limit
+        return abs(self.drift) + self.uncertainty <= limit
 
 
 class DisturbanceEstimator:

@@ -43,6 +43,17 @@ def increasing(name: str, values: ArrayLike, least: int = 2) -> Floats:
     return array
 
 
+def plays(thresholds: ArrayLike, weights: ArrayLike) -> tuple[Floats, Floats]:
+    """Return both as arrays: thresholds that increase from 0, and a weight for each; ValueError otherwise."""
+    increase = increasing("thresholds", thresholds, least=1)
+    if increase[0] != 0.0:
+        raise ValueError(f"thresholds: expected the first to be 0, got {increase[0]}")
+    one_each = samples("weights", weights)
+    if one_each.size != increase.size:
+        raise ValueError(f"weights: expected {increase.size} values, one for each play, got {one_each.size}")
+    return increase, one_each
+
+
 def number(name: str, value: Any) -> float:  # noqa: ANN401 - an unchecked argument
     """Return `value` as a finite float; a text is refused, even if it spells a number."""
     try:

@@ -181,12 +181,7 @@ class PrandtlIshlinskii(Operator[PlayState]):
     output_unit: str = ""
 
     def __post_init__(self) -> None:
-        thresholds = _checks.increasing("thresholds", self.thresholds, least=1)
-        if thresholds[0] != 0.0:
-            raise ValueError(f"thresholds: expected the first to be 0, got {thresholds[0]}")
-        weights = _checks.samples("weights", self.weights)
-        if weights.size != thresholds.size:
-            raise ValueError(f"weights: expected {thresholds.size} values, one for each play, got {weights.size}")
+        thresholds, weights = _checks.plays(self.thresholds, self.weights)
         sums = np.cumsum(weights)
         rounding = 1e-12 * np.abs(weights).max()
         if sums.min() < -rounding and sums.max() > rounding:

@@ -47,7 +47,7 @@ from bench.results.recalibrations import Session
 from bench.results.starting_state import StartingState, digest, starting_state
 from bench.results.times import bind_times, check_model_name, read_times, time_quantity
 from bench.timed import identify_in_time
-from bench.transients.identification import identify_dynamics, read_transients
+from bench.transients.identification import Transients, identify_dynamics, identify_transients, read_transients
 
 Floats = npt.NDArray[np.float64]
 
@@ -197,6 +197,7 @@ def identify_file(
     time_column: str | None = None,
     band: bool = False,
     reading: ReadingOptions | None = None,
+    transients: Transients | None = None,
     **options: Any,  # noqa: ANN401 - each model names and types its own
 ) -> IdentifiedFile:
     """Identify a model from a file of measurements or a run.
@@ -227,6 +228,8 @@ def identify_file(
         Whether a prediction band is calibrated on blocks of the rows.
     reading : ReadingOptions, optional
         What is known of the layout of the file.
+    transients : Transients, optional
+        Of the runs, as `transients_of` gives them, for several models of the same runs; found if not given.
     **options
         `initial`, `orientation` and the options of the model, as in `identify`; None leaves the default.
 
@@ -336,7 +339,11 @@ def identify_file(
         "ridge": penalties.ridge,
         "orientation": found.orientation,
     }
-    dynamics = None if times is not None else _dynamics(paths, input_column, output_column, found.model)
+    dynamics: IdentifiedDynamics | None = None
+    if times is None:
+        transients = transients or transients_of(paths, input_column, output_column)
+        if transients is not None:
+            dynamics = identify_dynamics(transients, [found.model.evaluate] * len(transients.recordings))
     file = ModelFile(model, found.model, memory, provenance, found.initial_state, calibrated, dynamics)
     return IdentifiedFile(
         file,
@@ -353,11 +360,14 @@ def identify_file(
     )
 
 
-def _dynamics(paths: Sequence[Path], drive: str, response: str, model: Operator[Any]) -> IdentifiedDynamics | None:
-    """Return the dynamics that the transients of runs show; None of tables, which have none."""
+def transients_of(paths: Sequence[Path], drive: str, response: str) -> Transients | None:
+    """Return what the transients of runs show of a drive and a response; None of tables, which have none.
+
+    Raises DataError if the record of a run is damaged.
+    """
     runs = [path for path in paths if path.is_dir() or path.suffix == ".sqlite"]
     found = [recording for path in runs if (recording := read_transients(path, drive, response)) is not None]
-    return identify_dynamics(found, [model.evaluate] * len(found)) if found else None
+    return identify_transients(found) if found else None
 
 
 def _shape(operator: Operator[Any] | TimedModel[Any]) -> dict[str, float]:

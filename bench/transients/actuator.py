@@ -60,13 +60,15 @@ class IdentifiedActuator:
     rms: float
 
 
-def at_rows(recording: Recording, values: Floats, first: float, step: float, delay: float) -> Floats:
-    """Return what a quantity had at each row of a recording that its values on a grid of time reach to.
+def at_rows(times: Floats, values: Floats, first: float, step: float, delay: float) -> Floats:
+    """Return what a quantity had at each row of a recording.
 
     Parameters
     ----------
+    times : ndarray, shape (M,)
+        Of the rows, s.
     values : ndarray, shape (N,)
-        After each step of the grid.
+        After each step of a grid of time.
     first : float
         At the beginning.
     step : float
@@ -75,46 +77,49 @@ def at_rows(recording: Recording, values: Floats, first: float, step: float, del
         Time by which the rows see it late, s.
     """
     grid = step * np.arange(values.size + 1)
-    times = recording.times[recording.times <= step * (values.size - 1)]
     return np.asarray(np.interp(times - delay, grid, np.concatenate([[first], values])))
 
 
-def simulate_drive(recording: Recording, dynamics: ActuatorDynamics, step: float, end: float) -> Floats:
-    """Return the position (before gain and offset) that the drive had at each row up to `end` s."""
-    initial = (float(recording.driven[0]) - dynamics.offset) / dynamics.gain
-    if dynamics.order == 0:
-        times = recording.times[recording.times <= end]
-        # A reading that is complete as a set-point is sent has not seen it.
-        levels = np.concatenate([[initial], recording.setpoints])
-        return np.asarray(levels[np.searchsorted(recording.changes, times - dynamics.delay - _ON_TIME)])
-    setpoints = recording.on_grid(step, initial, end)
-    out = np.empty((2, setpoints.size))
-    _kernels.follow(
-        np.array([initial, 0.0, initial, 0.0, 0.0]), setpoints, np.zeros((2, setpoints.size)), out, step,
-        dynamics.frequency, dynamics.damping, dynamics.rate, 0.0, 1.0, 0.0, 1.0, 0.0, 1.0,
-    )  # fmt: skip
-    return at_rows(recording, out[0], initial, step, dynamics.delay)
+class _Part:
+    """The first part of a recording, up to `end` s, with what its simulations have in common."""
+
+    def __init__(self, recording: Recording, end: float) -> None:
+        rows = recording.times <= end
+        self.driven, self.weights = recording.driven[rows], _weights(recording)[rows]
+        self._recording, self._end, self._times = recording, end, recording.times[rows]
+        # Of the simulation before: most are on the same grid.
+        self._grid, self._holds = (GRID, 0.0), recording.holds(GRID, 0.0, end)
+
+    def positions(self, dynamics: ActuatorDynamics) -> Floats:
+        """Return the position (before gain and offset) that the drive has at each row."""
+        initial = start_position(self._recording, dynamics)
+        times = self._times - dynamics.delay
+        if dynamics.order == 0:
+            levels = np.append(initial, self._recording.setpoints)
+            # A reading that is complete as a set-point is sent has not seen it.
+            return np.asarray(levels[np.searchsorted(self._recording.changes, times - _ON_TIME)])
+        step = grid_step(dynamics)
+        if self._grid != (step, initial):
+            self._grid, self._holds = (step, initial), self._recording.holds(step, initial, self._end)
+        positions = np.empty(times.size)
+        _kernels.move_to_rows(
+            initial, *self._holds, times, positions, step, dynamics.frequency, dynamics.damping, dynamics.rate
+        )
+        return positions
 
 
 def identify_actuator(recordings: Sequence[Recording], longest: float = LONGEST_PART) -> IdentifiedActuator:
     """Identify the dynamics of the drive of some runs, of each by as long a part, s."""
     from scipy.optimize import least_squares
 
-    ends = [min(longest, float(each.times[-1])) for each in recordings]
+    parts = [_Part(each, min(longest, float(each.times[-1]))) for each in recordings]
     slow = _time_scale(recordings)
-
-    def simulated(dynamics: ActuatorDynamics) -> Floats:
-        step = grid_step(dynamics)
-        return np.concatenate(
-            [simulate_drive(r, dynamics, step, end) for r, end in zip(recordings, ends, strict=True)]
-        )
-
-    measured = np.concatenate([r.driven[r.times <= end] for r, end in zip(recordings, ends, strict=True)])
-    weights = np.concatenate([_weights(r)[r.times <= end] for r, end in zip(recordings, ends, strict=True)])
+    measured = np.concatenate([part.driven for part in parts])
+    weights = np.concatenate([part.weights for part in parts])
 
     def fitted(dynamics: ActuatorDynamics) -> tuple[Floats, float, float]:
         """Return what is left over, weighted, with gain and offset."""
-        positions = simulated(dynamics)
+        positions = np.concatenate([part.positions(dynamics) for part in parts])
         columns = weights[:, None] * np.column_stack([positions, np.ones(positions.size)])
         (gain, offset), *_ = np.linalg.lstsq(columns, weights * measured, rcond=None)
         return weights * measured - columns @ (gain, offset), float(gain), float(offset)
@@ -161,6 +166,11 @@ def identify_actuator(recordings: Sequence[Recording], longest: float = LONGEST_
     # What is sent is a little late on the record, and no actuator moves before it is.
     causal = replace(dynamics, delay=max(dynamics.delay, 0.0))
     return IdentifiedActuator(causal, uncertainties, float(np.sqrt(np.mean(left**2))))
+
+
+def start_position(recording: Recording, dynamics: ActuatorDynamics) -> float:
+    """Return the position (before gain and offset) of the drive at the beginning of a recording, input units."""
+    return (float(recording.driven[0]) - dynamics.offset) / dynamics.gain
 
 
 def grid_step(dynamics: ActuatorDynamics) -> float:

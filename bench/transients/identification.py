@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from bench.hysteresis._checks import Floats
 from bench.journal import Record
 from bench.transients.actuator import IdentifiedActuator, identify_actuator
 from bench.transients.recording import Recording, recording_of
-from bench.transients.response import Model, identify_lag, refine_lag
+from bench.transients.response import POWERS, Model, identify_lag, refine_lag
 
 _FEWEST = 10
 """Fewer changes of the set-point, or rows between them, show no dynamics."""
@@ -55,20 +56,30 @@ def read_transients(path: Path, drive: str, response: str) -> Recording | None:
     return found if found.changes.size >= _FEWEST and between >= _FEWEST else None
 
 
-def identify_dynamics(
-    recordings: Sequence[Recording], models: Sequence[Model], names: tuple[str, str] = ("input", "output")
-) -> IdentifiedDynamics:
-    """Identify the dynamics of a drive and of the response to it.
+@dataclass(frozen=True, eq=False)
+class Transients:
+    """What runs show of a drive and its response whatever the model of the specimen.
 
-    Parameters
+    Attributes
     ----------
-    recordings : sequence of Recording
-        Runs with transients.
-    models : sequence of callable
-        For each of them what comes of the drive at rest.
-    names : (str, str)
-        What drive and response are called.
+    recordings : tuple of Recording
+        The runs.
+    actuator : IdentifiedActuator
+        The dynamics of the drive.
+    noise : (float, float)
+        Standard deviation of one reading of the drive, input units, and of the response, output units.
+    first_look : float
+        Median time from a change of the set-point to the next reading, s.
     """
+
+    recordings: tuple[Recording, ...]
+    actuator: IdentifiedActuator
+    noise: tuple[float, float]
+    first_look: float
+
+
+def identify_transients(recordings: Sequence[Recording]) -> Transients:
+    """Identify what the transients of runs show without a model of the specimen."""
     noise = (
         max(noise_of(each, each.driven) for each in recordings),
         max(noise_of(each, each.responded) for each in recordings),
@@ -77,22 +88,49 @@ def identify_dynamics(
         actuator = IdentifiedActuator(ActuatorDynamics(), {}, noise[0])
     else:
         actuator = identify_actuator(recordings, _LONGEST)
+    firsts = np.concatenate([_first_looks(each) for each in recordings])
+    return Transients(tuple(recordings), actuator, noise, float(np.median(firsts)))
+
+
+def identify_dynamics(
+    transients: Transients,
+    models: Sequence[Model],
+    names: tuple[str, str] = ("input", "output"),
+    swings: Sequence[Recording] = (),
+) -> IdentifiedDynamics:
+    """Identify the dynamics of a response beside those of its drive.
+
+    Parameters
+    ----------
+    transients : Transients
+        What the runs show of the drive.
+    models : sequence of callable
+        For each of the runs what comes of the drive at rest.
+    names : (str, str)
+        What drive and response are called.
+    swings : sequence of Recording
+        Moves over the whole range of the drive, a recording for each model, if there are any. They tell the power of
+        the drive that lags: small steps are nearly the same by either.
+    """
+    recordings, actuator = transients.recordings, transients.actuator
     response, uncertainty = identify_lag(recordings, actuator.dynamics, models, _LONGEST)
     uncertainties = dict(actuator.uncertainties)
     # Late parts are in part what the model errs by at rest, and a controller learns of that by measuring.
     if response.lag:
         response = ResponseDynamics(response.lag, response.power)
-        response, uncertainty = refine_lag(recordings, actuator.dynamics, models, response, _LONGEST)
+        powers: Sequence[float] = POWERS
+        if swings:
+            powers = (refine_lag(swings, actuator.dynamics, models, response, _LONGEST)[0].power,)
+        response, uncertainty = refine_lag(recordings, actuator.dynamics, models, response, _LONGEST, powers)
         uncertainties["lag"] = uncertainty
     else:
         response = ResponseDynamics()
-    firsts = np.concatenate([_first_looks(each) for each in recordings])
     return IdentifiedDynamics(
         actuator.dynamics,
         response,
-        dict(zip(names, noise, strict=True)),
+        dict(zip(names, transients.noise, strict=True)),
         uncertainties,
-        float(np.median(firsts)) / 3.0,
+        transients.first_look / 3.0,
         ", ".join(each.path.name for each in recordings),
     )
 
@@ -122,8 +160,8 @@ def noise_of(recording: Recording, values: Floats) -> float:
     differences, holds = np.abs(np.diff(values))[same], last[1:][same]
     if differences.size == 0:
         return 0.0
-    numbers = np.unique(holds)
-    found = [float(np.sqrt(np.mean(differences[holds == number] ** 2) / 2.0)) for number in numbers]
+    by_hold = np.split(differences, np.flatnonzero(np.diff(holds)) + 1)
+    found = [float(np.sqrt(np.mean(each**2) / 2.0)) for each in by_hold]
     steps = np.diff(np.unique(values))
     digit = float(np.min(steps)) if steps.size and np.unique(values).size < 0.5 * values.size else 0.0
     return max(float(np.percentile(found, _QUIET)), digit / math.sqrt(12.0))

@@ -5,15 +5,21 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.deferred import DeferredModule
 from bench.devices import Signal
 from bench.errors import DataError
 from bench.hysteresis._checks import Floats
 from bench.journal import Record, StepRecord
+
+if TYPE_CHECKING:
+    from bench.transients import _kernels
+else:
+    _kernels = DeferredModule("bench.transients._kernels")
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,13 +112,21 @@ class Recording:
 
         Before the first change it is `initial`.
         """
-        edges = step * np.arange(int(np.ceil(end / step)) + 2)
-        levels = np.concatenate([[initial], self.setpoints])
-        instants = np.concatenate([[0.0], self.changes])
-        areas = np.concatenate([[0.0], np.cumsum(levels[:-1] * np.diff(instants))])
-        at = np.searchsorted(self.changes, edges, side="right")
-        integral = areas[at] + levels[at] * (edges - instants[at])
-        return np.asarray(np.diff(integral) / step)
+        means = np.empty(_steps_until(end, step))
+        _kernels.hold(self.changes, np.append(initial, self.setpoints), step, means)
+        return means
+
+    def holds(self, step: float, initial: float, end: float) -> tuple[NDArray[np.int64], Floats]:
+        """Return the same by its changes: step n to n + 1 of `starts`, shape (N + 1,), has one of shape (N,)."""
+        most = 2 * self.changes.size + 1
+        count = _steps_until(end, step)
+        starts, means = np.full(most + 1, count), np.empty(most)
+        found = _kernels.find_holds(self.changes, np.append(initial, self.setpoints), step, count, starts, means)
+        return starts[: found + 1], means[:found]
+
+
+def _steps_until(end: float, step: float) -> int:
+    return int(np.ceil(end / step)) + 1
 
 
 def recording_of(path: Path, record: Record, device: str, drive: str, response: str) -> Recording:

@@ -16,7 +16,7 @@ import numpy as np
 from bench.control.dynamics import ActuatorDynamics, ResponseDynamics
 from bench.deferred import DeferredModule
 from bench.hysteresis._checks import Floats
-from bench.transients.actuator import LONGEST_PART, at_rows, grid_step, latency
+from bench.transients.actuator import LONGEST_PART, at_rows, grid_step, latency, start_position
 from bench.transients.recording import Recording
 
 if TYPE_CHECKING:
@@ -26,6 +26,8 @@ else:
 
 _INSTANT = 0.03
 """Standard uncertainty of the instant of a reading, s."""
+POWERS = (1.0, 2.0)
+"""Powers of the drive that may lag: of a pressure or position, and of heat."""
 _LATE = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
 """Time constants of late parts that are tried, s."""
 
@@ -39,32 +41,53 @@ Model = Callable[[Floats], Floats]
 """Gives the output that follows a sequence of inputs at rest, each of shape (N,)."""
 
 
-def seen_by_specimen(
-    recording: Recording, actuator: ActuatorDynamics, response: ResponseDynamics, end: float
-) -> Floats:
-    """Return the drive behind its lag on the grid of time of the actuator, shape (N,), input units."""
-    step = grid_step(actuator)
-    initial = (float(recording.driven[0]) - actuator.offset) / actuator.gain
-    setpoints = recording.on_grid(step, initial, end)
-    out = np.empty((2, setpoints.size))
-    lagged = math.copysign(abs(initial) ** response.power, initial)
-    _kernels.follow(
-        np.array([initial, 0.0, lagged, 0.0, 0.0]), setpoints, np.zeros((2, setpoints.size)), out, step,
-        actuator.frequency, actuator.damping, actuator.rate, response.lag, response.power, 0.0, 1.0, 0.0, 1.0,
-    )  # fmt: skip
-    return np.asarray(actuator.gain * out[1] + actuator.offset)
+class SimulatedDrive:
+    """The drive of a recording on the grid of time of its actuator, up to some instant.
+
+    Parameters
+    ----------
+    recording : Recording
+        The run.
+    actuator : ActuatorDynamics
+        Its actuator.
+    end : float
+        The instant, s.
+
+    Attributes
+    ----------
+    step : float
+        Of the grid, s.
+    """
+
+    def __init__(self, recording: Recording, actuator: ActuatorDynamics, end: float) -> None:
+        self.step = grid_step(actuator)
+        self._actuator = actuator
+        self._times, self._late = recording.times[recording.times <= end], latency(actuator)
+        self._initial = start_position(recording, actuator)
+        setpoints = recording.on_grid(self.step, self._initial, end)
+        self._positions = np.empty(setpoints.size)
+        _kernels.move(
+            self._initial, 0.0, setpoints, self._positions, self.step,
+            actuator.frequency, actuator.damping, actuator.rate,
+        )  # fmt: skip
+
+    def behind(self, response: ResponseDynamics) -> Floats:
+        """Return what the specimen sees of it behind the lag of its response, shape (N,), input units."""
+        lagged = math.copysign(abs(self._initial) ** response.power, self._initial)
+        seen = np.empty(self._positions.size)
+        _kernels.hold_back(lagged, self._positions, seen, self.step, response.lag, response.power)
+        return np.asarray(self._actuator.gain * seen + self._actuator.offset)
+
+    def at_rows(self, values: Floats) -> Floats:
+        """Return what a quantity with these values on the grid, shape (N,), had at each row of the recording."""
+        return at_rows(self._times, values, float(values[0]), self.step, self._late)
 
 
 def late_parts(outputs: Floats, step: float, times: Sequence[float]) -> Floats:
-    """Return outputs behind lags of first order, which begin at rest, a column for each."""
-    from scipy.signal import lfilter
-
-    columns = []
-    for time in times:
-        remains = math.exp(-step / time)
-        column, _ = lfilter([1.0 - remains], [1.0, -remains], outputs, zi=[remains * outputs[0]])
-        columns.append(column)
-    return np.array(columns).reshape(len(columns), outputs.size)
+    """Return outputs, shape (N,), behind lags of first order, which begin at rest: shape (M, N) for M times, s."""
+    late = np.empty((len(times), outputs.size))
+    _kernels.lag_behind(outputs, step, np.array(times, dtype=np.float64), late)
+    return late
 
 
 def identify_lag(
@@ -80,9 +103,10 @@ def identify_lag(
     """
     from scipy.optimize import minimize_scalar
 
-    step = grid_step(actuator)
     ends = [min(longest, float(r.times[-1])) for r in recordings]
     parts = list(zip(recordings, ends, strict=True))
+    drives = [SimulatedDrive(r, actuator, end) for r, end in parts]
+    step = grid_step(actuator)
     measured = np.concatenate([r.responded[r.times <= end] for r, end in parts])
     runs = np.concatenate([np.full(int((r.times <= end).sum()), i) for i, (r, end) in enumerate(parts)])
     bases = (runs[:, None] == np.arange(len(parts))).astype(float)
@@ -91,10 +115,10 @@ def identify_lag(
     def columns_of(response: ResponseDynamics, times: Sequence[float]) -> Floats:
         """Return what comes at once and late at each row, a column each."""
         found = []
-        for (r, end), model in zip(parts, models, strict=True):
-            outputs = model(seen_by_specimen(r, actuator, response, end))
+        for drive, model in zip(drives, models, strict=True):
+            outputs = model(drive.behind(response))
             every = np.vstack([outputs, late_parts(outputs, step, times)])
-            found.append([at_rows(r, row, row[0], step, latency(actuator)) for row in every])
+            found.append([drive.at_rows(row) for row in every])
         return np.concatenate([np.array(each) for each in found], axis=1).T
 
     def fitted(columns: Floats, whole: bool) -> tuple[float, Floats]:
@@ -114,7 +138,7 @@ def identify_lag(
         return fitted(columns_of(ResponseDynamics(math.exp(logarithm), power), ()), True)[0]
 
     candidates = [(score(fitted(columns_of(ResponseDynamics(), ()), True)[0], 0), ResponseDynamics())]
-    for power in (1.0, 2.0):
+    for power in POWERS:
         best = minimize_scalar(
             squares_of,
             args=(power,),
@@ -146,42 +170,36 @@ def refine_lag(
     models: Sequence[Model],
     found: ResponseDynamics,
     longest: float = LONGEST_PART,
+    powers: Sequence[float] = POWERS,
 ) -> tuple[ResponseDynamics, float]:
     """Return dynamics with a lag that goes by the shape of the transients alone, and its standard uncertainty, s.
 
     Within each hold the model may be off by an offset and a factor of its own, so that its error at rest, which is
-    another from hold to hold, is not taken for a lag. Parameters as in `identify_lag`.
+    another from hold to hold, is not taken for a lag. Parameters as in `identify_lag`, and the powers that are tried.
     """
     from scipy.optimize import minimize_scalar
 
-    ends = [min(longest, float(r.times[-1])) for r in recordings]
-    parts = list(zip(recordings, models, ends, strict=True))
-    weights = [_weights(r) for r in recordings]
-    rows = 0
+    parts = []
+    for r, model in zip(recordings, models, strict=True):
+        end = min(longest, float(r.times[-1]))
+        parts.append((SimulatedDrive(r, actuator, end), model, _shapes_of_holds(r, end)))
+    rows = sum(target.size for _, _, holds in parts for _, _, target in holds)
 
     def squares_of(logarithm: float, power: float) -> float:
-        nonlocal rows
-        total, rows = 0.0, 0
+        total = 0.0
         lagged = ResponseDynamics(math.exp(logarithm), power)
-        for (r, model, end), weight in zip(parts, weights, strict=True):
-            outputs = model(seen_by_specimen(r, actuator, lagged, end))
-            modelled = at_rows(r, outputs, outputs[0], grid_step(actuator), latency(actuator))
-            holds = r.last_change[: modelled.size]
-            for hold in range(r.changes.size):
-                within = np.flatnonzero(holds == hold)
-                if within.size < _ROWS_OF_HOLD:
-                    continue
-                design = weight[within, None] * np.column_stack([np.ones(within.size), modelled[within]])
-                target = weight[within] * r.responded[within]
+        for drive, model, holds in parts:
+            modelled = drive.at_rows(model(drive.behind(lagged)))
+            for within, weight, target in holds:
+                design = np.column_stack([weight, weight * modelled[within]])
                 solution, *_ = np.linalg.lstsq(design, target, rcond=1e-6)
                 left = target - design @ solution
                 total += float(left @ left)
-                rows += within.size
         return total
 
     middle = math.log(found.lag)
     trials = []
-    for power in (1.0, 2.0):
+    for power in powers:
         best = minimize_scalar(
             squares_of,
             args=(power,),
@@ -194,6 +212,22 @@ def refine_lag(
     if rows == 0:
         return found, 0.0
     return replace(found, lag=better.lag, power=better.power), _uncertainty(squares_of, better, rows)
+
+
+def _shapes_of_holds(recording: Recording, end: float) -> list[tuple[slice, Floats, Floats]]:
+    """Return the rows of each hold up to an instant, s, that has enough of them, their weights and their response.
+
+    The response is weighted.
+    """
+    last = recording.last_change[recording.times <= end]
+    weights = _weights(recording)
+    found = []
+    for within in (
+        slice(*edges) for edges in np.searchsorted(last, [(k, k + 1) for k in np.unique(last[last >= 0])])
+    ):
+        if within.stop - within.start >= _ROWS_OF_HOLD:
+            found.append((within, weights[within], weights[within] * recording.responded[within]))
+    return found
 
 
 def _uncertainty(squares_of: Callable[[float, float], float], lagged: ResponseDynamics, count: int) -> float:

@@ -124,6 +124,15 @@ def search(
     return best
 
 
+def confirm(start: Numbers, found: Numbers, evaluate: Evaluate) -> tuple[Trial, Trial]:
+    """Return trials of two sets of numbers in sessions that the search has not seen.
+
+    The second one is that of the start again if what was found is not better there.
+    """
+    before, after = evaluate([start, found])
+    return before, after if after.cost < before.cost else before
+
+
 def get(numbers: Numbers, name: str) -> float:
     """Return a number by its name, `TABLE.NAME` for one in a table."""
     table, _, last = name.rpartition(".")

@@ -19,7 +19,7 @@ from bench.hysteresis import TwoStage
 from bench.model_file import load_model
 from bench.rig_file import load_rig
 from bench.tuning.runs import Task, TuningRuns, start_of, task_of
-from bench.tuning.search import MARGIN, TIME_WEIGHT, Trial, search
+from bench.tuning.search import MARGIN, TIME_WEIGHT, Trial, confirm, search
 from bench.tuning_file import tuning_text
 
 
@@ -34,9 +34,9 @@ class Tuned:
     twin : str
         The emulated rig on which they were found.
     first, best : Trial
-        The numbers before and after.
+        The numbers before and after, in sessions that the search has not seen. The same if nothing better was found.
     trials : int
-        Number of trials.
+        Number of trials of the search.
     others : dict
         Tables of the rig file for the other controllers of the protocol.
     provenance : dict
@@ -57,9 +57,10 @@ class Tuned:
 
     def rows(self) -> list[tuple[str, str]]:
         """Return what was found, for people."""
+        after = "after" if self.best is not self.first else "nothing better found"
         rows = [
             (name, f"cost {t.cost:.4g}, RMS {t.rms:.4g}, worst margin {t.worst:.4g}, {t.seconds:.1f} s a target")
-            for name, t in (("before", self.first), ("after", self.best))
+            for name, t in (("before", self.first), (after, self.best))
         ]
         return [*rows, ("trials", str(self.trials)), ("numbers", str(dict(self.best.numbers)))]
 
@@ -77,12 +78,15 @@ def tune(
     protocol: str | None = None,
     settings: Sequence[str] = (),
     seeds: int = 1,
+    checks: int = 2,
     rounds: int = 2,
     workers: int | None = None,
     folder: Path = Path("recordings/tuning"),
     console: Console | None = None,
 ) -> Tuned:
     """Tune a controller; parameters as the options of `bench tune`.
+
+    The numbers that the search finds are taken only if they are better in sessions that it has not seen as well.
 
     Raises
     ------
@@ -98,7 +102,7 @@ def tune(
     shown = console or Console(quiet=True)
     file = load_model(model)
     task = task_of(file, controller, protocol)
-    on = twin or rig
+    on = twin or load_rig(rig).rig.twin or rig
     if not load_rig(on).in_process:
         raise ConfigurationError(
             f"rig {on} is not emulated: give --twin, such as a rig file that bench twin has made"
@@ -129,8 +133,10 @@ def tune(
     with Workers(workers, title=f"tune {controller}") as pool:
         runs = TuningRuns(task, on, file, folder, pool, given, seeds)
         best = search(begin, spec.tunable, runs, tell, rounds)
-    if not math.isfinite(best.cost):
-        raise BenchError(f"the controller fails with all numbers that were tried: {runs.failures[0]}")
+        if not math.isfinite(best.cost):
+            raise BenchError(f"the controller fails with all numbers that were tried: {runs.failures[0]}")
+        unseen = TuningRuns(task, on, file, folder / "check", pool, given, checks, first_seed=seeds)
+        first, best = confirm(begin, best.numbers, unseen)
     provenance: dict[str, str | float] = {
         "model": model.name,
         "model_sha256": sha256(model.read_bytes()).hexdigest(),
@@ -140,13 +146,14 @@ def tune(
         "settings": ", ".join(settings),
         "cost": f"0.5 (as identified + worst margin) of RMS in % of the range + {TIME_WEIGHT:g} s a target; "
         f"margins: gain and time constant by {MARGIN:g} to either side",
-        "cost_before": trials[0].cost,
+        "cost_before": first.cost,
         "cost_after": best.cost,
-        "rms_before": trials[0].rms,
+        "rms_before": first.rms,
         "rms_after": best.rms,
         "trials": len(trials),
         "seeds": seeds,
+        "checks": checks,
         "made": wall_time().isoformat(timespec="seconds"),
         "bench": importlib.metadata.version("actuator-bench"),
     }
-    return Tuned(task, on, trials[0], best, len(trials), dict(tables), provenance)
+    return Tuned(task, on, first, best, len(trials), dict(tables), provenance)

@@ -246,7 +246,8 @@ class Part:
         specimen = Specimen(self._operators, dynamics, self._first, rng)
         before = specimen.response
         _, response = specimen.advance(self._setpoints)
-        return at_rows(self._recording, response, before, dynamics.step, latency(dynamics.actuator))
+        times = self._recording.times
+        return at_rows(times[times <= self._end], response, before, dynamics.step, latency(dynamics.actuator))
 
     def _local_slopes(self, count: int) -> Floats:
         """Return by how much the model's response depends on the drive at each row, by its greater slope."""

@@ -16,9 +16,8 @@ import numpy as np
 from bench.control.dynamics import ActuatorDynamics, ResponseDynamics
 from bench.hysteresis import Operator
 from bench.hysteresis._checks import Floats
-from bench.transients.actuator import at_rows, grid_step, latency
 from bench.transients.recording import Recording
-from bench.transients.response import identify_lag, late_parts, seen_by_specimen
+from bench.transients.response import SimulatedDrive, identify_lag, late_parts
 from bench.twin.correction import identify_correction
 
 
@@ -57,16 +56,15 @@ def identify_response(
 ) -> IdentifiedResponse:
     """Identify the response of a specimen, whose model and actuator are known."""
     dynamics, uncertainty = identify_lag(recordings, actuator, [model.evaluate] * len(recordings))
-    step = grid_step(actuator)
     inputs, errors, offsets, readings = [], [], [], []
     for r in recordings:
-        end = float(r.times[-1])
-        seen = seen_by_specimen(r, actuator, dynamics, end)
+        drive = SimulatedDrive(r, actuator, float(r.times[-1]))
+        seen = drive.behind(dynamics)
         outputs = model.evaluate(seen)
-        whole = dynamics.gain * outputs + np.array(dynamics.shares) @ late_parts(outputs, step, dynamics.times)
-        error = r.responded - at_rows(r, whole, whole[0], step, latency(actuator))
+        whole = dynamics.gain * outputs + np.array(dynamics.shares) @ late_parts(outputs, drive.step, dynamics.times)
+        error = r.responded - drive.at_rows(whole)
         offset = float(np.median(error[r.is_reading]))
-        inputs.append(at_rows(r, seen, seen[0], step, latency(actuator)))
+        inputs.append(drive.at_rows(seen))
         errors.append(error - offset)
         offsets.append(offset)
         readings.append(r.is_reading)

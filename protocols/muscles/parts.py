@@ -31,6 +31,8 @@ from protocols.preparation import DRIVE_AND_RESPONSE, SETTLE_LOAD, Part, prompt_
 
 SAMPLE = "sample"
 """Label of the readings that count."""
+CONDITIONING = "conditioning"
+"""Label of the cycles of the voltage over its whole range before them."""
 
 ON_WEIGHTS = {**DRIVE_AND_RESPONSE, "force": Signal, "load": Signal, "cooling": Actuator}
 ON_STAGE = {**DRIVE_AND_RESPONSE, "force": Signal, "stage": Actuator}
@@ -140,8 +142,8 @@ def prepare_on_stage(parameters: StageParameters, slots: Slots, cycles: int) -> 
     yield from reset_on_stage(parameters, slots)
     yield Phase("conditioning")
     for _ in range(cycles):
-        yield drive_to(slots, parameters.highest, parameters.dwell, "conditioning")
-        yield drive_to(slots, 0.0, parameters.dwell, "conditioning")
+        yield drive_to(slots, parameters.highest, parameters.dwell, CONDITIONING)
+        yield drive_to(slots, 0.0, parameters.dwell, CONDITIONING)
     return (yield from stretch(slots, parameters.pretension))
 
 

@@ -7,7 +7,7 @@ positive current heats.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -19,7 +19,9 @@ from bench.hysteresis import Polynomial, PrandtlIshlinskii
 from bench.identification import Errors, Identification
 from bench.identification.dynamics import DynamicsIdentification, identify_dynamics
 from bench.journal import Record, Table
+from bench.model_file import ModelFile
 from bench.protocol import LATENESS
+from bench.results.whole_models import WholeIdentification
 from rigs.hybrid.model import HybridModel, OrderChoice, choose_order, identify_pi, identify_polynomial
 from rigs.hybrid.network_identification import NetworkIdentification, identify_network
 
@@ -30,11 +32,11 @@ DEFLECTION, BASE, TIP, WITNESS = "response", "base", "tip", "witness"
 CURRENT, VOLTAGE = "coarse_setpoint", "fine_setpoint"
 """Set-points of their slots."""
 
+PROTOCOLS = ("current-steps", "thermomechanical", "piezo-loops", "piezo-step")
+"""Protocols of the runs from which a hybrid is identified, in the order of `identify_hybrid`."""
+
 REFERENCE = 22.0
 """Reference of the polynomial, °C: the nominal temperature of the room."""
-
-CURRENT_STEPS = "current-steps"
-"""Protocol of the run for the thermal network."""
 
 _DRIFT_PASSES = 64
 """Passes in which operator and parabola are fitted in turn; more change less than the sensor's noise."""
@@ -196,12 +198,7 @@ def identify_hybrid(
     DataError
         If a run is of another kind or was not completed, or a part cannot be identified.
     """
-    for run, protocol in (
-        (steps, CURRENT_STEPS),
-        (static, "thermomechanical"),
-        (loops, "piezo-loops"),
-        (step, "piezo-step"),
-    ):
+    for run, protocol in zip((steps, static, loops, step), PROTOCOLS, strict=True):
         _check_protocol(run, protocol)
     with Record(static) as record:
         if record.status != "completed":
@@ -223,7 +220,7 @@ def identify_hybrid(
 
 def network_of(steps: Path) -> NetworkIdentification:
     """Return the thermal network of a run of `current-steps`; raises DataError as `identify_hybrid`."""
-    _check_protocol(steps, CURRENT_STEPS)
+    _check_protocol(steps, PROTOCOLS[0])
     currents = read_loop(steps)
     try:
         return identify_network(currents[CURRENT], currents[BASE], currents[TIP], currents.period)
@@ -239,6 +236,20 @@ def _check_protocol(run: Path, protocol: str) -> None:
 
 def _unidentified(error: ValueError) -> DataError:
     return DataError(f"the hybrid cannot be identified: {error}")
+
+
+def hybrid_file(found: HybridIdentification, runs: Sequence[Path]) -> ModelFile:
+    """Return the model file of a hybrid that was identified from runs."""
+    return ModelFile("hybrid", found.model, provenance={"sources": [run.name for run in runs]})
+
+
+def identify_runs(runs: Mapping[str, Path]) -> ModelFile:
+    """Return the model of a hybrid from its runs by protocol; raises as `identify_hybrid`."""
+    folders = [runs[name] for name in PROTOCOLS]
+    return hybrid_file(identify_hybrid(*folders), folders)
+
+
+FROM_RUNS = WholeIdentification(PROTOCOLS, identify_runs)
 
 
 def identify_piezo(samples: Samples, plays: int = 15) -> PiezoIdentification:

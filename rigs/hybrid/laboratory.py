@@ -24,6 +24,7 @@ from sim_devices.instruments.labjack_t7 import EmulatedT7
 from sim_devices.instruments.meerstetter_table import DeviceStatus
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC
 from sim_devices.laboratory import EmulatedLaboratory, TrueValue, compile_loops, tec_faults
+from sim_devices.plants.grid import changed
 from sim_devices.plants.hybrid import HybridCantilever
 from sim_devices.plants.hybrid_parameters import HybridParameters
 from sim_devices.transducers.data_sheets import DISPLACEMENT, THERMISTOR
@@ -83,6 +84,9 @@ class HybridLaboratorySettings(SensorSettings):
     resonance_offset: float = Field(
         default=0.0, ge=-0.1, le=0.1, description="deviation of the resonance from the paper's, as a share"
     )
+    plant: dict[str, float] = Field(
+        default={}, description="numbers of the plant in place of its own; see `sim_devices.plants`"
+    )
     current_limit: float = Field(
         default=0.15, gt=0, le=0.4, description="as set in the TEC controller, A; a driver sets its own"
     )
@@ -133,10 +137,13 @@ class HybridLaboratory(EmulatedLaboratory):
         plant, tec, sensor, base, tip, amplifier, t7 = np.random.default_rng(seed).spawn(7)
         self._settings = settings
         self.plant = HybridCantilever(
-            HybridParameters(
-                ambient_temperature=settings.ambient,
-                ambient_sd=settings.ambient_deviation,
-                resonance_offset=settings.resonance_offset,
+            changed(
+                HybridParameters(
+                    ambient_temperature=settings.ambient,
+                    ambient_sd=settings.ambient_deviation,
+                    resonance_offset=settings.resonance_offset,
+                ),
+                settings.plant,
             ),
             plant,
         )

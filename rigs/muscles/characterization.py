@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
+from bench.hysteresis import TwoStage
 from bench.identification.two_stage import CoupledIdentification, Series, measure_series
 from bench.journal import add_model
 from bench.model_file import ModelFile
@@ -25,6 +26,7 @@ from rigs.muscles.identification import (
     Resting,
     errors_json,
     identify_muscle,
+    identify_muscle_dynamics,
     muscle_file,
     read_resting,
     read_series,
@@ -124,8 +126,11 @@ def characterize(campaign: Campaign, runs: Mapping[str, Pending[RunResult]]) -> 
     lengths = [folders["length-voltage"], folders["length-force"]]
     series = [one for run in lengths for one in read_series(run)]
     models = {name: identify_muscle(name, resting, series) for name in MODELS}
+    # The models of two stages have the same first one, which is all that counts here.
+    dynamics = identify_muscle_dynamics(models["two-stage"].model, folders["force-voltage"], lengths)
     for name, found in models.items():
-        muscle_file(name, found, folders["force-voltage"], lengths).save(campaign.folder / f"{name}.json")
+        known = dynamics if isinstance(found.model, TwoStage) else None
+        muscle_file(name, found, [folders["force-voltage"], *lengths], known).save(campaign.folder / f"{name}.json")
     return Characterization(resting, series, read_series(folders["length-verification"]), models)
 
 

@@ -38,6 +38,7 @@ def ended(child):
     return child.exitstatus
 
 
+@pytest.mark.seeds
 def test_a_pause_with_all_that_it_offers(start, tmp_path, rig_file):
     told = tmp_path / "told"
     listener = tmp_path / "listener.py"

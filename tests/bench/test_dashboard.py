@@ -915,6 +915,7 @@ def test_clients_that_never_read_hold_nothing_up(tmp_path: Path) -> None:
     assert len(table(read(tmp_path / "run.rrd")["/signals/temperature"], "scalars")[0]) == 20_000
 
 
+@pytest.mark.seeds
 def test_a_viewer_that_hangs_holds_nothing_up(tmp_path: Path) -> None:
     dashboard = make_dashboard(tmp_path / "run.rrd", live=True)
     assert dashboard.uri is not None
@@ -1076,6 +1077,7 @@ def test_the_viewer_draws_it_without_complaint(
 
 
 @NEEDS_VULKAN
+@pytest.mark.seeds
 def test_the_viewer_draws_a_control_run_without_complaint(tmp_path: Path, control_folder: Path) -> None:
     png = tmp_path / "dashboard.png"
     assert picture(control_folder / "rebuilt.rrd", png, size=(1280, 800)) == []
@@ -1089,6 +1091,7 @@ def test_the_viewer_draws_a_control_run_without_complaint(tmp_path: Path, contro
 
 
 @NEEDS_VULKAN
+@pytest.mark.seeds
 def test_the_viewer_shows_three_loops_and_two_planes_at_once(tmp_path: Path, muscle: Path) -> None:
     png = tmp_path / "dashboard.png"
     assert picture(muscle, png, at=8000.0) == []

@@ -269,7 +269,13 @@ class TestEnd:
             ("creep", "vo2", {"duration": 30}, "x50"),
             pytest.param("tracking", "vo2", {"count": 4}, "x40", marks=pytest.mark.seeds),
             pytest.param("following", "vo2", {"duration": 100}, "x50", marks=pytest.mark.seeds),
-            ("length-voltage", "sma", {"loads": "0.98, 2.94", "points": 11, "dwell": 5}, "x100"),
+            pytest.param(
+                "length-voltage",
+                "sma",
+                {"loads": "0.98, 2.94", "points": 11, "dwell": 5},
+                "x100",
+                marks=pytest.mark.seeds,
+            ),
         ],
     )
     @pytest.mark.skipif(sys.platform == "win32", reason="needs a pseudo-terminal")

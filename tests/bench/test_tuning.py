@@ -13,7 +13,7 @@ from bench.hysteresis import Preisach, TwoStage, uniform_levels
 from bench.model_file import ModelFile
 from bench.protocol import find_protocol
 from bench.rig_file import load_rig
-from bench.tuning.search import MARGIN, Trial, cost_of, get, perturbed_models, put, search
+from bench.tuning.search import MARGIN, Trial, confirm, cost_of, get, perturbed_models, put, search
 from bench.tuning_file import load_tuning, tuning_text
 
 FILM = Preisach(uniform_levels(30.0, 70.0, 4), np.ones(10), 20.0, None, (21.0, 84.0), "°C", "1/m")
@@ -39,6 +39,14 @@ def test_the_search_comes_near_the_best_numbers_and_keeps_off_those_that_fail():
     assert best.cost == min(trial.cost for trial in seen)
     assert len(seen) == 1 + 4 * 2 * 2
     assert NUMBERS == {"wait": 8.0, "arrival": {"hold": 0.4}}
+
+
+@pytest.mark.parametrize(("wait", "taken"), [(3.5, True), (8.0, False), (9.0, False), (2.0, False)])
+def test_numbers_that_are_not_better_in_other_sessions_are_not_taken(wait, taken):
+    found = put(NUMBERS, "wait", wait)
+    first, best = confirm(NUMBERS, found, evaluate)
+    assert first.numbers is NUMBERS
+    assert best.numbers is (found if taken else NUMBERS)
 
 
 def test_the_cost_is_the_error_in_percent_and_the_time():
@@ -102,7 +110,10 @@ def fails(capsys, *arguments):
 def test_what_cannot_be_tuned_is_refused_before_a_run(tmp_path, capsys):
     model, out = tmp_path / "model.json", ["--out", tmp_path / "tuning.toml", "--runs", tmp_path / "runs"]
     ModelFile("preisach", FILM).save(model)
+    twinned = tmp_path / "twinned.toml"
+    twinned.write_text('extends = "vo2-hardware"\n[rig]\ntwin = "vo2"\n')
     for arguments, said in (
+        (["--rig", twinned, "--controller", "polynomial"], "no numbers that could be tuned"),
         (["--rig", "vo2-hardware"], "is not emulated: give --twin"),
         (["--rig", "vo2", "--controller", "polynomial"], "no numbers that could be tuned"),
         (["--rig", "vo2", "--protocol", "length-control"], "is controlled by tracking"),
@@ -123,7 +134,7 @@ def test_a_controller_is_tuned_on_the_emulated_rig(tmp_path):
             [
                 *("tune", str(model), "--rig", "vo2", "--controller", "integral", "--rounds", "1", "--workers", "1"),
                 *("--set", "count=4", "--set", "low=500", "--set", "high=1200"),
-                *("--runs", str(tmp_path / "runs"), "--out", str(out)),
+                *("--checks", "1", "--runs", str(tmp_path / "runs"), "--out", str(out)),
             ]
         )
     assert not stopped.value.code

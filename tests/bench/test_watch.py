@@ -109,6 +109,7 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, s
     return int(stopped.value.code or 0), said
 
 
+@pytest.mark.seeds
 def test_a_run_in_progress_is_watched_from_another_process_and_once_more(tmp_path: Path) -> None:
     runs = tmp_path / "runs"
     with started(*ENDLESS, "--out", str(runs)) as run:

@@ -153,6 +153,7 @@ def test_a_device_of_a_stranger_keeps_its_contract_and_is_left_safe(contracts, s
     assert (tmp_path / "closed").read_text().splitlines() == ["0 on"] * len(tests)
 
 
+@pytest.mark.slow
 def test_on_a_real_rig_an_actuator_moves_between_the_set_points_that_are_given(contracts, stranger):
     stranger(coil="Supply")
     code, output = contracts("--device", "coil", "--rig", "own.toml")

@@ -32,6 +32,12 @@ def test_a_controller_without_a_reference_is_not_judged():
     assert not any(cycles([0.0, 3.0] * 20, reference=math.nan))
 
 
+def test_the_ends_are_parts_of_the_range_wherever_it_lies():
+    assert cycles([1.7, 3.3] * 4, low=1.0, high=4.0)[-1]
+    assert not any(cycles([1.8, 3.3] * 20, low=1.0, high=4.0))
+    assert not any(cycles([1.7, 3.2] * 20, low=1.0, high=4.0))
+
+
 @given(st.lists(st.floats(0.8, 3.0), max_size=200))
 def test_a_loop_that_stays_off_one_end_never_cycles(setpoints):
     assert not any(cycles(setpoints))

@@ -154,6 +154,27 @@ class TestBoth:
         return rms(errors[40:])
 
 
+def test_refusals_that_lie_far_apart_do_not_begin_it_anew(identified):
+    adaptation = SessionFilter(identified)
+    moved = specimen(identified, offset=25.0)
+    learnt(adaptation, readings(moved, 60))
+    for k, (state, output) in enumerate(readings(moved, 120, seed=1)):
+        adaptation.update(state, identified.value(state) if k % 30 < 5 else output)
+    assert adaptation.refused >= 15
+    assert adaptation.restarts == 0
+    assert adaptation.estimates()["offset"].value == pytest.approx(25.0, abs=3.0)
+
+
+def test_the_mass_of_a_density_is_given_in_parts_of_the_identified_one(identified):
+    adaptation = DensityFilter(identified)
+    mass = adaptation.estimates()["mass"]
+    assert mass.value == pytest.approx(1.0)
+    assert 0.05 < mass.uncertainty < 0.3
+    learnt(adaptation, readings(specimen(identified, gain=1.1), 100))
+    mass = adaptation.estimates()["mass"]
+    assert abs(mass.value - 1.1) < 3.0 * mass.uncertainty < 0.15
+
+
 def test_the_session_is_found_within_its_uncertainty(identified):
     adaptation = SessionFilter(identified)
     learnt(adaptation, readings(specimen(identified, **PERTURBED["all"]), 100))

@@ -101,6 +101,16 @@ def test_an_actuator_at_the_end_of_its_stroke_ends_it():
         follow(9.0, delay=0, gain=0.7)
 
 
+def test_it_waits_50_ms_at_the_end_of_the_stroke():
+    parameters = NotchLoopParameters(rate=RATE, integral=300.0, stroke=10.0)
+    loop = NotchLoop(STIFF, PUBLISHED_DYNAMICS.frequency, 0.0039, lambda _: 9.0, parameters)
+    # Nothing moves: the integral comes to the end of the stroke after 10 / (300 / RATE * 9) samples.
+    for k in range(math.floor(10.0 / (300.0 / RATE * 9.0)) + round(0.05 * RATE)):
+        loop.update(k / RATE, (0.0,))
+    with pytest.raises(ConvergenceError, match="at the end of its stroke"):
+        loop.update(k / RATE, (0.0,))
+
+
 def test_the_reach_is_less_than_the_stroke():
     parameters = NotchLoopParameters(rate=RATE, integral=300.0, stroke=4.0)
     loop = NotchLoop(STIFF, PUBLISHED_DYNAMICS.frequency, 0.0039, float, parameters)

@@ -163,6 +163,14 @@ def test_an_actuator_that_follows_at_once_is_set_to_the_inverse_of_the_reference
     assert setpoint == pytest.approx(model.inverse().invert(model.initial_state(), 1.5).setpoints[-1], abs=0.01)
 
 
+@pytest.mark.parametrize(
+    ("delay", "lag", "periods"), [(0.0, 0.0, 6), (0.6, 0.0, 6), (0.0, 1.0, 8), (1.1, 1.0, 11), (0.0, 60.0, 24)]
+)
+def test_the_horizon_is_the_delay_and_four_time_constants_within_bounds(model, delay, lag, periods):
+    dynamics = IdentifiedDynamics(ActuatorDynamics(delay=delay), ResponseDynamics(lag))
+    assert PredictiveFollower(model.inverse("nearest"), dynamics).horizon == periods
+
+
 def test_a_reference_that_is_no_number_is_refused(model):
     with pytest.raises(ValueError, match="reference"):
         PredictiveFollower(model.inverse(), IdentifiedDynamics()).update(0.0, 0.0, 0.0, math.nan)

@@ -39,6 +39,11 @@ class TestTargets:
         assert np.abs(first[24:30]).max() < 0.25
         assert (tracking_targets(np.random.default_rng(1), -1.0, 1.0, 60) == first).all()
 
+    def test_they_begin_at_the_top_of_the_range(self):
+        targets = tracking_targets(np.random.default_rng(1), 10.0, 30.0, 20)
+        assert targets[0] == pytest.approx(30.0)
+        assert targets[1] == pytest.approx(20.0 + 10.0 * 0.9 * math.sin(0.9 * math.pi))
+
     def test_wrong_arguments(self):
         with pytest.raises(ValueError, match="low, high"):
             tracking_targets(np.random.default_rng(1), 1.0, 1.0)

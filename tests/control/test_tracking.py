@@ -169,7 +169,6 @@ readings = st.one_of(
 
 
 class TestLimits:
-    @pytest.mark.costly
     @pytest.mark.parametrize("limits", [(LOW, HIGH), NARROW, (0.0, 200.0)])
     @pytest.mark.parametrize("name", TARGETS)
     @settings(max_examples=40)
@@ -423,6 +422,8 @@ class TestClosedLoop:
             replace(CORRECTION, walk_variance=math.nan)
         with pytest.raises(ValueError, match="lead"):
             FollowingParameters(30.0, 1.0, lead=-1.0)
+        with pytest.raises(ValueError, match="walk_variance: expected a positive number"):
+            FollowingParameters(0.0, 1.0)
 
 
 class TestLatched:

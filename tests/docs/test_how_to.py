@@ -22,6 +22,15 @@ PAGES = [
     if path.stem != "index"
 ]
 EXECUTED = [*PAGES, *(DOCS / "reference" / f"{name}.md" for name in ("campaign", "interlocks"))]
+LONG = {
+    "add-a-controller",
+    "describe-an-instrument",
+    "identify-from-a-file",
+    "resume-a-run",
+    "sma",
+    "vo2",
+}
+"""More than five seconds each; of these `make test` looks at the commands only (`test_readme.py`)."""
 BLOCK = re.compile(r"^```(\w+)(?: file: (\S+))?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 
@@ -42,7 +51,10 @@ def environment(tmp_path, warm_commands):
     }
 
 
-@pytest.mark.parametrize("path", EXECUTED, ids=lambda path: path.stem)
+@pytest.mark.parametrize(
+    "path",
+    [pytest.param(path, id=path.stem, marks=[pytest.mark.seeds] if path.stem in LONG else []) for path in EXECUTED],
+)
 def test_page(path, tmp_path, environment, finished_process, warm_process):
     page, printed = path.stem, None
     for language, name, text in BLOCK.findall(path.read_text()):

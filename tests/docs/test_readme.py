@@ -21,18 +21,19 @@ def blocks(language):
 
 
 def commands():
-    """Yield each command line of the README, from blocks and from the text, and those of tutorials for hardware."""
-    hardware = [
+    """Yield each command line of the README, from blocks and from the text, and those of tutorials and guides."""
+    others = [
         line.strip()
-        for page in sorted((ROOT / "docs" / "tutorials").glob("*.md"))
-        for block in re.findall(r"^ *```bash\n(.*?)^ *```$", page.read_text(), re.DOTALL | re.MULTILINE)
+        for folder in ("tutorials", "how-to")
+        for page in sorted((ROOT / "docs" / folder).glob("*.md"))
+        for block in re.findall(r"^ *```(?:ba)?sh\n(.*?)^ *```$", page.read_text(), re.DOTALL | re.MULTILINE)
         for line in block.replace("\\\n", " ").splitlines()
     ]
-    shell = "\n".join([*blocks("sh"), *hardware]).replace("\\\n", " ")
+    shell = "\n".join([*blocks("sh"), *others]).replace("\\\n", " ")
     text = re.sub(r"^```.*?^```$", "", README, flags=re.DOTALL | re.MULTILINE)
     for line in [*shell.splitlines(), *(code.replace("\n", " ") for code in re.findall(r"`([^`]+)`", text))]:
         if line.split(maxsplit=1)[:1] in (["bench"], ["make"]):
-            yield line.partition("#")[0].partition(">")[0].strip()
+            yield re.split(r"[#>|&]", line)[0].strip()
 
 
 def test_the_readme_has_commands():

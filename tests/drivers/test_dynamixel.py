@@ -504,9 +504,10 @@ def test_first_set_point_switches_on_under_the_watchdog_where_it_stands(script, 
 
 
 def test_profile_is_rounded_down(script, clock):
-    servo = connect(clock, profile_velocity=42 * 0.229 * 2 * math.pi / 60, profile_acceleration=0.7)
-    servo.set(1.0)
-    assert (script.values[112], script.values[108]) == (42, 1)
+    for acceleration, units in ((0.7, 1), (3 * 214.577 * 2 * math.pi / 3600, 3)):
+        servo = connect(clock, profile_velocity=42 * 0.229 * 2 * math.pi / 60, profile_acceleration=acceleration)
+        servo.set(1.0)
+        assert (script.values[112], script.values[108]) == (42, units)
 
 
 def test_no_set_point_beyond_the_limits_is_sent(script, servo):

@@ -566,6 +566,7 @@ def test_a_damaged_reply_is_asked_for_again(bench, damage):
 
 
 @needs_pty
+@pytest.mark.slow
 def test_a_late_reply_is_not_taken_for_the_next(bench, pseudo_terminal):
     class Late(WireServer):
         slow = False

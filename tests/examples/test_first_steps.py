@@ -4,11 +4,14 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import bench
 
 SCRIPT = Path(__file__).parents[2] / "examples" / "first_steps.py"
 
 
+@pytest.mark.seeds
 def test_it_runs_and_shows_what_it_says(tmp_path, warm_popen):
     done = subprocess.run(
         [sys.executable, SCRIPT], cwd=tmp_path, capture_output=True, text=True, timeout=240, check=False

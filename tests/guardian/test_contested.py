@@ -63,6 +63,7 @@ def endpoints(rig, path, **ports):
     return "--attach", str(path)
 
 
+@pytest.mark.seeds
 def test_the_second_bench_is_refused_and_the_first_one_is_not_disturbed(emulated_rig, tmp_path):
     rig = emulated_rig("vo2", clock="x2", overrides=OVERRIDES)
     enough, contested, undisturbed, refused = (tmp_path / name for name in ("enough", "first", "alone", "second"))

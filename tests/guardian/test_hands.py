@@ -69,6 +69,7 @@ def test_set_40_degrees_then_the_terminal_hangs_up(panel, vo2, tmp_path):
         assert [dict(each.setpoints) for each in record.step_records()] == [{"tec": 40.0}]
 
 
+@pytest.mark.seeds
 def test_an_interlock_trips_and_is_said(panel, vo2, tmp_path):
     file = tmp_path / "vo2.toml"
     file.write_text(load_rig("vo2").text.replace("high = 100.0", "high = 45.0"), encoding="utf-8")
@@ -84,6 +85,7 @@ def test_an_interlock_trips_and_is_said(panel, vo2, tmp_path):
         assert [each.level for each in record.events() if each.kind == "warning"] == ["WARN"]
 
 
+@pytest.mark.seeds
 def test_ctrl_c_leaves_in_the_safe_state(panel, vo2):
     child = panel()
     child.expect("tec_temperature")

@@ -36,6 +36,7 @@ def departures(band, model, inputs):
 
 @pytest.mark.parametrize("plant", ["bouc-wen", "duhem"])
 @pytest.mark.parametrize("model", [PREISACH, PLAYS], ids=["preisach", "plays"])
+@pytest.mark.slow
 def test_nine_of_ten_are_covered_on_other_inputs_of_the_same_class(plant, model):
     covered, together, flagged = [], [], 0
     for seed in range(8):

@@ -160,6 +160,7 @@ def test_exact_step_gives_the_exact_system(change):
     assert found.offset == pytest.approx(-0.4)
 
 
+@pytest.mark.slow
 def test_uncertainties_are_the_scatter_of_the_estimates():
     found = [identify_dynamics(*measured(PIEZO, 1e4, seed=seed, delay=5e-5)) for seed in range(30)]
     for name in ("real_pole", "frequency", "damping", "gain"):

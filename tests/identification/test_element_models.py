@@ -61,6 +61,7 @@ def test_the_parameters_of_bouc_wen_are_found():
     assert found.coefficients == pytest.approx(plant.coefficients, rel=1e-5)
 
 
+@pytest.mark.slow
 def test_bouc_wen_of_other_exponents_and_stiffening_is_found():
     inputs = inputs_of(800)
     for beta, gamma, exponent, hysteretic in ((30.0, 10.0, 3.0, -0.4), (0.4, -1.1, 1.0, 1.0), (4.0, 2.0, 1.7, 1.0)):
@@ -75,6 +76,7 @@ def test_the_rate_of_duhem_is_found():
     assert found.rate == pytest.approx(3.0, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_loop_that_saturates_suits_envelopes_better_than_plain_plays():
     inputs = inputs_of()
     outputs = np.tanh(1.5 * plants()["generalized-prandtl-ishlinskii"].evaluate(inputs))

@@ -106,6 +106,7 @@ def test_one_kind_of_cycle_is_warned_of():
     assert any("4.0 times" in text for text in ratio.warnings())
 
 
+@pytest.mark.slow
 def test_of_one_kind_of_cycle_a_model_is_chosen_that_the_record_determines():
     turns = np.array([0.0, *[1.0, -1.0] * 8])
     inputs = np.interp(np.arange(17 * 30 - 29), np.arange(17) * 30, turns)

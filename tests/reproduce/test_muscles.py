@@ -2,10 +2,13 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+import bench
 from bench.journal import Record
-from rigs.muscles.identification import MODELS, SAMPLE
+from bench.results.tracking import target_results
+from rigs.muscles.identification import FORCE, LENGTH, MODELS, SAMPLE
 
 MUSCLES = ("mckibben", "coiled_polymer")
 SAMPLES = {"force-voltage": 37, "length-voltage": 185, "length-force": 138, "length-verification": 90}
@@ -50,3 +53,21 @@ def test_campaign(reproduce, seed):
     ]
     assert len(campaign["recordings"]) == 8
     assert all(Path(path).stat().st_size > 1000 for path in campaign["figures"] + campaign["recordings"])
+
+
+@pytest.mark.slow
+@pytest.mark.seeds
+def test_closed_loop(reproduce, tmp_path):
+    _, campaign = reproduce("muscles", 0)
+    for muscle in MUSCLES:
+        model = Path(campaign["folder"]) / muscle / "two-stage.json"
+        # Recorded with seeds 0 to 12: at most 0.036 mm and 0.044 N.
+        for protocol, signal, most in (("length-control", LENGTH, 0.05e-3), ("force-control", FORCE, 0.1)):
+            for seed in (0, 1):
+                run = bench.run(
+                    protocol, muscle.replace("_", "-"), out=tmp_path, clock="virtual", seed=10 + seed,
+                    model=str(model), sequence_seed=seed + 1, count=20,
+                )  # fmt: skip
+                with Record(run.folder) as record:
+                    results = target_results(record, signal)
+                assert np.sqrt(np.mean((results.outputs - results.targets) ** 2)) <= most, (muscle, protocol, seed)
