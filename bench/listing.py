@@ -24,7 +24,7 @@ def listing() -> dict[str, Any]:
     It is remembered in the user's folder for caches, unless something could not be loaded.
     """
     state = _state()
-    file = _folder() / "catalogue.json"
+    file = _file_of_this_environment()
     with suppress(OSError, ValueError):
         remembered = json.loads(file.read_text(encoding="utf-8"))
         if isinstance(remembered, dict) and remembered.get("state") == state:
@@ -41,6 +41,11 @@ def listing() -> dict[str, Any]:
             made.write_text(json.dumps({"state": state, "catalogue": found}), encoding="utf-8")
             made.replace(file)
     return found
+
+
+def _file_of_this_environment() -> Path:
+    # Another environment has another listing, which shall not take the place of this one's.
+    return _folder() / f"catalogue-{hashlib.sha256(sys.prefix.encode()).hexdigest()[:12]}.json"
 
 
 def _folder() -> Path:

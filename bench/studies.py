@@ -199,6 +199,14 @@ class ResultTable:
         if self.note:
             console.print(self.note.format_map(values), highlight=False)
 
+    def markdown(self, values: Mapping[str, Any]) -> str:
+        """Return it as a table of a Markdown text, with title and note as paragraphs."""
+        title = self.title.format_map(values)
+        rows = [self.columns, ["---"] * len(self.columns)]
+        rows += [[cell.format_map(values) for cell in row] for row in self.rows]
+        table = "\n".join(f"| {' | '.join(row)} |" for row in rows)
+        return "\n\n".join(filter(None, (title[:1].upper() + title[1:] + ":", table, self.note.format_map(values))))
+
 
 @dataclass(frozen=True)
 class StudyResult:

@@ -105,7 +105,7 @@ def runs_table(expansion: Expansion, done: Mapping[str, Done], table: str) -> Re
     models: dict[str, list[ModelTask]] = {}
     for task in expansion.tasks.values():
         if isinstance(task, ModelTask):
-            models.setdefault(task.source, []).append(task)
+            models.setdefault(task.sources[0], []).append(task)
     rows: list[dict[tuple[str, str], Cell]] = []
     for task in expansion.tasks.values():
         if not isinstance(task, RunTask) or task.table != table:
@@ -211,6 +211,15 @@ def in_one_cell(summary: ResultsTable) -> ResultsTable:
         elif which not in (WORST, SPREAD) and name != "table":
             columns[(name, unit)] = cells
     return ResultsTable(columns)
+
+
+def studies_of(expansion: Expansion, done: Mapping[str, Done]) -> dict[str, list[str]]:
+    """Return the names of the tasks of each study that were completed, by study and rig."""
+    found: dict[str, list[str]] = {}
+    for task in expansion.tasks.values():
+        if isinstance(task, StudyTask) and done[task.name].status == "completed":
+            found.setdefault(" on ".join(filter(None, (task.study, Path(task.rig).stem))), []).append(task.name)
+    return found
 
 
 def studies_table(expansion: Expansion, done: Mapping[str, Done]) -> ResultsTable:

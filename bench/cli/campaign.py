@@ -173,11 +173,13 @@ def _show(expansion: Expansion, done: dict[str, Done], folder: Path) -> list[Pat
         over_seeds,
         runs_table,
         shown_columns,
+        studies_of,
         studies_table,
         study_values,
         together,
         write_tables,
     )
+    from bench.campaigns.study_tables import MARKDOWN_NAME, print_over_seeds
 
     summaries: dict[str, ResultsTable] = {}
     tables = {name: runs_table(expansion, done, name) for name in expansion.varying}
@@ -196,6 +198,11 @@ def _show(expansion: Expansion, done: dict[str, Done], folder: Path) -> list[Pat
         files |= {"comparisons": comparisons, "comparisons-summary": compared}
     studies = studies_table(expansion, done)
     if len(studies):
-        studies.print("studies, over the seeds", console, most=200)
+        texts = [
+            print_over_seeds(name, [folder / task for task in tasks], console)
+            for name, tasks in studies_of(expansion, done).items()
+        ]
+        (folder / MARKDOWN_NAME).write_text("\n\n".join(texts) + "\n", encoding="utf-8")
+        print_plain(console, f"every number: {folder / 'studies.csv'}")
         files |= {"studies": studies, "study-values": study_values(expansion, done)}
     return write_tables(files, folder, console)

@@ -47,7 +47,13 @@ class CoupledStream(Generic[S]):
 
 
 class TwoStageStream(CoupledStream[TwoStageState]):
-    """The two-stage model and its memories, each a stream; equal to `TwoStage.evaluate` to the last bit."""
+    """The two-stage model and its memories, each a stream; equal to `TwoStage.evaluate` to the last bit.
+
+    Attributes
+    ----------
+    force, argument, length : float
+        Present ones, as in `TwoStageState`.
+    """
 
     model: TwoStage
 
@@ -55,8 +61,8 @@ class TwoStageStream(CoupledStream[TwoStageState]):
         self.model = model
         self._first, self._second = model.first.stream(state.first), model.second.stream(state.second)
         self._step_first, self._step_second = self._first.step, self._second.step
-        self._voltage, self._force = state.voltage, state.force
-        self._blocked, self._argument, self.length = state.blocked, state.argument, state.length
+        self._voltage, self.force = state.voltage, state.force
+        self._blocked, self.argument, self.length = state.blocked, state.argument, state.length
 
     def step(self, voltage: float, force: float, *, together: bool = False) -> float:
         """Move both inputs to new values and return the length; see `CoupledStream.step`.
@@ -67,13 +73,26 @@ class TwoStageStream(CoupledStream[TwoStageState]):
         if not (voltage - voltage == 0.0 and force - force == 0.0):
             _checks.number("voltage", voltage)
             _checks.number("force", force)
-        if not together and force != self._force:
+        if not together and force != self.force:
             self._step_second(force - self._blocked)
         if voltage != self._voltage:
             self._blocked = self._step_first(voltage)
             self._voltage = float(voltage)
-        self._force = force = float(force)
-        self._argument = argument = force - self._blocked
+        self.force = force = float(force)
+        self.argument = argument = force - self._blocked
+        self.length = length = self._step_second(argument)
+        return length
+
+    def move(self, voltage: float, argument: float) -> float:
+        """Move voltage and argument u to new values, the force follows; return the length; see `TwoStage.move`."""
+        if not (voltage - voltage == 0.0 and argument - argument == 0.0):
+            _checks.number("voltage", voltage)
+            _checks.number("argument", argument)
+        self.argument = argument = float(argument)
+        if voltage != self._voltage:
+            self._blocked = self._step_first(voltage)
+            self._voltage = float(voltage)
+        self.force = argument + self._blocked
         self.length = length = self._step_second(argument)
         return length
 
@@ -82,10 +101,10 @@ class TwoStageStream(CoupledStream[TwoStageState]):
         """Present state, as a value."""
         return TwoStageState(
             self._voltage,
-            self._force,
+            self.force,
             self._first.state,
             self._second.state,
             self._blocked,
-            self._argument,
+            self.argument,
             self.length,
         )

@@ -96,3 +96,47 @@ class CellLayout:
         laplacian = coo_array((data, (np.concatenate([a, a]), np.concatenate([b, a]))), shape=(rows.size, rows.size))
         spread = csr_array(laplacian)[:, self.cells]
         return csr_array(spread.T @ spread)
+
+
+@dataclass(frozen=True, eq=False)
+class PlanesBeside(CellLayout):
+    """The cells of several planes, whose columns stand one plane after the other.
+
+    Parameters
+    ----------
+    planes : tuple of CellLayout
+        Layout of each plane. The order of the whole is the least, and 0 if the columns of one have no place.
+    """
+
+    planes: tuple[CellLayout, ...]
+
+    @classmethod
+    def of_planes(cls, *planes: CellLayout) -> PlanesBeside:
+        """Return the layout of planes beside each other."""
+        return cls(
+            min(plane.order for plane in planes),
+            np.concatenate([plane.cells for plane in planes]),
+            np.concatenate([plane.layers for plane in planes]),
+            planes,
+        )
+
+    @cached_property
+    def neighbours(self) -> Indices:
+        """The neighbours of each column, of its own plane, as those of a `CellLayout`."""
+        found, before = [], 0
+        for plane in self.planes:
+            found.append(np.where(plane.neighbours < 0, -1, plane.neighbours + before))
+            before += plane.cells.size
+        return np.concatenate(found)
+
+    def coarser(self) -> tuple[CellLayout, Indices]:
+        """Return the layout with the cells of each plane merged two by two, and the column of each column there."""
+        merged, parents = zip(*(plane.coarser() for plane in self.planes), strict=True)
+        before = np.cumsum([0, *(plane.cells.size for plane in merged)])
+        return self.of_planes(*merged), np.concatenate([each + n for each, n in zip(parents, before, strict=False)])
+
+    def roughness(self) -> csr_array:
+        """Return LᵀL of the discrete Laplacians of the densities, each on its plane."""
+        from scipy.sparse import block_diag, csr_array
+
+        return csr_array(block_diag([plane.roughness() for plane in self.planes]))

@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from bench.hysteresis import Regressor
+from bench.hysteresis._checks import Floats
 from bench.identification.by_name import Initial, set_up_problem
+from bench.identification.cell_layout import CellLayout, Indices
+from bench.identification.folds import fold_numbers
+from bench.identification.least_squares import Fit, counted_weights, fit_cells
 from bench.identification.orientation import Orientation
+
+Fitted = Callable[[Floats], Fit]
+"""Returns a fit with weights of the samples, shape (N,)."""
 
 
 @dataclass(frozen=True)
@@ -126,31 +135,97 @@ def cross_validate(
         used = problem.outputs.size - problem.skip
         if used < blocks:
             raise ValueError(f"blocks: expected at most {used}, one for each sample used, got {blocks}")
-        fold = (np.arange(used) * blocks // used) % folds
-        fold = np.concatenate([np.full(problem.skip, -1), fold])
+        fold = np.concatenate([np.full(problem.skip, -1), fold_numbers(used, folds, blocks)])
         for weight in smoothing:
-            squares, training = np.zeros(problem.outputs.size), []
-            for k in range(folds):
-                left_out = fold == k
-                found = problem.fit(weight, np.where(left_out, 0.0, problem.weights), ridge)
-                error = problem.outputs - found.bias - problem.regressor.product(found.coefficients)
-                squares[left_out] = error[left_out] ** 2
-                training.append(_rms(error**2, np.where(left_out | (fold < 0), 0.0, problem.weights)))
-            rms = [_rms(squares, np.where(fold == k, problem.weights, 0.0)) for k in range(folds)]
+            fitted = partial(problem.fit, weight, ridge=ridge)
             trials.append(
-                Trial(
-                    smoothing=float(weight),
-                    levels=None if order is None else int(order),
-                    rms=_rms(squares, np.where(fold < 0, 0.0, problem.weights)),
-                    spread=float(np.std(rms, ddof=1) / np.sqrt(folds)),
-                    training_rms=float(np.mean(training)),
-                    folds=tuple(rms),
-                )
+                _trial(float(weight), order, fitted, problem.regressor, problem.outputs, problem.weights, fold)
             )
     return CrossValidation(tuple(trials))
 
 
-def _rms(squares: np.ndarray[Any, np.dtype[np.float64]], weights: np.ndarray[Any, np.dtype[np.float64]]) -> float:
+def choose_smoothing(
+    layout: CellLayout,
+    regressor: Regressor,
+    outputs: Floats,
+    weights: Floats,
+    smoothing: Sequence[float],
+    *,
+    folds: int = 5,
+    blocks: int = 20,
+) -> CrossValidation:
+    """Return how well nonnegative fits predict parts of their own data that were left out of them.
+
+    The samples that count are cut into blocks, see `cross_validate`. Each counts once in the errors, however great
+    its weight in the fit is.
+
+    Parameters
+    ----------
+    layout : CellLayout
+        Places of the cells.
+    regressor : Regressor
+        Shape (N, K + q).
+    outputs, weights : ndarray, shape (N,)
+        Measured outputs, and the weight of each sample in the fit; 0 for those that do not count.
+    smoothing : sequence of float
+        Weights to try; of equal errors the first is the best.
+    folds, blocks : int
+        Number of folds, >= 2, and of blocks, >= folds; with fewer samples than blocks each sample is one.
+
+    Raises
+    ------
+    ValueError
+        If there is nothing to try, a weight is wrong, or a fold has no sample that counts.
+    """
+    if not len(smoothing):
+        raise ValueError("smoothing: expected at least one weight, got none")
+    counted = counted_weights(regressor.shape[0], weights, 0) > 0.0
+    used = int(counted.sum())
+    fold = np.full(weights.size, -1)
+    fold[counted] = fold_numbers(used, folds, min(blocks, used))
+    counts = np.where(counted, 1.0, 0.0)
+    trials = []
+    for weight in smoothing:
+        fitted = partial(fit_cells, layout, regressor, outputs, True, smoothing=weight)
+        trials.append(_trial(weight, None, fitted, regressor, outputs, weights, fold, counts))
+    return CrossValidation(tuple(trials))
+
+
+def _trial(
+    smoothing: float,
+    levels: int | None,
+    fitted: Fitted,
+    regressor: Regressor,
+    outputs: Floats,
+    weights: Floats,
+    fold: Indices,
+    counts: Floats | None = None,
+) -> Trial:
+    """Return how well fits predict what was left out; samples of no fold, −1, are in every fit and in no error.
+
+    The errors count with `counts`, or as the fits do.
+    """
+    counts = weights if counts is None else counts
+    numbers = range(int(fold.max()) + 1)
+    squares, training = np.zeros(outputs.size), []
+    for k in numbers:
+        left_out = fold == k
+        found = fitted(np.where(left_out, 0.0, weights))
+        error = outputs - found.bias - regressor.product(found.coefficients)
+        squares[left_out] = error[left_out] ** 2
+        training.append(_rms(error**2, np.where(left_out | (fold < 0), 0.0, counts)))
+    rms = [_rms(squares, np.where(fold == k, counts, 0.0)) for k in numbers]
+    return Trial(
+        smoothing=smoothing,
+        levels=None if levels is None else int(levels),
+        rms=_rms(squares, np.where(fold < 0, 0.0, counts)),
+        spread=float(np.std(rms, ddof=1) / np.sqrt(len(rms))),
+        training_rms=float(np.mean(training)),
+        folds=tuple(rms),
+    )
+
+
+def _rms(squares: Floats, weights: Floats) -> float:
     total = float(weights.sum())
     if total <= 0.0:
         raise ValueError("weights: expected a positive weight in each fold")

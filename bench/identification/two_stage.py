@@ -30,12 +30,16 @@ from bench.hysteresis import (
     uniform_levels,
 )
 from bench.hysteresis._checks import Floats
-from bench.identification.least_squares import Certificate, Fit, fit
+from bench.identification.cell_layout import CellLayout, PlanesBeside
+from bench.identification.cross_validation import choose_smoothing
+from bench.identification.least_squares import Certificate, Fit, fit_cells
 from bench.identification.measures import Errors, measure_errors
 
 M = TypeVar("M", TwoStage, Summed, Linear)
 Kind: TypeAlias = Literal["length-voltage", "length-force"]
 Stage: TypeAlias = Operator[Any]
+Smoothing: TypeAlias = float | Sequence[float]
+"""Weight of the roughness penalty of `fit`, or several; of these that of the least error on blocks left out."""
 
 # Room beyond the greatest force in a plane of forces: the pretension of a reset lowers u by as much.
 _MARGIN = 0.3
@@ -127,6 +131,8 @@ class CoupledIdentification(Generic[M]):
         "second" only.
     uncertainties : mapping of str to ndarray
         Standard uncertainties of the coefficients of each fit, by the same names.
+    smoothing : mapping of str to float
+        Weight of the roughness penalty of each fit, by the same names.
     """
 
     model: M
@@ -134,6 +140,7 @@ class CoupledIdentification(Generic[M]):
     residuals: Mapping[str, Floats]
     certificates: Mapping[str, Certificate]
     uncertainties: Mapping[str, Floats]
+    smoothing: Mapping[str, float]
 
 
 def identify_two_stage(
@@ -148,7 +155,7 @@ def identify_two_stage(
     voltage_range: tuple[float, float] = (0.0, 3.0),
     force_limit: float = 11.2,
     pretension: float = 0.3,
-    smoothing: float = 0.0,
+    smoothing: Smoothing = 0.0,
     units: tuple[str, str, str] = ("V", "N", "mm"),
 ) -> CoupledIdentification[TwoStage]:
     """Return the two-stage model that fits best, one stage after the other.
@@ -178,8 +185,9 @@ def identify_two_stage(
         Greatest force expected, force units.
     pretension : float
         Force during resets, force units.
-    smoothing : float
-        As in `fit`, for both stages.
+    smoothing : float or sequence of float
+        Weight of the roughness penalty, see `fit`, for both stages. Of several each stage has the one of the least
+        error on blocks of its own samples left out, see `choose_smoothing`.
     units : tuple of str
         Units of voltage, force and length of the default stages, for labels.
 
@@ -192,14 +200,17 @@ def identify_two_stage(
     template = _plane(*voltage_range, order, units[0], units[1]) if first is None else first
     v, f = _resting(voltages, forces, template.input_range[0])
     start = template.initial_state()
-    one = fit(template.regressor(v, start), f, weights=weights, smoothing=smoothing)
+    held = np.ones(v.size) if weights is None else _checks.samples("weights", weights)
+    regressor = template.regressor(v, start)
+    one, first_smoothing = _fit(CellLayout.of(regressor.base.size), regressor, f, held, smoothing)
     found = template.with_coefficients(one.coefficients, one.bias)
 
     limit = max(_checks.number("force_limit", force_limit), found.output_range()[1]) + _MARGIN
     inner = _plane(-limit, limit, order, units[1], units[2]) if second is None else second
-    two, inner = _fit_second(TwoStage(found, inner, pretension), measured, smoothing)
+    two, inner, second_smoothing = _fit_second(TwoStage(found, inner, pretension), measured, smoothing)
     model = TwoStage(found, inner, pretension)
-    return _identification(model, measured, {"first": one, "second": two}, f, found.evaluate(v, start))
+    fits = {"first": (one, first_smoothing), "second": (two, second_smoothing)}
+    return _identification(model, measured, fits, f, found.evaluate(v, start))
 
 
 def identify_linear(
@@ -212,7 +223,7 @@ def identify_linear(
     voltage_range: tuple[float, float] = (0.0, 3.0),
     force_limit: float = 11.2,
     pretension: float = 0.3,
-    smoothing: float = 0.0,
+    smoothing: Smoothing = 0.0,
     units: tuple[str, str, str] = ("V", "N", "mm"),
 ) -> CoupledIdentification[Linear]:
     """Return the model with a straight line as first stage (Zhang and Yip 2017, eq. 9), fitted as the two-stage one.
@@ -246,8 +257,8 @@ def identify_linear(
     def line(stage: Stage) -> Linear:
         return Linear(slope, offset, stage, voltage_range, pretension, units[0])
 
-    found, inner = _fit_second(line(inner).two_stage, measured, smoothing)
-    return _identification(line(inner), measured, {"second": found}, f, slope * v + offset)
+    found, inner, chosen = _fit_second(line(inner).two_stage, measured, smoothing)
+    return _identification(line(inner), measured, {"second": (found, chosen)}, f, slope * v + offset)
 
 
 def identify_summed(
@@ -259,6 +270,7 @@ def identify_summed(
     voltage_range: tuple[float, float] = (0.0, 3.0),
     force_limit: float = 11.2,
     pretension: float = 0.3,
+    smoothing: Smoothing = 0.0,
     units: tuple[str, str, str] = ("V", "N", "mm"),
 ) -> CoupledIdentification[Summed]:
     """Return the difference of two operators that fits best (Zhang and Yip 2017, eq. 8), both fitted at once.
@@ -268,8 +280,8 @@ def identify_summed(
 
     Parameters
     ----------
-    series, order, voltage_range, force_limit, pretension, units
-        As in `identify_two_stage`.
+    series, order, voltage_range, force_limit, pretension, smoothing, units
+        As in `identify_two_stage`; one weight of the penalty serves both operators.
     by_force, by_voltage : Operator or None
         H3 and H4 before the fit.
 
@@ -296,7 +308,8 @@ def identify_summed(
         skipped = np.zeros(len(s.preparation))
         weights.append(np.append(skipped, np.ones(s.lengths.size)))
         outputs.append(np.append(skipped, s.lengths))
-    found = fit(_chained(parts), np.concatenate(outputs), weights=np.concatenate(weights))
+    layout = PlanesBeside.of_planes(*(CellLayout.of(count) for count in cells))
+    found, chosen = _fit(layout, _chained(parts), np.concatenate(outputs), np.concatenate(weights), smoothing)
     dense = by_force.coefficients.size - cells[0]
     kinds = np.split(found.coefficients, np.cumsum([*cells, dense]))
     model = Summed(
@@ -304,7 +317,7 @@ def identify_summed(
         by_voltage.with_coefficients(np.append(kinds[1], kinds[3]), 0.0),
         pretension,
     )
-    return _identification(model, measured, {"second": found})
+    return _identification(model, measured, {"second": (found, chosen)})
 
 
 def predict_series(model: Coupled[Any], series: Series) -> Floats:
@@ -384,8 +397,22 @@ def _path(series: Series) -> tuple[Floats, Floats]:
     return np.append(before[:, 0], series.voltages), np.append(before[:, 1], series.forces)
 
 
-def _fit_second(model: TwoStage, series: Sequence[Series], smoothing: float) -> tuple[Fit, Stage]:
-    """Fit the second stage of a model whose first one is known; return the fit and the stage."""
+def _fit(
+    layout: CellLayout, regressor: Regressor, outputs: Floats, weights: Floats, smoothing: Smoothing
+) -> tuple[Fit, float]:
+    """Return a fit and the weight of its roughness penalty, chosen by cross-validation if there are several."""
+    if not isinstance(smoothing, Sequence):
+        chosen = smoothing
+    elif layout.order:
+        chosen = choose_smoothing(layout, regressor, outputs, weights, smoothing).best.smoothing
+    else:
+        # Columns that have no place in a plane have no roughness.
+        chosen = 0.0
+    return fit_cells(layout, regressor, outputs, weights=weights, smoothing=chosen), chosen
+
+
+def _fit_second(model: TwoStage, series: Sequence[Series], smoothing: Smoothing) -> tuple[Fit, Stage, float]:
+    """Fit the second stage of a model whose first one is known; return fit, stage, and weight of the penalty."""
     start: TwoStageState = model.initial_state()
     parts, weights, outputs = [], [], []
     for s in series:
@@ -397,14 +424,16 @@ def _fit_second(model: TwoStage, series: Sequence[Series], smoothing: float) -> 
         output[2 * len(s.preparation) + 1 :: 2] = s.lengths
         weights.append(weight)
         outputs.append(output)
-    found = fit(_chained(parts), np.concatenate(outputs), weights=np.concatenate(weights), smoothing=smoothing)
-    return found, model.second.with_coefficients(found.coefficients, found.bias)
+    regressor = _chained(parts)
+    layout = CellLayout.of(regressor.base.size)
+    found, chosen = _fit(layout, regressor, np.concatenate(outputs), np.concatenate(weights), smoothing)
+    return found, model.second.with_coefficients(found.coefficients, found.bias), chosen
 
 
 def _identification(
     model: M,
     series: Sequence[Series],
-    fits: Mapping[str, Fit],
+    fits: Mapping[str, tuple[Fit, float]],
     forces: Floats | None = None,
     line: Floats | None = None,
 ) -> CoupledIdentification[M]:
@@ -420,8 +449,9 @@ def _identification(
         model=model,
         errors={kind: measure_errors(*pair) for kind, pair in pairs.items()},
         residuals={kind: measured - predicted for kind, (measured, predicted) in pairs.items()},
-        certificates={name: f.certificate for name, f in fits.items()},
-        uncertainties={name: f.uncertainties for name, f in fits.items()},
+        certificates={name: f.certificate for name, (f, _) in fits.items()},
+        uncertainties={name: f.uncertainties for name, (f, _) in fits.items()},
+        smoothing={name: chosen for name, (_, chosen) in fits.items()},
     )
 
 

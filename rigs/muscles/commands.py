@@ -41,6 +41,7 @@ def identify_muscle(
     if verify is not None:
         errors["verification"] = measure_series(found.model, muscle.read_series(verify))
     rows = [(kind, f"average {e.average_percent:.2f} %, RMS {e.rms_percent:.2f} %") for kind, e in errors.items()]
+    rows += [(f"smoothing, {stage}", f"{weight:.0e}") for stage, weight in found.smoothing.items()]
     rows += [(f"KKT residual, {stage}", f"{fit.kkt_residual:.1e}") for stage, fit in found.certificates.items()]
     print_rows(f"{model} from {len(series)} series of lengths", rows)
     if out is not None:
@@ -54,5 +55,6 @@ def identify_muscle(
             "series": len(series),
             "errors": {kind: muscle.errors_json(e) for kind, e in errors.items()},
             "kkt": {stage: fit.kkt_residual for stage, fit in found.certificates.items()},
+            "smoothing": dict(found.smoothing),
         },
     )

@@ -32,9 +32,10 @@ from bench.control.loops import SHORTEST_WAIT
 from bench.control.tracking import Command, ControllerBase, Trace, check_positive, widened
 from bench.control.tuning import tuned
 from bench.control.two_stage_inverse import TwoStageInverse
-from bench.controllers import ControllerSetup, ControllerSpec
+from bench.controllers import ControllerSetup, ControllerSpec, greatest_error
 from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import Reach, TwoStageState, _checks
+from bench.hysteresis.coupled_stream import TwoStageStream
 from rigs.muscles.lag import Lag, LagSearch
 from rigs.muscles.tasks import ForceTask, LengthTask, Task
 
@@ -143,7 +144,7 @@ class _Hypothesis:
     """A time constant, and what the model and its error are if it is the muscle's."""
 
     lag: Lag
-    state: TwoStageState
+    stream: TwoStageStream
     estimator: DisturbanceEstimator
     error: float = math.nan
     """The model's error at the last reading, output units."""
@@ -172,7 +173,7 @@ class _Modelled(MuscleController):
         self._hypotheses = [
             _Hypothesis(
                 Lag(factor * p.time_constant, start.voltage**p.power, p.power),
-                start,
+                model.stream(start),
                 DisturbanceEstimator(walk_variance=task.walk_variance, reading_variance=task.reading_variance),
             )
             for factor in factors
@@ -186,7 +187,7 @@ class _Modelled(MuscleController):
     @property
     def state(self) -> TwoStageState:
         """Memory of the muscle as the controller knows it; its voltage is the one that would hold what it has."""
-        return self._believed.state
+        return self._believed.stream.state
 
     @property
     def time_constant(self) -> float:
@@ -207,9 +208,9 @@ class _Modelled(MuscleController):
         least, greatest = self._plausible_output
         for each in self._hypotheses:
             each.lag = each.lag.advance(passed, applied)
-            each.state = self._task.advance(each.state, each.lag.voltage, others)
+            self._task.advance(each.stream, each.lag.voltage, others)
             if least <= output <= greatest:
-                error = output - self._task.output(each.state)
+                error = output - self._task.output(each.stream)
                 each.estimator.update(error)
                 if passed > 0.0 and not math.isnan(each.error):
                     kept = math.exp(-passed / (search.memory * self._parameters.period))
@@ -221,11 +222,11 @@ class _Modelled(MuscleController):
             self._likeliest = best
 
     def _modelled(self) -> float:
-        return self._task.output(self._believed.state)
+        return self._task.output(self._believed.stream)
 
     def _steady(self, target: float) -> float:
         """Return the steady voltage for a target of the model within the limits; note whether it meets the target."""
-        found = self._task.invert(self._believed.state, target)
+        found = self._task.invert(self.state, target)
         voltage = self._clip(found.voltage)
         self._reach = found.reach
         if voltage != found.voltage:
@@ -435,12 +436,21 @@ def _task(setup: ControllerSetup, kind: type[Task]) -> Task:
     return kind.of_model(inverse, state, setup.limits, noise)
 
 
+def _holds(setup: ControllerSetup, kind: type[Task]) -> float:
+    """Return the greatest RMS error of a model that still holds, output units."""
+    low, high = _task(setup, kind).output_range()
+    # The file states errors in percent of the range.
+    own = setup.model.provenance.get("errors", {}).get(kind.kind, {}).get("rms", 0.0)
+    return greatest_error(0.01 * own * (high - low), high - low)
+
+
 def _with_inverse(summary: str, controller: Callable[..., MuscleController], kind: type[Task]) -> ControllerSpec:
     return ControllerSpec(
         summary,
         lambda s: controller(_task(s, kind), _timing(s), s.state, s.limits),
         numbers=_timing,
         tunable=("caution", "horizon", "period") if controller is MuscleClosedLoop else (),
+        holds=(lambda s: _holds(s, kind)) if controller is MuscleOpenLoop else None,
     )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from bench.control.tracking import check_positive
 from bench.hysteresis import _checks
@@ -58,7 +58,7 @@ class Lag:
         final = max(_checks.number("voltage", voltage), 0.0) ** self.power
         if duration == 0.0:
             return self
-        return replace(self, level=final + (self.level - final) * self._remains(duration))
+        return Lag(self.time_constant, final + (self.level - final) * self._remains(duration), self.power)
 
     def lead(self, target: float, horizon: float, limits: tuple[float, float]) -> tuple[float, bool]:
         """Return the constant voltage that leads to a target within a time, and whether it had to be clipped.

@@ -12,6 +12,7 @@ from bench.control.tracking import check_positive, widened
 from bench.control.two_stage_inverse import TwoStageInverse, TwoStageInversion
 from bench.errors import DataError
 from bench.hysteresis import TwoStageState, _checks
+from bench.hysteresis.coupled_stream import TwoStageStream
 
 _MODEL_ERROR = 0.02
 """Change of the model's error within one period, as a part of the output's range."""
@@ -52,6 +53,8 @@ class Task(ABC):
     _sign: ClassVar[float]
     quantity: ClassVar[str]
     """What is controlled, as the noise of a model file names it."""
+    kind: ClassVar[str]
+    """Data over the voltage from which the model was identified, as the errors of a model file name them."""
 
     def __post_init__(self) -> None:
         check_positive(self, "walk_variance", "reading_variance")
@@ -75,10 +78,11 @@ class Task(ABC):
         # Only the model is used until the numbers are known.
         trial = cls(inverse, 1.0, 1.0, (1.0, 2.0) if cls._sign > 0 else (-2.0, -1.0))
         low, high = limits
-        others = trial.others(state)
-        cold = trial.advance(state, low, others)
-        hot = trial.advance(cold, high, others)
-        rise = trial.output(hot) - trial.output(cold)
+        others, stream = trial.others(state), inverse.model.stream(state)
+        trial.advance(stream, low, others)
+        cold = trial.output(stream)
+        trial.advance(stream, high, others)
+        rise = trial.output(stream) - cold
         if not rise * cls._sign > 0.0:
             raise DataError(
                 f"the model's {cls.quantity} does not {'rise' if cls._sign > 0 else 'fall'} with the voltage between "
@@ -93,11 +97,11 @@ class Task(ABC):
         """Return the further signals in a state."""
 
     @abstractmethod
-    def advance(self, state: TwoStageState, voltage: float, others: tuple[float, ...]) -> TwoStageState:
-        """Return the model's state after it has come to a voltage, with further signals."""
+    def advance(self, stream: TwoStageStream, voltage: float, others: tuple[float, ...]) -> None:
+        """Bring the model to a voltage, with further signals."""
 
     @abstractmethod
-    def output(self, state: TwoStageState) -> float:
+    def output(self, stream: TwoStageStream) -> float:
         """Return the model's output."""
 
     @abstractmethod
@@ -119,25 +123,25 @@ class LengthTask(Task):
 
     _sign = -1.0
     quantity = "length"
+    kind = "length-voltage"
 
     def others(self, state: TwoStageState) -> tuple[float, ...]:
         """Return the force of a state."""
         return (state.force,)
 
-    def advance(self, state: TwoStageState, voltage: float, others: tuple[float, ...]) -> TwoStageState:
-        """Return the model's state after force and voltage have come to new values, the force first.
+    def advance(self, stream: TwoStageStream, voltage: float, others: tuple[float, ...]) -> None:
+        """Bring force and voltage of the model to new values, the force first.
 
         A missing force is replaced by the last one. Raises ValueError if there is not one further signal.
         """
         if len(others) != 1:
             raise ValueError(f"length task: expected the force as one further signal, got {len(others)}")
         low, high = widened(*self.inverse.model.second.input_range)
-        force = others[0] if low <= others[0] <= high else state.force
-        return self.inverse.model.step(state, voltage, force)[0]
+        stream.step(voltage, others[0] if low <= others[0] <= high else stream.force)
 
-    def output(self, state: TwoStageState) -> float:
+    def output(self, stream: TwoStageStream) -> float:
         """Return the model's length."""
-        return state.length
+        return stream.length
 
     def output_range(self) -> tuple[float, float]:
         """Return the range of the model's length."""
@@ -154,23 +158,24 @@ class ForceTask(Task):
 
     _sign = 1.0
     quantity = "force"
+    kind = "force-voltage"
 
     def others(self, state: TwoStageState) -> tuple[float, ...]:  # noqa: ARG002
         """Return nothing."""
         return ()
 
-    def advance(self, state: TwoStageState, voltage: float, others: tuple[float, ...]) -> TwoStageState:
-        """Return the model's state after the voltage has come to a new value; the argument of H2 stays.
+    def advance(self, stream: TwoStageStream, voltage: float, others: tuple[float, ...]) -> None:
+        """Bring the voltage of the model to a new value; the argument of H2 stays.
 
         Raises ValueError if there are further signals.
         """
         if others:
             raise ValueError(f"force task: expected no further signals, got {len(others)}")
-        return self.inverse.model.move(state, voltage, state.argument)[0]
+        stream.move(voltage, stream.argument)
 
-    def output(self, state: TwoStageState) -> float:
+    def output(self, stream: TwoStageStream) -> float:
         """Return the model's force."""
-        return state.force
+        return stream.force
 
     def output_range(self) -> tuple[float, float]:
         """Return the range of the model's force at the resting length."""

@@ -6,6 +6,7 @@ VO2-Coated Microactuators*, IEEE/ASME Transactions on Mechatronics, 2013; here "
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -84,10 +85,15 @@ CONTROLLERS = {
     "open_loop_inverse": ("open-loop inverse", "78", "26.7"),
     "polynomial": ("polynomial look-up", "734.2", "320.6"),
     "integral": ("integral, no inverse", "–", "–"),
+    "integral_equal_time": ("integral, as long as latched", "–", "–"),
     "closed_loop_inverse": ("closed-loop inverse", "–", "–"),
     "latched": ("latched", "–", "–"),
 }
-"""Title, and the paper's largest and RMS error, 1/m (section V-B). With - for _ the keys are names of controllers."""
+"""Title, and the paper's largest and RMS error, 1/m (section V-B). With - for _ the keys are names of controllers,
+but for the one of equal time."""
+
+EQUAL_TIME = "integral_equal_time"
+"""Integral action with as many seconds a target as the slowest controller took in the same study."""
 
 FOLLOWERS = ("open_loop_inverse", "integral", "closed_loop_inverse")
 
@@ -143,6 +149,7 @@ TABLES = (
             )
             for key, texts in CONTROLLERS.items()
         ],
+        "Integral action is shown in the time of the open-loop inverse, and in that of the slowest controller.",
     ),
     ResultTable(
         "following a modulated sine at 2 Hz, errors in 1/m",
@@ -187,8 +194,11 @@ def carry_out(campaign: Campaign) -> StudyResult:
     folder = campaign.folder
     sign = 1.0 if campaign.seed % 2 == 0 else -1.0
 
-    def session(protocol: str, settings: Mapping[str, str], offset: float) -> Pending[RunResult]:
-        return campaign.start(protocol, settings, {"emulation.session_offset": str(sign * offset)})
+    def session(
+        protocol: str, settings: Mapping[str, str], offset: float, tuning: Mapping[str, str] | None = None
+    ) -> Pending[RunResult]:
+        overrides = {"emulation.session_offset": str(sign * offset), **(tuning or {})}
+        return campaign.start(protocol, settings, overrides)
 
     def model_path(name: str) -> str:
         return str(folder / f"{name}.json")
@@ -197,12 +207,14 @@ def carry_out(campaign: Campaign) -> StudyResult:
         session("damped-oscillation", {}, 0.0),
         session("random-validation", {}, SESSION_OFFSET),
     )
+    # Loaded while they run.
+    truth = true_curvatures(campaign.rig)
     characterized = characterization.result().folder
     transients = transients_of([characterized], INPUT, OUTPUT)
-    models: dict[str, IdentifiedFile] = {}
-    for key, model in MODELS.items():
-        name, options = model.model, model.options
-        models[key] = identify_file(
+
+    def identified(key: str) -> IdentifiedFile:
+        name, options = MODELS[key].model, MODELS[key].options
+        found = identify_file(
             characterized,
             input_column=INPUT,
             output_column=OUTPUT,
@@ -210,19 +222,18 @@ def carry_out(campaign: Campaign) -> StudyResult:
             transients=transients,
             **options,
         )
-        models[key].file.save(Path(model_path(key if model.validation is None else name)))
-    tracking_runs = {
-        key: session(
-            "tracking",
-            {
-                "model": model_path("polynomial" if key == "polynomial" else PROPOSED),
-                "controller": key.replace("_", "-"),
-                "sequence_seed": str(campaign.seed + 1),
-            },
-            TRACKING_OFFSET,
-        )
-        for key in CONTROLLERS
-    }
+        found.file.save(Path(model_path(key if MODELS[key].validation is None else name)))
+        return found
+
+    def tracking(key: str, tuning: Mapping[str, str] | None = None) -> Pending[RunResult]:
+        controller = "integral" if key == EQUAL_TIME else key.replace("_", "-")
+        model = model_path("polynomial" if key == "polynomial" else PROPOSED)
+        settings = {"model": model, "controller": controller, "sequence_seed": str(campaign.seed + 1)}
+        return session("tracking", settings, TRACKING_OFFSET, tuning)
+
+    # The sessions wait for these; the others are identified beside them.
+    needed = {key: identified(key) for key in ("nonmonotonic", "polynomial")}
+    tracking_runs = {key: tracking(key) for key in CONTROLLERS if key != EQUAL_TIME}
     following_runs = {
         (period, key): session(
             "following",
@@ -232,15 +243,21 @@ def carry_out(campaign: Campaign) -> StudyResult:
         for period in PERIODS
         for key in FOLLOWERS
     }
+    # The last run waits for this one.
+    tracking_runs["latched"].hurry()
+    models = {key: needed.get(key) or identified(key) for key in MODELS}
     with Record(validation.result().folder) as record:
         steps = record.steps()
         inputs, outputs = steps[INPUT], steps[OUTPUT]
     predictions = {key: predict(model.file, inputs) for key, model in models.items()}
     figures = _draw_models(campaign, models, inputs, outputs, predictions)
+    slowest = reached_targets(tracking_runs["latched"].result(), OUTPUT).summary()["seconds_per_target"]
+    tracking_runs[EQUAL_TIME] = tracking(
+        EQUAL_TIME, {"protocols.tracking.tuning.integral.duration": str(math.ceil(2.0 * slowest) / 2.0)}
+    )
     reached = {key: reached_targets(run.result(), OUTPUT) for key, run in tracking_runs.items()}
     followed = {key: _followed(run.result()) for key, run in following_runs.items()}
     figures += _draw_control(campaign, reached, followed)
-    truth = true_curvatures(campaign.rig)
 
     for run in (characterization.result(), validation.result()):
         with Record(run.folder) as record:

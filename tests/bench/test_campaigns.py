@@ -17,13 +17,14 @@ from bench.campaigns.cluster import ClusterExecutor, check_address
 from bench.campaigns.execution import WorkersExecutor, carry_out_tasks, done_before, opened_folder
 from bench.campaigns.expansion import expand
 from bench.campaigns.file import read_campaign
+from bench.campaigns.study_tables import OverSeeds, over_seeds
 from bench.campaigns.tasks import DONE_NAME, UNFINISHED
 from bench.cli import main
 from bench.errors import ConfigurationError
 from bench.journal import Record
 from bench.locks import Holder, Locks
 from bench.runs import carry_out
-from bench.studies import Study, StudyResult
+from bench.studies import ResultTable, Study, StudyResult
 from bench.workers import Workers
 
 pytestmark = pytest.mark.usefixtures("warm_popen")
@@ -196,6 +197,22 @@ class TestFile:
                 r"models\.0 \(density\): output = 'x': there is no such signal; .*curvature",
             ),
             ("count = 2", "count = 1", r"parameter count = 1 is not allowed; allowed: 2 to 10000"),
+            (
+                'runs = "characterize"',
+                'runs = ["characterize", "track"]',
+                r"models\.0 \(density\): runs: a model preisach-nonmonotonic is identified from one run",
+            ),
+            (
+                '"preisach-nonmonotonic"\nlevels = 6\nplane = [30.0, 70.0]',
+                '"hybrid"',
+                r"models\.0 \(density\): runs: expected one run each of current-steps, thermomechanical, .* on a rig "
+                r"and seed; on vo2 with seed 0 there are: damped-oscillation",
+            ),
+            (
+                '"preisach-nonmonotonic"',
+                '"hybrid"',
+                r"models\.0 \(density\)\.levels: there is no such key; allowed are: none",
+            ),
         ],
     )
     def test_models_have_to_be_there(self, campaign, old, new, said):
@@ -355,7 +372,8 @@ class TestTasks:
 def the_study(series):
     """A study of one run."""
     reached = series.run(f"{PROTOCOLS}:stairs", {"count": "2"})
-    return StudyResult({"seed": series.seed, "nested": {"steps": reached.outcome.steps}, "word": "no"}, (), ())
+    table = ResultTable("a {word}", ("seed", "steps"), [("{seed:.1f}", "{nested[steps]:g}")])
+    return StudyResult({"seed": series.seed, "nested": {"steps": reached.outcome.steps}, "word": "no"}, (table,), ())
 
 
 def test_a_study_runs_with_several_seeds(campaign, tmp_path, monkeypatch, capsys):
@@ -367,7 +385,11 @@ def test_a_study_runs_with_several_seeds(campaign, tmp_path, monkeypatch, capsys
     assert set(by_number) == {"seed", "nested.steps"}
     assert [float(by_number["seed"][head]) for head in ("seeds", "median", "worst", "spread")] == [3, 2, 6, 5]
     assert len(rows(tmp_path / "out" / "study-values.csv")) == 6
-    assert "studies, over the seeds" in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "climbs, 3 seeds: median (least–greatest)" in said
+    assert "2.0 (1.0–6.0)" in said
+    written = (tmp_path / "out" / "studies.md").read_text(encoding="utf-8")
+    assert "A no:\n\n| seed | steps |\n| --- | --- |\n| 2.0 (1.0–6.0) | 2 |" in written
 
 
 def test_a_killed_worker_is_replaced_and_its_run_equals_one_alone(campaign, tmp_path):
@@ -444,3 +466,12 @@ def test_a_cluster_gives_the_same(campaign, tmp_path, rig_file):
         assert there[name].identity == here[name].identity
         if task.describe()["kind"] == "run":
             assert content(tmp_path / "there" / name) == content(tmp_path / "here" / name)
+
+
+def test_a_number_over_seeds_is_its_median_and_its_range():
+    values = over_seeds(
+        [{"a": [1.0, 0.2], "same": 7, "word": "x", "only": 1}, {"a": [4.0, -0.2], "same": 7, "word": "x"}]
+    )
+    assert set(values) == {"a", "same", "word"}
+    assert "{a[0]:.1f}, {a[1]:+g}, {same}, {word}".format_map(values) == "2.5 (1.0–4.0), +0 (-0.2 to +0.2), 7, x"
+    assert f"{OverSeeds((float('nan'), 3.0, 5.0)):.0f}" == "4 (3–5)"

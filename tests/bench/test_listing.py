@@ -73,10 +73,19 @@ def test_a_problem_is_not_remembered(made, outside):
 @pytest.mark.parametrize("damage", ["", "null", "{}", '{"state": 1}'])
 def test_what_is_damaged_is_made_anew(made, damage):
     first = listing.listing()
-    file = listing._folder() / "catalogue.json"
+    (file,) = listing._folder().glob("catalogue-*.json")
     file.write_text(damage)
     assert listing.listing() == first
     assert listing.listing() == first
+    assert len(made) == 2
+
+
+def test_another_environment_has_a_listing_of_its_own(made, monkeypatch, tmp_path):
+    listing.listing()
+    with monkeypatch.context() as elsewhere:
+        elsewhere.setattr(sys, "prefix", str(tmp_path))
+        listing.listing()
+    listing.listing()
     assert len(made) == 2
 
 

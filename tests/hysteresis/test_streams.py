@@ -178,6 +178,21 @@ def test_two_stage_stream_equals_evaluate_to_the_last_bit(seed, together):
     assert stream.length == outputs[-1]
 
 
+def test_a_two_stage_stream_moves_as_its_model_between_fixed_ends():
+    rng = np.random.default_rng(8)
+    model = TwoStage(preisach(rng, term=None), preisach(rng, low=-3.0, high=2.0, term=None), 0.3)
+    state = model.advance(walk(rng, 4), walk(rng, 4))
+    stream = model.stream(state)
+    for voltage, argument in zip(walk(rng, 40).tolist(), np.repeat(walk(rng, 10), 4).tolist(), strict=True):
+        state, length = model.move(state, voltage, argument)
+        assert stream.move(voltage, argument) == length
+        assert stream.state == state
+    for wrong in ((math.nan, 0.1), (0.1, math.inf)):
+        with pytest.raises(ValueError, match=r"(voltage|argument): expected a finite number"):
+            stream.move(*wrong)
+    assert stream.state == state
+
+
 @pytest.mark.parametrize("kind", ["polynomial", "summed", "linear"])
 def test_every_other_model_has_a_stream(kind):
     rng = np.random.default_rng(3)
@@ -248,7 +263,6 @@ def test_streams_of_one_operator_are_independent():
     assert other.step(0.4) == operator.evaluate([0.4])[0]
 
 
-@pytest.mark.costly
 @settings(max_examples=150)
 @given(SEEDS, st.sampled_from(["nearest", "paper"]))
 def test_preisach_inverse_stream_equals_follow_to_the_last_bit(seed, policy):

@@ -14,6 +14,7 @@ from bench.identification import (
     predict_series,
     voltage_steps,
 )
+from bench.identification.cell_layout import CellLayout, PlanesBeside
 from bench.identification.two_stage import _beside, _chained
 
 LOADS = (0.98, 2.94, 4.90, 6.86, 8.82)
@@ -29,6 +30,20 @@ def preisach(low, high, least, greatest, seed, order=20, zeros=0.85, units=("", 
     density[rng.random(density.size) < zeros] = 0.0
     density *= 0.5 * (greatest - least) / (density @ Preisach(levels, density).cell_areas())
     return Preisach(levels, density, 0.5 * (least + greatest), input_unit=units[0], output_unit=units[1])
+
+
+def smooth(low, high, units):
+    """Return an operator whose density has one broad crest."""
+    levels = uniform_levels(low, high, 20)
+    rows, columns = np.tril_indices(20)
+    density = np.exp(-(((rows - 12) / 6.0) ** 2) - ((columns - 7) / 6.0) ** 2)
+    density *= 3.0 / (density @ Preisach(levels, density).cell_areas())
+    return Preisach(levels, density, 2.0, input_unit=units[0], output_unit=units[1])
+
+
+def roughness(operator):
+    plane = operator.density_matrix()
+    return np.nansum(np.diff(plane, axis=0) ** 2) + np.nansum(np.diff(plane, axis=1) ** 2)
 
 
 def plays(low, high, weights, bias=0.0):
@@ -124,6 +139,64 @@ def test_second_fit_is_the_constrained_optimum():
     squares = sum(float(found.residuals[k] @ found.residuals[k]) for k in ("length-voltage", "length-force"))
     assert np.sqrt(squares) == pytest.approx(best, rel=1e-9)
     assert found.certificates["second"].kkt_residual < 1e-10
+
+
+def test_of_several_weights_of_smoothness_the_best_on_samples_left_out_is_taken():
+    second = smooth(-13.8, 13.8, ("N", "mm"))
+    truth = Linear(3.8, -2.9, second, (0.0, 3.0), 0.3, "V")
+    series, other = campaign(truth, noise=0.1), campaign(truth, seed=1)
+    blank = second.with_coefficients(np.zeros(210), 0.0)
+    forces, tried = 3.8 * VOLTAGES - 2.9, (0.0, 1e-4, 1e-2)
+    fits = [identify_linear(VOLTAGES, forces, series, operator=blank, smoothing=weight) for weight in tried]
+    found = identify_linear(VOLTAGES, forces, series, operator=blank, smoothing=tried)
+    (same,) = (fit for fit in fits if fit.smoothing == found.smoothing)
+    np.testing.assert_array_equal(found.model.operator.coefficients, same.model.operator.coefficients)
+    # The truth is smooth and the noise is not.
+    assert found.smoothing == {"second": 1e-2}
+    assert measure_series(found.model, other).rms < 0.8 * measure_series(fits[0].model, other).rms
+
+
+def test_each_stage_has_a_smoothness_of_its_own():
+    truth = TwoStage(plays(0.0, 3.0, [1.0, 0.5, 0.0, 2.0], 4.0), smooth(-14.0, 14.0, ("N", "mm")), 0.3)
+    blank = truth.second.with_coefficients(np.zeros(210), 0.0)
+    found = identify_two_stage(
+        VOLTAGES,
+        resting(truth),
+        campaign(truth, noise=0.1),
+        first=plays(0.0, 3.0, np.zeros(4)),
+        second=blank,
+        smoothing=(1e-2, 0.0),
+    )
+    # Plays have no place in a plane, so that there is nothing to smooth.
+    assert found.smoothing == {"first": 0.0, "second": 1e-2}
+
+
+@pytest.mark.parametrize("order", [20, 25])
+def test_both_planes_of_a_summed_model_are_smoothed(order):
+    truth = Summed(smooth(0.0, 11.5, ("N", "mm")), smooth(0.0, 3.0, ("V", "mm")), 0.3)
+    series, other = campaign(truth, noise=0.1), campaign(truth, seed=1)
+    plain, smoothed = (identify_summed(series, order=order, smoothing=weight) for weight in (0.0, 1e-2))
+    assert smoothed.certificates["second"].kkt_residual < 1e-10
+    for plane in ("by_force", "by_voltage"):
+        rough, even = (roughness(getattr(each.model, plane)) for each in (plain, smoothed))
+        assert even < 0.3 * rough, plane
+    assert measure_series(smoothed.model, other).rms < measure_series(plain.model, other).rms
+
+
+def test_planes_beside_each_other_keep_their_neighbours():
+    small, large = CellLayout.of(3), CellLayout.of(10)
+    both = PlanesBeside.of_planes(small, large)
+    rough = both.roughness().toarray()
+    np.testing.assert_array_equal(rough[:3, :3], small.roughness().toarray())
+    np.testing.assert_array_equal(rough[3:, 3:], large.roughness().toarray())
+    assert not rough[:3, 3:].any()
+    np.testing.assert_array_equal(both.neighbours[:3], small.neighbours)
+    inside = large.neighbours >= 0
+    np.testing.assert_array_equal(both.neighbours[3:][inside], large.neighbours[inside] + 3)
+    assert (both.neighbours[3:][~inside] == -1).all()
+    merged, parents = both.coarser()
+    assert (merged.order, merged.cells.size) == (1, 1 + 3)
+    np.testing.assert_array_equal(parents, [0, 0, 0, *(large.coarser()[1] + 1)])
 
 
 def test_planes_and_resets():

@@ -91,7 +91,7 @@ def everything_that_it_says_is_there(campaign):
     assert all(Path(path).stat().st_size > 1000 for path in campaign["figures"] + campaign["recordings"])
     model = load_model(folder / "preisach-nonmonotonic.json")
     runs = sorted(folder.glob("vo2-*/journal.sqlite"))
-    assert len(runs) == 13
+    assert len(runs) == 14
     for run in runs:
         with Record(run) as record:
             assert record.status == "completed"

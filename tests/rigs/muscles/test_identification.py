@@ -173,6 +173,9 @@ class TestIdentifying:
         assert again.provenance["sources"] == [runs["force-voltage"].name, runs["length-voltage"].name]
         assert again.provenance["errors"] == {kind: errors_json(errors) for kind, errors in found.errors.items()}
         assert all(residual < 1e-10 for residual in again.provenance["kkt"].values())
+        # Chosen for each model alike; 15 plays have no density to smooth.
+        assert again.provenance["smoothing"] == found.smoothing
+        assert (found.smoothing["second"] == 0.0) or name != "two-stage-prandtl-ishlinskii"
         for one in series:
             np.testing.assert_array_equal(predict_series(again.model, one), predict_series(found.model, one))
         assert again.model.to_json() == found.model.to_json()
