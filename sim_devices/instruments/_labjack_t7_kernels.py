@@ -16,4 +16,5 @@ def converted(volts: float, normal: float, scale: Floats) -> float:
     """Return the reading (V) of a voltage (V), with a number of the standard normal distribution as its noise."""
     # A sum with zero makes zero of minus zero.
     reading = np.round((volts + scale[NOISE] * normal) / scale[STEP]) * scale[STEP] + 0.0
-    return min(max(reading, scale[LOWEST]), scale[HIGHEST])
+    clipped: float = min(max(reading, scale[LOWEST]), scale[HIGHEST])
+    return clipped
