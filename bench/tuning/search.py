@@ -129,12 +129,13 @@ def search(
 def confirm(trials: Sequence[Trial], evaluate: Evaluate) -> tuple[Trial, Trial]:
     """Return trials of the first numbers of a search and of its best, in sessions that it has not seen.
 
-    Of those that were better in the search, the best `FINALISTS` take part: one session may flatter any of them. The
-    first numbers are the best if none is better there.
+    The best `FINALISTS` of the others take part, even if none was better in the search: a session may flatter the
+    first numbers as well. These are the best if no others are better here. Of trials of the same cost the first takes
+    part: a number between them plays no part for this specimen.
     """
     start, *others = trials
-    better = sorted((each for each in others if each.cost < start.cost), key=lambda each: each.cost)
-    found = evaluate([each.numbers for each in (start, *better[:FINALISTS])])
+    by_cost = {each.cost: each for each in reversed(others) if math.isfinite(each.cost)}
+    found = evaluate([start.numbers, *(by_cost[cost].numbers for cost in sorted(by_cost)[:FINALISTS])])
     return found[0], min(found, key=lambda each: each.cost)
 
 

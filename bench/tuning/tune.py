@@ -77,7 +77,7 @@ def tune(
     controller: str = "closed-loop-inverse",
     protocol: str | None = None,
     settings: Sequence[str] = (),
-    seeds: int = 1,
+    seeds: int = 2,
     checks: int = 2,
     rounds: int = 2,
     workers: int | None = None,

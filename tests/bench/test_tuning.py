@@ -163,7 +163,7 @@ def test_a_controller_is_tuned_on_the_emulated_rig(tmp_path):
             [
                 *("tune", str(model), "--rig", "vo2", "--controller", "integral", "--rounds", "1", "--workers", "1"),
                 *("--set", "count=4", "--set", "low=500", "--set", "high=1200"),
-                *("--checks", "1", "--runs", str(tmp_path / "runs"), "--out", str(out)),
+                *("--seeds", "1", "--checks", "1", "--runs", str(tmp_path / "runs"), "--out", str(out)),
             ]
         )
     assert not stopped.value.code
