@@ -133,7 +133,7 @@ def main() -> int:
             if not tuning.exists():
                 found = tune(
                     model, case.rig, controller=case.controller, protocol=case.protocol, workers=given.workers,
-                    settings=SEARCHED, rounds=ROUNDS, folder=folder / "search", console=shown,
+                    settings=SEARCHED, seeds=1, rounds=ROUNDS, folder=folder / "search", console=shown,
                 )  # fmt: skip
                 tuning.write_text(found.text(), encoding="utf-8")
                 (folder / "numbers.json").write_text(json.dumps(found.summary()), encoding="utf-8")
