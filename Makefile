@@ -56,7 +56,7 @@ $(COLLECTED): $(shell find tests -name '*.py') | lint
 	-$(BIN)/python -m pytest --collect-only -qq > /dev/null
 	touch $@
 
-# A sixth of the examples of each property that is costly.
+# A quarter of the examples of each property.
 tests: kernels $(COLLECTED)
 	$(PYTEST) --hypothesis-profile=brief
 

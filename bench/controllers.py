@@ -19,7 +19,7 @@ from bench.control.following import ClosedLoopFollower, FollowingParameters, Int
 from bench.control.latched import Latched, LatchParameters
 from bench.control.model_filters import AdaptationName, ModelFilter, model_filter
 from bench.control.opposite_output import OppositeOutput
-from bench.control.supervision import Supervised
+from bench.control.supervision import CHANCE, HOLDS, Supervised, SupervisedFollower
 from bench.control.tracking import ClosedLoopInverse, CorrectionParameters, OpenLoopInverse
 from bench.control.tuning import Spans, tuned
 from bench.errors import ConfigurationError, DataError
@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from bench.control.predictive import PredictiveFollower
 
 T = TypeVar("T")
+S = TypeVar("S", Supervised, SupervisedFollower)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -127,6 +128,10 @@ class ControllerSpec:
     """Returns the numbers of the controller, a dataclass, for `bench tune`."""
     tunable: tuple[str, ...] = ()
     """Those of them that it may change, all positive; one of a table as `TABLE.NAME`."""
+    holds: Callable[[ControllerSetup], float] | None = None
+    """Of a controller without feedback: returns the greatest RMS error of a model that still holds, output units."""
+    misses: bool = False
+    """Whether it may miss targets by design, as one for comparison; its errors then are not judged."""
 
 
 def controller_names(task: str) -> tuple[str, ...]:
@@ -172,6 +177,7 @@ Fallback = Literal["none", "open-loop"]
 
 
 def make_supervised(
+    kind: type[S],
     task: str,
     name: str,
     setup: ControllerSetup,
@@ -179,15 +185,17 @@ def make_supervised(
     span: float,
     fallback: Fallback = "none",
     **options: Any,  # noqa: ANN401
-) -> Supervised:
-    """Return a target controller by name, which is given up when it does not converge.
+) -> S:
+    """Return a controller by name, which is given up when it does not converge or its model does not hold.
 
     Parameters
     ----------
+    kind : type
+        `Supervised` for a sequence of targets, `SupervisedFollower` for a moving reference.
     task, name, setup
         As in `make_controller`.
     span : float
-        Range of the targets, output units.
+        Range of the output by the model, output units.
     fallback : {"none", "open-loop"}
         See `Fallback`.
     options
@@ -199,18 +207,36 @@ def make_supervised(
         As `make_controller`, for the controller or for its fallback.
     """
     controller = make_controller(task, name, setup)
+    spec = controller_spec(task, name)
+    judged: dict[str, Any] = {
+        "judges": setup.adaptation == "off" and not spec.misses,
+        "holds": math.nan if spec.holds is None else spec.holds(setup),
+    }
     if fallback == "none":
-        return Supervised(controller, setup.limits, span, compares=setup.adaptation == "off")
+        return kind(controller, setup.limits, span, **judged)
     opened = replace(setup, options=options)
     # What it needs of the model is known before anything moves.
     make_controller(task, _OPEN, opened)
-    return Supervised(
+    return kind(
         controller,
         setup.limits,
         span,
         lambda state: make_controller(task, _OPEN, replace(opened, state=state)),
-        compares=setup.adaptation == "off",
+        **judged,
     )
+
+
+def greatest_error(own: float, span: float) -> float:
+    """Return the greatest RMS error of a model that still holds, output units.
+
+    Parameters
+    ----------
+    own : float
+        RMS error of the model on the data from which it was identified, output units.
+    span : float
+        Width of its range, output units.
+    """
+    return max(CHANCE * own, HOLDS * span)
 
 
 _OPEN = "open-loop-inverse"
@@ -270,12 +296,17 @@ def _predictive(setup: ControllerSetup) -> PredictiveFollower:
     return PredictiveFollower(inverse, dynamics, setup.start, setup.limits, parameters, setup.model_filter())
 
 
+def _holds(setup: ControllerSetup) -> float:
+    return greatest_error(float(setup.model.provenance.get("rms", 0.0)), setup.spans.output)
+
+
 OPEN_LOOP_INVERSE = ControllerSpec(
     "the inverse of the model, without feedback",
     lambda s: OpenLoopInverse(s.inverse(), s.start, s.limits, wait=_wait(s), adaptation=s.model_filter()),
     adapts=True,
     numbers=lambda _: _Settling(),
     tunable=("wait",),
+    holds=_holds,
 )
 CLOSED_LOOP_INVERSE = ControllerSpec(
     "the inverse of the model, corrected by the measured disturbance",
@@ -292,17 +323,19 @@ LATCHED = ControllerSpec(
     numbers=lambda s: LatchParameters.scaled(s.spans),
     tunable=("approach", "creep_gain", "creep_until", "fine_period"),
 )
-POLYNOMIAL = ControllerSpec("the look-up table of a model without memory", _look_up)
+POLYNOMIAL = ControllerSpec("the look-up table of a model without memory", _look_up, misses=True)
 INTEGRAL = ControllerSpec(
     "integral action without a model",
     lambda s: IntegralControl(s.limits, _integral(s)),
     numbers=lambda s: _integral(replace(s, options={})),
     tunable=("gain", "period"),
+    misses=True,
 )
 OPEN_LOOP_FOLLOWER = ControllerSpec(
     "the inverse of the model, without feedback",
     lambda s: OpenLoopFollower(s.inverse(), s.start, s.limits, s.tuned(FollowingParameters.scaled), s.model_filter()),
     adapts=True,
+    holds=_holds,
 )
 CLOSED_LOOP_FOLLOWER = ControllerSpec(
     "the inverse of the model, corrected by the measured disturbance",
@@ -315,7 +348,7 @@ PREDICTIVE_FOLLOWER = ControllerSpec(
     "set-points of a horizon by model, dynamics and coming reference, within the limits", _predictive, adapts=True
 )
 INTEGRAL_FOLLOWER = ControllerSpec(
-    "integral action without a model", lambda s: IntegralFollower(s.limits, _integral(s))
+    "integral action without a model", lambda s: IntegralFollower(s.limits, _integral(s)), misses=True
 )
 
 

@@ -40,6 +40,7 @@ from bench.protocol.plan import EXPECTED, Plan
 from bench.protocol.vocabulary import (
     PROMPT,
     ByHand,
+    Caution,
     Control,
     FixedRate,
     KeptModel,
@@ -202,7 +203,7 @@ class Engine:
                     run.phase = message.name
                     run.event("INFO", "phase", message.name)
                 elif isinstance(message, Note):
-                    run.event("INFO", "note", message.text)
+                    run.event("WARN" if isinstance(message, Caution) else "INFO", "note", message.text)
                     if isinstance(message, KeptModel):
                         run.keep_model(message.name, message.content)
                 elif type(message) in self._work:

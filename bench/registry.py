@@ -33,6 +33,7 @@ Group = Literal[
     "laboratories",
     "derived_signals",
     "models",
+    "identifications",
     "controllers",
     "studies",
     "commands",

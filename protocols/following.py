@@ -9,8 +9,9 @@ import numpy as np
 
 from bench.control.loops import FollowReference
 from bench.control.references import fastest_slope, modulated_sine
-from bench.controllers import ControllerSetup, controller_names, make_controller
-from bench.protocol import Control, Messages, Phase, Slots, from_slot, parameter, protocol, unit_of
+from bench.control.supervision import SupervisedFollower
+from bench.controllers import ControllerSetup, Fallback, controller_names, make_supervised
+from bench.protocol import Caution, Control, Messages, Phase, Slots, from_slot, parameter, protocol, unit_of
 from bench.results.data import read_columns
 from bench.results.tracking import FOLLOW
 from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LOOP, load_checked_model
@@ -33,6 +34,9 @@ class Parameters(SessionParameters):
     period: float = parameter(200.0, unit="s", low=1, high=1e6, help="period of the sine, whose amplitude varies")
     duration: float = parameter(800.0, unit="s", low=1, high=1e7, help="how long the sine is followed")
     rate: float = parameter(2.0, unit="1/s", low=0.01, high=50, help="set-points and readings per second")
+    fallback: Fallback = parameter(
+        "none", unit="", help="what goes on in place of a controller that is given up; none ends the run"
+    )
     fastest: float = parameter(from_slot("drive", "rate"), unit=f"{_DRIVE}/s", help="what the drive can follow")
 
 
@@ -71,7 +75,15 @@ def following(parameters: Parameters, slots: Slots) -> Messages:
         adaptation=parameters.adaptation,
         period=1.0 / parameters.rate,
     )
-    follower = make_controller("follow", parameters.controller, setup)
+    follower = make_supervised(
+        SupervisedFollower,
+        "follow",
+        parameters.controller,
+        setup,
+        span=setup.spans.output,
+        fallback=parameters.fallback,
+        **parameters.tuning.get("open-loop-inverse", {}),
+    )
 
     def follow(reference: Callable[[float], float], seconds: float, timeout: float, label: str) -> Control:
         return Control(
@@ -89,6 +101,8 @@ def following(parameters: Parameters, slots: Slots) -> Messages:
     yield follow(lambda _: float(values[0]), 20.0, 60.0, "approach")
     yield Phase(f"follow, {parameters.controller}")
     yield follow(lambda t: float(np.interp(t, times, values)), duration, duration + 60.0, FOLLOW)
+    if notice := follower.take_notice():
+        yield Caution(notice)
     yield from keep_adapted(follower, model)
 
 

@@ -8,9 +8,23 @@ import numpy as np
 
 from bench.control.loops import ReachTarget
 from bench.control.references import tracking_targets
+from bench.control.supervision import Supervised
 from bench.controllers import ControllerSetup, Fallback, controller_names, make_supervised
 from bench.hysteresis import Policy
-from bench.protocol import Control, Dwell, Messages, Note, Phase, Slots, Step, from_slot, parameter, protocol, unit_of
+from bench.protocol import (
+    Caution,
+    Control,
+    Dwell,
+    Messages,
+    Note,
+    Phase,
+    Slots,
+    Step,
+    from_slot,
+    parameter,
+    protocol,
+    unit_of,
+)
 from bench.results.data import read_columns
 from bench.results.tracking import REACH, READING
 from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LOOP, load_checked_model
@@ -40,7 +54,7 @@ class Parameters(SessionParameters):
         10, unit="1", low=1, high=1000, help="readings at each target once it is reached", changeable=True
     )
     fallback: Fallback = parameter(
-        "none", unit="", help="what goes on in place of a controller that does not converge; none ends the run"
+        "none", unit="", help="what goes on in place of a controller that is given up; none ends the run"
     )
     timeout: float = parameter(
         300.0, unit="s", low=1, high=86400, help="longest time for one target", changeable=True
@@ -79,10 +93,11 @@ def tracking(parameters: Parameters, slots: Slots) -> Messages:
         adaptation=parameters.adaptation,
     )
     controller = make_supervised(
+        Supervised,
         "target",
         parameters.controller,
         setup,
-        span=float(np.ptp(targets)) or 1.0,
+        span=setup.spans.output,
         fallback=parameters.fallback,
         **parameters.tuning.get("open-loop-inverse", {}),
     )
@@ -102,7 +117,7 @@ def tracking(parameters: Parameters, slots: Slots) -> Messages:
         )
         seconds.append(reading.time - start)
         if notice := controller.take_notice():
-            yield Note(notice)
+            yield Caution(notice)
         outputs: list[float] = []
         for _ in range(parameters.readings):
             reading = yield Step({}, Dwell(0.1), label=READING)

@@ -56,16 +56,33 @@ class World:
         self.time = clock.now()
         self._now = clock.now
         self._timed: list[tuple[Callable[[], float], Timed]] = []
-        self._deadlines: list[Callable[[], float]] = []
+        self._asked: list[Callable[[], float]] = []
+        self._soonest = -math.inf
+        """No announced deadline is before; it may be earlier than the next of them."""
         self._late: list[Callable[[], None]] = []
         self._advancing = False
 
-    def add(self, timed: Timed, *, catch_up: Callable[[], None] | None = None) -> None:
-        """Keep the deadlines of an instrument; `catch_up` does what it has put off, before anybody interferes."""
+    def add(self, timed: Timed, *, announces: bool = False, catch_up: Callable[[], None] | None = None) -> None:
+        """Keep the deadlines of an instrument.
+
+        Parameters
+        ----------
+        announces : bool
+            Whether it calls `announce` whenever its deadline comes closer, so that it need not be asked all the time.
+        catch_up : callable, optional
+            Does what it has put off, before anybody interferes.
+        """
         self._timed.append((timed.deadline, timed))
-        self._deadlines.append(timed.deadline)
+        if not announces:
+            self._asked.append(timed.deadline)
+        self._soonest = -math.inf
         if catch_up is not None:
             self._late.append(catch_up)
+
+    def announce(self, instant: float) -> None:
+        """Note that something may be due at an instant, s."""
+        if instant < self._soonest:
+            self._soonest = instant
 
     @contextmanager
     def at_present(self) -> Iterator[None]:
@@ -96,15 +113,16 @@ class World:
             return
         target = self._now()
         # Mostly nothing is due, and a fast loop asks several times for each sample.
-        for deadline in self._deadlines:
-            if deadline() <= target:
-                break
-        else:
-            before = self.time
-            if target > before:
-                self._plant.advance(target - before)
-                self.time = target
-            return
+        if target < self._soonest:
+            for deadline in self._asked:
+                if deadline() <= target:
+                    break
+            else:
+                before = self.time
+                if target > before:
+                    self._plant.advance(target - before)
+                    self.time = target
+                return
         self._advancing = True
         try:
             self._advance_to(target)
@@ -119,6 +137,7 @@ class World:
                 if instant < due:
                     due, first = instant, timed
             if first is None or due > target:
+                self._soonest = due
                 break
             if due > self.time:
                 self._plant.advance(due - self.time)

@@ -42,14 +42,14 @@ for _name in ("SIGHUP", "SIGQUIT"):
 
 # Chosen by `make test`; `make test-all` looks at all examples. Without deadlines, as several folders have it.
 settings.register_profile("brief", deadline=None)
-_BRIEF, _FEWEST = 6, 10
+_BRIEF, _FEWEST = 4, 10
 """What examples are divided by then, and how few there are at least."""
 _SETTINGS = "_hypothesis_internal_use_settings"
 
 
 def _take_fewer_examples(items):
-    """Divide the examples of each costly property: a profile would not reach those that say their number."""
-    tests = (getattr(item, "obj", None) for item in items if item.get_closest_marker("costly"))
+    """Divide the examples of each property: a profile would not reach those that say their number."""
+    tests = (getattr(item, "obj", None) for item in items)
     for test in {getattr(test, "__func__", test) for test in tests if hasattr(test, "hypothesis")}:
         own = getattr(test, _SETTINGS, settings.default)
         fewer = max(own.max_examples // _BRIEF, min(own.max_examples, _FEWEST))

@@ -39,6 +39,7 @@ from bench.errors import BenchError, ConfigurationError
 from bench.hysteresis import find_model, identifiable_models
 from bench.protocol import Plan, ProtocolDefinition, find_protocol, plan
 from bench.results.models import check_template, option_names
+from bench.results.whole_models import WholeIdentification, whole_identification, whole_models
 from bench.rig_file import RigFile
 from bench.studies import Study
 
@@ -132,7 +133,7 @@ class _Expander:
         waiting = list(file.models)
         for number, table in enumerate(file.runs):
             self._add_runs(number, table)
-            for models in [each for each in waiting if each.runs == table.label]:
+            for models in [each for each in waiting if self._runs.keys() >= set(each.runs)]:
                 self._add_models(file.where("models", file.models.index(models)), models)
                 waiting.remove(models)
         for number, comparisons in enumerate(file.comparisons):
@@ -161,29 +162,38 @@ class _Expander:
 
     def _check_models(self, number: int, table: ModelsTable) -> None:
         where = self._file.where("models", number)
-        known = [runs.label for runs in self._file.runs]
-        if table.runs not in known:
-            raise ConfigurationError(
-                f"{where}: runs = {table.runs!r}: there is no table of runs of this name; there are: "
-                f"{', '.join(known) or 'none'}"
-            )
-        try:
-            find_model(table.model)
-        except ValueError:
-            raise ConfigurationError(
-                f"{where}: model = {table.model!r}: there is no such model; there are: "
-                f"{', '.join(identifiable_models())}"
-            ) from None
-        allowed = option_names(table.model)
+        known = {runs.label: runs for runs in self._file.runs}
+        for name in table.runs:
+            if name not in known:
+                raise ConfigurationError(
+                    f"{where}: runs = {name!r}: there is no table of runs of this name; there are: "
+                    f"{', '.join(known) or 'none'}"
+                )
+            seeds = known[name].seeds
+            if table.seed is not None and table.seed not in seeds:
+                raise ConfigurationError(
+                    f"{where}: seed = {table.seed}: {name} has no run with this seed; it has: "
+                    f"{', '.join(map(str, seeds))}"
+                )
+        allowed: tuple[str, ...] = ()
+        if whole_identification(table.model) is None:
+            try:
+                find_model(table.model)
+            except ValueError:
+                raise ConfigurationError(
+                    f"{where}: model = {table.model!r}: there is no such model; there are: "
+                    f"{', '.join((*identifiable_models(), *whole_models()))}"
+                ) from None
+            if len(table.runs) > 1:
+                raise ConfigurationError(
+                    f"{where}: runs: a model {table.model} is identified from one run; expected one table"
+                )
+            allowed = option_names(table.model)
         for key in table.options:
             if key not in allowed:
-                raise ConfigurationError(f"{where}.{key}: there is no such key; allowed are: {', '.join(allowed)}")
-        seeds = self._file.runs[known.index(table.runs)].seeds
-        if table.seed is not None and table.seed not in seeds:
-            raise ConfigurationError(
-                f"{where}: seed = {table.seed}: {table.runs} has no run with this seed; it has: "
-                f"{', '.join(map(str, seeds))}"
-            )
+                raise ConfigurationError(
+                    f"{where}.{key}: there is no such key; allowed are: {', '.join(allowed) or 'none'}"
+                )
 
     def _add_runs(self, number: int, table: RunsTable) -> None:
         where = self._file.where("runs", number)
@@ -305,36 +315,67 @@ class _Expander:
             found[key] = self._models[name].get((rig, wanted or 0), [])
             if not found[key]:
                 raise ConfigurationError(
-                    f"{where}: parameters.{key} = '{REFERENCE}{name}': {tables[name].runs} has no run on {rig} with "
-                    f"seed {wanted}; expected the same rigs and seeds there, or `seed` in the table of models"
+                    f"{where}: parameters.{key} = '{REFERENCE}{name}': {', '.join(tables[name].runs)} has no run on "
+                    f"{rig} with seed {wanted}; expected the same rigs and seeds there, or `seed` in the table of "
+                    "models"
                 )
         for chosen in itertools.product(*found.values()):
             yield dict(zip(found, chosen, strict=True))
 
     def _add_models(self, where: str, table: ModelsTable) -> None:
         self._models[table.name] = {}
-        varying = [key for key in self._varying[table.runs] if key not in ("rig", "seed")]
+        runs = [
+            (self._rig_as_given(label, run), run)
+            for label in table.runs
+            for run in self._runs[label]
+            if table.seed in (None, run.seed)
+        ]
+        if (whole := whole_identification(table.model)) is not None:
+            self._several[table.name] = False
+            for key in dict.fromkeys((rig, run.seed) for rig, run in runs):
+                together = [run for rig, run in runs if (rig, run.seed) == key]
+                self._check_whole(where, whole, *key, together)
+                self._add_model(table, key, together, f"{Path(key[0]).stem}-seed={key[1]}", table.name)
+            return
+        (table_of_runs,) = table.runs
+        varying = [key for key in self._varying[table_of_runs] if key not in ("rig", "seed")]
         self._several[table.name] = bool(varying)
-        for run in self._runs[table.runs]:
-            if table.seed not in (None, run.seed):
-                continue
+        for rig, run in runs:
             self._check_identification(where, table, run)
-            identity = digest({"run": run.identity, **table.model_dump(exclude={"name", "runs", "seed"})})
-            base = run.name.rpartition("/")[2].rpartition("-")[0]
-            task = ModelTask(
-                name=f"{table.name}/{base}{'-' * bool(base)}{identity[:SHOWN_DIGITS]}",
-                identity=identity,
-                table=table.name,
-                source=run.name,
-                model=table.model,
-                input=table.input,
-                output=table.output,
-                options=table.options,
-                label=" ".join([table.name, *(f"{key}={_setting(run, key)}" for key in varying)]),
+            label = " ".join([table.name, *(f"{key}={_setting(run, key)}" for key in varying)])
+            self._add_model(table, (rig, run.seed), [run], run.name.rpartition("/")[2].rpartition("-")[0], label)
+
+    def _add_model(
+        self, table: ModelsTable, key: tuple[str, int], runs: Sequence[RunTask], base: str, label: str
+    ) -> None:
+        """Add the identification of a model of a rig and seed from runs."""
+        identity = digest(
+            {"runs": [run.identity for run in runs], **table.model_dump(exclude={"name", "runs", "seed"})}
+        )
+        task = ModelTask(
+            name=f"{table.name}/{base}{'-' * bool(base)}{identity[:SHOWN_DIGITS]}",
+            identity=identity,
+            table=table.name,
+            sources=tuple(run.name for run in runs),
+            model=table.model,
+            input=table.input,
+            output=table.output,
+            options=table.options,
+            label=label,
+        )
+        self._add(task)
+        self._models[table.name].setdefault(key, []).append(task)
+
+    def _check_whole(
+        self, where: str, whole: WholeIdentification, rig: str, seed: int, runs: Sequence[RunTask]
+    ) -> None:
+        """Check that a model of several runs gets one of each protocol that it needs."""
+        found = [self._definition_of[run.name].name for run in runs]
+        if sorted(found) != sorted(whole.protocols):
+            raise ConfigurationError(
+                f"{where}: runs: expected one run each of {', '.join(whole.protocols)} on a rig and seed; on {rig} "
+                f"with seed {seed} there are: {', '.join(found)}"
             )
-            self._add(task)
-            rig = self._rig_as_given(table.runs, run)
-            self._models[table.name].setdefault((rig, run.seed), []).append(task)
 
     def _check_identification(self, where: str, table: ModelsTable, run: RunTask) -> None:
         """Check columns and options of an identification from a run."""
@@ -385,8 +426,8 @@ class _Expander:
                     found[task.label] = task
                 if not any(task.table == name for task in found.values()):
                     raise ConfigurationError(
-                        f"{where}: models = {name!r}: {tables[name].runs} has no run on {rig} with seed {wanted}; "
-                        f"expected the same rigs and seeds there, or `seed` in the table of models"
+                        f"{where}: models = {name!r}: {', '.join(tables[name].runs)} has no run on {rig} with seed "
+                        f"{wanted}; expected the same rigs and seeds there, or `seed` in the table of models"
                     )
             content = table.model_dump(exclude={"name", "runs", "models"})
             identity = digest({"run": run.identity, **content, "models": {k: t.identity for k, t in found.items()}})

@@ -135,12 +135,15 @@ class RunsTable(_Table):
 
 
 class ModelsTable(_Table):
-    """A table `[[models]]`: a model that is identified from each run of a table; other keys are its options."""
+    """A table `[[models]]`: a model that is identified from each run of a table; other keys are its options.
+
+    One that takes several runs (`bench.results.whole_models`) is identified from those of a rig and seed together.
+    """
 
     model_config = ConfigDict(extra="allow")
 
     name: str = Field(pattern=f"^{_NAME}$", description="its name, which runs refer to as '@NAME'")
-    runs: str = Field(min_length=1, description="name of an earlier table [[runs]]")
+    runs: Names = Field(description="name of an earlier table [[runs]], or a list of these")
     model: str = Field(min_length=1, description="model, as `bench list` names it")
     input: str = Field(default="", description="input column; the signal of the slot `drive` if not given")
     output: str = Field(default="", description="output column; the signal of the slot `response` if not given")
@@ -149,6 +152,11 @@ class ModelsTable(_Table):
         ge=0,
         description="seed of its run; that of the run that uses the model if not given",
     )
+
+    @model_validator(mode="after")
+    def _has_runs(self) -> Self:
+        _each_once(self.runs)
+        return self
 
     @property
     def options(self) -> dict[str, Any]:

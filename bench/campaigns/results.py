@@ -105,7 +105,7 @@ def runs_table(expansion: Expansion, done: Mapping[str, Done], table: str) -> Re
     models: dict[str, list[ModelTask]] = {}
     for task in expansion.tasks.values():
         if isinstance(task, ModelTask):
-            models.setdefault(task.source, []).append(task)
+            models.setdefault(task.sources[0], []).append(task)
     rows: list[dict[tuple[str, str], Cell]] = []
     for task in expansion.tasks.values():
         if not isinstance(task, RunTask) or task.table != table:

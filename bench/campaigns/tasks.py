@@ -22,6 +22,7 @@ from bench.results.models import compare_models, identify_file
 from bench.results.recalibrations import Session
 from bench.results.run_folder import RunFolder
 from bench.results.tracking import results_json
+from bench.results.whole_models import whole_identification
 from bench.runs import Run, carry_out
 from bench.studies import Campaign, Study
 from bench.workers import Workers
@@ -51,7 +52,7 @@ class Done:
         `completed`, or how a run ended: `failed`, `unsafe` if the safe state was not confirmed; `refused` if it could
         not start, `crashed` if it ended by a defect of a program.
     reason : str
-        Why, empty where it was completed.
+        Why, and what the run warned of; empty where it was completed without a warning.
     results : mapping of str to (float, str)
         Value and unit by name.
     """
@@ -251,20 +252,20 @@ class RunTask(Task):
             **run_results(result.folder),
         }
         unsafe = "" if outcome.is_safe else f"NOT in the safe state: {dict(outcome.safe_state)}"
-        reason = "; ".join(filter(None, (outcome.reason, unsafe)))
+        reason = "; ".join(filter(None, (outcome.reason, unsafe, *warnings_of(result.folder))))
         return result.folder, Done(self.identity, outcome.status if outcome.is_safe else "unsafe", reason, results)
 
 
 @dataclass(frozen=True)
 class ModelTask(Task):
-    """The identification of a model from a run.
+    """The identification of a model from a run, or from several together.
 
     Attributes
     ----------
     table : str
         Name of the table that asks for it.
-    source : str
-        Name of the run's task.
+    sources : tuple of str
+        Names of the tasks of the runs; several for a model that needs them.
     model : str
         Name of a registered model.
     input, output : str
@@ -276,7 +277,7 @@ class ModelTask(Task):
     """
 
     table: str
-    source: str
+    sources: tuple[str, ...]
     model: str
     input: str = ""
     output: str = ""
@@ -285,21 +286,28 @@ class ModelTask(Task):
 
     @property
     def needs(self) -> tuple[str, ...]:
-        """The run."""
-        return (self.source,)
+        """The runs."""
+        return self.sources
 
     def describe(self) -> dict[str, Any]:
         """Return what it is, for programs."""
         return {
             "kind": "model",
             "table": self.table,
-            "source": self.source,
+            "sources": self.sources,
             "model": self.model,
             "options": self.options,
         }
 
     def _work(self, campaign: Path, scratch: Path) -> tuple[Path, Done]:
-        source = completed_run(campaign, self.source)
+        made = scratch / "made"
+        made.mkdir()
+        runs = [completed_run(campaign, name) for name in self.sources]
+        whole = whole_identification(self.model)
+        if whole is not None:
+            whole.identify({str(run.meta["protocol"]): run.folder for run in runs}).save(made / MODEL_NAME)
+            return made, Done(self.identity, "completed")
+        (source,) = runs
         found = identify_file(
             source.folder,
             input_column=self.input or source.signal_of("drive"),
@@ -307,8 +315,6 @@ class ModelTask(Task):
             model=self.model,
             **identification_options(self.options),
         )
-        made = scratch / "made"
-        made.mkdir()
         found.file.save(made / MODEL_NAME)
         summary, unit = found.summary(), found.file.operator.output_unit or "1"
         units = {"max": unit, "rms": unit, "rms_percent": "%"}
@@ -440,6 +446,12 @@ def run_results(folder: Path) -> dict[str, tuple[float, str]]:
         for kind, values in found.items()
         for name, value in values.items()
     }
+
+
+def warnings_of(folder: Path) -> list[str]:
+    """Return the warnings that the protocol of a run noted."""
+    with Record(folder) as record:
+        return [event.text for event in record.events() if event.kind == "note" and event.level == "WARN"]
 
 
 def flat_numbers(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, tuple[float, str]]]:

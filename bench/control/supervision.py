@@ -1,4 +1,4 @@
-"""Watches over a target controller, whose feedback may do harm on another specimen than it was made for."""
+"""Watches over a controller: its feedback, made for another specimen, may do harm, or its model no longer hold."""
 
 from __future__ import annotations
 
@@ -8,84 +8,82 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bench.control.convergence import MOST_SWINGS, LimitCycleWatch
-from bench.control.loops import Reaching
+from bench.control.loops import Foreseeing, Reaching
 from bench.control.model_filters import ModelFilter
-from bench.control.tracking import Command, Trace
+from bench.control.tracking import Command, Follower, Trace
 from bench.errors import ConvergenceError
 from bench.hysteresis import Reach
 
 TARGETS = 5
 """Number of targets in a row over which errors are judged."""
-_TOLERANCE = 0.02
-"""Part of the range of the targets within which no error is judged."""
-_BEYOND = 2.25
+SAMPLES = 200
+"""Number of samples of a moving reference over which they are judged."""
+CHANCE = 2.25
 """Ratio of two RMS errors over five targets that chance exceeds in 5 % of cases: the root of F(5, 5) = 5.05."""
+HOLDS = 0.03
+"""Part of the output's range that a model may err by that fits its own data well: sessions differ. Feedback that errs
+by more does not do what it is for."""
+_TOLERANCE = 0.02
+"""Part of the range within which the model alone is not taken for better."""
+_WARNED = 0.01
+"""The same part from which on there is a warning at targets."""
+_MOVING = 1.5
+"""How much more a model may err where the reference moves: the actuator's lag is no part of its error at rest."""
 _SWINGS = MOST_SWINGS - 2
 """Swings at one target after which its controller is given up: fewer than those that end the run."""
 
 
-class Supervised:
-    """A target controller that is given up when it does not converge: a `Reaching`.
-
-    It does not if it sends the actuator to and fro between the ends of its range at one target; or if over several
-    targets it errs by more than its model does at the same places, and more than by chance: then the model alone,
-    without feedback, would have been better; or if it says so itself (`doubt`). Targets that cannot be met do not
-    count, and a controller that does not say what its model errs by is judged by the swings alone.
+class _Supervision:
+    """What the supervision of targets and of a moving reference have in common.
 
     Parameters
     ----------
-    controller : Reaching
+    controller : object
         The controller.
     limits : (float, float)
         Set-points that it may ask for, input units.
     span : float
-        Range of the targets, output units, > 0.
+        Range of the output by the model, output units, > 0.
     fallback : callable or None
         Makes the controller that goes on, from the memory of the one that is given up. Without it a
         `ConvergenceError` ends the run in the safe state.
-    compares : bool
-        Whether errors are compared with those of the model. Not of a controller that corrects its model: what that
-        errs by at present is the same.
+    judges : bool
+        Whether errors are judged. Not of a controller that corrects its model, which takes its time, nor of one that
+        may miss targets by design.
+    holds : float
+        Of a controller without feedback: greatest RMS error of a model that still holds, output units. nan for one
+        with feedback, whose model may err by more.
     """
+
+    _window = TARGETS
+    _over = "targets"
+    _strict = True
+    """Whether an error beyond the tolerance ends the run, also where the model alone would err by more."""
 
     def __init__(
         self,
-        controller: Reaching,
+        controller: Any,  # noqa: ANN401 - `Reaching` or `Follower`
         limits: tuple[float, float],
         span: float,
-        fallback: Callable[[Any], Reaching] | None = None,
+        fallback: Callable[[Any], Any] | None = None,
         *,
-        compares: bool = True,
+        judges: bool = True,
+        holds: float = math.nan,
     ) -> None:
         self._controller: Any = controller
-        self._watch = LimitCycleWatch(*limits)
         self._limits = limits
-        self._tolerance = _TOLERANCE * span
+        self._span = span
         self._fallback = fallback
-        self._compares = compares
-        self._judged: deque[tuple[float, float]] = deque(maxlen=TARGETS)
-        self._target = self._output = math.nan
-        self._finished = False
+        self._judges = judges
+        self._holds = holds
+        self._judged: deque[tuple[float, float]] = deque(maxlen=self._window)
         self._notice = ""
+        self._warned = False
         self.gave_up = False
         """Whether the fallback is at work."""
-
-    def aim(self, target: float, t: float, measured_input: float, output: float, *others: float) -> Command:
-        """Aim at the next target; see `Reaching`. Raises ConvergenceError if the controller does not converge."""
-        if why := self._judge():
-            self._give_up(why)
-        self._target, self._output, self._finished = target, output, False
-        command: Command = self._controller.aim(target, t, measured_input, output, *others)
-        return self._watched(command, t, measured_input, output, others)
-
-    def update(self, t: float, measured_input: float, output: float, *others: float) -> Command:
-        """Go on towards the target; see `Reaching`. Raises ConvergenceError if the controller does not converge."""
-        if math.isfinite(output):
-            self._output = output
-        command: Command = self._controller.update(t, measured_input, output, *others)
-        return self._watched(command, t, measured_input, output, others)
 
     @property
     def trace(self) -> Trace:
@@ -106,14 +104,97 @@ class Supervised:
 
     @property
     def reach(self) -> Reach:
-        """Whether the present target can be met."""
+        """Whether the present target or reference can be met."""
         reach: Reach = self._controller.reach
         return reach
 
     def take_notice(self) -> str:
-        """Return why the controller was given up, once; empty if it was not."""
+        """Return why the controller was given up, or what error it leaves, once; empty if there is nothing to say."""
         notice, self._notice = self._notice, ""
         return notice
+
+    def _judge(self, error: float) -> None:
+        """Take the error of a target or sample, output units; give the controller up if it does no good.
+
+        Raises ConvergenceError if nothing goes on in its place.
+        """
+        without = self.trace.disturbance
+        if not math.isfinite(error):
+            return
+        self._judged.append((error, without))
+        if len(self._judged) < self._window:
+            return
+        # Of a controller that does not say what its model errs by, that is not known.
+        errors, without = np.sqrt(np.mean(np.square(self._judged), axis=0)).tolist()
+        over = f"over {self._window} {self._over} its error is {errors:.3g} RMS"
+        if not math.isnan(self._holds):
+            if errors > self._holds:
+                self._give_up(f"{over}, and that of a model that holds at most {self._holds:.3g}")
+            return
+        part = errors / self._span
+        text = f"{over}, {100.0 * part:.2g} % of the range"
+        known = f"{text}, and that of its model alone, without feedback, {without:.3g}"
+        if part > _TOLERANCE and errors > CHANCE * without:
+            self._give_up(known)
+        elif part > HOLDS and self._strict and self._fallback is None:
+            self._give_up(text if math.isnan(without) else known)
+        elif part > (_WARNED if self._strict else _TOLERANCE) and not self._warned:
+            self._notice, self._warned = f"the controller leaves an error: {text}", True
+
+    def _give_up(self, why: str) -> None:
+        if math.isnan(self._holds):
+            text, remedy = f"the controller does not converge: {why}", "tune it for this specimen, "
+        else:
+            text, remedy = f"the model does not hold for this specimen: {why}", "correct it by adaptation=session, "
+        if self._fallback is None:
+            raise ConvergenceError(
+                f"{text}; {remedy}identify the specimen again, or set fallback=open-loop to go on without feedback"
+            )
+        if self._controller.state is None:
+            raise ConvergenceError(f"{text}; it keeps no memory of the specimen from which the open loop could go on")
+        self._notice = f"{text}; it goes on in open loop"
+        self._controller = self._fallback(self._controller.state)
+        self.gave_up = True
+
+
+class Supervised(_Supervision):
+    """A target controller that is given up when it does not converge: a `Reaching`.
+
+    It does not if it sends the actuator to and fro between the ends of its range at one target; or if over several
+    targets it errs by more than its model does at the same places, and more than by chance: then the model alone,
+    without feedback, would have been better; or if it says so itself (`doubt`); or, without a fallback, if it errs by
+    more than 3 % of the range. One without feedback is given up where its model does not hold. From 1 % of the range
+    on there is a warning. Targets that cannot be met do not count. Parameters as `_Supervision`.
+    """
+
+    def __init__(
+        self,
+        controller: Reaching,
+        limits: tuple[float, float],
+        span: float,
+        fallback: Callable[[Any], Reaching] | None = None,
+        *,
+        judges: bool = True,
+        holds: float = math.nan,
+    ) -> None:
+        super().__init__(controller, limits, span, fallback, judges=judges, holds=holds)
+        self._watch = LimitCycleWatch(*limits)
+        self._target = self._output = math.nan
+        self._finished = False
+
+    def aim(self, target: float, t: float, measured_input: float, output: float, *others: float) -> Command:
+        """Aim at the next target; see `Reaching`. Raises ConvergenceError if the controller does not converge."""
+        self._judge_target()
+        self._target, self._output, self._finished = target, output, False
+        command: Command = self._controller.aim(target, t, measured_input, output, *others)
+        return self._watched(command, t, measured_input, output, others)
+
+    def update(self, t: float, measured_input: float, output: float, *others: float) -> Command:
+        """Go on towards the target; see `Reaching`. Raises ConvergenceError if the controller does not converge."""
+        if math.isfinite(output):
+            self._output = output
+        command: Command = self._controller.update(t, measured_input, output, *others)
+        return self._watched(command, t, measured_input, output, others)
 
     def _watched(
         self, command: Command, t: float, measured_input: float, output: float, others: tuple[float, ...]
@@ -132,35 +213,57 @@ class Supervised:
         again: Command = self._controller.aim(self._target, t, measured_input, output, *others)
         return again
 
-    def _judge(self) -> str:
-        """Judge how the last target was met; return why the controller does not converge, or nothing."""
-        if not self._compares or self.gave_up or not self._finished or self.reach is not Reach.MET:
-            return ""
+    def _judge_target(self) -> None:
+        """Judge how the last target was met."""
+        if not self._judges or self.gave_up or not self._finished or self.reach is not Reach.MET:
+            return
         if doubt := getattr(self._controller, "doubt", ""):
-            return str(doubt)
-        error, without = self._output - self._target, self.trace.disturbance
-        if not math.isfinite(without):
-            return ""
-        self._judged.append((error, without))
-        if len(self._judged) < TARGETS:
-            return ""
-        errors, opened = np.sqrt(np.mean(np.square(self._judged), axis=0)).tolist()
-        if errors <= max(_BEYOND * opened, self._tolerance):
-            return ""
-        return (
-            f"over {TARGETS} targets its error is {errors:.3g} RMS, and that of its model alone, without feedback, "
-            f"{opened:.3g}"
-        )
+            self._give_up(str(doubt))
+        else:
+            self._judge(self._output - self._target)
 
-    def _give_up(self, why: str) -> None:
-        text = f"the controller does not converge: {why}"
-        if self._fallback is None:
-            raise ConvergenceError(
-                f"{text}; tune it for this specimen, identify the specimen again, or set fallback=open-loop to go on "
-                "without feedback"
-            )
-        if self._controller.state is None:
-            raise ConvergenceError(f"{text}; it keeps no memory of the specimen from which the open loop could go on")
-        self._notice = f"{text}; it goes on in open loop"
-        self._controller = self._fallback(self._controller.state)
-        self.gave_up = True
+
+class SupervisedFollower(_Supervision):
+    """A follower that is given up where it errs by more than its model, and more than by chance: a `Follower`.
+
+    That is judged from 2 % of the range on, where there is a warning. One without feedback is given up where its
+    model does not hold. Samples at which the reference stands, as on the way to its beginning, or cannot be met, do
+    not count. Parameters as `_Supervision`.
+    """
+
+    _window = SAMPLES
+    _over = "samples"
+    _strict = False
+
+    def __init__(
+        self,
+        controller: Follower,
+        limits: tuple[float, float],
+        span: float,
+        fallback: Callable[[Any], Follower] | None = None,
+        *,
+        judges: bool = True,
+        holds: float = math.nan,
+    ) -> None:
+        super().__init__(controller, limits, span, fallback, judges=judges, holds=_MOVING * holds)
+        self._reference = math.nan
+
+    @property
+    def horizon(self) -> int:
+        """Number of coming periods whose reference the controller at work wants; 0 for none."""
+        return self._controller.horizon if isinstance(self._controller, Foreseeing) else 0
+
+    def foresee(self, references: NDArray[np.float64]) -> None:
+        """Take the reference at the end of each coming period; see `Foreseeing`."""
+        if isinstance(self._controller, Foreseeing):
+            self._controller.foresee(references)
+
+    def update(self, t: float, measured_input: float, output: float, reference: float) -> float:
+        """Take in a reading; see `Follower`. Raises ConvergenceError if the follower does no good."""
+        # The last reference is that of now.
+        moves = reference != self._reference
+        if moves and self._judges and not self.gave_up and self.reach is Reach.MET:
+            self._judge(output - self._reference)
+        self._reference = reference
+        setpoint: float = self._controller.update(t, measured_input, output, reference)
+        return setpoint

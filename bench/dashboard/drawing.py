@@ -9,13 +9,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
+import pyarrow as pa
 import rerun as rr
 import rerun.blueprint as rrb
+from rerun.components import LineStrip2DBatch
+from rerun.encodings import Vec2DBatch
 
 from bench.dashboard.recording import Floats, Recording
 from bench.devices import Signal
@@ -120,6 +124,14 @@ class Frame:
 def lines(strips: Any, colour: Colour | Sequence[Colour], points: float, order: float) -> rr.LineStrips2D:  # noqa: ANN401
     """Return lines of a width in points of the screen."""
     return rr.LineStrips2D(strips, colors=colour, radii=rr.Radius.ui_points(points), draw_order=order)
+
+
+def strips_at_once(strips: Sequence[Sequence[tuple[float, float]]]) -> pa.Array:
+    """Return lines as one array, which Rerun would make from one array a line."""
+    points = np.array(list(chain.from_iterable(strips)), dtype=np.float32)
+    ends = np.cumsum([0, *map(len, strips)], dtype=np.int32)
+    vectors = Vec2DBatch(points).as_arrow_array()
+    return pa.ListArray.from_arrays(pa.array(ends), vectors, type=LineStrip2DBatch._ARROW_DATATYPE)
 
 
 def line_style(points: float, colour: Colour | None = None) -> rr.LineStrips2D:

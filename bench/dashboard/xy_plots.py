@@ -15,7 +15,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from bench.dashboard.bounds import Bound
-from bench.dashboard.drawing import Colour, Frame, line_style, lines, point_style, xy_view
+from bench.dashboard.drawing import Colour, Frame, line_style, lines, point_style, strips_at_once, xy_view
 from bench.dashboard.recording import Recording, times
 from bench.dashboard.signal_plots import find_column
 from bench.devices import Signal
@@ -130,12 +130,13 @@ class XYPlots:
             when = times([points[k][0] for k, _ in shown], [points[k][1] for k, _ in shown])
             strips = [line for _, line in shown]
             colours = [_RISING if line[-1][0] >= line[0][0] else _FALLING for line in strips]
+            ends = [line[-1] for line in strips]
+            drawable = strips_at_once(strips)
             if self._fades:
-                recent = rr.LineStrips2D.columns(strips=strips, colors=colours)
+                recent = rr.LineStrips2D.columns(strips=drawable, colors=colours)
                 recording.send(f"{track.path}/data/recent", when, recent)
                 colours = [_pale(colour) for colour in colours]
-            recording.send(f"{track.path}/data/path", when, rr.LineStrips2D.columns(strips=strips, colors=colours))
-            ends = [line[-1] for line in strips]
+            recording.send(f"{track.path}/data/path", when, rr.LineStrips2D.columns(strips=drawable, colors=colours))
             recording.send(f"{track.path}/data/now", when, rr.Points2D.columns(positions=ends))
         return drawn
 

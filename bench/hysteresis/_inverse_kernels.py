@@ -17,8 +17,11 @@ Ends = tuple[float, float, float, float, float, bool, bool]
 Place = tuple[int, float, int, float]  # number of pieces, input within the plane, its cell, and the mass up to it
 
 _ALL = 2**62
-# Segments that are walked before a leap: a smooth reference needs one or two.
-_NEAR = 4
+# Segments that are walked before a leap, and levels that a target is away for one at once: a smooth reference needs
+# one or two.
+_NEAR = 8
+# Tries from which every other one halves the way.
+_INTERPOLATED = 6
 
 
 @njit(cache=True, forceinline=True)
@@ -39,6 +42,10 @@ def _first_root(a: float, b: float, r: float, length: float, tolerance: float) -
             return vertex
         return -1.0
     q = -0.5 * (b + np.copysign(np.sqrt(square), b))
+    if b * r > 0.0:
+        # The other root, if it is ahead too, lies beyond the vertex.
+        nearer: float = -r / q
+        return nearer if nearer <= length else -1.0
     first: float = q / a
     second: float = -r / q if q != 0.0 else first
     if first > second:
@@ -173,70 +180,67 @@ def _leap(
     below: Floats,
     offset: float,
     terms: memory.Terms,
-    end: float,
+    ends: Ends,
     pieces: memory.Pieces,
     place: Place,
+    value: float,
     target: float,
-    tolerance: float,
-    direction: int,
 ) -> tuple[float, float, int]:
     """Return what `walk` does, of a monotone operator, from within the plane.
 
-    By bisection over the corners of the memory curve, and then over the levels between two of them: the output at
-    each follows from the mass to the left of one piece.
+    By bisection over the corners of the memory curve, and then by interpolation over the levels between two of them:
+    the output at each follows from the mass to the left of one piece.
     """
     levels, inverse_step, _ = plane
     left, height, mass_left, column, _ = pieces
-    n, present, k, mass = place
-    u, edge = present, present
-    # Of the pieces from `last` on, each is wiped out before the target.
+    n, near, k, mass = place
+    low, high, minus, plus, tolerance, _, _ = ends
+    rises = target > value
+    edge = near
+    moved = near, k, mass
+    # The target lies between `near` and `far`. Of the pieces from `last` on, each is wiped out before it.
+    far, far_value = (levels[-1], plus) if rises else (levels[0], minus)
     first, last = 0, n
-    if direction > 0:
-        while first < last:
-            p = (first + last) // 2
-            if _risen(plane, below, offset, terms, (left[p], column[p], mass_left[p]), height[p]) < target:
-                last = p
-            else:
-                first = p + 1
-        rising = present, k, mass
-        if last < n:
-            rising = left[last], column[last], mass_left[last]
-            u, edge = height[last], left[last]
-        top = height[last - 1] if last > 0 else levels[-1]
-        # The last level between that is still too low.
-        i = memory.locate(levels, inverse_step, u)
-        j = levels.size - 1 if top >= levels[-1] else memory.locate(levels, inverse_step, top)
-        while i < j:
-            middle = (i + j + 1) // 2
-            if _risen(plane, below, offset, terms, rising, levels[middle]) < target:
-                i = middle
-            else:
-                j = middle - 1
-        u = max(u, levels[i])
-        value = _risen(plane, below, offset, terms, rising, u)
-    else:
-        while first < last:
-            p = (first + last) // 2
-            if _fallen(plane, below, offset, terms, pieces, p - 1, left[p]) > target:
-                last = p
-            else:
-                first = p + 1
-        if last < n:
-            u = left[last]
-        # The first level between that is still too high.
-        j = memory.locate(levels, inverse_step, u) + 1
-        i = memory.locate(levels, inverse_step, left[last - 1]) + 1 if last > 0 else 0
-        while i < j:
-            middle = (i + j) // 2
-            if _fallen(plane, below, offset, terms, pieces, last - 1, levels[middle]) > target:
-                j = middle
-            else:
-                i = middle + 1
-        if levels[i] < u:
-            u = levels[i]
-        value = _fallen(plane, below, offset, terms, pieces, last - 1, u)
+    while first < last:
+        p = (first + last) // 2
+        corner = height[p] if rises else left[p]
+        piece = left[p], column[p], mass_left[p]
+        if rises:
+            reached = _risen(plane, below, offset, terms, piece, corner)
+        else:
+            reached = memory.output_at(plane, below, offset, terms, corner, corner, column[p], mass_left[p])
+        if reached != target and (reached < target) == rises:
+            last, near, value = p, corner, reached
+            edge, moved = left[p], piece
+        else:
+            first, far, far_value = p + 1, corner, reached
+    if far_value != target and (far_value < target) == rises:
+        # Not within the plane.
+        near = far
+    tries = 0
+    while near != far:
+        share = 0.5
+        # Interpolation alone may creep.
+        if tries < _INTERPOLATED or tries % 2 == 0:
+            share = (target - value) / (far_value - value)
+        tries += 1
+        k = memory.locate(levels, inverse_step, near + share * (far - near))
+        level = levels[k] if rises else levels[k + 1]
+        if level == near or (level < near) == rises:
+            break
+        if rises:
+            reached = _risen(plane, below, offset, terms, moved, level)
+        else:
+            reached = _fallen(plane, below, offset, terms, pieces, last - 1, level)
+        if reached != target and (reached < target) == rises:
+            near, value = level, reached
+        else:
+            far, far_value = level, reached
+    if near == far:
+        value = far_value
+    direction, end = (1, high) if rises else (-1, low)
     corners = left, height, last
-    return walk(plane, terms, end, corners, u, value, target, tolerance, direction, np.inf, _ALL, edge)
+    return walk(plane, terms, end, corners, near, value, target, tolerance, direction, np.inf, _ALL, edge)
 
 
 @njit(cache=True, forceinline=True)
@@ -261,15 +265,16 @@ def invert(
     if monotone:
         direction = 1 if target > value else -1
         end = high if direction > 0 else low
-        x, e, steps = _walk_on(plane, terms, end, corners, u, value, target, tolerance, direction, np.inf, _NEAR)
-        if abs(e) > tolerance and steps == _NEAR:
-            if plane[0][0] <= u <= plane[0][-1]:
-                x, e, further = _leap(plane, below, offset, terms, end, pieces, place, target, tolerance, direction)
-                steps += further
-            else:
-                x, e, steps = _walk_on(
-                    plane, terms, end, corners, u, value, target, tolerance, direction, np.inf, _ALL
-                )
+        levels = plane[0]
+        within = levels[0] <= u <= levels[-1]
+        if within and abs(target - value) * levels.size > _NEAR * (plus - minus):
+            x, e, steps = _leap(plane, below, offset, terms, ends, pieces, place, value, target)
+            return 1, x, x, e, steps
+        most = _NEAR if within else _ALL
+        x, e, steps = _walk_on(plane, terms, end, corners, u, value, target, tolerance, direction, np.inf, most)
+        if abs(e) > tolerance and steps == most:
+            x, e, further = _leap(plane, below, offset, terms, ends, pieces, place, value, target)
+            steps += further
         return 1, x, x, e, steps
     # The other way is walked no further than the way on which the target is met first.
     first = 1 if target > value else -1

@@ -23,6 +23,8 @@ S = TypeVar("S")
 
 # Samples of the operating range by which the defaults look for extrema and for falling parts.
 _SAMPLES = 1001
+# Part of the range of inputs at its ends whose memory is as good as known.
+_OUTERMOST = 0.01
 
 
 class Shape(NamedTuple):
@@ -219,15 +221,20 @@ class Operator(Model, ABC, Generic[S]):
         return None
 
     def unknown_until(self, inputs: ArrayLike) -> int:
-        """Return the first sample from which the inputs, shape (N,), have overwritten all memory they ever do."""
+        """Return the first sample from which the inputs, shape (N,), have overwritten all memory they ever do.
+
+        What only the outermost hundredth of their range overwrites does not count: sampled turning points that are
+        meant to be equal are not.
+        """
         if self.memoryless:
             return 0
         sequence = _checks.samples("inputs", inputs)
         top, bottom = np.maximum.accumulate(sequence), np.minimum.accumulate(sequence)
         low, high = self.plane or (-np.inf, np.inf)
+        margin = _OUTERMOST * (top[-1] - bottom[-1])
         # A relay is known once α <= top or β >= bottom: none that will be switched may be left.
-        rising = (top >= min(top[-1], high)) | (bottom <= low)
-        falling = (bottom <= max(bottom[-1], low)) | (top >= high)
+        rising = (top >= min(top[-1] - margin, high)) | (bottom <= low)
+        falling = (bottom <= max(bottom[-1] + margin, low)) | (top >= high)
         return int(np.argmax(rising & falling))
 
     def coverage(self, inputs: ArrayLike, state: S | None = None) -> Coverage | None:  # noqa: ARG002

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
@@ -162,8 +163,9 @@ def identify(
 class FitProblem:
     """A measured sequence set up for a model: everything but the smoothing.
 
-    `orientation` is -1 if the model is fitted to the opposite output and its coefficients are the opposite ones;
-    `known` is the fit for one smoothing by which that was decided, if it had to be.
+    `start` returns an operator's state before the first sample. `orientation` is -1 if the model is fitted to the
+    opposite output and its coefficients are the opposite ones; `known` is the fit for one smoothing by which that was
+    decided, if it had to be.
     """
 
     spec: ModelSpec
@@ -174,6 +176,7 @@ class FitProblem:
     template: Operator[Any]
     state: Any
     regressor: Regressor
+    start: Callable[[Operator[Any]], Any]
     orientation: Sign = 1
     known: tuple[float, Fit] | None = None
 
@@ -198,6 +201,20 @@ class FitProblem:
         if self.orientation > 0:
             return found
         return replace(found, coefficients=0.0 - found.coefficients, bias=0.0 - found.bias)
+
+    def reshaped(self, outputs: Floats, respond: Callable[[Floats], Floats]) -> FitProblem:
+        """Return the problem with the shape of the operator that fits outputs best behind what `respond` does.
+
+        `respond` takes and returns columns of a regressor, shape (N, K).
+        """
+        measured = outputs if self.orientation > 0 else -outputs
+        template = fit_shape(
+            self.template, self.spec.constrained, self.start, self.inputs, measured, self.weights, self.skip, 0.0,
+            respond,
+        )  # fmt: skip
+        state = self.start(template)
+        regressor = template.regressor(self.inputs, state)
+        return replace(self, template=template, state=state, regressor=regressor, known=None)
 
     def cost(self, fit: Fit) -> float:
         """Return the weighted sum of squares that a fit leaves."""
@@ -285,4 +302,4 @@ def _orient(
     template = fit_shape(template, spec.constrained, start, inputs, measured, weights, skip, smoothing)
     before = start(template)
     regressor = template.regressor(inputs, before)
-    return FitProblem(spec, inputs, outputs, weights, skip, template, before, regressor, sign)
+    return FitProblem(spec, inputs, outputs, weights, skip, template, before, regressor, start, sign)

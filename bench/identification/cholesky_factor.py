@@ -13,13 +13,20 @@ from bench.identification.cell_layout import Flags, Indices
 DEPENDENT = (1e-12, 1e-13, 1e-14)
 MANY = 256
 """Columns or rows of which a copy is cheap."""
+# Right sides that a plain loop solves faster than BLAS, which would copy the factor.
+_FEW = 24
 
 
 class CholeskyFactor:
-    """The triangular factor U of the passive Gram block UᵀU, kept up to date as columns come and go."""
+    """The triangular factor U of the passive Gram block UᵀU, kept up to date as columns come and go.
+
+    `half` is the solution of Uᵀ half = right for the columns' right side: it turns with the factor, so that the
+    solution of UᵀU x = right takes one pass.
+    """
 
     def __init__(self) -> None:
         self.upper = np.zeros((0, 0))
+        self.half = np.empty(0)
         self.size = 0
         self.threshold = DEPENDENT[0]
 
@@ -41,26 +48,31 @@ class CholeskyFactor:
             grown[: self.size, : self.size] = self.upper[: self.size, : self.size]
             self.upper = grown
 
-    def append(self, cross: Floats, square: Floats) -> Flags | None:
-        """Add columns, given their products with the present ones, shape (size, p), and with each other.
+    def append(self, cross: Floats, square: Floats, right: Floats) -> Flags | None:
+        """Add columns, given their products with the present ones, shape (p, size), with each other, and right sides.
 
-        In Fortran's order the latter are overwritten.
+        The first are overwritten, the second in Fortran's order.
 
         Return which were added: the others depend on the present ones and those added before them. None if there
         are others among many: nothing is added then, and fewer are to be tried.
         """
+        from scipy.linalg.blas import dtrsv
         from scipy.linalg.lapack import dpotrf
 
         from bench.identification import _kernels
 
-        old, more = cross.shape
+        more, old = cross.shape
         squares = np.diag(square).copy()
         rest = np.asfortranarray(square)
         if old and more:
             self._make_room(old + more)
             side = self.upper[:old, old : old + more]
-            side[:] = cross
-            self._solve_lower(side)
+            if more <= _FEW:
+                _kernels.solve_lower(self.upper, old, cross)
+                side[:] = cross.T
+            else:
+                side[:] = cross.T
+                self._solve_lower(side)
             rest -= side.T @ side
         # Kept for a second try only where that is cheap.
         again = None if more > MANY else rest.copy(order="F")
@@ -74,6 +86,8 @@ class CholeskyFactor:
             _kernels.factor_independent(block, self.threshold * squares, good)
             block = block[np.ix_(good, good)]
         added = int(np.count_nonzero(good))
+        left = right[good] - (side.T @ self.half)[good] if old and more else right[good]
+        self.half = np.concatenate([self.half, dtrsv(block, left, lower=1) if added else left])
         self.size = old + added
         if not old and added > self.upper.shape[0]:
             self.upper = np.ascontiguousarray(block.T)
@@ -101,6 +115,7 @@ class CholeskyFactor:
     def truncate(self, size: int) -> None:
         """Keep the first columns only."""
         self.size = size
+        self.half = self.half[:size]
         if not size:
             # There is no space for it and its successor.
             self.upper = np.zeros((0, 0))
@@ -110,21 +125,29 @@ class CholeskyFactor:
         from bench.identification import _kernels
 
         for place in places[::-1]:
-            _kernels.delete_column(self.upper, self.size, place)
+            _kernels.delete_column(self.upper, self.size, place, self.half)
             self.size -= 1
+        self.half = self.half[: self.size]
+
+    def solution(self) -> Floats:
+        """Return the solution for the columns' right side."""
+        from bench.identification import _kernels
+
+        return np.asarray(_kernels.solve_upper(self.upper, self.size, self.half))
 
     def solve(self, right: Floats) -> Floats:
         """Return the solution for a right side."""
         from bench.identification import _kernels
 
-        return np.asarray(_kernels.solve_factored(self.upper, self.size, right))
+        half = right.copy()
+        _kernels.solve_lower(self.upper, self.size, half[None, :])
+        return np.asarray(_kernels.solve_upper(self.upper, self.size, half))
 
-    def lengths(self, first: Floats, second: Floats) -> tuple[float, float]:
-        """Return the norms of two steps in the outputs they cause."""
+    def length(self, places: Indices, values: Floats) -> float:
+        """Return the norm in the outputs of a step that is zero but at increasing places."""
         from bench.identification import _kernels
 
-        one, two = _kernels.factored_lengths(self.upper, self.size, first, second)
-        return float(one), float(two)
+        return float(_kernels.factored_length(self.upper, self.size, places, values))
 
     def condition(self, norm: float) -> float:
         """Return the condition number of the columns, given the greatest sum of magnitudes over a Gram row."""

@@ -142,7 +142,7 @@ def _maxwell_slip(
 
 
 BOUC_WEN = ModelSpec("Bouc-Wen operator, rate-independent, with a spring", BoucWen, _bouc_wen)
-DUHEM = ModelSpec("Duhem operator of Coleman and Hodgdon", Duhem, _duhem)
+DUHEM = ModelSpec("Duhem operator of Coleman and Hodgdon", Duhem, _duhem, sizes={"degree": (3, 5, 7)})
 GENERALIZED_PRANDTL_ISHLINSKII = ModelSpec(
     "Prandtl-Ishlinskii operator between two tanh envelopes, for loops that saturate or are asymmetric",
     GeneralizedPrandtlIshlinskii,

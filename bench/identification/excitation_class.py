@@ -25,8 +25,11 @@ _MOST = 0.8
 # Fewer reversals than this say nothing of a class.
 _FEWEST = 4
 _DECILES = np.linspace(0.0, 1.0, 11)
-# Factor of the two-sample Kolmogorov-Smirnov statistic that equal distributions exceed in 5 % of the cases.
+# Factors of the two-sample Kolmogorov-Smirnov statistic. Independent samples of one distribution exceed 1.36 in 5 %
+# of the cases. Swings and distances of random reversals exceed theirs in 1 to 2 %, as measured; corners of the memory
+# depend on each other over many reversals, so that theirs is greater.
 _SMIRNOV = 1.36
+_OF_SWINGS, _OF_REACHES, _OF_DEPTHS = 1.08, 0.9, 2.1
 
 DAMPED = "damped oscillations"
 GROWING = "growing oscillations"
@@ -57,6 +60,10 @@ class ExcitationClass:
         Deciles of the lengths of the swings, as parts of the range, 11 numbers; none without a swing.
     highs, lows : tuple of float
         Deciles of the upper and of the lower turning points, input units, 11 numbers each; none without one.
+    reaches : tuple of float
+        Deciles of the distances of the turning points from the middle of the range, parts of the range, 11 numbers.
+    depths : tuple of float
+        Deciles of the number of corners of the memory at the turning points, 11 numbers.
     """
 
     kind: str
@@ -68,6 +75,8 @@ class ExcitationClass:
     swings: tuple[float, ...]
     highs: tuple[float, ...]
     lows: tuple[float, ...]
+    reaches: tuple[float, ...] = ()
+    depths: tuple[float, ...] = ()
 
     @classmethod
     def of(cls, inputs: ArrayLike) -> ExcitationClass:
@@ -92,6 +101,8 @@ class ExcitationClass:
             swings=_deciles(lengths),
             highs=_deciles(upper),
             lows=_deciles(lower),
+            reaches=_deciles(_reaches(points, low, high)),
+            depths=_deciles(_depths(points)),
         )
 
     @property
@@ -103,10 +114,9 @@ class ExcitationClass:
         """Return in which ways other inputs, shape (N,), are not of this class; none if they are.
 
         They are of the class if they stay in its range (to 3 % of it), are of its kind, die out at the same place (to
-        3 % of the range) if they are damped oscillations, and the distributions of the
-        swings and of the turning points differ by no more than two samples of one distribution do in 95 % of the
-        cases (two-sample Kolmogorov-Smirnov test on the deciles; the turning points of one sequence depend on each
-        other, so the level is nominal).
+        3 % of the range) if they are damped oscillations, and the distributions of the swings, of the turning points
+        and of the corners of the memory differ by no more than those of two sequences of one kind (two-sample
+        Kolmogorov-Smirnov test on the deciles).
 
         Raises ValueError if they are empty or not finite.
         """
@@ -127,14 +137,19 @@ class ExcitationClass:
         upper, lower = _turning(points)
         swings = np.abs(np.diff(points)) / max(span, 1e-300)
         # A turning point belongs to two swings: half of them are independent, at most.
-        limit = _SMIRNOV * float(np.sqrt(2.0 / max(self.reversals, 1) + 2.0 / max(other.reversals, 1)))
-        for name, deciles, sample, tolerance in (
-            ("swings", self.swings, swings, _TOLERANCE),
-            ("upper reversals", self.highs, upper, margin),
-            ("lower reversals", self.lows, lower, margin),
+        independent = float(np.sqrt(2.0 / max(self.reversals, 1) + 2.0 / max(other.reversals, 1)))
+        reaches = _reaches(points, self.low, self.high)
+        for name, deciles, sample, tolerance, factor in (
+            ("swings", self.swings, swings, _TOLERANCE, _OF_SWINGS),
+            ("upper reversals", self.highs, upper, margin, _SMIRNOV),
+            ("lower reversals", self.lows, lower, margin, _SMIRNOV),
+            ("reversals about the middle", self.reaches, reaches, 0.5 * _TOLERANCE, _OF_REACHES),
+            ("corners of the memory", self.depths, _depths(points), 0.0, _OF_DEPTHS),
         ):
             if not deciles or not sample.size:
                 continue
+            # The others have half of their turning points in common.
+            limit = (factor if self.kind == RANDOM else max(factor, _SMIRNOV)) * independent
             distance = _distance(deciles, sample, tolerance)
             if distance > limit:
                 found.append(f"its {name} are distributed otherwise (distance {distance:.2f}, allowed {limit:.2f})")
@@ -161,7 +176,7 @@ class ExcitationClass:
             raise ValueError(f"calibrated_on: expected a text for kind, got {found.kind!r}")
         for name in ("low", "high", "reversals", "minor", "contracting"):
             _checks.number(f"calibrated_on: {name}", getattr(found, name))
-        for name in ("swings", "highs", "lows"):
+        for name in ("swings", "highs", "lows", "reaches", "depths"):
             deciles = getattr(found, name)
             if deciles and _checks.samples(f"calibrated_on: {name}", deciles).size != _DECILES.size:
                 raise ValueError(f"calibrated_on: {name}: expected {_DECILES.size} deciles, got {len(deciles)}")
@@ -178,6 +193,23 @@ def _turning(points: Floats) -> tuple[Floats, Floats]:
     inner = points[1:-1]
     above = inner > points[:-2]
     return inner[above], inner[~above]
+
+
+def _reaches(points: Floats, low: float, high: float) -> Floats:
+    """Return the distances of the turning points from the middle of a range, as parts of it."""
+    return np.abs(points[1:-1] - 0.5 * (low + high)) / max(high - low, 1e-300)
+
+
+def _depths(points: Floats) -> Floats:
+    """Return the number of corners of the memory at each turning point but the first; a closed loop leaves none."""
+    corners: list[float] = []
+    depths = []
+    for point in points[:-1].tolist():
+        while len(corners) >= 2 and abs(point - corners[-1]) >= abs(corners[-1] - corners[-2]):
+            del corners[-2:]
+        corners.append(point)
+        depths.append(len(corners))
+    return np.array(depths[2:], dtype=np.float64)
 
 
 def _deciles(values: Floats) -> tuple[float, ...]:

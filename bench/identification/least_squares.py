@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
 _TOLERANCE = 1e-12
+# A part of the cost that is no gain but for rounding.
+_ROUNDED = 1e-12
 # A gradient that is zero but for rounding.
 _LEVEL = 1e-11
 # Columns enter together if their gradient is at least this part of the greatest.
@@ -391,7 +393,8 @@ class _ActiveSet:
         self.place[new] = np.arange(old, size)
         for first in range(0, new.size, MANY):
             block = new[first : first + MANY]
-            rows = np.empty((block.size, size))
+            end = old + first + block.size
+            rows = np.empty((block.size, end))
             _kernels.gram_rows(
                 self.columns,
                 self.regressor.base,
@@ -400,18 +403,18 @@ class _ActiveSet:
                 self.w,
                 self.extra,
                 block,
-                self.known,
+                self.known[:end],
                 rows,
             )
             if self.penalty is not None:
                 inside = np.flatnonzero(block < self.cells)
                 rough = self.penalty[block[inside]].tocoo()
                 places = self.place[rough.col]
-                seen = places >= 0
+                seen = (places >= 0) & (places < end)
                 rows[inside[rough.row[seen]], places[seen]] += rough.data[seen]
-            place = slice(old + first, old + first + block.size)
-            self.gram[place, :size] = rows
-            self.gram[:size, place] = rows.T
+            place = slice(old + first, end)
+            self.gram[place, :end] = rows
+            self.gram[:end, place] = rows.T
 
     def _make_room(self, columns: Indices, more: int) -> None:
         """Make room for Gram entries of more columns; if many are neither passive nor asked for, forget those."""
@@ -428,15 +431,21 @@ class _ActiveSet:
 
     def products_of(self, first: Indices, second: Indices) -> Floats:
         """Return the Gram entries of two sets of known columns."""
-        return np.asarray(self.gram[self.place[first][:, None], self.place[second]])
+        from bench.identification import _kernels
+
+        return np.asarray(_kernels.gathered(self.gram, self.place[first], self.place[second]))
 
     def enter(self, columns: Indices) -> Indices:
         """Add columns to the passive set; return those left out because they depend on it."""
         if not columns.size:
             return columns
         self.iterations += 1
-        # Transposed, as LAPACK wants them.
-        good = self.factor.append(self.products_of(columns, self.passive).T, self.products_of(columns, columns).T)
+        good = self.factor.append(
+            self.products_of(columns, self.passive),
+            # Transposed, as LAPACK wants them.
+            self.products_of(columns, columns).T,
+            self.right[columns],
+        )
         if good is None:
             half = columns.size // 2
             return np.concatenate([self.enter(columns[:half]), self.enter(columns[half:])])
@@ -468,28 +477,32 @@ class _ActiveSet:
         If bold, all that turns negative leaves at once, whether or not that lowers the cost.
         """
         barred = [np.empty(0, dtype=np.int64)]
+        # What the passive coefficients lower the cost by: at first they are the best of those that are not zero.
+        lowered = self.gain()
         while True:
             passive = self.passive
             old = self.x[passive]
             signed = self.constrained[passive]
-            new = self.factor.solve(self.right[passive])
+            new = self.factor.solution()
             negative = signed & (new <= 0.0)
             if not negative.any():
                 self.x[passive] = new
                 return np.concatenate(barred)
             # Cutting off all negative parts at once is allowed if that lowers the cost ...
-            cut = np.where(negative, 0.0, new)
+            moved, leave = np.where(negative, 0.0, new), negative
             if not bold:
-                after, before = self.factor.lengths(cut - new, old - new)
-            if bold or after < before:
-                moved, leave = cut, negative
-            else:
-                # ... otherwise go as far as the first one allows.
-                reach = np.where(negative, old / np.maximum(old - new, 1e-300), np.inf)
-                step = float(reach.min())
-                moved = old + step * (new - old)
-                leave = negative & (reach <= step * (1.0 + 1e-12))
-                moved[leave] = 0.0
+                most = float(self.right[passive] @ new)
+                places = np.flatnonzero(negative)
+                after = most - self.factor.length(places, new[places]) ** 2
+                if after <= lowered + _ROUNDED * most:
+                    # ... otherwise go as far as the first one allows.
+                    reach = np.where(negative, old / np.maximum(old - new, 1e-300), np.inf)
+                    step = float(reach.min())
+                    moved = old + step * (new - old)
+                    leave = negative & (reach <= step * (1.0 + 1e-12))
+                    moved[leave] = 0.0
+                    after = most - (1.0 - step) ** 2 * (most - lowered)
+                lowered = after
             self.x[passive] = moved
             barred.append(self.leave(leave))
 

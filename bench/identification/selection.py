@@ -413,14 +413,13 @@ class _Search:
             for each in list(best.values())[:_IN_TIME]
         ]
         found = [one for each in self.carry(tasks) for one in each]
-        determined = {name: each.determined for name, each in best.items()}
         self.given_up += [each for each in found if each.failure]
         # What is left out of the others decides.
         units = bool(self.measured.units())
         return [
             replace(
                 each,
-                determined=determined[each.candidate.options["static"]],
+                determined=best[each.candidate.options["static"]].determined,
                 units=each.units if units else (),
             )
             for each in found
@@ -457,9 +456,7 @@ class _Search:
     def _decide(self, finalists: list[Evaluation]) -> tuple[Evaluation, Evaluation]:
         """Return the one of the least error, and the simplest near it, of those that may be chosen."""
         judged = [each for each in finalists if each.units] or self._without_units(finalists)
-        best = min(judged, key=lambda each: _score(each).mean())
-        within = [each for each in judged if is_within_one_standard_error(each, best)]
-        return best, min(within, key=lambda each: (each.free, _score(each).mean()))
+        return _simplest_near_best(judged)
 
     def _trend(self, chosen: Evaluation) -> Trend | None:
         """Return the trend of errors over the rows tested; None of fewer rows than tell one from chance."""
@@ -475,13 +472,29 @@ class _Search:
         """Return the finalists that may be chosen where no cycles could be left out.
 
         Of one kind of cycle, these are what the record determines and signs bound, else what it determines, unless
-        they err many times more.
+        they err many times more. A differential equation, which has no signs, must take fewer coefficients than what
+        would be chosen of these.
         """
         least = min(each.rms for each in finalists)
         determined = [each for each in finalists if each.determined and each.rms <= _UNDETERMINED * least]
         if not self._has_one_kind or not determined:
             return self._bounded(finalists)
-        return [each for each in determined if self._is_bounded(each)] or determined
+        bounded = [each for each in determined if self._is_bounded(each)]
+        if not bounded:
+            return determined
+        simplest = _simplest_near_best(bounded)[1]
+        return bounded + [
+            each for each in determined if each not in bounded and each.free < simplest.free and self._has_shape(each)
+        ]
+
+    def _has_shape(self, each: Evaluation) -> bool:
+        """Return whether shape parameters say how the output answers, not coefficients alone."""
+        options = {
+            name: value for name, value in each.candidate.options.items() if name not in ("static", "dynamics")
+        }
+        template = find_model(each.candidate.options.get("static", each.candidate.model)).template
+        assert template is not None
+        return bool(template(self.measured.inputs, **options).shape_parameters().names)
 
     def _is_bounded(self, each: Evaluation) -> bool:
         """Return whether signs bound the answer to other inputs, or it has no memory."""
@@ -565,10 +578,18 @@ def _times(number: int) -> str:
     return "once" if number == 1 else f"{number} times"
 
 
+def _simplest_near_best(judged: Sequence[Evaluation]) -> tuple[Evaluation, Evaluation]:
+    """Return the one of the least error, and the simplest within one standard error of it."""
+    best = min(judged, key=lambda each: _score(each).mean())
+    within = [each for each in judged if is_within_one_standard_error(each, best)]
+    return best, min(within, key=lambda each: (each.free, _score(each).mean()))
+
+
 def is_within_one_standard_error(simple: Evaluation, best: Evaluation) -> bool:
     """Return whether an error is within one standard error of the best, or 2 %, and at most 5 % above it.
 
-    The standard error is that of the differences fold by fold: what is hard to predict is so for both.
+    The standard error is that of the differences fold by fold: what is hard to predict is so for both. To leave out
+    time the 2 % do not count: at the rates of the record a lag may hardly show, and at others be most of the error.
     """
     first, second = _score(simple), _score(best)
     if first.size != second.size:
@@ -576,7 +597,9 @@ def is_within_one_standard_error(simple: Evaluation, best: Evaluation) -> bool:
         first, second = np.array(simple.blocks), np.array(best.blocks)
     difference = first - second
     allowed = float(np.std(difference, ddof=1) / np.sqrt(difference.size))
-    allowed = min(max(allowed, (_EQUAL**2 - 1.0) * second.mean()), (_WORSE**2 - 1.0) * second.mean())
+    if "static" in simple.candidate.options or "static" not in best.candidate.options:
+        allowed = max(allowed, (_EQUAL**2 - 1.0) * second.mean())
+    allowed = min(allowed, (_WORSE**2 - 1.0) * second.mean())
     return bool(difference.mean() <= allowed)
 
 

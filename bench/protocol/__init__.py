@@ -16,6 +16,7 @@ from bench.protocol.views import Views
 from bench.protocol.vocabulary import (
     LATENESS,
     TRACES,
+    Caution,
     Control,
     FixedRate,
     KeptModel,
@@ -33,6 +34,7 @@ __all__ = [
     "LATENESS",
     "TRACES",
     "Arrived",
+    "Caution",
     "Control",
     "Dwell",
     "FixedRate",

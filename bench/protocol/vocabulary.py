@@ -331,6 +331,11 @@ class Note(Message):
 
 
 @dataclass(frozen=True)
+class Caution(Note):
+    """A warning for the log."""
+
+
+@dataclass(frozen=True)
 class KeptModel(Note):
     """A model that is kept with the run, in place of an earlier one of this name; the text goes to the log.
 

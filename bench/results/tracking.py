@@ -1,4 +1,4 @@
-"""Errors of a run that reached targets or followed a reference, from its journal."""
+"""Errors of a run that reached targets, or followed a reference or held it in a fast loop, from its journal."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.journal import Record
+from bench.protocol import LATENESS
 
 Floats = npt.NDArray[np.float64]
 
@@ -17,6 +18,10 @@ REACH = "reach"
 READING = "reading"
 FOLLOW = "follow"
 """Labels of the steps of a protocol that are evaluated."""
+WITNESS = "witness"
+"""Slot of a sensor beside the loop, which sees what is controlled as it is."""
+_HELD = 0.5
+"""Part of its longest rest for which a reference has rested where it counts as held."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +68,40 @@ class FollowingResult:
         return _greatest_and_rms(self.output - self.reference)
 
 
+@dataclass(frozen=True)
+class LoopResult:
+    """The reference of a loop at a fixed rate, and the output.
+
+    Attributes
+    ----------
+    reference, output : ndarray, shape (N,)
+        At each recorded sample, output units.
+    """
+
+    reference: Floats
+    output: Floats
+
+    def summary(self) -> dict[str, float]:
+        """Return greatest and RMS error where the reference is held and where it moves, as far as it does so.
+
+        Held is where it has rested for half of its longest rest, but for the one before it first moves.
+        """
+        moves = np.append(False, np.diff(self.reference) != 0.0)
+        rested = np.arange(moves.size) - np.maximum.accumulate(np.where(moves, np.arange(moves.size), 0))
+        if moves.any():
+            rested[: int(moves.argmax())] = 0
+        held = rested > _HELD * rested.max()
+        # A step moves at a single sample.
+        moving = moves & np.append(False, moves[:-1])
+        error = self.output - self.reference
+        return {
+            f"{name}_{key}": value
+            for name, chosen in (("hold", held), ("move", moving))
+            if chosen.any()
+            for key, value in _greatest_and_rms(error[chosen]).items()
+        }
+
+
 def target_results(record: Record, output: str) -> TargetResults | None:
     """Return the targets of a run and the outputs reached, or None if it had none.
 
@@ -98,13 +137,31 @@ def following_result(record: Record, output: str) -> FollowingResult | None:
     return FollowingResult(times - times[0], reference, outputs)
 
 
+def loop_results(record: Record, output: str) -> dict[str, LoopResult]:
+    """Return by signals the results of a loop at a fixed rate: of the controlled one, and of a witness beside it.
+
+    It is empty if the run had no such loop with a reference.
+    """
+    ticks = record.telemetry()
+    if not {"reference", LATENESS.name} <= ticks.columns.keys():
+        return {}
+    reference = ticks["reference"]
+    rows = np.isfinite(reference) & np.isfinite(ticks[LATENESS.name])
+    witness = record.meta.get("slots", {}).get(WITNESS, {}).get("signal", "")
+    signals = [name for name in (output, witness) if name in ticks.columns and np.isfinite(ticks[name][rows]).all()]
+    return {name: LoopResult(reference[rows], ticks[name][rows]) for name in signals} if rows.any() else {}
+
+
 def results_json(record: Record, output: str) -> Mapping[str, Any]:
-    """Return the summaries of both, as far as the run has them, for programs."""
+    """Return the summaries of these, as far as the run has them, for programs; those of a witness by `true_`."""
     results: dict[str, Any] = {}
     if (reached := target_results(record, output)) is not None:
         results["tracking"] = reached.summary()
     if (followed := following_result(record, output)) is not None:
         results["following"] = followed.summary()
+    for signal, loop in loop_results(record, output).items():
+        prefix = "" if signal == output else "true_"
+        results["loop"] = results.get("loop", {}) | {f"{prefix}{key}": v for key, v in loop.summary().items()}
     return results
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from itertools import product
 from typing import Any, Literal, NamedTuple
 
@@ -33,8 +34,12 @@ ELEMENTS = ("lag", "resonance", "delay", "creep", "kelvin-voigt", "drift", "fadi
 _CHOICE = ("lag", "resonance", "delay", "creep", "drift")
 # What cannot stand beside each other.
 _EXCLUSIVE = ({"lag", "resonance"}, {"creep", "kelvin-voigt"}, {"drift", "fading-drift"})
+# Numbers of a regressor up to which the shape of the operator is found anew with what follows it, and how often.
+_RESHAPED, _RESHAPES = 500_000, 5
+# Relative gain of the cost at which that ends.
+_GAIN_OF_SHAPE = 1e-4
 # Part by which an element must lower the RMS error, if nobody asked for it. A drift belongs to one record only.
-_WORTH, _WORTH_OF_DRIFT = 0.03, 0.2
+_WORTH, _WORTH_OF_DRIFT = 0.005, 0.2
 # Greatest regressor, numbers; 400 MB.
 _LARGEST = 50_000_000
 # Rounds of search and constrained fit, and the relative gain of the cost at which they end.
@@ -332,7 +337,7 @@ def identify_hammerstein(
         Name of the operator in `bench.models`.
     dynamics : str or None
         Elements as listed above, separated by commas. None chooses among lag, resonance, delay, creep and drift: one
-        after the other as long as it lowers the RMS error by 3 %, and more than its parameters would by chance.
+        after the other as long as it lowers the RMS error by 0.5 %, and more than its parameters would by chance.
     **options
         Those of the operator; see `identify`. A Preisach operator has a linear reversible part unless they say
         otherwise.
@@ -349,7 +354,8 @@ def identify_hammerstein(
     )
     warnings = list(problem.warnings())
     with one_thread():
-        found = choose_elements(search) if chosen is None else _best(search, chosen)
+        search, found = choose_elements(search) if chosen is None else _reshaped(search, _best(search, chosen))
+    problem = search.static
     parameters = search.parameters(found.elements)
     for parameter, value, deviation in zip(parameters, found.values, found.deviations, strict=True):
         # A delay or creep of 0 is an answer; a time at its bound is not.
@@ -428,8 +434,11 @@ def set_up_search(
     return problem, Search(times, problem, problem.regressor.dense(), roots, signs)
 
 
-def choose_elements(search: Search) -> Found:
-    """Return the elements that are worth it, one after the other, with the rest."""
+def choose_elements(search: Search) -> tuple[Search, Found]:
+    """Return the elements that are worth it, one after the other, with the rest.
+
+    The search that is returned has the operator's shape as it is with them.
+    """
     found = _best(search, ())
     used = max(int(np.count_nonzero(search.roots)), 1)
     shortest, longest = search.creep_span
@@ -443,15 +452,44 @@ def choose_elements(search: Search) -> Found:
                 continue
             trials += _ends(search, (*kept, element), found, basis, starts=1, evaluations=_FEW)
         least = min(trials, key=lambda trial: trial.cost, default=found)
-        best = _best(search, least.elements, found, rounds=1) if least.elements else least
+        reshaped, best = search, least
+        if least.elements:
+            reshaped, best = _reshaped(search, _best(search, least.elements, found, rounds=1))
         added = set(best.elements) - set(found.elements)
         more = max(best.values.size - found.values.size + len(added & {"drift"}), 1)
         gain = math.log(found.cost / max(best.cost, 1e-300))
         worth = _WORTH_OF_DRIFT if "drift" in added else _WORTH
         if not gain > max(-2.0 * math.log1p(-worth), 2.0 * more * math.log(used) / used):
             break
-        found = best
-    return min(_best(search, found.elements), found, key=lambda each: each.cost)
+        search, found = reshaped, best
+    return search, min(_best(search, found.elements), found, key=lambda each: each.cost)
+
+
+def _reshaped(search: Search, found: Found) -> tuple[Search, Found]:
+    """Return search and parameters with the operator's shape fitted together with them.
+
+    A shape that was found without what follows the operator has taken some of that for hysteresis. Shape and
+    parameters are fitted in turns.
+    """
+    if not search.static.template.shape_parameters().names or search.columns.size > _RESHAPED:
+        return search, found
+    for _ in range(_RESHAPES):
+        part, time = search.linear(search.parameters(found.elements), found.values)
+        drift = search.drifts(found.elements, time) @ found.fit.coefficients[search.columns.shape[1] :]
+        static = search.static.reshaped(search.static.outputs - drift, partial(_respond, part, search.times))
+        other = replace(search, static=static, columns=static.regressor.dense())
+        fitted = other.fit(found.elements, found.values)
+        again = _best(other, found.elements, replace(found, fit=fitted), rounds=1)
+        gained = found.cost - again.cost
+        if gained > 0.0:
+            search, found = other, again
+        if not gained > _GAIN_OF_SHAPE * found.cost:
+            break
+    return search, found
+
+
+def _respond(part: LinearPart, times: Floats, columns: Floats) -> Floats:
+    return part.respond(times, columns)[0]
 
 
 def _best(search: Search, elements: tuple[str, ...], before: Found | None = None, rounds: int = _ROUNDS) -> Found:

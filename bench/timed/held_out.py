@@ -79,11 +79,11 @@ class HeldOutInTime:
         )
         if problem.skip > measured.known:
             raise ValueError(f"its memory is unknown until row {problem.skip}: too few rows are left")
-        found = choose_elements(search)
+        search, found = choose_elements(search)
         if not found.elements:
             return []
         columns, drifts = search.responses(found.elements, found.values)
-        constrained = problem.template.nonnegative()
+        constrained = search.static.template.nonnegative()
         sign: Literal[1, -1] = -1 if (found.fit.coefficients[: columns.shape[1]][constrained] < 0.0).any() else 1
         trained = []
 

@@ -127,6 +127,17 @@ def creep(slow: Floats, outputs: Floats, step: float, shares: Floats, times: Flo
 
 
 @njit(cache=True)
+def lag_behind(outputs: Floats, step: float, times: Floats, late: Floats) -> None:
+    """Write outputs behind lags of first order, which begin at rest, to the rows of `late`, one for each time, s."""
+    for j in range(times.size):
+        remains = math.exp(-step / times[j])
+        value = outputs[0]
+        for k in range(outputs.size):
+            value = (1.0 - remains) * outputs[k] + remains * value
+            late[j, k] = value
+
+
+@njit(cache=True)
 def hold(changes: Floats, levels: Floats, step: float, means: Floats) -> None:
     """Write the mean of a quantity over each step of a grid of time to `means`.
 

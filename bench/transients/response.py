@@ -84,15 +84,10 @@ class SimulatedDrive:
 
 
 def late_parts(outputs: Floats, step: float, times: Sequence[float]) -> Floats:
-    """Return outputs behind lags of first order, which begin at rest, a column for each."""
-    from scipy.signal import lfilter
-
-    columns = []
-    for time in times:
-        remains = math.exp(-step / time)
-        column, _ = lfilter([1.0 - remains], [1.0, -remains], outputs, zi=[remains * outputs[0]])
-        columns.append(column)
-    return np.array(columns).reshape(len(columns), outputs.size)
+    """Return outputs, shape (N,), behind lags of first order, which begin at rest: shape (M, N) for M times, s."""
+    late = np.empty((len(times), outputs.size))
+    _kernels.lag_behind(outputs, step, np.array(times, dtype=np.float64), late)
+    return late
 
 
 def identify_lag(

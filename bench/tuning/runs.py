@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from bench.controllers import controller_spec
 from bench.errors import BenchError, ConfigurationError
 from bench.hysteresis import TwoStage
 from bench.model_file import ModelFile
@@ -93,6 +94,7 @@ class TuningRuns:
         if role is None:
             raise ConfigurationError(f"rig {self.rig} does not bind [roles.{self.task.slot}]")
         self._signal = role.signal or role.reading
+        self._opened = controller_spec(self.task.kind, self.task.controller).holds is not None
         self._models = {}
         for name, model in {_AS_IDENTIFIED: self.file, **perturbed_models(self.file)}.items():
             self._models[name] = self.folder / f"{name}.json"
@@ -114,6 +116,9 @@ class TuningRuns:
                     self.rig, self.folder / f"{self._count:03}" / name, seed, live=False, workers=self.workers
                 )
                 settings = {"model": str(path), "controller": self.task.controller, "sequence_seed": str(seed + 1)}
+                if self._opened:
+                    # It goes on where the model of another specimen does not hold.
+                    settings["fallback"] = "open-loop"
                 found[name, seed] = campaign.start(
                     self.task.protocol, {**self.settings, **settings, "tuning": tuning}
                 )

@@ -10,7 +10,8 @@ import struct
 from binascii import crc_hqx
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from functools import lru_cache
+from typing import NamedTuple
 
 import serial
 from pydantic import Field
@@ -49,8 +50,7 @@ class TECLineSettings(SerialSettings):
     )
 
 
-@dataclass(frozen=True)
-class Parameter:
+class Parameter(NamedTuple):
     """A device parameter: INT32 or FLOAT32, of a channel or of the whole device."""
 
     number: int
@@ -83,7 +83,7 @@ class TECLine:
     def __init__(self, device: str, settings: TECLineSettings) -> None:
         self._device = device
         self._settings = settings
-        self._address = settings.address
+        self._begin = b"#%02X" % settings.address
         self._sequence = 0
         self._most_resends = RESENDS
         self.repeats = 0
@@ -134,7 +134,7 @@ class TECLine:
 
     def _exchange(self, request: str, digits: int, resends: int = RESENDS) -> bytes:
         sequence = self._sequence = (self._sequence + 1) & 0xFFFF
-        body = b"#%02X%04X%b" % (self._address, sequence, request.encode("ascii"))
+        body = b"%b%04X%b" % (self._begin, sequence, request.encode("ascii"))
         crc = b"%04X" % crc_hqx(body, 0)
         frame = b"%b%b\r" % (body, crc)
         head = b"!" + body[1:7]
@@ -143,6 +143,9 @@ class TECLine:
             for attempt in range(1 + resends):
                 self.repeats += attempt > 0
                 self._port.write(frame)
+                whole = self._whole_answer(head, crc, digits)
+                if whole is not None:
+                    return whole
                 problem, content = self._answer(head, crc, digits)
                 if not problem:
                     return content
@@ -155,6 +158,18 @@ class TECLine:
         except (serial.SerialException, OSError) as error:
             raise lost_line(self._device, self._settings, error) from None
         raise no_answer(self._device, self._settings, problem, "address", self._settings.address, resends=resends)
+
+    def _whole_answer(self, head: bytes, crc: bytes, digits: int) -> bytes | None:
+        """Return the payload of a good answer that is all there is, as it mostly is on an emulated line."""
+        if self._received:
+            return None
+        answer: bytes = self._port.read_all()
+        if len(answer) == _ACKNOWLEDGE_LENGTH + digits and answer.startswith(head) and answer.endswith(b"\r"):
+            content = answer[7:-5]
+            if answer[-5:-1] == (b"%04X" % crc_hqx(answer[:-5], 0) if content else crc):
+                return content
+        self._received += answer
+        return None
 
     def _answer(self, head: bytes, crc: bytes, digits: int) -> tuple[str, bytes]:
         """Return what is wrong with the answer, if anything, and its payload."""
@@ -181,12 +196,6 @@ class TECLine:
     def _read_answer(self, length: int) -> bytes | None:
         """Read up to the next carriage return, without waiting for more than the shortest answer has."""
         received = self._received
-        if not received:
-            # All of it may be there, as it always is on an emulated line.
-            answer = self._port.read_all()
-            if answer.find(b"\r") == len(answer) - 1 >= 0:
-                return bytes(answer[:-1])
-            received += answer
         while (end := received.find(b"\r")) < 0:
             if len(received) < _ACKNOWLEDGE_LENGTH:
                 missing = _ACKNOWLEDGE_LENGTH - len(received)
@@ -237,6 +246,7 @@ class Block:
             raise DeviceError(device, f"answered {digits!r} for {len(self.parameters)} parameters at once") from None
 
 
+@lru_cache(256)
 def selector(parameter: Parameter, channel: int) -> str:
     """Return number and instance of a parameter as 6 hex digits."""
     return f"{parameter.number:04X}{channel if parameter.of_channel else 1:02X}"

@@ -14,6 +14,7 @@ from bench.errors import DataError
 from bench.hysteresis import TwoStage, TwoStageState
 from bench.model_file import ModelFile, load_model
 from bench.protocol import (
+    Caution,
     Control,
     Dwell,
     Messages,
@@ -63,7 +64,7 @@ class Controlled(ProtocolParameters):
         {}, unit="", help="numbers of controllers in place of those from the model: a tuning file, or tables"
     )
     fallback: Fallback = parameter(
-        "none", unit="", help="what goes on in place of a controller that does not converge; none ends the run"
+        "none", unit="", help="what goes on in place of a controller that is given up; none ends the run"
     )
     duration: float = parameter(20.0, unit="s", low=2, high=3600, help="time for each target")
     readings: int = parameter(5, unit="1", low=1, high=1000, help="readings at each target after that time")
@@ -163,7 +164,13 @@ def _make_controller(
     )
     opened = common | parameters.tuning.get("open-loop-inverse", {})
     return make_supervised(
-        f"coupled-{output}", parameters.controller, setup, span=span, fallback=parameters.fallback, **opened
+        Supervised,
+        f"coupled-{output}",
+        parameters.controller,
+        setup,
+        span=span,
+        fallback=parameters.fallback,
+        **opened,
     )
 
 
@@ -214,7 +221,7 @@ def _reach(
         others=tuple(slots[name].signal for name in others),
     )
     if notice := controller.take_notice():
-        yield Note(notice)
+        yield Caution(notice)
     outputs = []
     for _ in range(parameters.readings):
         reading = yield Step({}, Dwell(0.1), label=READING)

@@ -25,8 +25,7 @@ def identify(
     Thermal network from the steps of the current, polynomial from the static curve, plays from the slow loops of the
     voltage, third-order dynamics from the fast step.
     """
-    from bench.model_file import ModelFile
-    from rigs.hybrid.identification import identify_hybrid
+    from rigs.hybrid.identification import hybrid_file, identify_hybrid
 
     found = identify_hybrid(steps, static, loops, step, plays=plays)
     network, dynamics, piezo = found.network, found.dynamics, found.piezo.errors
@@ -46,9 +45,7 @@ def identify(
     ]
     print_rows("hybrid", rows)
     if out is not None:
-        ModelFile(
-            "hybrid", found.model, provenance={"sources": [run.name for run in (steps, static, loops, step)]}
-        ).save(out)
+        hybrid_file(found, (steps, static, loops, step)).save(out)
         print_plain(console, f"model: {out}")
     write_json(
         json_file,

@@ -47,6 +47,12 @@ _TOLERATED = 0.6
 """Difference of the lateness that is found to the one that is known, in periods, up to which both are the same."""
 _ROOM = 4
 """Room for the reference that comes, in lengths of the known one."""
+_RESTED = 15.0
+"""Time for which the reference has rested where the error of the model alone is judged, s."""
+_JUDGED = 5.0
+"""Time over which it is, s."""
+_HOLDS = 0.12
+"""Part of the stroke that the model alone may err by there, RMS."""
 _THERMAL_GAIN = 3e4
 """Heat fed back per missing deflection where there is no piezo part, W/m."""
 
@@ -350,14 +356,44 @@ class OpenLoopHybrid(_MidRanging):
     """Inverse of the model without the deflection sensor, from the temperature of the tip alone.
 
     The thermal part follows the inverted polynomial, the piezo part adds what the polynomial at the measured
-    temperature lacks, through the inverse of the hysteresis. Parameters as `HybridController`.
+    temperature lacks, through the inverse of the hysteresis. The deflection tells only whether the model holds: where
+    the reference has rested, the error may not be more than 12 % of the stroke. Parameters as `HybridController`.
     """
+
+    _resting = -math.inf
+    """Since when the reference rests, s."""
+    _squares, _count = 0.0, 0
 
     def __init__(
         self, model: HybridModel, reference: Reference, parameters: MidRangingParameters | None = None
     ) -> None:
         p = parameters or MidRangingParameters()
         super().__init__(model, reference, p, lambda bending, _: Thermistor(bending, p.share(p.period * p.every)))
+
+    def update(self, t: float, measured: tuple[float, ...]) -> tuple[float, float]:
+        """Take readings and return set-points; see `HybridController`.
+
+        Raises `ConvergenceError` if the model does not hold.
+        """
+        before = self._wanted
+        setpoints = super().update(t, measured)
+        if self._wanted != before:
+            self._resting, self._squares, self._count = t, 0.0, 0
+        elif t - self._resting >= _RESTED and math.isfinite(measured[0]):
+            self._squares += (measured[0] - self._wanted) ** 2
+            self._count += 1
+            if self._count * self._p.period >= _JUDGED:
+                self._judge(math.sqrt(self._squares / self._count))
+                self._squares, self._count = 0.0, 0
+        return setpoints
+
+    def _judge(self, error: float) -> None:
+        most = _HOLDS * self._p.stroke
+        if error > most:
+            raise ConvergenceError(
+                f"the model does not hold for this specimen: its error at rest is {error:.2g} m RMS, and that of a "
+                f"model that holds at most {most:.2g}; identify the specimen again"
+            )
 
 
 class ThermalFeedback(_MidRanging):

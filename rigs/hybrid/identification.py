@@ -7,7 +7,7 @@ positive current heats.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -19,7 +19,9 @@ from bench.hysteresis import Polynomial, PrandtlIshlinskii
 from bench.identification import Errors, Identification
 from bench.identification.dynamics import DynamicsIdentification, identify_dynamics
 from bench.journal import Record, Table
+from bench.model_file import ModelFile
 from bench.protocol import LATENESS
+from bench.results.whole_models import WholeIdentification
 from rigs.hybrid.model import HybridModel, OrderChoice, choose_order, identify_pi, identify_polynomial
 from rigs.hybrid.network_identification import NetworkIdentification, identify_network
 
@@ -29,6 +31,9 @@ DEFLECTION, BASE, TIP, WITNESS = "response", "base", "tip", "witness"
 """Slots of the runs whose signals are used."""
 CURRENT, VOLTAGE = "coarse_setpoint", "fine_setpoint"
 """Set-points of their slots."""
+
+PROTOCOLS = ("current-steps", "thermomechanical", "piezo-loops", "piezo-step")
+"""Protocols of the runs from which a hybrid is identified, in the order of `identify_hybrid`."""
 
 REFERENCE = 22.0
 """Reference of the polynomial, °C: the nominal temperature of the room."""
@@ -183,12 +188,7 @@ def identify_hybrid(steps: Path, static: Path, loops: Path, step: Path, *, plays
     DataError
         If a run is of another kind or was not completed, or a part cannot be identified.
     """
-    for run, protocol in (
-        (steps, "current-steps"),
-        (static, "thermomechanical"),
-        (loops, "piezo-loops"),
-        (step, "piezo-step"),
-    ):
+    for run, protocol in zip((steps, static, loops, step), PROTOCOLS, strict=True):
         with Record(run) as record:
             if record.meta.get("protocol") != protocol:
                 raise DataError(f"{run}: is a run of {record.meta.get('protocol')}; expected one of {protocol}")
@@ -209,6 +209,20 @@ def identify_hybrid(steps: Path, static: Path, loops: Path, step: Path, *, plays
     except ValueError as error:
         raise DataError(f"the hybrid cannot be identified: {error}") from error
     return HybridIdentification(model, network, order, polynomial, piezo, dynamics)
+
+
+def hybrid_file(found: HybridIdentification, runs: Sequence[Path]) -> ModelFile:
+    """Return the model file of a hybrid that was identified from runs."""
+    return ModelFile("hybrid", found.model, provenance={"sources": [run.name for run in runs]})
+
+
+def identify_runs(runs: Mapping[str, Path]) -> ModelFile:
+    """Return the model of a hybrid from its runs by protocol; raises as `identify_hybrid`."""
+    folders = [runs[name] for name in PROTOCOLS]
+    return hybrid_file(identify_hybrid(*folders), folders)
+
+
+FROM_RUNS = WholeIdentification(PROTOCOLS, identify_runs)
 
 
 def identify_piezo(samples: Samples, plays: int = 15) -> PiezoIdentification:

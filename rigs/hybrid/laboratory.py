@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import Field
 
 from bench.clock import Clock
+from rigs.hybrid.scan import SensorScan
 from rigs.hybrid.witness import WitnessRegisters
 from sim_devices.faults.fault import Fault, Quantity
 from sim_devices.faults.sensor import FaultySensor
@@ -23,11 +24,12 @@ from sim_devices.instruments.labjack_t7 import EmulatedT7
 from sim_devices.instruments.meerstetter_table import DeviceStatus
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC
 from sim_devices.laboratory import EmulatedLaboratory, TrueValue, compile_loops, tec_faults
+from sim_devices.plants.grid import changed
 from sim_devices.plants.hybrid import HybridCantilever
 from sim_devices.plants.hybrid_parameters import HybridParameters
 from sim_devices.transducers.data_sheets import DISPLACEMENT, THERMISTOR
 from sim_devices.transducers.displacement import DisplacementSensor
-from sim_devices.transducers.imperfect import SensorErrors, imperfect, shown
+from sim_devices.transducers.imperfect import SensorErrors, characteristic_of, imperfect, shown
 from sim_devices.transducers.piezo_amplifier import PiezoAmplifier
 from sim_devices.transducers.specimens import SensorSettings
 from sim_devices.transducers.thermistor import Thermistor
@@ -82,6 +84,9 @@ class HybridLaboratorySettings(SensorSettings):
     resonance_offset: float = Field(
         default=0.0, ge=-0.1, le=0.1, description="deviation of the resonance from the paper's, as a share"
     )
+    plant: dict[str, float] = Field(
+        default={}, description="numbers of the plant in place of its own; see `sim_devices.plants`"
+    )
     current_limit: float = Field(
         default=0.15, gt=0, le=0.4, description="as set in the TEC controller, A; a driver sets its own"
     )
@@ -132,10 +137,13 @@ class HybridLaboratory(EmulatedLaboratory):
         plant, tec, sensor, base, tip, amplifier, t7 = np.random.default_rng(seed).spawn(7)
         self._settings = settings
         self.plant = HybridCantilever(
-            HybridParameters(
-                ambient_temperature=settings.ambient,
-                ambient_sd=settings.ambient_deviation,
-                resonance_offset=settings.resonance_offset,
+            changed(
+                HybridParameters(
+                    ambient_temperature=settings.ambient,
+                    ambient_sd=settings.ambient_deviation,
+                    resonance_offset=settings.resonance_offset,
+                ),
+                settings.plant,
             ),
             plant,
         )
@@ -182,6 +190,18 @@ class HybridLaboratory(EmulatedLaboratory):
             self.amplifier.status,
         ]
         self.t7 = EmulatedT7(self.world, dict(enumerate(wires)), rng=t7)
+        characteristics = [characteristic_of(seen) for seen in self._shown.values()]
+        if None not in characteristics:
+            scan = SensorScan(
+                self.plant,
+                self.displacement,
+                self.base,
+                self.tip,
+                [each for each in characteristics if each is not None],
+                sensors,
+                lambda: self._stuck is None and not self._beyond,
+            )
+            self.t7.scan_by(scan)
         self.t7.add_follower(
             lambda: self.amplifier.drive(self.t7.tdac_volts(0), self.t7.dio_level(ENABLE_LINE, pulled_down=True))
         )

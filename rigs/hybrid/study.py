@@ -15,7 +15,6 @@ import numpy.typing as npt
 
 from bench.identification import measure_errors
 from bench.journal import Record
-from bench.model_file import ModelFile
 from bench.results.calibrations import calibrate_run
 from bench.results.figures import plot_fit, plot_tracking
 from bench.results.prediction_figures import errors_text
@@ -42,6 +41,7 @@ from rigs.hybrid.identification import (
     HybridIdentification,
     Samples,
     bandwidth_of,
+    hybrid_file,
     identify_hybrid,
     read_loop,
     read_loops,
@@ -245,7 +245,7 @@ def _carry_out(campaign: Campaign) -> StudyResult:
     sources = [run.result().folder for run in (steps, static, loops, step)]
     found = identify_hybrid(*sources)
     model = campaign.folder / "hybrid.json"
-    ModelFile("hybrid", found.model, provenance={"sources": [folder.name for folder in sources]}).save(model)
+    hybrid_file(found, sources).save(model)
 
     tracking_runs = {name: _start(campaign, model, {"controller": name, "hold": f"{HOLD:g}"}) for name in CONTROLLERS}
     thermal_run = _start(

@@ -32,7 +32,7 @@ from bench.control.loops import SHORTEST_WAIT
 from bench.control.tracking import Command, ControllerBase, Trace, check_positive, widened
 from bench.control.tuning import tuned
 from bench.control.two_stage_inverse import TwoStageInverse
-from bench.controllers import ControllerSetup, ControllerSpec
+from bench.controllers import ControllerSetup, ControllerSpec, greatest_error
 from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import Reach, TwoStageState, _checks
 from bench.hysteresis.coupled_stream import TwoStageStream
@@ -436,12 +436,21 @@ def _task(setup: ControllerSetup, kind: type[Task]) -> Task:
     return kind.of_model(inverse, state, setup.limits, noise)
 
 
+def _holds(setup: ControllerSetup, kind: type[Task]) -> float:
+    """Return the greatest RMS error of a model that still holds, output units."""
+    low, high = _task(setup, kind).output_range()
+    # The file states errors in percent of the range.
+    own = setup.model.provenance.get("errors", {}).get(kind.kind, {}).get("rms", 0.0)
+    return greatest_error(0.01 * own * (high - low), high - low)
+
+
 def _with_inverse(summary: str, controller: Callable[..., MuscleController], kind: type[Task]) -> ControllerSpec:
     return ControllerSpec(
         summary,
         lambda s: controller(_task(s, kind), _timing(s), s.state, s.limits),
         numbers=_timing,
         tunable=("caution", "horizon", "period") if controller is MuscleClosedLoop else (),
+        holds=(lambda s: _holds(s, kind)) if controller is MuscleOpenLoop else None,
     )
 
 

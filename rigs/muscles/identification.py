@@ -7,7 +7,7 @@ Everything is in V, N and m.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
@@ -30,6 +30,7 @@ from bench.identification.two_stage import (
 )
 from bench.journal import Record
 from bench.model_file import ModelFile
+from bench.results.whole_models import WholeIdentification
 from bench.transients.identification import identify_dynamics, identify_transients, noise_of, read_transients
 from bench.transients.recording import Recording
 from protocols.muscles.parts import CONDITIONING, SAMPLE
@@ -176,6 +177,22 @@ def muscle_file(
             "smoothing": dict(found.smoothing),
         },
     )
+
+
+def identify_runs(runs: Mapping[str, Path]) -> ModelFile:
+    """Return the two-stage model of a muscle from its runs by protocol.
+
+    Raises DataError if one was not completed, or they do not determine the model.
+    """
+    force_run = runs["force-voltage"]
+    length_runs = [runs[name] for name in ("length-voltage", "length-force")]
+    series = [one for run in length_runs for one in read_series(run)]
+    found = identify_muscle("two-stage", read_resting(force_run), series)
+    dynamics = identify_muscle_dynamics(found.model, force_run, length_runs)
+    return muscle_file("two-stage", found, [force_run, *length_runs], dynamics)
+
+
+FROM_RUNS = WholeIdentification(("force-voltage", "length-voltage", "length-force"), identify_runs)
 
 
 def protocol_of(run: Path) -> str:

@@ -53,6 +53,8 @@ class Task(ABC):
     _sign: ClassVar[float]
     quantity: ClassVar[str]
     """What is controlled, as the noise of a model file names it."""
+    kind: ClassVar[str]
+    """Data over the voltage from which the model was identified, as the errors of a model file name them."""
 
     def __post_init__(self) -> None:
         check_positive(self, "walk_variance", "reading_variance")
@@ -121,6 +123,7 @@ class LengthTask(Task):
 
     _sign = -1.0
     quantity = "length"
+    kind = "length-voltage"
 
     def others(self, state: TwoStageState) -> tuple[float, ...]:
         """Return the force of a state."""
@@ -155,6 +158,7 @@ class ForceTask(Task):
 
     _sign = 1.0
     quantity = "force"
+    kind = "force-voltage"
 
     def others(self, state: TwoStageState) -> tuple[float, ...]:  # noqa: ARG002
         """Return nothing."""

@@ -207,6 +207,8 @@ def carry_out(campaign: Campaign) -> StudyResult:
         session("damped-oscillation", {}, 0.0),
         session("random-validation", {}, SESSION_OFFSET),
     )
+    # Loaded while they run.
+    truth = true_curvatures(campaign.rig)
     characterized = characterization.result().folder
     transients = transients_of([characterized], INPUT, OUTPUT)
 
@@ -244,7 +246,6 @@ def carry_out(campaign: Campaign) -> StudyResult:
     # The last run waits for this one.
     tracking_runs["latched"].hurry()
     models = {key: needed.get(key) or identified(key) for key in MODELS}
-    truth = true_curvatures(campaign.rig)
     with Record(validation.result().folder) as record:
         steps = record.steps()
         inputs, outputs = steps[INPUT], steps[OUTPUT]

@@ -33,15 +33,16 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bench.devices import Identity
 from sim_devices.instruments.emulated import LineFaults
 from sim_devices.instruments.registers import Register, RegisterInstrument
 from sim_devices.noise import normals
-from sim_devices.wire.modbus import DEVICE_FAILURE, ILLEGAL_ADDRESS, RegisterError
+from sim_devices.wire.modbus import DEVICE_FAILURE, ILLEGAL_ADDRESS, Packet, RegisterError
 from sim_devices.world import World
 
 CHANNELS = 14
@@ -155,6 +156,29 @@ _SCALES = {(volts, index): _scale(volts, index) for volts in RANGES for index in
 """By range and resolution index."""
 
 
+class Scan(Protocol):
+    """The wires at the first inputs, with the conversion of each, in one call."""
+
+    count: int
+    """How many inputs."""
+
+    def __call__(self, scales: NDArray[np.float64], draw: Callable[[], float]) -> Sequence[float] | None:
+        """Return a reading (V) of each input, as conversions one after the other give it.
+
+        Parameters
+        ----------
+        scales : numpy.ndarray, shape (14, 4)
+            What a reading of each input is made of: noise, step, lowest and highest, V.
+        draw : callable
+            Returns the next number of the standard normal distribution, one a conversion.
+
+        Returns
+        -------
+        sequence of float or None
+            None, and nothing drawn, if the inputs have to be converted one by one.
+        """
+
+
 def _ground() -> float:
     return 0.0
 
@@ -218,6 +242,8 @@ class EmulatedT7(LineFaults, RegisterInstrument):
         self._sources = {channel: inputs.get(channel, _ground) for channel in range(CHANNELS)}
         self._draw = normals(rng).__next__
         self._held: dict[int, float] | None = None
+        self._scan: Scan | None = None
+        self._scales = np.zeros((CHANNELS, len(_Scale._fields)))
         self._watchdog = _Watchdog()
         self._expired_at: float | None = None
         self._followers: list[Callable[[], None]] = []
@@ -225,11 +251,13 @@ class EmulatedT7(LineFaults, RegisterInstrument):
         self.flash_writes = 0
         self._start()
         self._set_map_up(self._register_map())
-        world.add(self)
+        world.add(self, announces=True)
 
     def _start(self) -> None:
         """Set everything up that is not kept in the flash memory."""
         self._inputs = [_Input() for _ in range(CHANNELS)]
+        self._scales[:] = [settings.scale for settings in self._inputs]
+        self._are_single_ended = True
         self._stream_index = 0
         self._stream_settling = 0.0
         self._dacs = [0.0, 0.0]
@@ -241,6 +269,7 @@ class EmulatedT7(LineFaults, RegisterInstrument):
         self._user_ram = [0.0] * _USER_RAM
         self._expired_at = None
         self._due = self.world.time + self._watchdog.timeout if self._watchdog.enabled else math.inf
+        self.world.announce(self._due)
 
     def power_cycle(self) -> None:
         """Switch the instrument off and on: what is in its RAM is lost, what is in its flash memory stays.
@@ -262,6 +291,10 @@ class EmulatedT7(LineFaults, RegisterInstrument):
     def thaw(self) -> None:
         """Undo `freeze`."""
         self._held = None
+
+    def scan_by(self, scan: Scan | None) -> None:
+        """Convert the first inputs in one call wherever a packet reads all of them first; None for one by one."""
+        self._scan = scan
 
     def on_restart(self, follow: Callable[[], None]) -> None:
         """Call `follow()` at each power cycle."""
@@ -321,12 +354,15 @@ class EmulatedT7(LineFaults, RegisterInstrument):
                 return
             if not dog.strict:
                 self._due = world.time + dog.timeout
-                self._expired_at = None
+                if self._expired_at is not None:
+                    self._expired_at = None
+                    world.announce(self._due)
             elif self._expired_at is not None:
                 # In strict mode the timer has gone on; what the request changes lasts until it next runs out.
                 periods = math.floor((world.time - self._expired_at) / dog.timeout) + 1
                 self._due = self._expired_at + periods * dog.timeout
                 self._expired_at = None
+                world.announce(self._due)
         except BaseException:
             world.lock.release()
             raise
@@ -376,6 +412,7 @@ class EmulatedT7(LineFaults, RegisterInstrument):
     def _feed(self) -> None:
         self._due = self.world.time + self._watchdog.timeout
         self._expired_at = None
+        self.world.announce(self._due)
 
     def _enable_watchdog(self, value: float) -> None:
         if value not in (0, 1):
@@ -458,11 +495,46 @@ class EmulatedT7(LineFaults, RegisterInstrument):
             held[channel] = volts
         return volts
 
+    def _frame_reader(self, frames: Sequence[Sequence[Callable[[], float]]], pack: Callable[..., bytes]) -> Packet:
+        """Return what reads several frames; those that begin with a scan have it in one call."""
+        scan, first, left = self._scan, 0, [] if self._scan is None else self._conversions(self._scan.count)
+        while left and first < len(frames) and left[: len(frames[first])] == list(frames[first]):
+            left = left[len(frames[first]) :]
+            first += 1
+        if scan is None or left:
+            return super()._frame_reader(frames, pack)
+        one_by_one = self._conversions(scan.count)
+        begin, end, lead, rest = self._begin, self._end, self._lead, frames[first:]
+        draw, scales = self._draw, self._scales
+
+        def read_scan(packet: bytes) -> bytes:  # noqa: ARG001
+            begin()
+            try:
+                volts = scan(scales, draw) if self._held is None and self._are_single_ended else None
+                values = [read() for read in one_by_one] if volts is None else [*volts]
+                for readers in rest:
+                    for read in readers:
+                        values.append(read())
+                    if self._touched:
+                        lead()
+                answer = pack(*values)
+            except BaseException as error:
+                end(error)
+                raise
+            end(None)
+            return answer
+
+        return read_scan
+
+    def _conversions(self, count: int) -> list[Callable[[], float]]:
+        """Return what converts the first inputs, as the register map has it."""
+        return [read for n in range(count) if (read := self._named[f"AIN{n}"].read) is not None]
+
     def _set_range(self, channel: int, value: float) -> None:
         wanted = value or RANGES[0]  # 0 stands for the default
         for each in RANGES:
             if math.isclose(wanted, each, rel_tol=1e-6):
-                self._inputs[channel].set_up(each, self._inputs[channel].resolution)
+                self._set_input_up(channel, each, self._inputs[channel].resolution)
                 return
         raise _DetailedError(ERROR_RANGE, f"AIN{channel}_RANGE: {value:g} is none of {RANGES}")
 
@@ -470,6 +542,7 @@ class EmulatedT7(LineFaults, RegisterInstrument):
         if value != SINGLE_ENDED and not (channel % 2 == 0 and value == channel + 1):
             raise _DetailedError(ERROR_NEGATIVE_CHANNEL, f"AIN{channel}_NEGATIVE_CH: {value:g} is not allowed")
         self._inputs[channel].negative = int(value)
+        self._are_single_ended = all(settings.negative == SINGLE_ENDED for settings in self._inputs)
 
     def _checked_resolution(self, value: float) -> int:
         if not 0 <= value <= len(CONVERSIONS):
@@ -482,7 +555,11 @@ class EmulatedT7(LineFaults, RegisterInstrument):
         return value
 
     def _set_index(self, channel: int, value: float) -> None:
-        self._inputs[channel].set_up(self._inputs[channel].range, self._checked_resolution(value))
+        self._set_input_up(channel, self._inputs[channel].range, self._checked_resolution(value))
+
+    def _set_input_up(self, channel: int, volts: float, resolution: int) -> None:
+        self._inputs[channel].set_up(volts, resolution)
+        self._scales[channel] = self._inputs[channel].scale
 
     def _set_settling(self, channel: int, value: float) -> None:
         self._inputs[channel].settling = self._checked_settling(value, _LONGEST_SETTLING)

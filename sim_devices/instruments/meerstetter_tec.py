@@ -65,6 +65,7 @@ OBJECT_NOISE = 0.002
 SUPPLY_VOLTAGE = 24.0
 """Input voltage, V; the output stage saturates there."""
 
+_READY, _RUN = DeviceStatus.READY, DeviceStatus.RUN  # sooner than by the class
 _OBJECT_RESOLUTION = 128.0 / 2**23  # K: a converter of 23 bits, with the range of an NTC set-up
 _SINK_RESOLUTION = 128.0 / 2**12  # K: 12 bits
 _OUTPUT_RESOLUTION = 1e-3  # A and V
@@ -167,7 +168,7 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
         self._supervised_at = world.time
         self._last_object, self._last_sink = load.plate_temperature, load.sink_temperature
         self._started_at = self._in_window_since = self._saturated_since = math.nan
-        world.add(self)
+        world.add(self, announces=True)
 
     # Parameters and commands.
 
@@ -264,6 +265,7 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
             self.attend()
             self._shut_down()
             self._restart_due = self.world.time + RESET_DELAY
+            self.world.announce(self._restart_due)
 
     # Faults.
 
@@ -426,8 +428,11 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
         return 2 if self.world.time - self._in_window_since >= self._values[4041] else 1
 
     def _feed(self, now: float) -> None:
-        watched = self._values[2060] > 0.0 and self._status in (DeviceStatus.READY, DeviceStatus.RUN)
-        self._watchdog_due = now + self._values[2060] if watched else math.inf
+        watchdog, status = self._values[2060], self._status
+        due = now + watchdog if watchdog > 0.0 and (status is _RUN or status is _READY) else math.inf
+        if due < self._watchdog_due:
+            self.world.announce(due)
+        self._watchdog_due = due
 
     def _trip(self, error_number: int, parameter: int = 0) -> None:
         if self._status not in (DeviceStatus.READY, DeviceStatus.RUN):
@@ -438,6 +443,7 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
         if self._values[6310] > 0.0:
             # No sooner than a reset: otherwise a cause that stays would trip and restart it within one instant.
             self._recovery_due = self.world.time + max(self._values[6310], RESET_DELAY)
+            self.world.announce(self._recovery_due)
         self._apply()
 
     def _shut_down(self) -> None:
@@ -465,7 +471,7 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
         values = self._values
         enable = values[2010]
         wanted = enable == ENABLE_ON or (enable == ENABLE_LIVE and values[50000] == 1)
-        on = wanted and self._status in (DeviceStatus.READY, DeviceStatus.RUN)
+        on = wanted and (self._status is _RUN or self._status is _READY)
         output: tuple[str, float, float] | None = None
         if on:
             limit = values[2030]
@@ -492,9 +498,10 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
             self._load.regulate(value, limit)
         else:
             self._load.drive(value)
-        self._status = DeviceStatus.RUN
+        self._status = _RUN
         if not was_on:
             self._supervision_due = now + SUPERVISION_INTERVAL
+            self.world.announce(self._supervision_due)
         self._supervise(now)
 
     def _supervise(self, now: float) -> None:
@@ -517,7 +524,7 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
             self._trip(142, 5010)
         elif sink > values[5011]:
             self._trip(143, 5011)
-        if self._status is DeviceStatus.RUN:
+        if self._status is _RUN:
             self._supervise_output(now, plate, current, voltage)
 
     def _supervise_output(self, now: float, plate: float, current: float, voltage: float) -> None:
@@ -532,7 +539,7 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
             self._saturated_since = now
         elif 0 <= values[6320] < 1e3 * (now - self._saturated_since):
             self._trip(108, 6320)
-        if self._status is not DeviceStatus.RUN or values[2000] != CONTROLLER:
+        if values[2000] != CONTROLLER or self._status is not _RUN:
             return
         if abs(plate - self._target()) > values[4040]:
             self._in_window_since = math.nan

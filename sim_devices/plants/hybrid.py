@@ -194,6 +194,15 @@ class HybridCantilever(CooledPlant[HybridParameters]):
     def _fraction(self) -> float:
         return self._pending / self._step if self._ahead else 0.0
 
+    @property
+    def numbers(self) -> Floats:
+        """All its numbers, as `_hybrid_kernels` takes them; read them only."""
+        return self._numbers
+
+    def moment(self) -> tuple[float, float]:
+        """Return the fraction of the grid step under way, and the time since the voltage last changed, s."""
+        return self._pending / self._step if self._ahead else 0.0, self._elapsed
+
     def _temperature(self, node: int) -> float:
         rise: float = self._rise.item(node)
         if self._ahead:
@@ -240,7 +249,9 @@ class HybridCantilever(CooledPlant[HybridParameters]):
     def terminals(self) -> tuple[float, float, float, float]:
         """Return the temperatures of base and block's front (°C), current (A) and voltage (V) of the cooler."""
         # In one call, as a TEC controller looks with each request.
-        seen: tuple[float, float, float, float] = kernels.terminals(self._fraction, self._ambient, self._numbers)
+        seen: tuple[float, float, float, float] = kernels.terminals(
+            self._pending / self._step if self._ahead else 0.0, self._ambient, self._numbers
+        )
         return seen
 
     @property

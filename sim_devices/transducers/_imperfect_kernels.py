@@ -12,6 +12,26 @@ Floats = NDArray[np.float64]
 
 
 @njit(cache=True)
+def shown(
+    quantity: float,
+    gain: float,
+    offset: float,
+    wave: float,
+    scale: float,
+    middle: float,
+    most: float,
+    resolution: float,
+) -> float:
+    """Return what `Characteristic.value` makes of a quantity, to the last bit."""
+    value = gain * quantity + offset
+    if wave:
+        value += wave * math.sin(min(max(scale * (quantity - middle), -most), most))
+    if resolution:
+        value = np.round(value / resolution) * resolution
+    return value
+
+
+@njit(cache=True)
 def show(
     values: Floats,
     gain: float,
@@ -24,10 +44,4 @@ def show(
 ) -> None:
     """Replace quantities by what `Characteristic.value` makes of them, to the last bit."""
     for i in range(values.size):
-        quantity = values[i]
-        value = gain * quantity + offset
-        if wave:
-            value += wave * math.sin(min(max(scale * (quantity - middle), -most), most))
-        if resolution:
-            value = np.round(value / resolution) * resolution
-        values[i] = value
+        values[i] = shown(values[i], gain, offset, wave, scale, middle, most, resolution)

@@ -4,10 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from bench.deferred import DeferredModule
 from sim_devices.noise import normals
+
+if TYPE_CHECKING:
+    from sim_devices.transducers import _voltage_kernels as kernels
+else:
+    kernels = DeferredModule("sim_devices.transducers._voltage_kernels")
 
 
 @dataclass(eq=False)
@@ -29,13 +36,10 @@ class DisplacementSensor:
     """Source of the noise."""
 
     def __post_init__(self) -> None:
-        self._normals = normals(self.rng)
+        self.draw: Callable[[], float] = normals(self.rng).__next__
+        """Gives the next number of the standard normal distribution, for the noise of a conversion."""
 
     def __call__(self) -> float:
         """Return the voltage in V at this instant."""
-        noisy = self.displacement() + self.noise * next(self._normals)
-        shown = round(noisy / self.resolution) * self.resolution
-        reach = self.reach
-        if not -reach <= shown <= reach:
-            shown = min(max(shown, -reach), reach)
-        return self.volts_per_metre * shown
+        noisy = self.displacement() + self.noise * self.draw()
+        return float(kernels.displacement_volts(noisy, self.resolution, self.reach, self.volts_per_metre))

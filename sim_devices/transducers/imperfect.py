@@ -176,8 +176,13 @@ class Characteristic:
             found += (values - smooth) / self._gain
         return found
 
+    @property
+    def numbers(self) -> tuple[float, float, float, float, float, float, float]:
+        """What `_imperfect_kernels.shown` takes besides the quantity."""
+        return self._gain, self._offset, self._wave, self._scale, self._middle, _WAVE, self._resolution
+
     def _replace(self, quantities: Floats, resolution: float) -> None:
-        kernels.show(quantities, self._gain, self._offset, self._wave, self._scale, self._middle, _WAVE, resolution)
+        kernels.show(quantities, *self.numbers[:-1], resolution)
 
 
 class ImperfectSensor:
@@ -227,6 +232,13 @@ def imperfect(
 ) -> Callable[[], float]:
     """Return what a sensor makes of a quantity; see `ImperfectSensor`. An ideal one makes nothing of it."""
     return quantity if errors == SensorErrors() else ImperfectSensor(quantity, errors, low, high, world)
+
+
+def characteristic_of(sensor: Callable[[], float]) -> Characteristic | None:
+    """Return what a sensor without lag and latency makes of its quantity; None if it has either."""
+    if not isinstance(sensor, ImperfectSensor):
+        return Characteristic(SensorErrors(), -1.0, 1.0)
+    return sensor.characteristic if sensor.is_static else None
 
 
 def shown(sensor: Callable[[], float]) -> float:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import KW_ONLY, dataclass, field
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from bench.deferred import DeferredModule
 from sim_devices.noise import normals
 
-_KELVIN = 273.15
+if TYPE_CHECKING:
+    from sim_devices.transducers import _voltage_kernels as kernels
+else:
+    kernels = DeferredModule("sim_devices.transducers._voltage_kernels")
 
 STEINHART_HART = (1.129148e-3, 2.34125e-4, 8.76741e-8)
 """A, B and C of a common thermistor of 10 kΩ at 25 °C, in 1/K, for the resistance in Ω."""
@@ -44,7 +48,16 @@ class Thermistor:
 
     def __post_init__(self) -> None:
         self.excitation_volts += self.excitation_error * self.rng.standard_normal()
-        self._normals = normals(self.rng)
+        self.draw: Callable[[], float] = normals(self.rng).__next__
+        """Gives the next number of the standard normal distribution, for the noise of a conversion."""
+        a, b, c = self.steinhart_hart
+        self.circuit = self.reference_ohms, a, c, (b / (3 * c)) ** 3
+        """Reference resistor (Ω), A and C (1/K), and (B / 3C)³."""
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether it is neither open nor shorted."""
+        return not (self.open or self.shorted)
 
     def divider(self) -> float:
         """Return the voltage in V at the input of the divider at this instant."""
@@ -52,16 +65,9 @@ class Thermistor:
             return 0.0
         if self.open:
             return self.excitation_volts
-        ohms = self._ohms(self.temperature() + self.noise * next(self._normals))
-        return self.excitation_volts * ohms / (ohms + self.reference_ohms)
+        celsius = self.temperature() + self.noise * self.draw()
+        return float(kernels.divider_volts(celsius, self.excitation_volts, *self.circuit))
 
     def excitation(self) -> float:
         """Return the voltage in V of the excitation at this instant."""
         return self.excitation_volts
-
-    def _ohms(self, celsius: float) -> float:
-        """Return the resistance in Ω: the one real root of a cubic equation in ln R."""
-        a, b, c = self.steinhart_hart
-        half = (a - 1 / (celsius + _KELVIN)) / (2 * c)
-        root = math.sqrt((b / (3 * c)) ** 3 + half**2)
-        return math.exp(math.cbrt(root - half) - math.cbrt(root + half))

@@ -22,7 +22,7 @@ from __future__ import annotations
 import math
 import re
 import struct
-from binascii import crc_hqx
+from binascii import crc_hqx, hexlify
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
@@ -50,8 +50,8 @@ class _Selection:
     keys: tuple[tuple[int, int], ...]
     form: struct.Struct
 
-    def encode(self, values: list[float]) -> str:
-        return self.form.pack(*values).hex().upper()
+    def encode(self, values: list[float]) -> bytes:
+        return hexlify(self.form.pack(*values)).upper()
 
 
 class MeComServer(WireServer):
@@ -121,14 +121,14 @@ class MeComServer(WireServer):
             selection = self._selections.get(payload)
             content = self._act(payload) if selection is None else self._values(selection)
         except RequestRefusedError as error:
-            content = f"+{error.reason:02X}"
+            content = b"+%02X" % error.reason
         if number == _SILENT:
             return b""
-        answer = head + content.encode("ascii")
+        answer = head + content
         # An acknowledge carries the CRC of its request.
         return device.transmit(answer + (b"%04X\r" % crc_hqx(answer, 0) if content else crc + b"\r"))
 
-    def _act(self, request: bytes) -> str:
+    def _act(self, request: bytes) -> bytes:
         """Carry a request out; return the payload of the answer, empty for an acknowledge."""
         payload = request.decode("ascii", "replace")
         command = payload[:3] if payload.startswith("?") else payload[:2]
@@ -143,9 +143,9 @@ class MeComServer(WireServer):
             carry_out = self._commands[command]
         except KeyError:
             raise RequestRefusedError(ServerError.COMMAND_NOT_AVAILABLE) from None
-        return carry_out(operand)
+        return carry_out(operand).encode("ascii")
 
-    def _values(self, selection: _Selection) -> str:
+    def _values(self, selection: _Selection) -> bytes:
         value = self._device.value
         return selection.encode([value(number, instance) for number, instance in selection.keys])
 

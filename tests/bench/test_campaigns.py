@@ -197,6 +197,22 @@ class TestFile:
                 r"models\.0 \(density\): output = 'x': there is no such signal; .*curvature",
             ),
             ("count = 2", "count = 1", r"parameter count = 1 is not allowed; allowed: 2 to 10000"),
+            (
+                'runs = "characterize"',
+                'runs = ["characterize", "track"]',
+                r"models\.0 \(density\): runs: a model preisach-nonmonotonic is identified from one run",
+            ),
+            (
+                '"preisach-nonmonotonic"\nlevels = 6\nplane = [30.0, 70.0]',
+                '"hybrid"',
+                r"models\.0 \(density\): runs: expected one run each of current-steps, thermomechanical, .* on a rig "
+                r"and seed; on vo2 with seed 0 there are: damped-oscillation",
+            ),
+            (
+                '"preisach-nonmonotonic"',
+                '"hybrid"',
+                r"models\.0 \(density\)\.levels: there is no such key; allowed are: none",
+            ),
         ],
     )
     def test_models_have_to_be_there(self, campaign, old, new, said):

@@ -272,6 +272,13 @@ class TestRemovedAndDamaged:
             assert run.status == "failed"
             assert run.meta["safe_state"] == {"tec": "safe"}
 
+    def test_one_that_cannot_be_written_anew_says_so(self, journal, tmp_path, monkeypatch):
+        add(journal, 5)
+        shutil.rmtree(tmp_path)
+        monkeypatch.setattr(tempfile, "tempdir", str(tmp_path / "gone"))
+        with pytest.raises(RecordError, match=r"was removed while the run went on; .* could not be written anew"):
+            add(journal, 1)
+
     @pytest.mark.parametrize("content", [b"\xa5", b"\0"], ids=["noise", "zeros"])
     def test_overwritten_pages_are_noticed_at_the_end(self, journal, tmp_path, content):
         count = add(journal, 300)

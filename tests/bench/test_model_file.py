@@ -190,7 +190,6 @@ values = st.recursive(
 )
 
 
-@pytest.mark.costly
 @settings(max_examples=500, deadline=None)
 @given(name=st.sampled_from(list(MODELS)), data=st.data())
 def test_any_mutation_is_a_usable_model_or_a_data_error(name, data):
@@ -424,7 +423,6 @@ class TestHybrid:
             load_model(hybrid_file([(path, value)]))
 
 
-@pytest.mark.costly
 @settings(max_examples=300, deadline=None)
 @given(data=st.data())
 def test_any_mutation_of_a_hybrid_model_is_usable_or_a_data_error(tmp_path_factory, data):

@@ -523,7 +523,6 @@ values = st.one_of(
 )
 
 
-@pytest.mark.costly
 @settings(max_examples=400, deadline=None)
 @given(data=st.data())
 def test_any_mutation_loads_or_is_a_configuration_error(tmp_path_factory, data):

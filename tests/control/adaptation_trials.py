@@ -54,7 +54,7 @@ def tracked(folder: Path, changes: dict[str, float], adaptation: str, seed: int)
     run = bench.run(
         "tracking", "vo2", out=folder, clock="virtual", seed=seed, overrides=overrides,
         model=str(folder / "model.json"), controller="open-loop-inverse", count=COUNT, sequence_seed=seed + 1,
-        adaptation=adaptation,
+        adaptation=adaptation, fallback="open-loop",
     )  # fmt: skip
     with Record(run.folder) as record:
         results = target_results(record, "curvature")

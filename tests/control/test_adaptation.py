@@ -40,7 +40,6 @@ def by_definition(model, state, before, value, output, step, bias_step, regulari
     return adapted.with_coefficients(coefficients, model.bias + bias_step * left), error
 
 
-@pytest.mark.costly
 @pytest.mark.slow
 @given(st.integers(0, 1000), st.booleans(), st.sampled_from([1e-4, 0.05]))
 def test_equals_the_definition(seed, uneven, noise):

@@ -5,7 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from bench.control.supervision import TARGETS, Supervised
+from bench.control.following import ClosedLoopFollower, OpenLoopFollower
+from bench.control.supervision import TARGETS, Supervised, SupervisedFollower
 from bench.control.tracking import ClosedLoopInverse, Command, CorrectionParameters, OpenLoopInverse, Trace
 from bench.control.tuning import Spans
 from bench.errors import ConvergenceError
@@ -98,18 +99,45 @@ class Contrary(Swinging):
         return Command(0.0, 1.0, done=True)
 
 
-@pytest.mark.parametrize("disturbance", [0.02, math.nan])
-def test_errors_beyond_those_of_the_model_alone_over_several_targets(disturbance):
+def judged(error, disturbance, fallback=None):
+    """Have a controller miss several targets, in parts of the range; return its supervision."""
     inner = Contrary()
     inner.trace = Trace(disturbance=disturbance)
-    controller = Supervised(inner, LIMITS, 1.0)
-    for n in range(TARGETS):
-        controller.aim(0.1, float(n), 0.0, 0.0)
-    if math.isnan(disturbance):
-        controller.aim(0.1, 9.0, 0.0, 0.0)
-    else:
-        with pytest.raises(ConvergenceError, match=r"error is 0\.1 RMS, and that of its model alone.* 0\.02"):
-            controller.aim(0.1, 9.0, 0.0, 0.0)
+    controller = Supervised(inner, LIMITS, 1.0, fallback)
+    for n in range(TARGETS + 1):
+        controller.aim(error, float(n), 0.0, 0.0)
+    return controller
+
+
+@pytest.mark.parametrize(
+    ("disturbance", "said"),
+    [
+        (0.02, r"error is 0\.1 RMS, 10 % of the range, and that of its model alone.* 0\.02;"),
+        (math.nan, r"10 % of the"),
+    ],
+)
+def test_errors_beyond_three_percent_over_several_targets_end_the_run(disturbance, said):
+    with pytest.raises(ConvergenceError, match=said):
+        judged(0.1, disturbance)
+
+
+@pytest.mark.parametrize(("error", "notice"), [(0.008, ""), (0.012, "1.2 % of the range")])
+def test_an_error_that_is_left_is_said_once(error, notice):
+    controller = judged(error, 0.02)
+    found = controller.take_notice()
+    assert (notice in found) if notice else not found
+    controller.aim(error, 9.0, 0.0, 0.0)
+    assert not controller.take_notice()
+
+
+def test_the_open_loop_goes_on_only_where_it_would_have_been_better():
+    def fallback(state):
+        return OpenLoopInverse(MODEL.inverse(), wait=1.0)
+
+    assert judged(0.1, 0.02, fallback).gave_up
+    kept = judged(0.1, 0.08, fallback)
+    assert not kept.gave_up
+    assert "leaves an error" in kept.take_notice()
 
 
 def test_targets_that_cannot_be_met_do_not_count():
@@ -138,3 +166,102 @@ def test_a_controller_may_doubt_itself():
     controller.aim(0.0, 0.0, 0.0, 0.0)
     with pytest.raises(ConvergenceError, match="its lock held nowhere"):
         controller.aim(0.0, 1.0, 0.0, 0.0)
+
+
+def opened(offset, *, holds=0.1, fallback=None):
+    """Return the errors of an open loop on a specimen of an offset, in parts of the range, and its supervision."""
+    span = HIGH - LOW
+    inner = OpenLoopInverse(MODEL.inverse(), wait=1.0)
+    controller = Supervised(inner, LIMITS, span, fallback, holds=holds * span)
+    specimen = Specimen(offset=offset * span)
+    return [specimen.reach(controller, target) / span for target in TARGETS_WITHIN], controller
+
+
+def test_an_open_loop_whose_model_does_not_hold_is_stopped_with_what_to_do():
+    with pytest.raises(ConvergenceError, match=r"the model does not hold .* over 5 targets .* adaptation=session"):
+        opened(0.15)
+
+
+def test_an_open_loop_whose_model_holds_is_left_alone():
+    errors, controller = opened(0.05)
+    assert max(map(abs, errors)) > 0.03
+    assert not controller.gave_up
+
+
+def test_an_open_loop_goes_on_where_that_is_asked_for():
+    errors, controller = opened(0.15, fallback=lambda state: OpenLoopInverse(MODEL.inverse(), state, wait=1.0))
+    assert len(errors) == len(TARGETS_WITHIN)
+    assert controller.gave_up
+    assert "the model does not hold" in controller.take_notice()
+
+
+PERIOD = 0.5
+
+
+def follow(follower, specimen, seconds, *, high=0.8):
+    """Follow a sine; return the RMS error in parts of the range."""
+    errors = []
+    for k in range(round(seconds / PERIOD)):
+        wanted = LOW + (HIGH - LOW) * (0.5 - 0.3 * math.cos(2.0 * math.pi * k * PERIOD / 60.0)) * high / 0.8
+        t, measured, output = specimen.read()
+        specimen.state = specimen.state.step(follower.update(t, measured, output, wanted))
+        specimen.t += PERIOD
+        errors.append((specimen.read()[2] - wanted) / (HIGH - LOW))
+    return math.sqrt(sum(error**2 for error in errors) / len(errors))
+
+
+def supervised_follower(inner, *, holds=math.nan, fallback=None):
+    return SupervisedFollower(inner, LIMITS, HIGH - LOW, fallback, holds=holds * (HIGH - LOW))
+
+
+@pytest.mark.parametrize("offset", [0.0, 0.05])
+def test_a_follower_that_follows_is_left_alone(offset):
+    span = HIGH - LOW
+    controller = supervised_follower(ClosedLoopFollower(MODEL.inverse()))
+    assert follow(controller, Specimen(offset=offset * span), 300.0) < 0.06
+    assert not controller.gave_up
+    controller = supervised_follower(OpenLoopFollower(MODEL.inverse()), holds=0.1)
+    follow(controller, Specimen(offset=offset * span), 300.0)
+    assert not controller.gave_up
+
+
+def test_an_open_loop_follower_whose_model_does_not_hold_is_stopped():
+    specimen = Specimen(offset=0.2 * (HIGH - LOW))
+    with pytest.raises(ConvergenceError, match=r"the model does not hold .* over 200 samples"):
+        follow(supervised_follower(OpenLoopFollower(MODEL.inverse()), holds=0.1), specimen, 300.0)
+
+
+class Runaway(ClosedLoopFollower):
+    """Corrects twice as far as it should, and the wrong way."""
+
+    def _inverted(self, step, disturbance):
+        return super()._inverted(step, -2.0 * disturbance)
+
+
+def test_a_follower_that_errs_by_more_than_its_model_is_stopped_or_replaced():
+    offset = 0.1 * (HIGH - LOW)
+    with pytest.raises(ConvergenceError, match=r"does not converge: over 200 samples .* without feedback"):
+        follow(supervised_follower(Runaway(MODEL.inverse())), Specimen(offset=offset), 300.0)
+    replaced = supervised_follower(
+        Runaway(MODEL.inverse()), fallback=lambda state: OpenLoopFollower(MODEL.inverse(), state)
+    )
+    specimen = Specimen(offset=offset)
+    follow(replaced, specimen, 300.0)
+    assert replaced.gave_up
+    assert follow(replaced, specimen, 300.0) < 0.15
+
+
+def test_a_follower_that_foresees_goes_on_doing_so_and_others_need_not():
+    class Foreseer(OpenLoopFollower):
+        horizon = 3
+        seen = None
+
+        def foresee(self, references):
+            self.seen = references
+
+    inner = Foreseer(MODEL.inverse())
+    controller = supervised_follower(inner)
+    assert controller.horizon == 3
+    controller.foresee(np.arange(3.0))
+    assert inner.seen.tolist() == [0.0, 1.0, 2.0]
+    assert supervised_follower(OpenLoopFollower(MODEL.inverse())).horizon == 0

@@ -169,7 +169,6 @@ readings = st.one_of(
 
 
 class TestLimits:
-    @pytest.mark.costly
     @pytest.mark.parametrize("limits", [(LOW, HIGH), NARROW, (0.0, 200.0)])
     @pytest.mark.parametrize("name", TARGETS)
     @settings(max_examples=40)

@@ -147,7 +147,6 @@ def test_random_states_between_fixed_ends(kinds):
     assert met > COUNTS[kinds] // 2
 
 
-@pytest.mark.costly
 @pytest.mark.slow
 @settings(max_examples=400)
 @given(st.integers(0, 100_000))

@@ -25,12 +25,9 @@ EXECUTED = [*PAGES, *(DOCS / "reference" / f"{name}.md" for name in ("campaign",
 LONG = {
     "add-a-controller",
     "describe-an-instrument",
-    "hybrid",
     "identify-from-a-file",
-    "inject-faults",
     "resume-a-run",
     "sma",
-    "use-a-notebook",
     "vo2",
 }
 """More than five seconds each; of these `make test` looks at the commands only (`test_readme.py`)."""

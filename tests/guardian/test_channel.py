@@ -58,7 +58,6 @@ def pair():
         yield made
 
 
-@pytest.mark.costly
 @settings(deadline=None)
 @given(st.lists(messages, max_size=5))
 def test_what_is_sent_is_received_to_the_last_bit(sent):
@@ -76,7 +75,6 @@ def test_what_is_sent_is_received_to_the_last_bit(sent):
         theirs.close()
 
 
-@pytest.mark.costly
 @settings(deadline=None)
 @given(st.lists(messages, min_size=1, max_size=4), st.data())
 def test_frames_may_be_torn_anywhere(sent, data):

@@ -263,7 +263,6 @@ def test_streams_of_one_operator_are_independent():
     assert other.step(0.4) == operator.evaluate([0.4])[0]
 
 
-@pytest.mark.costly
 @settings(max_examples=150)
 @given(SEEDS, st.sampled_from(["nearest", "paper"]))
 def test_preisach_inverse_stream_equals_follow_to_the_last_bit(seed, policy):

@@ -31,7 +31,6 @@ def uneven(seed, order):
     return np.cumsum(np.random.default_rng(seed).uniform(0.5, 2.0, order + 1))
 
 
-@pytest.mark.costly
 @given(st.integers(0, 1000), st.integers(1, 12))
 def test_covering_sequence_determines_every_cell_with_no_set_point_to_spare(seed, order):
     operator = plane(uneven(seed, order))
@@ -51,7 +50,6 @@ def test_covering_sequence_determines_every_cell_with_no_set_point_to_spare(seed
     )
 
 
-@pytest.mark.costly
 @given(st.integers(0, 1000), st.integers(1, 12), st.integers(1, 3))
 def test_first_order_reversals_measure_every_pair_of_levels(seed, order, per_cell):
     operator = plane(uneven(seed, order))

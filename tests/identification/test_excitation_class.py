@@ -26,6 +26,22 @@ def test_each_is_known_by_name_and_holds_for_its_own_class_only(name):
             assert bool(found.departures(make(rng))) == (other != name)
 
 
+def multisine(rng):
+    """Eight frequencies of random phases, three periods."""
+    t = np.linspace(0.0, 6.0 * np.pi, 2400)
+    values = sum(np.cos(k * t + phase) for k, phase in enumerate(rng.uniform(0.0, 2.0 * np.pi, 8), start=1))
+    return values / np.abs(values).max()
+
+
+def test_many_multisines_are_told_from_random_reversals():
+    rng = np.random.default_rng(0)
+    pairs = [(ExcitationClass.of(random_reversals(rng)), random_reversals(rng), multisine(rng)) for _ in range(40)]
+    own = np.mean([bool(found.departures(other)) for found, other, _ in pairs])
+    another = np.mean([bool(found.departures(other)) for found, _, other in pairs])
+    assert own <= 0.1
+    assert another >= 0.3
+
+
 def test_noise_of_the_input_is_no_reversal():
     inputs = random_reversals(np.random.default_rng(0))
     plain, rng = ExcitationClass.of(inputs), np.random.default_rng(1)

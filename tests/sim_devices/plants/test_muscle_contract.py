@@ -198,7 +198,6 @@ class TestSpecimen:
 class TestDirections:
     """From a random past, one input is moved monotonically."""
 
-    @pytest.mark.costly
     @given(st.data(), st.booleans())
     @settings(max_examples=60, deadline=None)
     def test_voltage_contracts(self, case, data, falling):
@@ -214,7 +213,6 @@ class TestDirections:
         backwards = 1e-11 + case.expansion * np.abs(np.diff(np.square(voltages)))
         assert np.all(np.diff(lengths) * (1 if falling else -1) >= -backwards)
 
-    @pytest.mark.costly
     @given(st.data(), st.booleans())
     @settings(max_examples=60, deadline=None)
     def test_load_elongates(self, case, data, falling):
@@ -229,7 +227,6 @@ class TestDirections:
             lengths.append(muscle.length)
         assert np.all(np.diff(lengths) * (-1 if falling else 1) >= -1e-11)
 
-    @pytest.mark.costly
     @given(st.data())
     @settings(max_examples=40, deadline=None)
     def test_voltage_pulls_at_constant_length(self, case, data):
@@ -245,7 +242,6 @@ class TestDirections:
         backwards = 1e-7 + case.jump.get("force", 0.0) + case.slackening * np.diff(np.square(voltages))
         assert np.all(np.diff(forces) >= -backwards)
 
-    @pytest.mark.costly
     @given(st.data(), st.booleans())
     @settings(max_examples=40, deadline=None)
     def test_nothing_changes_while_nothing_changes(self, case, data, held):
@@ -260,7 +256,6 @@ class TestDirections:
 
 
 class TestClamped:
-    @pytest.mark.costly
     @given(st.data())
     @settings(max_examples=30, deadline=None)
     def test_imposed_length_is_met_or_the_muscle_is_slack(self, case, data):
@@ -431,7 +426,6 @@ class TestTime:
     # Whole microseconds, from one call to many, that add up to what the other plant does at once.
     pieces = st.lists(st.integers(0, 700_000), min_size=1, max_size=12)
 
-    @pytest.mark.costly
     @given(st.data(), st.integers(0, 2**32 - 1))
     @settings(max_examples=60, deadline=None)
     def test_splitting_advance_changes_nothing(self, case, data, seed):

@@ -1,0 +1,53 @@
+"""A campaign that identifies the model of a muscle from several runs together, and uses it."""
+
+import csv
+
+import pytest
+from test_identification import SHORT
+
+from bench.campaigns.tasks import MODEL_NAME
+from bench.cli import main
+from bench.model_file import load_model
+
+pytestmark = pytest.mark.usefixtures("warm_popen")
+
+PARTS = ("force-voltage", "length-voltage", "length-force")
+MODEL = f"""
+[[models]]
+name = "wire"
+runs = {list(PARTS)}
+model = "two-stage"
+
+[[runs]]
+protocol = "length-control"
+rigs = ["sma"]
+seed_offset = 1000
+[runs.parameters]
+model = "@wire"
+count = 2
+duration = 10.0
+controller = ["open-loop-inverse", "closed-loop-inverse"]
+"""
+
+
+def table(protocol):
+    settings = "\n".join(f"{key} = '{value}'" for key, value in SHORT[protocol].items())
+    return f'[[runs]]\nprotocol = "{protocol}"\nrigs = ["sma"]\n[runs.parameters]\n{settings}\n'
+
+
+def test_a_model_of_several_runs_is_identified_from_those_of_a_rig_and_seed(tmp_path):
+    file, out = tmp_path / "wire.toml", tmp_path / "out"
+    file.write_text("".join(map(table, PARTS)) + MODEL)
+    with pytest.raises(SystemExit) as end:
+        main(["campaign", str(file), "--out", str(out), "--workers", "1"])
+    assert end.value.code == 0
+    (folder,) = (out / "wire").iterdir()
+    assert folder.name.startswith("sma-seed=0-")
+    model = load_model(folder / MODEL_NAME, "two-stage")
+    assert len(model.provenance["sources"]) == len(PARTS)
+    assert model.dynamics is not None
+    with (out / "results.csv").open(newline="") as results:
+        rows = {row["controller"]: row for row in csv.DictReader(results) if row["protocol"] == "length-control"}
+    assert {row["status"] for row in rows.values()} == {"completed"}
+    errors = {name: float(row["tracking_rms [m]"]) for name, row in rows.items()}
+    assert 0.0 < errors["closed-loop-inverse"] < errors["open-loop-inverse"]
