@@ -127,7 +127,8 @@ class ControllerSpec:
     numbers: Callable[[ControllerSetup], Any] | None = None
     """Returns the numbers of the controller, a dataclass, for `bench tune`."""
     tunable: tuple[str, ...] = ()
-    """Those of them that it may change, all positive; one of a table as `TABLE.NAME`."""
+    """Those of them that it may change, all positive; one of a table as `TABLE.NAME`, those that change together as
+    `NAME+NAME`."""
     holds: Callable[[ControllerSetup], float] | None = None
     """Of a controller without feedback: returns the greatest RMS error of a model that still holds, output units."""
     misses: bool = False

@@ -35,7 +35,7 @@ def tune_(
     settings: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Parameter of the protocol; repeatable.")
     ] = None,
-    seeds: Annotated[int, typer.Option(min=1, max=100, help="Sessions of each run.")] = 1,
+    seeds: Annotated[int, typer.Option(min=1, max=100, help="Sessions of each run.")] = 2,
     checks: Annotated[
         int, typer.Option(min=1, max=100, help="Further sessions, in which the result has to be better as well.")
     ] = 2,

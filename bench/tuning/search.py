@@ -24,6 +24,8 @@ TIME_WEIGHT = 0.02
 """Percent of the range of the targets that a second at each target costs."""
 FACTOR = 1.7
 """By how much a number is raised and lowered at first."""
+FINALISTS = 3
+"""How many sets of numbers of a search run in further sessions."""
 _ENOUGH = 0.99
 """Part of the cost below which a change is taken, as two runs of one controller differ a little."""
 
@@ -102,7 +104,8 @@ def search(
     start : mapping
         Numbers to begin with, tables within as mappings.
     names : sequence of str
-        Those that may change; one in a table by `TABLE.NAME`. All are positive.
+        Those that may change; one in a table by `TABLE.NAME`, those that change together by `NAME+NAME`. All are
+        positive.
     evaluate : callable
         Carries out trials.
     tell : callable
@@ -115,8 +118,7 @@ def search(
     for number in range(rounds):
         factor = FACTOR ** (1.0 / (number + 1))
         for name in names:
-            present = get(best.numbers, name)
-            candidates = [put(best.numbers, name, present * each) for each in (factor, 1.0 / factor)]
+            candidates = [multiplied(best.numbers, name, each) for each in (factor, 1.0 / factor)]
             for trial in evaluate(candidates):
                 tell(trial)
                 if trial.cost < _ENOUGH * best.cost:
@@ -124,13 +126,24 @@ def search(
     return best
 
 
-def confirm(start: Numbers, found: Numbers, evaluate: Evaluate) -> tuple[Trial, Trial]:
-    """Return trials of two sets of numbers in sessions that the search has not seen.
+def confirm(trials: Sequence[Trial], evaluate: Evaluate) -> tuple[Trial, Trial]:
+    """Return trials of the first numbers of a search and of its best, in sessions that it has not seen.
 
-    The second one is that of the start again if what was found is not better there.
+    The best `FINALISTS` of the others take part, even if none was better in the search: a session may flatter the
+    first numbers as well. These are the best if no others are better here. Of trials of the same cost the first takes
+    part: a number between them plays no part for this specimen.
     """
-    before, after = evaluate([start, found])
-    return before, after if after.cost < before.cost else before
+    start, *others = trials
+    by_cost = {each.cost: each for each in reversed(others) if math.isfinite(each.cost)}
+    found = evaluate([start.numbers, *(by_cost[cost].numbers for cost in sorted(by_cost)[:FINALISTS])])
+    return found[0], min(found, key=lambda each: each.cost)
+
+
+def multiplied(numbers: Numbers, name: str, factor: float) -> Numbers:
+    """Return numbers with one of them, or those of `NAME+NAME`, multiplied by a factor."""
+    for each in name.split("+"):
+        numbers = put(numbers, each, factor * get(numbers, each))
+    return numbers
 
 
 def get(numbers: Numbers, name: str) -> float:

@@ -77,7 +77,7 @@ def tune(
     controller: str = "closed-loop-inverse",
     protocol: str | None = None,
     settings: Sequence[str] = (),
-    seeds: int = 1,
+    seeds: int = 2,
     checks: int = 2,
     rounds: int = 2,
     workers: int | None = None,
@@ -86,7 +86,8 @@ def tune(
 ) -> Tuned:
     """Tune a controller; parameters as the options of `bench tune`.
 
-    The numbers that the search finds are taken only if they are better in sessions that it has not seen as well.
+    Of the best numbers of the search those are taken that are best in sessions that it has not seen, and better there
+    than the first ones.
 
     Raises
     ------
@@ -136,7 +137,7 @@ def tune(
         if not math.isfinite(best.cost):
             raise BenchError(f"the controller fails with all numbers that were tried: {runs.failures[0]}")
         unseen = TuningRuns(task, on, file, folder / "check", pool, given, checks, first_seed=seeds)
-        first, best = confirm(begin, best.numbers, unseen)
+        first, best = confirm(trials, unseen)
     provenance: dict[str, str | float] = {
         "model": model.name,
         "model_sha256": sha256(model.read_bytes()).hexdigest(),

@@ -449,7 +449,8 @@ def _with_inverse(summary: str, controller: Callable[..., MuscleController], kin
         summary,
         lambda s: controller(_task(s, kind), _timing(s), s.state, s.limits),
         numbers=_timing,
-        tunable=("caution", "horizon", "period") if controller is MuscleClosedLoop else (),
+        # The lead is by a number of periods.
+        tunable=("period+horizon", "horizon", "caution") if controller is MuscleClosedLoop else (),
         holds=(lambda s: _holds(s, kind)) if controller is MuscleOpenLoop else None,
     )
 

@@ -2,6 +2,7 @@
 
 import math
 import tomllib
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,7 +14,7 @@ from bench.hysteresis import Preisach, TwoStage, uniform_levels
 from bench.model_file import ModelFile
 from bench.protocol import find_protocol
 from bench.rig_file import load_rig
-from bench.tuning.search import MARGIN, Trial, confirm, cost_of, get, perturbed_models, put, search
+from bench.tuning.search import FACTOR, MARGIN, Trial, confirm, cost_of, get, perturbed_models, put, search
 from bench.tuning_file import load_tuning, tuning_text
 
 FILM = Preisach(uniform_levels(30.0, 70.0, 4), np.ones(10), 20.0, None, (21.0, 84.0), "°C", "1/m")
@@ -41,12 +42,40 @@ def test_the_search_comes_near_the_best_numbers_and_keeps_off_those_that_fail():
     assert NUMBERS == {"wait": 8.0, "arrival": {"hold": 0.4}}
 
 
-@pytest.mark.parametrize(("wait", "taken"), [(3.5, True), (8.0, False), (9.0, False), (2.0, False)])
-def test_numbers_that_are_not_better_in_other_sessions_are_not_taken(wait, taken):
-    found = put(NUMBERS, "wait", wait)
-    first, best = confirm(NUMBERS, found, evaluate)
+def test_numbers_may_change_together():
+    tried = []
+    search(NUMBERS, ("wait+arrival.hold",), evaluate, tried.append, rounds=1)
+    assert [(get(each.numbers, "wait"), get(each.numbers, "arrival.hold")) for each in tried] == [
+        (8.0, 0.4),
+        (pytest.approx(8.0 * FACTOR, rel=1e-3), pytest.approx(0.4 * FACTOR, rel=1e-3)),
+        (pytest.approx(8.0 / FACTOR, rel=1e-3), pytest.approx(0.4 / FACTOR, rel=1e-3)),
+    ]
+
+
+def test_the_best_in_sessions_that_the_search_has_not_seen_is_taken():
+    tried = []
+    search(NUMBERS, ("wait", "arrival.hold"), evaluate, tried.append)
+
+    def unseen(candidates):
+        # Where the best of the search fails.
+        found = evaluate(candidates)
+        best = min(found, key=lambda each: each.cost)
+        return [replace(each, cost=math.inf) if each is best else each for each in found]
+
+    first, best = confirm(tried, unseen)
     assert first.numbers is NUMBERS
-    assert best.numbers is (found if taken else NUMBERS)
+    ranked = sorted(tried, key=lambda each: each.cost)
+    assert best.numbers == ranked[1].numbers
+    assert best.cost < first.cost
+
+
+def test_the_first_numbers_stay_if_none_is_better_in_other_sessions():
+    tried = []
+    search(NUMBERS, ("wait",), evaluate, tried.append)
+    first, best = confirm(tried, lambda found: [Trial(each, get(each, "wait"), 1.0, 1.0, 1.0) for each in found[:1]])
+    assert best is first
+    worse = lambda found: [Trial(each, -get(each, "wait"), 1.0, 1.0, 1.0) for each in found]  # noqa: E731
+    assert confirm(tried, worse)[1].numbers is NUMBERS
 
 
 def test_the_cost_is_the_error_in_percent_and_the_time():
@@ -134,7 +163,7 @@ def test_a_controller_is_tuned_on_the_emulated_rig(tmp_path):
             [
                 *("tune", str(model), "--rig", "vo2", "--controller", "integral", "--rounds", "1", "--workers", "1"),
                 *("--set", "count=4", "--set", "low=500", "--set", "high=1200"),
-                *("--checks", "1", "--runs", str(tmp_path / "runs"), "--out", str(out)),
+                *("--seeds", "1", "--checks", "1", "--runs", str(tmp_path / "runs"), "--out", str(out)),
             ]
         )
     assert not stopped.value.code

@@ -39,8 +39,9 @@ from rigs.muscles.identification import (
 
 UNSEEN = 1000
 """Seed of the first session that no tuning has seen."""
-SEARCHED = ("count=20",)
-"""Settings of the runs of the search: fewer targets than in a session, for the sake of time."""
+SEARCHED, ROUNDS = ("count=20",), 1
+"""Settings and rounds of the search: fewer targets than in a session and each number changed once, for the sake of
+time."""
 LOOPS: Mapping[str, Mapping[str, Any]] = {
     "vo2": {"model": "preisach-nonmonotonic", "levels": 20, "plane": (30.0, 70.0)},
     "hybrid": {"model": "preisach", "levels": 20},
@@ -120,13 +121,11 @@ def main() -> int:
     parser.add_argument("--workers", type=int)
     parser.add_argument("--out", type=Path, help="folder that keeps models, tuning files and runs")
     given = parser.parse_args()
-    shown = Console(width=160)
+    shown, by_name = Console(width=160), {case.name: case for case in CASES}
     worse = 0
     with tempfile.TemporaryDirectory() as name:
         out = given.out or Path(name)
-        for case in CASES:
-            if given.case and case.name not in given.case:
-                continue
+        for case in CASES if given.case is None else [by_name[each] for each in given.case]:
             rig, folder = out / case.rig, out / case.name
             rig.mkdir(parents=True, exist_ok=True)
             folder.mkdir(parents=True, exist_ok=True)
@@ -134,7 +133,7 @@ def main() -> int:
             if not tuning.exists():
                 found = tune(
                     model, case.rig, controller=case.controller, protocol=case.protocol, workers=given.workers,
-                    settings=SEARCHED, folder=folder / "search", console=shown,
+                    settings=SEARCHED, seeds=1, rounds=ROUNDS, folder=folder / "search", console=shown,
                 )  # fmt: skip
                 tuning.write_text(found.text(), encoding="utf-8")
                 (folder / "numbers.json").write_text(json.dumps(found.summary()), encoding="utf-8")
