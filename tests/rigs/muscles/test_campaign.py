@@ -8,7 +8,8 @@ from bench.campaigns.tasks import MODEL_NAME
 from bench.cli import main
 from bench.model_file import load_model
 
-pytestmark = pytest.mark.usefixtures("warm_popen")
+# The runs and the identification take some 20 s.
+pytestmark = [pytest.mark.seeds, pytest.mark.usefixtures("warm_popen")]
 
 # Few points, and dwells in which the wire only just settles.
 PARTS = """
