@@ -192,7 +192,7 @@ class ResultTable:
         """Print it, with the first column aligned left and all others right."""
         table = Table(title=self.title.format_map(values), title_justify="left")
         for i, column in enumerate(self.columns):
-            table.add_column(column, justify="left" if i == 0 else "right")
+            table.add_column(column, justify="left" if i == 0 else "right", overflow="fold")
         for row in self.rows:
             table.add_row(*(cell.format_map(values) for cell in row))
         console.print(table)
@@ -200,12 +200,12 @@ class ResultTable:
             console.print(self.note.format_map(values), highlight=False)
 
     def markdown(self, values: Mapping[str, Any]) -> str:
-        """Return it as a table of a Markdown text, with title and note as paragraphs."""
+        """Return it as a table of a Markdown text, the title in bold above and the note below."""
         title = self.title.format_map(values)
         rows = [self.columns, ["---"] * len(self.columns)]
         rows += [[cell.format_map(values) for cell in row] for row in self.rows]
         table = "\n".join(f"| {' | '.join(row)} |" for row in rows)
-        return "\n\n".join(filter(None, (title[:1].upper() + title[1:] + ":", table, self.note.format_map(values))))
+        return "\n\n".join(filter(None, (f"**{title[:1].upper()}{title[1:]}**", table, self.note.format_map(values))))
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,9 @@ from bench.identification.folds import fold_numbers
 from bench.identification.least_squares import Fit, counted_weights, fit_cells
 from bench.identification.orientation import Orientation
 
+EQUAL = 1.02
+"""Ratio of errors that are no difference: of smoothing weights the greatest is taken then."""
+
 Fitted = Callable[[Floats], Fit]
 """Returns a fit with weights of the samples, shape (N,)."""
 
@@ -60,6 +63,12 @@ class CrossValidation:
     def best(self) -> Trial:
         """The trial of the least error on samples left out."""
         return min(self.trials, key=lambda trial: trial.rms)
+
+    @property
+    def smoothest(self) -> Trial:
+        """The trial of the greatest smoothing whose error does not differ from the least."""
+        near = EQUAL * self.best.rms
+        return max((trial for trial in self.trials if trial.rms <= near), key=lambda trial: trial.smoothing)
 
     def table(self) -> str:
         """Return the table as text, the best row marked."""
@@ -168,7 +177,7 @@ def choose_smoothing(
     outputs, weights : ndarray, shape (N,)
         Measured outputs, and the weight of each sample in the fit; 0 for those that do not count.
     smoothing : sequence of float
-        Weights to try; of equal errors the first is the best.
+        Weights to try.
     folds, blocks : int
         Number of folds, >= 2, and of blocks, >= folds; with fewer samples than blocks each sample is one.
 

@@ -28,6 +28,7 @@ from bench.hysteresis import ModelSpec, Operator, find_model
 from bench.hysteresis._checks import Floats
 from bench.identification.branches import turning_points
 from bench.identification.by_name import Initial
+from bench.identification.cross_validation import EQUAL
 from bench.identification.evaluation import (
     Candidate,
     Evaluation,
@@ -58,8 +59,6 @@ _NEAR = 2.0
 _GAIN = 0.98
 # Coefficients for each row up to which a finer order is tried.
 _MOST_COEFFICIENTS = 5
-# Errors this near are no difference: of smoothing weights the greatest is taken, of structures the simplest.
-_EQUAL = 1.02
 # What the simplest may err more than the best, however large the standard error.
 _WORSE = 1.05
 # Without units left out nothing bounds a density of either sign on other inputs: it has to be so much better.
@@ -390,7 +389,7 @@ class _Search:
             assert one is not None
             others = [memory for memory in self._memories[kind] if memory != one.candidate.initial]
             tries = [replace(one.candidate, initial=memory) for memory in others]
-            tasks.append((kind.model, partial(evaluate, self.measured, tries, hopeless=_EQUAL * one.rms)))
+            tasks.append((kind.model, partial(evaluate, self.measured, tries, hopeless=EQUAL * one.rms)))
         for kind, found in zip(chosen, self.carry(tasks), strict=True):
             self.done[kind] += found
 
@@ -617,7 +616,7 @@ def is_within_one_standard_error(simple: Evaluation, best: Evaluation) -> bool:
     difference = first - second
     allowed = float(np.std(difference, ddof=1) / np.sqrt(difference.size))
     if "static" in simple.candidate.options or "static" not in best.candidate.options:
-        allowed = max(allowed, (_EQUAL**2 - 1.0) * second.mean())
+        allowed = max(allowed, (EQUAL**2 - 1.0) * second.mean())
     allowed = min(allowed, (_WORSE**2 - 1.0) * second.mean())
     return bool(difference.mean() <= allowed)
 
@@ -626,7 +625,7 @@ def best_smoothing(tries: Sequence[Evaluation]) -> Evaluation:
     """Return the try of the least error; of several within 2 % of it the smoothest."""
     least = min(each.rms for each in tries)
     return max(
-        (each for each in tries if each.rms <= _EQUAL * least),
+        (each for each in tries if each.rms <= EQUAL * least),
         key=lambda each: (each.candidate.smoothing or 0.0, -each.rms),
     )
 
@@ -643,7 +642,7 @@ def _of_best_memory(tries: Sequence[Evaluation]) -> list[Evaluation]:
 def _best_memory(tries: Sequence[Evaluation]) -> Evaluation:
     """Return the try of the least error; of several within 2 % of it that of the least error in the first rows."""
     least = min(each.rms for each in tries)
-    return min((each for each in tries if each.rms <= _EQUAL * least), key=lambda each: each.start)
+    return min((each for each in tries if each.rms <= EQUAL * least), key=lambda each: each.start)
 
 
 def _score(each: Evaluation) -> Floats:

@@ -39,7 +39,7 @@ M = TypeVar("M", TwoStage, Summed, Linear)
 Kind: TypeAlias = Literal["length-voltage", "length-force"]
 Stage: TypeAlias = Operator[Any]
 Smoothing: TypeAlias = float | Sequence[float]
-"""Weight of the roughness penalty of `fit`, or several; of these that of the least error on blocks left out."""
+"""Weight of the roughness penalty of `fit`, or several to choose from by the errors on blocks left out."""
 
 # Room beyond the greatest force in a plane of forces: the pretension of a reset lowers u by as much.
 _MARGIN = 0.3
@@ -186,8 +186,8 @@ def identify_two_stage(
     pretension : float
         Force during resets, force units.
     smoothing : float or sequence of float
-        Weight of the roughness penalty, see `fit`, for both stages. Of several each stage has the one of the least
-        error on blocks of its own samples left out, see `choose_smoothing`.
+        Weight of the roughness penalty, see `fit`, for both stages. Of several each stage has the greatest of those
+        with the least error, within 2 %, on blocks of its own samples left out; see `choose_smoothing`.
     units : tuple of str
         Units of voltage, force and length of the default stages, for labels.
 
@@ -404,7 +404,7 @@ def _fit(
     if not isinstance(smoothing, Sequence):
         chosen = smoothing
     elif layout.order:
-        chosen = choose_smoothing(layout, regressor, outputs, weights, smoothing).best.smoothing
+        chosen = choose_smoothing(layout, regressor, outputs, weights, smoothing).smoothest.smoothing
     else:
         # Columns that have no place in a plane have no roughness.
         chosen = 0.0

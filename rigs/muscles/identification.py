@@ -53,7 +53,7 @@ MODELS: tuple[ModelName, ...] = ("two-stage", "two-stage-prandtl-ishlinskii", "s
 _COLD_WEIGHT = 100.0
 """Weight of the sample of the cold muscle: the second stage starts from the force there."""
 _SMOOTHING = (0.0, *SMOOTHING)
-"""Of the densities of each model: that of the least error on blocks of the characterization left out of the fit."""
+"""Of the densities of each model, chosen by the errors on blocks of the characterization left out of the fit."""
 _PLAYS = 15
 
 

@@ -389,7 +389,7 @@ def test_a_study_runs_with_several_seeds(campaign, tmp_path, monkeypatch, capsys
     assert "climbs, 3 seeds: median (least–greatest)" in said
     assert "2.0 (1.0–6.0)" in said
     written = (tmp_path / "out" / "studies.md").read_text(encoding="utf-8")
-    assert "A no:\n\n| seed | steps |\n| --- | --- |\n| 2.0 (1.0–6.0) | 2 |" in written
+    assert "**A no**\n\n| seed | steps |\n| --- | --- |\n| 2.0 (1.0–6.0) | 2 |" in written
 
 
 def test_a_killed_worker_is_replaced_and_its_run_equals_one_alone(campaign, tmp_path):
