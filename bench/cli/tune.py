@@ -38,7 +38,7 @@ def tune_(
     seeds: Annotated[int, typer.Option(min=1, max=100, help="Sessions of each run.")] = 2,
     checks: Annotated[
         int, typer.Option(min=1, max=100, help="Further sessions, in which the result has to be better as well.")
-    ] = 2,
+    ] = 4,
     rounds: Annotated[int, typer.Option(min=1, max=10, help="How often each number is changed.")] = 2,
     workers: Annotated[
         int | None, typer.Option(min=1, help="Worker processes; as many as cores if not given.")

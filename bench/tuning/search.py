@@ -126,17 +126,25 @@ def search(
     return best
 
 
-def confirm(trials: Sequence[Trial], evaluate: Evaluate) -> tuple[Trial, Trial]:
-    """Return trials of the first numbers of a search and of its best, in sessions that it has not seen.
+def confirm(trials: Sequence[Trial], sessions: Sequence[Evaluate]) -> tuple[Trial, Trial]:
+    """Return trials of the first numbers of a search and of its best, means over sessions that it has not seen.
 
     The best `FINALISTS` of the others take part, even if none was better in the search: a session may flatter the
-    first numbers as well. These are the best if no others are better here. Of trials of the same cost the first takes
-    part: a number between them plays no part for this specimen.
+    first numbers as well. Others are better if they are so in each session; if none are, the first ones are the best.
+    Of trials of the same cost the first takes part: a number between them plays no part for this specimen.
     """
     start, *others = trials
     by_cost = {each.cost: each for each in reversed(others) if math.isfinite(each.cost)}
-    found = evaluate([start.numbers, *(by_cost[cost].numbers for cost in sorted(by_cost)[:FINALISTS])])
-    return found[0], min(found, key=lambda each: each.cost)
+    numbers = [start.numbers, *(by_cost[cost].numbers for cost in sorted(by_cost)[:FINALISTS])]
+    first, *found = zip(*(evaluate(numbers) for evaluate in sessions), strict=True)
+    better = [each for each in found if all(a.cost < b.cost for a, b in zip(each, first, strict=True))]
+    before, *after = map(_mean, [first, *better])
+    return before, min(after, key=lambda each: each.cost, default=before)
+
+
+def _mean(trials: Sequence[Trial]) -> Trial:
+    values = [(each.cost, each.rms, each.seconds, each.worst) for each in trials]
+    return Trial(trials[0].numbers, *(sum(each) / len(trials) for each in zip(*values, strict=True)))
 
 
 def multiplied(numbers: Numbers, name: str, factor: float) -> Numbers:

@@ -78,7 +78,7 @@ def tune(
     protocol: str | None = None,
     settings: Sequence[str] = (),
     seeds: int = 2,
-    checks: int = 2,
+    checks: int = 4,
     rounds: int = 2,
     workers: int | None = None,
     folder: Path = Path("recordings/tuning"),
@@ -86,8 +86,8 @@ def tune(
 ) -> Tuned:
     """Tune a controller; parameters as the options of `bench tune`.
 
-    Of the best numbers of the search those are taken that are best in sessions that it has not seen, and better there
-    than the first ones.
+    Of the best numbers of the search those are taken that are best in sessions that it has not seen, and better than
+    the first ones in each.
 
     Raises
     ------
@@ -136,7 +136,10 @@ def tune(
         best = search(begin, spec.tunable, runs, tell, rounds)
         if not math.isfinite(best.cost):
             raise BenchError(f"the controller fails with all numbers that were tried: {runs.failures[0]}")
-        unseen = TuningRuns(task, on, file, folder / "check", pool, given, checks, first_seed=seeds)
+        unseen = [
+            TuningRuns(task, on, file, folder / f"check-{seed}", pool, given, first_seed=seed)
+            for seed in range(seeds, seeds + checks)
+        ]
         first, best = confirm(trials, unseen)
     provenance: dict[str, str | float] = {
         "model": model.name,

@@ -62,7 +62,7 @@ def test_the_best_in_sessions_that_the_search_has_not_seen_is_taken():
         best = min(found, key=lambda each: each.cost)
         return [replace(each, cost=math.inf) if each is best else each for each in found]
 
-    first, best = confirm(tried, unseen)
+    first, best = confirm(tried, [evaluate, unseen])
     assert first.numbers is NUMBERS
     ranked = sorted(tried, key=lambda each: each.cost)
     assert best.numbers == ranked[1].numbers
@@ -72,10 +72,14 @@ def test_the_best_in_sessions_that_the_search_has_not_seen_is_taken():
 def test_the_first_numbers_stay_if_none_is_better_in_other_sessions():
     tried = []
     search(NUMBERS, ("wait",), evaluate, tried.append)
-    first, best = confirm(tried, lambda found: [Trial(each, get(each, "wait"), 1.0, 1.0, 1.0) for each in found[:1]])
+
+    def unseen(candidates):
+        return [Trial(each, 0.9 if each is NUMBERS else 1.0, 1.0, 1.0, 1.0) for each in candidates]
+
+    first, best = confirm(tried, [evaluate, evaluate, unseen])
     assert best is first
-    worse = lambda found: [Trial(each, -get(each, "wait"), 1.0, 1.0, 1.0) for each in found]  # noqa: E731
-    assert confirm(tried, worse)[1].numbers is NUMBERS
+    assert first.numbers is NUMBERS
+    assert confirm(tried, [evaluate, evaluate])[1].cost < first.cost
 
 
 def test_the_cost_is_the_error_in_percent_and_the_time():
