@@ -29,7 +29,7 @@ by more does not do what it is for."""
 _TOLERANCE = 0.02
 """Part of the range within which the model alone is not taken for better."""
 _WARNED = 0.01
-"""The same part from which on there is a warning at targets."""
+"""The same part from which on there is a warning."""
 _MOVING = 1.5
 """How much more a model may err where the reference moves: the actuator's lag is no part of its error at rest."""
 _SWINGS = MOST_SWINGS - 2
@@ -138,7 +138,7 @@ class _Supervision:
             self._give_up(known)
         elif part > HOLDS and self._strict and self._fallback is None:
             self._give_up(text if math.isnan(without) else known)
-        elif part > (_WARNED if self._strict else _TOLERANCE) and not self._warned:
+        elif part > _WARNED and not self._warned:
             self._notice, self._warned = f"the controller leaves an error: {text}", True
 
     def _give_up(self, why: str) -> None:
@@ -226,9 +226,9 @@ class Supervised(_Supervision):
 class SupervisedFollower(_Supervision):
     """A follower that is given up where it errs by more than its model, and more than by chance: a `Follower`.
 
-    That is judged from 2 % of the range on, where there is a warning. One without feedback is given up where its
-    model does not hold. Samples at which the reference stands, as on the way to its beginning, or cannot be met, do
-    not count. Parameters as `_Supervision`.
+    That is judged from 2 % of the range on; from 1 % on there is a warning. One without feedback is given up where
+    its model does not hold. Samples at which the reference stands, as on the way to its beginning, or cannot be met,
+    do not count. Parameters as `_Supervision`.
     """
 
     _window = SAMPLES
