@@ -63,7 +63,13 @@ class Catalogue:
         packages |= {name: package for name, package in packaged.packages.items() if package != registry.OWN_PACKAGE}
         models = identifiable_models() | timed_models()
         # Not listed by themselves; what another package cannot load is named all the same.
-        groups: tuple[registry.Group, ...] = ("devices", "laboratories", "derived_signals", "commands")
+        groups: tuple[registry.Group, ...] = (
+            "devices",
+            "laboratories",
+            "derived_signals",
+            "identifications",
+            "commands",
+        )
         for group in groups:
             foreign = {name: entry for name, entry in registry.entries(group).items() if not entry.own}
             loaded(foreign, lambda _, entry: entry.load())

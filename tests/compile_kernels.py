@@ -111,10 +111,10 @@ def timed() -> None:
 
 
 def laboratories() -> None:
-    """Open each: it compiles its loops."""
+    """Open each, which compiles its loops, and read it once, as single readings have loops of their own."""
     for rig in ("vo2", "sma", "mckibben", "coiled-polymer", "hybrid"):
-        with bench.open_rig(rig):
-            pass
+        with bench.open_rig(rig) as opened:
+            opened.glance()
 
 
 if __name__ == "__main__":

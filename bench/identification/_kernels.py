@@ -210,14 +210,12 @@ def crests(g: Floats, threshold: float, neighbours: Integers) -> Flags:
 
 
 @njit(cache=True)
-def gathered(matrix: Floats, rows: Integers, columns: Integers) -> Floats:
-    """Return matrix[rows][:, columns]; several times as fast."""
-    result = np.empty((rows.size, columns.size))
+def gather(matrix: Floats, rows: Integers, columns: Integers, result: Floats) -> None:
+    """Fill the upper left of `result` with matrix[rows][:, columns]; several times as fast, and without a copy."""
     for i in range(rows.size):
         row = matrix[rows[i]]
         for j in range(columns.size):
             result[i, j] = row[columns[j]]
-    return result
 
 
 @njit(cache=True)

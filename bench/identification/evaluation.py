@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,8 @@ _LEAST_MOVE = 0.005
 _LEAST_CYCLE = 0.02
 # Rank of the regressor by coefficients, from which the data determine a model.
 _DETERMINED = 0.9
+# Part of the travel of an output on smaller cycles that may be against the input's beyond what the record's is.
+_RETREAT = 0.01
 
 
 @dataclass(frozen=True)
@@ -146,6 +149,8 @@ class Evaluation:
         Why it could not be evaluated.
     determined : bool
         Whether the rows determine all coefficients; known only where there is one kind of cycle.
+    follows : bool
+        Whether the output follows the input on smaller cycles as on the record; known only there.
     """
 
     candidate: Candidate
@@ -157,6 +162,7 @@ class Evaluation:
     seconds: float = 0.0
     failure: str = ""
     determined: bool = True
+    follows: bool = True
 
     @property
     def rms(self) -> float:
@@ -230,14 +236,46 @@ def _evaluate(
 
 
 def judge_determined(measured: Measurements, evaluated: Evaluation) -> list[Evaluation]:
-    """Return an evaluation with whether the rows tested determine its coefficients: nine tenths of them or more.
+    """Return an evaluation with whether the rows determine its coefficients, and its output follows smaller cycles.
 
-    Signs and penalties, which choose among what fits alike, are left out of account.
+    The rank must be nine tenths of the coefficients or more; signs and penalties, which choose among what fits alike,
+    are left out of account. A model without signs must follow the input on smaller cycles as it does on the record:
+    the output moves the other way by no more of its travel.
     """
     trial = _Trial(measured, evaluated.candidate)
-    found = resolve(trial.problem.regressor, measured.tested.astype(np.float64), trial.problem.skip)
-    count = trial.problem.regressor.shape[1]
-    return [replace(evaluated, determined=found is None or found.rank >= _DETERMINED * count)]
+    problem = trial.problem
+    found = resolve(problem.regressor, measured.tested.astype(np.float64), problem.skip)
+    count = problem.regressor.shape[1]
+    determined = found is None or found.rank >= _DETERMINED * count
+    follows = True
+    if evaluated.candidate.orientation == "auto" and not problem.template.memoryless:
+        fit = trial.fit(problem)
+        model = problem.template.with_coefficients(fit.coefficients, fit.bias)
+        fitted = model.evaluate(measured.inputs, problem.state)[measured.tested]
+        cycles = _smaller_cycles(measured.inputs)
+        after = model.evaluate(cycles, model.advance(problem.state, measured.inputs))
+        follows = _retreat(cycles, after) <= _retreat(measured.inputs[measured.tested], fitted) + _RETREAT
+    return [replace(evaluated, determined=determined, follows=follows)]
+
+
+def _smaller_cycles(inputs: Floats) -> Floats:
+    """Return cycles of a half, a quarter and an eighth of the range about several inputs, on either branch."""
+    low, high = float(inputs.min()), float(inputs.max())
+    ends = []
+    for part in (0.5, 0.25, 0.125):
+        for middle in np.linspace(low, high, 5)[1:-1]:
+            reach = 0.5 * part * (high - low)
+            for beyond in (low, high):
+                ends += [beyond, *[max(middle - reach, low), min(middle + reach, high)] * 2]
+    steps = [np.linspace(a, b, 21)[1:] for a, b in pairwise([float(inputs[-1]), *ends])]
+    return np.concatenate(steps)
+
+
+def _retreat(inputs: Floats, outputs: Floats) -> float:
+    """Return how far the output moves against the input, or with it if that is less, as a part of all its travel."""
+    moves = np.diff(outputs) * np.sign(np.diff(inputs))
+    against, along = float(-moves[moves < 0.0].sum()), float(moves[moves > 0.0].sum())
+    return min(against, along) / max(against + along, 1e-300)
 
 
 def residuals_of(measured: Measurements, candidate: Candidate) -> Floats:

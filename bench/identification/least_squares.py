@@ -418,13 +418,15 @@ class _ActiveSet:
 
     def _make_room(self, columns: Indices, more: int) -> None:
         """Make room for Gram entries of more columns; if many are neither passive nor asked for, forget those."""
+        from bench.identification import _kernels
+
         asked = columns[self.place[columns] >= 0]
         needed = np.union1d(self.passive, asked)
         stay = needed if needed.size < 0.9 * self.known.size else self.known
         room = stay.size + more
         room += room // 4
         grown = np.zeros((room, room))
-        grown[: stay.size, : stay.size] = self.products_of(stay, stay)
+        _kernels.gather(self.gram, self.place[stay], self.place[stay], grown)
         self.gram, self.known = grown, stay
         self.place[:] = -1
         self.place[stay] = np.arange(stay.size)
@@ -433,7 +435,9 @@ class _ActiveSet:
         """Return the Gram entries of two sets of known columns."""
         from bench.identification import _kernels
 
-        return np.asarray(_kernels.gathered(self.gram, self.place[first], self.place[second]))
+        result = np.empty((first.size, second.size))
+        _kernels.gather(self.gram, self.place[first], self.place[second], result)
+        return result
 
     def enter(self, columns: Indices) -> Indices:
         """Add columns to the passive set; return those left out because they depend on it."""

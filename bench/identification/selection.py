@@ -66,6 +66,8 @@ _WORSE = 1.05
 _UNBOUNDED = 1.2
 # Of one kind of cycle, what the record leaves open of a model is tested by nothing: it has to be so much better.
 _UNDETERMINED = 2.0
+# Part of their coefficients that a model may have which signs do not bound.
+_FEWER = 2.0 / 3.0
 # Part of the variance of the errors that a trend over the rows must be, to be no chance of neighbouring errors.
 _DRIFTS, _FEWEST_OF_TREND = 0.15, 100
 # Turns of the input that say nothing of its minor loops, and moves that are none.
@@ -133,6 +135,8 @@ class Selection:
         How often the input turns back, by 2 % of its range or more.
     trend : Trend or None
         That of the errors of the chosen model, if it is one without time.
+    has_one_rate : bool
+        Whether times are known and the input moves at one speed only.
     """
 
     evaluations: tuple[Evaluation, ...]
@@ -144,6 +148,7 @@ class Selection:
     has_one_kind: bool = False
     reversals: int | None = None
     trend: Trend | None = None
+    has_one_rate: bool = False
 
     def warnings(self) -> list[str]:
         """Return what the held-out errors say against the chosen model, in sentences."""
@@ -160,6 +165,11 @@ class Selection:
                 f"the errors drift by {part:.1f} % of the range from the first to the last row "
                 f"({self.trend.share:.0%} of their variance): give --time COLUMN, so that models with drift and "
                 "creep take part"
+            )
+        if self.has_one_rate:
+            found.append(
+                "the input always moves at about one speed, at which a lag can hardly be told from hysteresis: "
+                "errors at other rates are unknown; record slower and faster cycles"
             )
         if not chosen.units and self.has_one_kind:
             found.append(
@@ -185,6 +195,9 @@ class InTime(Protocol):
 
     def is_small(self, coefficients: int) -> bool:
         """Return whether an operator of so many coefficients can be evaluated in seconds."""
+
+    def has_one_rate(self) -> bool:
+        """Return whether the input moves at one speed only."""
 
     def evaluate(self, static: Candidate, gap: int) -> list[Evaluation]:
         """Return the errors of a model with time with a candidate's operator; none if time tells nothing."""
@@ -251,6 +264,7 @@ class _Search:
         self.done: dict[_Kind, list[Evaluation]] = {kind: [] for kind in self.kinds}
         self.given_up: list[Evaluation] = []
         self._has_plane: dict[_Kind, bool] = {}
+        self._with_shape: set[str] = set()
         self._has_one_kind = has_one_kind(measured.inputs, measured.tested)
         turns = turning_points(measured.inputs, _LEAST_MOVE * float(np.ptp(measured.inputs)))
         self._reversals = max(turns.size - 2, 0)
@@ -362,9 +376,14 @@ class _Search:
         ]
 
     def remember(self) -> None:
-        """Try the other initial memories on the best, which were compared at the coarsest order only."""
+        """Try the other initial memories on the best, which were compared at the coarsest order only.
+
+        Of models with a shape not all were; of these they are tried on all near the best.
+        """
         best = sorted((each.rms, self.kinds.index(kind)) for kind in self.kinds if (each := self._best(kind)))
         chosen = [self.kinds[index] for _, index in best[:_REMEMBERED]]
+        near = [self.kinds[index] for rms, index in best[_REMEMBERED:] if rms <= _NEAR * best[0][0]]
+        chosen += [kind for kind in near if kind.model in self._with_shape]
         tasks = []
         for kind in chosen:
             one = self._best(kind)
@@ -420,6 +439,7 @@ class _Search:
             replace(
                 each,
                 determined=best[each.candidate.options["static"]].determined,
+                follows=best[each.candidate.options["static"]].follows,
                 units=each.units if units else (),
             )
             for each in found
@@ -451,6 +471,7 @@ class _Search:
             self._has_one_kind,
             self._reversals,
             self._trend(chosen) if "static" not in chosen.candidate.options else None,
+            self.in_time is not None and self.in_time.has_one_rate(),
         )
 
     def _decide(self, finalists: list[Evaluation]) -> tuple[Evaluation, Evaluation]:
@@ -472,8 +493,8 @@ class _Search:
         """Return the finalists that may be chosen where no cycles could be left out.
 
         Of one kind of cycle, these are what the record determines and signs bound, else what it determines, unless
-        they err many times more. A differential equation, which has no signs, must take fewer coefficients than what
-        would be chosen of these.
+        they err many times more. A differential equation, which has no signs, must follow smaller cycles and take
+        clearly fewer coefficients than what would be chosen of these.
         """
         least = min(each.rms for each in finalists)
         determined = [each for each in finalists if each.determined and each.rms <= _UNDETERMINED * least]
@@ -484,17 +505,13 @@ class _Search:
             return determined
         simplest = _simplest_near_best(bounded)[1]
         return bounded + [
-            each for each in determined if each not in bounded and each.free < simplest.free and self._has_shape(each)
+            each
+            for each in determined
+            if each not in bounded
+            and each.follows
+            and each.free <= _FEWER * simplest.free
+            and each.candidate.options.get("static", each.candidate.model) in self._with_shape
         ]
-
-    def _has_shape(self, each: Evaluation) -> bool:
-        """Return whether shape parameters say how the output answers, not coefficients alone."""
-        options = {
-            name: value for name, value in each.candidate.options.items() if name not in ("static", "dynamics")
-        }
-        template = find_model(each.candidate.options.get("static", each.candidate.model)).template
-        assert template is not None
-        return bool(template(self.measured.inputs, **options).shape_parameters().names)
 
     def _is_bounded(self, each: Evaluation) -> bool:
         """Return whether signs bound the answer to other inputs, or it has no memory."""
@@ -557,9 +574,11 @@ class _Search:
             estimated: tuple[Initial, ...] = ("estimate",) if spec.estimate_state is not None else ()
             memories = (None, "positive", *estimated, "skip") if self.given.initial is None else (self.given.initial,)
         self._memories[kind] = memories
-        if template.shape_parameters().names and self.given.initial is None:
-            # Each set-up is a search for the shape; the others are tried on the best only.
-            memories = (None, "skip")
+        if template.shape_parameters().names:
+            self._with_shape.add(kind.model)
+            if self.given.initial is None:
+                # Each set-up is a search for the shape; the others are tried on those near the best only.
+                memories = (None, "skip")
         weight: float | None = 0.0
         if self._has_plane[kind]:
             weight = 0.0 if self.given.smoothing is None and spec.constrained else self.given.smoothing

@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from bench.hysteresis._checks import Floats
+from bench.identification.branches import turning_points
 from bench.identification.evaluation import Candidate, Evaluation, Measurements
 from bench.identification.folds import Fold
 from bench.identification.least_squares import one_thread
@@ -17,6 +18,8 @@ from bench.timed.hammerstein_fit import choose_elements, set_up_search
 
 # Rows times coefficients of the operator up to which the choice of what follows it takes seconds.
 _MOST = 2_000_000
+# Moves from this part of the range on have a speed.
+_LEAST_MOVE = 0.02
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,6 +43,14 @@ class HeldOutInTime:
     def is_small(self, coefficients: int) -> bool:
         """Return whether an operator of so many coefficients can be evaluated in seconds."""
         return coefficients * self.times.size <= _MOST
+
+    def has_one_rate(self) -> bool:
+        """Return whether most moves from one turning point to the next are alike in speed, to a factor of two."""
+        inputs = self.measured.inputs
+        turns = turning_points(inputs, _LEAST_MOVE * float(np.ptp(inputs)))
+        speeds = np.abs(np.diff(inputs[turns])) / np.diff(self.times[turns])
+        slow, fast = np.quantile(speeds, (0.1, 0.9))
+        return bool(fast <= 2.0 * slow)
 
     def evaluate(self, static: Candidate, gap: int) -> list[Evaluation]:
         """Return the errors of a Hammerstein model with a candidate's operator; none if nothing need follow it.

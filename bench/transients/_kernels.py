@@ -138,7 +138,7 @@ def lag_behind(outputs: Floats, step: float, times: Floats, late: Floats) -> Non
 
 
 @njit(cache=True)
-def hold(changes: Floats, levels: Floats, step: float, means: Floats) -> None:
+def step_means(changes: Floats, levels: Floats, step: float, means: Floats) -> None:
     """Write the mean of a quantity over each step of a grid of time to `means`.
 
     It is `levels[0]` at first and `levels[i + 1]` from `changes[i]` on, s.
@@ -160,9 +160,9 @@ def hold(changes: Floats, levels: Floats, step: float, means: Floats) -> None:
 def find_holds(
     changes: Floats, levels: Floats, step: float, count: int, starts: NDArray[np.int64], means: Floats
 ) -> int:
-    """Find the steps of a grid over which the mean of a quantity, as for `hold`, is the same; return their number.
+    """Find between which of `count` steps of a grid the mean of a quantity changes; return how often it stands.
 
-    It is `means[i]` from step `starts[i]` on; of `count` steps.
+    It is `means[i]` from step `starts[i]` on. The quantity is given as for `step_means`.
     """
     found, at, k = 0, 0, 0
     while k < count:

@@ -113,7 +113,7 @@ class Recording:
         Before the first change it is `initial`.
         """
         means = np.empty(_steps_until(end, step))
-        _kernels.hold(self.changes, np.append(initial, self.setpoints), step, means)
+        _kernels.step_means(self.changes, np.append(initial, self.setpoints), step, means)
         return means
 
     def holds(self, step: float, initial: float, end: float) -> tuple[NDArray[np.int64], Floats]:

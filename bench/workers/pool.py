@@ -20,7 +20,7 @@ from rich.console import Console
 from bench.errors import AbortError, BenchError
 from bench.workers.display import TasksDisplay
 from bench.workers.messages import Order, Progress, Result, Welcome, Words, receive, send
-from bench.workers.task import task_surroundings
+from bench.workers.task import collecting_seldom, task_surroundings
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -136,6 +136,7 @@ class Workers:
                     former = signal.signal(getattr(signal, name), self._interrupt)
                     self._stack.callback(signal.signal, getattr(signal, name), former)
         self._stack.enter_context(_one_thread())
+        self._stack.enter_context(collecting_seldom())
         if self.in_process:
             self._stack.enter_context(task_surroundings(self._console, None))
         else:

@@ -17,7 +17,7 @@ from rich.console import Console
 
 from bench.errors import BenchError
 from bench.workers.messages import Message, Order, Progress, Result, Welcome, Words, receive, send
-from bench.workers.task import task_surroundings
+from bench.workers.task import collecting_seldom, task_surroundings
 
 
 def main() -> None:
@@ -32,7 +32,7 @@ def main() -> None:
     sys.argv = welcome.command
     threading.Thread(target=_listen, args=(orders, inbox), name="orders", daemon=True).start()
     console = Console(file=_Speaker(outbox), width=welcome.width, force_terminal=False)
-    with task_surroundings(console, lambda *how_far: outbox.put(Progress(*how_far))):
+    with collecting_seldom(), task_surroundings(console, lambda *how_far: outbox.put(Progress(*how_far))):
         while (order := inbox.get()) is not None:
             outbox.put(_carry_out(order))
 

@@ -12,9 +12,11 @@ from rich.console import Console
 Report = Callable[[int, int | None, str], None]
 
 _COLLECTIONS = 100_000, 20, 50
-"""Thresholds of the garbage collection during tasks, see `gc.set_threshold`. A task loads hundreds of thousands of
-objects that stay, and makes rows by the thousand that are no garbage: with Python's own thresholds, looking through
-them takes a quarter of the time of an export."""
+"""Thresholds of the garbage collection, see `gc.set_threshold`.
+
+A task loads hundreds of thousands of objects that stay, and makes rows by the thousand that are no garbage. With
+Python's own thresholds, looking through them takes a quarter of the time of an export.
+"""
 
 
 @dataclass(frozen=True)
@@ -31,13 +33,21 @@ def task_surroundings(console: Console, report: Report | None) -> Iterator[None]
     """Let tasks of this process print on a console and report; without `report` they draw their own progress."""
     global _surroundings
     former, _surroundings = _surroundings, _Surroundings(console, report)
-    thresholds = gc.get_threshold()
+    try:
+        yield
+    finally:
+        _surroundings = former
+
+
+@contextmanager
+def collecting_seldom() -> Iterator[None]:
+    """Look for garbage seldom."""
+    former = gc.get_threshold()
     gc.set_threshold(*_COLLECTIONS)
     try:
         yield
     finally:
-        gc.set_threshold(*thresholds)
-        _surroundings = former
+        gc.set_threshold(*former)
 
 
 def task_console() -> Console:

@@ -87,9 +87,10 @@ class _Preview:
         """Return the smoothed reference now (m), and ahead (m) with its derivative (m/s)."""
         values, width, begin = self._values, self._width, self._begin
         end = begin + self._known
-        now = float(self._weights @ values[begin : begin + width])
+        # As a product by `@`, in half the time.
+        now = float(self._weights.dot(values[begin : begin + width]))
         window = values[end - width : end]
-        ahead, rate = float(self._weights @ window), float(self._slopes @ window)
+        ahead, rate = float(self._weights.dot(window)), float(self._slopes.dot(window))
         if end == len(values):
             values[: self._known] = values[begin:]
             begin, end = 0, self._known
@@ -183,6 +184,7 @@ class _MidRanging:
         # What the piezo part was asked for, as far back as readings are late, the last one first.
         whole, self._late_part = divmod(parameters.samples_late, 1.0)
         self._late_whole = int(whole)
+        self._is_late = parameters.lateness > 0.0
         self._asked = deque([0.0], maxlen=2 + self._late_whole)
         self._fed_back = 0.0
         self._start = math.nan
@@ -246,7 +248,7 @@ class _MidRanging:
         deflection, base, tip = measured
         complete = math.isfinite(deflection + base + tip)
         if complete:
-            piezo = self._seen_piezo()
+            piezo = self._seen_piezo() if self._is_late else self._asked[0]
             if math.isnan(self._start):
                 self._begin(t, deflection - piezo, base, tip)
             self._base, self._tip = base - self._celsius, tip - self._celsius

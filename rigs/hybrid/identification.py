@@ -173,7 +173,15 @@ def bandwidth_of(frequencies: Floats, gains: Floats) -> float:
     )
 
 
-def identify_hybrid(steps: Path, static: Path, loops: Path, step: Path, *, plays: int = 15) -> HybridIdentification:
+def identify_hybrid(
+    steps: Path,
+    static: Path,
+    loops: Path,
+    step: Path,
+    *,
+    plays: int = 15,
+    network: NetworkIdentification | None = None,
+) -> HybridIdentification:
     """Return the model of a hybrid from its four runs.
 
     Parameters
@@ -182,6 +190,8 @@ def identify_hybrid(steps: Path, static: Path, loops: Path, step: Path, *, plays
         Runs of `current-steps`, `thermomechanical`, `piezo-loops` and `piezo-step`.
     plays : int
         Number of play operators.
+    network : NetworkIdentification, optional
+        What `network_of` the first run gives, if it is known already.
 
     Raises
     ------
@@ -189,17 +199,14 @@ def identify_hybrid(steps: Path, static: Path, loops: Path, step: Path, *, plays
         If a run is of another kind or was not completed, or a part cannot be identified.
     """
     for run, protocol in zip((steps, static, loops, step), PROTOCOLS, strict=True):
-        with Record(run) as record:
-            if record.meta.get("protocol") != protocol:
-                raise DataError(f"{run}: is a run of {record.meta.get('protocol')}; expected one of {protocol}")
-    currents = read_loop(steps)
+        _check_protocol(run, protocol)
     with Record(static) as record:
         if record.status != "completed":
             raise DataError(f"{static}: the run is {record.status}; a model needs a completed one")
         curve, names = record.steps(), signal_names(record)
     fast = read_loop(step)
+    network = network_of(steps) if network is None else network
     try:
-        network = identify_network(currents[CURRENT], currents[BASE], currents[TIP], currents.period)
         rises, deflections = curve[names[TIP]] - REFERENCE, curve[names[DEFLECTION]]
         order = choose_order(rises, deflections)
         polynomial = identify_polynomial(rises, deflections, order.order)
@@ -207,8 +214,28 @@ def identify_hybrid(steps: Path, static: Path, loops: Path, step: Path, *, plays
         dynamics = identify_dynamics(fast[VOLTAGE], fast[DEFLECTION], fast.period)
         model = HybridModel(network.network, polynomial.model, piezo.operator, dynamics.model, REFERENCE)
     except ValueError as error:
-        raise DataError(f"the hybrid cannot be identified: {error}") from error
+        raise _unidentified(error) from error
     return HybridIdentification(model, network, order, polynomial, piezo, dynamics)
+
+
+def network_of(steps: Path) -> NetworkIdentification:
+    """Return the thermal network of a run of `current-steps`; raises DataError as `identify_hybrid`."""
+    _check_protocol(steps, PROTOCOLS[0])
+    currents = read_loop(steps)
+    try:
+        return identify_network(currents[CURRENT], currents[BASE], currents[TIP], currents.period)
+    except ValueError as error:
+        raise _unidentified(error) from error
+
+
+def _check_protocol(run: Path, protocol: str) -> None:
+    with Record(run) as record:
+        if record.meta.get("protocol") != protocol:
+            raise DataError(f"{run}: is a run of {record.meta.get('protocol')}; expected one of {protocol}")
+
+
+def _unidentified(error: ValueError) -> DataError:
+    return DataError(f"the hybrid cannot be identified: {error}")
 
 
 def hybrid_file(found: HybridIdentification, runs: Sequence[Path]) -> ModelFile:

@@ -54,9 +54,9 @@ class SensorScan:
         faults: Sequence[FaultySensor],
         is_free: Callable[[], bool],
     ) -> None:
-        self._plant = plant
+        self._plant, self._plant_numbers = plant, plant.numbers
         self._base, self._tip = base, tip
-        self._faults = tuple(faults)
+        self._faults = faults
         self._is_free = is_free
         own = (
             (displacement.noise, displacement.resolution, displacement.reach, displacement.volts_per_metre),
@@ -74,16 +74,17 @@ class SensorScan:
     def __call__(self, scales: Floats, draw: Callable[[], float]) -> tuple[float, ...] | None:
         """Return a reading of each input, V; None if a fault asks for single ones."""
         base, tip = self._base, self._tip
-        for sensor in self._faults:
-            if not sensor.is_whole:
-                return None
-        if not self._is_free() or base.open or base.shorted or tip.open or tip.shorted:
+        first, second, third = self._faults
+        if not (first.is_whole and second.is_whole and third.is_whole and self._is_free()):
+            return None
+        if base.open or base.shorted or tip.open or tip.shorted:
             return None
         draw_displacement, draw_base, draw_tip = self._draws
-        plant = self._plant
+        fraction, elapsed = self._plant.moment()
         readings: tuple[float, ...] = kernels.scan(
-            *plant.moment(),
-            plant.numbers,
+            fraction,
+            elapsed,
+            self._plant_numbers,
             self._numbers,
             scales,
             base.excitation_volts,

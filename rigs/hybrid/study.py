@@ -43,6 +43,7 @@ from rigs.hybrid.identification import (
     bandwidth_of,
     hybrid_file,
     identify_hybrid,
+    network_of,
     read_loop,
     read_loops,
     signal_names,
@@ -242,8 +243,9 @@ def _carry_out(campaign: Campaign) -> StudyResult:
     ]
     # Identified beside the runs that it does not need.
     _, steps, static, loops, step, _, _ = started
+    network = network_of(steps.result().folder)
     sources = [run.result().folder for run in (steps, static, loops, step)]
-    found = identify_hybrid(*sources)
+    found = identify_hybrid(*sources, network=network)
     model = campaign.folder / "hybrid.json"
     hybrid_file(found, sources).save(model)
 

@@ -128,7 +128,10 @@ def carry_out(campaign: Campaign) -> StudyResult:
     The values are errors in percent of the range by `fv`, `lv`, `lf` and `verification`, and those of `control` in
     `units`. Raises BenchError if a run did not complete; its record is kept.
     """
-    measured = characterize(campaign, start_runs(campaign))
+    characterizing = start_runs(campaign)
+    # Loaded while they run.
+    truth = true_quantities(campaign.rig)
+    measured = characterize(campaign, characterizing)
     common = {"model": str(campaign.folder / "two-stage.json"), "sequence_seed": str(campaign.seed + 1)}
     runs = {
         key: {
@@ -148,7 +151,6 @@ def carry_out(campaign: Campaign) -> StudyResult:
         for key, entry in runs.items()
     }
     figures += _draw_control(campaign, reached)
-    truth = true_quantities(campaign.rig)
     measured.keep_model(campaign)
     return StudyResult(
         {

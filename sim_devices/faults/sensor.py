@@ -28,6 +28,11 @@ class FaultySensor:
     seed : sequence of int
         Seed of the noise of a noisy sensor.
 
+    Attributes
+    ----------
+    is_whole : bool
+        Whether it sees the quantity as it is.
+
     Notes
     -----
     Without a fault it draws nothing, so that a run without faults is the same to the last digit.
@@ -51,18 +56,13 @@ class FaultySensor:
         self._scale = scale
         self._beyond = beyond
         self._normals = normals(np.random.default_rng(seed))
-        self._is_whole = True
+        self.is_whole = True
         self._stuck = self._elsewhere = math.nan
         self._noise = self._slope = self._since = 0.0
 
     def __call__(self) -> float:
         """Return what the sensor sees at this instant, without its own noise."""
-        return self._quantity() if self._is_whole else self._disturbed()
-
-    @property
-    def is_whole(self) -> bool:
-        """Whether it sees the quantity as it is."""
-        return self._is_whole
+        return self._quantity() if self.is_whole else self._disturbed()
 
     def faults(self) -> dict[str, Fault]:
         """Return what can be wrong with it, by `NAME.FAULT`."""
@@ -92,7 +92,7 @@ class FaultySensor:
         return value + self._noise * next(self._normals) if self._noise else value
 
     def _look(self) -> None:
-        self._is_whole = (
+        self.is_whole = (
             math.isnan(self._stuck) and math.isnan(self._elsewhere) and not self._noise and not self._slope
         )
 

@@ -15,5 +15,5 @@ NOISE, STEP, LOWEST, HIGHEST = range(4)
 def converted(volts: float, normal: float, scale: Floats) -> float:
     """Return the reading (V) of a voltage (V), with a number of the standard normal distribution as its noise."""
     # A sum with zero makes zero of minus zero.
-    reading = np.round((volts + scale[NOISE] * normal) / scale[STEP]) * scale[STEP] + 0.0
-    return min(max(reading, scale[LOWEST]), scale[HIGHEST])
+    reading = float(np.round((volts + scale[NOISE] * normal) / scale[STEP])) * scale[STEP] + 0.0
+    return float(min(max(reading, scale[LOWEST]), scale[HIGHEST]))

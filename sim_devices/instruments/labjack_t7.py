@@ -368,8 +368,11 @@ class EmulatedT7(LineFaults, RegisterInstrument):
             raise
 
     def _end(self, error: BaseException | None) -> None:
+        if error is None and not self._touched:
+            self.world.lock.release()
+            return
         try:
-            if error is not None and isinstance(error, RegisterError):
+            if isinstance(error, RegisterError):
                 self._last_error = error.detail if isinstance(error, _DetailedError) else 0
             if self._touched:
                 self._lead()

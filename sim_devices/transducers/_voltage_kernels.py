@@ -13,7 +13,7 @@ _KELVIN = 273.15
 @njit(cache=True)
 def displacement_volts(metres: float, resolution: float, reach: float, volts_per_metre: float) -> float:
     """Return the output (V) of a displacement sensor with steps (m) that stays where it is beyond its reach (m)."""
-    shown = np.round(metres / resolution) * resolution
+    shown = float(np.round(metres / resolution)) * resolution
     return volts_per_metre * min(max(shown, -reach), reach)
 
 

@@ -54,11 +54,6 @@ class Thermistor:
         self.circuit = self.reference_ohms, a, c, (b / (3 * c)) ** 3
         """Reference resistor (Ω), A and C (1/K), and (B / 3C)³."""
 
-    @property
-    def is_whole(self) -> bool:
-        """Whether it is neither open nor shorted."""
-        return not (self.open or self.shorted)
-
     def divider(self) -> float:
         """Return the voltage in V at the input of the divider at this instant."""
         if self.shorted:

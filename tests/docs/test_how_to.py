@@ -30,7 +30,7 @@ LONG = {
     "sma",
     "vo2",
 }
-"""More than five seconds each; of these `make test` looks at the commands only (`test_readme.py`)."""
+"""Some seconds each; of these `make test` looks at the commands only (`test_readme.py`)."""
 BLOCK = re.compile(r"^```(\w+)(?: file: (\S+))?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 
 

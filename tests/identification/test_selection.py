@@ -4,11 +4,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hysteretic_plants import duhem, random_reversals, settled
+from hysteretic_plants import bouc_wen, duhem, random_reversals, settled, through
 
 from bench.hysteresis import ModelSpec, Polynomial, PrandtlIshlinskii, Preisach, models, uniform_levels
 from bench.identification.evaluation import Candidate, Evaluation, Measurements, evaluate
 from bench.identification.selection import Given, best_smoothing, is_within_one_standard_error, select
+from bench.timed.held_out import HeldOutInTime
 
 INPUTS = random_reversals(np.random.default_rng(1), 400, 30)
 NAMES = ("polynomial", "polynomial-plays", "prandtl-ishlinskii")
@@ -117,6 +118,27 @@ def test_of_one_kind_of_cycle_a_model_is_chosen_that_the_record_determines():
     planes = [each for each in found.evaluations if each.candidate.model == "preisach" and len(each.blocks) == 5]
     assert min(each.rms for each in planes) < found.chosen.rms
     assert not any(each.determined for each in planes if each.rms < 1.5 * found.chosen.rms)
+
+
+@pytest.mark.seeds
+def test_of_one_kind_of_cycle_a_differential_equation_is_chosen_that_takes_clearly_fewer_coefficients():
+    inputs = through([0.0, *[1.0, -1.0] * 6], 1000)
+    measured = Measurements.of(inputs, noisy(settled(bouc_wen, inputs), 0.01))
+    # Sampled turning points do not all reach the ends.
+    assert 0 < measured.known < 200
+    found = select(measured, ("maxwell-slip", "bouc-wen"))
+    assert found.has_one_kind
+    assert found.chosen.candidate.model == "bouc-wen"
+
+
+def test_one_rate_is_warned_of():
+    slow = random_reversals(np.random.default_rng(0), 200, 12)
+    inputs = np.append(slow, slow[-1] * (1 - slow[::10]))
+    measured, one = Measurements.of(inputs, noisy(duhem(inputs))), Measurements.of(slow, noisy(duhem(slow)))
+    assert HeldOutInTime(one, 0.1 * np.arange(slow.size), slow.size).has_one_rate()
+    assert not HeldOutInTime(measured, 0.1 * np.arange(inputs.size), inputs.size).has_one_rate()
+    found = select(one, ("polynomial",), in_time=HeldOutInTime(one, 0.1 * np.arange(slow.size), slow.size))
+    assert any("one speed" in text for text in found.warnings())
 
 
 def test_few_reversals_and_a_trend_of_the_errors_are_warned_of():

@@ -3,19 +3,44 @@
 import csv
 
 import pytest
-from test_identification import SHORT
 
 from bench.campaigns.tasks import MODEL_NAME
 from bench.cli import main
 from bench.model_file import load_model
 
-pytestmark = pytest.mark.usefixtures("warm_popen")
+# The runs and the identification take some 20 s.
+pytestmark = [pytest.mark.seeds, pytest.mark.usefixtures("warm_popen")]
 
-PARTS = ("force-voltage", "length-voltage", "length-force")
-MODEL = f"""
+# Few points, and dwells in which the wire only just settles.
+PARTS = """
+[[runs]]
+protocol = "force-voltage"
+rigs = ["sma"]
+[runs.parameters]
+points = 13
+conditioning = 1
+dwell = 20.0
+
+[[runs]]
+protocol = "length-voltage"
+rigs = ["sma"]
+[runs.parameters]
+points = 13
+loads = "0.98, 4.9, 8.82"
+dwell = 8.0
+
+[[runs]]
+protocol = "length-force"
+rigs = ["sma"]
+[runs.parameters]
+points = 4
+voltages = "0.0, 1.5, 3.0"
+dwell = 8.0
+"""
+MODEL = """
 [[models]]
 name = "wire"
-runs = {list(PARTS)}
+runs = ["force-voltage", "length-voltage", "length-force"]
 model = "two-stage"
 
 [[runs]]
@@ -30,21 +55,16 @@ controller = ["open-loop-inverse", "closed-loop-inverse"]
 """
 
 
-def table(protocol):
-    settings = "\n".join(f"{key} = '{value}'" for key, value in SHORT[protocol].items())
-    return f'[[runs]]\nprotocol = "{protocol}"\nrigs = ["sma"]\n[runs.parameters]\n{settings}\n'
-
-
 def test_a_model_of_several_runs_is_identified_from_those_of_a_rig_and_seed(tmp_path):
     file, out = tmp_path / "wire.toml", tmp_path / "out"
-    file.write_text("".join(map(table, PARTS)) + MODEL)
+    file.write_text(PARTS + MODEL)
     with pytest.raises(SystemExit) as end:
         main(["campaign", str(file), "--out", str(out), "--workers", "1"])
     assert end.value.code == 0
     (folder,) = (out / "wire").iterdir()
     assert folder.name.startswith("sma-seed=0-")
     model = load_model(folder / MODEL_NAME, "two-stage")
-    assert len(model.provenance["sources"]) == len(PARTS)
+    assert len(model.provenance["sources"]) == 3
     assert model.dynamics is not None
     with (out / "results.csv").open(newline="") as results:
         rows = {row["controller"]: row for row in csv.DictReader(results) if row["protocol"] == "length-control"}
