@@ -129,7 +129,7 @@ def characterize(campaign: Campaign, runs: Mapping[str, Pending[RunResult]]) -> 
     # The models of two stages have the same first one, which is all that counts here.
     dynamics = identify_muscle_dynamics(models["two-stage"].model, folders["force-voltage"], lengths)
     for name, found in models.items():
-        known = dynamics if isinstance(found.model, TwoStage) else None
+        known = dynamics if found.model.kind == TwoStage.kind else None
         muscle_file(name, found, [folders["force-voltage"], *lengths], known).save(campaign.folder / f"{name}.json")
     return Characterization(resting, series, read_series(folders["length-verification"]), models)
 

@@ -11,7 +11,7 @@ from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from itertools import groupby
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -139,13 +139,14 @@ def identify_muscle_dynamics(model: Model, force_run: Path, length_runs: Sequenc
     the length, and the cycles of the voltage before the samples whether it is heat or a pressure that lags. None of a
     model that is not of two stages, or if the run has no quick readings between its steps.
     """
-    if not isinstance(model, TwoStage):
+    if model.kind != TwoStage.kind:
         return None
+    first = cast("TwoStage", model).first
     recording = read_transients(force_run, VOLTAGE_READING, FORCE)
     if recording is None:
         return None
     samples, swings = _parts(recording, SAMPLE), _parts(recording, CONDITIONING)
-    found = identify_dynamics(identify_transients(samples), [model.first.evaluate], ("voltage", "force"), swings)
+    found = identify_dynamics(identify_transients(samples), [first.evaluate], ("voltage", "force"), swings)
     under_weights = next((run for run in length_runs if protocol_of(run) == "length-voltage"), None)
     lengths = None if under_weights is None else read_transients(under_weights, VOLTAGE_READING, LENGTH)
     if lengths is None:
