@@ -38,6 +38,8 @@ class DisplacementSensor:
     def __post_init__(self) -> None:
         self.draw: Callable[[], float] = normals(self.rng).__next__
         """Gives the next number of the standard normal distribution, for the noise of a conversion."""
+        # Compiled before a driver waits for an answer.
+        kernels.displacement_volts(0.0, self.resolution, self.reach, self.volts_per_metre)
 
     def __call__(self) -> float:
         """Return the voltage in V at this instant."""

@@ -53,6 +53,8 @@ class Thermistor:
         a, b, c = self.steinhart_hart
         self.circuit = self.reference_ohms, a, c, (b / (3 * c)) ** 3
         """Reference resistor (Ω), A and C (1/K), and (B / 3C)³."""
+        # Compiled before a driver waits for an answer.
+        kernels.divider_volts(25.0, self.excitation_volts, *self.circuit)
 
     def divider(self) -> float:
         """Return the voltage in V at the input of the divider at this instant."""
