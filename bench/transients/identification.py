@@ -58,7 +58,7 @@ def read_transients(path: Path, drive: str, response: str) -> Recording | None:
 
 @dataclass(frozen=True, eq=False)
 class Transients:
-    """What runs show of a drive and its response whatever the model of the specimen.
+    """What runs show of a drive and its response independently of the model of the specimen.
 
     Attributes
     ----------

@@ -530,7 +530,7 @@ class EmulatedT7(LineFaults, RegisterInstrument):
         return read_scan
 
     def _conversions(self, count: int) -> list[Callable[[], float]]:
-        """Return what converts the first inputs, as the register map has it."""
+        """Return what converts the first inputs, for the register map."""
         return [read for n in range(count) if (read := self._named[f"AIN{n}"].read) is not None]
 
     def _set_range(self, channel: int, value: float) -> None:

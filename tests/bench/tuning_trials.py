@@ -5,7 +5,7 @@
 Each rig is characterized once. Each controller is tuned for the model, and brings its output to its targets in
 sessions whose noise and targets the tuning has not seen, with the numbers of model and rig file and with those of the
 tuning file. The table, for docs/reference/tuning.md, has median and worst over the sessions of the RMS error, and the
-median of the cost as `bench tune` has it for one run; `not worse` says in how many sessions the cost with the tuning
+median of the cost of one run by `bench tune`; `not worse` says in how many sessions the cost with the tuning
 file is the smaller one. Exits with 1 if a median is worse with it.
 """
 
