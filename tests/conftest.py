@@ -40,7 +40,7 @@ for _name in ("SIGHUP", "SIGQUIT"):
         signal.signal(getattr(signal, _name), signal.SIG_DFL)
 
 
-# Chosen by `make test`; `make test-all` looks at all examples. Without deadlines, like the profiles of several folders.
+# Chosen by `make test`; `make test-all` looks at all examples. No deadlines, like the profiles of several folders.
 settings.register_profile("brief", deadline=None)
 _BRIEF, _FEWEST = 4, 10
 """What examples are divided by then, and how few there are at least."""
