@@ -40,7 +40,10 @@ for _name in ("SIGHUP", "SIGQUIT"):
         signal.signal(getattr(signal, _name), signal.SIG_DFL)
 
 
-# Chosen by `make test`; `make test-all` looks at all examples. No deadlines, like the profiles of several folders.
+# A machine may be busy.
+settings.register_profile("whole", deadline=None)
+settings.load_profile("whole")
+# Chosen by `make test`; `make test-all` looks at all examples.
 settings.register_profile("brief", deadline=None)
 _BRIEF, _FEWEST = 4, 10
 """What examples are divided by then, and how few there are at least."""
