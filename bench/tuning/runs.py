@@ -164,7 +164,7 @@ def start_of(task: Task, rig: str, numbers: Any, tunable: Sequence[str]) -> Numb
     """Return the numbers from which the search begins: those of the rig file over those of the controller."""
     table = dict((load_rig(rig).protocols.get(task.protocol) or {}).get("tuning", {}).get(task.controller, {}))
     found: dict[str, Any] = dict(table)
-    for name in "+".join(tunable).split("+") if tunable else ():
+    for name in (each for together in tunable for each in together.split("+")):
         outer, _, inner = name.rpartition(".")
         if outer:
             within = dict(found.get(outer, {}))
