@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from bench.cli.console import check_outputs, console, print_rows, warn
+from bench.cli.console import check_outputs, console, print_rows
 from bench.cli.data_options import offer_options
 from bench.cli.model_options import ModelOptions
 from bench.errors import ConfigurationError
@@ -140,8 +140,6 @@ def choose_model(
         reading=reading,
     )
     _print_table(found)
-    for warning in found.warnings:
-        warn(warning)
     if time_column is None and len(files) == 1 and (name := find_times(files[0], reading)) is not None:
         print_plain(console, f"column {name} holds times: with --time {name} rate, creep and drift would take part")
     if comparing.table_out is not None:

@@ -74,6 +74,20 @@ class BandedPrediction:
             f"{100 * self.band.level:g} %. Calibrate on inputs like this one: `bench identify --band`"
         )
 
+    def rows(self) -> list[tuple[str, str]]:
+        """Return what the band is: name and value of each row of a table."""
+        widths = [
+            ("half-width, median", np.median(self.half_widths)),
+            ("half-width, largest", self.half_widths.max()),
+        ]
+        if self.simultaneous is not None:
+            widths.append((f"half-width for all of {self.band.stretch} rows", np.median(self.simultaneous)))
+        return [
+            ("level", f"{100.0 * self.band.level:g} %"),
+            *((name, f"{value:.4g} {self.unit}".rstrip()) for name, value in widths),
+            ("calibrated on", self.band.calibrated_on.kind),
+        ]
+
     def to_json(self, residuals: Floats | None = None) -> dict[str, Any]:
         """Return the band for programs; `coverage` is None without residuals of measured outputs."""
         together = self.simultaneous

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import importlib.metadata
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +16,14 @@ from bench.errors import DataError
 from bench.hysteresis import MemoryCurve, Operator, TimedModel
 from bench.identification import Errors
 from bench.journal import Record
+from bench.results.bands import predict_band
 from bench.results.models import IdentifiedFile, certificate_lines
 from bench.results.predictions import Predictions, Quantity
 
 Floats = npt.NDArray[np.float64]
+
+# Models in the table of those that were compared; all are in the model file.
+_SHOWN = 10
 
 
 def write_card(
@@ -102,6 +106,15 @@ def model_card(
         "Certificate": _table(("", ""), certificate_lines(found)),
         "Limits of validity": _table(("", ""), _limits(found, rows.input, rows.time)),
     }
+    if (band := predict_band(found.file, found.inputs, found.identification.initial_state)) is not None:
+        held_out = f"{band.band.held_out:.4g} {band.unit}".rstrip()
+        sections["Prediction band"] = _table(
+            ("", ""), [*band.rows(), ("RMS error of the rows, each left out of the fit", held_out)]
+        )
+    if (selection := found.file.provenance.get("selection")) is not None:
+        unit = selection["unit"] or "output units"
+        heads = ("model", f"held out, {unit}", "±", "% of the range", f"other cycles, {unit}", "free", "")
+        sections["Models compared"] = _table(heads, _compared(selection["table"]))
     if found.trials is not None:
         sections["Selection"] = _fenced(found.trials.table())
     if found.warnings:
@@ -147,6 +160,25 @@ def _errors(found: IdentifiedFile) -> list[tuple[str, str, str]]:
         ("RMS", f"{errors.rms:.4g}", f"{errors.rms_percent:.2f}"),
         ("mean absolute", f"{errors.average:.4g}", f"{errors.average_percent:.2f}"),
         ("range of the output", f"{errors.span:.4g}", "100.00"),
+    ]
+
+
+def _compared(table: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
+    """Return the models that were compared to the end, the best first, at most ten beside the chosen one."""
+    whole = [row for row in table if row["note"] in ("", "chosen", "least error")]
+    shown = [*whole[:_SHOWN], *(row for row in whole[_SHOWN:] if row["note"] == "chosen")]
+    return [
+        (
+            f"{row['model']} {row['options']}".strip(),
+            *(
+                "" if row[name] is None else f"{row[name]:.{digits}g}"
+                for name, digits in (("held_out_rms", 3), ("held_out_spread", 1), ("held_out_percent", 3))
+            ),
+            "" if row["units_rms"] is None else f"{row['units_rms']:.3g}",
+            f"{row['free']:.0f}",
+            row["note"],
+        )
+        for row in shown
     ]
 
 

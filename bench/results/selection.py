@@ -118,9 +118,9 @@ class SelectedModel:
         return {"gap": self.selection.gap, "rows": self.selection.rows, "unit": self.unit, "table": self.rows()}
 
     def record_in(self, found: IdentifiedFile) -> IdentifiedFile:
-        """Return an identified model with the table in its provenance."""
+        """Return an identified model with the table in its provenance, and the warnings before its own."""
         file = replace(found.file, provenance={**found.file.provenance, "selection": self.to_json()})
-        return replace(found, file=file)
+        return replace(found, file=file, warnings=(*self.warnings, *found.warnings))
 
     def save(self, path: Path) -> None:
         """Write the table as CSV.

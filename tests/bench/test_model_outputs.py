@@ -263,6 +263,35 @@ class TestCard:
         for link in re.findall(r"\]\(<(.+?)>\)", card["Figures"]):
             assert (tmp_path / link).stat().st_size > 0
 
+    def test_a_card_has_the_band_and_the_models_that_were_compared(self, bench, tmp_path, loop):
+        result = tmp_path / "fit.json"
+        code, _, err = bench(
+            "identify", loop, *COLUMNS, "--model", "polynomial,polynomial-plays,prandtl-ishlinskii", "--band",
+            "--card", tmp_path / "card.md", "--json", result,
+        )  # fmt: skip
+        assert code == 0, err
+        card, fit = read_card(tmp_path / "card.md"), json.loads(result.read_text())
+        band = card["Prediction band"]
+        assert band["level"] == ["90 %"]
+        assert band["half-width, median"] == [f"{fit['band']['half_width']:.4g} µm"]
+        assert band["calibrated on"] == [fit["band"]["calibrated_on"]]
+        compared = card["Models compared"]
+        chosen = [row for row in fit["selection"]["table"] if row["note"] == "chosen"]
+        marked = [key for key, cells in compared.items() if cells[-1] == "chosen"]
+        assert marked == [f"{chosen[0]['model']} {chosen[0]['options']}".strip()]
+        assert compared[marked[0]][0] == f"{chosen[0]['held_out_rms']:.3g}"
+
+    def test_a_card_has_what_the_held_out_errors_say_against_the_choice(self, bench, tmp_path, loop):
+        code, _, err = bench(
+            "identify", loop, *COLUMNS, "--model", "polynomial,polynomial-plays", "--train", "0:110",
+            "--card", tmp_path / "card.md", "--json", tmp_path / "fit.json",
+        )  # fmt: skip
+        assert code == 0, err
+        few = "the input does not vary its amplitude"
+        assert few in err.replace("\n", " ")
+        assert few in read_card(tmp_path / "card.md")["Warnings"]
+        assert any(few in warning for warning in json.loads((tmp_path / "fit.json").read_text())["warnings"])
+
     def test_its_command_identifies_the_same_model(self, bench, tmp_path, loop):
         bench(
             "identify", loop, *COLUMNS, "--model", "prandtl-ishlinskii", "--option", "plays=4", "--option",

@@ -121,16 +121,8 @@ def _fits(models: Sequence[ModelOnRun], times: Floats, scratch: Path, number: in
 def _bands(model: ModelOnRun) -> Iterator[PageTable | PageText]:
     if model.band is None:
         return
-    found = model.band.to_json(model.residuals[model.skip :])
-    rows = [
-        ("level", f"{100.0 * found['level']:g} %"),
-        ("half-width, median", f"{found['half_width']:.4g} {model.unit}"),
-        ("half-width, largest", f"{found['largest_half_width']:.4g} {model.unit}"),
-        ("covers of the readings", f"{100.0 * found['coverage']:.1f} %"),
-        ("calibrated on", str(found["calibrated_on"])),
-    ]
-    if found["simultaneous_half_width"] is not None:
-        rows.insert(3, ("half-width for all of a stretch", f"{found['simultaneous_half_width']:.4g} {model.unit}"))
+    covered = model.band.coverage(model.residuals[model.skip :])
+    rows = [*model.band.rows(), ("covers of the readings", f"{100.0 * covered:.1f} %")]
     yield PageTable(("", ""), rows, title=f"prediction band of {model.file.name}")
     if warning := model.band.warning():
         yield PageText(f"Warning: {warning}")
