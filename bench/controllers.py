@@ -19,7 +19,7 @@ from bench.control.following import ClosedLoopFollower, FollowingParameters, Int
 from bench.control.latched import Latched, LatchParameters
 from bench.control.model_filters import AdaptationName, ModelFilter, model_filter
 from bench.control.opposite_output import OppositeOutput
-from bench.control.supervision import CHANCE, HOLDS, Supervised, SupervisedFollower
+from bench.control.supervision import HOLDS, Supervised, SupervisedFollower
 from bench.control.tracking import ClosedLoopInverse, CorrectionParameters, OpenLoopInverse
 from bench.control.tuning import Spans, tuned
 from bench.errors import ConfigurationError, DataError
@@ -237,10 +237,12 @@ def greatest_error(own: float, span: float) -> float:
     span : float
         Width of its range, output units.
     """
-    return max(CHANCE * own, HOLDS * span)
+    return max(_OWN * own, HOLDS * span)
 
 
 _OPEN = "open-loop-inverse"
+_OWN = 2.25
+"""By how much more than on its own data a model may err."""
 
 
 @dataclass(frozen=True)

@@ -21,11 +21,13 @@ TARGETS = 5
 """Number of targets in a row over which errors are judged."""
 SAMPLES = 200
 """Number of samples of a moving reference over which they are judged."""
-CHANCE = 2.25
-"""Ratio of two RMS errors over five targets that chance exceeds in 5 % of cases: the root of F(5, 5) = 5.05."""
 HOLDS = 0.03
 """Part of the output's range that a model may err by that fits its own data well: sessions differ. Feedback that errs
 by more does not do what it is for."""
+_CHANCE_OF_TARGETS = 2.7
+"""Ratio of two RMS errors over five targets, each without the greatest, that chance exceeds in 5 % of cases."""
+_CHANCE_OF_SAMPLES = 2.25
+"""The same for a moving reference, whose errors are alike over many samples: as of five that are not."""
 _TOLERANCE = 0.02
 """Part of the range within which the model alone is not taken for better."""
 _WARNED = 0.01
@@ -56,10 +58,16 @@ class _Supervision:
     holds : float
         Of a controller without feedback: greatest RMS error of a model that still holds, output units. nan for one
         with feedback, whose model may err by more.
+
+    Notes
+    -----
+    A controller is given up by the RMS of the errors of a window without the greatest: one missed target is no reason
+    to end a run. A warning is by the RMS of all.
     """
 
     _window = TARGETS
     _over = "targets"
+    _chance = _CHANCE_OF_TARGETS
     _strict = True
     """Whether an error beyond the tolerance ends the run, also where the model alone would err by more."""
 
@@ -124,22 +132,33 @@ class _Supervision:
         self._judged.append((error, without))
         if len(self._judged) < self._window:
             return
+        squares = np.sort(np.square(self._judged), axis=0)
+        everything = math.sqrt(float(np.mean(squares[:, 0])))
         # Of a controller that does not say what its model errs by, that is not known.
-        errors, without = np.sqrt(np.mean(np.square(self._judged), axis=0)).tolist()
-        over = f"over {self._window} {self._over} its error is {errors:.3g} RMS"
+        errors, without = np.sqrt(np.mean(squares[:-1], axis=0)).tolist()
+        over = f"over {self._window} {self._over} its error"
+        but = f"{over} but for the greatest is {errors:.3g} RMS"
         if not math.isnan(self._holds):
+            known = f"and that of a model that holds at most {self._holds:.3g}"
             if errors > self._holds:
-                self._give_up(f"{over}, and that of a model that holds at most {self._holds:.3g}")
+                self._give_up(f"{but}, {known}")
+            elif everything > self._holds:
+                self._warn(f"the open loop errs: {over} is {everything:.3g} RMS, {known}")
             return
-        part = errors / self._span
-        text = f"{over}, {100.0 * part:.2g} % of the range"
+        text = f"{but}, {100.0 * errors / self._span:.2g} % of the range"
         known = f"{text}, and that of its model alone, without feedback, {without:.3g}"
-        if part > _TOLERANCE and errors > CHANCE * without:
+        if errors > _TOLERANCE * self._span and errors > self._chance * without:
             self._give_up(known)
-        elif part > HOLDS and self._strict and self._fallback is None:
+        elif errors > HOLDS * self._span and self._strict and self._fallback is None:
             self._give_up(text if math.isnan(without) else known)
-        elif part > _WARNED and not self._warned:
-            self._notice, self._warned = f"the controller leaves an error: {text}", True
+        elif everything > _WARNED * self._span:
+            part = 100.0 * everything / self._span
+            self._warn(f"the controller leaves an error: {over} is {everything:.3g} RMS, {part:.2g} % of the range")
+
+    def _warn(self, text: str) -> None:
+        """Have something said, once in a run."""
+        if not self._warned:
+            self._notice, self._warned = text, True
 
     def _give_up(self, why: str) -> None:
         if math.isnan(self._holds):
@@ -163,8 +182,9 @@ class Supervised(_Supervision):
     It does not if it sends the actuator to and fro between the ends of its range at one target; or if over several
     targets it errs by more than its model does at the same places, and more than by chance: then the model alone,
     without feedback, would have been better; or if it says so itself (`doubt`); or, without a fallback, if it errs by
-    more than 3 % of the range. One without feedback is given up where its model does not hold. From 1 % of the range
-    on there is a warning. Targets that cannot be met do not count. Parameters as `_Supervision`.
+    more than 3 % of the range. One without feedback is given up where its model does not hold. One missed target of
+    several is no reason, but from 1 % of the range on there is a warning. Targets that cannot be met do not count.
+    Parameters as `_Supervision`.
     """
 
     def __init__(
@@ -233,6 +253,7 @@ class SupervisedFollower(_Supervision):
 
     _window = SAMPLES
     _over = "samples"
+    _chance = _CHANCE_OF_SAMPLES
     _strict = False
 
     def __init__(

@@ -441,7 +441,10 @@ def _holds(setup: ControllerSetup, kind: type[Task]) -> float:
     low, high = _task(setup, kind).output_range()
     # The file states errors in percent of the range.
     own = setup.model.provenance.get("errors", {}).get(kind.kind, {}).get("rms", 0.0)
-    return greatest_error(0.01 * own * (high - low), high - low)
+    timing = _timing(setup)
+    # What is left of a move at the end of its time, of moves between targets at random.
+    left = math.exp(-timing.duration / max(timing.time_constant, SHORTEST_WAIT)) * (high - low) / math.sqrt(6.0)
+    return math.hypot(greatest_error(0.01 * own * (high - low), high - low), left)
 
 
 def _with_inverse(summary: str, controller: Callable[..., MuscleController], kind: type[Task]) -> ControllerSpec:

@@ -42,9 +42,6 @@ from rigs.muscles.identification import FORCE, LENGTH
 Floats = npt.NDArray[np.float64]
 
 CONTROLLERS = ("open-loop-inverse", "proportional-integral", "closed-loop-inverse")
-_PROPOSED = CONTROLLERS[-1]
-_RIVAL = {"fallback": "open-loop"}
-"""A rival shows its errors, however large they are; it is not ended for them."""
 LOAD_CHANGE = 1.96
 """What is hung on and taken off again in the session with a changing load, N."""
 _PROTOCOLS = {
@@ -139,13 +136,7 @@ def carry_out(campaign: Campaign) -> StudyResult:
     runs = {
         key: {
             controller: campaign.start(
-                session.controlled.protocol,
-                {
-                    "controller": controller,
-                    **({} if controller == _PROPOSED else _RIVAL),
-                    **session.settings,
-                    **common,
-                },
+                session.controlled.protocol, {"controller": controller, **session.settings, **common}
             )
             for controller in CONTROLLERS
         }

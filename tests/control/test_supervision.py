@@ -112,7 +112,7 @@ def judged(error, disturbance, fallback=None):
 @pytest.mark.parametrize(
     ("disturbance", "said"),
     [
-        (0.02, r"error is 0\.1 RMS, 10 % of the range, and that of its model alone.* 0\.02;"),
+        (0.02, r"error but for the greatest is 0\.1 RMS, 10 % of the range, and that of its model alone.* 0\.02;"),
         (math.nan, r"10 % of the"),
     ],
 )
@@ -138,6 +138,31 @@ def test_the_open_loop_goes_on_only_where_it_would_have_been_better():
     kept = judged(0.1, 0.08, fallback)
     assert not kept.gave_up
     assert "leaves an error" in kept.take_notice()
+
+
+def missing(errors, **options):
+    """Have a controller err at target after target, in parts of the range; return its supervision."""
+    inner = Contrary()
+    inner.trace = Trace(disturbance=0.02)
+    controller = Supervised(inner, LIMITS, 1.0, **options)
+    for n, error in enumerate([*errors, 0.0]):
+        controller.aim(error, float(n), 0.0, 0.0)
+    return controller
+
+
+@pytest.mark.parametrize("options", [{}, {"holds": 0.03}])
+def test_one_missed_target_of_five_is_warned_of_and_two_end_the_run(options):
+    controller = missing([0.0, 0.3, 0.0, 0.0, 0.0, 0.0, 0.3, 0.0, 0.0, 0.0], **options)
+    assert "error is 0.134 RMS" in controller.take_notice()
+    with pytest.raises(ConvergenceError, match=r"over 5 targets its error but for the greatest is 0\.15 RMS"):
+        missing([0.0, 0.3, 0.0, 0.3, 0.0], **options)
+
+
+def test_a_specimen_that_changes_is_noticed_at_the_second_target_that_is_missed():
+    steady = [0.0] * 10
+    missing([*steady, 0.1])
+    with pytest.raises(ConvergenceError):
+        missing([*steady, 0.1, 0.1])
 
 
 def test_targets_that_cannot_be_met_do_not_count():

@@ -17,6 +17,7 @@ from bench.hysteresis import Preisach, Reach, TwoStage, uniform_levels
 from bench.identification import Series, identify_two_stage, voltage_steps
 from bench.model_file import ModelFile
 from rigs.muscles.control import (
+    FORCE_OPEN_LOOP,
     LENGTH_CLOSED_LOOP,
     InverseControlParameters,
     MuscleClosedLoop,
@@ -626,3 +627,15 @@ def test_a_model_without_dynamics_is_refused_unless_the_rig_file_gives_them(inve
     assert LENGTH_CLOSED_LOOP.make(given).time_constant == 5.0
     with pytest.raises(ConfigurationError, match=r"duration = 20 s is too short .* 30 s"):
         LENGTH_CLOSED_LOOP.make(replace(setup, options={"duration": 20.0, "time_constant": 30.0}))
+
+
+def test_what_a_lag_leaves_of_a_move_counts_in_favour_of_an_open_loop(inverse):
+    def holds(lag):
+        dynamics = IdentifiedDynamics(response=ResponseDynamics(lag, 2.0))
+        file = ModelFile("two-stage", inverse.model, dynamics=dynamics)
+        return FORCE_OPEN_LOOP.holds(ControllerSetup(model=file, limits=LIMITS, options={"duration": 20.0}))
+
+    low, high = inverse.model.first.output_range()
+    assert holds(0.0) == pytest.approx(0.03 * (high - low))
+    left = math.exp(-20.0 / 8.0) * (high - low) / math.sqrt(6.0)
+    assert holds(8.0) == pytest.approx(math.hypot(holds(0.0), left))
