@@ -23,6 +23,8 @@ from bench.identification.resolution import resolve
 _LEAST_MOVE = 0.005
 # Moves from this part of the range on make cycles.
 _LEAST_CYCLE = 0.02
+# Part of the range of all inputs from which rows cover it.
+_COVERED = 0.95
 # Rank of the regressor by coefficients, from which the data determine a model.
 _DETERMINED = 0.9
 # Part of the travel of an output on smaller cycles that may be against the input's beyond what the record's is.
@@ -105,6 +107,11 @@ class Measurements:
     def tested(self) -> Flags:
         """Rows that may be tested, shape (N,)."""
         return np.asarray(self.fitted & (np.arange(self.inputs.size) >= self.known), dtype=bool)
+
+    def covers_its_range(self) -> bool:
+        """Return whether the rows that are tested reach the inputs that all do, but for 5 % of the range."""
+        tested = self.inputs[self.tested]
+        return bool(tested.size and np.ptp(tested) >= _COVERED * np.ptp(self.inputs))
 
     def blocks(self) -> tuple[Fold, ...]:
         """Return the folds of contiguous blocks of a cycle or more; rows before `known` are in every fit."""

@@ -569,15 +569,19 @@ class _Search:
             given = self.given.orientation
             orientations = ("rising", "falling") if given in (None, "auto") else (given,)
         memories: tuple[Initial | None, ...] = (None,)
+        # Without the first rows a model must not extrapolate to inputs that no other rows reach.
+        skipping: tuple[Initial, ...] = ("skip",) if self.measured.covers_its_range() else ()
         if not template.memoryless:
             estimated: tuple[Initial, ...] = ("estimate",) if spec.estimate_state is not None else ()
-            memories = (None, "positive", *estimated, "skip") if self.given.initial is None else (self.given.initial,)
+            memories = (
+                (None, "positive", *estimated, *skipping) if self.given.initial is None else (self.given.initial,)
+            )
         self._memories[kind] = memories
         if template.shape_parameters().names:
             self._with_shape.add(kind.model)
             if self.given.initial is None:
                 # Each set-up is a search for the shape; the others are tried on those near the best only.
-                memories = (None, "skip")
+                memories = (None, *(skipping or ("positive",)))
         weight: float | None = 0.0
         if self._has_plane[kind]:
             weight = 0.0 if self.given.smoothing is None and spec.constrained else self.given.smoothing

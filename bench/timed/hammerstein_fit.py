@@ -50,6 +50,8 @@ _FEW = 8
 # Principal columns of the operator in a first search, and in the grid that it starts from.
 _FREE, _COARSE = 30, 6
 _STEP = 1e-5
+# Part of the range of a column that the rows fitted must go through, or its coefficient would be noise.
+_MOVED = 0.01
 
 
 @dataclass(frozen=True)
@@ -175,6 +177,9 @@ class Search:
     def fit_columns(self, columns: Floats, drifts: Floats, weights: Floats, sign: Literal[1, -1]) -> Fit:
         """Return the coefficients of filtered columns and drift, with those of the operator of one sign."""
         problem = self.static
+        # A filter leaves a trace of each cell in all later rows, even if none of those fitted moves it.
+        fitted = columns[problem.skip :][weights[problem.skip :] > 0.0]
+        columns = np.where(np.ptp(fitted, axis=0) >= _MOVED * np.ptp(columns, axis=0), columns, 0.0)
         if not problem.spec.constrained:
             regressor = Regressor.of_columns(np.column_stack([columns, drifts]))
             return fit_minimum_norm(regressor, problem.outputs, weights=weights, skip=problem.skip)

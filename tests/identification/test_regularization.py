@@ -4,11 +4,15 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hysteretic_plants import PLANTS, settled
+from hysteretic_plants import butterfly as butterfly_of_duhem
 from scipy.optimize import lsq_linear
 
 from bench.hysteresis import Preisach, uniform_levels
 from bench.identification import choose_regularization, cross_validate, fit, fit_minimum_norm, identify, ramps
 from bench.identification.cell_layout import CellLayout
+
+OTHER_PLANTS = PLANTS | {"butterfly": butterfly_of_duhem}
 
 
 def operator(order=6):
@@ -48,8 +52,8 @@ def damped(count=30):
     return ramps([-1.0, *(((-1) ** n) * (1.0 - n / count) for n in range(count))], 0.05)
 
 
-def held_out(found, inputs, outputs):
-    return float(np.sqrt(np.mean((outputs - found.evaluate(inputs)) ** 2)))
+def held_out(found, inputs, outputs, known=0):
+    return float(np.sqrt(np.mean((outputs - found.model.evaluate(inputs))[known:] ** 2)))
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.005])
@@ -60,12 +64,46 @@ def test_error_on_other_reversals_is_below_three_times_the_cross_validated_one(s
     span = np.ptp(outputs)
     outputs = outputs + noise * span * np.random.default_rng(seed).normal(size=outputs.size)
     found = identify("preisach-signed", inputs, outputs, plane=(-1.0, 1.0))
-    error = held_out(found.model, others, expected)
+    error = held_out(found, others, expected)
     assert error <= 3.0 * found.regularization.rms
     assert error <= 0.1 * span
     least_norm = identify("preisach-signed", inputs, outputs, plane=(-1.0, 1.0), smoothing=0.0, ridge=0.0)
     assert least_norm.regularization is None
-    assert error < held_out(least_norm.model, others, expected)
+    assert error < held_out(least_norm, others, expected)
+
+
+def ratio_to_cross_validated(plant, seed, options):
+    """Return the error on other random reversals without noise, in cross-validated errors."""
+    inputs, others = reversals(seed), reversals(seed + 100)
+    outputs, expected = (settled(plant, each) for each in (inputs, others))
+    outputs = outputs + 0.01 * np.ptp(outputs) * np.random.default_rng(seed).normal(size=outputs.size)
+    found = identify("preisach-signed", inputs, outputs, initial="skip", **options)
+    return held_out(found, others, expected, 80) / found.regularization.rms
+
+
+@pytest.mark.parametrize("plant", OTHER_PLANTS)
+@pytest.mark.parametrize("options", [{"levels": 5}, {"levels": 30, "spacing": "quantiles"}])
+def test_that_holds_on_any_plane(plant, options):
+    assert ratio_to_cross_validated(OTHER_PLANTS[plant], 0, options) <= 3.0
+
+
+@pytest.mark.seeds
+@pytest.mark.parametrize("plant", OTHER_PLANTS)
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"levels": 5, "reversible": "polynomial"},
+        {"levels": 10, "spacing": "quantiles", "reversible": "linear"},
+        {"levels": 20},
+        {"levels": 20, "plane": (-2.0, 2.0)},
+        {"levels": 20, "plane": (-0.5, 0.5)},
+        {"levels": 40, "reversible": "linear"},
+        {"levels": 60, "spacing": "quantiles"},
+    ],
+)
+def test_that_holds_on_many_planes(plant, seed, options):
+    assert ratio_to_cross_validated(OTHER_PLANTS[plant], seed, options) <= 3.0
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -75,7 +113,7 @@ def test_weights_from_a_damped_oscillation_are_near_the_best_for_random_reversal
 
     def error(**penalties):
         found = identify("preisach-signed", inputs, outputs, plane=(-1.0, 1.0), **penalties)
-        return held_out(found.model, others, expected)
+        return held_out(found, others, expected)
 
     tried = [error(smoothing=s, ridge=r) for s in (1e-4, 1e-2, 1.0) for r in (0.0, 1e-2)]
     assert error() <= 2.0 * min(tried)
