@@ -473,8 +473,9 @@ class Actuator(Device):
 
     def check(self, value: float) -> None:
         """Raise `LimitError` if `set` would not take `value`."""
-        if not (math.isfinite(value) and value in self.limits):
-            raise LimitError(self.name, f"set-point {value:g} {self.limits.unit} is outside of {self.limits}")
+        limits = self.limits
+        if not (limits.low <= value <= limits.high and math.isfinite(value)):
+            raise LimitError(self.name, f"set-point {value:g} {limits.unit} is outside of {limits}")
 
 
 @dataclass(frozen=True)

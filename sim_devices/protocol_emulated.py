@@ -231,13 +231,24 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
 
     def exchange(self, data: bytes) -> bytes:
         """Send bytes and return what was received then; as `write` and `read_all` do, but sooner."""
-        if self._connection is not None and self.is_open and self._socket.taken and not self._received:
-            try:
-                return self._connection.receive(data)
-            except (FramingError, ConnectionError) as error:
-                raise self._ended(error) from None
-        self.write(data)
-        return self.read_all()
+        if not self.is_open or not self._socket.taken:
+            self._check()
+        received, connection = self._received, self._connection
+        if connection is not None:
+            if not received:
+                try:
+                    return connection.receive(data)
+                except (FramingError, ConnectionError) as error:
+                    raise self._ended(error) from None
+            self.write(data)
+            return self.read_all()
+        answer = self._answer(data)
+        # What comes while the answer passes comes behind it.
+        answer += self._stream.unsolicited()
+        if received:
+            answer = bytes(received) + answer
+            received.clear()
+        return answer
 
     def ask(self, data: bytes) -> bytes:
         """Forget what was received and not read, send bytes on a serial line, and return what was received then."""

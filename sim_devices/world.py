@@ -11,6 +11,7 @@ import math
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Protocol
 
 from bench.clock import Clock
@@ -55,32 +56,41 @@ class World:
         self._plant = plant
         self.time = clock.now()
         self._now = clock.now
-        self._timed: list[tuple[Callable[[], float], Timed]] = []
-        self._asked: list[Callable[[], float]] = []
+        self._timed: list[Timed] = []
+        self._dues: list[float] = []
+        """Of each, an instant that its deadline is not before, as far as it announces it."""
+        self._asked: list[tuple[int, Callable[[], float]]] = []
+        """Numbers and deadlines of those that do not."""
         self._soonest = -math.inf
         """No announced deadline is before; it may be earlier than the next of them."""
         self._late: list[Callable[[], None]] = []
         self._advancing = False
 
-    def add(self, timed: Timed, *, announces: bool = False, catch_up: Callable[[], None] | None = None) -> None:
-        """Keep the deadlines of an instrument.
+    def add(
+        self, timed: Timed, *, announces: bool = False, catch_up: Callable[[], None] | None = None
+    ) -> Callable[[float], None]:
+        """Keep the deadlines of an instrument; return what it calls with its deadline (s) to announce it.
 
         Parameters
         ----------
         announces : bool
-            Whether it calls `announce` whenever its deadline comes closer, so that it need not be asked all the time.
+            Whether it does so whenever its deadline comes closer, so that it need not be asked all the time.
         catch_up : callable, optional
             Does what it has put off, before anybody interferes.
         """
-        self._timed.append((timed.deadline, timed))
+        number = len(self._timed)
+        self._timed.append(timed)
+        self._dues.append(-math.inf)
         if not announces:
-            self._asked.append(timed.deadline)
+            self._asked.append((number, timed.deadline))
         self._soonest = -math.inf
         if catch_up is not None:
             self._late.append(catch_up)
+        return partial(self._note, number)
 
-    def announce(self, instant: float) -> None:
-        """Note that something may be due at an instant, s."""
+    def _note(self, number: int, instant: float) -> None:
+        if instant < self._dues[number]:
+            self._dues[number] = instant
         if instant < self._soonest:
             self._soonest = instant
 
@@ -114,7 +124,7 @@ class World:
         target = self._now()
         # Mostly nothing is due, and a fast loop asks several times for each sample.
         if target < self._soonest:
-            for deadline in self._asked:
+            for _, deadline in self._asked:
                 if deadline() <= target:
                     break
             else:
@@ -130,19 +140,25 @@ class World:
             self._advancing = False
 
     def _advance_to(self, target: float) -> None:
+        dues = self._dues
         while True:
-            due, first = math.inf, None
-            for deadline, timed in self._timed:
-                instant = deadline()
-                if instant < due:
-                    due, first = instant, timed
-            if first is None or due > target:
+            for number, deadline in self._asked:
+                dues[number] = deadline()
+            due = min(dues, default=math.inf)
+            if due > target:
                 self._soonest = due
                 break
+            first = dues.index(due)
+            timed = self._timed[first]
+            # It may have been put off since it was announced.
+            if (instant := timed.deadline()) != due:
+                dues[first] = instant
+                continue
             if due > self.time:
                 self._plant.advance(due - self.time)
                 self.time = due
-            first.expire()
+            timed.expire()
+            dues[first] = timed.deadline()
         if target > self.time:
             self._plant.advance(target - self.time)
             self.time = target

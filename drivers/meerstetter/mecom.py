@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 from binascii import crc_hqx
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import lru_cache
 from typing import NamedTuple
@@ -90,6 +90,8 @@ class TECLine:
         self._received = bytearray()
         self._silence = f"no answer within {settings.timeout:g} s"
         self._port = open_port(device, settings)
+        # An emulated line hands the answer over with the request.
+        self._swap: Callable[[bytes], bytes] = getattr(self._port, "exchange", self._write_and_look)
 
     def close(self) -> None:
         """Release the line."""
@@ -135,18 +137,22 @@ class TECLine:
     def _exchange(self, request: str, digits: int, resends: int = RESENDS) -> bytes:
         sequence = self._sequence = (self._sequence + 1) & 0xFFFF
         body = b"%b%04X%b" % (self._begin, sequence, request.encode("ascii"))
-        crc = b"%04X" % crc_hqx(body, 0)
-        frame = b"%b%b\r" % (body, crc)
-        head = b"!" + body[1:7]
+        end = b"%04X\r" % crc_hqx(body, 0)
+        frame, head = body + end, b"!" + body[1:7]
         resends = min(resends, self._most_resends)
         try:
             for attempt in range(1 + resends):
                 self.repeats += attempt > 0
-                self._port.write(frame)
-                whole = self._whole_answer(head, crc, digits)
-                if whole is not None:
-                    return whole
-                problem, content = self._answer(head, crc, digits)
+                answer = self._swap(frame)
+                if len(answer) == _ACKNOWLEDGE_LENGTH + digits and answer.startswith(head) and not self._received:
+                    # A good answer that is all there is, as it mostly is on an emulated line.
+                    if not digits:
+                        if answer.endswith(end):
+                            return b""
+                    elif answer.endswith(b"%04X\r" % crc_hqx(answer[:-5], 0)):
+                        return answer[7:-5]
+                self._received += answer
+                problem, content = self._answer(head, end[:-1], digits)
                 if not problem:
                     return content
                 if content[:1] == b"+":
@@ -159,17 +165,11 @@ class TECLine:
             raise lost_line(self._device, self._settings, error) from None
         raise no_answer(self._device, self._settings, problem, "address", self._settings.address, resends=resends)
 
-    def _whole_answer(self, head: bytes, crc: bytes, digits: int) -> bytes | None:
-        """Return the payload of a good answer that is all there is, as it mostly is on an emulated line."""
-        if self._received:
-            return None
-        answer: bytes = self._port.read_all()
-        if len(answer) == _ACKNOWLEDGE_LENGTH + digits and answer.startswith(head) and answer.endswith(b"\r"):
-            content = answer[7:-5]
-            if answer[-5:-1] == (b"%04X" % crc_hqx(answer[:-5], 0) if content else crc):
-                return content
-        self._received += answer
-        return None
+    def _write_and_look(self, frame: bytes) -> bytes:
+        """Send a frame; return what has come already."""
+        self._port.write(frame)
+        come: bytes = self._port.read_all()
+        return come
 
     def _answer(self, head: bytes, crc: bytes, digits: int) -> tuple[str, bytes]:
         """Return what is wrong with the answer, if anything, and its payload."""

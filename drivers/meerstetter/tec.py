@@ -75,6 +75,9 @@ class _State(IntEnum):
 _STATES = {int(state): state for state in _State}
 """States by their value, sooner than by the class."""
 
+_RUNNING = f"{_State.RUN:08X}"
+"""The status of an output that is on, in the digits of an answer."""
+
 
 _DEVICE_TYPE = Parameter(100, "device type", of_channel=False)
 _SERIAL_NUMBER = Parameter(102, "serial number", of_channel=False)
@@ -240,9 +243,13 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
 
         The status completes when the device reports the temperature stable; at once in current mode.
         """
-        self.check(value)
+        limits = self.limits
+        if not limits.low <= value <= limits.high:
+            self.check(value)
         if self._on:
-            self._check_output(self._read(_STATUS))
+            status = self._ask("?VR", _STATUS, 8)
+            if status != _RUNNING:
+                self._check_output(decode(self.name, _STATUS, status))
         else:
             self._check_restart()
         repeats = self._line.repeats

@@ -249,9 +249,9 @@ class EmulatedT7(LineFaults, RegisterInstrument):
         self._followers: list[Callable[[], None]] = []
         self._restart_followers: list[Callable[[], None]] = []
         self.flash_writes = 0
+        self._announce = world.add(self, announces=True)
         self._start()
         self._set_map_up(self._register_map())
-        world.add(self, announces=True)
 
     def _start(self) -> None:
         """Set everything up that is not kept in the flash memory."""
@@ -269,7 +269,7 @@ class EmulatedT7(LineFaults, RegisterInstrument):
         self._user_ram = [0.0] * _USER_RAM
         self._expired_at = None
         self._due = self.world.time + self._watchdog.timeout if self._watchdog.enabled else math.inf
-        self.world.announce(self._due)
+        self._announce(self._due)
 
     def power_cycle(self) -> None:
         """Switch the instrument off and on: what is in its RAM is lost, what is in its flash memory stays.
@@ -356,13 +356,13 @@ class EmulatedT7(LineFaults, RegisterInstrument):
                 self._due = world.time + dog.timeout
                 if self._expired_at is not None:
                     self._expired_at = None
-                    world.announce(self._due)
+                    self._announce(self._due)
             elif self._expired_at is not None:
                 # In strict mode the timer has gone on; what the request changes lasts until it next runs out.
                 periods = math.floor((world.time - self._expired_at) / dog.timeout) + 1
                 self._due = self._expired_at + periods * dog.timeout
                 self._expired_at = None
-                world.announce(self._due)
+                self._announce(self._due)
         except BaseException:
             world.lock.release()
             raise
@@ -415,7 +415,7 @@ class EmulatedT7(LineFaults, RegisterInstrument):
     def _feed(self) -> None:
         self._due = self.world.time + self._watchdog.timeout
         self._expired_at = None
-        self.world.announce(self._due)
+        self._announce(self._due)
 
     def _enable_watchdog(self, value: float) -> None:
         if value not in (0, 1):

@@ -86,7 +86,7 @@ class PiezoAmplifier:
         self._since = world.time
         self._step = self._steps = 0
         self._due = math.inf
-        world.add(self, announces=True)
+        self._announce = world.add(self, announces=True)
 
     @property
     def on(self) -> bool:
@@ -161,7 +161,7 @@ class PiezoAmplifier:
     def _schedule(self) -> None:
         left = self._steps - self._step - 0.5
         self._due = self._since + self._time_constant * math.log(self._steps / left) if left > 0 else math.inf
-        self._world.announce(self._due)
+        self._announce(self._due)
 
     def _apply(self, volts: float) -> None:
         # A load that is ahead of the output waits for it: going back would be a loop of its hysteresis.

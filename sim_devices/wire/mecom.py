@@ -19,13 +19,13 @@ Assumptions:
 
 from __future__ import annotations
 
-import math
 import re
 import struct
-from binascii import crc_hqx, hexlify
+from binascii import crc_hqx, hexlify, unhexlify
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 from sim_devices.instruments.emulated import RequestRefusedError
 from sim_devices.instruments.meerstetter_table import Parameter, ServerError, find_parameter
@@ -40,6 +40,9 @@ _SILENT = 255
 _SHORTEST_FRAME = 11
 _PREAMBLE = re.compile(rb"#[0-9A-F]{6}")
 _HEX = re.compile(r"[0-9A-F]*")
+_VALUE = re.compile(rb"[0-9A-F]{8}")
+_WRITE_HEAD, _WRITE_LENGTH = 8, 16  # characters of a payload that writes: command and parameter; these and the value
+_FORMS = {"INT32": struct.Struct(">i"), "FLOAT32": struct.Struct(">f")}
 _PARSED = 256  # payloads that are kept as parsed; a client that measures sends a few over and over
 
 
@@ -52,6 +55,14 @@ class _Selection:
 
     def encode(self, values: list[float]) -> bytes:
         return hexlify(self.form.pack(*values)).upper()
+
+
+class _Writing(NamedTuple):
+    """A parameter that is written, and how its value is coded."""
+
+    row: Parameter
+    instance: int
+    form: struct.Struct
 
 
 class MeComServer(WireServer):
@@ -70,6 +81,8 @@ class MeComServer(WireServer):
         self._received = b""
         self._selections: dict[bytes, _Selection] = {}
         """What the payloads that only read select, of those that came last."""
+        self._writes: dict[bytes, _Writing] = {}
+        """What the payloads that write one value begin with, of those that came last."""
         self._commands: dict[str, Callable[[str], str]] = {
             "VS": self._write,
             "?VL": self._limits,
@@ -114,7 +127,7 @@ class MeComServer(WireServer):
         number = int(body[1:3], 16)
         if number != device.address and number not in (_BROADCAST, _SILENT):
             return b""
-        device.attend()
+        device.attend_locked()
         head = b"!" + body[1:7]
         try:
             payload = body[7:]
@@ -130,6 +143,11 @@ class MeComServer(WireServer):
 
     def _act(self, request: bytes) -> bytes:
         """Carry a request out; return the payload of the answer, empty for an acknowledge."""
+        writing = self._writes.get(request[:_WRITE_HEAD])
+        if writing is not None and len(request) == _WRITE_LENGTH and _VALUE.match(request, _WRITE_HEAD):
+            row, instance, form = writing
+            self._device.assign(row, _number(form, unhexlify(request[_WRITE_HEAD:])), instance)
+            return b""
         payload = request.decode("ascii", "replace")
         command = payload[:3] if payload.startswith("?") else payload[:2]
         operand = payload[len(command) :]
@@ -152,6 +170,9 @@ class MeComServer(WireServer):
     def _write(self, operand: str) -> str:
         _check_digits(operand, 14)
         row, instance = _row(operand)
+        if len(self._writes) >= _PARSED:
+            self._writes.clear()
+        self._writes[b"VS" + operand[:6].encode("ascii")] = _Writing(row, instance, _FORMS[row.kind])
         self._device.assign(row, _decode(row, operand[6:]), instance)
         return ""
 
@@ -256,7 +277,11 @@ def _encode(row: Parameter, *values: float) -> str:
 
 
 def _decode(row: Parameter, digits: str) -> float:
-    value: float = struct.unpack(">i" if row.kind == "INT32" else ">f", bytes.fromhex(digits))[0]
-    if math.isnan(value):
+    return _number(_FORMS[row.kind], bytes.fromhex(digits))
+
+
+def _number(form: struct.Struct, data: bytes) -> float:
+    value: float = form.unpack(data)[0]
+    if value != value:  # nan
         raise RequestRefusedError(ServerError.OUT_OF_RANGE)
     return value

@@ -116,7 +116,8 @@ class TestDeadlines:
                 self.asked += 1
                 return super().deadline()
 
-        add, world.add = world.add, lambda timed: add(timed, announces=True)
+        announced = []
+        add, world.add = world.add, lambda timed: announced.append(add(timed, announces=True))
         alarm = Announcing(world, log, "a", [8.0])
         at(world, 1.0)
         asked = alarm.asked
@@ -124,7 +125,8 @@ class TestDeadlines:
             at(world, 1.0 + 0.01 * tick)
         assert alarm.asked == asked
         alarm.times.insert(0, 3.0)
-        world.announce(3.0)
+        (announce,) = announced
+        announce(3.0)
         at(world, 5.0)
         assert [(name, due, time) for name, due, time, _ in log] == [("a", 3.0, 3.0)]
         at(world, 9.0)
