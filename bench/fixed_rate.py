@@ -55,6 +55,7 @@ def _samples(run: RunAtHand, message: FixedRate, period: float) -> Reading:
     # What is watched is for the record alone.
     read_recorded = run.station.quick_reader((*inputs, *message.watched)) if message.watched else read
     measured = row_of(inputs)
+    is_slow = period > run.period
     move = run.station.mover(message.actuators)
     samples = message.samples
     started = clock.now()
@@ -67,7 +68,7 @@ def _samples(run: RunAtHand, message: FixedRate, period: float) -> Reading:
     while True:
         due = start + k * period
         # Between the samples of a slow loop interlocks and watchdogs do not wait for the next one.
-        while period > run.period and next_tick < due - 1e-6 * run.period:
+        while is_slow and next_tick < due - 1e-6 * run.period:
             run.sleep_until(next_tick)
             values = run.tick()
             next_tick = run.tick_after(next_tick)
@@ -82,8 +83,11 @@ def _samples(run: RunAtHand, message: FixedRate, period: float) -> Reading:
             run.station.promise(_GRACE + _PERIODS_OF_GRACE * period, f"a loop at {message.rate:g} Hz")
         now = clock.now()
         is_recorded = taken % message.record_every == 0
-        values.update(read_recorded() if is_recorded else read())
-        commands = update(now - start, measured(values))
+        if is_recorded:
+            values.update(read_recorded())
+            commands = update(now - start, measured(values))
+        else:
+            commands = update(now - start, measured(read()))
         if len(commands) != len(setpoints):
             raise ConfigurationError(
                 f"the controller of {', '.join(message.actuators)} gave {len(commands)} set-points; "
@@ -93,12 +97,12 @@ def _samples(run: RunAtHand, message: FixedRate, period: float) -> Reading:
             if not low <= command <= high:
                 raise LimitError(name, f"the controller asked for {command:g}, beyond {low:g} to {high:g}")
         move(commands)
-        values.update(zip(setpoints, commands, strict=False))
         late = now - due
         note_late(late)
         if is_recorded:
             # Without the lateness, which tells the samples from the ticks.
             run.trace = traced(controller.trace)
+            values.update(zip(setpoints, commands, strict=True))
             values.update(run.trace)
             values[LATENESS.name] = late
             run.record_tick(now, values)

@@ -230,14 +230,15 @@ class InterlockWatch:
 
     def __init__(self, interlocks: Iterable[Interlock], units: Mapping[str, str]) -> None:
         self._courses = tuple(_Course(interlock, units) for interlock in interlocks)
+        self._plain = tuple((each, each.plain, each.interlock.low, each.interlock.high) for each in self._courses)
         # Those with something that may act or is not over: mostly none.
         self._restless: list[_Course] = []
         self._latest = -math.inf
         self._tripped: Finding | None = None
         watched = [course.interlock for course in self._courses]
-        names = {name for each in watched for name in (each.signal, each.minus) if name}
-        names |= {f"{each.setpoint}{SETPOINT}" for each in watched if each.setpoint}
-        if missing := sorted(names - units.keys()):
+        self._names = {name for each in watched for name in (each.signal, each.minus) if name}
+        self._names |= {f"{each.setpoint}{SETPOINT}" for each in watched if each.setpoint}
+        if missing := sorted(self._names - units.keys()):
             raise ConfigurationError(
                 f"interlocks: there is no signal {', '.join(missing)}; there are: {', '.join(units)}"
             )
@@ -245,9 +246,7 @@ class InterlockWatch:
     @property
     def signals(self) -> frozenset[str]:
         """Names of the signals that have to be read for it; set-points are not among them, as they are known."""
-        watched = [course.interlock for course in self._courses]
-        names = {name for each in watched for name in (each.signal, each.minus) if name}
-        return frozenset(name for name in names if not name.endswith(SETPOINT))
+        return frozenset(name for name in self._names if not name.endswith(SETPOINT))
 
     @property
     def active(self) -> tuple[Finding, ...]:
@@ -300,10 +299,11 @@ class InterlockWatch:
         self._latest = t = max(t, self._latest)
         found: list[Finding] = []
         restless: list[_Course] = []
-        for course in self._courses:
-            course.look(t, values, setpoints, found)
-            if course.restless:
-                restless.append(course)
+        for course, signal, low, high in self._plain:
+            if course.restless or not (signal and signal in values and low <= values[signal] <= high):
+                course.look(t, values, setpoints, found)
+                if course.restless:
+                    restless.append(course)
         self._restless = restless
         if found and self._tripped is None:
             self._tripped = next((finding for finding in found if finding.level is Level.SAFE), None)
@@ -569,6 +569,8 @@ class _Course:
         self._settling = _Settling(interlock) if interlock.settle else None
         self._follows = f"{interlock.setpoint}{SETPOINT}" if interlock.stuck is not None else ""
         self._criteria = self._make_criteria()
+        self.plain = "" if len(self._criteria) > 1 or interlock.settle or interlock.minus else self._signal
+        """The signal, if readings within the range need no further look; empty otherwise."""
         self.active: list[Finding | None] = [None] * len(self._criteria)
         self._acted = [math.nan] * len(self._criteria)
 
@@ -617,9 +619,7 @@ class _Course:
         if self._settling is not None:
             self._settling.look(t, _setpoints(values) if setpoints is None else setpoints)
         setpoint = _reading(self._follows, values, setpoints) if self._follows else None
-        value = values.get(self._signal)
-        if value is None:
-            value = _reading(self._signal, values, setpoints)
+        value = _reading(self._signal, values, setpoints)
         if interlock.minus and value is not None:
             other = _reading(interlock.minus, values, setpoints)
             value = None if other is None else value - other

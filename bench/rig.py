@@ -230,9 +230,11 @@ class Rig:
         if len(readers) == 1 and not derived:
             return readers[0]
 
+        first, others = readers[0] if readers else dict[str, float], readers[1:]
+
         def read() -> dict[str, float]:
-            values: dict[str, float] = {}
-            for reader in readers:
+            values = first()
+            for reader in others:
                 values.update(reader())
             for name, compute in derived:
                 values[name] = compute(values)

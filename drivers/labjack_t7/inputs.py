@@ -170,22 +170,23 @@ class T7InputDevice(T7Device[InputSettingsT]):
             assert isinstance(device, T7InputDevice)
             spans += device.conversions
             end = begin + len(device._settings.channels)
-            parts.append((slice(begin, end), device._taken, device._values))
+            parts.append((begin, end, device._taken, device._put))
             begin, limit = end, min(limit, device._limit)
         packet = Packet.of(spans)
+        lowest, highest = -limit, limit
 
         def glance() -> dict[str, float]:
             # Over the line of the moment, as it may have been renewed.
             voltages = self._line.read_packet(packet)
             values: dict[str, float] = {}
             for volts in voltages:
-                if not -limit < volts < limit:
+                if not lowest < volts < highest:
                     # Each device knows its own limit.
-                    for part, taken, _ in parts:
-                        values.update(taken(voltages[part]))
+                    for begin, end, taken, _ in parts:
+                        values.update(taken(voltages[begin:end]))
                     return values
-            for part, _, converted in parts:
-                values.update(converted(*voltages[part]))
+            for begin, _, _, put in parts:
+                put(values, voltages, begin)
             return values
 
         return glance
@@ -213,7 +214,12 @@ class T7InputDevice(T7Device[InputSettingsT]):
         return np.array([list(self._values(*row).values()) for row in voltages.tolist()])
 
     @abstractmethod
-    def _values(self, *volts: float) -> dict[str, float]: ...
+    def _values(self, *volts: float) -> dict[str, float]:
+        """Return the signals of a voltage of each input."""
+
+    def _put(self, values: dict[str, float], voltages: Sequence[float], begin: int) -> None:
+        """Put the signals among the values; the voltages of this device begin there."""
+        values.update(self._values(*voltages[begin : begin + len(self._settings.channels)]))
 
     def _average(self) -> Sequence[float]:
         """Get the mean of `samples` conversions of each input in V; the inputs are averaged one after the other."""

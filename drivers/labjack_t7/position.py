@@ -7,6 +7,7 @@ Assumption: a linear magnet sensor such as the SPS-L035-LATS gives 10 to 90 % of
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
@@ -115,13 +116,18 @@ class T7PositionSensor(T7InputDevice[T7PositionSettings], PositionSensor):
         """Do nothing: a sensor is safe in any state."""
 
     def _values(self, *volts: float) -> dict[str, float]:
+        values: dict[str, float] = {}
+        self._put(values, volts, 0)
+        return values
+
+    def _put(self, values: dict[str, float], voltages: Sequence[float], begin: int) -> None:
         settings = self._settings
         if settings.readout == "voltage":
-            position = (volts[0] - settings.zero_volts) / settings.volts_per_metre
+            position = (voltages[begin] - settings.zero_volts) / settings.volts_per_metre
         elif settings.readout == "currents":
-            position = self._from_currents(*volts)
+            position = self._from_currents(*voltages[begin : begin + 2])
         else:
-            position = self._from_ratio(*volts)
+            position = self._from_ratio(*voltages[begin : begin + 2])
         low, high = settings.position_limits
         if not low <= position <= high:
             raise DeviceError(
@@ -129,7 +135,7 @@ class T7PositionSensor(T7InputDevice[T7PositionSettings], PositionSensor):
                 f"position {position:.6g} m is outside of its calibrated range {low:g} to {high:g} m; bring the "
                 "actuator back or extend the calibration and `position_limits`",
             )
-        return {self._signal: position}
+        values[self._signal] = position
 
     def _converted(self, voltages: Floats) -> Floats:
         settings = self._settings

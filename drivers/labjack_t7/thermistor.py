@@ -6,6 +6,7 @@ Source: Steinhart and Hart 1968, Deep-Sea Research 15.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import ClassVar, Self
 
 from pydantic import Field, model_validator
@@ -88,41 +89,49 @@ class T7Thermistor(T7InputDevice[T7ThermistorSettings], TemperatureSensor):
         self._signal = f"{name}_temperature"
         lowest, highest = ((1 + side * _EXCITATION) * settings.excitation_volts for side in (-1, 1))
         self._excitation = lowest, highest
+        self._reference_ohms, self._steinhart_hart = settings.reference_ohms, settings.steinhart_hart
+        self._temperature_limits = settings.temperature_limits
 
     def safe(self) -> None:
         """Do nothing: a sensor is safe in any state."""
 
     def _values(self, *volts: float) -> dict[str, float]:
-        settings = self._settings
-        divider, excitation = volts
-        divider_channel, excitation_channel = settings.channels
+        values: dict[str, float] = {}
+        self._put(values, volts, 0)
+        return values
+
+    def _put(self, values: dict[str, float], voltages: Sequence[float], begin: int) -> None:
+        excitation = voltages[begin + 1]
+        low, high = self._excitation
+        if low <= excitation <= high:
+            share = voltages[begin] / excitation
+            if _SHORTED < share < _OPEN:
+                temperature = _celsius(self._steinhart_hart, self._reference_ohms * share / (1 - share))
+                low, high = self._temperature_limits
+                if low <= temperature <= high:
+                    values[self._signal] = temperature
+                else:
+                    text = f"temperature {temperature:.4g} °C is outside of"
+                    advice = "bring it back, or check the thermistor and `temperature_limits`"
+                    self._check_range(text, temperature, self._temperature_limits, "°C", advice)
+                return
+        raise self._fault(voltages[begin], excitation)
+
+    def _fault(self, divider: float, excitation: float) -> DeviceError:
+        """Return what is wrong with the wires."""
+        divider_channel, excitation_channel = self._settings.channels
         low, high = self._excitation
         if not low <= excitation <= high:
-            raise DeviceError(
+            return DeviceError(
                 self.name,
                 f"excitation of the thermistor is {excitation:.3g} V at AIN{excitation_channel}, expected {low:g} to "
                 f"{high:g} V; it has failed or is not connected",
             )
         share = divider / excitation
+        at = f"the divider at AIN{divider_channel} is at {100 * share:.4g} % of its excitation"
         if share >= _OPEN:
-            raise DeviceError(
-                self.name,
-                f"thermistor open: the divider at AIN{divider_channel} is at {100 * share:.4g} % of its excitation; "
-                "a wire is broken or not connected",
-            )
-        if share <= _SHORTED:
-            raise DeviceError(
-                self.name,
-                f"thermistor shorted: the divider at AIN{divider_channel} is at {100 * share:.4g} % of its "
-                "excitation; check its wires for a short circuit",
-            )
-        temperature = _celsius(settings.steinhart_hart, settings.reference_ohms * share / (1 - share))
-        low, high = settings.temperature_limits
-        if not low <= temperature <= high:
-            text = f"temperature {temperature:.4g} °C is outside of"
-            advice = "bring it back, or check the thermistor and `temperature_limits`"
-            self._check_range(text, temperature, settings.temperature_limits, "°C", advice)
-        return {self._signal: temperature}
+            return DeviceError(self.name, f"thermistor open: {at}; a wire is broken or not connected")
+        return DeviceError(self.name, f"thermistor shorted: {at}; check its wires for a short circuit")
 
 
 def _celsius(steinhart_hart: tuple[float, float, float], ohms: float) -> float:

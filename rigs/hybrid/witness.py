@@ -17,7 +17,7 @@ from bench.devices import DriverSettings, Identity
 from bench.errors import DeviceConnectionError
 from bench.roles import PositionSensor
 from drivers.device import LineDevice
-from drivers.modbus import RefusedError
+from drivers.modbus import RefusedError, read_request
 from drivers.modbus_tcp import Connection, share
 from sim_devices.wire.modbus import ILLEGAL_ADDRESS, Frame, Packet, RegisterError
 from sim_devices.world import World
@@ -26,6 +26,9 @@ _VALUE = struct.Struct(">d")
 _WORDS = struct.Struct(">4H")
 _REGISTERS = (0, 4)
 """Address and number of them."""
+_REQUEST = read_request(*_REGISTERS)
+_REPLY = struct.Struct(">xBd")
+"""Form of the reply: its function (skipped), the number of bytes of the value, and the value."""
 
 
 class WitnessRegisters:
@@ -67,6 +70,10 @@ class Witness(LineDevice[WitnessSettings, Connection], PositionSensor):
 
     Settings: ClassVar[type[WitnessSettings]] = WitnessSettings
 
+    def __init__(self, name: str, settings: WitnessSettings, clock: Clock, line: Connection) -> None:
+        super().__init__(name, settings, clock, line)
+        self._signal = f"{name}_position"
+
     @classmethod
     def _open_line(cls, name: str, settings: WitnessSettings, clock: Clock) -> Connection:  # noqa: ARG003
         try:
@@ -83,10 +90,12 @@ class Witness(LineDevice[WitnessSettings, Connection], PositionSensor):
     def measure(self) -> dict[str, float]:
         """Return the deflection, m."""
         try:
-            (deflection,) = _VALUE.unpack(self._line.client.read(0, 4))
+            announced, deflection = _REPLY.unpack(self._line.client.request(_REQUEST, _REPLY.size))
+            if announced != _VALUE.size:
+                raise OSError(f"the answer announces {announced} bytes where {_VALUE.size} were asked for")
         except (RefusedError, OSError) as error:
             raise DeviceConnectionError(self.name, f"no witness at {self._settings.port}: {error}") from error
-        return {f"{self.name}_position": deflection}
+        return {self._signal: deflection}
 
     def safe(self) -> None:
         """Do nothing: a sensor is safe in any state."""
