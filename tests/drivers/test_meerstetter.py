@@ -1053,7 +1053,9 @@ def test_another_line_goes_on_counting(script, tec):
     tec.measure()
     last = int(script.received[-1][3:7], 16)
     script.received.clear()
+    before = tec._line
     tec.reconnect()
+    assert tec._line is not before
     assert int(script.received[0][3:7], 16) == last + 1
     assert tec.repeats == 1
 
