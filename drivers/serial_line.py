@@ -75,6 +75,16 @@ def _holder(port: str) -> str:
         return "another process"
 
 
+def forget_received(port: Any) -> None:  # noqa: ANN401 - pyserial is untyped
+    """Forget what a line has received and nobody has read; raises `OSError` if the line is lost."""
+    try:
+        port.reset_input_buffer()
+    except OSError:
+        raise
+    except Exception as error:  # pyserial passes on that of termios, which is no OSError
+        raise OSError(str(error)) from error
+
+
 def settle_line(port: Any, silence: float) -> None:  # noqa: ANN401 - pyserial is untyped
     """Discard what comes on a line until nothing has come for `silence` seconds.
 

@@ -11,7 +11,7 @@ from bench.errors import DeviceConnectionError, DeviceError
 from bench.twin.device import DONE, END, GLANCE, IDENTITY, MEASURE, OFF, OUTPUT, SET, TwinSettings, number_text
 from drivers.device import LineActuator, LineDevice
 from drivers.quantities import identity_of
-from drivers.serial_line import RESENDS, SerialSettings, lost_line, open_port
+from drivers.serial_line import RESENDS, SerialSettings, forget_received, lost_line, open_port
 
 _ARRIVAL_TIMEOUT = 600.0  # s
 
@@ -38,7 +38,7 @@ class TwinLine:
         """
         for _ in range(1 + RESENDS):
             try:
-                self._port.reset_input_buffer()
+                forget_received(self._port)
                 self._port.write(request.encode() + END)
                 answer: bytes = self._port.read_until(END)
             except OSError as error:  # pyserial's errors among them

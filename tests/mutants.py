@@ -8,8 +8,8 @@ numba's cache does not see the change; they are compared with brute-force oracle
     python tests/mutants.py bench/control/tracking.py
 
 Those of a line that is executed when the module is loaded, such as a constant, may be killed by any test that
-executes a line of the module. A mutant counts as killed if a test fails or does not end. The sample is drawn with a
-seed. Needs POSIX, as each mutant is a fork of a process that has loaded the libraries.
+executes a line of the module or has its name, and by the table of all settings. A mutant counts as killed if a test
+fails or does not end. The sample is drawn with a seed. Needs POSIX, as each mutant is a fork of a process that has loaded the libraries.
 """
 
 from __future__ import annotations
@@ -37,7 +37,8 @@ import pytest
 ROOT = Path(__file__).parents[1]
 MODULES = ("bench/control", "bench/engine.py", "bench/journal", "drivers")
 TESTS = ("tests/control", "tests/drivers", "tests/contracts", "tests/bench", "tests/protocols")
-MOST_TESTS, MOST_SECONDS = 150, 40.0
+SETTINGS = "tests/contracts/test_settings.py"
+MOST_TESTS, MOST_SECONDS = 300, 40.0
 _NOT_LOADED = 99
 COMPARISONS = {
     ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
@@ -48,10 +49,14 @@ OPERATIONS = {ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: as
 
 @dataclass(frozen=True)
 class Mutant:
-    """One change: the file, the line, the number of the change in the file, and what it is."""
+    """One change: the file, the line, the number of the change in the file, and what it is.
+
+    `first` is the first line of its statement, 0 if it is executed when the module is loaded.
+    """
 
     file: str
     line: int
+    first: int
     number: int
     what: str
 
@@ -61,15 +66,23 @@ class Mutator(ast.NodeTransformer):
 
     def __init__(self, wanted: int | None = None) -> None:
         self.wanted, self.count, self.found = wanted, 0, []
+        self.depth = self.first = 0
+
+    def visit(self, node):
+        if self.depth and isinstance(node, ast.stmt):
+            self.first = node.lineno
+        return super().visit(node)
 
     def _change(self, node: ast.AST, what: str, make) -> ast.AST:
         number, self.count = self.count, self.count + 1
-        self.found.append((node.lineno, number, what))
+        self.found.append((node.lineno, self.first if self.depth else 0, number, what))
         return ast.copy_location(make(), node) if number == self.wanted else node
 
     def visit_FunctionDef(self, node):
         # Annotations, decorators and docstrings are not what a program does.
+        self.depth += 1
         node.body = [self.visit(each) for each in node.body]
+        self.depth -= 1
         return node
 
     def visit_AnnAssign(self, node):
@@ -231,13 +244,21 @@ def forked(work, timeout: float) -> int | None:
 def judge(mutant: Mutant, known: dict, folder: Path) -> str:
     """Return `killed`, `survived`, `not executed`, or `not loaded` if the tests took the unchanged module."""
     lines = known["lines"].get(mutant.file, {})
-    found = lines.get(str(mutant.line), [])
-    if not found and str(mutant.line) in lines:
-        found = {test for tests in lines.values() for test in tests}
-    tests, total = [], 0.0
-    # Those of the module or its package first, then the quick ones.
+    # Of a statement on several lines, the constants may be loaded on the first one.
+    found = set(lines.get(str(mutant.line)) or lines.get(str(mutant.first), []))
     own = tuple(f"test_{part}.py" for part in Path(mutant.file).with_suffix("").parts[1:])
-    for test in sorted(found, key=lambda name: (not any(each in name for each in own), known["seconds"][name])):
+    at_loading = not mutant.first or (not found and str(mutant.line) in lines)
+    if at_loading:
+        found = {test for tests in lines.values() for test in tests}
+        found |= {test for test in known["seconds"] if any(each in test for each in (*own, SETTINGS))}
+    tests, total = [], 0.0
+
+    def order(test: str) -> tuple[bool, bool, float]:
+        """Put those of the module or its package first, then the quick ones."""
+        is_table = at_loading and test.startswith(SETTINGS)
+        return not is_table, not any(each in test for each in own), known["seconds"][test]
+
+    for test in sorted(found, key=order):
         total += known["seconds"][test]
         if len(tests) == MOST_TESTS or (tests and total > MOST_SECONDS):
             break

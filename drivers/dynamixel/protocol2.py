@@ -14,7 +14,7 @@ import serial
 from pydantic import Field
 
 from bench.clock import Clock
-from drivers.serial_line import RESENDS, SerialSettings, lost_line, no_answer, open_port
+from drivers.serial_line import RESENDS, SerialSettings, forget_received, lost_line, no_answer, open_port
 
 PING, READ, WRITE, REBOOT = 0x01, 0x02, 0x03, 0x08
 RANGE_ERROR = 4
@@ -134,7 +134,7 @@ class ServoLine:
                     self.repeats += 1
                     self._expect_late()
                 self._received.clear()
-                self._port.reset_input_buffer()
+                forget_received(self._port)
                 self._port.write(request)
                 problem, error, content = self._answer(length)
                 if problem == "":

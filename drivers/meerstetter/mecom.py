@@ -17,7 +17,7 @@ import serial
 from pydantic import Field
 
 from bench.errors import DeviceError
-from drivers.serial_line import RESENDS, SerialSettings, lost_line, no_answer, open_port
+from drivers.serial_line import RESENDS, SerialSettings, forget_received, lost_line, no_answer, open_port
 
 _MOST_STALE_ANSWERS = 8
 _HASTE = 0.2  # s, longest wait for an answer where time is short
@@ -160,7 +160,7 @@ class TECLine:
                 if problem != self._silence:
                     # All else that has come belongs to the damage; after silence, a late answer may come.
                     self._received.clear()
-                    self._port.reset_input_buffer()
+                    forget_received(self._port)
         except (serial.SerialException, OSError) as error:
             raise lost_line(self._device, self._settings, error) from None
         raise no_answer(self._device, self._settings, problem, "address", self._settings.address, resends=resends)

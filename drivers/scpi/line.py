@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
+
 from bench.clock import Clock
 from bench.command_table import ANY_TEXT, CommandTable, Template, template
 from bench.errors import DeviceConnectionError, DeviceError
@@ -62,14 +65,13 @@ class TextLine:
         """Send a message that has no answer."""
         self._clock.sleep_until(self._free_at)
         try:
-            self._transport.write(f"{message}{self._end}".encode(self._encoding))
-        except DeviceConnectionError:
-            self.lost = True
-            raise
+            encoded = f"{message}{self._end}".encode(self._encoding)
         except UnicodeEncodeError as error:
             raise DeviceError(
                 self._device, f"{message!r} cannot be written in {self._settings.encoding}: {error}"
             ) from None
+        with self._noticing_loss():
+            self._transport.write(encoded)
         if self._delay:
             self._free_at = self._clock.now() + self._delay
 
@@ -129,17 +131,23 @@ class TextLine:
         numbers = _NO_ERROR.match(answer)
         return numbers is not None and numbers["value"] == 0.0
 
+    @contextmanager
+    def _noticing_loss(self) -> Iterator[None]:
+        try:
+            yield
+        except DeviceConnectionError:
+            self.lost = True
+            raise
+
     def _exchange(self, question: str) -> str | None:
-        self._transport.discard()
+        with self._noticing_loss():
+            self._transport.discard()
         self.tell(question)
         return self._receive()
 
     def _receive(self) -> str | None:
-        try:
+        with self._noticing_loss():
             answer = self._transport.read()
-        except DeviceConnectionError:
-            self.lost = True
-            raise
         return None if answer is None else answer.decode(self._encoding, "backslashreplace").strip()
 
     @property

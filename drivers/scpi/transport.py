@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Protocol
 from pydantic import AfterValidator, Field
 
 from bench.errors import DeviceConnectionError
-from drivers.serial_line import SerialSettings, lost_line, open_port
+from drivers.serial_line import SerialSettings, forget_received, lost_line, open_port
 
 TCP = "tcp://"
 VISA = "visa://"
@@ -115,7 +115,7 @@ class SerialTransport:
     def discard(self) -> None:
         """Forget what was received."""
         try:
-            self._port.reset_input_buffer()
+            forget_received(self._port)
         except OSError as error:
             raise lost_line(self._device, self._settings, error) from None
 

@@ -72,3 +72,36 @@ class FaultyLine(WireServer):
 
     def next_unsolicited(self):
         return self._due[0][0] if self._due else math.inf
+
+
+class InPieces(WireServer):
+    """Passes requests on; each answer comes in two pieces with a pause between them.
+
+    Parameters
+    ----------
+    place : int
+        Where an answer is cut, bytes from its beginning.
+    pause : float
+        Time between the pieces, s.
+    """
+
+    def __init__(self, server, clock, place, pause):
+        self.server, self.clock = server, clock
+        self.place, self.pause = place, pause
+        self._rest, self._due = b"", math.inf
+
+    def receive(self, data):
+        answer = self.server.receive(data)
+        if self.place >= len(answer):
+            return answer
+        self._rest, self._due = answer[self.place :], self.clock.now() + self.pause
+        return answer[: self.place]
+
+    def unsolicited(self):
+        if self.clock.now() < self._due:
+            return b""
+        sent, self._rest, self._due = self._rest, b"", math.inf
+        return sent
+
+    def next_unsolicited(self):
+        return self._due

@@ -4,16 +4,19 @@ import math
 import struct
 
 import pytest
+from faulty_line import InPieces
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from bench.clock import VirtualClock
-from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, LimitError
+from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, DeviceRestartedError, LimitError
 from drivers.dynamixel import HARDWARE_ERRORS, STATUS_ERRORS, DynamixelDrum, DynamixelMX28
+from drivers.dynamixel import mx28 as driver
 from drivers.dynamixel.mx28 import MX28Settings
 from drivers.dynamixel.protocol2 import RefusedError, ServoLine, frame
 from drivers.dynamixel.protocol2 import crc as driver_crc
+from sim_devices.instruments.dynamixel_table import ITEMS
 from sim_devices.protocol_emulated import register, unregister
 from sim_devices.wire import WireServer
 
@@ -1017,3 +1020,347 @@ def test_no_bytes_are_taken_for_an_answer_that_they_are_not(replies):
         assert line.ask(0x02, bytes.fromhex("84000400"), 4) == (1000).to_bytes(4, "little")
     finally:
         unregister("fuzzed-servo")
+
+
+# What stands in the manual.
+
+
+# ROBOTIS e-Manual, MX-28(2.0), control table: address, size, title.
+TABLE_OF_THE_MAKER = """
+9 1 return delay time
+10 1 drive mode
+11 1 operating mode
+20 4 homing offset
+40 4 acceleration limit
+44 4 velocity limit
+63 1 shutdown mask
+64 1 torque enable
+68 1 status return level
+70 1 hardware error status
+98 1 bus watchdog
+100 2 goal PWM
+108 4 profile acceleration
+112 4 profile velocity
+116 4 goal position
+132 4 position
+144 2 input voltage
+146 1 temperature
+"""
+
+
+def test_items_are_those_of_the_control_table():
+    items = [each for each in vars(driver).values() if isinstance(each, driver._Item)]
+    found = {f"{item.address} {item.size} {item.title}" for item in items}
+    together = "9 4 return delay time, modes and secondary id"
+    assert found == {*TABLE_OF_THE_MAKER.strip().splitlines(), together}
+    for item in items:
+        if item is not driver._MODES:
+            assert ITEMS[item.address].size == item.size
+    assert sum(ITEMS[address].size for address in (9, 10, 11, 12)) == driver._MODES.size
+    assert [driver._TICK, driver._MOVING, driver._LOAD, driver._VELOCITY] == [120, 122, 126, 128]
+
+
+def test_errors_are_those_of_the_manual():
+    assert {bit: text for bit, (text, _) in HARDWARE_ERRORS.items()} == {
+        0: "input voltage", 2: "overheating", 3: "motor encoder", 4: "electrical shock", 5: "overload",
+    }  # fmt: skip
+    assert [STATUS_ERRORS[code].split()[-1] for code in range(1, 7)] == [
+        "instruction", "instruction", "damaged", "range", "wrong", "servo",
+    ]  # fmt: skip
+    assert "read-only" in STATUS_ERRORS[7]
+    assert len(STATUS_ERRORS) == 7
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong"),
+    [
+        ({"watchdog": 0.02}, {"watchdog": 0.019}),
+        ({"position_limits": (-1048575 * COUNT, 1048575 * COUNT)}, {"position_limits": (-1048576 * COUNT, 1.0)}),
+        ({"position_limits": (1.0, 1.001)}, {"position_limits": (1.0, 1.0)}),
+        ({"position_limits": (0.0, 1048575 * COUNT)}, {"position_limits": (0.0, 1048576 * COUNT)}),
+        ({"return_delay": 508e-6}, {"return_delay": 510e-6}),
+    ],
+)
+def test_settings_at_their_bounds(right, wrong):
+    make_settings(**right)
+    with pytest.raises(ValidationError):
+        make_settings(**wrong)
+
+
+def test_oldest_firmware_and_limits_of_the_servo(script, clock):
+    # 1.0 rad/s and 2.0 rad/s² are 41 and 5 units.
+    script.values |= {6: 39, 44: 41, 40: 5}
+    connect(clock)
+    for address, value in ((6, 38), (44, 40), (40, 4)):
+        right, script.values[address] = script.values[address], value
+        with pytest.raises((DeviceConnectionError, ConfigurationError)):
+            connect(clock)
+        script.values[address] = right
+
+
+def test_furthest_goals(script, clock):
+    furthest = 1_048_575 * COUNT
+    servo = connect(clock, position_limits=(-furthest, furthest))
+    for value in (furthest, -furthest):
+        servo.set(value)
+        assert script.values[116] == round(value / COUNT)
+
+
+def test_error_tells_voltage_and_temperature(script, servo):
+    script.values[70] = 0x20
+    with pytest.raises(DeviceError, match=r"hardware error 0x20 \(overload; 12\.1 V, 31 °C\)"):
+        servo.measure()
+
+
+def test_own_check_tells_supply_and_turns(script, clock):
+    supply, turns = connect(clock, position_limits=(-math.pi, math.pi)).self_check()
+    assert supply.text == "12.1 V, servo 31 °C"
+    assert turns.text == "the limits span 1 turns; which of them it is in is lost when it is switched off"
+    _, turns = connect(clock, position_limits=(-math.pi, 0.9 * math.pi)).self_check()
+    assert turns.text == "the limits span 0.95 turns"
+    assert connect(clock).safe_within == 2.0
+
+
+# What is held, and what is not.
+
+
+def test_servo_without_feedback_is_not_connected(script, clock):
+    for key in ((2, 224), (3, 168)):
+        script.refusals = {key: 7}
+        with pytest.raises(DeviceError, match="refused"):
+            connect(clock)
+
+
+def test_tick_that_stands_still(script, servo, clock):
+    servo.measure()
+    still = [script.values[120]]
+
+    def unmoved(_sent, _right):
+        script.values[120] = still[0] - 1
+        return packet(1, 0x55, b"\x00" + script.table(224, 21))
+
+    script.instead = [unmoved] * 3
+    script.received.clear()
+    servo.measure()
+    assert len(script.received) == 1  # within 5 ms the tick may be the same
+    clock.sleep(0.006)
+    script.instead = [unmoved] * 3
+    script.received.clear()
+    servo.measure()
+    assert len(script.received) == 4
+    assert servo.repeats == 3
+    still[0] = script.values[120]
+    clock.sleep(0.006)
+    script.instead = [unmoved] * 4
+    with pytest.raises(DeviceError, match="tick stands still"):
+        servo.measure()
+
+
+def test_goal_whose_answer_is_lost_may_be_the_former_or_the_new_one(script, servo):
+    servo.set(2.0)
+    script.instead = [None, b"", b"", b""]
+    with pytest.raises(DeviceConnectionError):
+        servo.set(1.0)
+    for goal in (1304, 652):
+        script.values[116] = goal
+        servo.measure()
+    servo.set(1.0)
+    script.values[116] = 1304
+    with pytest.raises(DeviceError, match="its goal was changed to 2 rad by another host, from 1 rad"):
+        servo.measure()
+
+
+def test_error_that_comes_with_the_goal(script, servo):
+    servo.set(2.0)
+    script.on_write = lambda address, _value: script.values.update({70: 0x20} if address == 116 else {})
+    with pytest.raises(DeviceError, match="overload"):
+        servo.set(1.0)
+
+
+def test_watchdog_that_expires_just_before_the_goal(script, servo):
+    servo.set(2.0)
+
+    def expired(_sent, _right):
+        script.values[98] = 255
+        return packet(1, 0x55, b"\x04")
+
+    script.instead = [None, expired]
+    with pytest.raises(DeviceError, match="the bus watchdog stopped the servo"):
+        servo.set(1.0)
+
+
+def test_torque_that_somebody_switched_off(script, servo):
+    servo.set(2.0)
+    script.values[64] = 0
+    with pytest.raises(DeviceError, match="torque was switched off, and not by this bench"):
+        servo.measure()
+    servo.measure()
+
+
+def test_restart_is_told_until_the_servo_is_connected_again(script, servo, clock):
+    servo.set(2.0)
+    script.indirect = [200] * 21  # nothing is there
+    script.values |= {64: 0}
+    SIZES[200] = 1
+    script.values[200] = 0
+    for action in (servo.measure, lambda: servo.set(1.0), servo.measure):
+        with pytest.raises(DeviceRestartedError, match="the servo has restarted"):
+            action()
+    connect(clock).measure()
+    servo.reboot()
+    servo.measure()
+
+
+def test_another_goal_ends_the_status_of_the_first(script, servo):
+    status = servo.set(2.0)
+    servo.set(1.0)
+    with pytest.raises(DeviceError, match="2 rad was replaced by another goal"):
+        status.wait()
+
+
+def test_time_that_a_motion_is_given(script, clock):
+    servo = connect(clock, profile_velocity=0.5, profile_acceleration=1.0, arrival_timeout=2.0)
+    velocity, acceleration = 20 * 0.229 * 2 * math.pi / 60, 2 * 214.577 * 2 * math.pi / 3600
+    begin = clock.now()
+    status = servo.set(1000 * COUNT - 1.0)
+    script.values[122] = 1
+    with pytest.raises(DeviceError, match="did not arrive within"):
+        status.wait()
+    expected = 2.0 + 1.0 / velocity + 4.0 * velocity / acceleration
+    assert clock.now() - begin == pytest.approx(expected, abs=0.12)
+
+
+def test_blocked_shaft_is_told_after_one_second(script, servo, clock):
+    status = servo.set(2.0)
+    script.values[132] = 1200
+    assert not status.update()
+    begin = clock.now()
+    clock.sleep(0.99)
+    assert not status.update()
+    clock.sleep(begin + 1.001 - clock.now())
+    status.update()
+    with pytest.raises(DeviceError, match="stands at"):
+        status.wait()
+
+
+# How long things take.
+
+
+def sending_times(script, clock):
+    """Return a list that fills with the times at which requests come."""
+    times, receive = [], script.receive
+    script.receive = lambda data: times.append(clock.now()) or receive(data)
+    return times
+
+
+def test_after_a_lost_answer_the_next_request_waits_for_it(script, servo, clock):
+    times = sending_times(script, clock)
+    script.instead = [b""]
+    servo.measure()
+    assert servo.repeats == 1
+    assert servo.torque_enabled is False
+    assert times[2] - times[1] == pytest.approx(0.3, abs=0.01)  # three time-outs after the second request
+    servo.torque_enabled  # noqa: B018 - asks the servo
+    assert times[3] - times[2] < 0.02
+
+
+def test_after_silence_the_next_request_waits_for_it(script, servo, clock):
+    times = sending_times(script, clock)
+    script.instead = [b""] * 3
+    with pytest.raises(DeviceConnectionError):
+        servo.measure()
+    servo.measure()
+    assert times[3] - times[2] == pytest.approx(0.4, abs=0.01)
+
+
+def test_safe_state_does_not_wait_for_late_answers(script, servo, clock):
+    times = sending_times(script, clock)
+    script.instead = [b""]
+    servo.measure()
+    servo.safe()
+    assert times[2] - times[1] < 0.02
+    assert times[3] - times[1] == pytest.approx(0.3, abs=0.01)
+
+
+def test_servo_is_left_alone_until_it_has_rebooted(script, servo, clock):
+    times = sending_times(script, clock)
+    servo.reboot()
+    assert times[1] - times[0] == pytest.approx(0.2, abs=0.01)
+
+
+def test_reboot_on_the_way_to_the_safe_state_takes_a_second(script, servo, clock):
+    servo.set(2.0)
+    script.refusals[3, 64] = 1
+    script.keeps.add(64)
+    times = sending_times(script, clock)
+    rebooted = []
+
+    def silence(address, _value):
+        if address == "reboot":
+            rebooted.append(clock.now())
+            script.silent = True
+
+    script.on_write = silence
+    with pytest.raises(DeviceError, match="does not confirm"):
+        servo.safe()
+    after = [time - rebooted[0] for time in times if time > rebooted[0]]
+    assert 0.9 < max(after) < 2.1
+
+
+@pytest.mark.parametrize("noise", [b"", b"no\xff\xff\xfd"])
+@pytest.mark.parametrize("place", range(20))
+@pytest.mark.parametrize("kind", ["value", "acknowledge"])
+def test_an_answer_in_pieces_is_put_together_and_costs_no_more_than_its_pause(clock, place, kind, noise):
+    script = Script()
+    answered = script.right_answer
+    script.right_answer = lambda data: noise + answered(data)
+    register("pieces-servo", InPieces(script, clock, place, 0.02), clock)
+    try:
+        line = ServoLine("servo", make_settings(port="emulated://pieces-servo"), clock)
+        before = clock.now()
+        if kind == "value":
+            assert line.ask(0x02, bytes.fromhex("84000400"), 4) == (1000).to_bytes(4, "little")
+        else:
+            line.order(0x03, bytes.fromhex("620005"))
+        assert clock.now() - before < 0.03
+        assert line.repeats == 0
+    finally:
+        unregister("pieces-servo")
+
+
+@pytest.mark.parametrize(("strays", "requests"), [(7, 1), (8, 2)])
+def test_so_many_packets_of_others_are_passed_over(script, servo, strays, requests):
+    script.instead = [lambda _sent, right: packet(2, 0x55, b"\x00") * strays + right]
+    servo.measure()
+    assert len(script.received) == requests
+
+
+@pytest.mark.parametrize(
+    ("head", "requests"), [("0200", 1), ("0101", 1), ("0000", 1), ("ffff", 1), ("0300", 2), ("0001", 2)]
+)
+def test_heads_that_are_none_are_passed_over(script, servo, clock, head, requests):
+    # Lengths are 3 to 256 bytes; what seems to have one of them is waited for, and is damaged.
+    script.instead = [lambda _sent, right: b"\xff\xff\xfd\x00\x01" + bytes.fromhex(head) + right]
+    before = clock.now()
+    servo.measure()
+    assert len(script.received) == requests
+    assert requests == 2 or clock.now() - before < 0.02
+
+
+def test_noise_without_end_is_over_after_a_kilobyte(script, servo, clock):
+    script.instead = [b"\x00" * 3000] * 3
+    before = clock.now()
+    with pytest.raises(DeviceConnectionError, match="damaged answer"):
+        servo.measure()
+    # No time-out, but the pauses for late answers.
+    assert clock.now() - before < 2.5
+
+
+def test_refusal_names_its_number(script, clock):
+    line = ServoLine("servo", make_settings(), clock)
+    for error, code in ((0x04, 4), (0x84, 4), (0x87, 7)):
+        script.instead = [packet(1, 0x55, bytes((error,)))]
+        with pytest.raises(RefusedError) as caught:
+            line.order(0x03, bytes.fromhex("620005"))
+        assert caught.value.code == code
+        assert line.alert is (error > 0x80)

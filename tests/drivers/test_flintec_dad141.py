@@ -16,7 +16,7 @@ from pydantic import ValidationError
 
 from bench.clock import VirtualClock, WallClock
 from bench.errors import DeviceConnectionError, DeviceError, DeviceRestartedError
-from drivers.flintec_dad141 import FlintecDAD141
+from drivers.flintec_dad141 import CUTOFF_HZ, FlintecDAD141, _agree
 from drivers.pymodbus_client import SerialClient
 from sim_devices import protocol_emulated
 from sim_devices.instruments.flintec_dad141 import EmulatedDAD141
@@ -819,3 +819,135 @@ def test_a_reply_of_another_form_is_an_error(bench, function):
                 cell.glance()
         bench.tap.alter = lambda reply: reply
         cell.close()
+
+
+# What stands in the manual, and what time takes
+
+
+def test_requests_of_connecting(bench):
+    bench.cell(filter=5)
+    assert bench.tap.sent == [
+        sealed("01 04 202C 0002"),  # identity
+        sealed("01 03 202E 0002"),  # firmware
+        sealed("01 04 2034 0002"),  # serial number
+        sealed("01 03 2080 0004"),  # peak, as floating-point number and as integer
+        sealed("01 04 2122 0002"),  # zero tracking
+        sealed("01 10 2110 0002 04 0000 0000"),  # filter mode: IIR
+        sealed("01 03 2110 0002"),
+        sealed("01 10 2106 0002 04 0000 0005"),  # filter
+        sealed("01 04 2106 0002"),
+        sealed("01 06 2061 0004"),  # reset of the tare
+        sealed("01 03 3500 0005"),  # gross, net and qualifier
+    ]
+
+
+def test_cutoffs_of_the_manual(bench):
+    assert CUTOFF_HZ == (17.0, 18.0, 8.0, 4.0, 3.0, 2.0, 1.0, 0.5, 0.25)
+    for number, cutoff in enumerate(CUTOFF_HZ):
+        assert bench.cell(filter=number)._interval == 0.5 / cutoff
+
+
+def test_after_a_lost_reply_a_request_like_no_other_brings_the_line_into_step(bench):
+    cell = bench.cell()
+    echoes = []
+    for _ in range(5):
+        times, lose = [], Once(lambda _: b"")
+        bench.tap.sent.clear()
+        bench.tap.alter = lambda reply, times=times, lose=lose: times.append(bench.clock.now()) or lose(reply)
+        cell.glance()
+        block, echo, again, look = bench.tap.sent
+        assert again == block
+        assert look in LOOK_AT_FILTER
+        echoes.append(echo)
+        # The time-out and a quarter of it in silence; three time-outs until nothing late can come.
+        assert times[1] - times[0] == pytest.approx(1.25 * 0.2, abs=0.01)
+        assert times[2] - times[0] == pytest.approx(3.0 * 0.2, abs=0.01)
+    forms = [
+        sealed(f"01 {function} 202A 000{count}") for function, count in (("04", 8), ("03", 6), ("03", 8), ("04", 6))
+    ]
+    assert echoes == [*forms, forms[0]]
+    assert cell.repeats == 5
+
+
+def test_a_line_that_was_lost_is_not_asked(bench):
+    cell = bench.cell()
+    protocol_emulated.unregister("load")
+    with pytest.raises(DeviceConnectionError, match="lost the line"):
+        cell.glance()
+    with pytest.raises(DeviceConnectionError, match="was lost; open it again"):
+        cell.self_check()
+    protocol_emulated.register("load", bench.tap, bench.clock)
+    cell.glance()
+
+
+def test_a_tare_is_waited_for_a_second(bench):
+    cell = bench.cell()
+    cell.glance()
+    bench.put(1.0)
+    cell.glance()
+    bench.bank.write_registers = lambda *_: None
+    begin = bench.clock.now()
+    with pytest.raises(DeviceError, match="took no tare"):
+        cell.tare()
+    assert bench.clock.now() - begin == pytest.approx(1.0, abs=0.06)
+
+
+@pytest.mark.parametrize(
+    ("weight", "digits", "agree"),
+    [
+        (0.5, 1, True),
+        (0.4, 1, False),
+        (-0.5, -1, True),
+        (12.3, 123, True),
+        (1e-5, 1, True),
+        (1e-6, 1, False),
+        (1e6, 1_000_001, True),
+        (1e6, 1_000_002, False),
+        (1.0, 0, False),
+    ],
+)
+def test_digits_of_a_weight(weight, digits, agree):
+    assert _agree(weight, digits) is agree
+
+
+def test_a_force_at_its_limits_is_good(bench):
+    cell = bench.cell(force_limits=(-4.0, 8.0), newtons_per_unit=2.0, zero_newtons=-2.0)
+    for weight, force in ((5.0, 8.0), (-1.0, -4.0)):
+        bench.put(weight)
+        assert cell.glance() == {"load_force": force}
+    for weight in (5.1, -1.1):
+        bench.put(weight)
+        with pytest.raises(DeviceError, match="outside of its calibrated range -4 to 8 N"):
+            cell.glance()
+
+
+def test_own_check_reads_the_filter_and_looks_at_the_converter(bench):
+    bench.instrument._noise = 2e-4
+    bench.instrument.power_cycle()
+    cell = bench.cell()
+    bench.tap.sent.clear()
+    filtered, converter = cell.self_check()
+    assert (filtered.text, filtered.advice) == ("3 in the instrument", "")
+    assert converter.text.endswith("in 5 readings")
+    assert converter.advice == ""
+    assert len(bench.tap.sent) == 6
+    bench.instrument.frozen = True
+    bench.instrument.write_registers(0x2106, [0, 4])
+    filtered, converter = cell.self_check()
+    assert "from 3" in filtered.advice
+    assert "off and on" in converter.advice
+
+
+def test_firmware_of_the_instrument(bench):
+    bench.bank.alter = lambda address, words: [0, 0x0C05] if address == 0x202E else words
+    assert bench.cell().identity.firmware == "5.12"
+    for wrong in ([1, 0x0C05], [0, 0]):
+        bench.bank.alter = lambda address, words, wrong=wrong: wrong if address == 0x202E else words
+        with pytest.raises(DeviceConnectionError, match="for its firmware, which no DAD 141"):
+            bench.cell()
+
+
+def test_settings_of_a_range_that_is_empty():
+    Settings(port="x", force_limits=(1.0, 1.001))
+    with pytest.raises(ValidationError):
+        Settings(port="x", force_limits=(1.0, 1.0))

@@ -14,7 +14,8 @@ from pydantic import ValidationError
 
 from bench.clock import VirtualClock
 from bench.errors import DeviceConnectionError, DeviceError, DeviceRestartedError, LimitError
-from drivers.labjack_t7 import T7HighVoltageSupply, T7PositionSensor, T7Switch, T7Thermistor
+from drivers import modbus_tcp
+from drivers.labjack_t7 import T7HighVoltageSupply, T7PositionSensor, T7Switch, T7Thermistor, registers
 from drivers.labjack_t7.lines import DigitalOutput
 from drivers.labjack_t7.registers import (
     AIN,
@@ -25,6 +26,10 @@ from drivers.labjack_t7.registers import (
     TEST,
     TEST_FLOAT32,
     LabJackT7,
+    Packet,
+    Register,
+    Span,
+    Target,
 )
 from sim_devices.instruments.labjack_t7 import EmulatedT7
 from sim_devices.protocol_emulated import register, unregister
@@ -96,6 +101,16 @@ class Bench:
         """The lines that the watchdog drives when it runs out."""
         on = self.t7.read_value(61600) and self.t7.read_value(61630)
         return ~int(self.t7.read_value(61636)) & ALL_LINES if on else 0
+
+
+@pytest.fixture(autouse=True)
+def _no_connection_stays() -> Iterator[None]:
+    """See that what opens a connection in a test releases it, also after an error."""
+    yield
+    left = dict(modbus_tcp._connections)
+    for connection in left.values():
+        connection.end()
+    assert not left
 
 
 @pytest.fixture
@@ -720,6 +735,8 @@ def test_a_lost_connection_is_masked_and_counted(bench):
         call()
         assert psd.repeats + supply.repeats == count
     assert bench.t7.tdac_volts(0) == pytest.approx(5.0 / 20.0, abs=1e-3)
+    psd.close()
+    supply.close()
     unregister(address)
 
 
@@ -1588,3 +1605,483 @@ def test_devices_on_one_connection_are_read_in_one_request(bench):
     bench.volts[3] = 2.5
     with pytest.raises(DeviceError, match=r"^base: thermistor open"):
         sensor.joined([thermistor])()
+
+
+# What stands in the map, and at the bounds of it
+
+
+# labjack/ljm_constants, ljm_constants.json: name, address, type, access.
+MAP_OF_THE_MAKER = """
+AIN# 0 F32 R
+DAC# 1000 F32 RW
+DIO# 2000 U16 RW
+DIO_STATE 2800 U32 RW
+DIO_DIRECTION 2850 U32 RW
+STREAM_SETTLING_US 4008 F32 RW
+STREAM_RESOLUTION_INDEX 4010 U32 RW
+AIN#_EF_READ_A 7000 F32 R
+AIN#_EF_READ_B 7300 F32 RW
+AIN#_EF_READ_C 7600 F32 RW
+AIN#_EF_INDEX 9000 U32 RW
+AIN#_EF_CONFIG_A 9300 U32 RW
+AIN#_EF_CONFIG_D 10200 F32 RW
+TDAC# 30000 F32 W
+AIN#_RANGE 40000 F32 RW
+AIN#_NEGATIVE_CH 41000 U16 RW
+AIN#_RESOLUTION_INDEX 41500 U16 RW
+AIN#_SETTLING_US 42000 F32 RW
+USER_RAM#_U32 46100 U32 RW
+LAST_ERR_DETAIL 55000 U16 R
+TEST 55100 U32 R
+TEST_FLOAT32 55124 F32 R
+PRODUCT_ID 60000 F32 R
+FIRMWARE_VERSION 60004 F32 R
+SERIAL_NUMBER 60028 U32 R
+WAIT_US_BLOCKING 61590 U32 W
+WATCHDOG_ENABLE_DEFAULT 61600 U32 RW
+WATCHDOG_TIMEOUT_S_DEFAULT 61604 U32 RW
+WATCHDOG_STRICT_ENABLE_DEFAULT 61610 U32 RW
+WATCHDOG_DIO_ENABLE_DEFAULT 61630 U32 RW
+WATCHDOG_DIO_STATE_DEFAULT 61632 U32 RW
+WATCHDOG_DIO_DIRECTION_DEFAULT 61634 U32 RW
+WATCHDOG_DIO_INHIBIT_DEFAULT 61636 U32 RW
+WATCHDOG_DAC0_ENABLE_DEFAULT 61640 U32 RW
+WATCHDOG_DAC1_ENABLE_DEFAULT 61650 U32 RW
+"""
+
+
+def test_registers_are_those_of_the_map():
+    parts = [*vars(registers).values(), *registers.WATCHDOG_DAC_ENABLE]
+    found = {
+        " ".join(map(str, each)) for each in parts if isinstance(each, Register) and each is not registers._OWNER
+    }
+    assert found == set(MAP_OF_THE_MAKER.strip().splitlines())
+    assert registers._OWNER == ("USER_RAM39_U32", 46178, "U32", "RW")
+    assert (TDAC.of(22).address, AIN_NEGATIVE_CH.of(13).address, AIN_RANGE.of(13).address) == (30044, 41013, 40026)
+    assert registers._DETAILS == {
+        2370: "AIN range not available",
+        2371: "AIN settling time too long",
+        2372: "AIN is set to binary",
+        2373: "AIN negative channel not allowed",
+        2374: "only zero may be written",
+        2375: "AIN resolution index not allowed",
+        2376: "AIN rate not possible at this resolution index",
+    }
+    with pytest.raises(ValueError, match="AIN# can only be read"):
+        Target.of(AIN)
+    with pytest.raises(ValueError, match="TDAC# can only be written"):
+        Span.of(TDAC)
+
+
+@pytest.mark.parametrize(
+    ("product", "name"), [(4.0, "a LabJack T4"), (8.0, "a LabJack T8"), (200.0, "LabJack Digit")]
+)
+def test_other_products_are_named(bench, product, name):
+    def alter(address: int, words: list[int]) -> list[int]:
+        raw = np.array([product], ">f4").tobytes()
+        return [int.from_bytes(raw[:2], "big"), int.from_bytes(raw[2:], "big")] if address == 60000 else words
+
+    with (
+        ModbusTcpServer(Altered(bench.t7, alter)) as server,
+        pytest.raises(DeviceConnectionError, match=f"is {name}, not a T7|is a LabJack Digit"),
+    ):
+        T7PositionSensor.connect("psd", Settings(port=server.address), bench.clock)
+
+
+@pytest.mark.parametrize(
+    ("kind", "right", "wrong"),
+    [
+        (Settings, {"port": "host:65535"}, {"port": "host:65536"}),
+        (Settings, {"port": "host:1"}, {"port": "host:0"}),
+        (Settings, {"samples": 180}, {"samples": 181}),
+        (Settings, {"samples": 1, "sample_rate": 2.0}, {"samples": 2, "sample_rate": 2.0, "timeout": 60}),
+        (Settings, {"samples": 49, "timeout": 0.05}, {"samples": 50, "timeout": 0.05}),
+        (
+            Settings,
+            {"samples": 49, "timeout": 0.1, "channels": (0, 1), "readout": "currents"},
+            {"samples": 50, "timeout": 0.1, "channels": (0, 1), "readout": "currents"},
+        ),
+        *(
+            (
+                Settings,
+                {"readout": "currents", "channels": (0, 1), "position_limits": limits, "metres_per_metre": gain},
+                {"readout": "currents", "channels": (0, 1), "position_limits": wrong, "metres_per_metre": gain},
+            )
+            for gain in (185.0, -185.0)
+            for limits, wrong in (
+                ((0.0, 0.95 * 0.037 / 2 / 185.0), (0.0, 0.951 * 0.037 / 2 / 185.0)),
+                ((-0.95 * 0.037 / 2 / 185.0, 0.0), (-0.951 * 0.037 / 2 / 185.0, 0.0)),
+            )
+        ),
+        (Settings, RATIOMETRIC | {"zero_position": 0.035, "position_limits": (-0.035, 0.0)},
+         RATIOMETRIC | {"zero_position": 0.0351, "position_limits": (-0.035, -0.001)}),
+        (Settings, RATIOMETRIC | {"position_limits": (0.0, 0.035 + 5e-10)},
+         RATIOMETRIC | {"position_limits": (0.0, 0.035 + 2e-9)}),
+        (Settings, {"position_limits": (1e-6, 1.1e-6)}, {"position_limits": (1e-6, 1e-6)}),
+        (SupplySettings, {"line": 5, "voltage_limits": (0.0, 40.0)}, {"line": 5, "voltage_limits": (0.1, 40.0)}),
+        (SupplySettings, {"line": 5, "gain": 4.0}, {"line": 5, "gain": 3.99}),
+        (
+            SupplySettings,
+            {"line": 5, "analog_output": "dac0", "offset_volts": 2.0, "voltage_limits": (-40.0, 60.0)},
+            {"line": 5, "analog_output": "dac0", "offset_volts": 1.99, "voltage_limits": (-40.0, 60.0)},
+        ),
+        (
+            SupplySettings,
+            {"line": 5, "analog_output": "dac0", "offset_volts": 2.0, "voltage_limits": (-40.0, 60.0)},
+            {"line": 5, "analog_output": "dac0", "offset_volts": 2.01, "voltage_limits": (-40.0, 60.0)},
+        ),
+        (
+            SupplySettings,
+            {"line": 5, "volts_per_volt": 10.0, "voltage_limits": (-99.8, 99.8)},
+            {"line": 5, "volts_per_volt": 10.0, "voltage_limits": (0.0, 10.0 * 0.999 * 10.0)},
+        ),
+        (
+            SupplySettings,
+            {"line": 5, "volts_per_volt": -10.0, "voltage_limits": (-99.8, 99.8)},
+            {"line": 5, "volts_per_volt": -10.0, "voltage_limits": (-10.0 * 0.999 * 10.0, 0.0)},
+        ),
+        (SupplySettings, {"line": 2}, {"line": 1}),
+        (SupplySettings, {"line": 1, "analog_output": "tdac2"}, {"line": 3, "analog_output": "tdac2"}),
+        (
+            ThermistorSettings,
+            {"range": 1.0, "excitation_volts": 0.8324},
+            {"range": 1.0, "excitation_volts": 0.999 / 1.2},
+        ),
+    ],
+)  # fmt: skip
+def test_settings_at_their_bounds(kind, right, wrong):
+    kind(**{"port": "host"} | right)
+    with pytest.raises(ValidationError):
+        kind(**{"port": "host"} | wrong)
+
+
+def without_a_line(kind, **settings):
+    """Return a device that converts voltages, and has nothing to read them with."""
+    return kind("psd", kind.Settings(port="host", **settings), VirtualClock(), None)
+
+
+@pytest.mark.parametrize("side", [1.0, -1.0])
+def test_a_conversion_at_the_rail_is_over_the_range(side):
+    sensor = without_a_line(T7PositionSensor, range=1.0, volts_per_metre=1.0, position_limits=(-1.0, 1.0))
+    below = side * math.nextafter(0.999, 0.0)
+    for take in (sensor._taken, sensor._check, lambda volts: sensor.converted(np.array([volts]))):
+        take([below])
+        with pytest.raises(DeviceError, match=r"is over its range of ±1 V; choose a larger `range`, or"):
+            take([side * 0.999])
+    with pytest.raises(DeviceError, match=r"±10 V; bring"):
+        without_a_line(T7PositionSensor)._taken([9.99])
+    two = without_a_line(T7PositionSensor, channels=(4, 7), readout="currents")
+    with pytest.raises(DeviceError, match="AIN7 reads 10 V"):
+        two._taken([1.0, 10.0])
+    with pytest.raises(DeviceError, match="AIN7 gave no valid conversion"):
+        two._taken([1.0, -9999.0])
+
+
+def test_a_position_at_its_limits_is_good():
+    sensor = without_a_line(T7PositionSensor, volts_per_metre=2.0, zero_volts=1.0, position_limits=(-0.5, 1.0))
+    assert sensor._values(3.0) == {"psd_position": 1.0}
+    assert sensor._values(0.0) == {"psd_position": -0.5}
+    rows = np.array([[0.0], [2.0], [3.0]])
+    np.testing.assert_array_equal(sensor.converted(rows), [[-0.5], [0.5], [1.0]])
+    for wrong in (-1e-9, 3.0 + 1e-9):
+        for take in (lambda volts: sensor._values(volts), lambda volts: sensor.converted(np.array([[1.0], [volts]]))):
+            with pytest.raises(DeviceError, match=r"outside of its calibrated range -0\.5 to 1 m"):
+                take(wrong)
+
+
+def test_other_readouts_are_converted_row_by_row():
+    sensor = without_a_line(T7PositionSensor, channels=(0, 1), readout="currents", minimum_sum_volts=0.5)
+    rows = np.array([[0.25, 0.25], [3.0, 5.0]])
+    np.testing.assert_allclose(sensor.converted(rows)[:, 0], [0.0, 0.037 / 2 * 2.0 / 8.0 / 185.0])
+    with pytest.raises(DeviceError, match="light lost"):
+        sensor._values(0.25, 0.25 - 1e-9)
+
+
+def test_a_ratiometric_sensor_at_its_bounds():
+    sensor = without_a_line(T7PositionSensor, **RATIOMETRIC)
+    for supply in (4.5, 5.5):
+        assert sensor._values(supply / 2, supply)["psd_position"] == pytest.approx(0.0175)
+        away = math.nextafter(supply, 5.0 + 3.0 * (supply - 5.0))
+        with pytest.raises(DeviceError, match="supply voltage"):
+            sensor._values(supply / 2, away)
+    for share, is_good in ((0.1 + 0.8 * 4e-4, False), (0.1 + 0.8 * 6e-4, True)):
+        for output in (5.0 * share, 5.0 * (1.0 - share)):
+            if is_good:
+                sensor._values(output, 5.0)
+            else:
+                with pytest.raises(DeviceError, match="the magnet is at or beyond the end"):
+                    sensor._values(output, 5.0)
+
+
+def test_a_thermistor_at_its_bounds():
+    sensor = without_a_line(T7Thermistor, excitation_volts=2.0)
+    for excitation in (0.8 * 2.0, 1.2 * 2.0):
+        assert sensor._values(excitation / 2, excitation)["psd_temperature"] == pytest.approx(25.0, abs=2e-3)
+        with pytest.raises(DeviceError, match="excitation of the thermistor"):
+            sensor._values(1.0, math.nextafter(excitation, 2.0 + 3.0 * (excitation - 2.0)))
+    for share, problem in ((0.99, "open"), (0.01, "shorted"), (0.9899, "temperature"), (0.0101, "temperature")):
+        with pytest.raises(DeviceError, match=problem):
+            sensor._values(2.0 * share, 2.0)
+    # 1/T = ln R / 3000 K with R = 10 kΩ, at exactly its limits.
+    celsius = 1 / (1 / 3e3 * math.log(10e3 * 0.5 / (1 - 0.5))) - 273.15
+    for limits in ((celsius, 60.0), (0.0, celsius)):
+        sensor = without_a_line(
+            T7Thermistor, steinhart_hart=(0.0, 1 / 3e3, 0.0), excitation_volts=2.0, temperature_limits=limits
+        )
+        assert sensor._values(1.0, 2.0)["psd_temperature"] == pytest.approx(celsius, rel=1e-12)
+
+
+def test_a_status_output_at_its_level(bench):
+    supply = without_a_line(T7HighVoltageSupply, line=5)
+    assert supply._monitored(1.0, 2.0, 2.0) == (20.0, 0.02, True)
+    assert supply._monitored(1.0, 2.0, math.nextafter(2.0, 0.0))[2] is False
+
+
+@pytest.mark.parametrize("volts", [0.9, -0.9, 1.1, -1.1])
+def test_an_output_is_discharged_below_one_volt(bench, volts):
+    supply = bench.supply()
+    bench.volts[0] = volts / 20.0
+    if abs(volts) < 1.0:
+        supply.safe()
+        return
+    begin = bench.clock.now()
+    with pytest.raises(DeviceError, match="although it was switched off"):
+        supply.safe()
+    assert bench.clock.now() - begin == pytest.approx(0.5)
+
+
+# Blocks of samples
+
+
+@pytest.fixture
+def in_process(bench) -> Iterator[str]:
+    """Return the address of the T7 in this process; its amplifier is wired, and AIN3 follows its voltage."""
+    amplifier = bench.wire()
+    bench.t7._sources[3] = lambda: amplifier.voltage / 10.0
+    address = register("t7-in-process", ModbusTcpInstrument(bench.t7), bench.clock)
+    yield address
+    for device in bench.devices:
+        device.close()
+    bench.devices.clear()
+    unregister("t7-in-process")
+
+
+def connected(bench, address, kind, **settings):
+    device = kind.connect(
+        {T7HighVoltageSupply: "hv"}.get(kind, "psd"), kind.Settings(port=address, **settings), bench.clock
+    )
+    bench.devices.append(device)
+    return device
+
+
+def test_a_block_is_what_single_samples_are(bench, in_process):
+    supply = connected(bench, in_process, T7HighVoltageSupply, line=5)
+    sensor = connected(
+        bench, in_process, T7PositionSensor, channels=(3,), volts_per_metre=1.0, position_limits=(-9.0, 9.0)
+    )
+    supply.set(0.0)
+    setpoints = np.linspace(-40.0, 40.0, 120)
+    begin = bench.clock.now()
+    found = supply.play(setpoints, 1e-3, sensor)
+    assert found.shape == (120, 1)
+    # A sample is read before its set-point is sent, the amplifier lags by less than a period.
+    np.testing.assert_allclose(found[2:, 0], setpoints[1:-1] / 10.0, atol=0.05)
+    assert supply.setpoint == 40.0
+    assert 0.119 <= bench.clock.now() - begin <= 0.121
+    assert bench.t7.tdac_volts(0) == pytest.approx(2.0, abs=2e-3)
+
+
+def test_a_block_is_sent_in_as_few_requests_as_can_be(bench, in_process):
+    supply = connected(bench, in_process, T7HighVoltageSupply, line=5)
+    sensor = connected(bench, in_process, T7PositionSensor, channels=(3,), position_limits=(-1.0, 1.0))
+    supply.set(0.0)
+    requests, client = [], supply._line._client
+    send = client.request
+    client.request = lambda request, expected: requests.append(request) or send(request, expected)
+    supply.play(np.zeros(103), 1e-4, sensor)
+    read, write, wait = "00 0006 02", "01 7530 02 00000000", "01 f096 02 00000064"
+    sample = bytes.fromhex(read + write + wait)
+    assert requests == [
+        *[b"\x4c" + (51 * sample)[:-8]] * 2,
+        b"\x4c" + sample[:-8],
+    ]
+    assert LabJackT7.most_played(sensor.conversions) == 51
+    assert LabJackT7.most_played(supply.conversions) == 51
+    two = connected(bench, in_process, T7PositionSensor, channels=(3, 5), readout="currents")
+    assert LabJackT7.most_played(two.conversions) == 1032 // 24
+
+
+def test_a_block_beyond_the_limits_is_not_sent(bench, in_process):
+    supply = connected(bench, in_process, T7HighVoltageSupply, line=5)
+    sensor = connected(bench, in_process, T7PositionSensor, channels=(3,), position_limits=(-1.0, 1.0))
+    for beyond in (40.1, -40.1):
+        with pytest.raises(LimitError, match=f"{beyond:g}"):
+            supply.play(np.array([0.0, beyond, 0.0]), 1e-3, sensor)
+    assert not bench.t7.dio_level(5)
+    # At the limits it is, and an amplifier that is off is switched on.
+    supply.play(np.array([40.0, -40.0]), 1e-3, sensor)
+    assert bench.t7.dio_level(5)
+
+
+def test_a_block_looks_at_the_status_from_time_to_time(bench, in_process):
+    supply = connected(bench, in_process, T7HighVoltageSupply, line=5)
+    sensor = connected(bench, in_process, T7PositionSensor, channels=(3,), position_limits=(-1.0, 1.0))
+    supply.set(0.0)
+    bench.t7._sources[2] = lambda: 0.0
+    supply.play(np.zeros(2), 1e-3, sensor)
+    bench.clock.sleep(0.1)
+    with pytest.raises(DeviceError, match="went off by itself"):
+        supply.play(np.zeros(2), 1e-3, sensor)
+
+
+def test_a_clipped_sample_of_a_block_is_told(bench, in_process):
+    supply = connected(bench, in_process, T7HighVoltageSupply, line=5)
+    sensor = connected(bench, in_process, T7PositionSensor, channels=(3,), position_limits=(-1.0, 1.0))
+    readings = iter([0.0, 0.0, 12.0, 0.0])
+    bench.t7._sources[3] = lambda: next(readings)
+    with pytest.raises(DeviceError, match="over its range"):
+        supply.play(np.zeros(4), 1e-3, sensor)
+
+
+@pytest.mark.parametrize(
+    ("period", "can"),
+    [
+        (1e-6, True),
+        (0.9e-6, False),
+        (1.5e-6, False),
+        (5e-5, True),
+        (1.00001e-3, False),
+        (0.019, True),
+        (0.0201, False),
+    ],
+)
+def test_periods_that_can_be_played(bench, in_process, period, can):
+    supply = connected(bench, in_process, T7HighVoltageSupply, line=5)
+    sensor = connected(bench, in_process, T7PositionSensor, channels=(3,))
+    assert supply.can_play(sensor, period) is can
+
+
+def test_what_can_be_played_with(bench, in_process):
+    supply = connected(bench, in_process, T7HighVoltageSupply, line=5, timeout=60.0)
+    sensor = connected(bench, in_process, T7PositionSensor, channels=(3,))
+    assert supply.can_play(sensor, 0.1)
+    assert not supply.can_play(sensor, 0.100001)
+    assert not supply.can_play(connected(bench, in_process, T7Switch, line=6), 0.1)
+    assert not supply.can_play(bench.sensor(), 0.1)
+
+
+def test_a_block_over_a_connection_that_has_ended(bench, in_process):
+    supply = connected(bench, in_process, T7HighVoltageSupply, line=5)
+    sensor = connected(bench, in_process, T7PositionSensor, channels=(3,), position_limits=(-1.0, 1.0))
+    supply.set(0.0)
+    supply._line._connection.end()
+    assert supply.play(np.zeros(3), 1e-3, sensor).shape == (3, 1)
+    # One that ends meanwhile is not played again, as part of it may have been.
+    supply._line._client.feedback = lambda *_: (_ for _ in ()).throw(OSError("gone"))
+    with pytest.raises(DeviceConnectionError, match="gone"):
+        supply.play(np.zeros(3), 1e-3, sensor)
+
+
+# Answers that belong to nothing
+
+
+class Spoiling(ModbusTcpInstrument):
+    """A T7 in this process whose next answers are altered."""
+
+    def __init__(self, bank):
+        super().__init__(bank)
+        self.alter: list[Callable[[bytes], bytes]] = []
+
+    def connect(self):
+        stream = super().connect()
+        receive = stream.receive
+
+        def altered(data: bytes) -> bytes:
+            answer = receive(data)
+            return self.alter.pop(0)(answer) if self.alter and answer else answer
+
+        stream.receive = altered
+        return stream
+
+
+@pytest.fixture
+def spoiling(bench) -> Iterator[Spoiling]:
+    bench.wire()
+    spoiling = Spoiling(bench.t7)
+    register("t7-spoiling", spoiling, bench.clock)
+    yield spoiling
+    for device in bench.devices:
+        device.close()
+    bench.devices.clear()
+    unregister("t7-spoiling")
+
+
+def with_byte(place: int, value: int) -> Callable[[bytes], bytes]:
+    return lambda answer: answer[:place] + bytes((value,)) + answer[place + 1 :]
+
+
+@pytest.mark.parametrize("place", [0, 1, 2, 3, 5, 6, 7, 8])
+@pytest.mark.parametrize("call", ["glance", "switch", "set", "write", "block"])
+def test_an_answer_that_belongs_to_nothing_is_asked_for_again(bench, spoiling, place, call):
+    address = "emulated://t7-spoiling"
+    supply = connected(bench, address, T7HighVoltageSupply, line=5)
+    sensor = connected(bench, address, T7PositionSensor, channels=(3,))
+    supply.set(5.0)
+    # Of function 76, what follows the function is a value.
+    spoiling.alter = [with_byte(place, 0x55)]
+    if call == "glance":
+        assert set(sensor.glance()) == {"psd_position"}
+        assert sensor.repeats == 1
+    elif call == "switch" and place < 8:
+        supply._output.switch(True)
+        assert supply.repeats == 1
+    elif call == "set":
+        supply.set(10.0)
+        assert bench.t7.tdac_volts(0) == pytest.approx(0.5, abs=1e-3)
+        assert supply.repeats == 1
+    elif call == "write":
+        sensor._line.write(AIN_NEGATIVE_CH.of(9), 199)
+        assert sensor.repeats == 1
+    elif call == "block" and place < 8:
+        with pytest.raises(DeviceConnectionError):
+            supply.play(np.zeros(3), 1e-3, sensor)
+
+
+def test_two_answers_that_belong_to_nothing_are_enough(bench, spoiling):
+    sensor = connected(bench, "emulated://t7-spoiling", T7PositionSensor, channels=(3,))
+    right = Span.of(TEST)
+    for take in (lambda: sensor._line.read_span(right), lambda: sensor._line.write(AIN_NEGATIVE_CH.of(9), 199)):
+        sensor._line.read_integer(TEST)
+        # Over the other connection come serial number and owner first, by which the instrument is known.
+        spoiling.alter = [with_byte(7, 0x55), lambda answer: answer, lambda answer: answer, with_byte(8, 0x55)]
+        with pytest.raises(DeviceConnectionError, match="no reply from emulated://t7-spoiling"):
+            take()
+        assert spoiling.alter == []
+
+
+def test_a_refusal_upon_a_repeated_request_is_told(bench, spoiling):
+    sensor = connected(bench, "emulated://t7-spoiling", T7PositionSensor, channels=(3,))
+    spoiling.alter = [with_byte(7, 0x55)]
+    with pytest.raises(DeviceError, match=r"exception 4 \(device failure\) on writing register 40018.* 2370 "):
+        sensor._line.write(AIN_RANGE.of(9), 5.0)
+    assert sensor.repeats == 1
+
+
+def test_longest_patience_of_the_devices_counts_for_all(bench, in_process):
+    quick = connected(bench, in_process, T7PositionSensor, channels=(3,), timeout=0.1, samples=1)
+    assert quick._line._connection.timeout == 0.1
+    slow = connected(bench, in_process, T7Switch, line=6, timeout=2.0)
+    assert quick._line._connection is slow._line._connection
+    assert quick._line._client._port.timeout == 2.0
+    connected(bench, in_process, T7Switch, line=7, timeout=0.5)
+    assert quick._line._connection.timeout == 2.0
+    with slow._line.in_haste():
+        assert quick._line._client._port.timeout == 0.5
+    assert quick._line._client._port.timeout == 2.0
+
+
+def test_packet_names_its_registers():
+    packet = Packet.of([Span.of(AIN.of(2), 2), Span.of(TEST)])
+    assert packet.name == "reading register 4, reading register 55100"
+    assert packet.request == bytes.fromhex("4c 00 0004 04 00 d73c 02 00 b462 02")
+    assert packet.size == 1 + 8 + 4 + 4

@@ -5,21 +5,31 @@ import struct
 from binascii import crc_hqx
 
 import pytest
+from faulty_line import InPieces
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
 from bench.clock import VirtualClock
-from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, LimitError
+from bench.errors import (
+    ConfigurationError,
+    DeviceConnectionError,
+    DeviceError,
+    DeviceRestartedError,
+    LimitError,
+    WatchdogError,
+)
 from bench.roles import TECMode
 from drivers.meerstetter import DEVICE_ERRORS, SERVER_ERRORS, MeerstetterTEC
 from drivers.meerstetter import tec as driver
-from drivers.meerstetter.mecom import RefusedError, TECLine, decode, encode
+from drivers.meerstetter.mecom import Parameter, RefusedError, TECLine, decode, encode
+from sim_devices.instruments.meerstetter_table import PARAMETERS
 from sim_devices.protocol_emulated import register, unregister
 from sim_devices.wire import WireServer
 
 PORT = "emulated://scripted-tec"
-REALS = {1000, 1001, 1020, 1021, 2030, 2031, 2060, 3000, 4040, 4041, 6310, 50001, 50002, 50012}
+REALS = {1000, 1001, 1020, 1021, 1060, 1063, 2030, 2031, 2060, 3000, 4010, 4011, 4040, 4041, 5011, 6310}
+REALS |= {50001, 50002, 50012}
 
 
 def answer(body):
@@ -662,3 +672,438 @@ def test_closing_leaves_the_device_alone(script, tec):
     assert len(script.received) == before
     with pytest.raises(DeviceConnectionError):
         tec.measure()
+
+
+# Meerstetter 5136AL: number, type, whether each channel has its own, and title.
+PARAMETERS_OF_THE_MAKER = """
+100 INT32 device: device type
+102 INT32 device: serial number
+103 INT32 device: firmware version
+104 INT32 device: device status
+105 INT32 device: error number
+106 INT32 device: error instance
+107 INT32 device: error parameter
+108 INT32 device: saving to flash off
+1000 FLOAT32 channel: object temperature
+1001 FLOAT32 channel: sink temperature
+1020 FLOAT32 channel: output current
+1021 FLOAT32 channel: output voltage
+1060 FLOAT32 device: driver input voltage
+1063 FLOAT32 device: base plate temperature
+1200 INT32 channel: temperature is stable
+2000 INT32 channel: output stage input selection
+2010 INT32 channel: output stage enable
+2030 FLOAT32 channel: current limitation
+2031 FLOAT32 channel: voltage limitation
+2060 FLOAT32 device: communication watchdog
+3000 FLOAT32 channel: target object temperature
+3034 INT32 channel: positive current heats
+4010 FLOAT32 channel: lower error threshold of the object temperature
+4011 FLOAT32 channel: upper error threshold of the object temperature
+4040 FLOAT32 channel: temperature window of stability
+4041 FLOAT32 channel: minimum time in the window of stability
+5011 FLOAT32 channel: upper error threshold of the sink temperature
+6310 FLOAT32 device: delay till restart
+50000 INT32 channel: live enable
+50001 FLOAT32 channel: live current
+50002 FLOAT32 channel: live voltage
+50011 INT32 channel: live target selected
+50012 FLOAT32 channel: live target object temperature
+"""
+
+# Meerstetter 5216G, error numbers.
+ERRORS_OF_THE_MAKER = """
+1-10 processor malfunction
+11 emergency stop
+12 operator panel timed out
+20-21 malfunction of the parameter system
+22 the parameter set in the flash is corrupt
+23 the parameter set does not fit the firmware
+24 the firmware does not know the hardware
+25-29 malfunction of the parameter system
+30 supply voltage too low
+31 supply voltage too high
+32 internal medium voltage too low
+33 internal medium voltage too high
+36 internal 3.3 V too low
+37 internal 3.3 V too high
+50-52 flash failure
+53 the serial send buffer overflowed
+60 the device is too hot
+61 factory test hardware does not answer
+100 over-current, positive at OUT+
+101 over-current, negative at OUT+
+102 over-current, positive at OUT−
+103 over-current, negative at OUT−
+104 over-voltage at OUT+
+105 over-voltage at OUT−
+106 the currents of OUT+ and OUT− differ
+107 over-current, fast switch-off
+108 the output stage is in saturation
+109 the currents of OUT+ and OUT− are too unequal
+110 the allowed output power is reached
+111 the resistance of the load is too low
+120-123 the current measurement has an offset
+130-132 object temperature circuit failure
+133 the object sensor reads below its range
+134 the object sensor reads above its range, as without a sensor
+137 the object temperature is below its error threshold
+138 the object temperature is above its error threshold
+139 the object temperature changes too fast
+140 the sink sensor reads below its range
+141 the sink sensor reads above its range, as without a sensor
+142 the sink temperature is below its error threshold
+143 the sink temperature is above its error threshold
+144 the sink temperature changes too fast
+150-153 object temperature circuit failure
+160-165 the connection of the boards fails
+170-173 auto tuning failed
+175 the fan does not reach its speed
+176 the fan is blocked
+180-181 the lookup table is wrong
+182 the temperature was not stable in time
+183 communication watchdog: the host was silent for too long and the output went off
+184 the display format is wrong
+"""
+
+
+def test_parameters_are_those_of_the_maker():
+    parameters = [each for each in vars(driver).values() if isinstance(each, Parameter)]
+    kinds = {False: "INT32", True: "FLOAT32"}, {False: "device", True: "channel"}
+    found = {f"{p.number} {kinds[0][p.real]} {kinds[1][p.of_channel]}: {p.title}" for p in parameters}
+    assert found == set(PARAMETERS_OF_THE_MAKER.strip().splitlines())
+    # What a real TEC-1091 reported of its parameters.
+    for line in found:
+        number, kind, belongs, *_ = line.replace(":", "").split()
+        row = PARAMETERS[int(number)]
+        assert kind == row.kind, line
+        assert (belongs == "channel") == (row.instances > 1), line
+
+
+def test_error_numbers_are_those_of_the_maker():
+    expected = {}
+    for line in ERRORS_OF_THE_MAKER.strip().splitlines():
+        numbers, _, text = line.partition(" ")
+        first, _, last = numbers.partition("-")
+        expected |= dict.fromkeys(range(int(first), int(last or first) + 1), text)
+    assert {number: text for number, (text, _) in DEVICE_ERRORS.items()} == expected
+    assert [SERVER_ERRORS[code].split()[-1] for code in range(1, 10)] == [
+        "available", "busy", "error", "error", "available", "read-only", "range", "channel", "parameter",
+    ]  # fmt: skip
+    assert len(SERVER_ERRORS) == 9
+
+
+def test_every_device_of_the_family_is_taken_and_no_other(script, clock):
+    family = (1089, 1090, 1091, 1092, 1122, 1123, 1161, 1162, 1163, 1166, 1167)
+    for number in {number + step for number in family for step in (-1, 0, 1)}:
+        script.values[100] = number
+        if number in family:
+            assert connect(clock).identity.model == f"TEC-{number}"
+        else:
+            with pytest.raises(DeviceConnectionError, match="expected a Meerstetter TEC controller"):
+                connect(clock)
+
+
+def test_settings_at_their_bounds():
+    assert make_settings(temperature_limits=(-100.0, 200.0), watchdog=0.1).watchdog == 0.1
+    for wrong in ({"temperature_limits": (-100.1, 50)}, {"temperature_limits": (20, 200.1)}, {"watchdog": 0.099}):
+        with pytest.raises(ValidationError):
+            make_settings(**wrong)
+    with pytest.raises(ValidationError):
+        make_settings(temperature_limits=(30.0, 30.0))
+
+
+def test_settings_at_the_bounds_of_the_device(script, clock):
+    script.limits = {2030: (1.0, 3.0), 2031: (2.0, 12.0), 3000: (15.0, 90.0), 4040: (0.1, 0.5), 4041: (1.0, 5.0)}
+    connect(clock)
+    connect(clock, current_limit=1.0, voltage_limit=2.0, stable_window=0.5, stable_time=5.0)
+    for key, wrong in (("stable_window", 0.6), ("stable_time", 0.5), ("temperature_limits", (14.0, 90.0))):
+        with pytest.raises(ConfigurationError, match=f"tec: {key}: "):
+            connect(clock, **{key: wrong})
+
+
+def test_static_on_is_refused(script, clock):
+    script.values[2010] = 1
+    with pytest.raises(DeviceError, match=r"output stage enable \(parameter 2010\) is static on"):
+        connect(clock)
+
+
+def test_measurement_of_numbers_that_are_none(script, tec):
+    script.values[1020] = math.inf
+    with pytest.raises(DeviceError, match="a value that is not a number"):
+        tec.measure()
+
+
+def test_output_that_does_not_go_on_is_switched_off_again(script, tec, clock):
+    looks = []
+
+    def ready(sent, right):
+        if sent[7:14] != b"?VR0068":
+            return right
+        looks.append(clock.now())
+        return answer(right[:7] + b"00000001")
+
+    script.instead = [ready] * 100
+    with pytest.raises(DeviceError, match="its output is off although it was switched on"):
+        tec.set(40.0)
+    assert len(looks) == 11  # and the last word
+    assert looks[-1] - looks[0] == pytest.approx(10 * 0.02, abs=0.08)
+    assert script.orders()[-2:] == ["VSC3500100000000", "VS07DA0100000000"]
+
+
+def test_output_that_goes_on_late_is_waited_for(script, tec):
+    looks = []
+
+    def late(sent, right):
+        if sent[7:14] != b"?VR0068":
+            return right
+        looks.append(right)
+        return right if len(looks) == 10 else answer(right[:7] + b"00000001")
+
+    script.instead = [late] * 100
+    tec.set(40.0)
+    assert len(looks) == 10
+    script.instead.clear()
+    assert tec.output_enabled
+
+
+def test_all_settings_are_read_back_after_an_answer_that_was_missing(script, tec):
+    script.instead = [None, b""]
+    tec.set(40.0)
+    blocks = [data[7:12].decode() for data in script.received if data[7:10] == b"?VX"]
+    # Seven that are configured and four of the output, five at once, before the last step and after it.
+    assert blocks == ["?VX05", "?VX05", "?VX01"] * 2
+    assert tec.repeats == 1
+    script.instead = [None, b""]
+    script.received.clear()
+    tec.set(41.0)
+    assert [data[7:-5] for data in script.received][-1] == b"?VR006801"
+
+
+@pytest.mark.parametrize(
+    ("number", "value"),
+    [
+        *((108, 0), (2000, 1), (2030, 2.5), (2031, 11.0), (4040, 0.2), (4041, 2.0), (6310, 1.0)),
+        *((50012, 41.0), (50011, 0), (2060, 4.0), (2010, 0), (104, 1)),
+    ],
+)
+def test_a_parameter_that_changed_is_found_by_reconnecting(script, tec, number, value):
+    tec.set(40.0)
+    tec.reconnect()
+    script.values[number] = value
+    with pytest.raises(DeviceError) as caught:
+        tec.reconnect()
+    assert isinstance(caught.value, DeviceRestartedError) == (number == 108)
+    if number not in (104, 108):
+        assert f"(parameter {number}) is {value:g}" in str(caught.value)
+
+
+def test_live_current_and_voltage_are_read_back(script, clock):
+    tec = connect(clock, mode="current")
+    tec.set(0.5)
+    tec.reconnect()
+    for number, value in ((50001, 0.25), (50002, 11.0)):
+        right, script.values[number] = script.values[number], value
+        with pytest.raises(DeviceError, match=f"parameter {number}"):
+            tec.reconnect()
+        script.values[number] = right
+
+
+def test_device_that_restarted_is_told_each_time_and_nothing_is_written_to_its_flash(script, tec):
+    tec.set(40.0)
+    script.values |= {108: 0, 104: 1, 2010: 0, 50000: 0}
+    script.received.clear()
+    for action in (tec.measure, lambda: tec.set(41.0), tec.reconnect):
+        with pytest.raises(DeviceRestartedError):
+            action()
+    assert script.orders() == []
+    tec.safe()
+    assert not any(order.startswith("VS080C") for order in script.orders())
+    tec.reset()
+    script.received.clear()
+    assert tec.measure()["tec_temperature"] == 25.5
+    tec.safe()
+    assert script.orders()[-1] == "VS080C0100000000"
+
+
+def test_restart_before_the_output_goes_on_is_found(script, tec):
+    script.values[108] = 0
+    script.received.clear()
+    with pytest.raises(DeviceRestartedError):
+        tec.set(40.0)
+    assert script.orders() == []
+
+
+def test_arrival_is_within_three_windows(script, clock):
+    tec = connect(clock, stable_window=0.25)
+    status = tec.set(40.0)
+    script.values |= {1200: 2, 1000: 39.24}
+    assert not status.update()
+    script.values[1000] = 39.25
+    assert status.update()
+    status = tec.set(40.0)
+    script.values |= {1200: 1, 1000: 40.0}
+    assert not status.update()
+
+
+def test_timeout_of_the_arrival_is_that_of_the_settings(script, clock):
+    status = connect(clock, stable_timeout=7.0).set(40.0)
+    before = clock.now()
+    with pytest.raises(DeviceError, match="7 s"):
+        status.wait()
+    assert clock.now() - before == pytest.approx(7.0, abs=0.3)
+
+
+def test_error_names_instance_and_parameter_and_the_watchdog_is_a_kind_of_its_own(script, tec):
+    script.values |= {104: 3, 105: 183, 106: 2, 107: 1234}
+    with pytest.raises(WatchdogError, match=r"error 183 \(.*; instance 2, parameter 1234\)"):
+        tec.measure()
+    script.values[105] = 182
+    with pytest.raises(DeviceError) as caught:
+        tec.measure()
+    assert not isinstance(caught.value, WatchdogError)
+
+
+def test_reset_leaves_the_device_alone_until_it_restarts(script, tec, clock):
+    heard = []
+    script.on_order = lambda text: heard.append((clock.now(), text))
+    script.instead = [None, lambda _sent, right: heard.append((clock.now(), "asked")) or right]
+    tec.reset()
+    (sent, order), (asked, _) = heard[:2]
+    assert order == "RS"
+    assert asked - sent == pytest.approx(0.3, abs=0.02)
+
+
+def test_stop_keeps_within_the_limits_and_leaves_a_current_alone(script, clock):
+    tec = connect(clock)
+    tec.set(40.0)
+    script.values[1000] = 95.0
+    tec.stop()
+    assert script.values[50012] == tec.setpoint == 90.0
+    tec.select_mode(TECMode.CURRENT)
+    tec.set(0.5)
+    script.received.clear()
+    tec.stop()
+    assert script.received == []
+    tec.select_mode(TECMode.TEMPERATURE)
+    assert script.orders()[-1] == "VS07D00100000002"
+    assert str(tec.limits) == "15 to 90 °C"
+
+
+def test_only_a_value_out_of_range_is_told_with_what_is_allowed(script, tec):
+    script.limits[50012] = (20.0, 30.0)
+    script.refusals["VSC35C"] = 7
+    with pytest.raises(DeviceError, match=r"refused 40 as .*; allowed are 20 to 30$"):
+        tec.set(40.0)
+    script.refusals["VSC35C"] = 6
+    with pytest.raises(DeviceError) as caught:
+        tec.set(40.0)
+    assert "allowed" not in str(caught.value)
+
+
+def test_own_check_compares_limits_and_thresholds(script, tec):
+    script.values |= {4010: 15.0, 4011: 90.0, 5011: 70.0, 1060: 24.1, 1063: 30.5}
+    current, voltage, thresholds, supply = tec.self_check()
+    assert (current.text, current.advice) == ("3 A in the device", "")
+    assert (voltage.text, voltage.advice) == ("12 V in the device", "")
+    assert thresholds.text == "15 to 90 °C of the object, up to 70 °C of the sink"
+    assert thresholds.advice == ""
+    assert supply.text == "24.1 V, base plate 30.5 °C"
+    script.values |= {2030: 2.0, 2031: 11.0, 4010: 15.5}
+    current, voltage, thresholds, _ = tec.self_check()
+    assert "from 3 A" in current.advice
+    assert "from 12 V" in voltage.advice
+    assert "within the thresholds" in thresholds.advice
+    script.values |= {4010: 15.0, 4011: 89.5}
+    assert "within the thresholds" in tec.self_check()[2].advice
+    tec.select_mode(TECMode.CURRENT)
+    assert tec.self_check()[2].advice == ""
+
+
+def test_safe_state_is_reached_in_haste_and_patience_comes_back(script, clock):
+    tec = connect(clock, timeout=1.0)
+    tec.set(40.0)
+    script.silent = True
+    script.received.clear()
+    before = clock.now()
+    with pytest.raises(DeviceError, match="does not confirm"):
+        tec.safe()
+    # Three orders, each twice, over this line and over a fresh one.
+    assert len(script.received) == 12
+    assert clock.now() - before == pytest.approx(12 * 0.2, abs=0.05)
+    script.received.clear()
+    before = clock.now()
+    with pytest.raises(DeviceConnectionError):
+        tec.measure()
+    assert len(script.received) == 3
+    assert clock.now() - before == pytest.approx(3.0, abs=0.05)
+
+
+def test_patience_that_is_short_already_is_not_made_longer(script, clock):
+    tec = connect(clock, timeout=0.05)
+    script.silent = True
+    before = clock.now()
+    with pytest.raises(DeviceError):
+        tec.safe()
+    assert clock.now() - before == pytest.approx(12 * 0.05, abs=0.05)
+
+
+def test_another_line_goes_on_counting(script, tec):
+    script.instead = [b""]
+    tec.measure()
+    last = int(script.received[-1][3:7], 16)
+    script.received.clear()
+    before = tec._line
+    tec.reconnect()
+    assert tec._line is not before
+    assert int(script.received[0][3:7], 16) == last + 1
+    assert tec.repeats == 1
+
+
+@pytest.mark.parametrize(("late", "requests"), [(7, 1), (8, 2)])
+def test_so_many_late_answers_are_passed_over(script, tec, late, requests):
+    script.instead = [lambda _sent, right: answer(b"!01000142C80000") * late + right]
+    assert tec.measure()["tec_sink_temperature"] == 24.0
+    assert len(script.received) == requests
+
+
+@pytest.mark.parametrize("place", range(21))
+@pytest.mark.parametrize("kind", ["value", "acknowledge", "refusal"])
+def test_an_answer_in_pieces_is_put_together_and_costs_no_more_than_its_pause(clock, place, kind):
+    script = Script()
+    script.refusals["?VR03E9"] = 5
+    register("pieces-tec", InPieces(script, clock, place, 0.05), clock)
+    try:
+        line = TECLine("tec", make_settings(port="emulated://pieces-tec"))
+        before = clock.now()
+        if kind == "value":
+            assert line.ask("?VR03E801", 8) == "41CC0000"
+        elif kind == "acknowledge":
+            line.order("VS07DA0100000002")
+        else:
+            with pytest.raises(RefusedError):
+                line.ask("?VR03E901", 8)
+        assert clock.now() - before < 0.06
+        assert line.repeats == 0
+    finally:
+        unregister("pieces-tec")
+
+
+def test_answers_behind_a_late_one_cost_no_wait(script, tec, clock):
+    late = answer(b"!01000142C80000")
+    script.refusals["?VR04B0"] = 9
+    script.instead = [lambda _sent, right: late + right] * 3
+    before = clock.now()
+    tec.measure()
+    tec._line.order("VS07DA0100000000")
+    with pytest.raises(RefusedError):
+        tec._line.ask("?VR04B001", 8)
+    assert clock.now() - before < 0.05
+
+
+def test_answer_that_misses_its_end_is_over_after_one_timeout(script, tec, clock):
+    script.instead = [lambda _sent, right: right[:-1]]
+    before = clock.now()
+    tec.measure()
+    assert clock.now() - before == pytest.approx(0.2, abs=0.05)
+    assert tec.repeats == 1

@@ -4,8 +4,10 @@ import gc
 import logging
 import math
 import threading
+from itertools import pairwise
 
 import pytest
+from faulty_line import InPieces
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
@@ -13,7 +15,9 @@ from pydantic import ValidationError
 from bench.clock import VirtualClock
 from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, DeviceRestartedError, LimitError
 from drivers.roboteq import ABORT_CODES, CHANNEL_FLAGS, FAULT_FLAGS, RoboteqSupply
-from drivers.roboteq.canopen import NodeLine
+from drivers.roboteq import supply as driver
+from drivers.roboteq.canopen import Entry, NodeLine
+from drivers.roboteq.process_data import ProcessData
 from drivers.roboteq.supply import _POWER, _VOLTS
 from sim_devices.protocol_emulated import register, unregister
 from sim_devices.wire import WireServer
@@ -1017,3 +1021,583 @@ def test_other_device_of_the_package_canopen_is_refused(local_node, connect):
     with pytest.raises(DeviceConnectionError, match="found 'Some drive'"):
         connect(port="emulated://local-node", node=9)
     assert local_node.written == []
+
+
+# What stands in the manuals.
+
+
+# Roboteq CANBus Networking Manual V2.0 and CiA 301: index, bytes of a download (0 if it is read only), signed, title.
+OBJECTS_OF_THE_MAKER = """
+1000 0 unsigned: device type
+1008 0 unsigned: device name
+1009 0 unsigned: hardware version
+100A 0 unsigned: software version
+1017 2 unsigned: producer heartbeat time
+1018 0 unsigned: identity
+2000 4 signed: motor command
+200C 1 unsigned: emergency stop
+200D 1 unsigned: release of the emergency stop
+200E 1 unsigned: stop
+2100 0 signed: motor current
+2102 0 signed: applied power
+210D 0 unsigned: battery voltage
+2112 0 unsigned: fault flags
+2122 0 unsigned: channel flags
+"""
+
+
+def test_objects_are_those_of_the_maker():
+    found = {
+        f"{each.index:04X} {each.size} {'signed' if each.signed else 'unsigned'}: {each.title}"
+        for each in vars(driver).values()
+        if isinstance(each, Entry)
+    }
+    assert found == set(OBJECTS_OF_THE_MAKER.strip().splitlines())
+    assert driver.DEVICE_TYPE == 0x000F0191
+
+
+def test_flags_and_abort_codes_are_those_of_the_standard():
+    faults = "overheat", "over-voltage", "under-voltage", "short circuit", "emergency stop", "setup fault"
+    faults += "MOSFET failure", "default configuration loaded"
+    assert {bit: text for bit, (text, _) in FAULT_FLAGS.items()} == {1 << n: text for n, text in enumerate(faults)}
+    flags = "amps limit", "stall", "loop error", "safety stop", "forward limit", "reverse limit", "amps trigger"
+    assert {bit: text for bit, (text, _) in CHANNEL_FLAGS.items()} == {1 << n: text for n, text in enumerate(flags)}
+    standard = pytest.importorskip("canopen").sdo.exceptions.SdoAbortedError.CODES
+    # What belongs to block transfers, or is no reason of its own, is left out.
+    assert set(standard) - set(ABORT_CODES) == {0x05040002, 0x05040003, 0x05040004, 0x060A0023, 0x08000024}
+    assert set(ABORT_CODES) <= set(standard)
+
+
+@pytest.mark.parametrize(
+    ("right", "wrong"),
+    [
+        ({"voltage_limits": (-60, 60)}, {"voltage_limits": (-60.1, 60)}),
+        ({"voltage_limits": (0, 60)}, {"voltage_limits": (0, 60.1)}),
+        ({"voltage_limits": (-1, 0)}, {"voltage_limits": (0, 0)}),
+        ({"voltage_limits": (0, 1)}, {"voltage_limits": (0.1, 1)}),
+        ({"voltage_limits": (0, 1), "output": "rms"}, {"voltage_limits": (-0.1, 1), "output": "rms"}),
+    ],
+)
+def test_settings_at_their_bounds(right, wrong):
+    make_settings(**right)
+    with pytest.raises(ValidationError):
+        make_settings(**wrong)
+
+
+# Reading and writing objects.
+
+
+@pytest.mark.parametrize(
+    ("command", "data", "text"),
+    [
+        (0x43, b"v1.2", "v1.2"),
+        (0x47, b"v12x", "v12"),
+        (0x4B, b"v1xx", "v1"),
+        (0x4F, b"vxxx", "v"),
+        (0x42, b"v1.2", "v1.2"),  # which does not say the size
+        (0x4E, b"v1.2", "v1.2"),
+        (0x43, b"v1\0x", "v1"),
+        (0x43, b" v1 ", "v1"),
+    ],
+)
+def test_expedited_text(script, connect, command, data, text):
+    original = script.answer
+    head = b"\x40\x0a\x10\x00"
+    script.answer = lambda sent: bytes((command,)) + head[1:] + data if sent[:4] == head else original(sent)
+    assert connect().identity.firmware == text
+
+
+@pytest.mark.parametrize(
+    ("command", "data", "value"),
+    [
+        (0x43, "F0000000", 240),
+        (0x47, "F00000FF", 240),
+        (0x4B, "F000FFFF", 240),
+        (0x4F, "F0FFFFFF", 240),
+        (0x42, "F0000000", 240),
+        (0x40, "F0000000", 240),  # as in the manual
+        (0x4F, "F0000001", 240),
+    ],
+)
+def test_numbers_of_every_size(script, supply, command, data, value):
+    script.instead = [line(0x581, bytes((command,)) + bytes.fromhex("0D2102" + data))]
+    assert supply._line.read(_VOLTS, 2) == value
+
+
+@pytest.mark.parametrize("command", [0x41, 0x45, 0x60, 0x20, 0x00])
+def test_answers_with_other_commands_are_no_numbers(script, supply, command):
+    script.instead = [line(0x581, bytes((command,)) + bytes.fromhex("0D2102F0000000"))]
+    with pytest.raises(DeviceError, match=f"answered {command:02x} 0d 21 02"):
+        supply._line.read(_VOLTS, 2)
+
+
+def test_value_that_is_never_the_same(script, supply):
+    values = iter(range(100, 200))
+    original = script.answer
+
+    def answer(data):
+        if data[:3] == b"\x40\x0d\x21":
+            script.objects[0x210D, 2] = (next(values), 2)
+        return original(data)
+
+    script.answer = answer
+    with pytest.raises(DeviceError, match=r"never reports the same battery voltage \(object 0x210D:2\) twice"):
+        supply._read(_VOLTS, 2)
+    assert len(script.received) == 6
+
+
+def test_time_stamps_of_the_adapter_are_passed_over(script, supply, connect, clock):
+    stamped = lambda right: right[:-1] + b"12AB\r"  # noqa: E731
+    script.instead = [stamped] * 5
+    assert supply.measure() == {"supply_voltage": 0.0, "supply_current": 1.2}
+    assert len(script.received) == 5
+    supply = connect(heartbeat=1)
+    clock.sleep(2.0)
+    script.before = b"t701105FFFF\r"
+    supply.measure()
+
+
+@pytest.mark.parametrize(
+    ("identifier", "heard"), [(0x700, ""), (0x702, "2"), (0x77F, "127"), (0x780, ""), (0x6FF, "")]
+)
+def test_nodes_whose_heartbeats_are_heard(script, supply, identifier, heard):
+    script.instead = [line(identifier, b"\x05")] * 3
+    with pytest.raises(DeviceConnectionError) as caught:
+        supply.measure()
+    assert (f"heard of node {heard} instead" in str(caught.value)) == bool(heard)
+
+
+def test_heartbeat_of_another_length_is_none(script, supply):
+    script.instead = [line(0x702, b"\x05\x05")] * 3
+    with pytest.raises(DeviceConnectionError) as caught:
+        supply.measure()
+    assert "heard" not in str(caught.value)
+
+
+@pytest.mark.parametrize("place", range(26))
+def test_an_answer_in_pieces_is_put_together_and_costs_no_more_than_its_pause(clock, place):
+    script = Script()
+    register("pieces-supply", InPieces(script, clock, place, 0.02), clock)
+    try:
+        node = NodeLine("supply", make_settings(port="emulated://pieces-supply"), clock)
+        before = clock.now()
+        assert node.read(_VOLTS, 2) == 240
+        assert clock.now() - before < 0.03
+        assert node.repeats == 0
+        node.close()
+    finally:
+        unregister("pieces-supply")
+
+
+def test_commands_that_are_kept_do_not_pile_up(script, connect):
+    supply = connect(voltage_limits=(0, 24))
+    for command in range(150):
+        supply.set(command * 0.024)
+    assert 0 < len(supply._line._downloads) <= 64
+    assert script.orders()[-1] == (0x2000, 1, 149)
+
+
+def test_line_that_is_lost_while_something_is_sent(script, supply):
+    unregister("scripted-supply")
+    for action in (
+        lambda: supply._line.transmit(b"t0800\r"),
+        lambda: supply._line.await_heartbeat(1.0),
+        lambda: supply._line.synchronize((b"t1814",)),
+        lambda: supply._line.tell(driver._STOP, 1, 0),
+    ):
+        with pytest.raises(DeviceConnectionError, match="lost the line"):
+            action()
+
+
+def test_requests_after_one_whose_answer_is_not_waited_for(script, supply, clock):
+    supply._line.tell(driver._STOP, 1, 0)
+    before = clock.now()
+    supply._line.read(_VOLTS, 2)
+    assert clock.now() - before == pytest.approx(0.3, abs=0.01)
+    supply._line.tell(driver._STOP, 1, 0)
+    supply._line.urgent = True
+    before = clock.now()
+    supply._line.read(_VOLTS, 2)
+    assert clock.now() - before < 0.01
+
+
+def test_text_whose_segments_are_lost_again_and_again(script, connect):
+    script.instead = [None, b"z\r", b"z\r"] * 3
+    with pytest.raises(DeviceConnectionError, match="no answer within"):
+        connect()
+    assert [data[0] for _, data in script.received] == [0x40, 0x60, 0x80] * 3
+
+
+# The voltage.
+
+
+def test_supply_that_is_a_little_too_low(script, connect):
+    supply = connect(voltage_limits=(0, 24))
+    script.objects[0x210D, 2] = (100, 2)
+    supply.set(10.04)  # half of the last digit
+    assert script.orders()[-1] == (0x2000, 1, 1000)
+    with pytest.raises(DeviceError, match="too low"):
+        supply.set(10.06)
+
+
+def test_no_command_is_beyond_the_limits(script, connect):
+    supply = connect(voltage_limits=(-7, 5))
+    for battery in range(121, 240, 7):
+        script.objects[0x210D, 2] = (battery, 2)
+        for volts in (5.0, -7.0, 4.9991, -6.9991):
+            supply.set(volts)
+            found = script.orders()[-1][2] * battery / 1e4
+            assert -7.0 <= found <= 5.0
+            assert abs(found - volts) <= 1.5 * battery / 1e4
+
+
+def test_own_check_compares_the_supply_with_the_limits(script, connect):
+    for limits, battery, advice in (
+        ((0, 12), 120, ""),
+        ((-12, 6), 119, "12 V cannot be reached"),
+        ((0, 12), 119, "12"),
+    ):
+        script.objects[0x210D, 2] = (battery, 2)
+        supply, watchdog = connect(voltage_limits=limits).self_check()
+        assert supply.text == f"{battery / 10:.1f} V"
+        assert advice in supply.advice
+        assert bool(advice) == bool(supply.advice)
+        assert watchdog.text.endswith("the rig file says 1000 ms")
+
+
+def test_longest_time_of_the_safe_state(supply):
+    assert supply.safe_within == 2.5
+
+
+def test_power_that_does_not_go_off_is_looked_at_for_a_second(script, supply, clock):
+    supply.set(6.0)
+    script.follow = False
+    looks = []
+    original = script.answer
+
+    def answer(data):
+        if data[:4] == b"\x40\x02\x21\x01":
+            looks.append(clock.now())
+        return original(data)
+
+    script.answer = answer
+    with pytest.raises(DeviceError, match="does not confirm"):
+        supply.safe()
+    # Once before the emergency stop and once after it.
+    assert looks[-1] - looks[0] == pytest.approx(2.0, abs=0.1)
+    steps = sorted(later - sooner for sooner, later in pairwise(looks))
+    assert steps[len(steps) // 2] == pytest.approx(0.02, abs=0.005)
+
+
+def test_last_heartbeat_is_waited_for_a_third_of_its_time(script, connect, clock):
+    script.before = line(0x701, b"\x05")
+    supply = connect(heartbeat=0.6)
+    clock.sleep(0.7)
+    before = clock.now()
+    with pytest.raises(DeviceConnectionError, match="no heartbeat"):
+        supply.measure()
+    assert clock.now() - before == pytest.approx(0.2, abs=0.11)
+
+
+def test_another_line_to_a_controller_without_a_heartbeat(script, connect):
+    supply = connect(heartbeat=0.5)
+    script.before = b""
+    with pytest.raises(DeviceConnectionError, match="no heartbeat"):
+        supply.reconnect()
+
+
+def test_another_line_goes_on_counting(script, supply):
+    script.instead = [b"z\r"]
+    supply.measure()
+    assert supply.repeats == 1
+    script.before = line(0x701, b"\x05")
+    supply._renew_line()
+    assert supply.repeats == 1
+
+
+# Process data.
+
+
+class SyncScript(Script):
+    """A controller that takes the configuration of its process data, and sends what it maps upon a SYNC.
+
+    `spoilt` holds, SYNC by SYNC, what is made of the lines (None for the right ones).
+    """
+
+    def __init__(self, clock):
+        super().__init__()
+        self.clock = clock
+        self.beat_at = math.inf
+        self.mapped = {}
+        self.configured = []
+        self.synchronized = 0
+        self.spoilt = []
+        self.marks = []
+        self.objects |= {(0x2106, 16): (0, 4), (0x2101, 1): (0, 2)}
+
+    def obey(self, text):
+        if text == b"t0800":
+            self.synchronized += 1
+            sent = [line(identifier, self.content(mapping)) for identifier, mapping in self.process_data()]
+            other = self.spoilt.pop(0) if self.spoilt else None
+            return b"z\r" + b"".join(other(sent) if other else sent)
+        if text.startswith(b"t%03X4" % (0x500 + self.node)):
+            self.marks.append(text)
+            if self.mapped.get((0x1603, 0)) != 1:
+                return b"z\r"  # as delivered there are two variables, and a frame that is too short is not taken
+            self.objects[0x2106, 16] = (int.from_bytes(bytes.fromhex(text[5:].decode()), "little"), 4)
+            return b"z\r"
+        return super().obey(text)
+
+    def answer(self, data):
+        index, sub, value = int.from_bytes(data[1:3], "little"), data[3], int.from_bytes(data[4:], "little")
+        if data[0] >> 5 == 1 and 0x1400 <= index < 0x1C00:
+            self.configured.append((index, sub, value, 4 - (data[0] >> 2 & 3)))
+            self.mapped[index, sub] = value
+            return b"\x60" + data[1:4] + bytes(4)
+        reply = super().answer(data)
+        if index == 0x2000 and data[0] >> 5 == 1:
+            self.objects[0x2101, sub] = (int.from_bytes(data[4:], "little", signed=True), 2)
+        return reply
+
+    def unsolicited(self):
+        if self.clock.now() < self.beat_at:
+            return b""
+        self.beat_at = self.clock.now() + 0.1
+        return line(0x700 + self.node, b"\x05")
+
+    def next_unsolicited(self):
+        return self.beat_at
+
+    def process_data(self):
+        for number in range(4):
+            identifier = self.mapped.get((0x1800 + number, 1), 1 << 31)
+            if not identifier >> 31:
+                count = self.mapped[0x1A00 + number, 0]
+                yield identifier & 0x7FF, [self.mapped[0x1A00 + number, 1 + place] for place in range(count)]
+
+    def content(self, mapping):
+        data = b""
+        for each in mapping:
+            index, sub, bits = each >> 16, each >> 8 & 0xFF, each & 0xFF
+            data += (self.objects[index, sub][0] & (1 << bits) - 1).to_bytes(bits // 8, "little")
+        return data
+
+
+@pytest.fixture
+def controller(clock):
+    controller = SyncScript(clock)
+    register("synchronous-supply", controller, clock)
+    yield controller
+    unregister("synchronous-supply")
+
+
+@pytest.fixture
+def synchronous(controller, connect):
+    controller.objects[0x2102, 1] = (0, 2)
+    supply = connect(port="emulated://synchronous-supply", voltage_limits=(-12, 12))
+    controller.received.clear()
+    controller.marks.clear()
+    controller.synchronized = 0
+    return supply
+
+
+def pdo(number, first, mapping, kind, *, remote=0x40000000):
+    """Return what configures a process data object: index, subindex, value and bytes."""
+    parameters, objects = (0x1800 + number, 0x1A00 + number) if number < 4 else (0x1403, 0x1603)
+    return [
+        (parameters, 1, 0x80000000 | remote | first, 4),
+        (objects, 0, 0, 1),
+        *((objects, 1 + place, each, 4) for place, each in enumerate(mapping)),
+        (objects, 0, len(mapping), 1),
+        (parameters, 2, kind, 1),
+        (parameters, 1, remote | first, 4),
+    ]
+
+
+@pytest.mark.parametrize(("node", "channel"), [(1, 1), (77, 2)])
+def test_configuration_of_the_process_data(controller, connect, node, channel):
+    controller.node = node
+    for index in (0x2100, 0x2101, 0x2102, 0x2122):
+        controller.objects[index, channel] = controller.objects[index, 1]
+    connect(port="emulated://synchronous-supply", node=node, channel=channel)
+    one = channel << 8
+    electrical = [0x21020010 | one, 0x210D0210, 0x21000010 | one, 0x21120010]
+    assert controller.configured == [
+        *pdo(0, 0x180 + node, electrical, 1),
+        *pdo(1, 0x280 + node, [0x21220020 | one, 0x21061020], 1),
+        *pdo(2, 0x380 + node, electrical, 1),
+        *pdo(3, 0x480 + node, [0x21220020 | one, 0x21010010 | one], 1),
+        *pdo(4, 0x500 + node, [0x20051020], 255, remote=0),
+    ]
+    assert controller.marks == [b"t%03X401000000" % (0x500 + node)]
+
+
+def test_reading_is_one_synchronization(controller, synchronous):
+    synchronous.set(-6.0)
+    controller.objects |= {(0x2100, 1): (-15, 2), (0x210D, 2): (241, 2)}
+    controller.received.clear()
+    controller.marks.clear()
+    controller.synchronized = 0
+    assert synchronous.measure() == {"supply_voltage": pytest.approx(-6.025), "supply_current": -1.5}
+    assert controller.synchronized == 1
+    assert len(controller.marks) == 1
+    assert [data[:4].hex() for _, data in controller.received] == ["23002001"]
+    assert synchronous.repeats == 0
+
+
+def test_flags_come_with_the_process_data(controller, synchronous):
+    controller.objects |= {(0x2112, 0): (0x8001, 2)}
+    with pytest.raises(DeviceError, match=r"overheat.*0x8000"):
+        synchronous.measure()
+    controller.objects |= {(0x2112, 0): (0, 2), (0x2122, 1): (0x04, 4)}
+    with pytest.raises(DeviceError, match="loop error"):
+        synchronous.measure()
+
+
+def test_marks_count_and_begin_again():
+    data = ProcessData("supply", 1, 1)
+    assert [data.next_mark() for _ in range(3)][1:] == [b"t501402000000\r", b"t501403000000\r"]
+    data._mark = 0x7FFFFFFE
+    assert [data.next_mark(), data.next_mark()] == [b"t5014FFFFFF7F\r", b"t501401000000\r"]
+
+
+def damaged(number, place=5):
+    """Return what makes one character of one of the lines another digit."""
+
+    def spoil(sent):
+        text = sent[number]
+        digit = b"1" if text[place : place + 1] == b"0" else b"0"
+        return [*sent[:number], text[:place] + digit + text[place + 1 :], *sent[number + 1 :]]
+
+    return spoil
+
+
+@pytest.mark.parametrize(("number", "place"), [(0, 5), (2, 9), (1, 5), (3, 12), (1, 14), (3, 13)])
+def test_damaged_process_data_are_asked_for_again(controller, synchronous, number, place):
+    synchronous.set(6.0)
+    controller.synchronized = 0
+    before = synchronous.repeats
+    controller.spoilt = [damaged(number, place)]
+    assert synchronous.measure() == {"supply_voltage": 6.0, "supply_current": 1.2}
+    assert controller.synchronized == 2
+    assert synchronous.repeats == before + 1
+
+
+@pytest.mark.parametrize("left_out", range(4))
+def test_process_data_that_are_not_whole_are_asked_for_again(controller, synchronous, clock, left_out):
+    controller.spoilt = [lambda sent: sent[:left_out] + sent[left_out + 1 :]]
+    before = clock.now()
+    assert synchronous.measure()["supply_voltage"] == 0.0
+    assert controller.synchronized == 2
+    assert clock.now() - before == pytest.approx(0.1, abs=0.03)
+
+
+def test_process_data_that_never_come(controller, synchronous):
+    controller.spoilt = [lambda _sent: []] * 4
+    with pytest.raises(DeviceConnectionError, match="no process data follow a SYNC"):
+        synchronous.measure()
+    assert controller.synchronized == 4
+    # Each with another mark, as what comes late would have the former one.
+    assert len(controller.marks) == 3
+
+
+def test_process_data_that_never_agree(controller, synchronous):
+    values = iter(range(100))
+
+    def another(sent):
+        first = b"t1818%02X" % next(values) + sent[0][7:]
+        third = b"t3818%02X" % next(values) + sent[2][7:]
+        return [first, sent[1], third, sent[3]]
+
+    controller.spoilt = [another] * 4
+    with pytest.raises(DeviceError, match="do not agree with each other"):
+        synchronous.measure()
+    assert controller.synchronized == 4
+
+
+def test_process_data_of_an_earlier_synchronization_are_not_taken(controller, synchronous):
+    sent = []
+    controller.spoilt = [lambda right: sent.extend(right) or right]
+    synchronous.measure()
+    controller.objects |= {(0x2100, 1): (20, 2)}
+    controller.spoilt = [lambda _right: list(sent), None]
+    assert synchronous.measure()["supply_current"] == 2.0
+    assert controller.synchronized == 3
+    # A rest of the earlier ones in front of those of now.
+    controller.spoilt = [lambda right: [*sent[:2], *right]]
+    assert synchronous.measure()["supply_current"] == 2.0
+    controller.spoilt = [lambda right: [line(0x702, b"\x05"), *right]]
+    assert synchronous.measure()["supply_current"] == 2.0
+
+
+def test_command_of_another_host_has_to_come_twice(controller, synchronous):
+    synchronous.set(6.0).wait()
+    controller.spoilt = [damaged(3, 13)]
+    synchronous.measure()
+    controller.objects[0x2101, 1] = (700, 2)
+    with pytest.raises(DeviceError, match="its command was changed to 700 by another host, from 250"):
+        synchronous.measure()
+
+
+def test_restart_is_known_by_the_mark(controller, synchronous):
+    synchronous.set(6.0)
+    controller.mapped.clear()
+    controller.objects |= {(0x2106, 16): (0, 4), (0x2102, 1): (0, 2)}
+    with pytest.raises(DeviceRestartedError):
+        synchronous.measure()
+    for action in (synchronous.measure, lambda: synchronous.set(3.0)):
+        with pytest.raises(DeviceRestartedError):
+            action()
+    assert synchronous.setpoint == 0.0
+
+
+def test_restart_that_is_announced_ends_the_reading(controller, synchronous):
+    controller.spoilt = [lambda _sent: [line(0x701, b"\x00")]]
+    with pytest.raises(DeviceRestartedError):
+        synchronous.measure()
+    assert controller.synchronized == 1
+
+
+def test_restart_is_found_by_another_line(controller, synchronous, clock):
+    synchronous.set(6.0)
+    controller.beat_at = clock.now()
+    before = synchronous._line
+    synchronous.reconnect()
+    assert synchronous._line is not before
+    controller.objects[0x2106, 16] = (0, 4)
+    with pytest.raises(DeviceRestartedError):
+        synchronous.reconnect()
+
+
+def test_mark_that_the_controller_does_not_report_is_none(controller, synchronous):
+    assert synchronous._process_data.is_marked(synchronous._line) is True
+    controller.aborts[0x2106, 16] = 0x06020000
+    assert synchronous._process_data.is_marked(synchronous._line) is False
+
+
+def test_configuration_without_effect_is_done_without(controller, connect):
+    controller.spoilt = [lambda _sent: []] * 4
+    supply = connect(port="emulated://synchronous-supply")
+    controller.synchronized = 0
+    assert supply.measure()["supply_voltage"] == 0.0
+    assert controller.synchronized == 0
+
+
+def test_zero_is_held_without_a_command(controller, synchronous, clock):
+    synchronous.measure()
+    clock.sleep(5.0)
+    synchronous.measure()
+    assert controller.received == []
+    assert len(controller.marks) == 2
+
+
+def test_command_that_may_have_arrived(controller, synchronous):
+    synchronous.set(6.0).wait()
+    controller.instead = [b"z\r"] * 3
+    with pytest.raises(DeviceConnectionError):
+        synchronous.set(3.0)
+    # Whichever of them the controller obeys, it is no other host's.
+    for power in (125, 250):
+        controller.objects[0x2101, 1] = controller.objects[0x2102, 1] = (power, 2)
+        synchronous.measure()

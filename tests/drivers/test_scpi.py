@@ -473,3 +473,234 @@ class TestContract(ActuatorContract):
     @pytest.fixture
     def effects(self, lab):
         return lambda: lab.instrument.output
+
+
+# What is asked, and how often
+
+
+def test_an_answer_for_the_output_that_is_neither_on_nor_off(lab):
+    device = lab.connect()
+    device.set(5.0)
+    lab.answer = lambda data, usual: b"2\n" if data == b"OUTP?\n" else usual(data)
+    with pytest.raises(DeviceError, match=r"answered '2' to 'OUTP\?', expected '1' or '0'"):
+        device.glance()
+
+
+@pytest.mark.parametrize(("answer", "is_on"), [(b"1", True), (b"1.0", True), (b"+1E0", True), (b"0.0", False)])
+def test_an_answer_for_the_output_may_be_any_form_of_its_number(lab, answer, is_on):
+    device = lab.connect()
+    device.set(5.0)
+    lab.answer = lambda data, usual: answer + b"\n" if data == b"OUTP?\n" else usual(data)
+    if is_on:
+        device.glance()
+    else:
+        with pytest.raises(DeviceError, match="its output is off although it was switched on"):
+            device.glance()
+
+
+def test_longest_time_of_the_safe_state(stack):
+    device = Laboratory(stack, timeout=2.0, delay=0.5, output={"on": [], "off": ["OUTP OFF", "VOLT 0"]}).connect()
+    assert device.safe_within == pytest.approx(2.0 + 4 * 0.6)
+
+
+def test_a_set_point_at_the_ends_of_the_instrument(stack):
+    setpoint = {**SUPPLY["setpoint"], "range_queries": ["VOLT? MIN", "VOLT? MAX"]}
+    lab = Laboratory(stack, setpoint=setpoint)
+    lab.answer = lambda data, usual: (
+        b"30\n" if b"MIN" in data else b"0\n" if b"MAX" in data else usual(data)
+    )  # either way round
+    lab.connect()
+    lab.answer = lambda data, usual: b"0.001\n" if b"MIN" in data else b"40\n" if b"MAX" in data else usual(data)
+    with pytest.raises(ConfigurationError, match=r"takes 0\.001 to 40 V"):
+        lab.connect()
+
+
+def test_a_set_point_in_another_unit_of_the_instrument(stack):
+    """The instrument is set in mV, and reads back what it was set to, to a digit of its message."""
+    setpoint = {"command": "VOLT {value:.0f}", "query": "VOLT?", "unit": "V", "scale": 1e-3, "limits": [0.0, 0.03]}
+    lab = Laboratory(stack, setpoint={**setpoint, "resolution": 1e-4})
+    device = lab.connect()
+    device.set(0.0254)
+    assert "VOLT 25" in lab.requests
+    found = 25.11
+    lab.answer = lambda data, usual: f"{found}\n".encode() if data == b"VOLT?\n" else usual(data)
+    with pytest.raises(DeviceError, match=r"reads its set-point back as 0\.02511 V, not 0\.025 V"):
+        device.measure()
+    found = 25.09
+    device.measure()
+
+
+def test_an_instrument_without_a_question_for_its_set_point(stack):
+    setpoint = {key: value for key, value in SUPPLY["setpoint"].items() if key != "query"}
+    lab = Laboratory(stack, setpoint=setpoint)
+    device = lab.connect()
+    device.set(5.0)
+    device.measure()
+    device.reconnect()
+    assert "VOLT?" not in lab.requests
+
+
+def test_errors_without_a_queue_are_not_asked_for(stack):
+    lab = Laboratory(stack, error_query="")
+    lab.connect().measure()
+    assert not any("ERR" in request for request in lab.requests)
+
+
+@pytest.mark.parametrize(
+    ("no_error", "answer", "is_error"),
+    [
+        ("", '0,"No error"', False),
+        ("", "+0", False),
+        ("", "No error", True),
+        ("", '1,"x"', True),
+        ("None", "None", False),
+        ("None", "0", True),
+        ("OK{any}", "OK 17", False),
+    ],
+)
+def test_what_the_queue_answers_when_it_is_empty(stack, no_error, answer, is_error):
+    lab = Laboratory(stack, no_error=no_error)
+    empty = (no_error or "0").replace("{any}", "")
+    lab.answer = lambda data, usual: f"{empty}\n".encode() if b"ERR" in data else usual(data)
+    device = lab.connect()
+    lab.answer = lambda data, usual: answer.encode() + b"\n" if b"ERR" in data else usual(data)
+    if is_error:
+        with pytest.raises(DeviceError, match="reports after measuring"):
+            device.measure()
+    else:
+        device.measure()
+
+
+def test_a_message_that_the_encoding_lacks(lab):
+    device = lab.connect()
+    with pytest.raises(DeviceError, match="'UNIT °C' cannot be written in ascii"):
+        device._line.tell("UNIT °C")
+
+
+def test_a_line_that_never_falls_silent(lab):
+    device = lab.connect()
+    lab.answer = lambda *_: b"nonsense\n" * 100
+    with pytest.raises(DeviceConnectionError, match="the line emulated://scpi-test does not fall silent"):
+        device.glance()
+
+
+@pytest.mark.parametrize(("strays", "is_good"), [(63, True), (64, False)])
+def test_so_many_late_answers_are_passed_over(lab, strays, is_good):
+    device = lab.connect()
+    answers = [b"nonsense\n" * (strays + 1)]
+    lab.answer = lambda data, usual: answers.pop(0) if answers else usual(data)
+    if is_good:
+        assert device.glance()["supply_voltage"] == 0.0
+    else:
+        with pytest.raises(DeviceConnectionError, match="does not fall silent"):
+            device.glance()
+
+
+def test_an_instrument_without_an_identity_comes_into_step_by_silence(stack):
+    lab = Laboratory(stack, identity_query="", identity="{any}")
+    device = lab.connect()
+    assert str(device.identity) == "unknown text instrument, serial number emulated://scpi-test, firmware unknown"
+    answers = [b""]
+    lab.answer = lambda data, usual: answers.pop(0) if answers else usual(data)
+    begin = lab.clock.now()
+    device.glance()
+    assert "*IDN?" not in lab.requests
+    assert lab.clock.now() - begin == pytest.approx(2.0, abs=0.1)
+    assert device.repeats == 1
+
+
+def test_questions_are_sent_three_times_at_most_and_those_to_reconnect_once(lab):
+    device = lab.connect()
+    lab.instrument.unplug()
+    lab.requests.clear()
+    with pytest.raises(DeviceConnectionError, match="after 3 requests"):
+        device.glance()
+    assert lab.requests.count("MEAS:VOLT?") == 1  # then the identity is asked for
+    assert lab.requests.count("*IDN?") == 2
+    lab.requests.clear()
+    with pytest.raises(DeviceConnectionError, match="after 1 request;"):
+        device.reconnect()
+    assert lab.requests == ["*IDN?"]
+
+
+def test_a_line_that_is_lost_is_opened_again_by_the_next_call(lab):
+    device = lab.connect()
+    device.set(5.0)
+    protocol_emulated.unregister("scpi-test")
+    for action in (device.glance, lambda: device._line.tell("*CLS"), device._line.errors):
+        device._line.lost = False
+        with pytest.raises(DeviceConnectionError, match="lost the line"):
+            action()
+        assert device._line.lost
+    before = device._line
+    protocol_emulated.register("scpi-test", lab.server, lab.clock)
+    assert device.measure()["supply_voltage"] == 5.0
+    assert device._line is not before
+    device.close()
+    assert not device._line.lost
+    assert not device._line._transport._port.is_open
+
+
+def test_lost_while_reading(lab):
+    device = lab.connect()
+
+    def pull_out(data, usual):
+        protocol_emulated.unregister("scpi-test")
+        return b""
+
+    lab.answer = pull_out
+    with pytest.raises(DeviceConnectionError, match="lost the line"):
+        device.glance()
+    assert device._line.lost
+    protocol_emulated.register("scpi-test", lab.server, lab.clock)
+
+
+@pytest.mark.parametrize("length", [1024, 1025])
+def test_an_answer_without_an_end_is_none(stack, length):
+    lab = Laboratory(stack, signals={"voltage": {"query": "MEAS:VOLT?", "unit": "V", "reply": "{any},{value}"}})
+    device = lab.connect()
+    answers = [b"x" * (length - 3) + b",5\n"]
+
+    def answer(data, usual):
+        return usual(data) if b"MEAS" not in data else answers.pop(0) if answers else b"x,7\n"
+
+    lab.answer = answer
+    assert device.glance() == {"supply_voltage": 5.0 if length <= 1024 else 7.0}
+
+
+@pytest.mark.parametrize(
+    ("port", "right"),
+    [
+        ("tcp://host:1", True),
+        ("tcp://host:65535", True),
+        ("tcp://host:65536", False),
+        ("tcp://host:0", False),
+        ("tcp://host", False),
+        ("tcp://:5025", False),
+        ("tcp://host:scpi", False),
+        ("/dev/ttyUSB0", True),
+        ("", False),
+    ],
+)
+def test_addresses(port, right):
+    if right:
+        assert SCPIActuator.Settings(port=port, **SUPPLY).port == port
+    else:
+        with pytest.raises(ValueError, match="port"):
+            SCPIActuator.Settings(port=port, **SUPPLY)
+
+
+@pytest.mark.parametrize(
+    ("changes", "options"),
+    [
+        ({}, {"parity": "N", "stopbits": 1, "xonxoff": False, "rtscts": False, "dsrdtr": False}),
+        ({"parity": "E", "flow_control": "xon-xoff"}, {"parity": "E", "xonxoff": True}),
+        ({"stop_bits": 2}, {"stopbits": 2}),
+        ({"flow_control": "rts-cts"}, {"rtscts": True, "xonxoff": False, "dsrdtr": False}),
+        ({"flow_control": "dtr-dsr"}, {"dsrdtr": True, "rtscts": False}),
+        ({"baudrate": 19200, "timeout": 0.5}, {"baudrate": 19200, "timeout": 0.5, "write_timeout": 0.5}),
+    ],
+)
+def test_a_serial_port_is_set_up_as_the_rig_file_says(stack, changes, options):
+    port = Laboratory(stack, **changes).connect()._line._transport._port
+    assert {key: getattr(port, key) for key in options} == options
