@@ -9,7 +9,8 @@ numba's cache does not see the change; they are compared with brute-force oracle
 
 Those of a line that is executed when the module is loaded, such as a constant, may be killed by any test that
 executes a line of the module or has its name, and by the table of all settings. A mutant counts as killed if a test
-fails or does not end. The sample is drawn with a seed. Needs POSIX, as each mutant is a fork of a process that has loaded the libraries.
+fails or does not end. The sample is drawn with a seed. Needs POSIX, as each mutant is a fork of a process that has
+loaded the libraries.
 """
 
 from __future__ import annotations
