@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from bench.compiled import inner, kernel
 from bench.hysteresis import _kernels as memory
 
 Floats = NDArray[np.float64]
@@ -15,7 +15,7 @@ _reversible_value = memory.reversible_value
 _swept_differences = memory.swept_differences
 
 
-@njit(cache=True)
+@inner
 def _tabulate(levels: Floats, density: Floats, table: Floats, below: Floats) -> float:
     """Fill in the prefix sums of `Preisach.lattice`; return the mass, the sum of density * area."""
     order = levels.size - 1
@@ -43,7 +43,7 @@ def _tabulate(levels: Floats, density: Floats, table: Floats, below: Floats) -> 
     return total
 
 
-@njit(cache=True)
+@kernel
 def adapt(
     axis: memory.Axis,
     old_density: Floats,

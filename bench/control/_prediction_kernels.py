@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 
-from numba import njit
 from numpy import int64
 from numpy.typing import NDArray
 
+from bench.compiled import kernel
 from bench.hysteresis._checks import Floats
 
 
-@njit(cache=True)
+@kernel
 def drive(
     start: Floats,
     setpoints: Floats,

@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from bench.compiled import inlined, inner, kernel
 
 Floats = NDArray[np.float64]
 
@@ -18,7 +19,7 @@ _REST = 1e-13
 _LIMIT = 1e6
 
 
-@njit(cache=True)
+@kernel
 def generalized_plays(lower: Floats, upper: Floats, thresholds: Floats, state: Floats) -> Floats:
     """Step plays between two drives; return their states sample by sample. `state` is changed."""
     result = np.empty((lower.size, state.size))
@@ -29,7 +30,7 @@ def generalized_plays(lower: Floats, upper: Floats, thresholds: Floats, state: F
     return result
 
 
-@njit(cache=True)
+@kernel
 def stops(inputs: Floats, present: float, limits: Floats, state: Floats) -> Floats:
     """Step stops through `inputs`; return their states sample by sample. `state` is changed."""
     result = np.empty((inputs.size, state.size))
@@ -42,7 +43,7 @@ def stops(inputs: Floats, present: float, limits: Floats, state: Floats) -> Floa
     return result
 
 
-@njit(cache=True)
+@kernel
 def ramps(inputs: Floats, rising: Floats, falling: Floats, width: float, state: Floats) -> Floats:
     """Step Krasnosel'skii-Pokrovskii kernels through `inputs`; return their states. `state` is changed.
 
@@ -59,7 +60,7 @@ def ramps(inputs: Floats, rising: Floats, falling: Floats, width: float, state: 
     return result
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def _grown(rate: float, path: float) -> float:
     """Return (exp(rate path) - 1) / rate."""
     if abs(rate * path) < 1e-8:
@@ -67,7 +68,7 @@ def _grown(rate: float, path: float) -> float:
     return math.expm1(rate * path) / rate
 
 
-@njit(cache=True)
+@inner
 def _exponential(z: float, path: float, loading: float, unloading: float) -> float:
     """Return z, counted along the move, after a path with dz/dx = 1 - c |z|: the exact solution."""
     if z < 0.0:
@@ -85,13 +86,13 @@ def _exponential(z: float, path: float, loading: float, unloading: float) -> flo
     return z * math.exp(-loading * path) + _grown(-loading, path)
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def _slope(z: float, loading: float, unloading: float, exponent: float) -> float:
     slope: float = 1.0 - (loading if z > 0.0 else unloading) * abs(z) ** exponent
     return slope
 
 
-@njit(cache=True)
+@inner
 def _integrated(z: float, path: float, loading: float, unloading: float, exponent: float) -> float:
     """Return z, counted along the move, after a path with dz/dx = 1 - c |z|^n: Dormand and Prince, order 5(4)."""
     x, h = 0.0, min(path, 0.05)
@@ -146,7 +147,7 @@ def _integrated(z: float, path: float, loading: float, unloading: float, exponen
     return z
 
 
-@njit(cache=True)
+@kernel
 def bouc_wen(inputs: Floats, present: float, z: float, beta: float, gamma: float, exponent: float) -> Floats:
     """Return z after each input, where dz/du = 1 - |z|^n (beta sgn(z du) + gamma)."""
     result = np.empty(inputs.size)
@@ -188,7 +189,7 @@ _WEIGHTS = (
 )
 
 
-@njit(cache=True)
+@kernel
 def duhem(inputs: Floats, present: float, rate: float, degree: int, state: Floats) -> Floats:
     """Step the elements of a Duhem operator through `inputs`; return their states. `state` is changed.
 

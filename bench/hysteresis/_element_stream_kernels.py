@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import carray, njit  # type: ignore[attr-defined]
+from numba import carray  # type: ignore[attr-defined]
 from numpy.typing import NDArray
 
+from bench.compiled import inlined, kernel
 from bench.hysteresis import _element_kernels as sequences
 from bench.hysteresis._stream_kernels import pointer
 
@@ -22,7 +23,7 @@ PRESENT, OUTPUT, BIAS, OWN = range(4)
 NUMBER_COUNT = 14
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def _opened(address: int) -> tuple[Words, Floats, Floats]:
     """Return words, numbers and elements."""
     words = carray(pointer(address), WORD_COUNT, np.int64)
@@ -30,19 +31,19 @@ def _opened(address: int) -> tuple[Words, Floats, Floats]:
     return words, numbers, carray(pointer(words[ELEMENTS]), words[COUNT], np.float64)
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def _array(words: Words, place: int, size: int) -> Floats:
     return carray(pointer(words[place]), size, np.float64)
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def _one(value: float) -> Floats:
     sequence = np.empty(1)
     sequence[0] = value
     return sequence
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def _sum(words: Words, row: Floats) -> float:
     weights = _array(words, WEIGHTS, row.size)
     total = 0.0
@@ -51,7 +52,7 @@ def _sum(words: Words, row: Floats) -> float:
     return total
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def _moved(numbers: Floats, value: float, total: float) -> float:
     output: float = numbers[BIAS] + total
     numbers[PRESENT] = value
@@ -59,7 +60,7 @@ def _moved(numbers: Floats, value: float, total: float) -> float:
     return output
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def _within(numbers: Floats, value: float) -> float:
     """Return an input as a part of the operating range, whose ends are the first numbers of an operator."""
     low, high = numbers[OWN], numbers[OWN + 1]
@@ -67,7 +68,7 @@ def _within(numbers: Floats, value: float) -> float:
     return x
 
 
-@njit(cache=True)
+@kernel
 def stops(address: int, value: float) -> float:
     """Step stops beside a spring; their limits, and the origin of the spring."""
     if not math.isfinite(value):
@@ -79,7 +80,7 @@ def stops(address: int, value: float) -> float:
     return _moved(numbers, value, _sum(words, row) + spring)
 
 
-@njit(cache=True)
+@kernel
 def ramps(address: int, value: float) -> float:
     """Step kernels between ramps; where these begin upwards and downwards, and their width."""
     if not math.isfinite(value):
@@ -90,14 +91,14 @@ def ramps(address: int, value: float) -> float:
     return _moved(numbers, value, _sum(words, row))
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def _envelope(numbers: Floats, place: int, x: float) -> float:
     steepness, offset, low, high = numbers[place], numbers[place + 1], numbers[place + 2], numbers[place + 3]
     drive: float = (2.0 * math.tanh(steepness * x - offset) - low - high) / (high - low)
     return drive
 
 
-@njit(cache=True)
+@kernel
 def plays(address: int, value: float) -> float:
     """Step plays between envelopes; their thresholds, the range, and of each envelope its numbers and ends."""
     if not math.isfinite(value):
@@ -109,7 +110,7 @@ def plays(address: int, value: float) -> float:
     return _moved(numbers, value, _sum(words, row))
 
 
-@njit(cache=True)
+@kernel
 def duhem(address: int, value: float) -> float:
     """Step the terms of a Duhem operator; the range, and the rate."""
     if not math.isfinite(value):
@@ -120,7 +121,7 @@ def duhem(address: int, value: float) -> float:
     return _moved(numbers, value, _sum(words, row))
 
 
-@njit(cache=True)
+@kernel
 def bouc_wen(address: int, value: float) -> float:
     """Step a Bouc-Wen operator; scale, beta, gamma, exponent and origin."""
     if not math.isfinite(value):

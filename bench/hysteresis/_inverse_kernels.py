@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from bench.compiled import inlined, inner, kernel
 from bench.hysteresis import _kernels as memory
 
 Floats = NDArray[np.float64]
@@ -24,7 +24,7 @@ _NEAR = 8
 _INTERPOLATED = 6
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def _first_root(a: float, b: float, r: float, length: float, tolerance: float) -> float:
     """Return the least d in [0, length] with A d² + B d = r, or -1.
 
@@ -55,7 +55,7 @@ def _first_root(a: float, b: float, r: float, length: float, tolerance: float) -
     return second if 0.0 <= second <= length else -1.0
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def walk(
     plane: memory.Plane,
     terms: memory.Terms,
@@ -115,7 +115,7 @@ def walk(
     return best, error, steps
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def _walk_on(
     plane: memory.Plane,
     terms: memory.Terms,
@@ -137,7 +137,7 @@ def _walk_on(
     return walk(plane, terms, end, (left, height, n), u, value, target, tolerance, direction, reach, most, edge)
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def _risen(
     plane: memory.Plane,
     below: Floats,
@@ -154,7 +154,7 @@ def _risen(
     return memory.output_at(plane, below, offset, terms, x, x, k, mass)
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def _fallen(
     plane: memory.Plane,
     below: Floats,
@@ -174,7 +174,7 @@ def _fallen(
     return memory.output_at(plane, below, offset, terms, x, x, k, mass)
 
 
-@njit(cache=True)
+@inner
 def _leap(
     plane: memory.Plane,
     below: Floats,
@@ -243,7 +243,7 @@ def _leap(
     return walk(plane, terms, end, corners, near, value, target, tolerance, direction, np.inf, _ALL, edge)
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def invert(
     plane: memory.Plane,
     below: Floats,
@@ -313,7 +313,7 @@ def invert(
     return count, s1, s2, error, steps
 
 
-@njit(cache=True)
+@kernel
 def invert_state(
     plane: memory.Plane,
     below: Floats,
@@ -333,7 +333,7 @@ def invert_state(
     return invert(plane, below, offset, terms, ends, pieces, (n, present, k, mass), u, value, target)
 
 
-@njit(cache=True)
+@kernel
 def follow(
     plane: memory.Plane,
     below: Floats,

@@ -14,9 +14,10 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numba.extending import intrinsic
 from numpy.typing import NDArray
+
+from bench.compiled import inlined, inner, kernel
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -45,7 +46,7 @@ def _unowned(typing_context: Any, array: Any) -> Any:  # noqa: ANN401, ARG001
 borrowed: Any = intrinsic(_unowned)
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def locate(levels: Floats, inverse_step: float, value: float) -> int:
     """Return k with levels[k] <= value < levels[k + 1], kept within the lattice."""
     last = levels.size - 2
@@ -71,7 +72,7 @@ def locate(levels: Floats, inverse_step: float, value: float) -> int:
     return low
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def bilinear(table: Floats, levels: Floats, b: float, j: int, a: float, i: int) -> float:
     x = b - levels[j]
     y = a - levels[i]
@@ -80,7 +81,7 @@ def bilinear(table: Floats, levels: Floats, b: float, j: int, a: float, i: int) 
     return value
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def reversible_value(terms: Terms, u: float) -> float:
     """Return the single-valued part at u."""
     breaks, quadratics = terms
@@ -91,7 +92,7 @@ def reversible_value(terms: Terms, u: float) -> float:
     return value
 
 
-@njit(cache=True)
+@kernel
 def advance_extrema(inputs: Floats, stack: Floats, count: int, present: float, saturation: int) -> int:
     """Step the stack of extrema through `inputs`; return the new count."""
     rising = (saturation < 0) == (count % 2 == 0)
@@ -115,14 +116,14 @@ def advance_extrema(inputs: Floats, stack: Floats, count: int, present: float, s
     return count
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def borrow(plane: Plane, terms: Terms, stack: Floats, indices: Integers) -> tuple[Plane, Terms, Pieces]:
     """Return plane, terms, and the rows of `stack` and `indices` as pieces, all without ownership."""
     pieces = borrowed(stack[0]), borrowed(stack[1]), borrowed(stack[2]), borrowed(indices[0]), borrowed(indices[1])
     return (borrowed(plane[0]), plane[1], borrowed(plane[2])), (borrowed(terms[0]), borrowed(terms[1])), pieces
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def row_mass(
     levels: Floats,
     table: Floats,
@@ -140,7 +141,7 @@ def row_mass(
     return mass
 
 
-@njit(cache=True)
+@inner
 def load(plane: Plane, pieces: Pieces, n: int, u: float) -> tuple[int, float]:
     """Fill in what belongs to n given pieces; return the input's cell and the mass up to the input.
 
@@ -159,7 +160,7 @@ def load(plane: Plane, pieces: Pieces, n: int, u: float) -> tuple[int, float]:
     return locate(levels, inverse_step, u), mass
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def move(
     plane: Plane, pieces: Pieces, n: int, present: float, k: int, mass: float, u: float
 ) -> tuple[int, int, float]:
@@ -191,7 +192,7 @@ def move(
     return n, k, mass
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def output_at(
     plane: Plane, below: Floats, offset: float, terms: Terms, raw: float, u: float, k: int, mass: float
 ) -> float:
@@ -202,7 +203,7 @@ def output_at(
     return offset + 2.0 * mass + reversible_value(terms, raw)
 
 
-@njit(cache=True)
+@inner
 def _run(
     inputs: Floats,
     plane: Plane,
@@ -231,7 +232,7 @@ def _run(
         outputs[t] = output_at(plane, below, offset, terms, raw, u, k, mass)
 
 
-@njit(cache=True)
+@kernel
 def evaluate(inputs: Floats, plane: Plane, below: Floats, offset: float, terms: Terms, start: Start) -> Floats:
     """Return the outputs of a sequence: a running sum on the staircase, O(1) amortised a sample."""
     room = inputs.size + start[0].size + 1
@@ -241,7 +242,7 @@ def evaluate(inputs: Floats, plane: Plane, below: Floats, offset: float, terms: 
     return outputs
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def segment_up(
     plane: Plane, terms: Terms, high: float, edge: float, above: float, u: float
 ) -> tuple[float, float, float]:
@@ -274,7 +275,7 @@ def segment_up(
     return stop, a + quadratics[r, 2], b + quadratics[r, 1] + 2.0 * quadratics[r, 2] * u
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def segment_down(
     plane: Plane, terms: Terms, low: float, edge: float, top: float, u: float
 ) -> tuple[float, float, float]:
@@ -310,7 +311,7 @@ def segment_down(
     return stop, a + quadratics[r, 2], b - quadratics[r, 1] - 2.0 * quadratics[r, 2] * u
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def rising_piece(levels: Floats, left: Floats, height: Floats, n: int, u: float) -> tuple[int, float, float]:
     """Return what rises from u: pieces before it, its left edge, and the height at which it meets the last."""
     edge = max(u, levels[0])
@@ -320,7 +321,7 @@ def rising_piece(levels: Floats, left: Floats, height: Floats, n: int, u: float)
     return n, edge, height[n - 1] if n > 0 else math.inf
 
 
-@njit(cache=True)
+@kernel
 def segment(
     plane: Plane, terms: Terms, low: float, high: float, left: Floats, height: Floats, u: float, direction: int
 ) -> tuple[float, float, float]:
@@ -335,7 +336,7 @@ def segment(
     return max(u - stop, 0.0), a, b
 
 
-@njit(cache=True)
+@inner
 def _span(axis: Axis, low: float, high: float) -> tuple[int, int]:
     """Return the first and last cell that [low, high] overlaps by more than a point."""
     levels, inverse_step = axis
@@ -346,7 +347,7 @@ def _span(axis: Axis, low: float, high: float) -> tuple[int, int]:
     return first, last
 
 
-@njit(cache=True)
+@inner
 def _rectangle(
     axis: Axis, b0: float, b1: float, a0: float, a1: float, factor: float, entries: Entries, end: int
 ) -> int:
@@ -372,7 +373,7 @@ def _rectangle(
     return end
 
 
-@njit(cache=True)
+@inner
 def _triangle(axis: Axis, low: float, high: float, factor: float, entries: Entries, end: int) -> int:
     """Append factor * overlap with {low <= β <= α <= high} for each cell touched, or count them as `_rectangle`."""
     levels, _ = axis
@@ -396,7 +397,7 @@ def _triangle(axis: Axis, low: float, high: float, factor: float, entries: Entri
     return end
 
 
-@njit(cache=True)
+@kernel
 def swept_areas(axis: Axis, start: Start, entries: Entries) -> int:
     """List twice the on-area of each cell that the staircase touches; return the number of entries.
 
@@ -411,7 +412,7 @@ def swept_areas(axis: Axis, start: Start, entries: Entries) -> int:
     return end
 
 
-@njit(cache=True)
+@kernel
 def swept_differences(inputs: Floats, axis: Axis, start: Start, starts: Integers, entries: Entries) -> int:
     """List, sample by sample, the change of 2 * on-area of the cells that the input swept.
 
@@ -457,7 +458,7 @@ def swept_differences(inputs: Floats, axis: Axis, start: Start, starts: Integers
     return end
 
 
-@njit(cache=True)
+@kernel
 def difference_product(starts: Integers, cells: NDArray[np.int32], changes: Floats, weights: Floats) -> Floats:
     """Return the running sum of (row differences) @ weights."""
     result = np.empty(starts.size - 1)
@@ -471,7 +472,7 @@ def difference_product(starts: Integers, cells: NDArray[np.int32], changes: Floa
     return result
 
 
-@njit(cache=True)
+@kernel
 def dense_rows(starts: Integers, cells: NDArray[np.int32], changes: Floats, base: Floats, result: Floats) -> None:
     """Fill result[:, : base.size] with the rows themselves."""
     row = base.copy()
@@ -482,7 +483,7 @@ def dense_rows(starts: Integers, cells: NDArray[np.int32], changes: Floats, base
             result[t, c] = row[c]
 
 
-@njit(cache=True)
+@kernel
 def by_column(
     starts: Integers, cells: NDArray[np.int32], changes: Floats, columns: int
 ) -> tuple[Integers, NDArray[np.int32], Floats]:
@@ -518,7 +519,7 @@ def by_column(
     return packed, rows[:end].copy(), values[:end].copy()
 
 
-@njit(cache=True)
+@kernel
 def best_staircases(columns: Floats, widths: Floats) -> Floats:
     """Return F[j, i]: the greatest mass below a non-increasing staircase over columns < j, heights >= i.
 
@@ -535,7 +536,7 @@ def best_staircases(columns: Floats, widths: Floats) -> Floats:
     return best
 
 
-@njit(cache=True)
+@kernel
 def plays(drive: Floats, thresholds: Floats, state: Floats) -> Floats:
     """Step the plays through `drive`; return their states sample by sample. `state` is changed."""
     result = np.empty((drive.size, state.size))
@@ -547,7 +548,7 @@ def plays(drive: Floats, thresholds: Floats, state: Floats) -> Floats:
     return result
 
 
-@njit(cache=True)
+@kernel
 def weighted_plays(drive: Floats, thresholds: Floats, weights: Floats, state: Floats) -> Floats:
     """Step the plays through `drive`; return their weighted sum. `state` is changed."""
     result = np.empty(drive.size)

@@ -12,11 +12,12 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numba import carray, njit, types  # type: ignore[attr-defined]
+from numba import carray, types  # type: ignore[attr-defined]
 from numba.core import cgutils
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
+from bench.compiled import inlined, kernel
 from bench.hysteresis import _inverse_kernels as inverse
 from bench.hysteresis import _kernels as memory
 
@@ -54,37 +55,37 @@ def _pointer_type(typing_context: Any, address: Any) -> Any:  # noqa: ANN401, AR
 pointer: Any = intrinsic(_pointer_type)
 
 
-def entry(kernel: Any) -> Step:  # noqa: ANN401 - numba ships no types
+def entry(function: Any) -> Step:  # noqa: ANN401 - numba ships no types
     """Return a compiled step as a plain function of address and number, without numba's look at the arguments."""
-    compiled: Step = kernel.compile((types.int64, types.float64))
+    compiled: Step = function.compile((types.int64, types.float64))
     return compiled
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def _words(address: int) -> Words:
     return carray(pointer(address), WORD_COUNT, np.int64)
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def _numbers(words: Words) -> Floats:
     return carray(pointer(words[NUMBERS]), NUMBER_COUNT, np.float64)
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def _plane(words: Words, numbers: Floats) -> memory.Plane:
     size = words[LEVEL_COUNT]
     levels = carray(pointer(words[LEVELS]), size, np.float64)
     return levels, numbers[INVERSE_STEP], carray(pointer(words[TABLE]), (size - 1, size - 1, 4), np.float64)
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def _terms(words: Words) -> memory.Terms:
     size = words[BREAK_COUNT]
     breaks = carray(pointer(words[BREAKS]), size, np.float64)
     return breaks, carray(pointer(words[QUADRATICS]), (size + 1, 3), np.float64)
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def _pieces(words: Words) -> memory.Pieces:
     room = words[ROOM]
     stack = carray(pointer(words[PIECES]), (3, room), np.float64)
@@ -92,12 +93,12 @@ def _pieces(words: Words) -> memory.Pieces:
     return stack[0], stack[1], stack[2], indices[0], indices[1]
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def _below(words: Words) -> Floats:
     return carray(pointer(words[BELOW]), words[LEVEL_COUNT], np.float64)
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def _output(words: Words, numbers: Floats, plane: memory.Plane) -> float:
     return memory.output_at(
         plane,
@@ -111,7 +112,7 @@ def _output(words: Words, numbers: Floats, plane: memory.Plane) -> float:
     )
 
 
-@njit(cache=True)
+@kernel
 def begin(address: int, value: float) -> float:
     """Fill in what belongs to given pieces at the input `value`; return the output."""
     words = _words(address)
@@ -126,7 +127,7 @@ def begin(address: int, value: float) -> float:
     return output
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def _move(words: Words, numbers: Floats, plane: memory.Plane, value: float) -> float:
     """Move to an input; there is room for one more extremum and piece."""
     present = numbers[INPUT]
@@ -155,7 +156,7 @@ def _move(words: Words, numbers: Floats, plane: memory.Plane, value: float) -> f
     return output
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def _has_room(words: Words) -> bool:
     """Return whether two moves have room, as an inversion may take."""
     used: int = max(words[EXTREMUM_COUNT], words[PIECE_COUNT])
@@ -163,7 +164,7 @@ def _has_room(words: Words) -> bool:
     return used + 2 < room
 
 
-@njit(cache=True)
+@kernel
 def step(address: int, value: float) -> float:
     """Move to an input and return the output; nan, without a move, if there is no room or the input is not finite."""
     words = _words(address)
@@ -173,7 +174,7 @@ def step(address: int, value: float) -> float:
     return _move(words, numbers, _plane(words, numbers), value)
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def _find(words: Words, numbers: Floats, plane: memory.Plane, target: float) -> tuple[int, float, float]:
     ends = (
         numbers[LOW],
@@ -203,7 +204,7 @@ def _find(words: Words, numbers: Floats, plane: memory.Plane, target: float) -> 
     return count, first, last
 
 
-@njit(cache=True)
+@kernel
 def find(address: int, target: float) -> float:
     """Return the last set-point that meets the target, and keep the rest of the answer; nan if it is not finite."""
     if not math.isfinite(target):
@@ -213,7 +214,7 @@ def find(address: int, target: float) -> float:
     return _find(words, numbers, _plane(words, numbers), target)[2]
 
 
-@njit(cache=True)
+@kernel
 def follow(address: int, target: float) -> float:
     """Find and move there; nan, without a move, if there is no room or the target is not finite."""
     words = _words(address)
@@ -228,7 +229,7 @@ def follow(address: int, target: float) -> float:
     return last
 
 
-@njit(cache=True, forceinline=True)
+@inlined
 def _mapped(x: float, lines: int, count: int) -> float:
     """Return a map of dead zones at x, see `DeadZones.value`; without one x itself."""
     if count < 0:
@@ -241,7 +242,7 @@ def _mapped(x: float, lines: int, count: int) -> float:
     return mapped
 
 
-@njit(cache=True)
+@kernel
 def step_plays(address: int, value: float) -> float:
     """Move the plays to an input and return the output; nan, without a move, if the input is not finite."""
     words = carray(pointer(address), PLAY_WORD_COUNT, np.int64)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from bench.compiled import inner, kernel
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -19,7 +20,7 @@ _NODES = DEGREE + 1
 _KEPT = -1
 
 
-@njit(cache=True)
+@kernel
 def find_runs(starts: Integers, cells: Rows, changes: Floats) -> tuple[Integers, Floats]:
     """Return the first row of each run, and the travel of the input at each row.
 
@@ -72,7 +73,7 @@ def find_runs(starts: Integers, cells: Rows, changes: Floats) -> tuple[Integers,
     return firsts[: count + 1].copy(), travel
 
 
-@njit(cache=True)
+@inner
 def quadrature(
     s: Floats, w: Floats, values: Floats, points: Floats, weights: Floats, at_nodes: Floats, left: Floats
 ) -> int:
@@ -126,7 +127,7 @@ def quadrature(
     return nodes
 
 
-@njit(cache=True)
+@kernel
 def collapse_runs(
     values: Floats, w: Floats, firsts: Integers, travel: Floats, allowed: Floats
 ) -> tuple[Integers, Floats, Floats, Floats, Floats]:
@@ -152,7 +153,7 @@ def collapse_runs(
     return nodes, points, weights, at_nodes, left
 
 
-@njit(cache=True)
+@kernel
 def collapsed_rows(
     starts: Integers,
     cells: Rows,

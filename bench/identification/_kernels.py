@@ -8,8 +8,9 @@ sums over samples become sums over changes.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from bench.compiled import kernel, reordered
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -21,7 +22,7 @@ Columns = tuple[Integers, Rows, Floats]
 _BLOCK = 8
 
 
-@njit(cache=True)
+@kernel
 def moments(sparse: Columns, base: Floats, remaining: Floats) -> tuple[Floats, Floats]:
     """Return weighted mean and norm about the mean of each column."""
     starts, rows, values = sparse
@@ -47,7 +48,7 @@ def moments(sparse: Columns, base: Floats, remaining: Floats) -> tuple[Floats, F
     return means, norms
 
 
-@njit(cache=True)
+@kernel
 def products(
     sparse: Columns, norms: Floats, extra: Floats, weights: Floats, total: float, residual: Floats
 ) -> Floats:
@@ -79,7 +80,7 @@ def products(
     return result
 
 
-@njit(cache=True)
+@kernel
 def combination(
     sparse: Columns, base: Floats, means: Floats, chosen: Integers, factors: Floats, samples: int
 ) -> Floats:
@@ -99,7 +100,7 @@ def combination(
     return result
 
 
-@njit(cache=True)
+@kernel
 def gram_rows(
     columns: Columns,
     base: Floats,
@@ -165,7 +166,7 @@ def gram_rows(
                 result[first + k, m] = products[k]
 
 
-@njit(cache=True)
+@kernel
 def factor_independent(lower: Floats, least: Floats, good: Flags) -> None:
     """Replace the lower half of a symmetric matrix by its Cholesky factor, without columns of too small a pivot.
 
@@ -190,7 +191,7 @@ def factor_independent(lower: Floats, least: Floats, good: Flags) -> None:
         row[k] = np.sqrt(pivot) if good[k] else 0.0
 
 
-@njit(cache=True)
+@kernel
 def crests(g: Floats, threshold: float, neighbours: Integers) -> Flags:
     """Return which values are at least a threshold and not below any of their neighbours.
 
@@ -209,7 +210,7 @@ def crests(g: Floats, threshold: float, neighbours: Integers) -> Flags:
     return result
 
 
-@njit(cache=True)
+@kernel
 def gather(matrix: Floats, rows: Integers, columns: Integers, result: Floats) -> None:
     """Fill the upper left of `result` with matrix[rows][:, columns]; several times as fast, and without a copy."""
     for i in range(rows.size):
@@ -218,7 +219,7 @@ def gather(matrix: Floats, rows: Integers, columns: Integers, result: Floats) ->
             result[i, j] = row[columns[j]]
 
 
-@njit(cache=True)
+@kernel
 def delete_column(upper: Floats, size: int, k: int, half: Floats) -> None:
     """Remove column k of the triangular factor U = upper[:size, :size] of a Gram matrix UᵀU, by rotations.
 
@@ -243,7 +244,7 @@ def delete_column(upper: Floats, size: int, k: int, half: Floats) -> None:
             following[c] = cosine * b - sine * a
 
 
-@njit(cache=True, fastmath={"reassoc", "contract"})
+@reordered
 def products_of_rows(upper: Floats, first: Integers, second: Integers) -> Floats:
     """Return the products of rows first[k] and second[k] of an upper triangular matrix."""
     result = np.empty(first.size)
@@ -256,7 +257,7 @@ def products_of_rows(upper: Floats, first: Integers, second: Integers) -> Floats
     return result
 
 
-@njit(cache=True, fastmath={"reassoc", "contract"})
+@reordered
 def largest_row(gram: Floats, places: Integers) -> float:
     """Return the greatest sum of magnitudes of a row of the block of a matrix at rows and columns `places`."""
     result = 0.0
@@ -269,7 +270,7 @@ def largest_row(gram: Floats, places: Integers) -> float:
     return result
 
 
-@njit(cache=True, fastmath={"reassoc", "contract"})
+@reordered
 def solve_lower(upper: Floats, size: int, right: Floats) -> None:
     """Replace each of a few right sides, shape (p, size), by the x with Uᵀx = right and U = upper[:size, :size]."""
     whole = size - size % 4
@@ -293,7 +294,7 @@ def solve_lower(upper: Floats, size: int, right: Floats) -> None:
                 x[n] -= x[j] * upper[j, n]
 
 
-@njit(cache=True, fastmath={"reassoc", "contract"})
+@reordered
 def solve_upper(upper: Floats, size: int, right: Floats) -> Floats:
     """Return the solution of U x = right with U = upper[:size, :size]."""
     x = right[:size].copy()
@@ -306,7 +307,7 @@ def solve_upper(upper: Floats, size: int, right: Floats) -> Floats:
     return x
 
 
-@njit(cache=True)
+@kernel
 def factored_length(upper: Floats, size: int, places: Integers, values: Floats) -> float:
     """Return the norm of U @ vector with U = upper[:size, :size]; the vector is zero but at increasing places."""
     total = 0.0

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from bench.compiled import kernel
 from bench.hysteresis import _kernels as memory
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 
-@njit(cache=True)
+@kernel
 def filtered(
     columns: Floats,
     steps: Floats,
@@ -74,7 +74,7 @@ def filtered(
     return result
 
 
-@njit(cache=True)
+@kernel
 def oscillate(inputs: Floats, steps: Floats, parameters: Floats, state: Floats, outputs: Floats) -> bool:
     """Integrate m y'' + c y' + k y + z = u, z' = a y' - b |y'| z - d y' |z| by Runge and Kutta's method of order 4.
 
@@ -129,7 +129,7 @@ def oscillate(inputs: Floats, steps: Floats, parameters: Floats, state: Floats, 
     return True
 
 
-@njit(cache=True)
+@kernel
 def oscillate_on_plane(
     inputs: Floats,
     steps: Floats,

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from bench.compiled import inner, kernel
 from bench.hysteresis._checks import Floats
 
 STATE_SIZE = 5
@@ -17,7 +17,7 @@ _POWERS = 32
 """Enough for any number of steps of a grid, as powers of two."""
 
 
-@njit(cache=True)
+@kernel
 def move(
     position: float,
     velocity: float,
@@ -57,7 +57,7 @@ def move(
     return position, velocity
 
 
-@njit(cache=True)
+@kernel
 def hold_back(lagged: float, positions: Floats, seen: Floats, step: float, lag: float, power: float) -> float:
     """Write what an operator behind a lag sees of each position to `seen`; return the last |x|^power.
 
@@ -75,7 +75,7 @@ def hold_back(lagged: float, positions: Floats, seen: Floats, step: float, lag: 
     return lagged
 
 
-@njit(cache=True)
+@kernel
 def follow(
     state: Floats,
     setpoints: Floats,
@@ -114,7 +114,7 @@ def follow(
     state[3], state[4] = drift, place
 
 
-@njit(cache=True)
+@kernel
 def creep(slow: Floats, outputs: Floats, step: float, shares: Floats, times: Floats) -> None:
     """Replace outputs by what they are with their slow parts, each a lag of first order; `slow` is their state."""
     for j in range(times.size):
@@ -126,7 +126,7 @@ def creep(slow: Floats, outputs: Floats, step: float, shares: Floats, times: Flo
         slow[j] = value
 
 
-@njit(cache=True)
+@kernel
 def lag_behind(outputs: Floats, step: float, times: Floats, late: Floats) -> None:
     """Write outputs behind lags of first order, which begin at rest, to the rows of `late`, one for each time, s."""
     for j in range(times.size):
@@ -137,7 +137,7 @@ def lag_behind(outputs: Floats, step: float, times: Floats, late: Floats) -> Non
             late[j, k] = value
 
 
-@njit(cache=True)
+@kernel
 def step_means(changes: Floats, levels: Floats, step: float, means: Floats) -> None:
     """Write the mean of a quantity over each step of a grid of time to `means`.
 
@@ -156,7 +156,7 @@ def step_means(changes: Floats, levels: Floats, step: float, means: Floats) -> N
         before = integral
 
 
-@njit(cache=True)
+@kernel
 def find_holds(
     changes: Floats, levels: Floats, step: float, count: int, starts: NDArray[np.int64], means: Floats
 ) -> int:
@@ -186,7 +186,7 @@ def find_holds(
     return found
 
 
-@njit(cache=True)
+@inner
 def _advance(
     distance: float,
     velocity: float,
@@ -228,7 +228,7 @@ def _advance(
     return distance, velocity
 
 
-@njit(cache=True)
+@kernel
 def move_to_rows(
     position: float,
     starts: NDArray[np.int64],

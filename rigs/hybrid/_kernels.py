@@ -7,8 +7,8 @@ from itertools import accumulate
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from bench.compiled import inner, kernel
 from bench.hysteresis._checks import Floats
 
 STATES = 4
@@ -78,7 +78,7 @@ def allocate(powers: int) -> tuple[Floats, Filter]:
     return numbers, Filter(*(part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)))
 
 
-@njit(cache=True)
+@inner
 def _parts(numbers: Floats) -> Filter:
     """Return the parts of a filter, as `allocate` does."""
     at = _PLACES
@@ -102,7 +102,7 @@ def _parts(numbers: Floats) -> Filter:
     )
 
 
-@njit(cache=True)
+@inner
 def _factorise(matrix: Floats, factor: Floats, scale: float) -> None:
     """Find the Cholesky factor of a multiple of a positive definite matrix, in the lower triangle.
 
@@ -116,7 +116,7 @@ def _factorise(matrix: Floats, factor: Floats, scale: float) -> None:
             factor[i, j] = math.sqrt(total) if i == j else total / factor[j, j]
 
 
-@njit(cache=True)
+@inner
 def _spread(f: Filter) -> None:
     """Find the sigma points of the distribution."""
     # √n standard deviations of n states, so that the centre has no weight: the cubature rule, with equal positive
@@ -129,7 +129,7 @@ def _spread(f: Filter) -> None:
             f.points[STATES + i, j] = f.mean[j] - step
 
 
-@njit(cache=True)
+@inner
 def _average(points: Floats, mean: Floats) -> None:
     """Find the mean of sigma points."""
     for j in range(mean.size):
@@ -139,7 +139,7 @@ def _average(points: Floats, mean: Floats) -> None:
         mean[j] = total / POINTS
 
 
-@njit(cache=True)
+@inner
 def _correlate(first: Floats, mean: Floats, second: Floats, other: Floats, result: Floats) -> None:
     """Find the covariance of sigma points of two quantities with their means."""
     for i in range(mean.size):
@@ -150,7 +150,7 @@ def _correlate(first: Floats, mean: Floats, second: Floats, other: Floats, resul
             result[i, j] = total / POINTS
 
 
-@njit(cache=True)
+@inner
 def _deflection(rise: float, f: Filter) -> float:
     """Return the deflection (m) at a rise of the tip (K), as `Bending.deflection` does."""
     low, high, middle, half = f.bending
@@ -168,13 +168,13 @@ def _deflection(rise: float, f: Filter) -> float:
     return beyond
 
 
-@njit(cache=True)
+@kernel
 def predict(constant: float, slope: float, numbers: Floats) -> None:
     """Advance the distribution by a step; the heat into the base is `constant` (W) + `slope` (W/K) times its rise."""
     _predict(constant, slope, _parts(numbers))
 
 
-@njit(cache=True)
+@kernel
 def predict_and_correct(
     constant: float, slope: float, base: float, tip: float, deflection: float, numbers: Floats
 ) -> None:
@@ -184,7 +184,7 @@ def predict_and_correct(
     _correct(base, tip, deflection, f)
 
 
-@njit(cache=True)
+@inner
 def _predict(constant: float, slope: float, f: Filter) -> None:
     """Advance the distribution by a step; the heat into the base is `constant` (W) + `slope` (W/K) times its rise."""
     dt, along, air, base_capacity, tip_capacity = f.network
@@ -201,7 +201,7 @@ def _predict(constant: float, slope: float, f: Filter) -> None:
         f.covariance[i, i] += f.walk[i]
 
 
-@njit(cache=True)
+@inner
 def _correct(base: float, tip: float, deflection: float, f: Filter) -> None:
     """Take in rises of base and tip (K) and the deflection (m)."""
     _spread(f)

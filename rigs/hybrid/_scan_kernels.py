@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from numba import njit
-
+from bench.compiled import inner, kernel
 from bench.hysteresis._checks import Floats
 from sim_devices.instruments._labjack_t7_kernels import converted
 from sim_devices.plants._hybrid_kernels import FACE, INCREMENT, NODES, deflection
@@ -21,14 +20,14 @@ and what `displacement_volts` takes; then of either thermistor what `shown` take
 takes."""
 
 
-@njit(cache=True)
+@inner
 def _shown(quantity: float, numbers: Floats, at: int) -> float:
     n = numbers[at : at + CHARACTERISTIC_SIZE]
     value: float = shown(quantity, n[0], n[1], n[2], n[3], n[4], n[5], n[6])
     return value
 
 
-@njit(cache=True)
+@inner
 def _divided(
     node: int, fraction: float, excitation: float, normal: float, plant: Floats, n: Floats, at: int
 ) -> float:
@@ -38,7 +37,7 @@ def _divided(
     return volts
 
 
-@njit(cache=True)
+@kernel
 def scan(
     fraction: float,
     elapsed: float,

@@ -6,8 +6,9 @@ import math
 from typing import NamedTuple, Protocol
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from bench.compiled import kernel
 
 Floats = NDArray[np.float64]
 
@@ -66,7 +67,7 @@ class SetUp(NamedTuple):
     """Step of the last digit, digits."""
 
 
-@njit(cache=True)
+@kernel
 def fading(lags: float) -> tuple[float, float, float, float]:
     """Return how the noise behind two lags fades within some time constants, exactly for white noise before them.
 
@@ -87,7 +88,7 @@ def fading(lags: float) -> tuple[float, float, float, float]:
     return decay, along, math.sqrt(max(second - along * along, 0.0)), math.sqrt(first)
 
 
-@njit(cache=True)
+@kernel
 def next_look(converted: float, asked: float, s: SetUp) -> float:
     """Return when the filter next looks at the force (s) after a conversion, for a reading that is asked for."""
     waiting = asked - converted
@@ -99,7 +100,7 @@ def next_look(converted: float, asked: float, s: SetUp) -> float:
     return converted + COARSE
 
 
-@njit(cache=True)
+@kernel
 def convert_along(
     state: Floats,
     s: SetUp,

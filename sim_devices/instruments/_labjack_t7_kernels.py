@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from bench.compiled import inner
 from sim_devices.plants.grid import Floats
 
 NOISE, STEP, LOWEST, HIGHEST = range(4)
 """Places of what a reading is made of, V."""
 
 
-@njit(cache=True)
+@inner
 def converted(volts: float, normal: float, scale: Floats) -> float:
     """Return the reading (V) of a voltage (V), with a number of the standard normal distribution as its noise."""
     # A sum with zero makes zero of minus zero.

@@ -121,7 +121,7 @@ def reading_interval(setting: int) -> float:
 @lru_cache(maxsize=256)
 def _fading(lags: float) -> tuple[float, float, float, float]:
     """Return `kernels.fading`; kept, as the instrument mostly converts at even intervals."""
-    found: tuple[float, float, float, float] = kernels.fading.py_func(lags)
+    found: tuple[float, float, float, float] = kernels.fading.py_func(lags)  # type: ignore[attr-defined]
     return found
 
 
@@ -294,7 +294,9 @@ class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
         if now - self._converted <= self._near:
             # As a rule, and what the kernel says of it.
             return self._converted + self._fine
-        due: float = kernels.next_look.py_func(self._converted, now, self._conversion)
+        due: float = kernels.next_look.py_func(  # type: ignore[attr-defined]
+            self._converted, now, self._conversion
+        )
         return due
 
     def _may_wait(self, course: kernels.Course, now: float) -> bool:

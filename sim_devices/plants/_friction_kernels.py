@@ -13,8 +13,8 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from bench.compiled import inner, kernel
 from sim_devices.plants.grid import Floats, Record
 from sim_devices.plants.muscle import CLAMPED, FAN, LOAD, PLACE, VOLTAGE
 
@@ -69,7 +69,7 @@ class Parts(NamedTuple):
     """Forces of the contacts, N."""
 
 
-@njit(cache=True)
+@inner
 def expansion(temperature: float, c: Record) -> float:
     """Contraction of the unloaded coiled muscle, mm, from 0 °C on; steeper above the softening temperature."""
     above = (temperature - c.softening) / c.softening_width
@@ -79,7 +79,7 @@ def expansion(temperature: float, c: Record) -> float:
     return contraction
 
 
-@njit(cache=True)
+@kernel
 def law_at(drive: float, c: Record, law: Record) -> None:
     """Write the muscle's law at one value of its drive, pressure or temperature."""
     law.square = law.cube = law.stretch = law.press = law.press_from = 0.0
@@ -109,7 +109,7 @@ def law_at(drive: float, c: Record, law: Record) -> None:
         law.free = c.slip * contraction
 
 
-@njit(cache=True)
+@inner
 def backbone(length: float, law: Record) -> tuple[float, float, float, float]:
     """Tension of the elastic backbone and its slope, yield force of all contacts together and its slope."""
     smooth = law.level + length * (law.slope + length * (law.square + length * law.cube))
@@ -128,7 +128,7 @@ def backbone(length: float, law: Record) -> tuple[float, float, float, float]:
     return smooth + stretch - press, smooth_slope + stretch_slope - press_slope, yielding, yielding_slope
 
 
-@njit(cache=True)
+@inner
 def tension(length: float, parts: Parts) -> tuple[float, float]:
     """Tension of a trial from the committed state, and its slope; nothing is changed."""
     state, law, contacts, forces = parts.state, parts.law, parts.contacts, parts.forces
@@ -150,7 +150,7 @@ def tension(length: float, parts: Parts) -> tuple[float, float]:
     return total, slope
 
 
-@njit(cache=True)
+@inner
 def solve_length(clamped: bool, target: float, parts: Parts) -> float:
     """Find the length at which the tension is that of a load, or of a held end (clamped) at a position.
 
@@ -183,7 +183,7 @@ def solve_length(clamped: bool, target: float, parts: Parts) -> float:
     return length
 
 
-@njit(cache=True)
+@kernel
 def settle(clamped: bool, target: float, parts: Parts) -> None:
     """Find the equilibrium at the law's drive and take over its length, force and forces of the contacts."""
     state, law, c, contacts, forces = parts
@@ -209,7 +209,7 @@ def settle(clamped: bool, target: float, parts: Parts) -> None:
     state.position = target if clamped else length - c.rest + force * c.series_compliance
 
 
-@njit(cache=True)
+@inner
 def carry(clamped: bool, target: float, seconds: float, parts: Parts) -> None:
     """Go to an equilibrium while the Maxwell arm relaxes for some time: exact for a length that moves evenly."""
     state, law, c = parts.state, parts.law, parts.c
@@ -230,7 +230,7 @@ def carry(clamped: bool, target: float, seconds: float, parts: Parts) -> None:
     state.relaxing = arm if abs(arm) > _RELAXED else 0.0
 
 
-@njit(cache=True)
+@kernel
 def load_to(load: float, parts: Parts) -> None:
     """Move the imposed force at a constant drive, at once, in sub-steps."""
     state, law, c = parts.state, parts.law, parts.c
@@ -244,7 +244,7 @@ def load_to(load: float, parts: Parts) -> None:
     state.position = state.length - c.rest + load * c.series_compliance
 
 
-@njit(cache=True)
+@inner
 def stretch_to(position: float, parts: Parts) -> None:
     """Move the imposed position at a constant drive, at once, in sub-steps."""
     state, law, c = parts.state, parts.law, parts.c
@@ -256,7 +256,7 @@ def stretch_to(position: float, parts: Parts) -> None:
     state.position = position
 
 
-@njit(cache=True)
+@kernel
 def drive_to(drive: float, seconds: float, clamped: bool, parts: Parts) -> None:
     """Move pressure or temperature at constant load or at constant position, in sub-steps."""
     state, law, c = parts.state, parts.law, parts.c
@@ -271,7 +271,7 @@ def drive_to(drive: float, seconds: float, clamped: bool, parts: Parts) -> None:
     state.drive = drive
 
 
-@njit(cache=True)
+@inner
 def next_drive(state: Record, command: Floats, c: Record) -> float:
     """Pressure or temperature after one grid step: exact for a constant command; moves the regulator's aim."""
     decay = c.decay
@@ -291,7 +291,7 @@ def next_drive(state: Record, command: Floats, c: Record) -> float:
     return after
 
 
-@njit(cache=True)
+@kernel
 def advance_steps(normals: Floats, command: Floats, forces: Floats, parts: Parts) -> None:
     """Advance the whole plant by one grid step for each element of `normals`, and keep the force (N) at each.
 

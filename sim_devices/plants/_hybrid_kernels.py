@@ -10,8 +10,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from numba import njit
-
+from bench.compiled import inner, kernel
 from sim_devices.plants import cooler
 from sim_devices.plants.cooler import CLOSED, COMMAND, LIMIT, TARGET
 from sim_devices.plants.grid import Floats
@@ -127,7 +126,7 @@ class Thermal(NamedTuple):
     """State, commands, coefficients, node table and factorised matrix."""
 
 
-@njit(cache=True)
+@inner
 def _thermal(plant: Floats) -> Thermal:
     """Return the thermal part of a plant, as views."""
     c = plant[_COEFFICIENTS:_NODE_TABLE]
@@ -142,13 +141,13 @@ def _thermal(plant: Floats) -> Thermal:
     )
 
 
-@njit(cache=True)
+@kernel
 def take_commands(plant: Floats) -> None:
     """Set room temperature and current for the step that begins here."""
     _take_commands(_thermal(plant))
 
 
-@njit(cache=True)
+@inner
 def _take_commands(thermal: Thermal) -> bool:
     """Set room temperature and current for the step that begins here; return whether the current is saturated."""
     rise, _, state, command, c, _, _ = thermal
@@ -167,7 +166,7 @@ def _take_commands(thermal: Thermal) -> bool:
     return saturated
 
 
-@njit(cache=True)
+@inner
 def factorise(current: float, c: Coefficients, nodes: Floats, factors: Floats) -> None:
     """Factorise the matrix of a step, which is tridiagonal and depends on the current alone."""
     half = 0.5 * c.seebeck * current
@@ -188,13 +187,13 @@ def factorise(current: float, c: Coefficients, nodes: Floats, factors: Floats) -
         before = after
 
 
-@njit(cache=True)
+@kernel
 def look_ahead(plant: Floats) -> None:
     """Find the change of the temperatures over the step that begins here."""
     _look_ahead(_thermal(plant))
 
 
-@njit(cache=True)
+@inner
 def _look_ahead(thermal: Thermal) -> None:
     """Find the change of the temperatures over the step that begins here.
 
@@ -242,7 +241,7 @@ def _look_ahead(thermal: Thermal) -> None:
         increment[j] = after
 
 
-@njit(cache=True)
+@kernel
 def advance_steps(normals: Floats, ahead: bool, begin_next: bool, plant: Floats) -> None:
     """Complete one grid step for each of `normals`; `ahead` says whether the first step's change is known.
 
@@ -263,7 +262,7 @@ def advance_steps(normals: Floats, ahead: bool, begin_next: bool, plant: Floats)
         _take_commands(thermal)
 
 
-@njit(cache=True)
+@kernel
 def bending(fraction: float, plant: Floats) -> tuple[float, float]:
     """Add up the bending of the beam, after a fraction of the step under way, in [0, 1].
 
@@ -281,7 +280,7 @@ def bending(fraction: float, plant: Floats) -> tuple[float, float]:
     return shape[SENSITIVITY] * bent, 1.0 + shape[WARM_GAIN] * warm
 
 
-@njit(cache=True)
+@kernel
 def terminals(fraction: float, ambient: float, plant: Floats) -> tuple[float, float, float, float]:
     """Return the temperatures of face and block's front (°C), current (A) and voltage (V) of the cooler.
 
@@ -295,7 +294,7 @@ def terminals(fraction: float, ambient: float, plant: Floats) -> tuple[float, fl
     return face, front, current, c.seebeck * (face - back) + c.resistance * current
 
 
-@njit(cache=True)
+@kernel
 def heat_to_air(fraction: float, plant: Floats) -> float:
     """Add up the heat flow from all nodes to the air."""
     rise, increment, state, _, _, nodes, _ = _thermal(plant)
@@ -306,7 +305,7 @@ def heat_to_air(fraction: float, plant: Floats) -> float:
     return total
 
 
-@njit(cache=True)
+@kernel
 def piezo_deflection(elapsed: float, plant: Floats) -> float:
     """Evaluate the piezo deflection, at the temperature of the straight beam, some time after the last voltage."""
     fast, f = plant[FAST:FAST_COEFFICIENTS], plant[FAST_COEFFICIENTS:STATE]
@@ -319,7 +318,7 @@ def piezo_deflection(elapsed: float, plant: Floats) -> float:
     return total
 
 
-@njit(cache=True)
+@kernel
 def deflection(fraction: float, elapsed: float, plant: Floats) -> float:
     """Add up the deflection of the tip; takes what `bending` and `piezo_deflection` take."""
     thermal, warming = bending(fraction, plant)
@@ -327,7 +326,7 @@ def deflection(fraction: float, elapsed: float, plant: Floats) -> float:
     return total
 
 
-@njit(cache=True)
+@kernel
 def hysteresis(lag: float, change: float, f: Floats) -> float:
     """Move the Bouc-Wen part over a change of the voltage: the exact solution of its equation.
 
@@ -350,7 +349,7 @@ def hysteresis(lag: float, change: float, f: Floats) -> float:
     return after
 
 
-@njit(cache=True)
+@kernel
 def apply_voltage(voltage: float, elapsed: float, plant: Floats) -> None:
     """Change the voltage, some time after the last change."""
     fast, f = plant[FAST:FAST_COEFFICIENTS], plant[FAST_COEFFICIENTS:STATE]

@@ -10,9 +10,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from bench.compiled import inner, kernel
 from sim_devices.plants.grid import Floats, Record
 from sim_devices.plants.muscle import CLAMPED, FAN, LOAD, PLACE, VOLTAGE
 
@@ -58,7 +58,7 @@ class Parts(NamedTuple):
     """Quiet surroundings of the committed grain states; none while KELVIN and MEGAPASCAL are 0."""
 
 
-@njit(cache=True)
+@kernel
 def update_grains(
     temperature: float, stress: float, unoriented_share: float, grains: Floats, martensite: Flags, oriented: Flags
 ) -> tuple[int, int]:
@@ -91,7 +91,7 @@ def update_grains(
     return martensites, orienteds
 
 
-@njit(cache=True)
+@inner
 def look_around(temperature: float, stress: float, parts: Parts) -> None:
     """Find how far temperature and stress may move until the first of the committed grains switches."""
     _, c, grains, martensite, oriented, _, quiet = parts
@@ -121,7 +121,7 @@ def look_around(temperature: float, stress: float, parts: Parts) -> None:
     quiet[LEAST_SLOPE] = least_slope
 
 
-@njit(cache=True)
+@inner
 def quiet_stress(temperature: float, quiet: Floats) -> float:
     """How far the stress may be from the middle of the quiet surroundings at a temperature, MPa; 0 if not at all."""
     kelvin = quiet[KELVIN] - abs(temperature - quiet[MIDDLE_TEMPERATURE])
@@ -129,7 +129,7 @@ def quiet_stress(temperature: float, quiet: Floats) -> float:
     return megapascal
 
 
-@njit(cache=True)
+@kernel
 def wire_length(
     temperature: float, stress: float, martensites: float, orienteds: float, count: int, c: Record
 ) -> float:
@@ -143,7 +143,7 @@ def wire_length(
     return length
 
 
-@njit(cache=True)
+@inner
 def end_position(
     temperature: float, stress: float, martensites: float, orienteds: float, count: int, c: Record
 ) -> float:
@@ -153,7 +153,7 @@ def end_position(
     return position
 
 
-@njit(cache=True)
+@inner
 def switching_stresses(temperature: float, parts: Parts) -> None:
     """Write the stresses above which each grain will be martensite, and oriented, to the rows of `scratch`."""
     _, c, grains, martensite, oriented, scratch, _ = parts
@@ -173,7 +173,7 @@ def switching_stresses(temperature: float, parts: Parts) -> None:
         scratch[1, g] = max(switch, orient)
 
 
-@njit(cache=True)
+@inner
 def solve_quietly(position: float, temperature: float, committed: float, parts: Parts) -> float:
     """Return what `solve_stress` would if that lies where no grain switches, otherwise -1."""
     state, c, quiet = parts.state, parts.c, parts.quiet
@@ -204,7 +204,7 @@ def solve_quietly(position: float, temperature: float, committed: float, parts: 
     return low if low >= committed else high
 
 
-@njit(cache=True)
+@kernel
 def solve_stress(position: float, temperature: float, committed: float, parts: Parts) -> float:
     """Find the stress at which the wire is as long as imposed, by bisection on trials from the committed state.
 
@@ -288,7 +288,7 @@ def solve_stress(position: float, temperature: float, committed: float, parts: P
     return low if low >= committed else high
 
 
-@njit(cache=True)
+@inner
 def commit(temperature: float, stress: float, parts: Parts) -> None:
     """Take over temperature and stress and bring the grains there."""
     state, c, grains, martensite, oriented, _, quiet = parts
@@ -307,7 +307,7 @@ def commit(temperature: float, stress: float, parts: Parts) -> None:
     state[ORIENTED] = orienteds
 
 
-@njit(cache=True)
+@kernel
 def load_to(stress: float, parts: Parts) -> None:
     """Move the imposed stress at constant temperature, in sub-steps."""
     state, c = parts.state, parts.c
@@ -320,7 +320,7 @@ def load_to(stress: float, parts: Parts) -> None:
     state[POSITION] = end_position(temperature, stress, state[MARTENSITE], state[ORIENTED], parts.martensite.size, c)
 
 
-@njit(cache=True)
+@inner
 def stretch_to(position: float, parts: Parts) -> None:
     """Move the imposed position at constant temperature, in sub-steps."""
     state, c = parts.state, parts.c
@@ -334,7 +334,7 @@ def stretch_to(position: float, parts: Parts) -> None:
     state[POSITION] = position
 
 
-@njit(cache=True)
+@kernel
 def heat_to(temperature: float, clamped: bool, parts: Parts) -> None:
     """Move the temperature at constant load or at constant position, in sub-steps."""
     state, c = parts.state, parts.c
@@ -354,7 +354,7 @@ def heat_to(temperature: float, clamped: bool, parts: Parts) -> None:
         )
 
 
-@njit(cache=True)
+@kernel
 def advance_steps(normals: Floats, command: Floats, forces: Floats, parts: Parts) -> None:
     """Advance the whole plant by one grid step for each element of `normals`, and keep the force (N) at each.
 

@@ -10,9 +10,9 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
+from bench.compiled import inner, kernel
 from sim_devices.plants.cooler import CLOSED, COMMAND, LIMIT, TARGET
 from sim_devices.plants.grid import Floats, Record
 
@@ -47,7 +47,7 @@ class Parts(NamedTuple):
     """Relay states."""
 
 
-@njit(cache=True)
+@kernel
 def switch_relays(
     drive: float, counters: Integers, up: Floats, down: Floats, down_relay: Integers, on: Flags
 ) -> None:
@@ -81,7 +81,7 @@ def switch_relays(
     counters[DOWN_BELOW] = below
 
 
-@njit(cache=True)
+@kernel
 def settle_film(film: float, parts: Parts) -> None:
     """Sweep the effective temperature towards what the film temperature and the R fraction ask for.
 
@@ -101,7 +101,7 @@ def settle_film(film: float, parts: Parts) -> None:
         switch_relays(state[DRIVE], counters, up, down, down_relay, on)
 
 
-@njit(cache=True)
+@kernel
 def plate_rate(plate: float, current: float, sink: float, c: Record) -> float:
     """Evaluate the heat balance: rate of the plate temperature (K/s) under a current (A, positive heats)."""
     heat = c[0].seebeck * (plate + ZERO_CELSIUS) * current + 0.5 * c[0].resistance * current * current
@@ -110,7 +110,7 @@ def plate_rate(plate: float, current: float, sink: float, c: Record) -> float:
     return rate
 
 
-@njit(cache=True)
+@inner
 def current_for(plate: float, rate: float, sink: float, c: Record) -> float:
     """Find the current (A) that gives the plate a rate: inverse of `plate_rate`, the root of smaller magnitude."""
     heat = c[0].plate_capacity * rate
@@ -122,7 +122,7 @@ def current_for(plate: float, rate: float, sink: float, c: Record) -> float:
     return current
 
 
-@njit(cache=True)
+@inner
 def limited_rate(rate: float, slew: float, limit: float, plate: float, sink: float, c: Record) -> float:
     """Limit a rate (K/s) to the slew limit and the heat flow that the current limit (A, may be infinite) allows."""
     # Beyond this current the Joule heat outgrows the pumping and more current cools less.
@@ -132,7 +132,7 @@ def limited_rate(rate: float, slew: float, limit: float, plate: float, sink: flo
     return max(rate, plate_rate(plate, -min(limit, best_cooling), sink, c))
 
 
-@njit(cache=True)
+@inner
 def step_plate(state: Floats, command: Floats, c: Record) -> None:
     """Advance plate, current and sink by one grid step."""
     step = c[0].step
@@ -169,7 +169,7 @@ def step_plate(state: Floats, command: Floats, c: Record) -> None:
     state[SINK] = sink
 
 
-@njit(cache=True)
+@kernel
 def advance_steps(normals: Floats, command: Floats, parts: Parts) -> None:
     """Advance the whole plant by one grid step for each row of `normals`: wander, drift."""
     state, c = parts.state, parts.c

@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from bench.compiled import inner, kernel
 
 Floats = NDArray[np.float64]
 
 
-@njit(cache=True)
+@inner
 def shown(
     quantity: float,
     gain: float,
@@ -31,7 +32,7 @@ def shown(
     return value
 
 
-@njit(cache=True)
+@kernel
 def show(
     values: Floats,
     gain: float,

@@ -5,19 +5,20 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from bench.compiled import kernel
 
 _KELVIN = 273.15
 
 
-@njit(cache=True)
+@kernel
 def displacement_volts(metres: float, resolution: float, reach: float, volts_per_metre: float) -> float:
     """Return the output (V) of a displacement sensor with steps (m) that stays where it is beyond its reach (m)."""
     shown = float(np.round(metres / resolution)) * resolution
     return volts_per_metre * min(max(shown, -reach), reach)
 
 
-@njit(cache=True)
+@kernel
 def divider_volts(
     celsius: float, excitation_volts: float, reference_ohms: float, a: float, c: float, cube: float
 ) -> float:
