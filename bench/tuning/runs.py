@@ -25,6 +25,8 @@ if TYPE_CHECKING:
     from bench.workers import Pending, Workers
 
 _AS_IDENTIFIED = "as-identified"
+FORCE = "force"
+"""Slot of a rig whose force is controlled."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +52,7 @@ def task_of(file: ModelFile, controller: str, protocol: str | None) -> Task:
     chosen = protocol or offered[0]
     if chosen not in offered:
         raise ConfigurationError(f"--protocol {chosen}: a model {file.name} is controlled by {' or '.join(offered)}")
-    return Task(chosen, controller, "force" if chosen == "force-control" else "response")
+    return Task(chosen, controller, FORCE if chosen == "force-control" else "response")
 
 
 @dataclass
@@ -96,7 +98,8 @@ class TuningRuns:
         self._signal = role.signal or role.reading
         self._opened = controller_spec(self.task.kind, self.task.controller).holds is not None
         self._models = {}
-        for name, model in {_AS_IDENTIFIED: self.file, **perturbed_models(self.file)}.items():
+        others = perturbed_models(self.file, force=self.task.slot == FORCE)
+        for name, model in {_AS_IDENTIFIED: self.file, **others}.items():
             self._models[name] = self.folder / f"{name}.json"
             model.save(self._models[name])
 

@@ -26,6 +26,8 @@ FACTOR = 1.7
 """By how much a number is raised and lowered at first."""
 FINALISTS = 3
 """How many sets of numbers of a search run in further sessions."""
+_FARTHEST = 4
+"""How often a number is changed in the same direction in one round, as long as that is better."""
 _ENOUGH = 0.99
 """Part of the cost below which a change is taken, as two runs of one controller differ a little."""
 
@@ -61,14 +63,15 @@ Evaluate = Callable[[Sequence[Numbers]], list[Trial]]
 """Carries out the runs of several candidates beside each other."""
 
 
-def perturbed_models(file: ModelFile) -> dict[str, ModelFile]:
+def perturbed_models(file: ModelFile, *, force: bool = False) -> dict[str, ModelFile]:
     """Return models from which the specimen differs, by name: in its gain, and in its lag if it has one.
 
-    The gain of an operator turns about the middle of its output; that of a two-stage model is that of its lengths.
+    The gain of an operator turns about the middle of its output; that of a two-stage model is that of its lengths, or
+    of its force.
     """
     found = {}
     for name, gain in (("gain-high", MARGIN), ("gain-low", 1.0 / MARGIN)):
-        found[name] = replace(file, model=_scaled(file.model, gain), memory=None, initial=None, band=None)
+        found[name] = replace(file, model=_scaled(file.model, gain, force), memory=None, initial=None, band=None)
     known = file.dynamics
     if known is not None and known.response.lag > 0.0:
         for name, factor in (("lag-high", MARGIN), ("lag-low", 1.0 / MARGIN)):
@@ -76,9 +79,10 @@ def perturbed_models(file: ModelFile) -> dict[str, ModelFile]:
     return found
 
 
-def _scaled(model: Any, gain: float) -> Any:  # noqa: ANN401 - a model of the kind of the first
+def _scaled(model: Any, gain: float, force: bool) -> Any:  # noqa: ANN401 - a model of the kind of the first
     if model.kind == TwoStage.kind:
-        return replace(model, second=_scaled(model.second, gain))
+        stage = "first" if force else "second"
+        return replace(model, **{stage: _scaled(getattr(model, stage), gain, force)})
     assert isinstance(model, Operator)
     low, high = model.output_range()
     middle = 0.0 if low <= 0.0 <= high and min(-low, high) < 0.1 * (high - low) else 0.5 * (low + high)
@@ -111,18 +115,24 @@ def search(
     tell : callable
         Is told of each.
     rounds : int
-        How often each number is changed, by a smaller factor each time.
+        How often each number is changed, by a smaller factor each time; on in the direction that is better.
     """
     (best,) = evaluate([start])
     tell(best)
     for number in range(rounds):
         factor = FACTOR ** (1.0 / (number + 1))
         for name in names:
-            candidates = [multiplied(best.numbers, name, each) for each in (factor, 1.0 / factor)]
-            for trial in evaluate(candidates):
-                tell(trial)
-                if trial.cost < _ENOUGH * best.cost:
-                    best = trial
+            steps: Sequence[float] = (factor, 1.0 / factor)
+            for _ in range(_FARTHEST):
+                trials = evaluate([multiplied(best.numbers, name, each) for each in steps])
+                for trial in trials:
+                    tell(trial)
+                cost, step = min((trial.cost, step) for trial, step in zip(trials, steps, strict=True))
+                if not cost < _ENOUGH * best.cost:
+                    break
+                best = trials[steps.index(step)]
+                # On in the direction that was better.
+                steps = (step,)
     return best
 
 

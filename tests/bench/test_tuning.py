@@ -37,8 +37,12 @@ def test_the_search_comes_near_the_best_numbers_and_keeps_off_those_that_fail():
     assert get(best.numbers, "wait") == pytest.approx(3.0, rel=0.25)
     assert get(best.numbers, "wait") >= 2.5
     assert get(best.numbers, "arrival.hold") == pytest.approx(1.0, rel=0.25)
-    assert best.cost == min(trial.cost for trial in seen)
-    assert len(seen) == 1 + 4 * 2 * 2
+    # A change that gains less than a hundredth is not taken.
+    assert 0.99 * best.cost <= min(trial.cost for trial in seen)
+    # Two neighbours of each number in each round at least, and on where it is better.
+    assert 1 + 4 * 2 * 2 < len(seen) <= 1 + 4 * 2 * 5
+    waits = [get(trial.numbers, "wait") for trial in seen]
+    assert waits[1:4] == pytest.approx([8.0 * FACTOR, 8.0 / FACTOR, 8.0 / FACTOR**2], rel=1e-3)
     assert NUMBERS == {"wait": 8.0, "arrival": {"hold": 0.4}}
 
 
@@ -105,6 +109,9 @@ def test_a_muscle_has_other_lengths_and_other_time_constants():
     assert [*found] == ["gain-high", "gain-low", "lag-high", "lag-low"]
     np.testing.assert_allclose(found["gain-high"].model.second.density, MARGIN * second.density)
     assert found["gain-high"].model.first == rising
+    pulled = perturbed_models(ModelFile("two-stage", TwoStage(rising, second, 0.3)), force=True)
+    np.testing.assert_allclose(pulled["gain-low"].model.first.density, rising.density / MARGIN)
+    assert pulled["gain-low"].model.second == second
     assert [found[name].dynamics.response.lag for name in ("lag-high", "lag-low")] == [4.0 * MARGIN, 4.0 / MARGIN]
 
 
@@ -174,7 +181,7 @@ def test_a_controller_is_tuned_on_the_emulated_rig(tmp_path):
     content = tomllib.loads(out.read_text(encoding="utf-8"))
     provenance = content["provenance"]
     assert provenance["cost_after"] <= provenance["cost_before"]
-    assert provenance["trials"] == 5
+    assert provenance["trials"] >= 5
     assert {"gain", "period"} <= content["tuning"]["integral"].keys()
     # The other controllers keep what the rig file has for them.
     assert "latched" in content["tuning"]
