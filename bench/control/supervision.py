@@ -30,7 +30,7 @@ _CHANCE_OF_SAMPLES = 2.25
 """The same for a moving reference, whose errors are alike over many samples: as of five that are not."""
 _TOLERANCE = 0.02
 """Part of the range within which the model alone is not taken for better."""
-_WARNED = 0.01
+_WARNED = 0.008
 """The same part from which on there is a warning."""
 _MOVING = 1.5
 """How much more a model may err where the reference moves: the actuator's lag is no part of its error at rest."""
@@ -183,7 +183,7 @@ class Supervised(_Supervision):
     targets it errs by more than its model does at the same places, and more than by chance: then the model alone,
     without feedback, would have been better; or if it says so itself (`doubt`); or, without a fallback, if it errs by
     more than 3 % of the range. One without feedback is given up where its model does not hold. One missed target of
-    several is no reason, but from 1 % of the range on there is a warning. Targets that cannot be met do not count.
+    several is no reason, but from 0.8 % of the range on there is a warning. Targets that cannot be met do not count.
     Parameters as `_Supervision`.
     """
 
@@ -246,7 +246,7 @@ class Supervised(_Supervision):
 class SupervisedFollower(_Supervision):
     """A follower that is given up where it errs by more than its model, and more than by chance: a `Follower`.
 
-    That is judged from 2 % of the range on; from 1 % on there is a warning. One without feedback is given up where
+    That is judged from 2 % of the range on; from 0.8 % on there is a warning. One without feedback is given up where
     its model does not hold. Samples at which the reference stands, as on the way to its beginning, or cannot be met,
     do not count. Parameters as `_Supervision`.
     """
