@@ -33,6 +33,11 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 S = TypeVar("S", Supervised, SupervisedFollower)
 
+_TO_REST = 10.0
+"""Time constants in which a specimen comes to rest to the sensor's noise."""
+_LAGS = 2.5
+"""Lags of the response behind an input that has arrived, after which a reading shows the error of the model."""
+
 
 @dataclass(frozen=True, kw_only=True)
 class ControllerSetup:
@@ -56,6 +61,8 @@ class ControllerSetup:
         How the model is corrected while it is used.
     period : float
         Time between two set-points of a follower, s.
+    dwell : float, optional
+        Time in which actuator and specimen come to rest at a set-point, s, as the rig file says.
     """
 
     name: str = ""
@@ -66,6 +73,23 @@ class ControllerSetup:
     options: Mapping[str, Any] = field(default_factory=dict)
     adaptation: AdaptationName = "off"
     period: float = 0.5
+    dwell: float | None = None
+
+    @property
+    def rest(self) -> float:
+        """Time in which actuator and specimen come to rest at a set-point, s: the rig's, or that of the dynamics.
+
+        Raises ConfigurationError if neither says it.
+        """
+        if self.dwell is not None:
+            return self.dwell
+        dynamics = self.model.dynamics
+        if dynamics is None or dynamics.time_constant == 0.0:
+            raise ConfigurationError(
+                f"controller {self.name}: nothing says how long the specimen takes to come to rest; give "
+                "[roles.drive] dwell = ... (s) in the rig file, or identify the model from a run with transients"
+            )
+        return _TO_REST * dynamics.time_constant
 
     @property
     def start(self) -> Any:  # noqa: ANN401 - each operator has its own
@@ -247,11 +271,12 @@ _OWN = 2.25
 
 @dataclass(frozen=True)
 class _Settling:
-    wait: float = 8.0  # s at each set-point, without feedback
+    wait: float  # s at each set-point, without feedback
 
 
 def _wait(setup: ControllerSetup) -> float:
-    return setup.tuned(lambda _: _Settling()).wait
+    # What is given needs no other source.
+    return setup.tuned(lambda _: _Settling(1.0 if "wait" in setup.options else setup.rest)).wait
 
 
 def _look_up(setup: ControllerSetup) -> LookUp:
@@ -262,6 +287,13 @@ def _look_up(setup: ControllerSetup) -> LookUp:
             f"{setup.model.name}"
         )
     return LookUp(operator, setup.limits, wait=_wait(setup))
+
+
+def _correction(setup: ControllerSetup) -> CorrectionParameters:
+    found = CorrectionParameters.scaled(setup.spans)
+    further = 0.0 if setup.model.dynamics is None else _LAGS * setup.model.dynamics.response.lag
+    arrival = found.arrival
+    return replace(found, arrival=replace(arrival, hold=arrival.hold + further, patience=arrival.patience + further))
 
 
 def _latched(setup: ControllerSetup) -> Latched | OppositeOutput:
@@ -282,7 +314,7 @@ def _latched(setup: ControllerSetup) -> Latched | OppositeOutput:
 
 def _integral(setup: ControllerSetup) -> IntegralParameters:
     low, high = setup.model.operator.evaluate(setup.model.operator.input_range)
-    return setup.tuned(partial(IntegralParameters.scaled, falls=bool(high < low)))
+    return setup.tuned(partial(IntegralParameters.scaled, dwell=setup.rest, falls=bool(high < low)))
 
 
 def _predictive(setup: ControllerSetup) -> PredictiveFollower:
@@ -307,17 +339,15 @@ OPEN_LOOP_INVERSE = ControllerSpec(
     "the inverse of the model, without feedback",
     lambda s: OpenLoopInverse(s.inverse(), s.start, s.limits, wait=_wait(s), adaptation=s.model_filter()),
     adapts=True,
-    numbers=lambda _: _Settling(),
+    numbers=lambda s: _Settling(s.rest),
     tunable=("wait",),
     holds=_holds,
 )
 CLOSED_LOOP_INVERSE = ControllerSpec(
     "the inverse of the model, corrected by the measured disturbance",
-    lambda s: ClosedLoopInverse(
-        s.inverse(), s.start, s.limits, s.tuned(CorrectionParameters.scaled), s.model_filter()
-    ),
+    lambda s: ClosedLoopInverse(s.inverse(), s.start, s.limits, s.tuned(lambda _: _correction(s)), s.model_filter()),
     adapts=True,
-    numbers=lambda s: CorrectionParameters.scaled(s.spans),
+    numbers=_correction,
     tunable=("close_enough", "walk_variance", "arrival.tolerance", "arrival.hold"),
 )
 LATCHED = ControllerSpec(

@@ -70,6 +70,7 @@ def following(parameters: Parameters, slots: Slots) -> Messages:
     setup = ControllerSetup(
         model=model,
         limits=limits,
+        dwell=drive.table.dwell,
         state=state,
         options=options,
         adaptation=parameters.adaptation,

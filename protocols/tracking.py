@@ -87,6 +87,7 @@ def tracking(parameters: Parameters, slots: Slots) -> Messages:
     setup = ControllerSetup(
         model=model,
         limits=limits,
+        dwell=drive.table.dwell,
         policy=parameters.policy,
         state=state,
         options=options,

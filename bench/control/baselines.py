@@ -36,7 +36,7 @@ class LookUp(Scripted):
         model: Operator[None],
         limits: tuple[float, float] | None = None,
         *,
-        wait: float = 8.0,
+        wait: float,
         points: int = 4001,
     ) -> None:
         if not 0.0 < wait < math.inf:
@@ -84,8 +84,8 @@ class IntegralParameters:
     """
 
     gain: float
-    period: float = 0.5
-    duration: float = 8.0
+    period: float
+    duration: float
 
     def __post_init__(self) -> None:
         check_positive(self, "period", "duration")
@@ -93,9 +93,13 @@ class IntegralParameters:
             raise ValueError(f"gain: expected a number other than 0, got {self.gain}")
 
     @classmethod
-    def scaled(cls, spans: Spans, *, falls: bool = False) -> IntegralParameters:
-        """Return the defaults for a model: 7 s where its slope is the mean one; `falls` turns the sign."""
-        return cls((-1.0 if falls else 1.0) * spans.input / spans.output / 7.0)
+    def scaled(cls, spans: Spans, dwell: float, *, falls: bool = False) -> IntegralParameters:
+        """Return the defaults for a model and an actuator that comes to rest within `dwell` (s).
+
+        Where the slope is the mean one the loop has 7/8 of that as its time constant; `falls` turns its sign.
+        """
+        gain = spans.input / spans.output / (0.875 * dwell)
+        return cls(-gain if falls else gain, period=dwell / 16.0, duration=dwell)
 
 
 class IntegralControl(Scripted):

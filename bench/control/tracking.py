@@ -497,7 +497,7 @@ class OpenLoopInverse(Scripted):
         state: Any = None,  # noqa: ANN401
         limits: tuple[float, float] | None = None,
         *,
-        wait: float = 8.0,
+        wait: float,
         adaptation: ModelFilter | None = None,
     ) -> None:
         if not 0.0 < wait < math.inf:

@@ -119,8 +119,13 @@ def tune(
             raise ConfigurationError(f"--set {setting}: expected KEY=VALUE")
         given[key] = value
     low, high = file.model.first.input_range if file.model.kind == TwoStage.kind else file.operator.input_range
+    drive = load_rig(rig).roles.get("drive")
     setup = ControllerSetup(
-        name=controller, model=file, limits=(low, high), options={"duration": float(given.get("duration", 20.0))}
+        name=controller,
+        model=file,
+        limits=(low, high),
+        dwell=None if drive is None else drive.dwell,
+        options={"duration": float(given.get("duration", 20.0))},
     )
     begin = start_of(task, rig, spec.numbers(setup), spec.tunable)
     trials: list[Trial] = []

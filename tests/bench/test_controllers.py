@@ -1,9 +1,12 @@
 """Controllers by name: the numbers that a rig puts in place of their defaults."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from bench.controllers import ControllerSetup, controller_names, make_controller
+from bench.control.dynamics import ActuatorDynamics, IdentifiedDynamics, ResponseDynamics
+from bench.controllers import ControllerSetup, controller_names, controller_spec, make_controller
 from bench.errors import ConfigurationError
 from bench.hysteresis import Polynomial, Preisach, uniform_levels
 from bench.model_file import ModelFile
@@ -12,19 +15,41 @@ PREISACH = ModelFile("preisach", Preisach(uniform_levels(0.0, 3.0, 4), np.ones(1
 POLYNOMIAL = ModelFile("polynomial", Polynomial([1.0], (0.0, 3.0)))
 
 
-def setup(model=PREISACH, **options):
-    return ControllerSetup(model=model, limits=(0.0, 3.0), options=options)
+def setup(model=PREISACH, dwell=6.0, **options):
+    return ControllerSetup(model=model, limits=(0.0, 3.0), dwell=dwell, options=options)
 
 
 @pytest.mark.parametrize(("name", "model"), [("open-loop-inverse", PREISACH), ("polynomial", POLYNOMIAL)])
 def test_the_time_at_each_target_is_that_of_the_rig(name, model):
-    for options, wait in (({}, 8.0), ({"wait": 40}, 40.0)):
+    for options, wait in (({}, 6.0), ({"wait": 40}, 40.0), ({"wait": 3, "dwell": None}, 3.0)):
         controller = make_controller("target", name, setup(model, **options))
         command, t = controller.aim(1.0, 0.0, 0.0, 0.0), 0.0
         while not command.done:
             t += command.wait
             command = controller.update(t, command.setpoint, 0.0)
         assert t == pytest.approx(wait)
+
+
+def time_at_target(given):
+    return controller_spec("target", "open-loop-inverse").numbers(given).wait
+
+
+def test_a_rig_without_a_dwell_leaves_it_to_the_dynamics():
+    dynamics = IdentifiedDynamics(
+        actuator=ActuatorDynamics(delay=0.5, frequency=2.0), response=ResponseDynamics(lag=1.0)
+    )
+    assert time_at_target(setup(replace(PREISACH, dynamics=dynamics), dwell=None)) == pytest.approx(10.0 * 2.0)
+    for unknown in (PREISACH, replace(PREISACH, dynamics=IdentifiedDynamics())):
+        with pytest.raises(ConfigurationError, match=r"how long the specimen takes .* \[roles.drive\] dwell"):
+            time_at_target(setup(unknown, dwell=None))
+
+
+def test_a_reading_waits_for_the_lag_behind_an_input_that_has_arrived():
+    slow = replace(PREISACH, dynamics=IdentifiedDynamics(response=ResponseDynamics(lag=4.0)))
+    numbers = controller_spec("target", "closed-loop-inverse").numbers
+    here, there = (numbers(setup(model)).arrival for model in (PREISACH, slow))
+    assert there.hold - here.hold == there.patience - here.patience == pytest.approx(10.0)
+    assert there.tolerance == here.tolerance
 
 
 @pytest.mark.parametrize("task", ["target", "follow"])

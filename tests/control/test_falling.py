@@ -42,7 +42,7 @@ def test_targets_are_reached_as_with_the_opposite_output(name):
     for sign in (1, -1):
         plant = actuator(sign)
         model = Polynomial([sign * 2.0], LIMITS, sign * 1.5) if name == "polynomial" else plant
-        setup = ControllerSetup(model=ModelFile("m", model), limits=LIMITS)
+        setup = ControllerSetup(model=ModelFile("m", model), limits=LIMITS, dwell=8.0)
         controller = make_controller("target", name, setup)
         found[sign] = reach(controller, plant, sign, targets)
         assert controller.reach is Reach.MET
@@ -60,7 +60,7 @@ def test_a_reference_is_followed_as_with_the_opposite_output(name):
     for sign in (1, -1):
         plant = actuator(sign)
         model = ModelFile("m", plant, dynamics=IdentifiedDynamics())
-        controller = make_controller("follow", name, ControllerSetup(model=model, limits=LIMITS))
+        controller = make_controller("follow", name, ControllerSetup(model=model, limits=LIMITS, dwell=8.0))
         state, rows = plant.initial_state(), []
         for t, wanted in zip(times.tolist(), reference.tolist(), strict=True):
             output = plant.value(state) + sign * 0.05

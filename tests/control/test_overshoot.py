@@ -50,7 +50,7 @@ TARGETS = (LOW + (HIGH - LOW) * np.random.default_rng(4).uniform(0.1, 0.9, 30)).
 
 
 def open_loop():
-    return OpenLoopInverse(MODEL.inverse())
+    return OpenLoopInverse(MODEL.inverse(), wait=8.0)
 
 
 def closed_loop():

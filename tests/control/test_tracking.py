@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import asdict, replace
+from functools import partial
 from itertools import pairwise, product
 
 import numpy as np
@@ -27,13 +28,15 @@ WITH_MEMORY = ["open", "closed", "latched", "open-follower", "closed-follower"]
 
 # Numbers that suit the film, K, 1/m and s; the defaults are in proportion to the ranges of a model.
 CORRECTION = CorrectionParameters(5.0, 3.0, 1.0, Arrival(0.03))
-INTEGRAL = IntegralParameters(0.005)
+INTEGRAL = IntegralParameters(0.005, 0.5, 8.0)
 LATCH = LatchParameters(
     approach=25.0, arrival=Arrival(0.1, hold=0.2), creep_least=0.015, creep_most=0.12, creep_gain=0.003,
     creep_offset=1.8, creep_fast=0.3, creep_until=3.3, step_back=0.5, nearest=0.08, farthest=1.1, lock_within=4.5,
     accept=1.5, walk_variance=1e-2, reading_variance=0.14, end_margin=5.0,
 )  # fmt: skip
 NUMBERS = {
+    "open": {"wait": 8.0},
+    "look-up": {"wait": 8.0},
     "closed": {"parameters": CORRECTION},
     "latched": {"parameters": LATCH, "correction": replace(CORRECTION, corrections=9, close_enough=2.0)},
     "integral": {"parameters": INTEGRAL},
@@ -109,7 +112,7 @@ class TestGoals:
     @pytest.mark.parametrize("seed", SEEDS)
     @pytest.mark.parametrize("policy", ["nearest", "paper"])
     def test_open_loop(self, models, laboratory, seed, policy):
-        controller = OpenLoopInverse(PreisachInverse(models.film, policy))
+        controller = OpenLoopInverse(PreisachInverse(models.film, policy), wait=8.0)
         greatest, rms, _, _ = self.run(laboratory, controller, seed)
         assert greatest <= 90.0
         assert rms <= 42.0
@@ -538,7 +541,7 @@ class TestLatched:
 class TestLookUp:
     def test_is_the_inverse_on_a_monotone_polynomial(self):
         line = Polynomial([10.0], (0.0, 4.0), 20.0)
-        controller = LookUp(line)
+        controller = LookUp(line, wait=8.0)
         for target in (10.0, 13.0, 30.0):
             assert controller.aim(target, 0.0, 1.0, 0.0).setpoint == pytest.approx((target - 10.0) / 5.0)
             assert controller.reach is Reach.MET
@@ -547,12 +550,12 @@ class TestLookUp:
             assert controller.reach is reach
 
     def test_of_a_falling_one_too(self):
-        controller = LookUp(Polynomial([-10.0], (0.0, 4.0), 20.0))
+        controller = LookUp(Polynomial([-10.0], (0.0, 4.0), 20.0), wait=8.0)
         assert controller.aim(15.0, 0.0, 1.0, 0.0).setpoint == pytest.approx(3.0)
         assert controller.aim(99.0, 0.0, 1.0, 0.0).setpoint == 0.0
 
     def test_is_single_valued_where_the_polynomial_is_not(self, models):
-        controller = LookUp(models.polynomial)
+        controller = LookUp(models.polynomial, wait=8.0)
         low, high = models.polynomial.output_range()
         targets = np.linspace(low, high, 300)
         setpoints = np.array([controller.aim(float(target), 0.0, 50.0, 0.0).setpoint for target in targets])
@@ -561,13 +564,13 @@ class TestLookUp:
 
     def test_wrong_arguments(self, models):
         with pytest.raises(ValueError, match="points"):
-            LookUp(models.polynomial, points=1)
+            LookUp(models.polynomial, wait=8.0, points=1)
         with pytest.raises(ValueError, match="wait"):
             LookUp(models.polynomial, wait=0.0)
         with pytest.raises(ValueError, match="wait"):
             OpenLoopInverse(PreisachInverse(models.film), wait=math.inf)
         with pytest.raises(ValueError, match="gain"):
-            IntegralParameters(gain=0.0)
+            IntegralParameters(gain=0.0, period=0.5, duration=8.0)
 
 
 class TestTrace:
@@ -593,18 +596,28 @@ class TestTuning:
     spans = Spans(63.0, 1900.0)
 
     @pytest.mark.parametrize(
-        "numbers", [CorrectionParameters, FollowingParameters, IntegralParameters, LatchParameters, Arrival]
+        "scaled",
+        [
+            *(each.scaled for each in (CorrectionParameters, FollowingParameters, LatchParameters, Arrival)),
+            partial(IntegralParameters.scaled, dwell=8.0),
+        ],
     )
-    def test_other_units_of_the_same_model_change_nothing_but_the_units(self, numbers):
+    def test_other_units_of_the_same_model_change_nothing_but_the_units(self, scaled):
         """In mK and 1/mm every number with a unit changes by its unit's factor, every other not at all."""
-        here, there = asdict(numbers.scaled(self.spans)), asdict(numbers.scaled(Spans(63e3, 1.9)))
+        here, there = asdict(scaled(self.spans)), asdict(scaled(Spans(63e3, 1.9)))
         factors = {1.0, 1e3, 1e-3, 1e-6, 1e6}
         for name, value in here.items():
             pair = (value["tolerance"], there[name]["tolerance"]) if isinstance(value, dict) else (value, there[name])
             assert any(pair[1] == pytest.approx(factor * pair[0]) for factor in factors), name
 
     def test_an_output_that_falls_turns_the_integrator(self):
-        assert IntegralParameters.scaled(self.spans, falls=True).gain == -IntegralParameters.scaled(self.spans).gain
+        rising, falling = (IntegralParameters.scaled(self.spans, 8.0, falls=falls) for falls in (False, True))
+        assert falling.gain == -rising.gain
+
+    def test_an_actuator_that_takes_ten_times_as_long_has_ten_times_as_long(self):
+        fast, slow = (IntegralParameters.scaled(self.spans, dwell) for dwell in (8.0, 80.0))
+        assert (slow.period, slow.duration) == (10.0 * fast.period, 10.0 * fast.duration)
+        assert slow.gain == pytest.approx(fast.gain / 10.0)
 
     def test_some_numbers_are_replaced_also_within(self):
         changed = tuned(CORRECTION, {"close_enough": 2, "arrival": {"tolerance": 0.5}})

@@ -137,7 +137,7 @@ class TestOperator:
         assert inverse.nearest_input(state, state.input, true.value(state)) == state.input
 
     def test_controllers_work_with_it(self, true):
-        setup = ControllerSetup(model=ModelFile("normalised-bouc-wen", true), limits=(-5.0, 5.0))
+        setup = ControllerSetup(model=ModelFile("normalised-bouc-wen", true), limits=(-5.0, 5.0), dwell=8.0)
         actuator = true.step(true.initial_state(), 0.0)
         for name in ("open-loop-inverse", "closed-loop-inverse"):
             controller = make_controller("target", name, setup)
