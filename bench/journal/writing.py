@@ -120,6 +120,7 @@ class Journal:
         file, signals, counts = take_in(path)
         journal = cls.__new__(cls)
         was_mirrored = (file.parent / MIRROR_NAME).exists()
+        keeper: Keeper | None = None
         try:
             # A reader may have it for a moment.
             keeper = Keeper(Store(file, _READERS))
@@ -129,6 +130,8 @@ class Journal:
             if not was_mirrored:
                 keeper.begin(keeper.store.entries())
         except (sqlite3.Error, OSError) as error:
+            if keeper is not None:
+                keeper.close(is_whole=False)
             raise DataError(f"{file} cannot be written on: {error}") from None
         keeper.keep([entry("meta", meta_row(key, value)) for key, value in meta.items()])
         journal._begin(keeper, signals, counts, patience)

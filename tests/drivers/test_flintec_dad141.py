@@ -7,6 +7,7 @@ import struct
 import sys
 import threading
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -951,3 +952,25 @@ def test_settings_of_a_range_that_is_empty():
     Settings(port="x", force_limits=(1.0, 1.001))
     with pytest.raises(ValidationError):
         Settings(port="x", force_limits=(1.0, 1.0))
+
+
+def test_the_order_of_words_is_looked_at_three_times(bench):
+    bench.bank.alter = lambda address, words: [0x4120, 0, 0, 7] if address == 0x2080 else words
+    with pytest.raises(DeviceConnectionError, match="gives the same weight as 10 and, as an integer, 7"):
+        bench.cell()
+    assert sum(frame[2:4] == b"\x20\x80" for frame in bench.tap.sent) == 3
+
+
+def test_a_still_signal_is_waited_for_in_steps(bench):
+    cell = bench.cell(still_timeout=2.0)
+    cell.glance()
+    bench.put(1.0)
+    cell.glance()
+    times = []
+    bench.bank.alter = lambda address, words: (
+        times.append(bench.clock.now())
+        or ([*words[:4], 0 if len(times) < 9 else 0x30] if address == 0x3500 else words)
+    )
+    cell.tare()
+    steps = sorted(b - a for a, b in pairwise(times[:8]))
+    assert steps[3] == pytest.approx(0.05, abs=0.005)

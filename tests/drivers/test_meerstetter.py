@@ -1107,3 +1107,35 @@ def test_answer_that_misses_its_end_is_over_after_one_timeout(script, tec, clock
     tec.measure()
     assert clock.now() - before == pytest.approx(0.2, abs=0.05)
     assert tec.repeats == 1
+
+
+def test_device_that_restarts_slowly_is_asked_in_steps(script, tec, clock):
+    times, states = [], [0, 5, 0, 5, 1]
+
+    def later(sent, right):
+        if sent[7:14] == b"?VR0068" and states:
+            times.append(clock.now())
+            script.values[104] = states.pop(0)
+            return script.right_answer(sent)
+        return right
+
+    script.instead = [later] * 100
+    tec.reset()
+    assert times[4] - times[0] == pytest.approx(4 * 0.1, abs=0.05)
+
+
+def test_arrival_is_asked_for_in_steps(script, tec, clock):
+    times = []
+
+    def later(sent, right):
+        if sent[7:14] == b"?VR04B0":
+            times.append(clock.now())
+            if len(times) == 5:
+                script.values |= {1200: 2, 1000: 40.0}
+                return script.right_answer(sent)
+        return right
+
+    status = tec.set(40.0)
+    script.instead = [later] * 100
+    status.wait()
+    assert times[4] - times[0] == pytest.approx(4 * 0.1, abs=0.1)

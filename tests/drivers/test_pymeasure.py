@@ -11,7 +11,7 @@ from bench.clock import VirtualClock
 from bench.command_table import ActuatorTable
 from bench.contracts.devices import ActuatorContract
 from bench.contracts.faults import ActuatorLineLostContract, RestartedActuatorContract
-from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, LimitError
+from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, DeviceRestartedError, LimitError
 from bench.rig_file import load_rig
 from drivers.pymeasure import Adapter, InstrumentLine, SensorAdapter, parse_action
 from sim_devices.instruments.scpi import EmulatedTextInstrument, Meter
@@ -373,3 +373,240 @@ def test_an_address_without_an_instrument_is_a_connection_error():
     settings = Adapter.Settings(address=address, options={"visa_library": "@py"}, **TABLE)
     with pytest.raises(DeviceConnectionError, match=r"^supply: (cannot open|reading id)"):
         Adapter.connect("supply", settings, VirtualClock())
+
+
+class Supply:
+    """An instrument of another library's making: what was done to it, and properties that fail."""
+
+    id = "EXAMPLE,2260B,7,1.0"
+
+    def __init__(self):
+        from types import SimpleNamespace
+
+        self.done, self.failing, self.closed = [], {}, 0
+        self.values = {"voltage_setpoint": 0.0, "output_enabled": False, "voltage": 0.0, "current": 0.25}
+        self.errors = []
+        self.adapter = SimpleNamespace(close=lambda: setattr(self, "closed", self.closed + 1))
+
+    def __getattr__(self, name):
+        if name in ("values", "failing") or name not in self.values:
+            raise AttributeError(name)
+        if name in self.failing:
+            raise self.failing[name]
+        return self.values[name]
+
+    def __setattr__(self, name, value):
+        if name in ("done", "failing", "closed", "values", "errors", "adapter"):
+            return super().__setattr__(name, value)
+        if name in self.failing:
+            raise self.failing[name]
+        self.done.append((name, value))
+        self.values[name] = value
+        return None
+
+    def check_errors(self):
+        return self.errors
+
+    def shutdown(self):
+        self.done.append(("shutdown", None))
+
+
+@pytest.fixture
+def instruments(monkeypatch):
+    """The instruments that were opened, one after the other; opening one more fails while `refuses` is set."""
+
+    class Opened(list):
+        refuses = False
+
+    opened = Opened()
+
+    def of_reference(_):
+        def make(_address, **_options):
+            if opened.refuses:
+                raise OSError("no such device")
+            opened.append(Supply())
+            if len(opened) > 1:
+                opened[-1].values = opened[-2].values
+            return opened[-1]
+
+        return make
+
+    settings = Adapter.Settings(address="none", **TABLE)
+    monkeypatch.setattr("drivers.pymeasure.instrument_class", of_reference)
+    opened.connect = lambda **changes: Adapter.connect("supply", settings.model_copy(update=changes), VirtualClock())
+    return opened
+
+
+def test_an_output_is_switched_on_after_what_comes_before_it(instruments):
+    device = instruments.connect()
+    assert device.identity.serial_number == "7"
+    instruments[0].done.clear()
+    device.set(12.0)
+    assert instruments[0].done == [
+        ("output_enabled", False),
+        ("current_limit", 1.5),
+        ("voltage_setpoint", 12.0),
+        ("output_enabled", True),
+    ]
+    instruments[0].done.clear()
+    device.set(6.0)
+    assert instruments[0].done == [("voltage_setpoint", 6.0)]
+
+
+def test_a_set_point_is_scaled_and_its_read_back_too(instruments):
+    from drivers.pymeasure import PropertySetpointTable
+
+    table = {**TABLE["setpoint"], "scale": 1e-3, "limits": (0.0, 0.03), "resolution": 1e-4}
+    device = instruments.connect(setpoint=PropertySetpointTable(**table))
+    device.set(0.0125)
+    assert instruments[0].values["voltage_setpoint"] == 12.5
+    instruments[0].values["voltage_setpoint"] = 12.75
+    with pytest.raises(DeviceError, match=r"reads its set-point back as 0\.01275 V, not 0\.0125 V"):
+        device.reconnect()
+
+
+def test_what_is_not_read_back_is_not_compared(instruments):
+    from drivers.pymeasure import PropertySetpointTable
+
+    device = instruments.connect(setpoint=PropertySetpointTable(**{**TABLE["setpoint"], "read_back": False}))
+    device.set(5.0)
+    instruments[0].values["voltage_setpoint"] = 4.0
+    device.reconnect()
+    device.measure()
+    # An output that is off may have restarted; that cannot be known.
+    instruments[-1].values["output_enabled"] = False
+    with pytest.raises(DeviceError, match="its output is off although it was switched on") as caught:
+        device.measure()
+    assert not isinstance(caught.value, DeviceRestartedError)
+
+
+def test_a_restart_is_told_until_it_is_connected_again(instruments):
+    device = instruments.connect()
+    device.set(5.0)
+    instruments[0].values |= {"output_enabled": False, "voltage_setpoint": 0.0}
+    instruments[0].done.clear()
+    for action in (device.measure, lambda: device.set(1.0), device.measure, device.reconnect):
+        with pytest.raises(DeviceRestartedError, match="set-point is lost: it has restarted"):
+            action()
+    assert instruments[0].done == []
+    device.safe()
+
+
+def test_a_line_that_failed_is_opened_again_by_the_next_call(instruments):
+    device = instruments.connect()
+    device.set(5.0)
+    instruments[0].failing["voltage"] = OSError("timeout")
+    with pytest.raises(DeviceConnectionError, match="reading voltage: OSError: timeout"):
+        device.measure()
+    assert device.measure() == {"supply_voltage": 0.0, "supply_current": 0.25}
+    assert len(instruments) == 2
+    assert instruments[0].closed == 1
+    # On the way it is looked whether the output is as it was left.
+    instruments[1].failing["voltage"] = OSError("timeout")
+    with pytest.raises(DeviceConnectionError):
+        device.measure()
+    instruments[1].values["voltage_setpoint"] = 4.0
+    with pytest.raises(DeviceError, match="reads its set-point back as 4 V, not 5 V"):
+        device.measure()
+
+
+def test_a_sensor_is_read_when_its_line_is_opened_again(instruments):
+    settings = instruments.connect()._settings
+    meter = SensorAdapter("meter", settings, VirtualClock(), InstrumentLine("meter", instruments[0]))
+    instruments[0].failing["voltage"] = OSError("timeout")
+    with pytest.raises(DeviceConnectionError):
+        meter._check_unchanged()
+
+
+def test_another_error_is_none_of_the_line(instruments):
+    device = instruments.connect()
+    instruments[0].failing["voltage_setpoint"] = ValueError("out of range")
+    with pytest.raises(DeviceError, match=r"setting voltage_setpoint to 5: ValueError: out of range") as caught:
+        device.set(5.0)
+    assert not isinstance(caught.value, DeviceConnectionError)
+    instruments[0].failing.clear()
+    device.set(5.0)
+    assert len(instruments) == 1
+
+
+def test_the_safe_state_is_tried_over_a_fresh_line_and_confirmed(instruments):
+    device = instruments.connect()
+    device.set(5.0)
+    instruments[0].failing["voltage_setpoint"] = OSError("timeout")
+    device.safe()
+    assert len(instruments) == 2
+    assert instruments[1].done == [("voltage_setpoint", 0), ("output_enabled", False)]
+    # A line that was lost before is not asked first.
+    instruments[1].failing["voltage"] = OSError("timeout")
+    with pytest.raises(DeviceConnectionError):
+        device.measure()
+    instruments[1].done.clear()
+    device.safe()
+    assert instruments[1].done == []
+    assert len(instruments) == 3
+
+
+def test_a_safe_state_that_is_not_confirmed(instruments):
+    device = instruments.connect()
+    device.set(5.0)
+    instruments[0].failing["voltage_setpoint"] = OSError("timeout")
+    instruments.refuses = True
+    with pytest.raises(DeviceError, match=r"does not confirm that its output is off \(supply: .*timeout"):
+        device.safe()
+    # Without a failure before it, that of the line stands there.
+    with pytest.raises(DeviceError, match=r"does not confirm .*no such device"):
+        device.safe()
+    instruments.refuses = False
+    device.safe()
+    instruments[-1].failing["output_enabled"] = ValueError("locked")
+    with pytest.raises(DeviceError, match=r"does not confirm .*output_enabled = False: ValueError: locked"):
+        device.safe()
+
+
+def test_an_output_that_stays_on(instruments):
+    device = instruments.connect(safe=("voltage_setpoint = 0",))
+    device.set(5.0)
+    with pytest.raises(DeviceError, match=r"does not confirm .*output_enabled is true"):
+        device.safe()
+    device = instruments.connect(safe=("voltage_setpoint = 0",), output=None)
+    device.set(5.0)
+    device.safe()
+
+
+def test_an_arrival_is_read_from_the_signals(instruments):
+    from drivers.pymeasure import PropertySetpointTable
+
+    arrival = {"signal": "voltage", "tolerance": 0.25, "timeout": 3.0}
+    device = instruments.connect(setpoint=PropertySetpointTable(**{**TABLE["setpoint"], "arrival": arrival}))
+    status = device.set(5.0)
+    instruments[0].values["voltage"] = 4.7
+    assert not status.update()
+    instruments[0].values["voltage"] = 4.75
+    assert status.update()
+
+
+@pytest.mark.parametrize("number", [9.9e37, -9.9e37, math.nan, math.inf])
+def test_numbers_that_are_none(instruments, number):
+    device = instruments.connect()
+    instruments[0].values["voltage"] = number
+    with pytest.raises(DeviceError, match=r"voltage is .*; is it out of its range"):
+        device.measure()
+    instruments[0].values["voltage"] = 9.8e37
+    device.measure()
+
+
+def test_errors_are_asked_for_if_the_rig_file_says_so(instruments):
+    device = instruments.connect(check_errors=True)
+    instruments[0].errors = ["-222", "-113"]
+    with pytest.raises(DeviceError, match="reports after set-point 5 V: -222; -113"):
+        device.set(5.0)
+    instruments.connect().measure()
+
+
+def test_a_module_that_may_not_be_imported_is_refused():
+    from drivers.pymeasure import instrument_class
+
+    with pytest.raises(ValueError, match=r"module wsgiref .* may not be imported"):
+        instrument_class("wsgiref:Keithley")
+    with pytest.raises(ValueError, match="is no instrument of PyMeasure"):
+        instrument_class("pymeasure.instruments:list_resources")

@@ -17,7 +17,7 @@ from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError,
 from drivers.roboteq import ABORT_CODES, CHANNEL_FLAGS, FAULT_FLAGS, RoboteqSupply
 from drivers.roboteq import supply as driver
 from drivers.roboteq.canopen import Entry, NodeLine
-from drivers.roboteq.process_data import ProcessData
+from drivers.roboteq.process_data import ProcessData, _most_frequent
 from drivers.roboteq.supply import _POWER, _VOLTS
 from sim_devices.protocol_emulated import register, unregister
 from sim_devices.wire import WireServer
@@ -1601,3 +1601,72 @@ def test_command_that_may_have_arrived(controller, synchronous):
     for power in (125, 250):
         controller.objects[0x2101, 1] = controller.objects[0x2102, 1] = (power, 2)
         synchronous.measure()
+
+
+@pytest.mark.parametrize(
+    ("copies", "found"),
+    [("aa", "a"), ("ab", None), ("aab", "a"), ("aabb", None), ("aabbb", "b"), ("abc", None), ("a", None)],
+)
+def test_what_came_most_often_came_twice(copies, found):
+    wanted = None if found is None else found.encode()
+    assert _most_frequent([each.encode() for each in copies]) == wanted
+
+
+@pytest.mark.parametrize(("volts", "pause", "marks"), [(0.0, 2.0, 3), (6.0, 0.1, 3), (6.0, 2.0, 0)])
+def test_marks_feed_the_watchdog_only_where_they_may(controller, synchronous, clock, volts, pause, marks):
+    if volts:
+        synchronous.set(volts).wait()
+    clock.sleep(pause)
+    controller.spoilt = [lambda _sent: []] * 4
+    controller.marks.clear()
+    with pytest.raises(DeviceError):
+        synchronous.measure()
+    sent = [mark for mark in controller.marks if mark]
+    assert len(sent) >= marks
+    assert (len(sent) == 0) == (marks == 0)
+
+
+def test_zero_goes_to_the_own_channel_alone_after_a_command_of_zero(script, connect, clock):
+    script.objects |= {(0x2102, 2): (0, 2)}
+    supply = connect()
+    supply.set(0.0)
+    clock.sleep(5.0)
+    script.received.clear()
+    supply.safe()
+    assert script.orders() == [(0x2000, 1, 0), (0x200E, 0, 1)]
+
+
+def test_adapter_that_could_not_be_opened_releases_its_port(script, connect, monkeypatch):
+    from can.interfaces import slcan
+
+    ports, usual = [], slcan.serial.serial_for_url
+    monkeypatch.setattr(slcan.serial, "serial_for_url", lambda *a, **k: ports.append(usual(*a, **k)) or ports[-1])
+
+    def receive(_data):
+        raise OSError("gone")
+
+    right, script.receive = script.receive, receive
+    with pytest.raises(DeviceConnectionError, match="cannot open"):
+        connect()
+    assert [port.is_open for port in ports] == [False]
+    script.receive = right
+    supply = connect()
+    assert ports[-1].is_open
+    assert ports[-1].write_timeout == 0.1
+    supply.close()
+    assert not ports[-1].is_open
+
+
+def test_lines_of_the_adapter_in_any_pieces(script, supply):
+    adapter = supply._line._adapter
+    adapter._take(b"z\rt7011")
+    assert adapter.lines() == []
+    adapter._take(b"05\r\at70110")
+    assert adapter.lines() == [b"t701105"]
+    assert adapter.refusals == 1
+    adapter._take(b"5\n\n\rz\rF00\r")
+    assert adapter.lines() == [b"t701105"]
+    for length, kept in ((64, 64), (65, 0)):
+        adapter._rest = b""
+        adapter._take(b"t" * length)
+        assert len(adapter._rest) == kept

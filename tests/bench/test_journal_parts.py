@@ -1,0 +1,608 @@
+"""The parts of a journal by themselves: second file, keeper, thread, SQLite file, and reading damaged ones."""
+
+import json
+import sqlite3
+import tempfile
+import threading
+from collections import namedtuple
+from contextlib import closing
+
+import numpy as np
+import pytest
+
+from bench.devices import Signal
+from bench.errors import ConfigurationError, DataError, RecordError
+from bench.journal import FILE_NAME, Event, Journal, Record, StepRecord, background, keeping
+from bench.journal.background import Background
+from bench.journal.keeping import RESERVE_NAME, Keeper
+from bench.journal.mirror import NAME as MIRROR_NAME
+from bench.journal.mirror import Mirror, elsewhere, read_mirror
+from bench.journal.models import add_model
+from bench.journal.recovery import recover
+from bench.journal.rows import SCHEMA, checksum, checksums, entry, meta_row, split, ticks
+from bench.journal.store import Store
+from bench.journal.writing import abandon, take_in
+from bench.settling import Settled
+
+SIGNALS = (Signal("force", "N", "force"),)
+STATUS = {"status": "completed", "reason": "", "finished": 9.0, "safe_state": {}}
+
+
+@pytest.fixture(autouse=True)
+def other_disk(tmp_path_factory, monkeypatch):
+    folder = tmp_path_factory.mktemp("temporary")
+    monkeypatch.setattr(tempfile, "tempdir", str(folder))
+    return folder
+
+
+@pytest.fixture
+def synced(monkeypatch):
+    """The files that were made durable, by their names, in order."""
+    files, sync = [], Mirror.sync
+    monkeypatch.setattr(Mirror, "sync", lambda self: files.append(self.path.name) or sync(self))
+    return files
+
+
+def step(number, started=None):
+    first = float(number if started is None else started)
+    return StepRecord(number, first, first + 0.5, "", "", Settled.DWELL, {"tec": 20.0}, (float(number),))
+
+
+def note(number):
+    return entry("events", (number, float(number), "INFO", "note", f"event {number}"))
+
+
+def new_store(tmp_path):
+    store = Store(tmp_path / FILE_NAME)
+    head = [entry("meta", meta_row("schema", SCHEMA)), entry("signals", (0, "force", "N", "force", 3))]
+    store.create(["force"], head)
+    return store, head
+
+
+@pytest.fixture
+def keeper(tmp_path):
+    store, head = new_store(tmp_path)
+    keeper = Keeper(store)
+    keeper.begin(head)
+    yield keeper
+    keeper.close(is_whole=True)
+
+
+def stored(keeper_or_store):
+    store = getattr(keeper_or_store, "store", keeper_or_store)
+    return [each.row[0] for each in store.entries() if each.table == "events"]
+
+
+def refuse(monkeypatch, store, problem="database is locked"):
+    """Have a store refuse every row; return how to let it take them again."""
+
+    def write(_entries):
+        raise sqlite3.OperationalError(problem)
+
+    monkeypatch.setattr(store, "write", write)
+    return lambda: monkeypatch.undo()
+
+
+class At:
+    """A stopwatch that has run for so long."""
+
+    def __init__(self, seconds):
+        self.seconds = lambda: seconds
+
+
+class TestMirror:
+    def test_half_of_an_entry_is_taken_off_again(self, tmp_path):
+        file = Mirror(tmp_path / MIRROR_NAME)
+        file.append([note(1)])
+        real = file._file
+
+        class Full:
+            def __getattr__(self, name):
+                return getattr(real, name)
+
+            def write(self, data):
+                return real.write(data[: len(data) // 2])
+
+        file._file = Full()
+        with pytest.raises(OSError, match="takes no more"):
+            file.append([note(2)])
+        file._file = real
+        file.append([note(3)])
+        assert [each.row[0] for each in file.entries()] == [1, 3]
+        file.append([note(4)])
+        assert [each.row[0] for each in read_mirror(file.path)] == [1, 3, 4]
+        file.close()
+
+    def test_what_is_there_stays(self, tmp_path):
+        for number in (1, 2):
+            file = Mirror(tmp_path / MIRROR_NAME)
+            file.append([note(number)])
+            file.close()
+        assert [each.row[0] for each in read_mirror(tmp_path / MIRROR_NAME)] == [1, 2]
+
+    @pytest.mark.parametrize("spoilt", ["head", "payload", "end"])
+    def test_a_damaged_entry_is_left_out(self, tmp_path, spoilt):
+        path = tmp_path / MIRROR_NAME
+        file = Mirror(path)
+        file.append([note(1)])
+        first = path.stat().st_size
+        file.append([note(2), ticks([(1, 0.5, 0, 2.0), (2, 1.5, 0, 3.0)])])
+        file.close()
+        data = bytearray(path.read_bytes())
+        place = {"head": 4, "payload": first - 3, "end": len(data) - 3}[spoilt]
+        data[place] ^= 0x41
+        path.write_bytes(data)
+        found = [(each.table, each.row[0]) for each in read_mirror(path)]
+        rest = [("telemetry", 1), ("telemetry", 2)]
+        assert found == ([("events", 1), ("events", 2)] if spoilt == "end" else [("events", 2), *rest])
+
+    def test_one_that_is_cut_off(self, tmp_path):
+        path = tmp_path / MIRROR_NAME
+        file = Mirror(path)
+        file.append([note(1), note(2)])
+        file.close()
+        data = path.read_bytes()
+        for length in range(len(data) // 2, len(data)):
+            path.write_bytes(data[:length])
+            assert [each.row[0] for each in read_mirror(path)] == [1]
+
+    def test_where_others_are(self, tmp_path, other_disk):
+        first, late = elsewhere(tmp_path / FILE_NAME)
+        assert (first.parent, first.suffix, late.suffix) == (other_disk, ".mirror", ".late")
+        assert len(first.stem) == len("bench-") + 24
+        assert elsewhere(tmp_path / "other.sqlite")[0] != first
+
+
+class TestKeeper:
+    def test_rows_that_wait_are_durable_in_the_second_file_and_are_written_first(self, keeper, monkeypatch, synced):
+        again = refuse(monkeypatch, keeper.store)
+        keeper._tried = At(1.0)
+        keeper.keep([note(1)])
+        assert synced == [MIRROR_NAME]
+        assert keeper.why == "database is locked"
+        assert keeper.notices == ["the journal cannot be written (database is locked); rows wait in a second file"]
+        keeper.keep([note(2)])  # so soon it is not tried again
+        assert [each.row[0] for each in read_mirror(keeper.second_file) if each.table == "events"] == [1, 2]
+        again()
+        keeper._tried = At(0.49)
+        keeper.keep([note(3)])
+        assert stored(keeper) == []
+        keeper._tried = At(0.5)
+        keeper.keep([note(4)])
+        assert stored(keeper) == [1, 2, 3, 4]
+        assert keeper.why == ""
+        assert keeper.notices[1:] == ["the journal can be written again; 3 rows were waiting"]
+
+    @pytest.mark.parametrize(("problem", "reconnects"), [("database is locked", 0), ("disk I/O error", 1)])
+    def test_a_file_is_opened_anew_after_a_failure_of_the_disk(self, keeper, monkeypatch, problem, reconnects):
+        again, opened = refuse(monkeypatch, keeper.store, problem), []
+        keeper.keep([note(1)])
+        again()
+        monkeypatch.setattr(keeper.store, "reconnect", lambda: opened.append(1))
+        keeper._tried = At(1.0)
+        keeper.keep([note(2)])
+        assert len(opened) == reconnects
+        assert stored(keeper) == [1, 2]
+
+    def test_what_is_no_fault_of_the_disk_is_raised(self, keeper, monkeypatch):
+        def write(_entries):
+            raise sqlite3.IntegrityError("wrong")
+
+        monkeypatch.setattr(keeper.store, "write", write)
+        with pytest.raises(sqlite3.IntegrityError):
+            keeper.keep([note(1)])
+
+    def test_a_second_file_that_takes_nothing_has_one_elsewhere(self, keeper, monkeypatch, synced, other_disk):
+        refuse(monkeypatch, keeper.store)
+
+        def full(_entries):
+            raise OSError(28, "No space left on device")
+
+        keeper._mirror.append = full
+        for number in (1, 2):
+            keeper.keep([note(number)])
+        (path,) = other_disk.iterdir()
+        assert keeper.second_file == path
+        assert [each.row[0] for each in read_mirror(path)] == [1, 2]
+        assert synced == [path.name] * 2
+        assert f"rows wait in {path}" in keeper.notices[-1]
+        assert not keeper._is_whole
+
+    def test_a_second_file_that_cannot_be_made_durable_has_one_elsewhere(self, keeper, monkeypatch, other_disk):
+        again = refuse(monkeypatch, keeper.store)
+        keeper._tried = At(1.0)
+        broken = keeper._mirror
+
+        def sync(self, original=Mirror.sync):
+            if self is broken:
+                raise OSError(5, "Input/output error")
+            original(self)
+
+        monkeypatch.setattr(Mirror, "sync", sync)
+        keeper.keep([note(1)])
+        (path,) = other_disk.iterdir()
+        assert [each.row[0] for each in read_mirror(path)] == [1]
+        assert not keeper._is_whole
+        again()
+
+    def test_rows_that_are_nowhere_end_the_run(self, keeper, monkeypatch):
+        refuse(monkeypatch, keeper.store, "disk I/O error")
+
+        def full(*_):
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(Mirror, "append", full)
+        with pytest.raises(RecordError, match=r"cannot be written: disk I/O .*; its second file neither: .*No space"):
+            keeper.keep([note(1)])
+        monkeypatch.undo()
+
+    def test_what_waits_is_tried_again_while_nothing_happens(self, keeper, monkeypatch):
+        again = refuse(monkeypatch, keeper.store)
+        keeper.keep([note(1)])
+        again()
+        for seconds, found in ((0.49, []), (0.5, [1])):
+            keeper._tried = At(seconds)
+            keeper.fold_in()
+            assert stored(keeper) == found
+
+    def test_the_log_is_folded_in_now_and_then(self, keeper, monkeypatch):
+        folded = []
+        monkeypatch.setattr(keeper.store, "fold_in", lambda: folded.append(1))
+        for seconds, anyway, count in ((29.9, False, 0), (30.0, False, 1), (1.0, True, 2)):
+            keeper._folded = At(seconds)
+            keeper.fold_in(anyway=anyway)
+            assert len(folded) == count
+        keeper.fold_in()
+        assert len(folded) == 2
+
+    @pytest.mark.parametrize(
+        ("total", "free", "is_short"),
+        [
+            (1 << 40, 64 << 20, False),
+            (1 << 40, (64 << 20) - 1, True),
+            (100 << 20, 5 << 20, False),
+            (100 << 20, 5e6, True),
+        ],
+    )
+    def test_a_disk_that_is_nearly_full(self, keeper, monkeypatch, total, free, is_short):
+        usage = namedtuple("usage", "total used free")
+        monkeypatch.setattr(keeping.shutil, "disk_usage", lambda _: usage(total, 0, int(free)))
+        keeper._looked = At(0.99)
+        keeper.keep([note(1)])
+        assert not keeper.is_short
+        for number in (2, 3):
+            keeper._looked = At(1.0)
+            keeper.keep([note(number)])
+            assert keeper.is_short is is_short
+        told = [each for each in keeper.notices if "nearly full" in each]
+        assert told == [f"the disk is nearly full ({int(free) >> 20} MB free): recordings stop"] * is_short
+
+    def test_space_is_kept_and_given_back(self, keeper):
+        reserve = keeper.store.path.parent / RESERVE_NAME
+        assert reserve.stat().st_size == 1 << 18
+        keeper.make_room()
+        assert not reserve.exists()
+
+    def test_the_end_waits_for_others(self, keeper, monkeypatch):
+        waits = []
+        monkeypatch.setattr(keeper.store, "wait_for_others", waits.append)
+        keeper.keep([note(1)])
+        assert keeper.end({"events": 1}) == ""
+        assert waits == [5.0, 0.0]
+        assert keeper.end({"events": 2}) == "table events has 1 rows of 2"
+
+    def test_the_end_of_one_whose_rows_still_wait(self, keeper, monkeypatch):
+        again = refuse(monkeypatch, keeper.store)
+        keeper.keep([note(1)])
+        assert keeper.end({"events": 1}) == "database is locked"
+        again()
+        assert keeper.end({"events": 1}) == ""
+        assert stored(keeper) == [1]
+
+    def test_closing_writes_what_waits_and_is_done_once(self, tmp_path, monkeypatch):
+        store, head = new_store(tmp_path)
+        keeper = Keeper(store)
+        keeper.begin(head)
+        again = refuse(monkeypatch, store)
+        keeper.keep([note(1)])
+        again()
+        closed, close = [], store.close
+        monkeypatch.setattr(store, "close", lambda: closed.append(1) or close())
+        for _ in range(2):
+            keeper.close(is_whole=True)
+        assert closed == [1]
+        assert sorted(path.name for path in tmp_path.iterdir()) == [FILE_NAME]
+        with closing(sqlite3.connect(tmp_path / FILE_NAME)) as db:
+            assert db.execute("SELECT count(*) FROM events").fetchone() == (1,)
+
+    def test_one_that_is_not_whole_keeps_its_second_file(self, tmp_path):
+        store, head = new_store(tmp_path)
+        keeper = Keeper(store)
+        keeper.begin(head)
+        keeper.close(is_whole=False)
+        assert {path.name for path in tmp_path.iterdir()} == {FILE_NAME, MIRROR_NAME}
+
+    def test_one_that_is_removed_goes_on_with_every_row(self, keeper, other_disk):
+        keeper.keep([note(1)])
+        keeper._mirror.append = lambda _: (_ for _ in ()).throw(OSError("full"))
+        keeper.keep([note(2)])
+        keeper.store.path.unlink()
+        with pytest.raises(RecordError, match="was removed while the run went on; everything so far is in"):
+            keeper.keep([note(3)])
+        assert stored(keeper) == [1, 2, 3]
+        assert keeper.store.path.parent.parent == other_disk
+
+
+class TestBackground:
+    def test_an_idle_thread_folds_the_log_in(self, keeper, monkeypatch):
+        folded = threading.Event()
+        monkeypatch.setattr(background, "_IDLE", 0.01)
+        monkeypatch.setattr(keeper, "fold_in", folded.set)
+        thread = Background(keeper, 30.0)
+        assert folded.wait(30.0)
+        assert thread.stop()
+
+    def test_what_is_late_is_durable_elsewhere(self, keeper, monkeypatch, synced, other_disk):
+        held, keep = threading.Event(), keeper.keep
+        monkeypatch.setattr(keeper, "keep", lambda entries: held.wait(30.0) and keep(entries))
+        thread = Background(keeper, 0.05)
+        for number in (1, 2):
+            thread.keep([note(number)])
+        (path,) = other_disk.iterdir()
+        assert path.suffix == ".late"
+        assert synced == [path.name] * 2
+        assert [each.row[0] for each in read_mirror(path)] == [1, 2]
+        assert [each for each in keeper.notices if "is slow" in each] == [
+            f"the disk of the journal is slow; rows that wait are in {path} as well"
+        ]
+        held.set()
+        assert thread.stop()
+        assert stored(keeper) == [1, 2]
+        assert [each.path for each in keeper.spare] == [path]
+
+    def test_what_is_late_and_nowhere_else_ends_the_run(self, keeper, monkeypatch):
+        held, keep = threading.Event(), keeper.keep
+        monkeypatch.setattr(keeper, "keep", lambda entries: held.wait(30.0) and keep(entries))
+        thread = Background(keeper, 0.05)
+
+        def full(self, _entries):
+            raise OSError(28, "No space left on device", str(self.path))
+
+        monkeypatch.setattr(Mirror, "append", full)
+        with pytest.raises(RecordError, match=r"is not written in time, nor .*\.late"):
+            thread.keep([note(1)])
+        monkeypatch.undo()
+        held.set()
+        assert thread.stop()
+
+    def test_a_failure_is_raised_by_the_next_call(self, keeper, monkeypatch):
+        def fail(_entries):
+            raise RecordError("gone")
+
+        monkeypatch.setattr(keeper, "keep", fail)
+        thread = Background(keeper, 30.0)
+        with pytest.raises(RecordError, match="gone"):
+            thread.keep([note(1)])
+        assert thread.stop()
+        assert thread.failure is None
+
+
+class TestStore:
+    def test_rows_are_written_all_or_none(self, tmp_path):
+        store, _ = new_store(tmp_path)
+        wrong = entry("events", (2, 2.0, "INFO", "note"))
+        with pytest.raises(sqlite3.Error):
+            store.write([note(1), wrong])
+        assert stored(store) == []
+        store.write([note(1), note(2)])
+        store.write([note(3)])
+        assert stored(store) == [1, 2, 3]
+        store.close()
+
+    def test_rows_that_come_again_are_the_same(self, tmp_path):
+        store, _ = new_store(tmp_path)
+        for _ in range(2):
+            store.write([note(1)])
+        assert stored(store) == [1]
+        store.close()
+
+    def test_what_is_forgotten(self, tmp_path):
+        store, _ = new_store(tmp_path)
+        store.write([entry("meta", meta_row("status", "failed"))])
+        store.forget(["status", "reason"])
+        assert [each.row[0] for each in store.entries() if each.table == "meta"] == ["schema"]
+        store.close()
+
+    def test_a_closed_one_has_no_companions(self, tmp_path):
+        store, _ = new_store(tmp_path)
+        store.write([note(1)])
+        store.close()
+        assert [path.name for path in tmp_path.iterdir()] == [FILE_NAME]
+
+    def test_where_it_was_made(self, tmp_path):
+        store, _ = new_store(tmp_path)
+        assert store.loss() == ""
+        store.path.unlink()
+        assert store.loss() == "removed"
+        store.path.write_bytes(b"")
+        assert store.loss() == "replaced"
+        store.close()
+
+
+class TestReading:
+    def write(self, tmp_path, *entries):
+        store, _ = new_store(tmp_path)
+        store.write(list(entries))
+        store.close()
+        return Record(tmp_path)
+
+    def test_a_step_that_is_none_has_a_good_checksum_all_the_same(self, tmp_path):
+        row = (0, 0.0, 0.5, "", "", "nonsense", "{}", 1.0, "[]")
+        with (
+            self.write(tmp_path, entry("steps", row)) as record,
+            pytest.raises(DataError, match="is damaged: step 0: "),
+        ):
+            list(record.step_records())
+
+    def test_ticks_that_are_no_numbers(self, tmp_path):
+        row = entry("telemetry", (1, "soon", 0, 2.0))
+        with self.write(tmp_path, row) as record, pytest.raises(DataError, match="is damaged: table telemetry: "):
+            record.telemetry()
+
+    def test_rows_that_only_a_second_file_has_are_counted_by_their_numbers(self, tmp_path):
+        with _unfinished(tmp_path):
+            pass
+        file = Mirror(tmp_path / MIRROR_NAME)
+        file.append([entry("steps", (n, 50.0, 50.5, "", "", "dwell", "{}", 1.0, "[]")) for n in (1, 2, 3)])
+        file.close()
+        with Record(tmp_path) as record:
+            assert "lacks rows that its second file has (2 of steps): bench recover-journal" in record.remark()
+
+    def test_checksums_of_many_rows_are_those_of_each(self):
+        rows = np.array([[1.0, np.nan, -0.0], [np.inf, 2.5, -3.0]])
+        assert checksums(rows) == [checksum(tuple(row)) for row in rows.tolist()]
+        several = ticks([tuple(map(float, (n, n, 0, n))) for n in range(1, 40)])
+        assert [each.payload for each in split([several])] == [ticks([row]).payload for row in several.rows]
+        assert several.payload == b"".join(each.payload for each in split([several]))
+
+
+def _unfinished(tmp_path):
+    """Write two steps of a run that did not end."""
+    store, _ = new_store(tmp_path)
+    store.write([entry("steps", (n, 50.0, 50.5, "", "", "dwell", "{}", 1.0, "[]")) for n in (0, 1)])
+    return closing(store)
+
+
+class TestWritingOn:
+    def test_a_run_whose_end_waits_is_not_written_on(self, tmp_path):
+        with _unfinished(tmp_path):
+            pass
+        file = Mirror(tmp_path / MIRROR_NAME)
+        file.append([entry("meta", meta_row("status", "completed"))])
+        file.close()
+        with pytest.raises(ConfigurationError, match=r"a run that has ended, of which rows wait in a second file"):
+            take_in(tmp_path)
+
+    def test_what_waits_is_taken_in_and_numbered_on(self, tmp_path):
+        with _unfinished(tmp_path):
+            pass
+        file = Mirror(tmp_path / MIRROR_NAME)
+        file.append([entry("steps", (n, 50.0, 50.5, "", "", "dwell", "{}", 1.0, "[]")) for n in (1, 2)])
+        file.append([note(1)])
+        file.close()
+        path, signals, counts = take_in(tmp_path)
+        assert (path, signals[0].name) == (tmp_path / FILE_NAME, "force")
+        assert counts == {"steps": 3, "telemetry": 0, "events": 1}
+        with Record(tmp_path) as record:
+            assert len(record.steps()) == 3
+
+    @pytest.mark.parametrize("waits", [True, False])
+    def test_one_that_cannot_be_written_on(self, tmp_path, monkeypatch, waits):
+        with _unfinished(tmp_path):
+            pass
+        if waits:
+            file = Mirror(tmp_path / MIRROR_NAME)
+            file.append([entry("steps", (2, 50.0, 50.5, "", "", "dwell", "{}", 1.0, "[]"))])
+            file.close()
+
+        def refuse(*_):
+            raise sqlite3.OperationalError("attempt to write a readonly database")
+
+        monkeypatch.setattr(Store, "write" if waits else "forget", refuse)
+        with pytest.raises(DataError, match=r"cannot be written on: .*readonly"):
+            Journal.reopen(tmp_path)
+
+    def test_the_end_of_one_whose_thread_hangs(self, tmp_path):
+        journal = Journal(tmp_path / FILE_NAME, SIGNALS, {"rig": "vo2"})
+        journal.step(step(0))
+        abandon(journal.path, "it hangs", {"tec": "safe"})
+        assert not (tmp_path / RESERVE_NAME).exists()
+        with Record(tmp_path) as record:
+            assert (record.status, record.meta["reason"]) == ("aborted", "it hangs")
+            assert record.meta["safe_state"] == {"tec": "safe"}
+        # What it would have said of itself later stays.
+        abandon(journal.path, "again", {})
+        with Record(tmp_path) as record:
+            assert record.meta["reason"] == "it hangs"
+        journal.close()
+
+    def test_signals_with_a_null_character_are_refused(self, tmp_path):
+        with pytest.raises(ConfigurationError, match="may not have a null character"):
+            Journal(tmp_path / FILE_NAME, (Signal("a\0b", "N", ""),), {})
+
+
+class TestRecovering:
+    def test_a_journal_without_checksums_is_refused(self, tmp_path):
+        store = Store(tmp_path / FILE_NAME)
+        store.create(["force"], [entry("meta", meta_row("schema", 2)), entry("signals", (0, "force", "N", "", 3))])
+        store.close()
+        with pytest.raises(DataError, match="has schema version 2, which has no checksums to recover by"):
+            recover(tmp_path)
+
+    def test_a_copy_that_cannot_be_written(self, tmp_path):
+        with _unfinished(tmp_path):
+            pass
+        (tmp_path / MIRROR_NAME).unlink(missing_ok=True)
+        file = Mirror(tmp_path / MIRROR_NAME)
+        file.append([entry("steps", (2, 50.0, 50.5, "", "", "dwell", "{}", 1.0, "[]"))])
+        file.close()
+        with pytest.raises(ConfigurationError, match=r"cannot be written: .*name another one by --out"):
+            recover(tmp_path, out=tmp_path / "no folder" / "copy.sqlite")
+        recovery = recover(tmp_path)
+        assert recovery.tables["steps"].added == 1
+        assert recovery.is_complete
+
+    def test_rows_about_a_damaged_page_are_read_one_by_one(self, tmp_path):
+        journal = Journal(tmp_path / FILE_NAME, SIGNALS, {})
+        for tick in range(4000):
+            journal.telemetry(0.1 * tick, 0, (float(tick),))
+        journal.finish(**STATUS)
+        journal.close()
+        with closing(sqlite3.connect(tmp_path / FILE_NAME)) as db:
+            pages = db.execute("PRAGMA page_count").fetchone()[0]
+        with (tmp_path / FILE_NAME).open("r+b") as file:
+            for share in (0.4, 0.6):
+                file.seek(4096 * round(share * pages))
+                file.write(b"\xa5" * 4096)
+        recovery = recover(tmp_path)
+        kept = recovery.tables["telemetry"]
+        assert 3000 < kept.good < 4000
+        assert kept.good + kept.missing == 4000
+        with Record(recovery.copy) as record:
+            found = record.telemetry()["force"]
+        assert found.size == kept.good
+        # What lies between two pages that are damaged is kept as well.
+        assert np.isin([2000.0], found).all()
+
+
+class TestModels:
+    def test_a_model_file_is_readable_text(self, tmp_path):
+        with _unfinished(tmp_path):
+            pass
+        for number in (1, 2):
+            add_model(tmp_path, f"film {number}", 5.0, {"unit": "°C"})
+        text = (tmp_path / "models" / "film 1.json").read_text(encoding="utf-8")
+        assert "°C" in text
+        assert json.loads(text)["unit"] == "°C"
+        with Record(tmp_path) as record:
+            assert list(record.models()) == ["film 1", "film 2"]
+
+    def test_one_that_cannot_be_written(self, tmp_path):
+        with _unfinished(tmp_path):
+            pass
+        (tmp_path / "models").write_text("a file in its place")
+        with pytest.raises(DataError, match=r"model file .* cannot be written"):
+            add_model(tmp_path, "film", 5.0, {})
+
+
+def test_events_and_steps_are_numbered_by_the_journal(tmp_path):
+    journal = Journal(tmp_path / FILE_NAME, SIGNALS, {})
+    journal.event(Event(0.0, "INFO", "note", "one"))
+    journal.step(step(0, started=3.0))
+    journal.telemetry(0.5, 0, (1.0,))
+    assert (journal.steps, journal.ticks) == (1, 1)
+    journal.finish(**STATUS)
+    journal.close()
+    with Record(tmp_path) as record:
+        assert record.meta["counts"] == {"steps": 1, "telemetry": 1, "events": 1}
+        assert [each.text for each in record.events()] == ["one"]
