@@ -255,7 +255,9 @@ def spans():
 
 SCENES = {
     "open loop": lambda: reaching(OpenLoopInverse(film().inverse(), wait=1.5), Plant(film())),
-    "open loop, overshooting": lambda: reaching(OpenLoopInverse(film().inverse()), Plant(film(), damping=0.3)),
+    "open loop, overshooting": lambda: reaching(
+        OpenLoopInverse(film().inverse(), wait=8.0), Plant(film(), damping=0.3)
+    ),
     "open loop, learning": lambda: reaching(
         OpenLoopInverse(film().inverse(), wait=2.0, adaptation=model_filter("session", film())), Plant(film())
     ),
@@ -271,8 +273,10 @@ SCENES = {
     ),
     "latched": lambda: reaching(Latched(film().inverse()), Plant(film(), gain=1.0, lag=0.1), most=400),
     "latched, off by a gain": lambda: reaching(Latched(film().inverse()), Plant(film(), gain=0.9, lag=0.1), most=250),
-    "look-up": lambda: reaching(LookUp(Polynomial([3.0, 0.4], (0.0, 10.0), 5.0)), Plant(film())),
-    "integral": lambda: reaching(IntegralControl((0.0, 10.0), IntegralParameters.scaled(spans())), Plant(film())),
+    "look-up": lambda: reaching(LookUp(Polynomial([3.0, 0.4], (0.0, 10.0), 5.0), wait=8.0), Plant(film())),
+    "integral": lambda: reaching(
+        IntegralControl((0.0, 10.0), IntegralParameters.scaled(spans(), 8.0)), Plant(film())
+    ),
     "supervised": lambda: reaching(
         Supervised(ClosedLoopInverse(film().inverse()), (0.0, 10.0), 1.0), Plant(film(), offset=0.2), (0.3, 0.7, 0.5)
     ),
@@ -281,7 +285,7 @@ SCENES = {
     ),
     "following in closed loop": lambda: following(ClosedLoopFollower(film().inverse()), Plant(film()), sine),
     "following by the integral": lambda: following(
-        IntegralFollower((0.5, 9.5), IntegralParameters.scaled(spans())), Plant(film(), lag=0.2), sine
+        IntegralFollower((0.5, 9.5), IntegralParameters.scaled(spans(), 8.0)), Plant(film(), lag=0.2), sine
     ),
     "predictive, second order": lambda: predictive(SECOND, plant={"damping": 0.6}, pause=9),
     "predictive, first order": lambda: predictive(FIRST, limits=(1.0, 8.5)),
