@@ -606,3 +606,23 @@ def test_events_and_steps_are_numbered_by_the_journal(tmp_path):
     with Record(tmp_path) as record:
         assert record.meta["counts"] == {"steps": 1, "telemetry": 1, "events": 1}
         assert [each.text for each in record.events()] == ["one"]
+
+
+def test_a_model_is_kept_beside_the_journal(tmp_path):
+    journal = Journal(tmp_path / FILE_NAME, SIGNALS, {})
+    journal.keep_model("film", 3.0, {"order": 21})
+    journal.close()
+    with Record(tmp_path) as record:
+        assert record.models() == {"film": {"order": 21}}
+
+
+def test_a_model_in_an_old_journal_that_is_damaged(tmp_path):
+    journal = Journal(tmp_path / FILE_NAME, SIGNALS, {})
+    journal.close()
+    with closing(sqlite3.connect(tmp_path / FILE_NAME)) as db:
+        db.execute("UPDATE meta SET value = '2' WHERE key = 'schema'")
+        db.execute("CREATE TABLE models (name TEXT PRIMARY KEY, t REAL NOT NULL, model TEXT NOT NULL)")
+        db.execute("INSERT INTO models VALUES ('film', 4.0, '{')")
+        db.commit()
+    with Record(tmp_path) as record, pytest.raises(DataError, match="is damaged: Expecting property name"):
+        record.models()

@@ -2085,3 +2085,54 @@ def test_packet_names_its_registers():
     assert packet.name == "reading register 4, reading register 55100"
     assert packet.request == bytes.fromhex("4c 00 0004 04 00 d73c 02 00 b462 02")
     assert packet.size == 1 + 8 + 4 + 4
+
+
+def test_devices_that_are_read_together_have_limits_of_their_own(bench, in_process):
+    volts = {"volts_per_metre": 1.0, "position_limits": (-9.0, 9.0)}
+    wide = connected(bench, in_process, T7PositionSensor, channels=(4,), **volts)
+    fine = connected(bench, in_process, T7PositionSensor, channels=(5,), range=1.0, **volts)
+    pair = connected(bench, in_process, T7PositionSensor, channels=(8, 6), readout="currents")
+    for device, name in ((wide, "wide"), (fine, "fine"), (pair, "pair")):
+        device._signal = f"{name}_position"
+    glance = wide.joined([fine, pair])
+    bench.volts |= {4: 0.5, 5: 0.25, 8: 1.0, 6: 1.5}
+    expected = {
+        "wide_position": pytest.approx(0.5, abs=1e-2),
+        "fine_position": pytest.approx(0.25, abs=1e-2),
+        "pair_position": pytest.approx(0.037 / 2 * 0.5 / 2.5 / 185.0, rel=2e-2),
+    }
+    assert glance() == expected
+    # Over the range of the fine one, but not over its own.
+    bench.volts[4] = 5.0
+    assert glance() == expected | {"wide_position": pytest.approx(5.0, abs=1e-2)}
+    bench.volts[5] = 1.5
+    with pytest.raises(DeviceError, match=r"AIN5 reads \S+ V and is over its range of ±1 V"):
+        glance()
+    bench.volts |= {4: 0.5, 5: 0.25, 6: 9.995}
+    with pytest.raises(DeviceError, match=r"AIN6 reads \S+ V and is over its range of ±10 V"):
+        glance()
+
+
+def test_two_echoes_that_are_none_are_enough(bench, spoiling):
+    supply = connected(bench, "emulated://t7-spoiling", T7HighVoltageSupply, line=5)
+    supply.set(5.0)
+    spoiling.alter = [with_byte(8, 0x55), lambda answer: answer, lambda answer: answer, with_byte(8, 0x55)]
+    with pytest.raises(DeviceConnectionError, match="no reply from emulated://t7-spoiling"):
+        supply.set(10.0)
+    assert spoiling.alter == []
+
+
+def test_a_register_is_set_over_another_connection_if_the_former_has_ended(bench, in_process):
+    sensor = connected(bench, in_process, T7PositionSensor, channels=(3,))
+    for act in (
+        lambda: sensor._line.write(AIN_NEGATIVE_CH.of(9), 199),
+        lambda: sensor._line.send(Target.of(TDAC), 1.0),
+        lambda: sensor._line.read_span(Span.of(TEST)),
+        lambda: sensor._line.read_packet(Packet.of([Span.of(TEST)])),
+        lambda: sensor._line.read_spans([Span.of(TEST)]),
+    ):
+        sensor._line._connection.end()
+        act()
+        assert not sensor._line._connection.ended
+        assert sensor.repeats == 0
+    assert bench.t7.tdac_volts(0) == pytest.approx(1.0, abs=2e-3)

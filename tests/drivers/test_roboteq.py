@@ -1670,3 +1670,30 @@ def test_lines_of_the_adapter_in_any_pieces(script, supply):
         adapter._rest = b""
         adapter._take(b"t" * length)
         assert len(adapter._rest) == kept
+
+
+def test_command_that_is_acknowledged_too_late_counts_as_dropped(script, connect, clock):
+    supply = connect(watchdog=0.1)
+    original = script.answer
+
+    def answer(data):
+        if data[:3] == b"\x23\x00\x20":
+            clock.sleep(0.15)
+        return original(data)
+
+    script.answer = answer
+    with pytest.raises(DeviceError, match=r"no command arrives within the watchdog of 0\.1 s"):
+        supply.set(6.0)
+    # Once it has been seen how long a request takes, it is not sent again.
+    assert [value for index, _, value in script.orders()[-3:] if index == 0x2000] == [250, 0, 0]
+
+
+def test_refused_zero_after_a_gap(script, supply, clock):
+    supply.set(6.0)
+    clock.sleep(2.0)
+    script.aborts[0x2000, 1] = 0x08000022
+    with pytest.raises(DeviceError, match="refused 0 as its motor command"):
+        supply.measure()
+    # Another channel that is not there is no matter.
+    script.aborts = {(0x2000, 2): 0x06090011, (0x2000, 3): 0x06020000}
+    supply.safe()

@@ -704,3 +704,17 @@ def test_addresses(port, right):
 def test_a_serial_port_is_set_up_as_the_rig_file_says(stack, changes, options):
     port = Laboratory(stack, **changes).connect()._line._transport._port
     assert {key: getattr(port, key) for key in options} == options
+
+
+def test_a_sensor_that_is_connected_again_is_read(stack):
+    meter = {"identity": "EXAMPLE,DMM,{any}", "signals": {"current": {"query": "READ?", "unit": "A"}}}
+    lab = Laboratory(stack, meter, SCPISensor)
+    device = lab.connect()
+    device.reconnect()
+    assert lab.requests == ["*IDN?", "READ?"]
+
+
+def test_a_visa_address_needs_the_library(monkeypatch):
+    monkeypatch.setattr("drivers.scpi.transport.importlib.util.find_spec", lambda _: None)
+    with pytest.raises(ValueError, match=r"pip install 'actuator-bench\[visa\]'"):
+        SCPIActuator.Settings(port="visa://ASRL1::INSTR", **SUPPLY)
