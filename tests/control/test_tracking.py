@@ -14,7 +14,7 @@ from bench.control.baselines import IntegralControl, IntegralParameters, LookUp
 from bench.control.following import ClosedLoopFollower, FollowingParameters, IntegralFollower, OpenLoopFollower
 from bench.control.latched import Latched, LatchParameters, reversible_slope, walk
 from bench.control.references import modulated_sine, tracking_targets
-from bench.control.tracking import Arrival, ClosedLoopInverse, CorrectionParameters, OpenLoopInverse
+from bench.control.tracking import Arrival, ClosedLoopInverse, CorrectionParameters, OpenLoopInverse, widened
 from bench.control.tuning import Spans, tuned
 from bench.hysteresis import MemoryCurve, Polynomial, Preisach, Reach, uniform_levels
 from bench.hysteresis.inverse import PreisachInverse
@@ -635,3 +635,17 @@ class TestTuning:
     def test_nonsense_is_refused(self, options, words):
         with pytest.raises((ValueError, TypeError), match=words):
             tuned(CORRECTION, options)
+
+
+def test_what_is_plausible_is_a_range_with_its_own_width_at_both_ends(models):
+    assert widened(1.0, 3.0) == (-1.0, 5.0)
+    low, high = models.film.input_range
+    for name in ("open", "open-follower"):
+        for measured, taken in ((2.0 * low - high, True), (2.0 * high - low, True), (2.0 * low - high - 1e-6, False)):
+            controller = make(name, models)
+            before = controller.state.input
+            if name == "open":
+                controller.aim(900.0, 0.0, measured, 500.0)
+            else:
+                controller.update(0.0, measured, 500.0, 900.0)
+            assert (controller.state.input == before) is not taken

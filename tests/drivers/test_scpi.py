@@ -718,3 +718,21 @@ def test_a_visa_address_needs_the_library(monkeypatch):
     monkeypatch.setattr("drivers.scpi.transport.importlib.util.find_spec", lambda _: None)
     with pytest.raises(ValueError, match=r"pip install 'actuator-bench\[visa\]'"):
         SCPIActuator.Settings(port="visa://ASRL1::INSTR", **SUPPLY)
+
+
+def test_the_safe_state_is_asked_for_once_a_line(lab):
+    device = lab.connect()
+    device.set(5.0)
+    lab.answer = lambda data, usual: b"" if data == b"OUTP?\n" else usual(data)
+    lab.requests.clear()
+    with pytest.raises(DeviceError, match=r"does not confirm .*after 1 request;"):
+        device.safe()
+    assert lab.requests.count("OUTP?") == 2
+    # While the output is on, its state is asked for three times.
+    lab.answer = lambda data, usual: usual(data)
+    device.set(5.0)
+    lab.requests.clear()
+    lab.answer = lambda data, usual: b"" if data == b"OUTP?\n" else usual(data)
+    with pytest.raises(DeviceConnectionError, match="after 3 requests"):
+        device.glance()
+    assert lab.requests.count("OUTP?") == 3
