@@ -974,3 +974,15 @@ def test_a_still_signal_is_waited_for_in_steps(bench):
     cell.tare()
     steps = sorted(b - a for a, b in pairwise(times[:8]))
     assert steps[3] == pytest.approx(0.05, abs=0.005)
+
+
+def test_a_cell_over_its_range_is_told_on_reconnecting(bench):
+    cell = bench.cell()
+    cell.reconnect()
+    bench.bank.alter = lambda address, words: [*words[:4], 0x12] if address == 0x3500 else words
+    with pytest.raises(DeviceError, match="over its range"):
+        cell.reconnect()
+    bench.bank.alter = lambda _, words: words
+    bench.instrument.write_registers(0x2106, [0, 4])
+    with pytest.raises(DeviceRestartedError, match=r"its filter \(FL\) is 4, not 3"):
+        cell.reconnect()
