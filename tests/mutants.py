@@ -8,9 +8,9 @@ numba's cache does not see the change; they are compared with brute-force oracle
     python tests/mutants.py bench/control/tracking.py
 
 Those of a line that is executed when the module is loaded, such as a constant, may be killed by any test that
-executes a line of the module or has its name, and by the table of all settings. A mutant counts as killed if a test
-fails or does not end. The sample is drawn with a seed. Needs POSIX, as each mutant is a fork of a process that has
-loaded the libraries.
+executes a line of the module or has its name, and by the tables of all settings and values. A mutant counts as
+killed if a test fails or does not end. The sample is drawn with a seed. Needs POSIX, as each mutant is a fork of a
+process that has loaded the libraries.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 MODULES = ("bench/control", "bench/engine.py", "bench/journal", "drivers")
 TESTS = ("tests/control", "tests/drivers", "tests/contracts", "tests/bench", "tests/protocols")
-SETTINGS = "tests/contracts/test_settings.py"
+TABLES = ("tests/contracts/test_settings.py", "tests/contracts/test_values.py")
 MOST_TESTS, MOST_SECONDS = 300, 40.0
 _NOT_LOADED = 99
 COMPARISONS = {
@@ -251,12 +251,12 @@ def judge(mutant: Mutant, known: dict, folder: Path) -> str:
     at_loading = not mutant.first or (not found and str(mutant.line) in lines)
     if at_loading:
         found = {test for tests in lines.values() for test in tests}
-        found |= {test for test in known["seconds"] if any(each in test for each in (*own, SETTINGS))}
+        found |= {test for test in known["seconds"] if any(each in test for each in (*own, *TABLES))}
     tests, total = [], 0.0
 
     def order(test: str) -> tuple[bool, bool, float]:
         """Put those of the module or its package first, then the quick ones."""
-        is_table = at_loading and test.startswith(SETTINGS)
+        is_table = at_loading and test.startswith(TABLES)
         return not is_table, not any(each in test for each in own), known["seconds"][test]
 
     for test in sorted(found, key=order):
