@@ -142,24 +142,57 @@ def finished_process():
 
 @pytest.fixture(scope="session")
 def warm_start(tmp_path_factory):
-    """Return the socket of a process that starts Python programs as forks of it; None where it cannot watch them."""
+    """Return the socket of a process that starts Python programs as forks of it; None where it cannot watch them.
+
+    All workers use the same process. It ends when the last of them has closed the pipe.
+    """
     if not (hasattr(os, "fork") and hasattr(os, "pidfd_open")):
         yield None
         return
-    path = tmp_path_factory.mktemp("warm") / "socket"
-    command = [sys.executable, "-P", str(Path(__file__).with_name("warm_start.py")), str(path)]
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as server:
-        assert server.stdout.readline() == "ready\n"
-        yield path
+    import fcntl
+
+    folder = tmp_path_factory.getbasetemp()
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        folder = folder.parent
+    pipe, path = folder / "warm.pipe", folder / "warm.socket"
+    with (folder / "warm.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not pipe.exists():
+            os.mkfifo(pipe)
+        try:
+            held = os.open(pipe, os.O_WRONLY | os.O_NONBLOCK)
+        except OSError:
+            # Nobody reads it.
+            end = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+            held = os.open(pipe, os.O_WRONLY)
+            path.unlink(missing_ok=True)
+            command = [sys.executable, "-P", str(Path(__file__).with_name("warm_start.py")), str(path)]
+            # Returns when the process is ready.
+            subprocess.run(command, stdin=end, check=True)
+            os.close(end)
+    yield path
+    os.close(held)
+
+
+@pytest.fixture(scope="session")
+def warmly(warm_start):
+    """Start the Python programs of this process as forks, within a context."""
+
+    @contextmanager
+    def patched():
+        with pytest.MonkeyPatch.context() as patch:
+            if warm_start is not None:
+                patch.setattr(WarmPopen, "server", warm_start)
+                patch.setattr(subprocess, "Popen", WarmPopen)
+            yield
+
+    return patched
 
 
 @pytest.fixture(scope="module")
-def warm_popen(warm_start):
+def warm_popen(warmly):
     """Start the Python programs of this process as forks, where a cold start is not what is tested."""
-    with pytest.MonkeyPatch.context() as patch:
-        if warm_start is not None:
-            patch.setattr(WarmPopen, "server", warm_start)
-            patch.setattr(subprocess, "Popen", WarmPopen)
+    with warmly():
         yield
 
 

@@ -3,7 +3,8 @@
 A request is a connection to the Unix socket that the first argument names: arguments of `python`, folder,
 environment, and the session or group of processes that it gets as a line of JSON, with the descriptors of its
 standard streams.
-The answers are the process id, and at its end the exit code. The server ends with its standard input.
+The answers are the process id, and at its end the exit code. The server goes on in the background when it is ready,
+and ends with its standard input.
 """
 
 import atexit
@@ -20,6 +21,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from bench import registry
+from bench.protocol.discovery import packaged_protocols
 
 # Nothing that reads the width of the terminal or the entry points when it is imported.
 LIBRARIES = (
@@ -37,6 +39,8 @@ LIBRARIES = (
     "scipy.sparse",
     "scipy.special",
     "sqlite3",
+    "typer.main",
+    "bench.controllers",
     "bench.dashboard",
     "bench.results.report",
     "bench.runs",
@@ -126,14 +130,19 @@ def main():
     """Fork for each request."""
     for name in LIBRARIES:
         importlib.import_module(name)
-    # The first use of a kernel sets numba up.
-    runpy.run_path(str(Path(__file__).with_name("compile_kernels.py")))["operators"]()
+    # The first use of a kernel sets numba up, and each process would load those of its laboratory.
+    uses = runpy.run_path(str(Path(__file__).with_name("compile_kernels.py")))
+    uses["operators"]()
+    uses["laboratories"]()
+    packaged_protocols()
     # The pages of what is never collected stay shared.
     gc.freeze()
     server = socket.socket(socket.AF_UNIX)
     server.bind(sys.argv[1])
     server.listen()
-    print("ready", flush=True)
+    if os.fork():
+        # The end of this process says that the other one is ready.
+        os._exit(0)
     running = {}
     while sys.stdin not in (ready := select.select([sys.stdin, server, *running], [], [])[0]):
         for each in ready:

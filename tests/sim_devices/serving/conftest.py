@@ -3,7 +3,7 @@
 import json
 import subprocess
 import sys
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 import pytest
@@ -17,16 +17,20 @@ LONG = 60.0
 
 
 @pytest.fixture(scope="package")
-def sma():
+def sma(warmly):
     """The laboratory of the SMA wire, served for all tests of the package."""
-    with serve("sma", clock="x1") as rig:
+    with ExitStack() as stack:
+        with warmly():
+            rig = stack.enter_context(serve("sma", clock="x1"))
         yield rig
 
 
 @pytest.fixture(scope="package")
-def vo2():
+def vo2(warmly):
     """The VO2 laboratory, served for all tests of the package."""
-    with serve("vo2", clock="x1") as rig:
+    with ExitStack() as stack:
+        with warmly():
+            rig = stack.enter_context(serve("vo2", clock="x1"))
         yield rig
 
 
