@@ -24,7 +24,9 @@ PAGES = [
 EXECUTED = [*PAGES, *(DOCS / "reference" / f"{name}.md" for name in ("campaign", "interlocks"))]
 LONG = {
     "add-a-controller",
+    "campaign",
     "describe-an-instrument",
+    "hybrid",
     "identify-from-a-file",
     "resume-a-run",
     "sma",

@@ -16,10 +16,10 @@ from sim_devices.wire.canopen_slcan import CanopenSlcanServer
 
 @pytest.mark.parametrize("name", TARGETS)
 def test_no_input_does_harm(name):
-    outcome = fuzz(name, 2000, seed=0)
-    assert outcome.frames == 2000
+    outcome = fuzz(name, 1000, seed=0)
+    assert outcome.frames == 1000
     # Most requests reach the instrument, or the inputs would test the framing alone.
-    assert outcome.answers > 500
+    assert outcome.answers > 250
 
 
 @pytest.mark.parametrize("name", TARGETS)

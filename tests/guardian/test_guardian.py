@@ -136,13 +136,12 @@ class TestBenchGone:
     @pytest.mark.parametrize(
         "sent",
         [
-            b"GET / HTTP/1.1\r\n\r\n",
-            struct.pack(">I", 3) + b"[1]",
-            struct.pack(">I", 4) + b"{{{{",
-            struct.pack(">I", 1 << 31),
-            struct.pack(">I", 10) + b'{"n": 7, "',
+            pytest.param(b"GET / HTTP/1.1\r\n\r\n", id="no frame"),
+            pytest.param(struct.pack(">I", 10) + b'{"n": 7, "', id="torn JSON"),
+            pytest.param(struct.pack(">I", 3) + b"[1]", id="no object", marks=pytest.mark.seeds),
+            pytest.param(struct.pack(">I", 4) + b"{{{{", id="no JSON", marks=pytest.mark.seeds),
+            pytest.param(struct.pack(">I", 1 << 31), id="too long", marks=pytest.mark.seeds),
         ],
-        ids=["no frame", "no object", "no JSON", "too long", "torn JSON"],
     )
     def test_garbage(self, station, vo2, sent):
         it = station()
