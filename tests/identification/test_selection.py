@@ -4,9 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hysteretic_plants import bouc_wen, duhem, random_reversals, settled, through
+from hysteretic_plants import bouc_wen, butterfly, duhem, jiles_atherton, random_reversals, settled, through
 
 from bench.hysteresis import ModelSpec, Polynomial, PrandtlIshlinskii, Preisach, models, uniform_levels
+from bench.identification.by_name import set_up_problem
 from bench.identification.evaluation import Candidate, Evaluation, Measurements, evaluate
 from bench.identification.selection import Given, best_smoothing, is_within_one_standard_error, select
 from bench.timed.held_out import HeldOutInTime
@@ -186,6 +187,34 @@ def test_errors_left_out_are_those_of_fits_without_them():
         x = np.linalg.lstsq(columns[fold.trained], measured.outputs[fold.trained], rcond=None)[0]
         expected.append(np.mean((measured.outputs - columns @ x)[fold.tested] ** 2))
     np.testing.assert_allclose(found.blocks, expected, rtol=1e-8)
+
+
+@pytest.mark.seeds
+@pytest.mark.parametrize("plant", [duhem, jiles_atherton, butterfly])
+@pytest.mark.parametrize("seed", [10, 11])
+def test_penalties_of_all_rows_are_nearly_those_of_each_fold(plant, seed, capsys):
+    rng = np.random.default_rng(seed)
+    inputs = random_reversals(rng, 1500, 40)
+    outputs = noisy(settled(plant, inputs), 0.01, seed)
+    measured = Measurements.of(inputs, outputs)
+    one = Candidate("preisach-signed", {"levels": 20, "reversible": "linear"}, "auto", "skip", None)
+    found = evaluate(measured, [one])[0]
+    problem = set_up_problem(
+        one.model, inputs, outputs, None, measured.known, 0.0, one.initial, dict(one.options), orientation="auto"
+    )
+    errors = []
+    for fold in measured.blocks():
+        weights = fold.trained.astype(float)
+        penalties = replace(problem, weights=weights).regularization(None, None)
+        fit = problem.fit(penalties.smoothing, weights, ridge=penalties.ridge)
+        rest = outputs - fit.bias - problem.regressor.product(fit.coefficients)
+        errors.append(np.mean(rest[fold.tested] ** 2))
+    ratio = np.sqrt(np.mean(errors) / np.mean(found.blocks))
+    with capsys.disabled():
+        print(
+            f"\n{plant.__name__} {seed}: penalties of each fold, error {ratio:.3f} times that with those of all rows"
+        )
+    assert 0.85 <= ratio <= 1.15
 
 
 def test_what_is_left_out_still_drives_the_memory():
