@@ -6,7 +6,7 @@
 3. What is near the best is evaluated with whole units of the excitation left out, too.
 4. Of the smoothing weights the least error decides; among models, orders and reversible parts the simplest whose
    error is within one standard error of the best, from the differences fold by fold: always one within 2 % of it, and
-   never one more than 5 % above.
+   never one more than 5 % above. Of several that are about as simple it is the one of the least error.
 
 Source of the rule: Breiman, Friedman, Olshen, Stone, Classification and Regression Trees, 1984, section 3.4.3; its
 limits: Chen and Yang, Stat 10, e868, 2021 (the standard error is off by a factor of two either way, and a rule for
@@ -65,7 +65,7 @@ _WORSE = 1.05
 _UNBOUNDED = 1.2
 # Of one kind of cycle, what the record leaves open of a model is tested by nothing: it has to be so much better.
 _UNDETERMINED = 2.0
-# Part of their coefficients that a model may have which signs do not bound.
+# Part of the coefficients of another from which a model is clearly simpler.
 _FEWER = 2.0 / 3.0
 # Part of the variance of the errors that a trend over the rows must be, to be no chance of neighbouring errors.
 _DRIFTS, _FEWEST_OF_TREND = 0.15, 100
@@ -476,7 +476,7 @@ class _Search:
     def _decide(self, finalists: list[Evaluation]) -> tuple[Evaluation, Evaluation]:
         """Return the one of the least error, and the simplest near it, of those that may be chosen."""
         judged = [each for each in finalists if each.units] or self._without_units(finalists)
-        return _simplest_near_best(judged)
+        return simplest_near_best(judged)
 
     def _trend(self, chosen: Evaluation) -> Trend | None:
         """Return the trend of errors over the rows tested; None of fewer rows than tell one from chance."""
@@ -502,7 +502,7 @@ class _Search:
         bounded = [each for each in determined if self._is_bounded(each)]
         if not bounded:
             return determined
-        simplest = _simplest_near_best(bounded)[1]
+        simplest = simplest_near_best(bounded)[1]
         return bounded + [
             each
             for each in determined
@@ -600,11 +600,18 @@ def _times(number: int) -> str:
     return "once" if number == 1 else f"{number} times"
 
 
-def _simplest_near_best(judged: Sequence[Evaluation]) -> tuple[Evaluation, Evaluation]:
-    """Return the one of the least error, and the simplest within one standard error of it."""
+def simplest_near_best(judged: Sequence[Evaluation]) -> tuple[Evaluation, Evaluation]:
+    """Return the one of the least error, and the simplest within one standard error of it.
+
+    Those of up to half as many coefficients more are about as simple: of these it is the one of the least error.
+    """
     best = min(judged, key=lambda each: _score(each).mean())
     within = [each for each in judged if is_within_one_standard_error(each, best)]
-    return best, min(within, key=lambda each: (each.free, _score(each).mean()))
+    fewest = min(each.free for each in within)
+    return best, min(
+        (each for each in within if _FEWER * each.free <= fewest),
+        key=lambda each: (_score(each).mean(), each.free),
+    )
 
 
 def is_within_one_standard_error(simple: Evaluation, best: Evaluation) -> bool:

@@ -9,7 +9,13 @@ from hysteretic_plants import bouc_wen, butterfly, duhem, jiles_atherton, random
 from bench.hysteresis import ModelSpec, Polynomial, PrandtlIshlinskii, Preisach, models, uniform_levels
 from bench.identification.by_name import set_up_problem
 from bench.identification.evaluation import Candidate, Evaluation, Measurements, evaluate
-from bench.identification.selection import Given, best_smoothing, is_within_one_standard_error, select
+from bench.identification.selection import (
+    Given,
+    best_smoothing,
+    is_within_one_standard_error,
+    select,
+    simplest_near_best,
+)
 from bench.timed.held_out import HeldOutInTime
 
 INPUTS = random_reversals(np.random.default_rng(1), 400, 30)
@@ -39,6 +45,16 @@ class TestTheRuleOfOneStandardError:
         assert not is_within_one_standard_error(evaluation([1.021**2] * 5), best)
         # Within one standard error, but too much.
         assert not is_within_one_standard_error(evaluation([3.0, 0.2, 2.5, 0.1, 0.8]), best)
+
+    def test_of_models_about_as_simple_the_least_error_decides(self):
+        alike = [
+            evaluation([1.0] * 5, free=11.0),
+            evaluation([1.01] * 5, free=10.3),
+            evaluation([1.02] * 5, free=9.0),
+        ]
+        assert simplest_near_best(alike) == (alike[0], alike[0])
+        clear = [*alike, evaluation([1.03] * 5, free=5.0)]
+        assert simplest_near_best(clear) == (alike[0], clear[3])
 
     def test_units_left_out_count_as_much_as_blocks(self):
         best = evaluation([1.0] * 5, [1.0] * 5)
