@@ -16,6 +16,7 @@ from bench.identification.selection import (
     select,
     simplest_near_best,
 )
+from bench.timed import LinearPart
 from bench.timed.held_out import HeldOutInTime
 
 INPUTS = random_reversals(np.random.default_rng(1), 400, 30)
@@ -156,6 +157,24 @@ def test_one_rate_is_warned_of():
     assert not HeldOutInTime(measured, 0.1 * np.arange(inputs.size), inputs.size).has_one_rate()
     found = select(one, ("polynomial",), in_time=HeldOutInTime(one, 0.1 * np.arange(slow.size), slow.size))
     assert any("one speed" in text for text in found.warnings())
+
+
+@pytest.mark.seeds
+def test_at_one_rate_a_lag_is_not_taken_for_hysteresis():
+    rng = np.random.default_rng(1)
+    inputs = random_reversals(rng, 600, 25)
+    times = np.arange(600) / 960.0
+    lag = LinearPart(0.0, (1e-3, 0.0), np.empty(0), np.empty(0))
+    outputs = lag.respond(times, settled(jiles_atherton, inputs)[:, None])[0][:, 0]
+    outputs = outputs + 0.01 * np.ptp(outputs) * rng.standard_normal(600)
+    measured = Measurements.of(inputs, outputs)
+    in_time = HeldOutInTime(measured, times, 600)
+    assert in_time.has_one_rate()
+    found = select(measured, ("duhem", "generalized-prandtl-ishlinskii"), in_time=in_time)
+    # A differential equation does as well without time, at this rate.
+    assert found.evaluations[0].candidate.model == "duhem"
+    assert found.chosen.candidate.model == "hammerstein"
+    assert found.chosen.candidate.options["dynamics"] == "lag"
 
 
 def test_few_reversals_and_a_trend_of_the_errors_are_warned_of():
