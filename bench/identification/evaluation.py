@@ -23,7 +23,7 @@ from bench.identification.resolution import resolve
 _LEAST_MOVE = 0.005
 # Moves from this part of the range on make cycles.
 _LEAST_CYCLE = 0.02
-# Part of the range of all inputs from which rows cover it.
+# Part of a range from which rows cover it.
 _COVERED = 0.95
 # Rank of the regressor by coefficients, from which the data determine a model.
 _DETERMINED = 0.9
@@ -109,9 +109,9 @@ class Measurements:
         return np.asarray(self.fitted & (np.arange(self.inputs.size) >= self.known), dtype=bool)
 
     def covers_its_range(self) -> bool:
-        """Return whether the rows that are tested reach the inputs that all do, but for 5 % of the range."""
+        """Return whether the rows that are tested reach the inputs that all fitted ones do, to 5 % of the range."""
         tested = self.inputs[self.tested]
-        return bool(tested.size and np.ptp(tested) >= _COVERED * np.ptp(self.inputs))
+        return bool(tested.size and np.ptp(tested) >= _COVERED * np.ptp(self.inputs[self.fitted]))
 
     def blocks(self) -> tuple[Fold, ...]:
         """Return the folds of contiguous blocks of a cycle or more; rows before `known` are in every fit."""

@@ -4,9 +4,8 @@
    folds. The best orientation and memory of each are kept; what errs many times more than the best is given up.
 2. Finer ones are tried as long as they gain, on all folds, then the weights of the roughness penalty.
 3. What is near the best is evaluated with whole units of the excitation left out, too.
-4. Of the smoothing weights the least error decides; among models, orders and reversible parts the simplest whose
-   error is within one standard error of the best, from the differences fold by fold: always one within 2 % of it, and
-   never one more than 5 % above.
+4. Of the smoothing weights the least error decides; among models, orders and reversible parts one of the simplest
+   within one standard error of the best, from the differences fold by fold: always within 2 %, and never above 5 %.
 
 Source of the rule: Breiman, Friedman, Olshen, Stone, Classification and Regression Trees, 1984, section 3.4.3; its
 limits: Chen and Yang, Stat 10, e868, 2021 (the standard error is off by a factor of two either way, and a rule for
@@ -61,18 +60,19 @@ _GAIN = 0.98
 _MOST_COEFFICIENTS = 5
 # What the simplest may err more than the best, however large the standard error.
 _WORSE = 1.05
-# Without units left out nothing bounds a density of either sign on other inputs: it has to be so much better.
+# What no signs bound, on other inputs without units left out or at other rates, has to be so much better.
 _UNBOUNDED = 1.2
 # Of one kind of cycle, what the record leaves open of a model is tested by nothing: it has to be so much better.
 _UNDETERMINED = 2.0
-# Part of their coefficients that a model may have which signs do not bound.
+# Part of the coefficients of another from which a model is clearly simpler.
 _FEWER = 2.0 / 3.0
 # Part of the variance of the errors that a trend over the rows must be, to be no chance of neighbouring errors.
 _DRIFTS, _FEWEST_OF_TREND = 0.15, 100
 # Turns of the input that say nothing of its minor loops, and moves that are none.
 _FEW_REVERSALS, _LEAST_MOVE = 4, 0.02
-# Operators to which a linear part and a drift are added.
+# Operators to which a linear part and a drift are added, and what of it is a lag.
 _IN_TIME = 2
+_LAGS = {"lag", "resonance", "delay"}
 # Ratio of the two held-out errors from which the record is said to tell little of other inputs.
 _WARNED = 3.0
 
@@ -425,10 +425,12 @@ class _Search:
         for each in (self._decide(judged)[1], *sorted(judged, key=lambda one: one.rms)):
             if self._in_time_too(each.candidate):
                 best.setdefault(each.candidate.model, each)
+        tried = list(best.values())[:_IN_TIME]
+        if not any(_has_signs(each) for each in tried):
+            tried += [each for each in best.values() if _has_signs(each)][:1]
         gap = self.measured.gap
         tasks: list[tuple[str, Task]] = [
-            ("hammerstein", partial(self.in_time.evaluate, each.candidate, gap))
-            for each in list(best.values())[:_IN_TIME]
+            ("hammerstein", partial(self.in_time.evaluate, each.candidate, gap)) for each in tried
         ]
         found = [one for each in self.carry(tasks) for one in each]
         self.given_up += [each for each in found if each.failure]
@@ -475,8 +477,29 @@ class _Search:
 
     def _decide(self, finalists: list[Evaluation]) -> tuple[Evaluation, Evaluation]:
         """Return the one of the least error, and the simplest near it, of those that may be chosen."""
+        finalists = self._with_lag(finalists)
         judged = [each for each in finalists if each.units] or self._without_units(finalists)
-        return _simplest_near_best(judged)
+        return simplest_near_best(judged)
+
+    def _with_lag(self, finalists: list[Evaluation]) -> list[Evaluation]:
+        """Return the finalists; at one rate without those that leave time out, where signs ask for a lag.
+
+        There a model without signs takes a lag for hysteresis. One with signs moves with its input at once: where it
+        needs a lag, others must be so much better.
+        """
+        if self.in_time is None or not self.in_time.has_one_rate():
+            return finalists
+        lagging = [
+            _score(each).mean()
+            for each in finalists
+            if _has_signs(each) and _LAGS & set(str(each.candidate.options.get("dynamics")).split(","))
+        ]
+        least = min(lagging, default=float("inf"))
+        return [
+            each
+            for each in finalists
+            if "static" in each.candidate.options or not lagging or _UNBOUNDED**2 * _score(each).mean() < least
+        ]
 
     def _trend(self, chosen: Evaluation) -> Trend | None:
         """Return the trend of errors over the rows tested; None of fewer rows than tell one from chance."""
@@ -502,7 +525,7 @@ class _Search:
         bounded = [each for each in determined if self._is_bounded(each)]
         if not bounded:
             return determined
-        simplest = _simplest_near_best(bounded)[1]
+        simplest = simplest_near_best(bounded)[1]
         return bounded + [
             each
             for each in determined
@@ -514,8 +537,7 @@ class _Search:
 
     def _is_bounded(self, each: Evaluation) -> bool:
         """Return whether signs bound the answer to other inputs, or it has no memory."""
-        # A model without signs has no orientation.
-        if each.candidate.orientation != "auto":
+        if _has_signs(each):
             return True
         operator = find_model(each.candidate.options.get("static", each.candidate.model)).model
         # Beyond a single rise a polynomial is bounded by nothing, but for a straight line.
@@ -596,15 +618,26 @@ class _Search:
         return correlated_rows(residuals_of(self.measured, each.candidate)[self.measured.known :], max(1, block // 4))
 
 
+def _has_signs(each: Evaluation) -> bool:
+    return each.candidate.orientation != "auto"
+
+
 def _times(number: int) -> str:
     return "once" if number == 1 else f"{number} times"
 
 
-def _simplest_near_best(judged: Sequence[Evaluation]) -> tuple[Evaluation, Evaluation]:
-    """Return the one of the least error, and the simplest within one standard error of it."""
+def simplest_near_best(judged: Sequence[Evaluation]) -> tuple[Evaluation, Evaluation]:
+    """Return the one of the least error, and the simplest within one standard error of it.
+
+    Those of up to half as many coefficients more are about as simple: of these it is the one of the least error.
+    """
     best = min(judged, key=lambda each: _score(each).mean())
     within = [each for each in judged if is_within_one_standard_error(each, best)]
-    return best, min(within, key=lambda each: (each.free, _score(each).mean()))
+    fewest = min(each.free for each in within)
+    return best, min(
+        (each for each in within if _FEWER * each.free <= fewest),
+        key=lambda each: (_score(each).mean(), each.free),
+    )
 
 
 def is_within_one_standard_error(simple: Evaluation, best: Evaluation) -> bool:

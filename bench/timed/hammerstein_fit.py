@@ -31,7 +31,9 @@ from bench.timed.linear_parts import LinearPart, logarithmic_creep
 ELEMENTS = ("lag", "resonance", "delay", "creep", "kelvin-voigt", "drift", "fading-drift")
 """What can follow the operator: see `identify_hammerstein`."""
 
-_CHOICE = ("lag", "resonance", "delay", "creep", "drift")
+CHOICE = ("lag", "resonance", "delay", "creep", "drift")
+"""What is chosen among if nobody says what follows."""
+
 # What cannot stand beside each other.
 _EXCLUSIVE = ({"lag", "resonance"}, {"creep", "kelvin-voigt"}, {"drift", "fading-drift"})
 # Numbers of a regressor up to which the shape of the operator is found anew with what follows it, and how often.
@@ -439,7 +441,7 @@ def set_up_search(
     return problem, Search(times, problem, problem.regressor.dense(), roots, signs)
 
 
-def choose_elements(search: Search) -> tuple[Search, Found]:
+def choose_elements(search: Search, among: Sequence[str] = CHOICE) -> tuple[Search, Found]:
     """Return the elements that are worth it, one after the other, with the rest.
 
     The search that is returned has the operator's shape as it is with them.
@@ -449,7 +451,7 @@ def choose_elements(search: Search) -> tuple[Search, Found]:
     shortest, longest = search.creep_span
     while found.cost > 0.0:
         basis, trials = search.principal[:, :_FREE], []
-        for element in _CHOICE:
+        for element in among:
             kept = tuple(name for name in found.elements if not any({name, element} <= group for group in _EXCLUSIVE))
             if element in found.elements or (element == "lag" and "resonance" in found.elements):
                 continue

@@ -77,7 +77,7 @@ def ratio_to_cross_validated(plant, seed, options):
     inputs, others = reversals(seed), reversals(seed + 100)
     outputs, expected = (settled(plant, each) for each in (inputs, others))
     outputs = outputs + 0.01 * np.ptp(outputs) * np.random.default_rng(seed).normal(size=outputs.size)
-    found = identify("preisach-signed", inputs, outputs, initial="skip", **options)
+    found = identify("preisach-signed", inputs, outputs, skip=80, **options)
     return held_out(found, others, expected, 80) / found.regularization.rms
 
 

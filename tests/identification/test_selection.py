@@ -4,11 +4,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hysteretic_plants import bouc_wen, duhem, random_reversals, settled, through
+from hysteretic_plants import bouc_wen, butterfly, duhem, jiles_atherton, random_reversals, settled, through
 
 from bench.hysteresis import ModelSpec, Polynomial, PrandtlIshlinskii, Preisach, models, uniform_levels
+from bench.identification.by_name import set_up_problem
 from bench.identification.evaluation import Candidate, Evaluation, Measurements, evaluate
-from bench.identification.selection import Given, best_smoothing, is_within_one_standard_error, select
+from bench.identification.selection import (
+    Given,
+    best_smoothing,
+    is_within_one_standard_error,
+    select,
+    simplest_near_best,
+)
+from bench.timed import LinearPart
 from bench.timed.held_out import HeldOutInTime
 
 INPUTS = random_reversals(np.random.default_rng(1), 400, 30)
@@ -38,6 +46,16 @@ class TestTheRuleOfOneStandardError:
         assert not is_within_one_standard_error(evaluation([1.021**2] * 5), best)
         # Within one standard error, but too much.
         assert not is_within_one_standard_error(evaluation([3.0, 0.2, 2.5, 0.1, 0.8]), best)
+
+    def test_of_models_about_as_simple_the_least_error_decides(self):
+        alike = [
+            evaluation([1.0] * 5, free=11.0),
+            evaluation([1.01] * 5, free=10.3),
+            evaluation([1.02] * 5, free=9.0),
+        ]
+        assert simplest_near_best(alike) == (alike[0], alike[0])
+        clear = [*alike, evaluation([1.03] * 5, free=5.0)]
+        assert simplest_near_best(clear) == (alike[0], clear[3])
 
     def test_units_left_out_count_as_much_as_blocks(self):
         best = evaluation([1.0] * 5, [1.0] * 5)
@@ -141,6 +159,24 @@ def test_one_rate_is_warned_of():
     assert any("one speed" in text for text in found.warnings())
 
 
+@pytest.mark.seeds
+def test_at_one_rate_a_lag_is_not_taken_for_hysteresis():
+    rng = np.random.default_rng(1)
+    inputs = random_reversals(rng, 600, 25)
+    times = np.arange(600) / 960.0
+    lag = LinearPart(0.0, (1e-3, 0.0), np.empty(0), np.empty(0))
+    outputs = lag.respond(times, settled(jiles_atherton, inputs)[:, None])[0][:, 0]
+    outputs = outputs + 0.01 * np.ptp(outputs) * rng.standard_normal(600)
+    measured = Measurements.of(inputs, outputs)
+    in_time = HeldOutInTime(measured, times, 600)
+    assert in_time.has_one_rate()
+    found = select(measured, ("duhem", "generalized-prandtl-ishlinskii"), in_time=in_time)
+    # A differential equation does as well without time, at this rate.
+    assert found.evaluations[0].candidate.model == "duhem"
+    assert found.chosen.candidate.model == "hammerstein"
+    assert found.chosen.candidate.options["dynamics"] == "lag"
+
+
 def test_few_reversals_and_a_trend_of_the_errors_are_warned_of():
     rise = np.interp(np.arange(60), [0, 50, 59], [0.0, 1.0, 0.8])
     found = select(Measurements.of(rise, noisy(rise)), ("polynomial",))
@@ -186,6 +222,34 @@ def test_errors_left_out_are_those_of_fits_without_them():
         x = np.linalg.lstsq(columns[fold.trained], measured.outputs[fold.trained], rcond=None)[0]
         expected.append(np.mean((measured.outputs - columns @ x)[fold.tested] ** 2))
     np.testing.assert_allclose(found.blocks, expected, rtol=1e-8)
+
+
+@pytest.mark.seeds
+@pytest.mark.parametrize("plant", [duhem, jiles_atherton, butterfly])
+@pytest.mark.parametrize("seed", [10, 11])
+def test_penalties_of_all_rows_are_nearly_those_of_each_fold(plant, seed, capsys):
+    rng = np.random.default_rng(seed)
+    inputs = random_reversals(rng, 1500, 40)
+    outputs = noisy(settled(plant, inputs), 0.01, seed)
+    measured = Measurements.of(inputs, outputs)
+    one = Candidate("preisach-signed", {"levels": 20, "reversible": "linear"}, "auto", "skip", None)
+    found = evaluate(measured, [one])[0]
+    problem = set_up_problem(
+        one.model, inputs, outputs, None, measured.known, 0.0, one.initial, dict(one.options), orientation="auto"
+    )
+    errors = []
+    for fold in measured.blocks():
+        weights = fold.trained.astype(float)
+        penalties = replace(problem, weights=weights).regularization(None, None)
+        fit = problem.fit(penalties.smoothing, weights, ridge=penalties.ridge)
+        rest = outputs - fit.bias - problem.regressor.product(fit.coefficients)
+        errors.append(np.mean(rest[fold.tested] ** 2))
+    ratio = np.sqrt(np.mean(errors) / np.mean(found.blocks))
+    with capsys.disabled():
+        print(
+            f"\n{plant.__name__} {seed}: penalties of each fold, error {ratio:.3f} times that with those of all rows"
+        )
+    assert 0.85 <= ratio <= 1.15
 
 
 def test_what_is_left_out_still_drives_the_memory():
