@@ -113,6 +113,8 @@ class HybridLaboratorySettings(SensorSettings):
 def _use(plant: HybridCantilever) -> float:
     plant.advance(plant.parameters.step)
     plant.apply(1.0)
+    plant.lead(1.0, 2.0, 1, 1e-6)
+    plant.advance(plant.parameters.step)
     plant.terminals()
     return plant.deflection
 

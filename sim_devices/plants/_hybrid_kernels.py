@@ -11,6 +11,7 @@ import math
 from typing import NamedTuple
 
 from bench.compiled import inner, kernel
+from sim_devices.plants import _voltage_course_kernels as course_kernels
 from sim_devices.plants import cooler
 from sim_devices.plants.cooler import CLOSED, COMMAND, LIMIT, TARGET
 from sim_devices.plants.grid import Floats
@@ -87,7 +88,7 @@ class Coefficients(NamedTuple):
 
 # All numbers of a plant are one array: node temperatures, their change over the step under way, their shares in the
 # bending, the shape of the bent beam, fast state, constants of the fast part, slow state, command, constants of the
-# thermal step, node table, and the factorised matrix of a step.
+# thermal step, node table, the factorised matrix of a step, and the course of the voltage.
 PARTS = (
     NODES,
     NODES,
@@ -100,6 +101,7 @@ PARTS = (
     len(Coefficients._fields),
     NODE_ROWS * NODES,
     FACTOR_ROWS * NODES,
+    course_kernels.SIZE,
 )
 INCREMENT, SHARE, SHAPE = NODES, 2 * NODES, 3 * NODES
 FAST = SHAPE + SHAPE_SIZE
@@ -109,6 +111,7 @@ _COMMANDS = STATE + STATE_SIZE
 _COEFFICIENTS = _COMMANDS + COMMAND_SIZE
 _NODE_TABLE = _COEFFICIENTS + len(Coefficients._fields)
 _FACTORS = _NODE_TABLE + NODE_ROWS * NODES
+_COURSE = _FACTORS + FACTOR_ROWS * NODES
 
 
 class Thermal(NamedTuple):
@@ -137,7 +140,7 @@ def _thermal(plant: Floats) -> Thermal:
         plant[_COMMANDS:_COEFFICIENTS],
         Coefficients(c[0], c[1], c[2], c[3], c[4], c[5], c[6], c[7], c[8]),
         plant[_NODE_TABLE:_FACTORS].reshape((NODE_ROWS, NODES)),
-        plant[_FACTORS:].reshape((FACTOR_ROWS, NODES)),
+        plant[_FACTORS:_COURSE].reshape((FACTOR_ROWS, NODES)),
     )
 
 
@@ -370,3 +373,40 @@ def apply_voltage(voltage: float, elapsed: float, plant: Floats) -> None:
     fast[VOLTAGE] = voltage
     fast[LAG] = lag
     fast[DRIVE] = drive
+
+
+@kernel
+def lead_voltage(
+    start: float, target: float, steps: int, time_constant: float, elapsed: float, plant: Floats
+) -> float:
+    """Begin a course of the voltage, some time after its last change; return the time since that then."""
+    course = plant[_COURSE:]
+    course[course_kernels.START], course[course_kernels.TARGET] = start, target
+    course[course_kernels.STEPS], course[course_kernels.TAKEN] = steps, 0.0
+    course[course_kernels.TIME_CONSTANT] = time_constant
+    before = plant[FAST + VOLTAGE]
+    voltage = course_kernels.within(before, start, target)
+    if voltage != before:
+        apply_voltage(voltage, elapsed, plant)
+        return 0.0
+    return elapsed
+
+
+@kernel
+def follow_course(passed: float, elapsed: float, plant: Floats) -> tuple[float, bool]:
+    """Take the steps of the course up to an instant that is `passed` (s) after its beginning.
+
+    Takes and returns the time at that instant since the last change of the voltage, and returns whether the course
+    has come to its end.
+    """
+    course = plant[_COURSE:]
+    due = course_kernels.next_instant(course)
+    while due <= passed:
+        ago = passed - due
+        before = plant[FAST + VOLTAGE]
+        voltage = course_kernels.take_step(before, course)
+        if voltage != before:
+            apply_voltage(voltage, elapsed - ago, plant)
+            elapsed = ago
+        due = course_kernels.next_instant(course)
+    return elapsed, due == math.inf

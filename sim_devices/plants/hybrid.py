@@ -93,6 +93,9 @@ class HybridCantilever(CooledPlant[HybridParameters]):
         # Whether the change over the step under way is known, and the time since the voltage last changed.
         self._ahead = False
         self._elapsed = 0.0
+        # Whether a course of the voltage goes on, and since when.
+        self._is_led = False
+        self._passed = 0.0
 
         deviation = parameters.ambient_sd * float(self._noise.standard_normal())
         self._rise[:] = deviation
@@ -113,6 +116,7 @@ class HybridCantilever(CooledPlant[HybridParameters]):
             self._command,
             coefficients,
             nodes,
+            _,
             _,
         ) = np.split(self._numbers, np.cumsum(kernels.PARTS)[:-1])
         self._nodes = nodes.reshape(kernels.NODE_ROWS, kernels.NODES)
@@ -135,6 +139,10 @@ class HybridCantilever(CooledPlant[HybridParameters]):
         else:
             super().advance(dt)
         self._elapsed += dt
+        if self._is_led:
+            self._passed += dt
+            self._elapsed, is_over = kernels.follow_course(self._passed, self._elapsed, self._numbers)
+            self._is_led = not is_over
 
     def _take_steps(self, normals: Floats) -> None:
         begin_next = self._pending > GRID_TOLERANCE
@@ -185,10 +193,39 @@ class HybridCantilever(CooledPlant[HybridParameters]):
         ValueError
             If the voltage is out of range.
         """
-        if not abs(voltage) <= self._parameters.maximum_voltage:
-            raise ValueError(f"voltage must lie within ±{self._parameters.maximum_voltage} V, not {voltage} V")
+        self._check_voltage(voltage)
         kernels.apply_voltage(voltage, self._elapsed, self._numbers)
         self._elapsed = 0.0
+        self._is_led = False
+
+    def lead(self, start: float, target: float, steps: int, time_constant: float) -> None:
+        """Let the voltage go as a lag of first order does, in even steps.
+
+        Each step comes at the instant at which the lag passes its middle. A voltage that is ahead of the lag waits
+        for it.
+
+        Parameters
+        ----------
+        start, target : float
+            Where the lag is now, and where it goes, V, within ±``parameters.maximum_voltage``.
+        steps : int
+            Number of steps, 0 or more.
+        time_constant : float
+            Of the lag, s.
+
+        Raises
+        ------
+        ValueError
+            If the voltage is out of range.
+        """
+        self._check_voltage(start)
+        self._check_voltage(target)
+        self._elapsed = kernels.lead_voltage(start, target, steps, time_constant, self._elapsed, self._numbers)
+        self._is_led, self._passed = steps > 0, 0.0
+
+    def _check_voltage(self, voltage: float) -> None:
+        if not abs(voltage) <= self._parameters.maximum_voltage:
+            raise ValueError(f"voltage must lie within ±{self._parameters.maximum_voltage} V, not {voltage} V")
 
     @property
     def _fraction(self) -> float:

@@ -14,12 +14,12 @@ from sim_devices.world import World
 class PiezoLoad(Protocol):
     """The load of a high-voltage amplifier."""
 
-    def apply(self, voltage: float) -> None:
-        """Apply a voltage, V; held until the next."""
+    def lead(self, start: float, target: float, steps: int, time_constant: float) -> None:
+        """Go with a voltage from `start` to `target` (V) as a lag of first order does (s), in so many even steps."""
 
 
 class PiezoAmplifier:
-    """A high-voltage amplifier of fixed gain with an enable input, two monitors and a status output; `Timed`.
+    """A high-voltage amplifier of fixed gain with an enable input, two monitors and a status output.
 
     The output goes to a new value as a lag of first order does. The monitors show it exactly. The load, which
     holds a voltage until the next, gets it in even steps of `STEP` or less, each at the instant at which the
@@ -82,11 +82,8 @@ class PiezoAmplifier:
         self._saturation = self.SATURATION
         self._enabled = False
         self._tripped = False
-        self._start = self._target = self._applied = 0.0
+        self._start = self._target = 0.0
         self._since = world.time
-        self._step = self._steps = 0
-        self._due = math.inf
-        self._announce = world.add(self, announces=True)
 
     @property
     def on(self) -> bool:
@@ -134,17 +131,6 @@ class PiezoAmplifier:
         """Return the voltage in V of the status output: high while the amplifier is on."""
         return self.STATUS if self.on else 0.0
 
-    def deadline(self) -> float:
-        """Return when the load gets its next step, in laboratory seconds; infinity when the output has settled."""
-        return self._due
-
-    def expire(self) -> None:
-        """Give the load its next step."""
-        self._step += 1
-        share = self._step / self._steps
-        self._apply(self._start + share * (self._target - self._start) if share < 1 else self._target)
-        self._schedule()
-
     def _follow(self) -> None:
         output = self._gain * (self._input - self._offset) if self.on else 0.0
         target = min(max(output, -self._saturation), self._saturation)
@@ -153,21 +139,5 @@ class PiezoAmplifier:
         self._start = self.voltage
         self._target = target
         self._since = self._world.time
-        self._apply(self._start)
-        self._step = 0
-        self._steps = math.ceil(abs(target - self._start) / self.STEP)
-        self._schedule()
-
-    def _schedule(self) -> None:
-        left = self._steps - self._step - 0.5
-        self._due = self._since + self._time_constant * math.log(self._steps / left) if left > 0 else math.inf
-        self._announce(self._due)
-
-    def _apply(self, volts: float) -> None:
-        # A load that is ahead of the output waits for it: going back would be a loop of its hysteresis.
-        low, high = (volts, self._target) if volts < self._target else (self._target, volts)
-        applied = self._applied
-        if low <= applied <= high:
-            return
-        self._applied = low if applied < low else high
-        self._load.apply(self._applied)
+        steps = math.ceil(abs(target - self._start) / self.STEP)
+        self._load.lead(self._start, target, steps, self._time_constant)

@@ -210,7 +210,7 @@ class _Still:
     def advance(self, dt):
         pass
 
-    def apply(self, voltage):
+    def lead(self, start, target, steps, time_constant):
         pass
 
 

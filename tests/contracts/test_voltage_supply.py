@@ -26,6 +26,7 @@ from drivers.roboteq import RoboteqSupply
 from sim_devices.instruments.labjack_t7 import TDAC_STEP, EmulatedT7
 from sim_devices.instruments.roboteq import EmulatedRoboteq
 from sim_devices.instruments.roboteq_objects import ChannelFlag, Fault
+from sim_devices.plants import _voltage_course_kernels as course_kernels
 from sim_devices.transducers.piezo_amplifier import PiezoAmplifier
 from sim_devices.wire import WireServer
 from sim_devices.wire.canopen_slcan import CanopenSlcanServer
@@ -43,17 +44,31 @@ class Resistor:
         self.world = None
         self.voltage = 0.0
         self.applied = []
+        self.course = np.zeros(course_kernels.SIZE)
+        self.led_at = 0.0
 
     def apply(self, voltage):
         self.voltage = voltage
         self.applied.append((self.world.time, voltage))
+
+    def lead(self, start, target, steps, time_constant):
+        self.course[:] = start, target, steps, 0, time_constant
+        self.led_at = self.world.time
+        self.note(self.led_at, course_kernels.within(self.voltage, start, target))
+
+    def note(self, instant, voltage):
+        if voltage != self.voltage:
+            self.voltage = voltage
+            self.applied.append((instant, voltage))
 
     @property
     def current(self):
         return self.voltage / RESISTANCE
 
     def advance(self, dt):
-        pass
+        end = self.world.time + dt
+        while (instant := self.led_at + course_kernels.next_instant(self.course)) <= end:
+            self.note(instant, course_kernels.take_step(self.voltage, self.course))
 
 
 class LosingServer(WireServer):

@@ -55,7 +55,7 @@ class Still:
 
 
 class Load:
-    def apply(self, voltage: float) -> None:
+    def lead(self, start: float, target: float, steps: int, time_constant: float) -> None:
         pass
 
 

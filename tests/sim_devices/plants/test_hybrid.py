@@ -441,6 +441,44 @@ class TestTime:
         cut = play(LIVELY, [50e-6 * n for n in range(24_000)])
         assert np.allclose(snapshot(whole), snapshot(cut), rtol=1e-10, atol=1e-15)
 
+    def test_a_voltage_that_is_led_goes_in_even_steps_at_the_middles_of_the_lag(self):
+        led, by_hand, cut = make(LIVELY), make(LIVELY), make(LIVELY)
+        for plant in (led, by_hand, cut):
+            plant.advance(0.0123456)
+            plant.apply(2.0)
+            plant.advance(1e-3)
+        for plant in (led, cut):
+            plant.lead(2.0, 3.0, 4, 20e-6)
+        led.advance(0.02)
+        for _ in range(2000):
+            cut.advance(1e-5)
+        now = 0.0
+        for step in range(1, 5):
+            instant = 20e-6 * math.log(4.0 / (4.5 - step))
+            by_hand.advance(instant - now)
+            by_hand.apply(2.0 + 0.25 * step)
+            now = instant
+        by_hand.advance(0.02 - now)
+        assert led.piezo_voltage == cut.piezo_voltage == by_hand.piezo_voltage == 3.0
+        for each in (led, cut):
+            assert each.deflection == pytest.approx(by_hand.deflection, rel=1e-10)
+
+    def test_a_voltage_ahead_of_the_lag_waits_for_it(self):
+        plant = make(PURE)
+        plant.apply(2.0)
+        plant.lead(1.0, 3.0, 2, 20e-6)
+        assert plant.piezo_voltage == 2.0
+        plant.advance(7e-6)
+        assert plant.piezo_voltage == 2.0
+        plant.advance(1.0)
+        assert plant.piezo_voltage == 3.0
+        plant.lead(3.0, 0.0, 2, 20e-6)
+        plant.apply(5.0)
+        plant.advance(1.0)
+        assert plant.piezo_voltage == 5.0
+        with pytest.raises(ValueError, match="voltage must lie within"):
+            plant.lead(0.0, 61.0, 1, 20e-6)
+
     def test_hours_at_once_or_in_pieces(self):
         whole, cut = make(LIVELY), make(LIVELY)
         for plant in (whole, cut):
