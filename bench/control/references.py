@@ -242,6 +242,11 @@ class ApproachedReference:
         self.delay = 0.0
         """Time by which the other reference is put off, s."""
 
+    @property
+    def from_here(self) -> Reference:
+        """What gives the position from `begin` on: the other reference itself, where nothing is put before it."""
+        return self._reference if self._approach is None else self
+
     def begin(self, output: float) -> None:
         """Begin at the output of the moment (output units)."""
         first = self._reference(0.0)

@@ -185,9 +185,12 @@ class StationCore:
         except InterlockError as error:
             self.trip(error)
             return ()
-        acts_at = (t if now is None else now) + (self._watch.due_after(t) - t) / factor
-        # One in the past waits for a signal that this look has not seen, and whose own may still have to begin.
-        self._acts_at = acts_at if self._watch.due > t else min(self._acts_at, acts_at)
+        if (due := self._watch.due) == math.inf:
+            self._acts_at = math.inf
+        else:
+            acts_at = (t if now is None else now) + (self._watch.due_after(t) - t) / factor
+            # One in the past waits for a signal that this look has not seen, and whose own may still have to begin.
+            self._acts_at = acts_at if due > t else min(self._acts_at, acts_at)
         if findings:
             self.holding = any(each.level is Level.HOLD for each in self._watch.active)
             for each in findings:

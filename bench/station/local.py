@@ -111,11 +111,7 @@ class LocalStation(Station):
         def move(setpoints: Sequence[float]) -> None:
             if core.over:
                 core.raise_if_over()
-            changed = [
-                (actuator, value)
-                for actuator, value in zip(devices, setpoints, strict=True)
-                if value != actuator.setpoint
-            ]
+            changed = [each for each in zip(devices, setpoints, strict=True) if each[1] != each[0].setpoint]
             # None is sent when another is wrong; of one alone `set` sees it by itself.
             if len(changed) > 1:
                 for actuator, value in changed:
@@ -170,8 +166,10 @@ class LocalStation(Station):
 
     def judge(self, t: float, values: Mapping[str, float]) -> None:
         """Judge readings that were recorded by the interlocks."""
-        self._note(self._core.judge(t, values))
-        self._raise_if_tripped()
+        core = self._core
+        self._note(core.judge(t, values))
+        if core.cause is not None:
+            raise core.cause
 
     def sleep_until(self, instant: float) -> None:
         """Let laboratory time pass up to an instant, s; looks at the interlocks that are due on the way are taken."""

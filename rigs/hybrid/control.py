@@ -175,6 +175,7 @@ class _MidRanging:
         self._model = model
         self._make_estimate = estimate
         self._reference = ApproachedReference(reference, _NEAR * parameters.stroke, parameters.approach)
+        self._position: Reference = self._reference
         self._step = parameters.period * parameters.every
         self._prepare(model.reference)
         self._inverse = inverse = PlayInverse(model.hysteresis, parameters.stroke) if piezo else None
@@ -201,7 +202,7 @@ class _MidRanging:
         self._bending = Bending(model.polynomial, room - model.reference)
         self._network = ReducedNetwork(model.network, room)
         self._estimate = self._make_estimate(self._bending, self._network)
-        self._preview = _Preview(self._reference, p.window, p.lead, self._step)
+        self._preview = _Preview(self._position, p.window, p.lead, self._step)
 
     @property
     def delay(self) -> float:
@@ -212,6 +213,7 @@ class _MidRanging:
         """Begin at the first readings: deflection without the piezo part (m), temperatures (°C)."""
         self._start = t
         self._reference.begin(deflection)
+        self._position = self._reference.from_here
         # A rig that has rested is as warm as the room. Otherwise the room is that of the model.
         self._prepare(0.5 * (base + tip) if abs(base - tip) < _AT_REST else self._model.reference)
         self._estimate.begin(deflection, base - self._celsius, tip - self._celsius)
@@ -246,6 +248,7 @@ class _MidRanging:
         if len(measured) != 3:
             raise ValueError(f"measured: expected deflection and two temperatures, got {len(measured)} readings")
         deflection, base, tip = measured
+        p, inverse = self._p, self._inverse
         complete = math.isfinite(deflection + base + tip)
         if complete:
             piezo = self._seen_piezo() if self._is_late else self._asked[0]
@@ -256,31 +259,30 @@ class _MidRanging:
         elif math.isnan(self._start):
             return self._current, self._voltage
         now = t - self._start
-        self._wanted = wanted = self._reference(now)
-        if self._samples % self._p.every == 0:
+        self._wanted = wanted = self._position(now)
+        if self._samples % p.every == 0:
             self._heat(now, hold=not complete)
         self._samples += 1
-        if complete and self._inverse is not None:
+        if complete and inverse is not None:
             # The voltage aims at the reference at the end of the coming period.
-            thermal = self._estimate.value + self._p.period * self._estimate.rate
-            feedforward = self._reference(now + self._p.period) - thermal
-            late = self._p.lateness
-            error = (self._reference(now - late) if late else wanted) - deflection
+            period, late, estimate = p.period, p.lateness, self._estimate
+            feedforward = self._position(now + period) - (estimate.value + period * estimate.rate)
+            error = (self._position(now - late) if late else wanted) - deflection
             if self._probe is not None and now >= BEGIN:
                 # The integral waits.
                 added = self._probe.wave(now)
-                self._voltage = self._inverse.input(feedforward + self._integral + added)
+                self._voltage = inverse.input(feedforward + self._integral + added)
                 self._probe.note(added, -error)
                 if now >= END:
                     self._check_lateness(self._probe)
                     self._probe = None
-                self._asked.appendleft(self._inverse.output)
+                self._asked.appendleft(inverse.output)
                 return self._current, self._voltage
-            self._voltage = self._inverse.input(feedforward + self._integral + self._integral_gain * error)
-            self._asked.appendleft(self._inverse.output)
+            self._voltage = inverse.input(feedforward + self._integral + self._integral_gain * error)
+            self._asked.appendleft(inverse.output)
             if self._integral_gain:
                 # The part clipped by the stroke is taken back: the integral does not wind up.
-                self._integral = self._inverse.output - feedforward
+                self._integral = inverse.output - feedforward
         return self._current, self._voltage
 
     def _heat(self, now: float, *, hold: bool) -> None:

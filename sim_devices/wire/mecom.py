@@ -41,7 +41,7 @@ _SHORTEST_FRAME = 11
 _PREAMBLE = re.compile(rb"#[0-9A-F]{6}")
 _HEX = re.compile(r"[0-9A-F]*")
 _VALUE = re.compile(rb"[0-9A-F]{8}")
-_WRITE_HEAD, _WRITE_LENGTH = 8, 16  # characters of a payload that writes: command and parameter; these and the value
+_WRITE_HEAD = 8  # characters of a payload that writes: command and parameter, before the value
 _FORMS = {"INT32": struct.Struct(">i"), "FLOAT32": struct.Struct(">f")}
 _PARSED = 256  # payloads that are kept as parsed; a client that measures sends a few over and over
 
@@ -131,8 +131,17 @@ class MeComServer(WireServer):
         head = b"!" + body[1:7]
         try:
             payload = body[7:]
-            selection = self._selections.get(payload)
-            content = self._act(payload) if selection is None else self._values(selection)
+            # A client sends a few payloads over and over, those that write with other values.
+            if (selection := self._selections.get(payload)) is not None:
+                content = self._values(selection)
+            elif (writing := self._writes.get(payload[:_WRITE_HEAD])) is not None and _VALUE.fullmatch(
+                payload, _WRITE_HEAD
+            ):
+                row, instance, form = writing
+                device.assign(row, _number(form, unhexlify(payload[_WRITE_HEAD:])), instance)
+                content = b""
+            else:
+                content = self._act(payload)
         except RequestRefusedError as error:
             content = b"+%02X" % error.reason
         if number == _SILENT:
@@ -143,11 +152,6 @@ class MeComServer(WireServer):
 
     def _act(self, request: bytes) -> bytes:
         """Carry a request out; return the payload of the answer, empty for an acknowledge."""
-        writing = self._writes.get(request[:_WRITE_HEAD])
-        if writing is not None and len(request) == _WRITE_LENGTH and _VALUE.match(request, _WRITE_HEAD):
-            row, instance, form = writing
-            self._device.assign(row, _number(form, unhexlify(request[_WRITE_HEAD:])), instance)
-            return b""
         payload = request.decode("ascii", "replace")
         command = payload[:3] if payload.startswith("?") else payload[:2]
         operand = payload[len(command) :]
