@@ -67,7 +67,10 @@ def learnt(adaptation, found):
 
 @pytest.mark.parametrize("name", ["session", "density"])
 class TestBoth:
-    @pytest.mark.parametrize("changed", PERTURBED)
+    @pytest.mark.parametrize(
+        "changed",
+        [each if each in ("gain", "all") else pytest.param(each, marks=pytest.mark.seeds) for each in PERTURBED],
+    )
     def test_a_specimen_that_moved_is_explained_after_sixty_readings(self, identified, name, changed):
         found = readings(specimen(identified, **PERTURBED[changed]), 100)
         before = rms([output - identified.value(state) for state, output in found[60:]])

@@ -23,7 +23,7 @@ from sim_devices.wire.canopen_slcan import CanopenSlcanServer
 from sim_devices.wire.dynamixel2 import Dynamixel2Server
 from sim_devices.world import World
 
-CALLS = 2000
+CALLS = 1000
 TIMEOUT = 0.1
 LATEST = 2.8 * TIMEOUT
 FAULTS = {

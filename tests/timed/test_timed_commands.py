@@ -42,7 +42,7 @@ def oscillator(folder):
         (hammerstein, ("--model", "hammerstein", "--levels", 5, "--dynamics", "none", "--skip", 20)),
         (hammerstein, ("--model", "hammerstein", "--static", "polynomial", "--degree", 3, "--dynamics", "lag,drift")),
         (hammerstein, ("--model", "hammerstein", "--levels", 5, "--dynamics", "lag", "--initial", "positive")),
-        (oscillator, ("--model", "bouc-wen-oscillator")),
+        pytest.param(oscillator, ("--model", "bouc-wen-oscillator"), marks=pytest.mark.seeds),
         (oscillator, ("--model", "preisach-oscillator", "--levels", 4)),
     ],
 )
