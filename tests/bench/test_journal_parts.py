@@ -12,7 +12,7 @@ import pytest
 
 from bench.devices import Signal
 from bench.errors import ConfigurationError, DataError, RecordError
-from bench.journal import FILE_NAME, Event, Journal, Record, StepRecord, background, keeping
+from bench.journal import FILE_NAME, Event, Journal, Record, StepRecord, background, keeping, opening
 from bench.journal.background import Background
 from bench.journal.keeping import RESERVE_NAME, Keeper
 from bench.journal.mirror import NAME as MIRROR_NAME
@@ -626,3 +626,16 @@ def test_a_model_in_an_old_journal_that_is_damaged(tmp_path):
         db.commit()
     with Record(tmp_path) as record, pytest.raises(DataError, match="is damaged: Expecting property name"):
         record.models()
+
+
+@pytest.mark.parametrize("problem", ["disk I/O error", "database disk image is malformed"])
+def test_a_journal_that_cannot_be_opened_is_named(tmp_path, monkeypatch, problem):
+    with _unfinished(tmp_path):
+        pass
+
+    def refuse(*_):
+        raise sqlite3.OperationalError(problem)
+
+    monkeypatch.setattr(opening, "_connected", refuse)
+    with pytest.raises(DataError, match=f"is not a readable journal: {problem}"):
+        Record(tmp_path)
