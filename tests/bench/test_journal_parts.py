@@ -12,7 +12,7 @@ import pytest
 
 from bench.devices import Signal
 from bench.errors import ConfigurationError, DataError, RecordError
-from bench.journal import FILE_NAME, Event, Journal, Record, StepRecord, background, keeping
+from bench.journal import FILE_NAME, Event, Journal, Record, StepRecord, background, keeping, opening
 from bench.journal.background import Background
 from bench.journal.keeping import RESERVE_NAME, Keeper
 from bench.journal.mirror import NAME as MIRROR_NAME
@@ -626,3 +626,31 @@ def test_a_model_in_an_old_journal_that_is_damaged(tmp_path):
         db.commit()
     with Record(tmp_path) as record, pytest.raises(DataError, match="is damaged: Expecting property name"):
         record.models()
+
+
+@pytest.mark.parametrize("problem", ["disk I/O error", "database disk image is malformed"])
+def test_a_journal_that_cannot_be_opened_is_named(tmp_path, monkeypatch, problem):
+    with _unfinished(tmp_path):
+        pass
+
+    def refuse(*_):
+        raise sqlite3.OperationalError(problem)
+
+    monkeypatch.setattr(opening, "_connected", refuse)
+    with pytest.raises(DataError, match=f"is not a readable journal: {problem}"):
+        Record(tmp_path)
+
+
+def test_readers_are_waited_for_at_the_beginning_and_nobody_later(tmp_path, monkeypatch):
+    waits, create, forget = [], Store.create, Store.forget
+
+    def wait_of(store):
+        return store._db.execute("PRAGMA busy_timeout").fetchone()[0]
+
+    monkeypatch.setattr(Store, "create", lambda self, *a: waits.append(wait_of(self)) or create(self, *a))
+    monkeypatch.setattr(Store, "forget", lambda self, *a: waits.append(wait_of(self)) or forget(self, *a))
+    for opened in (lambda: Journal(tmp_path / FILE_NAME, SIGNALS, {}), lambda: Journal.reopen(tmp_path)):
+        journal = opened()
+        assert wait_of(journal._keeper.store) == 0
+        journal.close()
+    assert waits == [10_000, 10_000]

@@ -50,6 +50,18 @@ def film():
     return Preisach(levels, density, 3.0, QuadraticTerm(-0.4), (-1.0, 12.0), output_unit="1/m")
 
 
+def opposite(model):
+    """Return the model with the opposite output."""
+    return model.with_coefficients(-model.coefficients, -model.bias)
+
+
+def mixed(model):
+    """Return the model with a part of its density negative."""
+    cells = model.density.size
+    signs = np.where(np.arange(cells) % 7 == 3, -0.2, 1.0)
+    return model.with_coefficients(np.concatenate([signs * model.density, model.coefficients[cells:]]), model.bias)
+
+
 class Plant:
     """A model behind an input with a lag, or of second order, with an offset and noise of the output."""
 
@@ -296,6 +308,8 @@ SCENES = {
         "session", model=PrandtlIshlinskii(np.array([0.0, 1.0]), np.array([2.0, 1.0]), input_range=(-1.0, 11.0))
     ),
     "density filter": lambda: learning("density"),
+    "density filter of one that falls": lambda: learning("density", model=opposite(film())),
+    "density filter of one with both signs": lambda: learning("density", model=mixed(film())),
     "estimators": estimating,
     "references": referring,
     "notch loop": notched,

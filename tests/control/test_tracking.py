@@ -495,6 +495,16 @@ class TestLatched:
             assert t < 3000.0
         assert not controller.locked
 
+    def test_it_is_doubted_when_its_lock_held_at_three_targets_in_a_row_nowhere(self, models):
+        controller, t, setpoint = make("latched", models, NARROW), 0.0, 50.0
+        for target in (900.0, 800.0, 1000.0):
+            assert controller.doubt == ""
+            command = controller.aim(target, t, setpoint, 200.0)
+            while not command.done:
+                t, setpoint = t + command.wait, command.setpoint
+                command = controller.update(t, setpoint, 200.0)
+        assert controller.doubt.startswith("its lock held at none of the last 3 targets after 10 approaches each")
+
     def test_the_parameters_keep_the_step_within_the_stretch(self):
         with pytest.raises(ValueError, match="step_back"):
             replace(LATCH, step_back=1.5)

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from bench.control import two_stage_inverse
 from bench.control.two_stage_inverse import TwoStageInverse
 from bench.hysteresis import (
     DeadZones,
@@ -308,3 +309,14 @@ def test_wrong_input_is_named(make, message):
 def ask(task, *arguments):
     model = wire()
     return getattr(TwoStageInverse(model), task)(model.initial_state(), *arguments)
+
+
+def test_what_counts_as_met_is_a_part_of_the_spans():
+    model = wire()
+    inverse = TwoStageInverse(model)
+    spans = [float(np.ptp(stage.output_range())) for stage in (model.first, model.second)]
+    forces = spans[0] + float(np.ptp(model.second.input_range))
+    assert inverse._tolerances == pytest.approx((1e-10 * forces, 1e-10 * spans[1]), rel=1e-9)
+    assert [two_stage_inverse._flag(5.0 + off, 5.0, 0.25).name for off in (0.25, -0.25, 0.26, -0.26)] == [
+        "MET", "MET", "TOO_LOW", "TOO_HIGH",
+    ]  # fmt: skip

@@ -2136,3 +2136,23 @@ def test_a_register_is_set_over_another_connection_if_the_former_has_ended(bench
         assert not sensor._line._connection.ended
         assert sensor.repeats == 0
     assert bench.t7.tdac_volts(0) == pytest.approx(1.0, abs=2e-3)
+
+
+def test_every_request_of_a_closed_device_says_so(bench, in_process):
+    supply = connected(bench, in_process, T7HighVoltageSupply, line=5)
+    sensor = connected(bench, in_process, T7PositionSensor, channels=(3,))
+    supply.set(0.0)
+    supply.close()
+    line, span = supply._line, Span.of(TEST)
+    assert not line._connection.ended  # the sensor still uses it
+    for act in (
+        lambda: line.write(AIN_NEGATIVE_CH.of(9), 199),
+        lambda: line.send(Target.of(TDAC), 1.0),
+        lambda: line.read_span(span),
+        lambda: line.read_packet(Packet.of([span])),
+        lambda: line.read_spans([span]),
+        lambda: line.play(sensor.conversions, TDAC, np.zeros(2), 100),
+    ):
+        with pytest.raises(DeviceConnectionError, match="was closed by its device; connect again"):
+            act()
+    assert bench.t7.tdac_volts(0) == 0.0

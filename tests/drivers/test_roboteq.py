@@ -1697,3 +1697,14 @@ def test_refused_zero_after_a_gap(script, supply, clock):
     # Another channel that is not there is no matter.
     script.aborts = {(0x2000, 2): 0x06090011, (0x2000, 3): 0x06020000}
     supply.safe()
+
+
+@pytest.mark.parametrize(("channel", "code"), [(1, 0x06090011), (1, 0x08000022), (2, 0x08000022)])
+def test_zero_that_is_refused_after_a_gap_is_told(script, connect, clock, channel, code):
+    script.objects |= {(0x2102, 2): (0, 2)}
+    supply = connect()
+    supply.set(6.0)
+    clock.sleep(2.0)
+    script.aborts[0x2000, channel] = code
+    with pytest.raises(DeviceError, match=f"refused 0 as its motor command \\(object 0x2000:{channel}\\)"):
+        supply.measure()

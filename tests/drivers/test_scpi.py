@@ -736,3 +736,13 @@ def test_the_safe_state_is_asked_for_once_a_line(lab):
     with pytest.raises(DeviceConnectionError, match="after 3 requests"):
         device.glance()
     assert lab.requests.count("OUTP?") == 3
+
+
+def test_an_identity_that_may_be_anything_is_not_asked_for_to_come_into_step(stack):
+    lab = Laboratory(stack, identity="{any}")
+    device = lab.connect()
+    answers = [b""]
+    lab.answer = lambda data, usual: answers.pop(0) if answers else usual(data)
+    device.glance()
+    assert "*IDN?" not in lab.requests
+    assert device.repeats == 1
