@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import re
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 
 PAGE = Path(__file__).parent / "explanation" / "measured.md"
@@ -69,18 +70,23 @@ def _rows(file: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(lines))
 
 
+def put(page: Path, tables: Mapping[str, str]) -> None:
+    """Put tables between the marks of a page that bear their names."""
+    text = page.read_text(encoding="utf-8")
+    known = [name for name in MARKS.findall(text) if name in tables]
+    for name in known:
+        start, end = f"<!-- table {name} -->\n", "<!-- end -->\n"
+        before, _, after = text.partition(start)
+        text = before + start + tables[name] + "\n" + end + after.partition(end)[2]
+    page.write_text(text, encoding="utf-8")
+    print(f"{len(known)} tables in {page}")
+
+
 def main(recordings: Path) -> None:
     """Renew the page from the folders of the campaigns; a table of a study that they lack stays."""
     tables = studies(recordings / "campaign-studies" / "studies.md")
     tables["validation"] = validation(recordings / "campaign-validation")
-    page = PAGE.read_text(encoding="utf-8")
-    known = [name for name in MARKS.findall(page) if name in tables]
-    for name in known:
-        start, end = f"<!-- table {name} -->\n", "<!-- end -->\n"
-        before, _, after = page.partition(start)
-        page = before + start + tables[name] + "\n" + end + after.partition(end)[2]
-    PAGE.write_text(page, encoding="utf-8")
-    print(f"{len(known)} tables in {PAGE}")
+    put(PAGE, tables)
 
 
 if __name__ == "__main__":

@@ -32,6 +32,10 @@ _TOLERANCE = 0.02
 """Part of the range within which the model alone is not taken for better."""
 _WARNED = 0.008
 """The same part from which on there is a warning."""
+_MISSED = 0.01
+"""Part of the range by which a target that cannot be met is missed without a warning."""
+_DOUBTED = 2.0
+"""Factor below the error that ends an open loop from which on there is a warning, if its model errs by itself."""
 _MOVING = 1.5
 """How much more a model may err where the reference moves: the actuator's lag is no part of its error at rest."""
 _SWINGS = MOST_SWINGS - 2
@@ -142,7 +146,7 @@ class _Supervision:
             known = f"and that of a model that holds at most {self._holds:.3g}"
             if errors > self._holds:
                 self._give_up(f"{but}, {known}")
-            elif everything > self._holds:
+            elif everything > max(self._holds / _DOUBTED, min(self._holds, _DOUBTED * HOLDS * self._span)):
                 self._warn(f"the open loop errs: {over} is {everything:.3g} RMS, {known}")
             return
         text = f"{but}, {100.0 * errors / self._span:.2g} % of the range"
@@ -183,8 +187,8 @@ class Supervised(_Supervision):
     targets it errs by more than its model does at the same places, and more than by chance: then the model alone,
     without feedback, would have been better; or if it says so itself (`doubt`); or, without a fallback, if it errs by
     more than 3 % of the range. One without feedback is given up where its model does not hold. One missed target of
-    several is no reason, but from 0.8 % of the range on there is a warning. Targets that cannot be met do not count.
-    Parameters as `_Supervision`.
+    several is no reason, but from 0.8 % of the range on there is a warning. Targets that cannot be met do not count;
+    one that is missed by more than 1 % is warned of. Parameters as `_Supervision`.
     """
 
     def __init__(
@@ -235,12 +239,17 @@ class Supervised(_Supervision):
 
     def _judge_target(self) -> None:
         """Judge how the last target was met."""
-        if not self._judges or self.gave_up or not self._finished or self.reach is not Reach.MET:
+        if not self._judges or self.gave_up or not self._finished:
             return
-        if doubt := getattr(self._controller, "doubt", ""):
+        error = self._output - self._target
+        if self.reach is not Reach.MET:
+            if math.isnan(self._holds) and abs(error) > _MISSED * self._span:
+                missed = f"missed by {100.0 * abs(error) / self._span:.2g} % of the range"
+                self._warn(f"the target {self._target:.4g} cannot be met within the limits: {missed}")
+        elif doubt := getattr(self._controller, "doubt", ""):
             self._give_up(str(doubt))
         else:
-            self._judge(self._output - self._target)
+            self._judge(error)
 
 
 class SupervisedFollower(_Supervision):

@@ -5,14 +5,15 @@
 Each rig is characterized once. Each controller is tuned for the model, and brings its output to its targets in
 sessions whose noise and targets the tuning has not seen, with the numbers of model and rig file and with those of the
 tuning file. The table, for docs/reference/tuning.md, has median and worst over the sessions of the RMS error, and the
-median of the cost of one run by `bench tune`; `not worse` says in how many sessions the cost with the tuning
-file is the smaller one. Exits with 1 if a median is worse with it.
+median of the cost of one run by `bench tune`; then what supply and sensor of a muscle leave, and in how many sessions
+the cost with the tuning file is not the greater one. Exits with 1 if a median is worse with it.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 import tempfile
 from collections.abc import Mapping
@@ -23,6 +24,9 @@ import numpy as np
 from rich.console import Console
 
 import bench
+from bench.control.two_stage_inverse import TwoStageInverse
+from bench.model_file import load_model
+from bench.rig_file import load_rig
 from bench.studies import Campaign, reached_targets
 from bench.tuning.search import cost_of
 from bench.tuning.tune import tune
@@ -36,7 +40,12 @@ from rigs.muscles.identification import (
     read_resting,
     read_series,
 )
+from rigs.muscles.tasks import ForceTask, LengthTask
 
+STEP = 0.01
+"""Step of the supply of the muscles, V: a thousandth of its 10 V."""
+READINGS = 5
+"""Readings at each target of a muscle."""
 UNSEEN = 1000
 """Seed of the first session that no tuning has seen."""
 SEARCHED, ROUNDS = ("count=20",), 1
@@ -99,6 +108,22 @@ def characterized(rig: str, folder: Path) -> Path:
     return model
 
 
+def resolution(case: Case, model: Path) -> float:
+    """Return the RMS error that steps of the supply and noise of the sensor leave at a muscle, SI."""
+    if case.protocol == "tracking":
+        return math.nan
+    file = load_model(model)
+    state = file.model.initial_state()
+    kind = {LENGTH: LengthTask, FORCE: ForceTask}[case.signal]
+    if kind is LengthTask:
+        state, _ = file.model.step(state, state.voltage, load_rig(case.rig).roles["load"].rest)
+    low, high = file.model.first.input_range
+    task = kind.of_model(TwoStageInverse(file.model), state, (low, high), file.dynamics.noise)
+    # Of the mean slope; the error within a step is uniform.
+    step = abs(task.rise) / (high - low) * STEP
+    return math.hypot(step / math.sqrt(12.0), math.sqrt(task.reading_variance / READINGS))
+
+
 def compared(case: Case, model: Path, tuning: str, folder: Path, sessions: int, pool: Workers) -> np.ndarray:
     """Return RMS error and cost without and with a tuning file, shape (2, sessions, 2)."""
     runs = []
@@ -145,6 +170,7 @@ def main() -> int:
             cells = [
                 *(f"{np.median(each):.3g} / {each.max():.3g}" for each in sizes),
                 *(f"{np.median(each[:, 1]):.3f}" for each in (today, tuned)),
+                f"{resolution(case, model) / case.size:.3g}",
             ]
             shown.print(
                 f"| `{case.rig}` | {case.protocol}, {case.controller} | {case.unit} | {' | '.join(cells)} "

@@ -171,6 +171,25 @@ def test_targets_that_cannot_be_met_do_not_count():
     controller = Supervised(inner, LIMITS, 1.0)
     for n in range(3 * TARGETS):
         controller.aim(0.1, float(n), 0.0, 0.0)
+    assert controller.take_notice() == "the target 0.1 cannot be met within the limits: missed by 10 % of the range"
+
+
+@pytest.mark.parametrize(("error", "options"), [(0.009, {}), (0.1, {"holds": 0.03})])
+def test_a_target_that_is_nearly_met_or_by_an_open_loop_is_not_named(error, options):
+    inner = Contrary()
+    inner.reach = Reach.TOO_LOW
+    controller = Supervised(inner, LIMITS, 1.0, **options)
+    for n in range(2):
+        controller.aim(error, float(n), 0.0, 0.0)
+    assert not controller.take_notice()
+
+
+@pytest.mark.parametrize(
+    ("holds", "error", "warned"), [(0.03, 0.0299, False), (0.12, 0.065, True), (0.12, 0.055, False)]
+)
+def test_an_open_loop_is_warned_of_below_what_ends_it_if_its_model_errs_by_itself(holds, error, warned):
+    notice = missing([error] * TARGETS, holds=holds).take_notice()
+    assert notice.startswith("the open loop errs: over 5 targets") == warned
 
 
 @pytest.mark.parametrize(("gain", "offset"), [(1.0, 0.0), (1.0, 0.05), (1.3, 0.0), (0.7, 0.0)])

@@ -44,7 +44,7 @@ def test_each_rig_has_its_model_and_each_controller_runs_with_it():
     tasks = expand(replace(file, runs=tuple(map(first_of_each_axis, file.runs)))).tasks.values()
     models = {task.table: task for task in tasks if isinstance(task, ModelTask)}
     runs = {name: len(task.sources) for name, task in models.items()}
-    assert runs == {"density": 1, "wire-model": 3, "beam-model": 4}
+    assert runs == {"density": 1, "wire-model": 3, "braid-model": 3, "coil-model": 3, "beam-model": 4}
     used = [task for task in tasks if isinstance(task, RunTask) and task.models]
     assert {each for task in used for each in task.needs} == {task.name for task in models.values()}
 
