@@ -362,10 +362,12 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
         # Half a period of the filter's cut-off makes the noise of the readings nearly independent.
         self._interval = 0.5 / CUTOFF_HZ[settings.filter] if settings.interval is None else settings.interval
         self._gross = math.nan
-        self._gross_since = 0.0
-        self._adc: int | None = None
-        self._adc_since = self._adc_seen = 0.0
-        self._adc_looks = 0
+        # Since when it has stood, and what the converter behind it showed since then.
+        self._gross_since: float
+        self._adc: int | None
+        self._adc_since: float
+        self._adc_seen: float
+        self._adc_looks: int
 
     @classmethod
     def _open_line(cls, name: str, settings: DAD141Settings, clock: Clock) -> _Line:

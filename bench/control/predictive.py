@@ -161,8 +161,7 @@ class PredictiveFollower(ControllerBase):
         self._sent = np.full(self._before, self._through(self._setpoint))
         self._plan: Floats = np.full(self.horizon, self._setpoint)
         self._foreseen: Floats | None = None
-        self._place, self._velocity = math.nan, 0.0
-        self._time = math.nan
+        self._place = self._velocity = self._time = math.nan
         bend = np.diff(np.eye(self.horizon + 1), n=2, axis=0)
         self._bend = np.vstack([np.eye(1, self.horizon + 1, 1) - np.eye(1, self.horizon + 1), bend])
         self._bend *= p.smoothness * self._spans.output / self._spans.input

@@ -271,8 +271,10 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
         super().__init__(name, settings, clock, line)
         self._names = [signal.name for signal in self.signals]
         self._per_radian = settings.per_radian
-        self._goal: int | None = 0
-        self._on = self._restarted = False
+        # What is sent and found from `connect` on.
+        self._goal: int | None
+        self._on: bool
+        self._restarted: bool
         self._tick = -1
         self._read_at = -math.inf
         self._read_feedback = line.reading(_INDIRECT_DATA, _FEEDBACK.size)

@@ -190,14 +190,15 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
     def __init__(self, name: str, settings: TECSettings, clock: Clock, line: TECLine) -> None:
         super().__init__(name, settings, clock, line)
         self._mode = settings.mode
-        self._polarity = 1
-        self._on = False
+        self._polarity: int
+        """1 if a positive current heats, else -1; known from `connect` on, as the next two."""
+        self._on: bool
         """Whether the driver has switched the output on."""
+        self._reads_blocks: bool
         self._restarted = False
         self._configured: dict[Parameter, float] = {}
         """What the parameters are that `connect` has written, and a change of the mode."""
         self._measured = Block(settings.channel, _OBJECT_TEMPERATURE, _SINK_TEMPERATURE, _CURRENT, _VOLTAGE, _STATUS)
-        self._reads_blocks = False
         self._names = tuple(signal.name for signal in self.signals)
         self._sent = Status.completed(name, clock)
         self._limits: dict[TECMode, Limits] = {}

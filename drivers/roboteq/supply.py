@@ -171,7 +171,8 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
         self._battery = math.nan
         self._commanded_at = -math.inf
         self._powered = self._obeyed = self._restarted = False
-        self._order = 0
+        self._order = object()
+        """What the present set-point is known by, as long as no other order replaces it."""
 
     @classmethod
     def _open_line(cls, name: str, settings: SupplySettings, clock: Clock) -> NodeLine:
@@ -226,8 +227,7 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
                         "and the key watchdog)",
                     )
             self._setpoint, self._battery = value, battery
-            self._order += 1
-            order = self._order
+            order = self._order = object()
         interval = min(0.1, 0.25 * self._settings.watchdog) if self._settings.watchdog else 0.1
         return Status(
             self.name, self._clock, lambda: self._arrived(order), timeout=_ARRIVAL_TIMEOUT, interval=interval
@@ -271,7 +271,7 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
     def _make_safe(self) -> None:
         """Go to 0 V: command 0, stop, and the emergency stop if the device does not confirm."""
         with self._lock:
-            self._order += 1
+            self._order = object()
             line, channel = self._line, self._settings.channel
             first, *others = self._resumable()
             line.urgent = True
@@ -303,7 +303,7 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
         Raises `DeviceError` if the device does not acknowledge.
         """
         with self._lock:
-            self._order += 1
+            self._order = object()
             self._write(_EMERGENCY_STOP, 1)
             self._setpoint, self._command = 0.0, 0
 
@@ -313,7 +313,7 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
         Raises `DeviceError` if the device refuses, or reports a fault still.
         """
         with self._lock:
-            self._order += 1
+            self._order = object()
             # Whether the release brings the last command back is not documented.
             self._zero()
             self._write(_RELEASE, 1)
@@ -448,7 +448,7 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
 
     def _drop(self) -> None:
         """Command 0, which ends the present set-point."""
-        self._order += 1
+        self._order = object()
         self._obeyed = False
         self._setpoint = math.nan if math.isnan(self._setpoint) else 0.0
         self._zero()
@@ -477,9 +477,9 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
         resumable = self._was_silent() and (self._command != 0 or self._commanded_at == -math.inf)
         return self._channels if resumable else self._channels[:1]
 
-    def _arrived(self, order: int) -> bool:
+    def _arrived(self, order: object) -> bool:
         with self._lock:
-            if order != self._order:
+            if order is not self._order:
                 raise DeviceError(self.name, "was given another command before it arrived")
             report = self._look()
             arrived = abs(report.power - self._command) <= 1
@@ -547,7 +547,7 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
         """Take note of a restart, and return the error."""
         if not self._restarted:
             self._restarted = True
-            self._order += 1
+            self._order = object()
             self._setpoint = math.nan if math.isnan(self._setpoint) else 0.0
             self._command = 0
         return DeviceRestartedError(
