@@ -448,6 +448,7 @@ def choose_elements(search: Search, among: Sequence[str] = CHOICE) -> tuple[Sear
     """
     found = _best(search, ())
     used = max(int(np.count_nonzero(search.roots)), 1)
+    chance = 2.0 * math.log(used) / used
     shortest, longest = search.creep_span
     while found.cost > 0.0:
         basis, trials = search.principal[:, :_FREE], []
@@ -458,18 +459,28 @@ def choose_elements(search: Search, among: Sequence[str] = CHOICE) -> tuple[Sear
             if element == "creep" and longest < 10.0 * shortest:
                 continue
             trials += _ends(search, (*kept, element), found, basis, starts=1, evaluations=_FEW)
-        least = min(trials, key=lambda trial: trial.cost, default=found)
+        # Each parameter must be worth more than chance, so that a resonance does not stand for a lag.
+        least = min(trials, key=lambda trial: _log_cost(trial) + _count(trial) * chance, default=found)
         reshaped, best = search, least
         if least.elements:
             reshaped, best = _reshaped(search, _best(search, least.elements, found, rounds=1))
         added = set(best.elements) - set(found.elements)
-        more = max(best.values.size - found.values.size + len(added & {"drift"}), 1)
-        gain = math.log(found.cost / max(best.cost, 1e-300))
+        more = max(_count(best) - _count(found), 1)
+        gain = _log_cost(found) - _log_cost(best)
         worth = _WORTH_OF_DRIFT if "drift" in added else _WORTH
-        if not gain > max(-2.0 * math.log1p(-worth), 2.0 * more * math.log(used) / used):
+        if not gain > max(-2.0 * math.log1p(-worth), more * chance):
             break
         search, found = reshaped, best
     return search, min(_best(search, found.elements), found, key=lambda each: each.cost)
+
+
+def _log_cost(found: Found) -> float:
+    return math.log(max(found.cost, 1e-300))
+
+
+def _count(found: Found) -> int:
+    """Return the number of parameters of the elements, a drift's rate among them."""
+    return found.values.size + ("drift" in found.elements)
 
 
 def _reshaped(search: Search, found: Found) -> tuple[Search, Found]:
