@@ -5,6 +5,9 @@ import sys
 
 import pytest
 
+# Each in a process of its own.
+pytestmark = pytest.mark.slow
+
 RIG = """
 [rig]
 title = "supplies of one's own"

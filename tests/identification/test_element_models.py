@@ -54,6 +54,7 @@ def test_a_plant_of_its_own_kind_is_found(name):
     assert found.certificate.converged
 
 
+@pytest.mark.slow
 def test_the_parameters_of_bouc_wen_are_found():
     plant, inputs = plants()["bouc-wen"], inputs_of()
     found = identify("bouc-wen", inputs, plant.evaluate(inputs), input_range=RANGE).model

@@ -42,6 +42,7 @@ def ratio(plant, seed, models, options):
     return error(chosen, inputs, outputs, others, truth) / error(simple, inputs, outputs, others, truth)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("plant", ALL)
 def test_a_plane_that_is_asked_for_does_not_make_it_worse(plant):
     assert ratio(plant, 10, PLANES, {"levels": 20, "reversible": "linear"}) <= MOST
