@@ -1,7 +1,7 @@
 """Decorators of compiled loops. Imported with such loops only, because numba is slow to load.
 
 Around each function numba compiles a wrapper for calls from Python and one for calls from C, which may take as long
-as the function itself. Nothing here is called from C, and most functions are called by other compiled ones only.
+as the function itself. Nothing here is called from C, and nearly half of the functions by other compiled ones only.
 """
 
 from __future__ import annotations
