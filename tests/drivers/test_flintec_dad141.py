@@ -927,7 +927,9 @@ def test_own_check_reads_the_filter_and_looks_at_the_converter(bench):
     bench.instrument.power_cycle()
     cell = bench.cell()
     bench.tap.sent.clear()
+    begin = bench.clock.now()
     filtered, converter = cell.self_check()
+    assert bench.clock.now() - begin == pytest.approx(5 * 0.05, abs=0.03)
     assert (filtered.text, filtered.advice) == ("3 in the instrument", "")
     assert converter.text.endswith("in 5 readings")
     assert converter.advice == ""

@@ -183,7 +183,10 @@ def test_bytes_of_a_set_point_and_a_measurement(script, supply):
 
 
 def test_bytes_of_the_emergency_stop_and_its_release(script, supply):
+    supply.set(6.0)
+    script.received.clear()
     supply.emergency_stop()
+    assert supply.setpoint == 0.0
     assert script.received == [(0x601, bytes.fromhex("2F0C200001000000"))]
     script.received.clear()
     supply.release()
