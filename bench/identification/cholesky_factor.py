@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from bench.hysteresis._checks import Floats
@@ -11,161 +13,200 @@ from bench.identification.cell_layout import Flags, Indices
 # counts as dependent on them: Cholesky pivots carry rounding errors of about 1e-13. Only if such columns are
 # all that is left to enter, the threshold is lowered step by step.
 DEPENDENT = (1e-12, 1e-13, 1e-14)
-MANY = 256
-"""Columns or rows of which a copy is cheap."""
 # Right sides that a plain loop solves faster than BLAS, which would copy the factor.
-_FEW = 24
+_FEW = 32
 
 
 class CholeskyFactor:
-    """The triangular factor U of the passive Gram block UᵀU, kept up to date as columns come and go.
+    """The triangular factor L of the passive Gram block L Lᵀ, kept up to date as columns come and go.
 
-    `half` is the solution of Uᵀ half = right for the columns' right side: it turns with the factor, so that the
-    solution of UᵀU x = right takes one pass.
+    `half` is the solution of L half = right for the columns' right side: it turns with the factor, so that the
+    solution of L Lᵀ x = right takes one pass.
+
+    The rows of L are packed; see `_factor_kernels`.
     """
 
     def __init__(self) -> None:
-        self.upper = np.zeros((0, 0))
+        self.packed = np.empty(0)
         self.half = np.empty(0)
         self.size = 0
         self.threshold = DEPENDENT[0]
 
     @property
-    def compact(self) -> Floats:
-        """Lower factor as LAPACK wants it, in the place of the factor itself."""
-        size, room = self.size, self.upper.shape[1]
-        if room > size:
-            flat = self.upper.reshape(-1)
-            for row in range(1, size):
-                flat[row * size : (row + 1) * size] = flat[row * room : row * room + size]
-            self.upper = flat[: size * size].reshape(size, size)
-        return self.upper.T
+    def room(self) -> int:
+        """Number of columns that can be appended at a time: those that end the present block."""
+        from bench.identification._factor_kernels import BLOCK
+
+        return BLOCK - self.size % BLOCK
+
+    def _blocks(self, size: int) -> Iterator[tuple[int, int, Floats]]:
+        """Yield the first and the last row, exclusive, of each block of so many rows, and the block, a view."""
+        from bench.identification._factor_kernels import BLOCK, row_start
+
+        for first in range(0, size, BLOCK):
+            last = min(first + BLOCK, size)
+            start, width = row_start(first), first + BLOCK
+            # The last row may have no room but for itself.
+            whole = self.packed[start : start + (last - first) * width]
+            yield first, last, whole.reshape(last - first, width)[:, :last]
 
     def _make_room(self, size: int) -> None:
-        if size > self.upper.shape[0]:
-            room = max(64, size + size // 4)
-            grown = np.zeros((room, room))
-            grown[: self.size, : self.size] = self.upper[: self.size, : self.size]
-            self.upper = grown
+        from bench.identification._factor_kernels import row_start
 
-    def append(self, cross: Floats, square: Floats, right: Floats) -> Flags | None:
-        """Add columns, given their products with the present ones, shape (p, size), with each other, and right sides.
+        if row_start(size) > self.packed.size:
+            # Memory that nothing is written to takes none.
+            grown = np.empty(row_start(max(size + size // 2, 64)))
+            used = row_start(self.size)
+            grown[:used] = self.packed[:used]
+            self.packed = grown
 
-        The first are overwritten, the second in Fortran's order.
+    def append(self, rows: Floats, right: Floats) -> Flags:
+        """Add at most `room` columns, given their products with the present ones and each other, and right sides.
 
-        Return which were added: the others depend on the present ones and those added before them. None if there
-        are others among many: nothing is added then, and fewer are to be tried.
+        The products, shape (more, size + more), are overwritten. Of those of two new columns the lower half counts.
+
+        Return which were added: the others depend on the present ones and those added before them.
         """
         from scipy.linalg.blas import dtrsv
         from scipy.linalg.lapack import dpotrf
 
-        from bench.identification import _kernels
+        from bench.identification import _factor_kernels
 
-        more, old = cross.shape
-        squares = np.diag(square).copy()
-        rest = np.asfortranarray(square)
-        if old and more:
-            self._make_room(old + more)
-            side = self.upper[:old, old : old + more]
-            if more <= _FEW:
-                _kernels.solve_lower(self.upper, old, cross)
-                side[:] = cross.T
-            else:
-                side[:] = cross.T
-                self._solve_lower(side)
-            rest -= side.T @ side
-        # Kept for a second try only where that is cheap.
-        again = None if more > MANY else rest.copy(order="F")
-        block, info = dpotrf(rest, lower=1, clean=1, overwrite_a=1)
+        more, old = rows.shape[0], self.size
+        cross, square = rows[:, :old], rows[:, old:]
+        least = self.threshold * np.diag(square)
+        if old:
+            self._solve_lower(cross)
+            square -= cross @ cross.T
+        block, info = dpotrf(square.T, lower=0, clean=1)
+        block = block.T
         good = np.ones(more, dtype=bool)
         # Pivots below the threshold would pass as rounding noise.
-        if info or (np.diag(block) ** 2 < self.threshold * squares).any():
-            if again is None:
-                return None
-            block = np.array(np.tril(again), order="C")
-            _kernels.factor_independent(block, self.threshold * squares, good)
+        if info or (np.diag(block) ** 2 < least).any():
+            block = np.array(np.tril(square), order="C")
+            _factor_kernels.factor_independent(block, least, good)
+            cross, right = cross[good], right[good]
             block = block[np.ix_(good, good)]
-        added = int(np.count_nonzero(good))
-        left = right[good] - (side.T @ self.half)[good] if old and more else right[good]
-        self.half = np.concatenate([self.half, dtrsv(block, left, lower=1) if added else left])
-        self.size = old + added
-        if not old and added > self.upper.shape[0]:
-            self.upper = np.ascontiguousarray(block.T)
+        added = right.size
+        if not added:
             return good
-        if not old:
-            self.size = 0
-            self._make_room(added)
-            self.size = added
-        elif added < more:
-            self.upper[:old, old : self.size] = side[:, good]
-        self.upper[old : self.size, old : self.size] = block.T
+        self._make_room(old + added)
+        self.half = np.concatenate([self.half, dtrsv(block.T, right - cross @ self.half, trans=1)])
+        self.size = old + added
+        *_, (first, _, last) = self._blocks(self.size)
+        last[old - first :, :old] = cross
+        last[old - first :, old:] = block
         return good
 
     def _solve_lower(self, right: Floats) -> None:
-        """Replace right sides, shape (size, p), by the x with Uᵀx = right; without a copy of U."""
+        """Replace right sides, shape (p, size), by the x with L x = right."""
         from scipy.linalg.blas import dtrsm
 
-        for first in range(0, self.size, MANY):
-            block = slice(first, min(first + MANY, self.size))
+        from bench.identification import _factor_kernels
+
+        if right.shape[0] <= _FEW:
+            _factor_kernels.solve_lower(self.packed, self.size, right)
+            return
+        for first, last, block in self._blocks(self.size):
+            part = right[:, first:last]
             if first:
-                right[block] -= self.upper[:first, block].T @ right[:first]
-            corner = np.asfortranarray(self.upper[block, block].T)
-            right[block] = dtrsm(1.0, corner, np.asfortranarray(right[block]), lower=1, overwrite_b=1)
+                part -= right[:, :first] @ block[:, :first].T
+            # Transposed, as BLAS wants it.
+            corner = np.ascontiguousarray(block[:, first:]).T
+            part[:] = dtrsm(1.0, corner, np.ascontiguousarray(part).T, trans_a=1, overwrite_b=1).T
 
     def truncate(self, size: int) -> None:
         """Keep the first columns only."""
         self.size = size
         self.half = self.half[:size]
-        if not size:
-            # There is no space for it and its successor.
-            self.upper = np.zeros((0, 0))
 
     def delete(self, places: Indices) -> None:
         """Remove the columns at increasing places."""
-        from bench.identification import _kernels
+        from bench.identification import _factor_kernels
 
         for place in places[::-1]:
-            _kernels.delete_column(self.upper, self.size, place, self.half)
+            _factor_kernels.delete_row(self.packed, self.size, place, self.half)
             self.size -= 1
         self.half = self.half[: self.size]
 
     def solution(self) -> Floats:
         """Return the solution for the columns' right side."""
-        from bench.identification import _kernels
+        from bench.identification import _factor_kernels
 
-        return np.asarray(_kernels.solve_upper(self.upper, self.size, self.half))
+        return np.asarray(_factor_kernels.solve_upper(self.packed, self.size, self.half))
 
     def solve(self, right: Floats) -> Floats:
         """Return the solution for a right side."""
-        from bench.identification import _kernels
+        from bench.identification import _factor_kernels
 
         half = right.copy()
-        _kernels.solve_lower(self.upper, self.size, half[None, :])
-        return np.asarray(_kernels.solve_upper(self.upper, self.size, half))
+        _factor_kernels.solve_lower(self.packed, self.size, half[None, :])
+        return np.asarray(_factor_kernels.solve_upper(self.packed, self.size, half))
 
     def length(self, places: Indices, values: Floats) -> float:
         """Return the norm in the outputs of a step that is zero but at increasing places."""
-        from bench.identification import _kernels
+        from bench.identification import _factor_kernels
 
-        return float(_kernels.factored_length(self.upper, self.size, places, values))
+        return float(np.linalg.norm(_factor_kernels.combined_rows(self.packed, places, values)))
 
     def condition(self, norm: float) -> float:
-        """Return the condition number of the columns, given the greatest sum of magnitudes over a Gram row."""
-        from scipy.linalg.lapack import dpocon
+        """Return the condition number of the columns, given the greatest sum of magnitudes over a Gram row.
 
-        if not self.size:
+        That of the inverse is estimated as by LAPACK's dlacn2: Higham, ACM Trans. Math. Software 14, 381, 1988.
+        """
+        size = self.size
+        if not size:
             return 1.0
-        reciprocal, _ = dpocon(self.compact, norm, uplo="L")
-        return float(np.sqrt(1.0 / max(reciprocal, 1e-300)))
+        x = self.solve(np.full(size, 1.0 / size))
+        estimate, signs, place = float(np.abs(x).sum()), np.zeros(size), -1
+        for _ in range(5):
+            before, signs = signs, np.where(x > 0.0, 1.0, -1.0)
+            if (signs == before).all():
+                break
+            slope = np.abs(self.solve(signs))
+            last, place = place, int(np.argmax(slope))
+            if last >= 0 and slope[last] == slope[place]:
+                break
+            unit = np.zeros(size)
+            unit[place] = 1.0
+            x = self.solve(unit)
+            previous, estimate = estimate, float(np.abs(x).sum())
+            if estimate <= previous:
+                break
+        # Where all of that is cancelled.
+        alternating = np.where(np.arange(size) % 2 == 0, 1.0, -1.0) * (1.0 + np.arange(size) / max(size - 1, 1))
+        estimate = max(estimate, 2.0 * float(np.abs(self.solve(alternating)).sum()) / (3.0 * size))
+        return float(np.sqrt(norm * estimate))
 
-    def inverse_entries(self, rows: Indices, columns: Indices) -> Floats:
-        """Return entries of the inverse of the Gram block; the factor is used up."""
+    def dense(self) -> Floats:
+        """Return L, shape (size, size)."""
+        result = np.zeros((self.size, self.size))
+        for first, last, block in self._blocks(self.size):
+            result[first:last, :last] = block
+        return np.tril(result)
+
+    def invert(self) -> None:
+        """Replace L by its inverse: the factor is used up."""
         from scipy.linalg.lapack import dtrtri
 
-        from bench.identification import _kernels
+        for first, last, block in self._blocks(self.size):
+            corner, _ = dtrtri(np.tril(block[:, first:]).T, lower=0)
+            if first:
+                left = np.zeros((last - first, first))
+                for begin, end, above in self._blocks(first):
+                    left[:, :end] += block[:, begin:end] @ above
+                block[:, :first] = -corner.T @ left
+            block[:, first:] = corner.T
 
-        if not self.size:
-            return np.zeros(rows.size)
-        inverse, _ = dtrtri(self.compact, lower=1, overwrite_c=1)
-        self.size = 0
-        return np.asarray(_kernels.products_of_rows(inverse.T, rows, columns))
+    def inverse_entries(self, first: Indices, second: Indices) -> Floats:
+        """Return entries of the inverse of the Gram block, first[k] <= second[k], once `invert` was called."""
+        from bench.identification import _factor_kernels
+
+        return np.asarray(_factor_kernels.products_of_columns(self.packed, self.size, first, second))
+
+    def inverse_diagonal(self) -> Floats:
+        """Return the diagonal of the inverse of the Gram block, once `invert` was called."""
+        result = np.zeros(self.size)
+        for _, last, block in self._blocks(self.size):
+            result[:last] += np.einsum("ij,ij->j", block, block)
+        return result

@@ -192,16 +192,14 @@ def _inverse_root(
         CellLayout.of(regressor.base.size),
         *penalties,
     )
-    state.learn(chosen)
     if definite:
         state.enter(chosen)
         order = np.argsort(state.passive)
-        upper = state.factor.upper[: state.factor.size, : state.factor.size]
-        root = solve_triangular(upper, np.eye(state.factor.size))[order]
+        root = solve_triangular(state.factor.dense().T, np.eye(state.factor.size))[order]
         columns = state.passive[order]
         _, freedom = state.variances()
     else:
-        values, vectors = eigh(state.products_of(chosen, chosen))
+        values, vectors = eigh(state.gram(chosen, chosen[:0]))
         kept = values > _NO_INFORMATION * values[-1]
         root = vectors[:, kept] / np.sqrt(values[kept])
         columns, freedom = chosen, float(np.count_nonzero(kept))

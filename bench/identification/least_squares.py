@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from bench.hysteresis import Regressor, _checks
 from bench.hysteresis._checks import Floats
 from bench.identification.cell_layout import CellLayout, Flags, Indices
-from bench.identification.cholesky_factor import DEPENDENT, MANY, CholeskyFactor
+from bench.identification.cholesky_factor import DEPENDENT, CholeskyFactor
 from bench.identification.collapse import LONG, collapse
 from bench.identification.fit_progress import say_fit_progress
 
@@ -25,9 +25,11 @@ _ROUNDED = 1e-12
 # A gradient that is zero but for rounding.
 _LEVEL = 1e-11
 # Columns enter together if their gradient is at least this part of the greatest.
-_ENTRY = 0.5
+_ENTRY = 0.25
 # A smooth fit of at least this order starts from one of half the order.
 _COARSEST = 24
+# Gram rows formed at a time where they are only looked at.
+_ROWS = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -291,11 +293,12 @@ class _ActiveSet:
     2. `refine` the passive coefficients by the true residual and compute g; stop if g is within the tolerance.
     3. Choose the `candidates`: columns with g > 0 near the greatest, of neighbours in the plane only the `crests`.
        If only columns are left that were found dependent on P (`barred`), lower the threshold of dependence.
-    4. `learn` the rows of the Gram matrix G = A'A + λL of the candidates, and let them `enter` the Cholesky factor
-       U'U = G[P, P]; a column whose pivot falls below the threshold is dependent and is barred.
-    5. `settle`: solve U'U x = (A't)[P]. While constrained coefficients come out negative, they `leave` P, all at
+    4. Let the candidates `enter` the Cholesky factor LL' = G[P, P] of the Gram matrix G = A'A + λL; a column whose
+       pivot falls below the threshold is dependent and is barred.
+    5. `settle`: solve LL' x = (A't)[P]. While constrained coefficients come out negative, they `leave` P, all at
        once while that raises the `gain` (`bold`), otherwise as far as the step to the first zero allows.
-    6. Go to 2. The factor is updated by appended columns and by rotations, never formed anew from the data.
+    6. Go to 2. The factor is updated by appended columns and by rotations. Gram entries are formed where they are
+       needed: to keep and gather them would take as long, and more memory than the factor.
     """
 
     def __init__(
@@ -347,11 +350,12 @@ class _ActiveSet:
         self.centred = y - self.mean
         self.size = float(np.sqrt(w @ self.centred**2))
         self.right = self.products(self.centred)
+        # What the products of a column with the outputs are, they are with another column.
+        self.extra_gram = np.array([self.products(column) for column in np.ascontiguousarray(self.extra.T)])
         self.x = np.zeros(count)
-        self.known = np.empty(0, dtype=np.int64)
-        self.place = np.full(count, -1, dtype=np.int64)
-        self.gram = np.zeros((0, 0))
         self.factor = CholeskyFactor()
+        # The cache holds that of few samples.
+        self.tails = np.zeros(y.size * (32 if y.size <= LONG else 8))
         self.passive = np.empty(0, dtype=np.int64)
         self.iterations = 0
 
@@ -378,65 +382,39 @@ class _ActiveSet:
             g[: self.cells] -= self.penalty @ self.x[: self.cells]
         return g
 
-    def learn(self, columns: Indices) -> None:
-        """Form the Gram entries of columns not seen before."""
+    def gram(self, new: Indices, before: Indices) -> Floats:
+        """Return the Gram entries of columns with those before them, and the lower half of those with each other.
+
+        Shape (new, before + new).
+        """
         from bench.identification import _kernels
 
-        new = columns[self.place[columns] < 0]
-        if not new.size:
-            return
-        if self.known.size + new.size > self.gram.shape[0]:
-            self._make_room(columns, new.size)
-        old = self.known.size
-        self.known = np.concatenate([self.known, new])
-        size = self.known.size
-        self.place[new] = np.arange(old, size)
-        for first in range(0, new.size, MANY):
-            block = new[first : first + MANY]
-            end = old + first + block.size
-            rows = np.empty((block.size, end))
-            _kernels.gram_rows(
-                self.columns,
-                self.regressor.base,
-                self.cell_means,
-                self.norms[: self.cells],
-                self.w,
-                self.extra,
-                block,
-                self.known[:end],
-                rows,
-            )
-            if self.penalty is not None:
-                inside = np.flatnonzero(block < self.cells)
-                rough = self.penalty[block[inside]].tocoo()
-                places = self.place[rough.col]
-                seen = (places >= 0) & (places < end)
-                rows[inside[rough.row[seen]], places[seen]] += rough.data[seen]
-            place = slice(old + first, end)
-            self.gram[place, :end] = rows
-            self.gram[:end, place] = rows.T
-
-    def _make_room(self, columns: Indices, more: int) -> None:
-        """Make room for Gram entries of more columns; if many are neither passive nor asked for, forget those."""
-        from bench.identification import _kernels
-
-        asked = columns[self.place[columns] >= 0]
-        needed = np.union1d(self.passive, asked)
-        stay = needed if needed.size < 0.9 * self.known.size else self.known
-        room = stay.size + more
-        room += room // 4
-        grown = np.zeros((room, room))
-        _kernels.gather(self.gram, self.place[stay], self.place[stay], grown)
-        self.gram, self.known = grown, stay
-        self.place[:] = -1
-        self.place[stay] = np.arange(stay.size)
-
-    def products_of(self, first: Indices, second: Indices) -> Floats:
-        """Return the Gram entries of two sets of known columns."""
-        from bench.identification import _kernels
-
-        result = np.empty((first.size, second.size))
-        _kernels.gather(self.gram, self.place[first], self.place[second], result)
+        known = np.concatenate([before, new])
+        result = np.zeros((new.size, known.size))
+        width = min(-(-new.size // 8) * 8, self.tails.size // self.w.size)
+        _kernels.gram_rows(
+            self.columns,
+            self.regressor.base,
+            self.cell_means,
+            self.norms[: self.cells],
+            self.w,
+            new,
+            known,
+            self.tails[: self.w.size * width].reshape(self.w.size, width),
+            result,
+        )
+        if self.extra.shape[1]:
+            for one, other, part in ((new, known, result), (known, new, result.T)):
+                dense = np.flatnonzero(one >= self.cells)
+                part[dense] = self.extra_gram[one[dense] - self.cells][:, other]
+        if self.penalty is not None:
+            inside = np.flatnonzero(new < self.cells)
+            rough = self.penalty[new[inside]].tocoo()
+            place = np.full(self.x.size, -1)
+            place[known] = np.arange(known.size)
+            places = place[rough.col]
+            seen = places >= 0
+            result[inside[rough.row[seen]], places[seen]] += rough.data[seen]
         return result
 
     def enter(self, columns: Indices) -> Indices:
@@ -444,33 +422,36 @@ class _ActiveSet:
         if not columns.size:
             return columns
         self.iterations += 1
-        good = self.factor.append(
-            self.products_of(columns, self.passive),
-            # Transposed, as LAPACK wants them.
-            self.products_of(columns, columns).T,
-            self.right[columns],
-        )
-        if good is None:
-            half = columns.size // 2
-            return np.concatenate([self.enter(columns[:half]), self.enter(columns[half:])])
-        self.passive = np.concatenate([self.passive, columns[good]])
-        self.x[columns[~good]] = 0.0
-        return columns[~good]
+        barred = [np.empty(0, dtype=np.int64)]
+        while columns.size:
+            some, columns = np.split(columns, [self.factor.room])
+            rows = self.gram(some, self.passive)
+            good = self.factor.append(rows, self.right[some])
+            self.passive = np.concatenate([self.passive, some[good]])
+            barred.append(some[~good])
+        left = np.concatenate(barred)
+        self.x[left] = 0.0
+        return left
 
     def leave(self, gone: Flags) -> Indices:
         """Take columns out of the passive set; return those that turn out dependent on the way."""
         places = np.flatnonzero(gone)
         size, first = self.passive.size, int(places[0])
         self.iterations += 1
-        # Rotations take about 1 ns an element, factoring anew 0.036 ns an operation.
-        rotations = float(((size - places) ** 2).sum())
-        if rotations <= 1e5 + 0.012 * (size - first) ** 3:
+        # In ns: of a rotated row element, of a product of two changes, and of an operation of the factorisation.
+        rotations = 0.6 * float(((size - places) ** 2).sum())
+        rest, starts, cells = size - places.size, self.columns[0], self.passive[self.passive < self.cells]
+        changes = float((starts[cells + 1] - starts[cells]).sum()) / size
+        if rotations <= 0.17 * changes * (rest**2 - first**2) + 0.01 * (rest**3 - first**3):
             self.factor.delete(places)
             self.passive = self.passive[~gone]
             return np.empty(0, dtype=np.int64)
         if first < size // 8:
             first = 0
         again = self.passive[first:][~gone[first:]]
+        if self.penalty is not None:
+            # What is small is at an edge, and the next to leave: cheaply, if it is among the last.
+            again = again[np.argsort(-self.x[again], kind="stable")]
         self.passive = self.passive[:first]
         self.factor.truncate(first)
         return self.enter(again)
@@ -524,7 +505,6 @@ class _ActiveSet:
         barred = np.zeros(self.x.size, dtype=bool)
         tolerance = _TOLERANCE * self.size
         if first.size:
-            self.learn(first)
             barred[self.enter(first)] = True
             barred[self.settle(bold=True)] = True
         bold, gain = True, self.gain()
@@ -548,7 +528,6 @@ class _ActiveSet:
             room = max(10, self.passive.size // 3)
             if entering.size > room:
                 entering = entering[np.argpartition(-g[entering], room)[:room]]
-            self.learn(entering)
             dependent = self.enter(entering)
             entered = self.passive.size
             dependent = np.concatenate([dependent, self.settle(bold)])
@@ -567,7 +546,7 @@ class _ActiveSet:
         dense = np.flatnonzero(g[self.cells :] >= threshold) + self.cells
         if self.penalty is not None:
             # Roughness tells neighbours apart.
-            return np.concatenate([dense, np.flatnonzero(g[: self.cells] >= 0.1 * threshold)])
+            return np.concatenate([dense, np.flatnonzero(g[: self.cells] >= 0.2 * threshold)])
         return np.concatenate([dense, self.layout.crests(g[: self.cells], threshold)])
 
     def promising(self) -> Indices:
@@ -621,20 +600,34 @@ class _ActiveSet:
         The factor is used up.
         """
         passive, penalty = self.passive, self.penalty
-        rows = columns = np.arange(passive.size)
+        self.factor.invert()
+        diagonal = self.factor.inverse_diagonal()
         if penalty is None or not passive.size:
-            return self.factor.inverse_entries(rows, columns), float(passive.size)
+            return diagonal, float(passive.size)
         inside = np.flatnonzero(passive < self.cells)
         block = penalty[passive[inside]][:, passive[inside]].tocoo()
-        rows = np.concatenate([rows, inside[block.row]])
-        columns = np.concatenate([columns, inside[block.col]])
-        inverse = self.factor.inverse_entries(rows, columns)
+        below = block.row < block.col
+        inverse = self.factor.inverse_entries(inside[block.row[below]], inside[block.col[below]])
         # What smoothness determines the data do not.
-        return inverse[: passive.size], passive.size - float(block.data @ inverse[passive.size :])
+        smooth = float(block.diagonal() @ diagonal[inside]) + 2.0 * float(block.data[below] @ inverse)
+        return diagonal, passive.size - smooth
+
+    def largest_row(self) -> float:
+        """Return the greatest sum of magnitudes over a row of the passive Gram block."""
+        passive = self.passive
+        if passive.size <= 2 * _ROWS:
+            lower = self.factor.dense()
+            return float(np.abs(lower @ lower.T).sum(axis=1).max(initial=0.0))
+        sums = np.zeros(passive.size)
+        for first in range(0, passive.size, _ROWS):
+            last = min(first + _ROWS, passive.size)
+            rows = np.abs(np.tril(self.gram(passive[first:last], passive[:first]), first))
+            sums[first:last] += rows.sum(axis=1)
+            np.fill_diagonal(rows[:, first:], 0.0)
+            sums[:last] += rows.sum(axis=0)
+        return float(sums.max(initial=0.0))
 
     def result(self, samples: int, left: float) -> Fit:
-        from bench.identification import _kernels
-
         passive = self.passive
         g = self.slope()
         held = np.ones(self.x.size, dtype=bool)
@@ -643,8 +636,7 @@ class _ActiveSet:
         kkt = float(violation.max(initial=0.0)) / (self.size or 1.0)
         coefficients = self.x / self.norms
         uncertainties = np.full(self.x.size, np.nan)
-        largest = _kernels.largest_row(self.gram, self.place[passive])
-        condition = self.factor.condition(largest)
+        condition = self.factor.condition(self.largest_row())
         variances, effective = self.variances()
         spare = samples - 1.0 - effective
         if spare > 0.5:

@@ -4,8 +4,9 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from scipy.linalg.lapack import dpocon
 from scipy.optimize import lsq_linear, nnls
 
 from bench.hysteresis import Preisach, QuadraticTerm, Regressor, ThermalExpansion, uniform_levels
@@ -240,32 +241,56 @@ def test_smoothing_from_a_coarser_plane_equals_that_from_scratch(order, smoothin
     np.testing.assert_allclose(found.coefficients, expected.coefficients, atol=1e-6)
 
 
+def condition_by_lapack(block):
+    """The estimate of dpocon."""
+    norm = np.abs(block).sum(axis=0).max(initial=0.0)
+    reciprocal, _ = dpocon(np.linalg.cholesky(block), norm, uplo="L")
+    return norm, np.sqrt(1.0 / reciprocal)
+
+
 @settings(max_examples=40)
-@given(st.integers(0, 10_000), st.integers(1, 30))
+@given(st.integers(0, 10_000), st.one_of(st.integers(1, 30), st.integers(250, 600)))
+@example(1, 257)
 def test_factor_follows_the_columns(seed, size):
     rng = np.random.default_rng(seed)
-    matrix = rng.normal(size=(40, size))
-    gram = matrix.T @ matrix
-    right = rng.normal(size=size)
+    matrix = rng.normal(size=(size + 10, size))
+    gram = matrix.T @ matrix / size
     right = rng.normal(size=size)
     factor = CholeskyFactor()
     chosen = np.empty(0, dtype=np.int64)
-    for _ in range(8):
+    for _ in range(8 if size < 100 else 3):
         new = np.setdiff1d(rng.permutation(size)[: rng.integers(0, size + 1)], chosen)
-        assert factor.append(gram[np.ix_(new, chosen)], gram[np.ix_(new, new)], right[new]).all()
-        chosen = np.concatenate([chosen, new])
-        gone = np.flatnonzero(rng.random(chosen.size) < 0.4)
+        while new.size:
+            some, new = np.split(new, [factor.room])
+            entries = gram[np.ix_(some, np.concatenate([chosen, some]))]
+            assert factor.append(entries, right[some]).all()
+            chosen = np.concatenate([chosen, some])
+        gone = np.flatnonzero(rng.random(chosen.size) < (0.4 if size < 100 else 0.05))
         factor.delete(gone)
         chosen = np.delete(chosen, gone)
+        if rng.random() < 0.2:
+            chosen = chosen[: chosen.size // 2]
+            factor.truncate(chosen.size)
         block = gram[np.ix_(chosen, chosen)]
-        np.testing.assert_allclose(factor.compact @ factor.compact.T, block, atol=1e-10)
+        lower = factor.dense()
+        np.testing.assert_allclose(lower @ lower.T, block, atol=1e-10)
         np.testing.assert_allclose(block @ factor.solution(), right[chosen], atol=1e-6)
         other = rng.normal(size=chosen.size)
         np.testing.assert_allclose(block @ factor.solve(other), other, atol=1e-6)
         places = np.flatnonzero(rng.random(chosen.size) < 0.5)
         step = np.zeros(chosen.size)
         step[places] = other[places]
-        assert factor.length(places, other[places]) ** 2 == pytest.approx(step @ block @ step, abs=1e-9)
+        if places.size:
+            assert factor.length(places, other[places]) ** 2 == pytest.approx(step @ block @ step, abs=1e-9)
+        if chosen.size:
+            norm, expected = condition_by_lapack(block)
+            assert factor.condition(norm) == pytest.approx(expected, rel=1e-6)
+    factor.invert()
+    inverse = np.linalg.inv(block)
+    first, second = np.triu_indices(chosen.size)
+    entries = factor.inverse_entries(first, second)
+    np.testing.assert_allclose(entries, inverse[first, second], rtol=1e-6, atol=1e-9 * np.abs(inverse).max(initial=0))
+    np.testing.assert_allclose(factor.inverse_diagonal(), np.diag(inverse), rtol=1e-6)
 
 
 def test_minimum_norm_equals_the_pseudo_inverse():
