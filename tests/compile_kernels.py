@@ -4,6 +4,8 @@ In one process, before the tests: otherwise each of their workers compiles most 
 compiled by the test that needs it.
 """
 
+from pathlib import Path
+
 import numpy as np
 
 import bench
@@ -23,9 +25,13 @@ from bench.hysteresis import (
 )
 from bench.hysteresis.inverse import PreisachInverse
 from bench.identification import identify
+from bench.identification.cholesky_factor import CholeskyFactor
 from bench.identification.collapse import collapse
 from bench.identification.least_squares import fit
 from bench.timed import BoucWenOscillator, Hammerstein, LinearPart, PreisachOscillator
+from bench.transients.actuator import identify_actuator
+from bench.transients.recording import Recording
+from bench.transients.response import late_parts
 from bench.twin.specimen import Dynamics, Specimen
 from rigs.hybrid.design import Design
 from rigs.hybrid.estimates import Bending, ReducedNetwork, ThermalNoise, UnscentedEstimate
@@ -50,6 +56,9 @@ def operators() -> None:
     # Equal columns: one of them depends on the other.
     fit(operator.regressor([0.0, 1.0, 0.0, 1.0]), [0.0, 1.0, 0.0, 1.0])
     slow = np.interp(np.linspace(0.0, 3.0, 400), np.arange(4.0), [0.0, 1.0, 0.1, 0.8])
+    factor = CholeskyFactor()
+    factor.append(np.eye(2), np.ones(2))
+    factor.length(np.array([1]), np.ones(1))
     collapse(operator.regressor(slow), operator.evaluate(slow), np.ones(400))
     inverse = PreisachInverse(operator)
     inverse.invert(state, 0.1)
@@ -65,6 +74,7 @@ def operators() -> None:
         follower.update(t, 0.2, 0.1, 0.2)
     identify("preisach-nonmonotonic", inputs, outputs, input_range=(0.0, 1.0), plane=(0.0, 1.0), reference=0.0)
     identify("prandtl-ishlinskii", inputs, outputs, input_range=(0.0, 1.0))
+    identify("preisach", slow, operator.evaluate(slow), levels=6, smoothing=1e-3)
 
 
 def element_operators() -> None:
@@ -100,6 +110,21 @@ def twin() -> None:
     Specimen((operator,), Dynamics(0.02, ActuatorDynamics(frequency=1.0), response), 0.0).advance(np.ones(4))
 
 
+def transients() -> None:
+    """Identify what follows the set-points of a recording."""
+    times = 0.1 * np.arange(80.0)
+    changes, setpoints = np.array([0.0, 2.0, 4.0, 6.0]), np.array([1.0, 0.0, 2.0, 0.5])
+    driven = setpoints[np.searchsorted(changes, times, side="right") - 1]
+    columns = {"input": driven, "output": np.convolve(driven, np.full(4, 0.25))[:80]}
+    recording = Recording(
+        Path(), {}, (), (), times, np.zeros(80, dtype=bool), columns, changes, setpoints, "input", "output",
+        (times, np.zeros(80)),
+    )  # fmt: skip
+    recording.on_grid(0.05, 0.0, 8.0)
+    late_parts(driven, 0.1, (0.2, 0.4))
+    identify_actuator([recording])
+
+
 def timed() -> None:
     """Evaluate models with time."""
     times, inputs = np.arange(4.0), np.array([0.0, 1.0, 0.2, 0.8])
@@ -122,5 +147,6 @@ if __name__ == "__main__":
     element_operators()
     hybrid_estimate()
     twin()
+    transients()
     timed()
     laboratories()
