@@ -60,7 +60,8 @@ def minute(tmp_path_factory):
     """Status, reason and results by table, controller and plant."""
     file, out = read_campaign(FILE), tmp_path_factory.mktemp("robustness")
     chosen = tuple(first_of_each_axis(table, *MINUTE[table.name]) for table in file.runs if table.name in MINUTE)
-    tasks = expand(replace(file, runs=chosen)).tasks
+    models = tuple(model for model in file.models if MINUTE.keys() >= set(model.runs))
+    tasks = expand(replace(file, runs=chosen, models=models)).tasks
     with Workers(1) as workers:
         done = carry_out_tasks(tasks, {}, WorkersExecutor(workers, out))
     return {
