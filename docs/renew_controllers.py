@@ -90,13 +90,14 @@ def table(shown: Shown, rows: Sequence[Row]) -> str:
     cells: dict[str, dict[str, list[Row]]] = {}
     for row in rows:
         cells.setdefault(row[shown.varies], {}).setdefault(row.get("controller", ""), []).append(row)
-    controllers = list(dict.fromkeys(row.get("controller", "") for row in rows))
-    heads = [shown.unit, *(CONTROLLERS.get(name, name) or "fine step" for name in controllers)]
-    lines = [heads, ["---"] * len(heads)]
-    for change, by_controller in cells.items():
-        found = [_cell(by_controller[name], column, shown.size) for name in controllers]
-        lines.append([title(change, shown.nominal), *found])
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    lines = [
+        (
+            [title(change, shown.nominal)],
+            {name: _cell(runs, column, shown.size) for name, runs in by_controller.items()},
+        )
+        for change, by_controller in cells.items()
+    ]
+    return _by_controller([shown.unit], lines)
 
 
 def silent(shown: Shown, rows: Sequence[Row]) -> list[str]:
@@ -134,13 +135,25 @@ def following(rows: Sequence[Row]) -> str:
         unit = {"vo2": "1/m", "hybrid": "nm"}.get(row["rig"], "µm")
         reference = f"sine, {float(row['period [s]']):g} s" if row.get("period [s]") else "file"
         cells.setdefault((row["rig"], unit, reference), {}).setdefault(row["controller"], []).append(row)
-    controllers = list(dict.fromkeys(row["controller"] for row in rows if row.get("controller")))
-    heads = ["rig", "reference", *(CONTROLLERS.get(name, name) for name in controllers)]
-    lines = [heads, ["---"] * len(heads)]
-    for (rig, unit, reference), by_controller in cells.items():
-        found = [_cell(by_controller[name], f"following_rms [{_si(unit)}]", sizes[unit]) for name in controllers]
-        lines.append([f"`{rig}`, {unit}", reference, *found])
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    lines = [
+        (
+            [f"`{rig}`, {unit}", reference],
+            {name: _cell(runs, f"following_rms [{_si(unit)}]", sizes[unit]) for name, runs in by_controller.items()},
+        )
+        for (rig, unit, reference), by_controller in cells.items()
+    ]
+    return _by_controller(["rig", "reference"], lines)
+
+
+def _by_controller(heads: Sequence[str], lines: Sequence[tuple[list[str], dict[str, str]]]) -> str:
+    """Return a table of lines: their titles, and a cell for each controller."""
+    names = list(dict.fromkeys(name for _, cells in lines for name in cells))
+    whole = [
+        [*heads, *(CONTROLLERS.get(name, name) or "fine step" for name in names)],
+        ["---"] * (len(heads) + len(names)),
+        *([*titles, *(cells[name] for name in names)] for titles, cells in lines),
+    ]
+    return "\n".join(f"| {' | '.join(line)} |" for line in whole)
 
 
 def _cell(runs: Sequence[Row], column: str, size: float) -> str:
