@@ -12,9 +12,10 @@ from numpy.typing import ArrayLike
 from bench.hysteresis import Regressor, _checks
 from bench.hysteresis._checks import Floats
 from bench.identification.cell_layout import CellLayout, Flags, Indices
-from bench.identification.cholesky_factor import DEPENDENT, CholeskyFactor
+from bench.identification.cholesky_factor import DEPENDENT, CholeskyFactor, estimated_norm
 from bench.identification.collapse import LONG, collapse
 from bench.identification.fit_progress import say_fit_progress
+from bench.identification.scaled_columns import ScaledColumns
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -28,8 +29,6 @@ _LEVEL = 1e-11
 _ENTRY = 0.25
 # A smooth fit of at least this order starts from one of half the order.
 _COARSEST = 24
-# Gram rows formed at a time where they are only looked at.
-_ROWS = 256
 
 
 @dataclass(frozen=True, eq=False)
@@ -319,21 +318,20 @@ class _ActiveSet:
         self.regressor, self.y, self.w, self.constrained, self.layout = regressor, y, w, constrained, layout
         self.cells = regressor.base.size
         count = regressor.shape[1]
-        self.columns = lists.by_column(regressor.starts, regressor.cells, regressor.changes, self.cells)
+        changes = lists.by_column(regressor.starts, regressor.cells, regressor.changes, self.cells)
         remaining = w[::-1].cumsum()[::-1].copy()
-        self.total = float(remaining[0])
-        self.cell_means, cell_norms = _kernels.moments(self.columns, regressor.base, remaining)
+        total = float(remaining[0])
+        cell_means, cell_norms = _kernels.moments(changes, regressor.base, remaining)
         extra = regressor.extra
-        self.means = np.concatenate([self.cell_means, w @ extra / self.total])
+        self.means = np.concatenate([cell_means, w @ extra / total])
         centred = extra - self.means[self.cells :]
         norms = np.concatenate([cell_norms, np.sqrt(w @ centred**2)])
         scale = np.concatenate([np.abs(regressor.base), np.abs(extra).max(axis=0, initial=0.0)])
-        self.swept: Flags = changing(norms, scale, self.total)
+        self.swept: Flags = changing(norms, scale, total)
         unit = mean_square(cell_norms[self.swept[: self.cells]])
         self.norms = np.where(self.swept, norms, np.sqrt(unit))
-        self.extra = np.ascontiguousarray(centred / self.norms[self.cells :])
         self.usable = self.swept.copy()
-        self.penalty: csr_array | None = None
+        penalty: csr_array | None = None
         self.smoothing, self.ridge = (smoothing, ridge) if absolute else (smoothing * unit, ridge * unit)
         rough = self.smoothing > 0.0 and layout.order > 0
         if rough or (self.ridge > 0.0 and self.cells):
@@ -344,14 +342,24 @@ class _ActiveSet:
             if rough:
                 matrix = matrix + self.smoothing * layout.roughness()
                 self.usable[: self.cells] |= layout.layers == 0
-            self.penalty = csr_array(scaling @ matrix @ scaling)
+            penalty = csr_array(scaling @ matrix @ scaling)
+        self.columns = ScaledColumns(
+            changes=changes,
+            base=regressor.base,
+            means=cell_means,
+            norms=self.norms,
+            extra=np.ascontiguousarray(centred / self.norms[self.cells :]),
+            weights=w,
+            total=total,
+            penalty=penalty,
+        )
 
-        self.mean = float(w @ y / self.total)
+        self.mean = float(w @ y / total)
         self.centred = y - self.mean
         self.size = float(np.sqrt(w @ self.centred**2))
         self.right = self.products(self.centred)
         # What the products of a column with the outputs are, they are with another column.
-        self.extra_gram = np.array([self.products(column) for column in np.ascontiguousarray(self.extra.T)])
+        self.extra_gram = np.array([self.products(each) for each in np.ascontiguousarray(self.columns.extra.T)])
         self.x = np.zeros(count)
         self.factor = CholeskyFactor()
         # The cache holds that of few samples.
@@ -361,25 +369,18 @@ class _ActiveSet:
 
     def products(self, residual: Floats) -> Floats:
         """Return the scaled columns' products with the weighted residual."""
-        from bench.identification import _kernels
-
-        result = np.asarray(_kernels.products(self.columns, self.norms, self.extra, self.w, self.total, residual))
+        result = self.columns.products(residual)
         result[~self.usable] = 0.0
         return result
 
     def residual(self) -> Floats:
-        from bench.identification import _kernels
-
-        chosen = np.flatnonzero(self.x[: self.cells])
-        factors = self.x[chosen] / self.norms[chosen]
-        model = _kernels.combination(self.columns, self.regressor.base, self.cell_means, chosen, factors, self.y.size)
-        return np.asarray(self.centred - model - self.extra @ self.x[self.cells :])
+        return self.centred - self.columns.model(self.x)
 
     def slope(self) -> Floats:
         """Return the negative gradient of half the cost."""
         g = self.products(self.residual())
-        if self.penalty is not None:
-            g[: self.cells] -= self.penalty @ self.x[: self.cells]
+        if self.columns.penalty is not None:
+            g[: self.cells] -= self.columns.penalty @ self.x[: self.cells]
         return g
 
     def gram(self, new: Indices, before: Indices) -> Floats:
@@ -393,9 +394,9 @@ class _ActiveSet:
         result = np.zeros((new.size, known.size))
         width = min(-(-new.size // 8) * 8, self.tails.size // self.w.size)
         _kernels.gram_rows(
-            self.columns,
-            self.regressor.base,
-            self.cell_means,
+            self.columns.changes,
+            self.columns.base,
+            self.columns.means,
             self.norms[: self.cells],
             self.w,
             new,
@@ -403,13 +404,13 @@ class _ActiveSet:
             self.tails[: self.w.size * width].reshape(self.w.size, width),
             result,
         )
-        if self.extra.shape[1]:
+        if self.extra_gram.size:
             for one, other, part in ((new, known, result), (known, new, result.T)):
                 dense = np.flatnonzero(one >= self.cells)
                 part[dense] = self.extra_gram[one[dense] - self.cells][:, other]
-        if self.penalty is not None:
+        if self.columns.penalty is not None:
             inside = np.flatnonzero(new < self.cells)
-            rough = self.penalty[new[inside]].tocoo()
+            rough = self.columns.penalty[new[inside]].tocoo()
             place = np.full(self.x.size, -1)
             place[known] = np.arange(known.size)
             places = place[rough.col]
@@ -440,7 +441,7 @@ class _ActiveSet:
         self.iterations += 1
         # In ns: of a rotated row element, of a product of two changes, and of an operation of the factorisation.
         rotations = 0.6 * float(((size - places) ** 2).sum())
-        rest, starts, cells = size - places.size, self.columns[0], self.passive[self.passive < self.cells]
+        rest, starts, cells = size - places.size, self.columns.changes[0], self.passive[self.passive < self.cells]
         changes = float((starts[cells + 1] - starts[cells]).sum()) / size
         if rotations <= 0.17 * changes * (rest**2 - first**2) + 0.01 * (rest**3 - first**3):
             self.factor.delete(places)
@@ -449,7 +450,7 @@ class _ActiveSet:
         if first < size // 8:
             first = 0
         again = self.passive[first:][~gone[first:]]
-        if self.penalty is not None:
+        if self.columns.penalty is not None:
             # What is small is at an edge, and the next to leave: cheaply, if it is among the last.
             again = again[np.argsort(-self.x[again], kind="stable")]
         self.passive = self.passive[:first]
@@ -500,7 +501,7 @@ class _ActiveSet:
         """Find the passive set and the coefficients."""
         free = np.flatnonzero(~self.constrained & self.usable)
         first = np.concatenate([free[free >= self.cells], free[free < self.cells]])
-        if self.penalty is not None:
+        if self.columns.penalty is not None:
             first = np.concatenate([first, self.promising()])
         barred = np.zeros(self.x.size, dtype=bool)
         tolerance = _TOLERANCE * self.size
@@ -544,7 +545,7 @@ class _ActiveSet:
     def candidates(self, g: Floats, threshold: float) -> Indices:
         """Return the columns to enter next."""
         dense = np.flatnonzero(g[self.cells :] >= threshold) + self.cells
-        if self.penalty is not None:
+        if self.columns.penalty is not None:
             # Roughness tells neighbours apart.
             return np.concatenate([dense, np.flatnonzero(g[: self.cells] >= 0.2 * threshold)])
         return np.concatenate([dense, self.layout.crests(g[: self.cells], threshold)])
@@ -599,7 +600,7 @@ class _ActiveSet:
 
         The factor is used up.
         """
-        passive, penalty = self.passive, self.penalty
+        passive, penalty = self.passive, self.columns.penalty
         self.factor.invert()
         diagonal = self.factor.inverse_diagonal()
         if penalty is None or not passive.size:
@@ -612,20 +613,11 @@ class _ActiveSet:
         smooth = float(block.diagonal() @ diagonal[inside]) + 2.0 * float(block.data[below] @ inverse)
         return diagonal, passive.size - smooth
 
-    def largest_row(self) -> float:
-        """Return the greatest sum of magnitudes over a row of the passive Gram block."""
-        passive = self.passive
-        if passive.size <= 2 * _ROWS:
-            lower = self.factor.dense()
-            return float(np.abs(lower @ lower.T).sum(axis=1).max(initial=0.0))
-        sums = np.zeros(passive.size)
-        for first in range(0, passive.size, _ROWS):
-            last = min(first + _ROWS, passive.size)
-            rows = np.abs(np.tril(self.gram(passive[first:last], passive[:first]), first))
-            sums[first:last] += rows.sum(axis=1)
-            np.fill_diagonal(rows[:, first:], 0.0)
-            sums[:last] += rows.sum(axis=0)
-        return float(sums.max(initial=0.0))
+    def gram_product(self, values: Floats) -> Floats:
+        """Return the product of the passive Gram block with values."""
+        x = np.zeros(self.x.size)
+        x[self.passive] = values
+        return self.columns.gram_product(x)[self.passive]
 
     def result(self, samples: int, left: float) -> Fit:
         passive = self.passive
@@ -636,7 +628,7 @@ class _ActiveSet:
         kkt = float(violation.max(initial=0.0)) / (self.size or 1.0)
         coefficients = self.x / self.norms
         uncertainties = np.full(self.x.size, np.nan)
-        condition = self.factor.condition(self.largest_row())
+        condition = self.factor.condition(estimated_norm(self.gram_product, passive.size))
         variances, effective = self.variances()
         spare = samples - 1.0 - effective
         if spare > 0.5:
