@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
-BLOCK = 256
+BLOCK = 128
 """Rows of a block."""
 
 

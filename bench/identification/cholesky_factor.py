@@ -50,7 +50,8 @@ class CholeskyFactor:
             whole = self.packed[start : start + (last - first) * width]
             yield first, last, whole.reshape(last - first, width)[:, :last]
 
-    def _make_room(self, size: int) -> None:
+    def reserve(self, size: int) -> None:
+        """Take memory for so many columns at once."""
         from bench.identification._factor_kernels import row_start
 
         if row_start(size) > self.packed.size:
@@ -90,7 +91,7 @@ class CholeskyFactor:
         added = right.size
         if not added:
             return good
-        self._make_room(old + added)
+        self.reserve(old + added)
         self.half = np.concatenate([self.half, dtrsv(block.T, right - cross @ self.half, trans=1)])
         self.size = old + added
         *_, (first, _, last) = self._blocks(self.size)
@@ -170,7 +171,7 @@ class CholeskyFactor:
                 left = np.zeros((last - first, first))
                 for begin, end, above in self._blocks(first):
                     left[:, :end] += block[:, begin:end] @ above
-                block[:, :first] = -corner.T @ left
+                np.matmul(-corner.T, left, out=block[:, :first])
             block[:, first:] = corner.T
 
     def inverse_entries(self, first: Indices, second: Indices) -> Floats:

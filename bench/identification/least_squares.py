@@ -27,8 +27,12 @@ _ROUNDED = 1e-12
 _LEVEL = 1e-11
 # Columns enter together if their gradient is at least this part of the greatest.
 _ENTRY = 0.25
+# ... and with a penalty, which tells neighbours apart, at least this part of that.
+_KEEN = 0.2
 # A smooth fit of at least this order starts from one of half the order.
 _COARSEST = 24
+# More columns than these start from so many rounds of so many steps of conjugate gradients.
+_MANY, _ROUNDS, _STEPS = 1000, 4, 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -288,7 +292,8 @@ class _ActiveSet:
     cost is |A x - t|² + λ x'Lx, x >= 0 where constrained. Its negative half-gradient is g = A'(t - A x) - λ L x, and
     optimality (Karush-Kuhn-Tucker) means g = 0 on the passive columns P, g <= 0 on those held at zero.
 
-    1. Start with P = the free columns; with a penalty also the `promising` ones, from a plane of half the order.
+    1. Start with P = the free columns; with a penalty also the `promising` ones: those of a plane of half the order,
+       of many of them those that some steps of conjugate gradients leave positive (`approach`).
     2. `refine` the passive coefficients by the true residual and compute g; stop if g is within the tolerance.
     3. Choose the `candidates`: columns with g > 0 near the greatest, of neighbours in the plane only the `crests`.
        If only columns are left that were found dependent on P (`barred`), lower the threshold of dependence.
@@ -335,14 +340,19 @@ class _ActiveSet:
         self.smoothing, self.ridge = (smoothing, ridge) if absolute else (smoothing * unit, ridge * unit)
         rough = self.smoothing > 0.0 and layout.order > 0
         if rough or (self.ridge > 0.0 and self.cells):
-            from scipy.sparse import csr_array, diags_array, eye_array
+            from scipy.sparse import csr_array, eye_array
 
-            scaling = diags_array(1.0 / self.norms[: self.cells])
-            matrix = self.ridge * eye_array(self.cells)
+            penalty = csr_array((self.cells, self.cells))
             if rough:
-                matrix = matrix + self.smoothing * layout.roughness()
+                penalty = layout.roughness()
+                penalty.data *= self.smoothing
                 self.usable[: self.cells] |= layout.layers == 0
-            penalty = csr_array(scaling @ matrix @ scaling)
+            if self.ridge > 0.0:
+                penalty = csr_array(penalty + self.ridge * eye_array(self.cells))
+            scale = 1.0 / self.norms[: self.cells]
+            # In place: copies of it would count in the memory of a large fit.
+            penalty.data *= np.repeat(scale, np.diff(penalty.indptr))
+            penalty.data *= scale[penalty.indices]
         self.columns = ScaledColumns(
             changes=changes,
             base=regressor.base,
@@ -423,6 +433,7 @@ class _ActiveSet:
         if not columns.size:
             return columns
         self.iterations += 1
+        self.factor.reserve(self.passive.size + columns.size)
         barred = [np.empty(0, dtype=np.int64)]
         while columns.size:
             some, columns = np.split(columns, [self.factor.room])
@@ -546,8 +557,7 @@ class _ActiveSet:
         """Return the columns to enter next."""
         dense = np.flatnonzero(g[self.cells :] >= threshold) + self.cells
         if self.columns.penalty is not None:
-            # Roughness tells neighbours apart.
-            return np.concatenate([dense, np.flatnonzero(g[: self.cells] >= 0.2 * threshold)])
+            return np.concatenate([dense, np.flatnonzero(g[: self.cells] >= _KEEN * threshold)])
         return np.concatenate([dense, self.layout.crests(g[: self.cells], threshold)])
 
     def promising(self) -> Indices:
@@ -573,7 +583,34 @@ class _ActiveSet:
         chosen[: self.cells] &= values[parents] > 0.0
         self.x[: self.cells] = np.where(chosen[: self.cells], np.maximum(values[parents], 0.0), 0.0)
         self.x *= self.norms
-        return np.flatnonzero(chosen)
+        found = np.flatnonzero(chosen)
+        if found.size > _MANY:
+            for _ in range(_ROUNDS):
+                self.approach()
+            found = np.flatnonzero(signed & (self.x > 0.0))
+            # What is small is the next to leave: cheaply, if it is among the last.
+            found = found[np.argsort(-self.x[found], kind="stable")]
+        return found
+
+    def approach(self) -> None:
+        """Lower the cost by conjugate gradients over the columns likely to be passive; cut what turns negative."""
+        g = self.slope()
+        least = _ENTRY * _KEEN * g.max(initial=0.0)
+        chosen = np.flatnonzero(self.usable & (~self.constrained | (self.x > 0.0) | (g > least)))
+        part = self.columns.chosen(chosen)
+        x, r = self.x[chosen], g[chosen]
+        direction, square = r, float(r @ r)
+        for _ in range(_STEPS):
+            change = part.gram_product(direction)
+            curvature = float(direction @ change)
+            if curvature <= 0.0:
+                break
+            length = square / curvature
+            x += length * direction
+            r = r - length * change
+            before, square = square, float(r @ r)
+            direction = r + (square / before) * direction
+        self.x[chosen] = np.where(self.constrained[chosen], np.maximum(x, 0.0), x)
 
     def refine(self) -> Floats:
         """Correct the passive coefficients by the true residual; return the slope."""
