@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
-BLOCK = 256
+BLOCK = 128
 """Rows of a block."""
 
 
@@ -30,7 +30,10 @@ _start = inlined(row_start)
 
 @reordered
 def solve_lower(factor: Floats, size: int, right: Floats) -> None:
-    """Replace each of a few right sides, shape (p, size), by the x with L x = right."""
+    """Replace each of a few right sides, the first `size` of a row, by the x with L x = right.
+
+    Rows that are contiguous as a whole take a third of the time of those of a slice.
+    """
     whole = size - size % 4
     # Four rows at a time: one look at a right side then serves them all.
     for c in range(0, whole, 4):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -14,7 +14,7 @@ from bench.identification.cell_layout import Flags, Indices
 # all that is left to enter, the threshold is lowered step by step.
 DEPENDENT = (1e-12, 1e-13, 1e-14)
 # Right sides that a plain loop solves faster than BLAS, which would copy the factor.
-_FEW = 32
+_FEW = 24
 
 
 class CholeskyFactor:
@@ -50,12 +50,13 @@ class CholeskyFactor:
             whole = self.packed[start : start + (last - first) * width]
             yield first, last, whole.reshape(last - first, width)[:, :last]
 
-    def _make_room(self, size: int) -> None:
+    def reserve(self, size: int) -> None:
+        """Take memory for so many columns at once."""
         from bench.identification._factor_kernels import row_start
 
         if row_start(size) > self.packed.size:
             # Memory that nothing is written to takes none.
-            grown = np.empty(row_start(max(size + size // 2, 64)))
+            grown = np.empty(row_start(max(size + size // 2, 512)))
             used = row_start(self.size)
             grown[:used] = self.packed[:used]
             self.packed = grown
@@ -76,7 +77,7 @@ class CholeskyFactor:
         cross, square = rows[:, :old], rows[:, old:]
         least = self.threshold * np.diag(square)
         if old:
-            self._solve_lower(cross)
+            self._solve_lower(rows)
             square -= cross @ cross.T
         block, info = dpotrf(square.T, lower=0, clean=1)
         block = block.T
@@ -90,7 +91,7 @@ class CholeskyFactor:
         added = right.size
         if not added:
             return good
-        self._make_room(old + added)
+        self.reserve(old + added)
         self.half = np.concatenate([self.half, dtrsv(block.T, right - cross @ self.half, trans=1)])
         self.size = old + added
         *_, (first, _, last) = self._blocks(self.size)
@@ -99,7 +100,7 @@ class CholeskyFactor:
         return good
 
     def _solve_lower(self, right: Floats) -> None:
-        """Replace right sides, shape (p, size), by the x with L x = right."""
+        """Replace right sides, the first `size` of each contiguous row, by the x with L x = right."""
         from scipy.linalg.blas import dtrsm
 
         from bench.identification import _factor_kernels
@@ -150,33 +151,8 @@ class CholeskyFactor:
         return float(np.linalg.norm(_factor_kernels.combined_rows(self.packed, places, values)))
 
     def condition(self, norm: float) -> float:
-        """Return the condition number of the columns, given the greatest sum of magnitudes over a Gram row.
-
-        That of the inverse is estimated as by LAPACK's dlacn2: Higham, ACM Trans. Math. Software 14, 381, 1988.
-        """
-        size = self.size
-        if not size:
-            return 1.0
-        x = self.solve(np.full(size, 1.0 / size))
-        estimate, signs, place = float(np.abs(x).sum()), np.zeros(size), -1
-        for _ in range(5):
-            before, signs = signs, np.where(x > 0.0, 1.0, -1.0)
-            if (signs == before).all():
-                break
-            slope = np.abs(self.solve(signs))
-            last, place = place, int(np.argmax(slope))
-            if last >= 0 and slope[last] == slope[place]:
-                break
-            unit = np.zeros(size)
-            unit[place] = 1.0
-            x = self.solve(unit)
-            previous, estimate = estimate, float(np.abs(x).sum())
-            if estimate <= previous:
-                break
-        # Where all of that is cancelled.
-        alternating = np.where(np.arange(size) % 2 == 0, 1.0, -1.0) * (1.0 + np.arange(size) / max(size - 1, 1))
-        estimate = max(estimate, 2.0 * float(np.abs(self.solve(alternating)).sum()) / (3.0 * size))
-        return float(np.sqrt(norm * estimate))
+        """Return the condition number of the columns, given the greatest sum of magnitudes over a Gram row."""
+        return float(np.sqrt(norm * estimated_norm(self.solve, self.size)))
 
     def dense(self) -> Floats:
         """Return L, shape (size, size)."""
@@ -195,7 +171,7 @@ class CholeskyFactor:
                 left = np.zeros((last - first, first))
                 for begin, end, above in self._blocks(first):
                     left[:, :end] += block[:, begin:end] @ above
-                block[:, :first] = -corner.T @ left
+                np.matmul(-corner.T, left, out=block[:, :first])
             block[:, first:] = corner.T
 
     def inverse_entries(self, first: Indices, second: Indices) -> Floats:
@@ -210,3 +186,31 @@ class CholeskyFactor:
         for _, last, block in self._blocks(self.size):
             result[:last] += np.einsum("ij,ij->j", block, block)
         return result
+
+
+def estimated_norm(product: Callable[[Floats], Floats], size: int) -> float:
+    """Return the greatest sum of magnitudes over a row of a symmetric matrix, estimated from products with vectors.
+
+    As by LAPACK's dlacn2: Higham, ACM Trans. Math. Software 14, 381, 1988. It is never too large.
+    """
+    if not size:
+        return 1.0
+    x = product(np.full(size, 1.0 / size))
+    estimate, signs, place = float(np.abs(x).sum()), np.zeros(size), -1
+    for _ in range(5):
+        before, signs = signs, np.where(x > 0.0, 1.0, -1.0)
+        if (signs == before).all():
+            break
+        slope = np.abs(product(signs))
+        last, place = place, int(np.argmax(slope))
+        if last >= 0 and slope[last] == slope[place]:
+            break
+        unit = np.zeros(size)
+        unit[place] = 1.0
+        x = product(unit)
+        previous, estimate = estimate, float(np.abs(x).sum())
+        if estimate <= previous:
+            break
+    # Where all of that is cancelled.
+    alternating = np.where(np.arange(size) % 2 == 0, 1.0, -1.0) * (1.0 + np.arange(size) / max(size - 1, 1))
+    return max(estimate, 2.0 * float(np.abs(product(alternating)).sum()) / (3.0 * size))

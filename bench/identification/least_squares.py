@@ -12,9 +12,10 @@ from numpy.typing import ArrayLike
 from bench.hysteresis import Regressor, _checks
 from bench.hysteresis._checks import Floats
 from bench.identification.cell_layout import CellLayout, Flags, Indices
-from bench.identification.cholesky_factor import DEPENDENT, CholeskyFactor
+from bench.identification.cholesky_factor import DEPENDENT, CholeskyFactor, estimated_norm
 from bench.identification.collapse import LONG, collapse
 from bench.identification.fit_progress import say_fit_progress
+from bench.identification.scaled_columns import ScaledColumns
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -26,10 +27,12 @@ _ROUNDED = 1e-12
 _LEVEL = 1e-11
 # Columns enter together if their gradient is at least this part of the greatest.
 _ENTRY = 0.25
+# ... and with a penalty, which tells neighbours apart, at least this part of that.
+_KEEN = 0.2
 # A smooth fit of at least this order starts from one of half the order.
 _COARSEST = 24
-# Gram rows formed at a time where they are only looked at.
-_ROWS = 256
+# More columns than these start from so many rounds of so many steps of conjugate gradients.
+_MANY, _ROUNDS, _STEPS = 1000, 4, 50
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,7 +292,8 @@ class _ActiveSet:
     cost is |A x - t|² + λ x'Lx, x >= 0 where constrained. Its negative half-gradient is g = A'(t - A x) - λ L x, and
     optimality (Karush-Kuhn-Tucker) means g = 0 on the passive columns P, g <= 0 on those held at zero.
 
-    1. Start with P = the free columns; with a penalty also the `promising` ones, from a plane of half the order.
+    1. Start with P = the free columns; with a penalty also the `promising` ones: those of a plane of half the order,
+       of many of them those that some steps of conjugate gradients leave positive (`approach`).
     2. `refine` the passive coefficients by the true residual and compute g; stop if g is within the tolerance.
     3. Choose the `candidates`: columns with g > 0 near the greatest, of neighbours in the plane only the `crests`.
        If only columns are left that were found dependent on P (`barred`), lower the threshold of dependence.
@@ -319,39 +323,53 @@ class _ActiveSet:
         self.regressor, self.y, self.w, self.constrained, self.layout = regressor, y, w, constrained, layout
         self.cells = regressor.base.size
         count = regressor.shape[1]
-        self.columns = lists.by_column(regressor.starts, regressor.cells, regressor.changes, self.cells)
+        changes = lists.by_column(regressor.starts, regressor.cells, regressor.changes, self.cells)
         remaining = w[::-1].cumsum()[::-1].copy()
-        self.total = float(remaining[0])
-        self.cell_means, cell_norms = _kernels.moments(self.columns, regressor.base, remaining)
+        total = float(remaining[0])
+        cell_means, cell_norms = _kernels.moments(changes, regressor.base, remaining)
         extra = regressor.extra
-        self.means = np.concatenate([self.cell_means, w @ extra / self.total])
+        self.means = np.concatenate([cell_means, w @ extra / total])
         centred = extra - self.means[self.cells :]
         norms = np.concatenate([cell_norms, np.sqrt(w @ centred**2)])
         scale = np.concatenate([np.abs(regressor.base), np.abs(extra).max(axis=0, initial=0.0)])
-        self.swept: Flags = changing(norms, scale, self.total)
+        self.swept: Flags = changing(norms, scale, total)
         unit = mean_square(cell_norms[self.swept[: self.cells]])
         self.norms = np.where(self.swept, norms, np.sqrt(unit))
-        self.extra = np.ascontiguousarray(centred / self.norms[self.cells :])
         self.usable = self.swept.copy()
-        self.penalty: csr_array | None = None
+        penalty: csr_array | None = None
         self.smoothing, self.ridge = (smoothing, ridge) if absolute else (smoothing * unit, ridge * unit)
         rough = self.smoothing > 0.0 and layout.order > 0
         if rough or (self.ridge > 0.0 and self.cells):
-            from scipy.sparse import csr_array, diags_array, eye_array
+            from scipy.sparse import csr_array, eye_array
 
-            scaling = diags_array(1.0 / self.norms[: self.cells])
-            matrix = self.ridge * eye_array(self.cells)
+            penalty = csr_array((self.cells, self.cells))
             if rough:
-                matrix = matrix + self.smoothing * layout.roughness()
+                penalty = layout.roughness()
+                penalty.data *= self.smoothing
                 self.usable[: self.cells] |= layout.layers == 0
-            self.penalty = csr_array(scaling @ matrix @ scaling)
+            if self.ridge > 0.0:
+                penalty = csr_array(penalty + self.ridge * eye_array(self.cells))
+            scale = 1.0 / self.norms[: self.cells]
+            # In place: copies of it would count in the memory of a large fit.
+            penalty.data *= np.repeat(scale, np.diff(penalty.indptr))
+            penalty.data *= scale[penalty.indices]
+        self.columns = ScaledColumns(
+            changes=changes,
+            base=regressor.base,
+            means=cell_means,
+            norms=self.norms,
+            extra=np.ascontiguousarray(centred / self.norms[self.cells :]),
+            weights=w,
+            total=total,
+            penalty=penalty,
+        )
 
-        self.mean = float(w @ y / self.total)
+        self.mean = float(w @ y / total)
         self.centred = y - self.mean
         self.size = float(np.sqrt(w @ self.centred**2))
         self.right = self.products(self.centred)
         # What the products of a column with the outputs are, they are with another column.
-        self.extra_gram = np.array([self.products(column) for column in np.ascontiguousarray(self.extra.T)])
+        self.extra_gram = np.array([self.products(each) for each in np.ascontiguousarray(self.columns.extra.T)])
         self.x = np.zeros(count)
         self.factor = CholeskyFactor()
         # The cache holds that of few samples.
@@ -361,25 +379,18 @@ class _ActiveSet:
 
     def products(self, residual: Floats) -> Floats:
         """Return the scaled columns' products with the weighted residual."""
-        from bench.identification import _kernels
-
-        result = np.asarray(_kernels.products(self.columns, self.norms, self.extra, self.w, self.total, residual))
+        result = self.columns.products(residual)
         result[~self.usable] = 0.0
         return result
 
     def residual(self) -> Floats:
-        from bench.identification import _kernels
-
-        chosen = np.flatnonzero(self.x[: self.cells])
-        factors = self.x[chosen] / self.norms[chosen]
-        model = _kernels.combination(self.columns, self.regressor.base, self.cell_means, chosen, factors, self.y.size)
-        return np.asarray(self.centred - model - self.extra @ self.x[self.cells :])
+        return self.centred - self.columns.model(self.x)
 
     def slope(self) -> Floats:
         """Return the negative gradient of half the cost."""
         g = self.products(self.residual())
-        if self.penalty is not None:
-            g[: self.cells] -= self.penalty @ self.x[: self.cells]
+        if self.columns.penalty is not None:
+            g[: self.cells] -= self.columns.penalty @ self.x[: self.cells]
         return g
 
     def gram(self, new: Indices, before: Indices) -> Floats:
@@ -393,9 +404,9 @@ class _ActiveSet:
         result = np.zeros((new.size, known.size))
         width = min(-(-new.size // 8) * 8, self.tails.size // self.w.size)
         _kernels.gram_rows(
-            self.columns,
-            self.regressor.base,
-            self.cell_means,
+            self.columns.changes,
+            self.columns.base,
+            self.columns.means,
             self.norms[: self.cells],
             self.w,
             new,
@@ -403,13 +414,13 @@ class _ActiveSet:
             self.tails[: self.w.size * width].reshape(self.w.size, width),
             result,
         )
-        if self.extra.shape[1]:
+        if self.extra_gram.size:
             for one, other, part in ((new, known, result), (known, new, result.T)):
                 dense = np.flatnonzero(one >= self.cells)
                 part[dense] = self.extra_gram[one[dense] - self.cells][:, other]
-        if self.penalty is not None:
+        if self.columns.penalty is not None:
             inside = np.flatnonzero(new < self.cells)
-            rough = self.penalty[new[inside]].tocoo()
+            rough = self.columns.penalty[new[inside]].tocoo()
             place = np.full(self.x.size, -1)
             place[known] = np.arange(known.size)
             places = place[rough.col]
@@ -422,6 +433,7 @@ class _ActiveSet:
         if not columns.size:
             return columns
         self.iterations += 1
+        self.factor.reserve(self.passive.size + columns.size)
         barred = [np.empty(0, dtype=np.int64)]
         while columns.size:
             some, columns = np.split(columns, [self.factor.room])
@@ -440,7 +452,7 @@ class _ActiveSet:
         self.iterations += 1
         # In ns: of a rotated row element, of a product of two changes, and of an operation of the factorisation.
         rotations = 0.6 * float(((size - places) ** 2).sum())
-        rest, starts, cells = size - places.size, self.columns[0], self.passive[self.passive < self.cells]
+        rest, starts, cells = size - places.size, self.columns.changes[0], self.passive[self.passive < self.cells]
         changes = float((starts[cells + 1] - starts[cells]).sum()) / size
         if rotations <= 0.17 * changes * (rest**2 - first**2) + 0.01 * (rest**3 - first**3):
             self.factor.delete(places)
@@ -449,7 +461,7 @@ class _ActiveSet:
         if first < size // 8:
             first = 0
         again = self.passive[first:][~gone[first:]]
-        if self.penalty is not None:
+        if self.columns.penalty is not None:
             # What is small is at an edge, and the next to leave: cheaply, if it is among the last.
             again = again[np.argsort(-self.x[again], kind="stable")]
         self.passive = self.passive[:first]
@@ -500,7 +512,7 @@ class _ActiveSet:
         """Find the passive set and the coefficients."""
         free = np.flatnonzero(~self.constrained & self.usable)
         first = np.concatenate([free[free >= self.cells], free[free < self.cells]])
-        if self.penalty is not None:
+        if self.columns.penalty is not None:
             first = np.concatenate([first, self.promising()])
         barred = np.zeros(self.x.size, dtype=bool)
         tolerance = _TOLERANCE * self.size
@@ -544,9 +556,8 @@ class _ActiveSet:
     def candidates(self, g: Floats, threshold: float) -> Indices:
         """Return the columns to enter next."""
         dense = np.flatnonzero(g[self.cells :] >= threshold) + self.cells
-        if self.penalty is not None:
-            # Roughness tells neighbours apart.
-            return np.concatenate([dense, np.flatnonzero(g[: self.cells] >= 0.2 * threshold)])
+        if self.columns.penalty is not None:
+            return np.concatenate([dense, np.flatnonzero(g[: self.cells] >= _KEEN * threshold)])
         return np.concatenate([dense, self.layout.crests(g[: self.cells], threshold)])
 
     def promising(self) -> Indices:
@@ -572,7 +583,34 @@ class _ActiveSet:
         chosen[: self.cells] &= values[parents] > 0.0
         self.x[: self.cells] = np.where(chosen[: self.cells], np.maximum(values[parents], 0.0), 0.0)
         self.x *= self.norms
-        return np.flatnonzero(chosen)
+        found = np.flatnonzero(chosen)
+        if found.size > _MANY:
+            for _ in range(_ROUNDS):
+                self.approach()
+            found = np.flatnonzero(signed & (self.x > 0.0))
+            # What is small is the next to leave: cheaply, if it is among the last.
+            found = found[np.argsort(-self.x[found], kind="stable")]
+        return found
+
+    def approach(self) -> None:
+        """Lower the cost by conjugate gradients over the columns likely to be passive; cut what turns negative."""
+        g = self.slope()
+        least = _ENTRY * _KEEN * g.max(initial=0.0)
+        chosen = np.flatnonzero(self.usable & (~self.constrained | (self.x > 0.0) | (g > least)))
+        part = self.columns.chosen(chosen)
+        x, r = self.x[chosen], g[chosen]
+        direction, square = r, float(r @ r)
+        for _ in range(_STEPS):
+            change = part.gram_product(direction)
+            curvature = float(direction @ change)
+            if curvature <= 0.0:
+                break
+            length = square / curvature
+            x += length * direction
+            r = r - length * change
+            before, square = square, float(r @ r)
+            direction = r + (square / before) * direction
+        self.x[chosen] = np.where(self.constrained[chosen], np.maximum(x, 0.0), x)
 
     def refine(self) -> Floats:
         """Correct the passive coefficients by the true residual; return the slope."""
@@ -599,7 +637,7 @@ class _ActiveSet:
 
         The factor is used up.
         """
-        passive, penalty = self.passive, self.penalty
+        passive, penalty = self.passive, self.columns.penalty
         self.factor.invert()
         diagonal = self.factor.inverse_diagonal()
         if penalty is None or not passive.size:
@@ -612,20 +650,11 @@ class _ActiveSet:
         smooth = float(block.diagonal() @ diagonal[inside]) + 2.0 * float(block.data[below] @ inverse)
         return diagonal, passive.size - smooth
 
-    def largest_row(self) -> float:
-        """Return the greatest sum of magnitudes over a row of the passive Gram block."""
-        passive = self.passive
-        if passive.size <= 2 * _ROWS:
-            lower = self.factor.dense()
-            return float(np.abs(lower @ lower.T).sum(axis=1).max(initial=0.0))
-        sums = np.zeros(passive.size)
-        for first in range(0, passive.size, _ROWS):
-            last = min(first + _ROWS, passive.size)
-            rows = np.abs(np.tril(self.gram(passive[first:last], passive[:first]), first))
-            sums[first:last] += rows.sum(axis=1)
-            np.fill_diagonal(rows[:, first:], 0.0)
-            sums[:last] += rows.sum(axis=0)
-        return float(sums.max(initial=0.0))
+    def gram_product(self, values: Floats) -> Floats:
+        """Return the product of the passive Gram block with values."""
+        x = np.zeros(self.x.size)
+        x[self.passive] = values
+        return self.columns.gram_product(x)[self.passive]
 
     def result(self, samples: int, left: float) -> Fit:
         passive = self.passive
@@ -636,7 +665,7 @@ class _ActiveSet:
         kkt = float(violation.max(initial=0.0)) / (self.size or 1.0)
         coefficients = self.x / self.norms
         uncertainties = np.full(self.x.size, np.nan)
-        condition = self.factor.condition(self.largest_row())
+        condition = self.factor.condition(estimated_norm(self.gram_product, passive.size))
         variances, effective = self.variances()
         spare = samples - 1.0 - effective
         if spare > 0.5:

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from sim_devices.transducers import _imperfect_kernels as kernels
 from sim_devices.world import World
 
 Floats = NDArray[np.float64]
@@ -182,6 +181,8 @@ class Characteristic:
         return self._gain, self._offset, self._wave, self._scale, self._middle, _WAVE, self._resolution
 
     def _replace(self, quantities: Floats, resolution: float) -> None:
+        from sim_devices.transducers import _imperfect_kernels as kernels
+
         kernels.show(quantities, *self.numbers[:-1], resolution)
 
 

@@ -7,7 +7,6 @@ import time
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize, nnls
 from threadpoolctl import threadpool_limits
 
 from bench.hysteresis import Preisach, uniform_levels
@@ -42,6 +41,8 @@ def problem(order, samples=3000, cycles=30):
 
 def by_projected_quasi_newton(matrix, outputs):
     """L-BFGS-B on the dense matrix, columns scaled."""
+    from scipy.optimize import minimize
+
     norms = np.linalg.norm(matrix, axis=0)
     scaled = matrix / norms
 
@@ -56,6 +57,8 @@ def by_projected_quasi_newton(matrix, outputs):
 
 
 def test_fit(capsys):
+    from scipy.optimize import nnls  # No part of the memory of a large problem.
+
     operator, inputs, outputs = problem(5)
     fit(operator.regressor(inputs), outputs)
     fit(operator.regressor(inputs), outputs, smoothing=1e-3)

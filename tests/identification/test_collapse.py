@@ -53,6 +53,7 @@ def test_normal_equations_are_the_same(term, digits):
 @settings(max_examples=15)
 @given(st.integers(0, 10_000), st.sampled_from(TERMS), st.sampled_from([0.0, 1e-3]))
 @example(1540, None, 0.0)
+@example(1411, None, 0.0)
 def test_the_fit_is_the_same(seed, term, smoothing):
     regressor, outputs, weights = problem(seed, term)
     signs = np.arange(regressor.shape[1]) < regressor.base.size
@@ -64,13 +65,16 @@ def test_the_fit_is_the_same(seed, term, smoothing):
     np.testing.assert_array_equal(found.certificate.swept, expected.certificate.swept)
     size = np.abs(expected.coefficients).max()
     fitted = expected.bias + regressor.product(expected.coefficients)
-    np.testing.assert_allclose(found.bias + regressor.product(found.coefficients), fitted, atol=1e-7 * size)
+    # Samples without weight tell nothing of which minimiser is taken.
+    counted = np.flatnonzero(weights)[7:]
+    again = found.bias + regressor.product(found.coefficients)
+    np.testing.assert_allclose(again[counted], fitted[counted], atol=1e-7 * size)
     # Where cells can replace each other, those of either choice are a minimiser.
     if np.array_equal(found.coefficients == 0.0, expected.coefficients == 0.0):
         np.testing.assert_allclose(found.coefficients, expected.coefficients, atol=1e-7 * size)
         np.testing.assert_allclose(found.uncertainties, expected.uncertainties, rtol=1e-5, atol=1e-9 * size)
     # The residual, that of the whole record, is the least.
-    errors = outputs - found.bias - regressor.product(found.coefficients)
+    errors = outputs - again
     least = outputs - fitted
     assert weights[7:] @ errors[7:] ** 2 <= weights[7:] @ least[7:] ** 2 * (1.0 + 1e-12)
 
