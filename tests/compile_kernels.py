@@ -35,7 +35,7 @@ from bench.transients.response import late_parts
 from bench.twin.specimen import Dynamics, Specimen
 from rigs.hybrid.design import Design
 from rigs.hybrid.estimates import Bending, ReducedNetwork, ThermalNoise, UnscentedEstimate
-from rigs.hybrid.model import identify_polynomial
+from rigs.hybrid.model import PUBLISHED_DYNAMICS, identify_polynomial
 
 
 def operators() -> None:
@@ -103,6 +103,11 @@ def hybrid_estimate() -> None:
     estimate.correct(0.0, 0.0, 0.0)
 
 
+def third_order() -> None:
+    """Simulate the dynamics of a fast actuator."""
+    PUBLISHED_DYNAMICS.simulate(np.ones(2), 1e-3)
+
+
 def twin() -> None:
     """Move the specimen of a twin."""
     operator = Preisach(uniform_levels(0.0, 1.0, 4), np.ones(10), 0.0, None, (0.0, 1.0))
@@ -146,6 +151,7 @@ if __name__ == "__main__":
     operators()
     element_operators()
     hybrid_estimate()
+    third_order()
     twin()
     transients()
     timed()
