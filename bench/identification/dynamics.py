@@ -219,9 +219,7 @@ class ThirdOrder:
         u = _checks.samples("inputs", inputs)
         poles, residues = self._modes
         factors, entries = np.exp(poles * _checks.positive("dt", dt)), np.expm1(poles * dt) / poles
-        real, pair = (
-            np.asarray(residues[k] * held_response(factors[k], entries[k], u)).real for k in range(2)
-        )
+        real, pair = (np.asarray(residues[k] * held_response(factors[k], entries[k], u)).real for k in range(2))
         return np.asarray(real + 2.0 * pair)
 
     def to_json(self) -> dict[str, Any]:
