@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from bench.control.play_inverse import PlayInverse
 from bench.control.references import ApproachedReference, Reference
 from bench.control.tracking import Trace, check_positive
 from bench.controllers import ControllerSetup, ControllerSpec
+from bench.deferred import DeferredModule
 from bench.errors import ConvergenceError
 from rigs.hybrid.estimates import (
     Bending,
@@ -36,6 +37,11 @@ from rigs.hybrid.estimates import (
 )
 from rigs.hybrid.lateness import BEGIN, END, LatenessProbe
 from rigs.hybrid.model import HybridModel
+
+if TYPE_CHECKING:
+    from rigs.hybrid import _kernels as kernels
+else:
+    kernels = DeferredModule("rigs.hybrid._kernels")
 
 STROKE = 9e-6
 """Largest deflection of either sign that the piezo part is asked for, m."""
@@ -177,6 +183,7 @@ class _MidRanging:
         self._reference = ApproachedReference(reference, _NEAR * parameters.stroke, parameters.approach)
         self._position: Reference = self._reference
         self._step = parameters.period * parameters.every
+        self._settings = np.array([parameters.gain, self._step, parameters.integral_time, parameters.maximum_current])
         self._prepare(model.reference)
         self._inverse = inverse = PlayInverse(model.hysteresis, parameters.stroke) if piezo else None
         self._integral_gain = integral * parameters.period
@@ -287,23 +294,26 @@ class _MidRanging:
 
     def _heat(self, now: float, *, hold: bool) -> None:
         """Advance the thermal part over the past period; set the current of the coming one, or hold it."""
-        p, network, base = self._p, self._network, self._base
+        network, base = self._network, self._base
         network.advance(base, self._current, self._step)
         self._estimate.correct(base, self._tip, self._current)
         wanted, ahead, rate = self._preview.advance(now)
         if hold:
             return
-        rise = self._bending.rise(ahead)
-        slope = self._bending.slope(rise)
-        heat = network.heat_for(rise, rate / slope, base, self._current)
-        # Heat deflects negatively: the sign is that of the slope.
-        lacking = math.copysign(p.gain, slope) * (wanted - self._estimate.value)
-        further = self._fed_back + lacking * self._step / p.integral_time
-        current = network.current_for(heat + lacking + further, base)
-        self._current = min(max(current, -p.maximum_current), p.maximum_current)
-        # At the limit the integral only moves away from it.
-        if self._current == current or lacking * current < 0.0:
-            self._fed_back = further
+        bending = self._bending
+        self._current, self._fed_back = kernels.next_current(
+            ahead,
+            rate,
+            wanted - self._estimate.value,
+            base,
+            self._current,
+            self._fed_back,
+            self._settings,
+            network.numbers,
+            bending.range,
+            bending.slopes,
+            bending.table,
+        )
 
     @property
     def trace(self) -> Trace:
