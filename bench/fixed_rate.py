@@ -113,8 +113,8 @@ def _samples(run: RunAtHand, message: FixedRate, period: float) -> Reading:
             run.judge(clock.now(), values)
             next_tick = run.tick_after(next_tick)
         k += 1
-        if (reached := math.floor((clock.now() - start) / period)) > k:
-            k = min(samples, reached)
+        if (reached := (clock.now() - start) / period) >= k + 1:
+            k = min(samples, math.floor(reached))
     return _finish(run, message, started, taken, lateness, commands)
 
 
