@@ -52,7 +52,7 @@ _AT_REST = 0.2
 _TOLERATED = 0.6
 """Difference of the lateness that is found to the one that is known, in periods, up to which both are the same."""
 _ROOM = 4
-"""Room for the reference that comes, in lengths of the known one."""
+"""Room for the reference that comes, in widths of its window."""
 _RESTED = 15.0
 """Time for which the reference has rested where the error of the model alone is judged, s."""
 _JUDGED = 5.0
@@ -80,29 +80,31 @@ class _Preview:
         slopes = np.sin(math.pi * x)
         # Exact for a ramp.
         self._slopes = slopes / (slopes @ (x * (half + 1.0) * period))
-        self._width = 2 * half + 1
+        width = 2 * half + 1
         ahead = round(lead / period)
-        values = [reference(k * period) for k in range(-half, half + 1 + ahead)]
-        # The known reference moves along the array, and back to its beginning once it has come to the end.
-        self._known = len(values)
-        self._values = np.array(values + [0.0] * (_ROOM * self._known))
+        values = np.array([reference(k * period) for k in range(-half, half + 1 + ahead)])
+        # What is ahead now is the present in a while.
+        self._smoothed = deque(float(self._weights.dot(values[k : k + width])) for k in range(ahead))
+        # The window ahead moves along the array, and back to its beginning once it has come to the end.
+        self._width = width
+        self._values = np.append(values[ahead:], np.zeros(_ROOM * width))
         self._begin = 0
         self._next = half + 1 + ahead
 
     def advance(self, t: float) -> tuple[float, float, float]:
         """Return the smoothed reference now (m), and ahead (m) with its derivative (m/s)."""
-        values, width, begin = self._values, self._width, self._begin
-        end = begin + self._known
+        values, begin = self._values, self._begin
+        end = begin + self._width
+        window = values[begin:end]
         # As a product by `@`, in half the time.
-        now = float(self._weights.dot(values[begin : begin + width]))
-        window = values[end - width : end]
         ahead, rate = float(self._weights.dot(window)), float(self._slopes.dot(window))
+        self._smoothed.append(ahead)
         if end == len(values):
-            values[: self._known] = values[begin:]
-            begin, end = 0, self._known
+            values[: self._width] = window
+            begin, end = 0, self._width
         values[end] = self._reference(t + self._next * self._period)
         self._begin = begin + 1
-        return now, ahead, rate
+        return self._smoothed.popleft(), ahead, rate
 
 
 @dataclass(frozen=True)
