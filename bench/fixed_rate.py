@@ -50,7 +50,7 @@ def _samples(run: RunAtHand, message: FixedRate, period: float) -> Reading:
     assert isinstance(controller, SampledController)
     clock, update = run.clock, controller.update
     setpoints = [f"{name}_setpoint" for name in message.actuators]
-    limits = list(zip(message.actuators, message.limits, strict=False))
+    lowest, highest = ([each[side] for each in message.limits] for side in (0, 1))
     read = run.station.quick_reader(inputs)
     # What is watched is for the record alone.
     read_recorded = run.station.quick_reader((*inputs, *message.watched)) if message.watched else read
@@ -93,9 +93,9 @@ def _samples(run: RunAtHand, message: FixedRate, period: float) -> Reading:
                 f"the controller of {', '.join(message.actuators)} gave {len(commands)} set-points; "
                 f"expected {len(setpoints)}"
             )
-        for (name, (low, high)), command in zip(limits, commands, strict=False):
+        for low, command, high in zip(lowest, commands, highest, strict=False):
             if not low <= command <= high:
-                raise LimitError(name, f"the controller asked for {command:g}, beyond {low:g} to {high:g}")
+                _check_limits(message, np.array([commands]))
         move(commands)
         late = now - due
         note_late(late)
@@ -113,8 +113,8 @@ def _samples(run: RunAtHand, message: FixedRate, period: float) -> Reading:
             run.judge(clock.now(), values)
             next_tick = run.tick_after(next_tick)
         k += 1
-        if (reached := math.floor((clock.now() - start) / period)) > k:
-            k = min(samples, reached)
+        if (reached := (clock.now() - start) / period) >= k + 1:
+            k = min(samples, math.floor(reached))
     return _finish(run, message, started, taken, lateness, commands)
 
 
@@ -151,7 +151,7 @@ def _blocks(run: RunAtHand, message: FixedRate, period: float) -> Reading:
         out: Floats = np.full((count, len(setpoints)), math.nan)
         times = (np.arange(k, k + count) * period).astype(np.float64)
         controller.step_block(times, readings[:, : len(message.inputs)], out)
-        _check_block(message, out)
+        _check_limits(message, out)
         late = now - due
         readings = play(out) if play is not None else _sampled(run, message, signals, out, start + times)
         lateness.add(late, count)
@@ -172,8 +172,8 @@ def _blocks(run: RunAtHand, message: FixedRate, period: float) -> Reading:
     return _finish(run, message, started, taken, lateness, out[-1].tolist())
 
 
-def _check_block(message: FixedRate, out: Floats) -> None:
-    """Raise `LimitError` unless all set-points of a block are within the limits of the loop."""
+def _check_limits(message: FixedRate, out: Floats) -> None:
+    """Raise `LimitError` unless all set-points, a sample in a row, are within the limits of the loop."""
     for name, (low, high), column in zip(message.actuators, message.limits, out.T, strict=False):
         if not (allowed := (low <= column) & (column <= high)).all():
             wrong = column[~allowed][0]

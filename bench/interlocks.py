@@ -230,7 +230,7 @@ class InterlockWatch:
 
     def __init__(self, interlocks: Iterable[Interlock], units: Mapping[str, str]) -> None:
         self._courses = tuple(_Course(interlock, units) for interlock in interlocks)
-        self._plain = tuple((each, each.plain, each.interlock.low, each.interlock.high) for each in self._courses)
+        self._plain = tuple((each, each.plain, *each.quiet) for each in self._courses)
         # Those with something that may act or is not over: mostly none.
         self._restless: list[_Course] = []
         self._latest = -math.inf
@@ -568,25 +568,28 @@ class _Course:
         self._signal = interlock.signal
         self._settling = _Settling(interlock) if interlock.settle else None
         self._follows = f"{interlock.setpoint}{SETPOINT}" if interlock.stuck is not None else ""
-        self._criteria = self._make_criteria()
-        self.plain = "" if len(self._criteria) > 1 or interlock.settle or interlock.minus else self._signal
-        """The signal, if readings within the range need no further look; empty otherwise."""
+        self.quiet = max(interlock.low, interlock.unwarned[0]), min(interlock.high, interlock.unwarned[1])
+        """Range in which neither range nor warning band has anything to say."""
+        self._make_criteria()
+        self.plain = "" if self._further or interlock.settle or interlock.minus else self._signal
+        """The signal, if readings in the quiet range need no further look; empty otherwise."""
         self.active: list[Finding | None] = [None] * len(self._criteria)
         self._acted = [math.nan] * len(self._criteria)
 
-    def _make_criteria(self) -> tuple[_Criterion, ...]:
+    def _make_criteria(self) -> None:
         interlock, units = self.interlock, self._units
         # Of any interlock, as nan is outside of an infinite range too.
         criteria: list[_Criterion] = [_Range(interlock, units, interlock.seconds)]
         if interlock.unwarned != (-math.inf, math.inf):
             criteria.append(_Near(interlock, units))
+        of_range = len(criteria)
         if interlock.fastest is not None:
             criteria.append(_Rate(interlock, units, interlock.fastest))
         if interlock.stale is not None:
             criteria.append(_Stale(interlock, units, interlock.stale))
         if interlock.stuck is not None:
             criteria.append(_Follows(interlock, units, interlock.stuck))
-        return tuple(criteria)
+        self._criteria, self._further = tuple(criteria), tuple(criteria[of_range:])
 
     def due(self) -> float:
         """Return when it acts next if its signal stays as it is."""
@@ -609,11 +612,7 @@ class _Course:
         return self._settling.until
 
     def look(
-        self,
-        t: float,
-        values: Mapping[str, float],
-        setpoints: Mapping[str, float] | None,
-        found: list[Finding],
+        self, t: float, values: Mapping[str, float], setpoints: Mapping[str, float] | None, found: list[Finding]
     ) -> None:
         interlock = self.interlock
         if self._settling is not None:
@@ -626,9 +625,10 @@ class _Course:
         if value is None:
             return
         if value != value and self._is_off(values, setpoints):
-            self._criteria = self._make_criteria()
+            self._make_criteria()
         else:
-            for criterion in self._criteria:
+            low, high = self.quiet
+            for criterion in self._criteria if self.restless or not low <= value <= high else self._further:
                 criterion.look(t, value, setpoint)
                 if criterion.since is not None:
                     self.restless = True

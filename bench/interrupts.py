@@ -56,7 +56,8 @@ class Interrupts:
 
     def __init__(self, notify: Callable[[str], None] = lambda _: None) -> None:
         self._pause = False
-        self._reason: str | None = None
+        self.abort_reason: str | None = None
+        """Why to end at once; None while there is no reason."""
         self._notify = notify
         self._leave: Callable[[str], None] | None = None
         self._former: dict[int, object] = {}
@@ -78,18 +79,9 @@ class Interrupts:
         self._pause = wanted
         self._presses = int(wanted)
 
-    @property
-    def abort_reason(self) -> str | None:
-        """Why to end at once; None while there is no reason."""
-        return self._reason
-
-    @abort_reason.setter
-    def abort_reason(self, reason: str | None) -> None:
-        self._reason = reason
-
     def abort_requested(self) -> bool:
         """Return whether the run has to end at once."""
-        return self._reason is not None
+        return self.abort_reason is not None
 
     def acknowledge(self) -> None:
         """Note that the run has begun to end."""
@@ -149,12 +141,12 @@ class Interrupts:
 
     def _interrupt(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002 - signal's form
         if self._pause:
-            self._reason = "Ctrl-C, twice"
+            self.abort_reason = "Ctrl-C, twice"
         else:
             self._pause = True
 
     def _terminate(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002 - signal's form
-        self._reason = signal.Signals(number).name
+        self.abort_reason = signal.Signals(number).name
 
     def _listen(self) -> None:
         """Hear the signals beside the main thread, which may be unable to."""

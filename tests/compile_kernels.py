@@ -4,6 +4,7 @@ In one process, before the tests: otherwise each of their workers compiles most 
 compiled by the test that needs it.
 """
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -33,9 +34,9 @@ from bench.transients.actuator import identify_actuator
 from bench.transients.recording import Recording
 from bench.transients.response import late_parts
 from bench.twin.specimen import Dynamics, Specimen
+from rigs.hybrid.control import HybridController, MidRangingParameters
 from rigs.hybrid.design import Design
-from rigs.hybrid.estimates import Bending, ReducedNetwork, ThermalNoise, UnscentedEstimate
-from rigs.hybrid.model import identify_polynomial
+from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel, identify_polynomial
 
 
 def operators() -> None:
@@ -93,14 +94,20 @@ def element_operators() -> None:
         each.stream().step(0.2)
 
 
-def hybrid_estimate() -> None:
-    """Filter the readings of a hybrid cantilever."""
+def hybrid_controller() -> None:
+    """Control a hybrid cantilever, with a reading and without."""
     rises = np.linspace(-20.0, 20.0, 9)
-    bending = Bending(identify_polynomial(rises, -7e-6 * rises, 2).model)
-    estimate = UnscentedEstimate(bending, ReducedNetwork(Design().network(), 22.0), ThermalNoise(), 5e-3, 4)
-    estimate.begin(0.0, 0.0, 0.0)
-    estimate.sample(0.0)
-    estimate.correct(0.0, 0.0, 0.0)
+    plays = PrandtlIshlinskii(np.array([0.0, 10.0]), np.full(2, 1e-7), input_range=(-40.0, 40.0))
+    polynomial = identify_polynomial(rises, -7e-6 * rises, 2).model
+    model = HybridModel(Design().network(), polynomial, plays, PUBLISHED_DYNAMICS)
+    controller = HybridController(model, lambda _: 0.0, MidRangingParameters(every=1))
+    for deflection in (0.0, math.nan, math.nan):
+        controller.update(0.0, (deflection, 22.0, 22.0))
+
+
+def third_order() -> None:
+    """Simulate the dynamics of a fast actuator."""
+    PUBLISHED_DYNAMICS.simulate(np.ones(2), 1e-3)
 
 
 def twin() -> None:
@@ -145,7 +152,8 @@ def laboratories() -> None:
 if __name__ == "__main__":
     operators()
     element_operators()
-    hybrid_estimate()
+    hybrid_controller()
+    third_order()
     twin()
     transients()
     timed()

@@ -142,13 +142,12 @@ class SmoothMoves:
 
     def _move(self, t: float) -> int:
         """Return the number of the last move that has begun."""
-        return max(bisect_right(self._starts, t) - 1, 0)
+        return bisect_right(self._starts, t, 1) - 1
 
     def __call__(self, t: float) -> float:
         """Return the position at a time (s), output units; it rests before the start and after the end."""
         # As `_move` and `_blended` do, without their calls: a fast loop asks several times for each sample.
-        k = bisect_right(self._starts, t) - 1
-        k = max(k, 0)
+        k = bisect_right(self._starts, t, 1) - 1
         blend = self._blend
         x, cruise = (t - self._starts[k]) / blend, self._cruises[k] / blend
         if x >= cruise + 1.0:

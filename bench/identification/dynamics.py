@@ -213,14 +213,13 @@ class ThirdOrder:
         ValueError
             If an input is not finite or dt is not positive.
         """
-        from scipy.signal import lfilter
+        # scipy.signal would take a third of a second to load for its `lfilter`.
+        from bench.identification._mode_kernels import held_response
 
         u = _checks.samples("inputs", inputs)
         poles, residues = self._modes
         factors, entries = np.exp(poles * _checks.positive("dt", dt)), np.expm1(poles * dt) / poles
-        real, pair = (
-            np.asarray(residues[k] * lfilter([0.0, entries[k]], [1.0, -factors[k]], u)).real for k in range(2)
-        )
+        real, pair = (np.asarray(residues[k] * held_response(factors[k], entries[k], u)).real for k in range(2))
         return np.asarray(real + 2.0 * pair)
 
     def to_json(self) -> dict[str, Any]:

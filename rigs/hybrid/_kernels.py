@@ -1,4 +1,4 @@
-"""Compiled step of the Kalman filter of the thermal part. Imported on first use only."""
+"""Compiled parts of the control of the thermal part: model, Kalman filter, heat. Imported on first use only."""
 
 from __future__ import annotations
 
@@ -11,11 +11,180 @@ import numpy as np
 from bench.compiled import inner, kernel
 from bench.hysteresis._checks import Floats
 
+NETWORK = 13
+"""Numbers of a `Network`; the last one is its state."""
+
 STATES = 4
 READINGS = 3
 
 POINTS = 2 * STATES
 """Sigma points: two for each state; the centre has no weight."""
+
+
+class Network(NamedTuple):
+    """The thermal network in single numbers; see `rigs.hybrid.estimates.ReducedNetwork`."""
+
+    kelvin: float
+    """Temperature of the room, K."""
+    seebeck: float
+    """Of the cooler, V/K."""
+    resistance: float
+    """Of the cooler, Ω."""
+    along: float
+    glue: float
+    cooler: float
+    """Conductances along the beam, of the glue and of the cooler, W/K."""
+    base_air: float
+    tip_air: float
+    block_air: float
+    """Conductances of base, tip and block to the air, W/K."""
+    base_capacity: float
+    tip_capacity: float
+    block_capacity: float
+    """Heat capacities, J/K."""
+    block: float
+    """Rise of the block, K."""
+
+
+@inner
+def _network(n: Floats) -> Network:
+    return Network(n[0], n[1], n[2], n[3], n[4], n[5], n[6], n[7], n[8], n[9], n[10], n[11], n[12])
+
+
+@inner
+def _back(base: float, current: float, n: Network) -> float:
+    """Return the rise of the face between cooler and glue, K."""
+    pumped = n.seebeck * current
+    flow = 0.5 * n.resistance * current**2 - pumped * n.kelvin
+    rise: float = (flow + base * n.cooler + n.block * n.glue) / (n.glue + n.cooler + pumped)
+    return rise
+
+
+@kernel
+def advance_block(base: float, current: float, dt: float, network: Floats) -> None:
+    """Advance the block by dt (s), under the rise of the base (K) and the current (A)."""
+    n = _network(network)
+    flow = (_back(base, current, n) - n.block) * n.glue - n.block * n.block_air
+    network[NETWORK - 1] += dt * flow / n.block_capacity
+
+
+@kernel
+def heat_flow(current: float, network: Floats) -> tuple[float, float]:
+    """Return the heat into the base as constant (W) and slope (W/K) of its rise, at a current (A)."""
+    n = _network(network)
+    pumped = n.seebeck * current
+    constant = pumped * n.kelvin + 0.5 * n.resistance * current**2
+    slope = pumped - n.cooler
+    total = n.glue + n.cooler + pumped
+    back = 0.5 * n.resistance * current**2 - pumped * n.kelvin + n.block * n.glue
+    return constant + n.cooler * back / total, slope + n.cooler**2 / total - n.base_air
+
+
+@kernel
+def heat_for(rise: float, rate: float, base: float, current: float, network: Floats) -> float:
+    """Return the heat from the cooler (W); see `rigs.hybrid.estimates.ReducedNetwork.heat_for`."""
+    n = _network(network)
+    share = 1.0 + n.tip_air / n.along
+    stored = (n.base_capacity * share + n.tip_capacity) * rate
+    lost = (n.base_air * share + n.tip_air) * rise
+    heat: float = stored + lost + (share * rise - _back(base, current, n)) * n.cooler
+    return heat
+
+
+@kernel
+def current_for(heat: float, base: float, network: Floats) -> float:
+    """Return the smaller of the currents (A) that give a heat (W) at the rise of the base (K)."""
+    n = _network(network)
+    pumped = n.seebeck * (n.kelvin + base)
+    # Beyond the strongest cooling no current gives the heat: the strongest is returned.
+    square = max(pumped * pumped + 2.0 * n.resistance * heat, 0.0)
+    current: float = 2.0 * heat / (pumped + math.sqrt(square))
+    return current
+
+
+@kernel
+def deflection(rise: float, bending: Floats, powers: Floats, slopes: Floats) -> float:
+    """Return the deflection (m) at a rise of the tip (K); `bending` and the rest as in `Filter`."""
+    low, high, middle, half = bending
+    inside = min(max(rise, low), high)
+    x = (inside - middle) / half
+    total = 0.0
+    for power in powers:
+        total = total * x + power
+    if inside == rise:
+        return total
+    beyond: float = total + slope(inside, bending, slopes) * (rise - inside)
+    return beyond
+
+
+@kernel
+def slope(rise: float, bending: Floats, slopes: Floats) -> float:
+    """Return the deflection per rise (m/K)."""
+    low, high, middle, half = bending
+    x = (min(max(rise, low), high) - middle) / half
+    total = 0.0
+    for each in slopes:
+        total = total * x + each
+    per_rise: float = total / half
+    return per_rise
+
+
+@kernel
+def rise_for(wanted: float, table: Floats) -> float:
+    """Return the rise of the tip (K) for a deflection (m), at most that at the end of the table.
+
+    `table`, shape (2, N), has increasing deflections (m) and their rises (K).
+    """
+    deflections, rises = table[0], table[1]
+    k = np.searchsorted(deflections, wanted, side="right") - 1
+    if k < 0 or k + 1 == rises.size:
+        end: float = rises[max(k, 0)]
+        return end
+    per_deflection = (rises[k + 1] - rises[k]) / (deflections[k + 1] - deflections[k])
+    rise: float = per_deflection * (wanted - deflections[k]) + rises[k]
+    return rise
+
+
+@kernel
+def next_current(
+    ahead: float,
+    rate: float,
+    missing: float,
+    base: float,
+    current: float,
+    fed_back: float,
+    settings: Floats,
+    network: Floats,
+    bending: Floats,
+    slopes: Floats,
+    table: Floats,
+) -> tuple[float, float]:
+    """Return the current of the coming period (A), and the heat that is fed back over time (W).
+
+    Parameters
+    ----------
+    ahead, rate : float
+        Reference that the heat leads to, m, and its derivative, m/s.
+    missing : float
+        Reference of now less the estimated deflection, m.
+    base, current, fed_back : float
+        Rise of the base, K; current (A) and heat fed back over time (W) of the past period.
+    settings : numpy.ndarray, shape (4,)
+        Heat fed back per missing deflection, W/m; period and time constant of its integral, s; greatest current, A.
+    network, bending, slopes, table : numpy.ndarray
+        Numbers of the model.
+    """
+    gain, period, integral_time, most = settings
+    rise = rise_for(ahead, table)
+    per_rise = slope(rise, bending, slopes)
+    heat = heat_for(rise, rate / per_rise, base, current, network)
+    # Heat deflects negatively: the sign is that of the slope.
+    lacking = math.copysign(gain, per_rise) * missing
+    further = fed_back + lacking * period / integral_time
+    wanted = current_for(heat + lacking + further, base, network)
+    clipped = min(max(wanted, -most), most)
+    # At the limit the integral only moves away from it.
+    return clipped, further if clipped == wanted or lacking * wanted < 0.0 else fed_back
 
 
 class Filter(NamedTuple):
@@ -150,50 +319,46 @@ def _correlate(first: Floats, mean: Floats, second: Floats, other: Floats, resul
             result[i, j] = total / POINTS
 
 
-@inner
-def _deflection(rise: float, f: Filter) -> float:
-    """Return the deflection (m) at a rise of the tip (K), as `Bending.deflection` does."""
-    low, high, middle, half = f.bending
-    inside = min(max(rise, low), high)
-    x = (inside - middle) / half
-    total = 0.0
-    for power in f.powers:
-        total = total * x + power
-    if inside == rise:
-        return total
-    slope = 0.0
-    for each in f.slopes:
-        slope = slope * x + each
-    beyond: float = total + slope / half * (rise - inside)
-    return beyond
-
-
 @kernel
-def predict(constant: float, slope: float, numbers: Floats) -> None:
-    """Advance the distribution by a step; the heat into the base is `constant` (W) + `slope` (W/K) times its rise."""
-    _predict(constant, slope, _parts(numbers))
+def predict(current: float, network: Floats, numbers: Floats) -> tuple[float, float]:
+    """Advance the distribution by a step at a current (A); return the deflection, m, and its rate, m/s."""
+    f = _parts(numbers)
+    _predict(current, network, f)
+    return _estimate(f)
 
 
 @kernel
 def predict_and_correct(
-    constant: float, slope: float, base: float, tip: float, deflection: float, numbers: Floats
-) -> None:
-    """Advance as `predict`, then take in rises of base and tip (K) and the deflection (m)."""
+    current: float, base: float, tip: float, seen_deflection: float, network: Floats, numbers: Floats
+) -> tuple[float, float]:
+    """Advance as `predict`, take in rises of base and tip (K) and the deflection (m), and return the same."""
     f = _parts(numbers)
-    _predict(constant, slope, f)
-    _correct(base, tip, deflection, f)
+    _predict(current, network, f)
+    _correct(base, tip, seen_deflection, f)
+    return _estimate(f)
 
 
 @inner
-def _predict(constant: float, slope: float, f: Filter) -> None:
-    """Advance the distribution by a step; the heat into the base is `constant` (W) + `slope` (W/K) times its rise."""
+def _estimate(f: Filter) -> tuple[float, float]:
+    """Return the estimated deflection, m, and its rate by the model, m/s."""
+    here, there = f.mean[0], f.mean[1]
+    _, along, air, _, tip_capacity = f.network
+    cooling = ((here - there) * along - air * there) / tip_capacity
+    value = deflection(there, f.bending, f.powers, f.slopes) + f.mean[3]
+    return value, slope(there, f.bending, f.slopes) * cooling
+
+
+@inner
+def _predict(current: float, network: Floats, f: Filter) -> None:
+    """Advance the distribution by a step."""
+    constant, by_rise = heat_flow(current, network)
     dt, along, air, base_capacity, tip_capacity = f.network
     _spread(f)
     points = f.points
     for k in range(POINTS):
         base, tip, heat = points[k, 0], points[k, 1], points[k, 2]
         flow = (base - tip) * along
-        points[k, 0] = base + dt * (constant + slope * base + heat - flow) / base_capacity
+        points[k, 0] = base + dt * (constant + by_rise * base + heat - flow) / base_capacity
         points[k, 1] = tip + dt * (flow - air * tip) / tip_capacity
     _average(points, f.mean)
     _correlate(points, f.mean, points, f.mean, f.covariance)
@@ -202,13 +367,13 @@ def _predict(constant: float, slope: float, f: Filter) -> None:
 
 
 @inner
-def _correct(base: float, tip: float, deflection: float, f: Filter) -> None:
+def _correct(base: float, tip: float, seen_deflection: float, f: Filter) -> None:
     """Take in rises of base and tip (K) and the deflection (m)."""
     _spread(f)
     points, seen, expected, variance, factor, gain = f.points, f.seen, f.expected, f.variance, f.factor, f.gain
     for k in range(POINTS):
         seen[k, 0], seen[k, 1] = points[k, 0], points[k, 1]
-        seen[k, 2] = _deflection(points[k, 1], f) + points[k, 3]
+        seen[k, 2] = deflection(points[k, 1], f.bending, f.powers, f.slopes) + points[k, 3]
     _average(seen, expected)
     _correlate(seen, expected, seen, expected, variance)
     for j in range(READINGS):
@@ -229,7 +394,7 @@ def _correct(base: float, tip: float, deflection: float, f: Filter) -> None:
         f.mean[i] += (
             gain[i, 0] * (base - expected[0])
             + gain[i, 1] * (tip - expected[1])
-            + gain[i, 2] * (deflection - expected[2])
+            + gain[i, 2] * (seen_deflection - expected[2])
         )
         for j in range(STATES):
             for k in range(READINGS):

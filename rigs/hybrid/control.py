@@ -15,7 +15,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from typing import Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import numpy as np
 
@@ -24,6 +24,7 @@ from bench.control.play_inverse import PlayInverse
 from bench.control.references import ApproachedReference, Reference
 from bench.control.tracking import Trace, check_positive
 from bench.controllers import ControllerSetup, ControllerSpec
+from bench.deferred import DeferredModule
 from bench.errors import ConvergenceError
 from rigs.hybrid.estimates import (
     Bending,
@@ -37,6 +38,11 @@ from rigs.hybrid.estimates import (
 from rigs.hybrid.lateness import BEGIN, END, LatenessProbe
 from rigs.hybrid.model import HybridModel
 
+if TYPE_CHECKING:
+    from rigs.hybrid import _kernels as kernels
+else:
+    kernels = DeferredModule("rigs.hybrid._kernels")
+
 STROKE = 9e-6
 """Largest deflection of either sign that the piezo part is asked for, m."""
 _NEAR = 0.5
@@ -46,7 +52,7 @@ _AT_REST = 0.2
 _TOLERATED = 0.6
 """Difference of the lateness that is found to the one that is known, in periods, up to which both are the same."""
 _ROOM = 4
-"""Room for the reference that comes, in lengths of the known one."""
+"""Room for the reference that comes, in widths of its window."""
 _RESTED = 15.0
 """Time for which the reference has rested where the error of the model alone is judged, s."""
 _JUDGED = 5.0
@@ -74,29 +80,31 @@ class _Preview:
         slopes = np.sin(math.pi * x)
         # Exact for a ramp.
         self._slopes = slopes / (slopes @ (x * (half + 1.0) * period))
-        self._width = 2 * half + 1
+        width = 2 * half + 1
         ahead = round(lead / period)
-        values = [reference(k * period) for k in range(-half, half + 1 + ahead)]
-        # The known reference moves along the array, and back to its beginning once it has come to the end.
-        self._known = len(values)
-        self._values = np.array(values + [0.0] * (_ROOM * self._known))
+        values = np.array([reference(k * period) for k in range(-half, half + 1 + ahead)])
+        # What is ahead now is the present in a while.
+        self._smoothed = deque(float(self._weights.dot(values[k : k + width])) for k in range(ahead))
+        # The window ahead moves along the array, and back to its beginning once it has come to the end.
+        self._width = width
+        self._values = np.append(values[ahead:], np.zeros(_ROOM * width))
         self._begin = 0
         self._next = half + 1 + ahead
 
     def advance(self, t: float) -> tuple[float, float, float]:
         """Return the smoothed reference now (m), and ahead (m) with its derivative (m/s)."""
-        values, width, begin = self._values, self._width, self._begin
-        end = begin + self._known
+        values, begin = self._values, self._begin
+        end = begin + self._width
+        window = values[begin:end]
         # As a product by `@`, in half the time.
-        now = float(self._weights.dot(values[begin : begin + width]))
-        window = values[end - width : end]
         ahead, rate = float(self._weights.dot(window)), float(self._slopes.dot(window))
+        self._smoothed.append(ahead)
         if end == len(values):
-            values[: self._known] = values[begin:]
-            begin, end = 0, self._known
+            values[: self._width] = window
+            begin, end = 0, self._width
         values[end] = self._reference(t + self._next * self._period)
         self._begin = begin + 1
-        return now, ahead, rate
+        return self._smoothed.popleft(), ahead, rate
 
 
 @dataclass(frozen=True)
@@ -177,6 +185,7 @@ class _MidRanging:
         self._reference = ApproachedReference(reference, _NEAR * parameters.stroke, parameters.approach)
         self._position: Reference = self._reference
         self._step = parameters.period * parameters.every
+        self._settings = np.array([parameters.gain, self._step, parameters.integral_time, parameters.maximum_current])
         self._prepare(model.reference)
         self._inverse = inverse = PlayInverse(model.hysteresis, parameters.stroke) if piezo else None
         self._integral_gain = integral * parameters.period
@@ -287,23 +296,26 @@ class _MidRanging:
 
     def _heat(self, now: float, *, hold: bool) -> None:
         """Advance the thermal part over the past period; set the current of the coming one, or hold it."""
-        p, network, base = self._p, self._network, self._base
+        network, base = self._network, self._base
         network.advance(base, self._current, self._step)
         self._estimate.correct(base, self._tip, self._current)
         wanted, ahead, rate = self._preview.advance(now)
         if hold:
             return
-        rise = self._bending.rise(ahead)
-        slope = self._bending.slope(rise)
-        heat = network.heat_for(rise, rate / slope, base, self._current)
-        # Heat deflects negatively: the sign is that of the slope.
-        lacking = math.copysign(p.gain, slope) * (wanted - self._estimate.value)
-        further = self._fed_back + lacking * self._step / p.integral_time
-        current = network.current_for(heat + lacking + further, base)
-        self._current = min(max(current, -p.maximum_current), p.maximum_current)
-        # At the limit the integral only moves away from it.
-        if self._current == current or lacking * current < 0.0:
-            self._fed_back = further
+        bending = self._bending
+        self._current, self._fed_back = kernels.next_current(
+            ahead,
+            rate,
+            wanted - self._estimate.value,
+            base,
+            self._current,
+            self._fed_back,
+            self._settings,
+            network.numbers,
+            bending.range,
+            bending.slopes,
+            bending.table,
+        )
 
     @property
     def trace(self) -> Trace:

@@ -10,14 +10,20 @@ nonlinear estimation", Proceedings of the IEEE 92, 2004.
 from __future__ import annotations
 
 import math
-from bisect import bisect_right
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from bench.control.tracking import check_positive
+from bench.deferred import DeferredModule
 from bench.hysteresis import Polynomial
 from rigs.hybrid.network import ABSOLUTE_ZERO, ThermalNetwork
+
+if TYPE_CHECKING:
+    from rigs.hybrid import _kernels as kernels
+else:
+    kernels = DeferredModule("rigs.hybrid._kernels")
 
 # Points at which the polynomial of the thermal deflection is tabulated for its inverse.
 _TABLE = 2001
@@ -45,40 +51,29 @@ class Bending:
                 f"polynomial: expected one that rises or falls all over its range, {low:g} to {high:g} K"
             )
         order = slice(None) if falls[0] > 0.0 else slice(None, None, -1)
-        self._sorted: tuple[list[float], list[float]] = deflections[order].tolist(), (rises[order] - zero).tolist()
-        # Powers of the rise mapped to [-1, 1].
-        self.middle, self.half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
+        self.table = np.array([deflections[order], rises[order] - zero])
+        """Increasing deflections, m, and their rises, K; shape (2, N)."""
+        middle, half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
+        self.range = np.array([self.low, self.high, middle, half])
+        """Range of the rise, its middle and half its width, K."""
         series = np.append(polynomial.bias - polynomial.evaluate([0.0])[0], polynomial.series)
         powers = np.polynomial.chebyshev.cheb2poly(series)
-        self.powers: list[float] = powers[::-1].tolist()
-        self.slopes: list[float] = (powers[1:] * np.arange(1, powers.size))[::-1].tolist()
+        self.powers = powers[::-1].copy()
+        """Of the polynomial of the rise mapped to [-1, 1], highest first."""
+        self.slopes = (powers[1:] * np.arange(1.0, powers.size))[::-1].copy()
+        """Of its derivative, likewise."""
 
     def deflection(self, rise: float) -> float:
         """Return the deflection (m) at a rise of the tip (K)."""
-        inside = min(max(rise, self.low), self.high)
-        x = (inside - self.middle) / self.half
-        total = 0.0
-        for power in self.powers:
-            total = total * x + power
-        return total if inside == rise else total + self.slope(inside) * (rise - inside)
+        return float(kernels.deflection(rise, self.range, self.powers, self.slopes))
 
     def slope(self, rise: float) -> float:
         """Return the deflection per rise (m/K)."""
-        x = (min(max(rise, self.low), self.high) - self.middle) / self.half
-        total = 0.0
-        for slope in self.slopes:
-            total = total * x + slope
-        return total / self.half
+        return float(kernels.slope(rise, self.range, self.slopes))
 
     def rise(self, deflection: float) -> float:
         """Return the rise of the tip (K) for a deflection (m), at most that at the end of the range."""
-        # As np.interp does, which takes ten times as long for a single value.
-        deflections, rises = self._sorted
-        k = bisect_right(deflections, deflection) - 1
-        if k < 0 or k + 1 == len(rises):
-            return rises[max(k, 0)]
-        slope = (rises[k + 1] - rises[k]) / (deflections[k + 1] - deflections[k])
-        return slope * (deflection - deflections[k]) + rises[k]
+        return float(kernels.rise_for(deflection, self.table))
 
 
 class ReducedNetwork:
@@ -95,38 +90,36 @@ class ReducedNetwork:
     """
 
     def __init__(self, network: ThermalNetwork, room: float) -> None:
-        self.kelvin = room - ABSOLUTE_ZERO
-        self._network = network
         self.base_capacity, self.tip_capacity = (float(c) for c in network.capacities[2:])
-        self.base_air, self.tip_air = (float(g) for g in network.air_conductances[2:])
+        base_air, self.tip_air = (float(g) for g in network.air_conductances[2:])
         self.along = 1.0 / network.beam_resistance
-        self.glue, self.cooler = 1.0 / network.glue_resistance, 1.0 / network.tec_resistance
-        self._block_capacity = 2.0 * network.block_capacity
-        self._block_air = float(network.air_conductances[:2].sum())
-        self.block = 0.0
-        """Rise of the block, K."""
-
-    def _back(self, base: float, current: float) -> float:
-        """Return the rise of the face between cooler and glue, K."""
-        n = self._network
-        pumped = n.seebeck * current
-        flow = 0.5 * n.electrical_resistance * current**2 - pumped * self.kelvin
-        return (flow + base * self.cooler + self.block * self.glue) / (self.glue + self.cooler + pumped)
+        self.numbers = np.array(
+            kernels.Network(
+                kelvin=room - ABSOLUTE_ZERO,
+                seebeck=network.seebeck,
+                resistance=network.electrical_resistance,
+                along=self.along,
+                glue=1.0 / network.glue_resistance,
+                cooler=1.0 / network.tec_resistance,
+                base_air=base_air,
+                tip_air=self.tip_air,
+                block_air=float(network.air_conductances[:2].sum()),
+                base_capacity=self.base_capacity,
+                tip_capacity=self.tip_capacity,
+                block_capacity=2.0 * network.block_capacity,
+                block=0.0,
+            )
+        )
+        """As `rigs.hybrid._kernels.Network`; the last one is the rise of the block, K, which is changed in place."""
 
     def advance(self, base: float, current: float, dt: float) -> None:
         """Advance the block by dt (s), under the rise of the base (K) and the current (A)."""
-        flow = (self._back(base, current) - self.block) * self.glue - self.block * self._block_air
-        self.block += dt * flow / self._block_capacity
+        kernels.advance_block(base, current, dt, self.numbers)
 
     def heat_flow(self, current: float) -> tuple[float, float]:
         """Return the heat into the base as constant (W) and slope (W/K) of its rise, at a current (A)."""
-        n = self._network
-        pumped = n.seebeck * current
-        constant = pumped * self.kelvin + 0.5 * n.electrical_resistance * current**2
-        slope = pumped - self.cooler
-        total = self.glue + self.cooler + pumped
-        back = 0.5 * n.electrical_resistance * current**2 - pumped * self.kelvin + self.block * self.glue
-        return constant + self.cooler * back / total, slope + self.cooler**2 / total - self.base_air
+        constant, slope = kernels.heat_flow(current, self.numbers)
+        return constant, slope
 
     def heat_for(self, rise: float, rate: float, base: float, current: float) -> float:
         """Return the heat from the cooler (W) that moves the tip's rise (K) at a rate (K/s), quasi-statically.
@@ -134,18 +127,11 @@ class ReducedNetwork:
         The base leads the tip by the heat loss of the tip; the heat through the cooler is that at the present rise of
         the base (K) and current (A).
         """
-        share = 1.0 + self.tip_air / self.along
-        stored = (self.base_capacity * share + self.tip_capacity) * rate
-        lost = (self.base_air * share + self.tip_air) * rise
-        return stored + lost + (share * rise - self._back(base, current)) * self.cooler
+        return float(kernels.heat_for(rise, rate, base, current, self.numbers))
 
     def current_for(self, heat: float, base: float) -> float:
         """Return the smaller of the currents (A) that give a heat (W) at the rise of the base (K)."""
-        n = self._network
-        pumped = n.seebeck * (self.kelvin + base)
-        # Beyond the strongest cooling no current gives the heat: the strongest is returned.
-        square = max(pumped * pumped + 2.0 * n.electrical_resistance * heat, 0.0)
-        return 2.0 * heat / (pumped + math.sqrt(square))
+        return float(kernels.current_for(heat, base, self.numbers))
 
 
 class ThermalEstimate:
@@ -254,23 +240,20 @@ class UnscentedEstimate(ThermalEstimate):
         every: int,
         lateness: float = 0.0,
     ) -> None:
-        from rigs.hybrid import _kernels
-
         super().__init__(bending)
-        self._predict, self._predict_and_correct = _kernels.predict, _kernels.predict_and_correct
         self._network = network
         self._period = period
         self._lateness = lateness
         self._step = period * every
         self._noise = noise
-        self._numbers, self._filter = _kernels.allocate(len(bending.powers))
+        self._numbers, self._filter = kernels.allocate(len(bending.powers))
         parts = self._filter
-        parts.covariance[:] = np.eye(_kernels.STATES)
+        parts.covariance[:] = np.eye(kernels.STATES)
         parts.walk[:] = np.square([noise.base, noise.tip, noise.heat, noise.offset]) * self._step
         parts.reading_noise[:] = np.square([noise.thermistor, noise.thermistor, noise.deflection])
         parts.reading_noise[2] /= every
         parts.network[:] = [self._step, network.along, network.tip_air, network.base_capacity, network.tip_capacity]
-        parts.bending[:] = [bending.low, bending.high, bending.middle, bending.half]
+        parts.bending[:] = bending.range
         parts.powers[:] = bending.powers
         parts.slopes[:] = bending.slopes
         self._sum, self._count = 0.0, 0
@@ -291,20 +274,15 @@ class UnscentedEstimate(ThermalEstimate):
 
     def correct(self, base: float, tip: float, current: float) -> None:
         """Predict, and update with the mean of the deflections since the last thermal sample."""
-        constant, slope = self._network.heat_flow(current)
+        network = self._network.numbers
         if self._count:
             # The mean of the readings is that of half a period before their last, which may be late itself.
             age = 0.5 * (self._count - 1) * self._period + self._lateness
             mean = self._sum / self._count + self.rate * age
             self._sum, self._count = 0.0, 0
-            self._predict_and_correct(constant, slope, base, tip, mean, self._numbers)
+            self.value, self.rate = kernels.predict_and_correct(current, base, tip, mean, network, self._numbers)
         else:
-            self._predict(constant, slope, self._numbers)
-        here, there, _, offset = self._filter.mean.tolist()
-        n = self._network
-        cooling = ((here - there) * n.along - n.tip_air * there) / n.tip_capacity
-        self.rate = self._bending.slope(there) * cooling
-        self.value = self._bending.deflection(there) + offset
+            self.value, self.rate = kernels.predict(current, network, self._numbers)
 
     def describe(self, rise: float) -> tuple[float, float]:  # noqa: ARG002
         """Return the offset of the deflection and its standard deviation, m."""

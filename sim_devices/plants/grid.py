@@ -142,13 +142,14 @@ class GridPlant(ABC, Generic[P]):
         due = math.floor((pending + GRID_TOLERANCE) / self._step)
         self._pending = pending - due * self._step
         while due > 0:
-            if self._used == self._normals.shape[0]:
+            if self._used == len(self._normals):
                 self._normals = self._noise.standard_normal((_NOISE_BLOCK, *self._noise_shape))
                 self._used = 0
-            count = min(due, self._normals.shape[0] - self._used)
-            self._take_steps(self._normals[self._used : self._used + count])
+            normals = self._normals[self._used : self._used + due]
+            count = len(normals)
             self._used += count
             due -= count
+            self._take_steps(normals)
 
     @abstractmethod
     def _take_steps(self, normals: NDArray[np.float64]) -> None:

@@ -132,8 +132,9 @@ class PiezoAmplifier:
         return self.STATUS if self.on else 0.0
 
     def _follow(self) -> None:
-        output = self._gain * (self._input - self._offset) if self.on else 0.0
-        target = min(max(output, -self._saturation), self._saturation)
+        target = self._gain * (self._input - self._offset) if self.on else 0.0
+        if not -self._saturation <= target <= self._saturation:
+            target = math.copysign(self._saturation, target)
         if target == self._target:
             return
         self._start = self.voltage

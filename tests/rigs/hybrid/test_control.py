@@ -415,15 +415,15 @@ def test_reduced_network_agrees_with_the_whole_one():
     reduced = ReducedNetwork(whole, 22.0)
     rng = np.random.default_rng(0)
     for _ in range(20):
-        base, tip, reduced.block = rng.uniform(-20.0, 20.0, 3)
+        base, tip, reduced.numbers[-1] = rng.uniform(-20.0, 20.0, 3)
         current = rng.uniform(-0.15, 0.15)
-        expected = whole.rates(22.0 + np.array([reduced.block, reduced.block, base, tip]), current, 22.0)
+        expected = whole.rates(22.0 + np.array([reduced.numbers[-1], reduced.numbers[-1], base, tip]), current, 22.0)
         constant, slope = reduced.heat_flow(current)
         into_base = constant + slope * base - (base - tip) * reduced.along
         assert into_base / reduced.base_capacity == pytest.approx(expected[2], rel=1e-9)
-        before = reduced.block
+        before = reduced.numbers[-1]
         reduced.advance(base, current, 1e-3)
-        assert (reduced.block - before) / 1e-3 == pytest.approx(expected[:2].mean(), rel=1e-6)
+        assert (reduced.numbers[-1] - before) / 1e-3 == pytest.approx(expected[:2].mean(), rel=1e-6)
 
 
 @pytest.mark.parametrize("current", [-0.15, -0.05, 0.02, 0.1])
@@ -431,13 +431,13 @@ def test_heat_fed_forward_is_that_of_the_steady_state(current):
     whole = Design().network()
     reduced = ReducedNetwork(whole, 22.0)
     end, front, base, tip = whole.steady_rises(current, 22.0).tolist()
-    reduced.block = front
+    reduced.numbers[-1] = front
     assert reduced.current_for(reduced.heat_for(tip, 0.0, base, current), base) == pytest.approx(current, rel=1e-6)
     # The lumped block comes to the same.
-    reduced.block = 0.0
+    reduced.numbers[-1] = 0.0
     for _ in range(5000):
         reduced.advance(base, current, 1.0)
-    assert reduced.block == pytest.approx(0.5 * (end + front), rel=0.02)
+    assert reduced.numbers[-1] == pytest.approx(0.5 * (end + front), rel=0.02)
 
 
 def test_bending_is_inverted_and_goes_on_straight(model):
