@@ -291,7 +291,7 @@ def predict_(
         Quantity(output_column, unit, columns.values[output_column]) if output_column else None,
         time_quantity(times),
         skip=found.first,
-        further=found.band.columns(found.predicted) if found.band else (),
+        bands={model.name: found.band} if found.band else {},
     )
     result: dict[str, Any] = {"model": model.name, "samples": int(inputs.size), "out": str(out), **found.to_json()}
     print_examined(found)

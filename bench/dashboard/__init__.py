@@ -27,6 +27,12 @@ What is recorded, on the timelines `t` (laboratory time) and `step`
     controller is at work.
 `/control/error/targets`
     The mean error at each target.
+`/control/error/band`, `/signals/QUANTITY/band`
+    The prediction band of a model: under control less the reference, in the unit of the error, otherwise at each
+    reading. Lower and upper end where the input is of the class of the calibration, else nan; the same where it is
+    of another one or not judged yet; the model's own prediction.
+`/signals/QUANTITY/setpoint_band`
+    The band about the set-points of the model's input: the first four of these.
 `/loop/data/path`, `/loop/data/recent`, `/loop/data/now`
     Output against input: the line from each point to the next, pale under control, when the same is there once more
     for the last targets; and the last point. Further plots are `/loops/0`, `/loops/1` ...

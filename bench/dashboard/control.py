@@ -144,10 +144,13 @@ class ControlPlots:
         )
         return styles
 
-    def views(self, shown: frozenset[str], error_range: float | None) -> list[tuple[rrb.TimeSeriesView, int]]:
+    def views(
+        self, shown: frozenset[str], error_range: float | None, *, banded: bool = False
+    ) -> list[tuple[rrb.TimeSeriesView, int]]:
         """Return the plots of `series` that are `shown`, from top to bottom, with their heights.
 
-        `error_range` is what the plot of the error shows to either side of zero, in its unit.
+        `error_range` is what the plot of the error shows to either side of zero, in its unit; `banded` says whether
+        a prediction band is there, too.
         """
         views = []
         if "tracking" in shown:
@@ -158,6 +161,8 @@ class ControlPlots:
             title = f"Error [{self.error_unit}]: each tick within ± 2σ, mean at each target (points)"
             if self.witness is not None:
                 title = f"Error [{self.error_unit}]: each tick within ± 2σ, and of the witness (green)"
+            if banded:
+                title += ", band"
             views.append((time_view("/control/error", title, y=y), 6))
         if "disturbance" in shown:
             views.append((time_view("/control/disturbance", f"Disturbance ± 2σ [{self.unit}]"), 3))

@@ -10,12 +10,12 @@ from typing import Self
 
 import numpy as np
 
-from bench.dashboard.entries import End, Entry, ModelDensity, Tick, densities_of
+from bench.dashboard.entries import End, Entry, Tick, densities_of
 from bench.dashboard.live import CHUNK_ROWS
 from bench.dashboard.writer import Writer
 from bench.errors import ConfigurationError, DataError
 from bench.journal import Record
-from bench.model_file import is_model, models_among, parse_model
+from bench.model_file import ModelFile, is_model, models_among, parse_model
 
 
 def rebuild(record: Record, path: Path) -> None:
@@ -28,7 +28,7 @@ def rebuild(record: Record, path: Path) -> None:
     writer.open(path, None)
     try:
         _write(writer, _Tail().entries(record))
-        writer.write(models)
+        writer.write(densities_of(models))
         writer.write(_end_of(record))
         writer.arrange()
     finally:
@@ -62,11 +62,11 @@ class JournalView:
         self._run = run
         self._tail = _Tail()
         with Record(run) as record:
-            self._models = _models_of(record)
-            self._writer = _writer_of(record, self._models)
+            models = _models_of(record)
+            self._writer = _writer_of(record, models)
         self._writer.open(None, port)
         self.uri = str(self._writer.recording.uri)
-        self._writer.write(self._models)
+        self._writer.write(densities_of(models))
 
     def __enter__(self) -> Self:
         return self
@@ -136,17 +136,17 @@ def time_of(entry: Entry) -> float:
     return float(getattr(entry, "finished", getattr(entry, "t", 0.0)))
 
 
-def _models_of(record: Record) -> list[ModelDensity]:
+def _models_of(record: Record) -> list[ModelFile]:
     # What was identified from the run comes last, and is what its plane shows.
     identified = (
         parse_model(content, f"{record.path}: model {name}")
         for name, content in record.models().items()
         if is_model(content)
     )
-    return densities_of([*models_among(record.files(), str(record.path)).values(), *identified])
+    return [*models_among(record.files(), str(record.path)).values(), *identified]
 
 
-def _writer_of(record: Record, models: list[ModelDensity]) -> Writer:
+def _writer_of(record: Record, models: list[ModelFile]) -> Writer:
     try:
         return Writer(record.signals, record.meta, models)
     except (ConfigurationError, KeyError, TypeError) as error:

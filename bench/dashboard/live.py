@@ -52,7 +52,7 @@ class Dashboard:
     port : int
         Port of the loopback address for viewers; if it is taken, the next free one. 0 takes any.
     models : sequence of ModelFile
-        Models whose densities are shown under the memory curve.
+        Models whose densities are shown under the memory curve, and whose prediction bands beside the readings.
 
     Raises
     ------
@@ -74,14 +74,13 @@ class Dashboard:
     ) -> None:
         if path is None and not live:
             raise ValueError("a dashboard needs a file or a live view")
-        densities = densities_of(models)
         self._file: Writer | None = None
         self._view: Writer | None = None
         if path is not None:
-            self._file = Writer(signals, meta, densities)
+            self._file = Writer(signals, meta, models)
             self._file.open(path, None)
         if live:
-            self._view = Writer(signals, meta, densities)
+            self._view = Writer(signals, meta, models)
             self._view.open(None, port)
         self.uri = None if self._view is None else self._view.recording.uri
         """Address for a viewer, None without a live view."""
@@ -92,7 +91,7 @@ class Dashboard:
         # One counter a thread, as adding is not atomic.
         self._not_queued = self._not_written = self._reported = 0
         self._queue: queue.SimpleQueue[Entry] = queue.SimpleQueue()
-        for density in densities:
+        for density in densities_of(models):
             self._queue.put(density)
         self._wake = threading.Event()
         self._closing = self._recording_stops = False

@@ -12,6 +12,7 @@ import rerun as rr
 from bench.dashboard.bounds import Bound, nearest
 from bench.dashboard.control import Errors
 from bench.dashboard.entries import End, Entry, Tick
+from bench.dashboard.model_band import ModelBand
 from bench.dashboard.recording import Recording, times
 from bench.dashboard.signal_plots import likely_magnitude
 from bench.devices import Signal
@@ -42,6 +43,8 @@ class Numbers:
         Of the signals.
     errors : Errors or None
         Of a run under control.
+    band : ModelBand or None
+        Of the model in the run; it has seen the entries first.
     """
 
     def __init__(
@@ -51,7 +54,9 @@ class Numbers:
         shown: Sequence[int],
         bounds: Sequence[Bound],
         errors: Errors | None,
+        band: ModelBand | None = None,
     ) -> None:
+        self._band = band
         self._signals, self._shown, self._bounds, self._errors = signals, shown, bounds, errors
         self._epoch = datetime.fromisoformat(meta["epoch"]) if meta.get("epoch") else None
         self._is_dated = meta.get("clock") == "wall"
@@ -132,6 +137,8 @@ class Numbers:
         if self._values and (bound := nearest(self._bounds, self._values)) is not None:
             margin = bound.margin(self._values[bound.column])
             yield f"to the interlock {bound.name}", self._show(margin, bound.column)
+        if self._band is not None:
+            yield from self._band.texts(self._t)
         if is_over:
             yield "in all", _duration(self._t)
         elif self._expected is not None:

@@ -17,8 +17,9 @@ from bench.configuration_errors import problems
 from bench.dashboard.arrangement import Arranged, blueprint, seldom
 from bench.dashboard.bounds import BoundLines, bounds_of
 from bench.dashboard.control import TRACE_NAMES, WITNESS, ControlPlots, Errors
-from bench.dashboard.entries import End, Entry, ModelDensity, Tick
+from bench.dashboard.entries import End, Entry, ModelDensity, Tick, densities_of
 from bench.dashboard.lateness_plot import LatenessPlot
+from bench.dashboard.model_band import ModelBand, Plotted
 from bench.dashboard.numbers import LIVE_SECONDS, Numbers
 from bench.dashboard.planes import Planes
 from bench.dashboard.recording import Recording, times
@@ -31,20 +32,19 @@ from bench.interlocks import SETPOINT
 from bench.journal import StepRecord, run_card
 from bench.lateness import lateness_lines
 from bench.layout import DashboardLayout
+from bench.model_file import ModelFile
 from bench.protocol.vocabulary import LATENESS
 
 
 class Writer:
     """Writes a run to a recording, once it is open; used by one thread at a time.
 
-    Signals and metadata are those of the run's journal, `densities` those known from the start. Raises a
+    Signals and metadata are those of the run's journal, `models` those known from the start. Raises a
     ConfigurationError if the layout is wrong, or a signal that it or `controls` names does not exist, and a KeyError
     if the metadata is incomplete.
     """
 
-    def __init__(
-        self, signals: Sequence[Signal], meta: Mapping[str, Any], densities: Sequence[ModelDensity] = ()
-    ) -> None:
+    def __init__(self, signals: Sequence[Signal], meta: Mapping[str, Any], models: Sequence[ModelFile] = ()) -> None:
         layout = _layout_of(meta)
         ranges = {} if layout is None else layout.ranges
         controls = meta.get("controls", "")
@@ -56,7 +56,7 @@ class Writer:
         self._planes: Planes | None = None
         if layout is not None:
             self._plots = XYPlots(layout, signals, meta["rig_title"], bounds, fades=bool(controls))
-            self._planes = Planes(layout, signals, self._plots.columns, densities)
+            self._planes = Planes(layout, signals, self._plots.columns, densities_of(models))
         self._control: ControlPlots | None = None
         self._errors: Errors | None = None
         if controls:
@@ -74,8 +74,11 @@ class Writer:
         self._lateness_column = names.index(LATENESS.name) if LATENESS.name in names else None
         self._commanded = {} if self._plots is None else _commanded(signals, self._plots.inputs)
         self._over_time = {names.index(name) for name in meta.get("over_time") or () if name in names}
+        self._band = self._band_of(models, signals)
         shown = [self._control.output] if self._control else list(self._plots.columns[::-1] if self._plots else ())
-        self._numbers = Numbers(meta, signals, shown or sorted(self._over_time)[:2] or [0], bounds, self._errors)
+        self._numbers = Numbers(
+            meta, signals, shown or sorted(self._over_time)[:2] or [0], bounds, self._errors, self._band
+        )
         self._timeline = Timeline()
         self._lateness = LatenessPlot(meta)
         self._filled: set[str] = set()
@@ -92,6 +95,8 @@ class Writer:
         if self._control is not None:
             for name, look in self._control.styles().items():
                 self.recording.log(f"control/{name}", look)
+        if self._band is not None:
+            self._band.draw(self.recording)
         self._timeline.draw(self.recording)
         if self._plots is not None and self._planes is not None:
             self._plots.draw(self.recording)
@@ -102,6 +107,9 @@ class Writer:
 
     def write(self, entries: Sequence[Entry]) -> None:
         """Write entries in the order in which they happened."""
+        if self._band is not None:
+            self._band.see(entries)
+            self._band.write(self.recording)
         for entry in entries:
             if isinstance(entry, ModelDensity) and self._planes is not None:
                 self._planes.draw_density(self.recording, entry)
@@ -160,6 +168,25 @@ class Writer:
                 # Of the tracking the reference, as there is an output always.
                 self._note(name, np.isfinite(series[:, 0]) if name == "tracking" else series)
 
+    def _band_of(self, models: Sequence[ModelFile], signals: Sequence[Signal]) -> ModelBand | None:
+        """Return the prediction band of the model of the first loop, if it is plotted and there is one."""
+        if self._plots is None:
+            return None
+        drive, output = self._plots.columns
+        places = {
+            column: Plotted(column, f"signals/{plot.path}", plot.factor)
+            for plot in self._signals
+            for column in plot.columns
+        }
+        response, reference = places[output], None
+        if self._control is not None:
+            if self._control.output != output:
+                return None
+            response = Plotted(output, "control/error", self._control.error_factor)
+            reference = self._control.traces[0]
+        setpoint = places.get(self._commanded.get(drive, -1))
+        return ModelBand.of(models, signals, drive=drive, response=response, setpoint=setpoint, reference=reference)
+
     def _note(self, name: str, values: npt.NDArray[Any]) -> None:
         """Note whether a plot has something to show: numbers that are not all zero."""
         if name not in self._filled and np.any(np.nan_to_num(values)):
@@ -194,7 +221,9 @@ class Writer:
                 continue
             always = not self._over_time or self._over_time & set(plot.columns)
             (over_time if always else others).append(plot.view())
-        control = [] if self._control is None else self._control.views(filled, error_range)
+        control = (
+            [] if self._control is None else self._control.views(filled, error_range, banded=self._band is not None)
+        )
         return blueprint(
             Arranged(
                 control=[view for view, _ in control],

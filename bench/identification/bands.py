@@ -37,6 +37,8 @@ _FOLDS = 10
 _FEWEST_ROWS = 5  # in a block
 # Share of the samples that may be worse determined than any of the calibration.
 _OUTSIDE = 0.1
+# Step for the local slope at an input, as part of the operating range.
+_STEP = 1e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -271,6 +273,36 @@ def calibrate_band(problem: FitProblem, smoothing: float = 0.0, ridge: float = 0
         variance=variance,
         calibrated_on=ExcitationClass.of(problem.inputs[used]),
     )
+
+
+def input_half_widths(operator: Operator[Any], path: Floats, half_widths: Floats, state: Any = None) -> Floats:  # noqa: ANN401
+    """Return the half-width about each input of a path within which its output is met, shape (N,), input units.
+
+    That of the output over the local slope in the direction of arrival, which an input that stays keeps; nan where
+    that is more than the operating range, as the output hardly moves with the input, and before the input has moved.
+
+    Parameters
+    ----------
+    operator : Operator
+        The model.
+    path : ndarray, shape (N,)
+        Input units.
+    half_widths : ndarray, shape (N,)
+        Half-widths about the outputs there, output units.
+    state : object
+        State before the first input; None is the operator's initial one.
+    """
+    low, high = operator.input_range
+    memory = operator.initial_state() if state is None else state
+    before = np.append(path[0] if operator.memoryless else operator.present_input(memory), path[:-1])
+    # A little before the input on the way to it, and at most half the way: the branch is that of the arrival.
+    steps = np.clip(0.5 * (before - path), -_STEP * (high - low), _STEP * (high - low))
+    close, there = operator.evaluate(np.column_stack([path + steps, path]).ravel(), memory).reshape(-1, 2).T
+    moved = np.maximum.accumulate(np.where(steps != 0.0, np.arange(path.size), -1))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        slopes = np.where(moved >= 0, ((close - there) / steps)[moved], np.nan)
+        widths = half_widths / np.abs(slopes)
+    return np.where(widths <= high - low, widths, np.nan)
 
 
 def _residuals(problem: FitProblem, found: Fit) -> Floats:

@@ -9,17 +9,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bench.hysteresis import Operator
-from bench.identification.bands import Band, calibrate_band
+from bench.identification.bands import Band, calibrate_band, input_half_widths
 from bench.identification.by_name import set_up_problem
 from bench.identification.regularization import Regularization
 from bench.model_file import ModelFile
 from bench.units import header_with_unit
 
 Floats = npt.NDArray[np.float64]
-
-# Step for the local slope at a set-point, as part of the operating range.
-_STEP = 1e-3
 
 
 @dataclass(frozen=True)
@@ -52,6 +48,11 @@ class BandedPrediction:
             (header_with_unit("predicted lower", self.unit), predicted - self.half_widths),
             (header_with_unit("predicted upper", self.unit), predicted + self.half_widths),
         ]
+
+    @property
+    def label(self) -> str:
+        """The band in a figure; marked where the inputs are of another class than that of the calibration."""
+        return f"{100 * self.band.level:g} % band" + (", other class of input" if self.departures else "")
 
     def coverage(self, residuals: Floats) -> float:
         """Return the share of residuals, shape (n,), of the last n rows that lie within the band, 0 to 1."""
@@ -180,36 +181,10 @@ def invert_band(model: ModelFile, setpoints: Floats, passing: Floats, state: Any
     path = both[taken]
     found = predict_band(model, path, state)
     assert found is not None
-    slopes = _arrival_slopes(model.operator, path, state)[places]
+    widths = input_half_widths(model.operator, path, found.half_widths, state)[places]
     together = None if found.simultaneous is None else found.simultaneous[places]
     at = BandedPrediction(found.band, found.half_widths[places], together, found.departures, found.unit)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        widths = at.half_widths / np.abs(slopes)
-    low, high = model.operator.input_range
-    widths = np.where(widths <= high - low, widths, np.nan)
     return BandedTargets(at, widths)
-
-
-def _arrival_slopes(operator: Operator[Any], path: Floats, state: Any) -> Floats:  # noqa: ANN401
-    """Return the slope of the output just before each point of a path, in the direction of arrival, shape (N,)."""
-    low, high = operator.input_range
-    memory = operator.initial_state() if state is None else state
-    before = float(path[0]) if operator.memoryless else operator.present_input(memory)
-    slopes = []
-    for value in path.tolist():
-        # At most half the way: the branch is that of the arrival.
-        step = max(-0.5 * abs(value - before), -_STEP * (high - low)) * (1.0 if value >= before else -1.0)
-        if step == 0.0:
-            step = -_STEP * (high - low)
-            output = operator.step(memory, value)[1]
-            close = operator.step(memory, value + step)[1]
-        else:
-            near, close = operator.step(memory, value + step)
-            output = operator.step(near, value)[1]
-        slopes.append((close - output) / step)
-        memory, _ = operator.step(memory, value)
-        before = value
-    return np.array(slopes)
 
 
 def calibrate(

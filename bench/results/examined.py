@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -123,13 +122,3 @@ def examine(
         units,
         session.first_unused(inputs.size, skip),
     )
-
-
-def band_columns(examined: Mapping[str, Examined]) -> list[tuple[str, Floats]]:
-    """Return heads and values of the ends of all bands, the model named in the heads if there are several."""
-    return [
-        (f"{name} {head}" if len(examined) > 1 else head, values)
-        for name, each in examined.items()
-        if each.band is not None
-        for head, values in each.band.columns(each.predicted)
-    ]

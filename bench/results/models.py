@@ -37,9 +37,9 @@ from bench.identification.options import check_options, model_options
 from bench.identification.regularization import Regularization
 from bench.identification.resolution import Resolution, resolve
 from bench.model_file import ModelFile, load_model
-from bench.results.bands import band_json, calibrate
+from bench.results.bands import band_json, calibrate, predict_band
 from bench.results.data import FEWEST_ROWS, check_excitation, check_variation, read_columns
-from bench.results.examined import Examined, band_columns, examine
+from bench.results.examined import Examined, examine
 from bench.results.joined_files import fitted_rows, read_files
 from bench.results.predictions import Predictions, Quantity
 from bench.results.reading.options import ReadingOptions
@@ -107,6 +107,7 @@ class IdentifiedFile:
     def predictions(self) -> Predictions:
         """Return the outputs of the model beside the measurements, as the fit has them."""
         operator, names = self.file.response, self.file.provenance
+        band = predict_band(self.file, self.inputs, self.identification.initial_state)
         return Predictions(
             Quantity(names["input"], operator.input_unit, self.inputs),
             operator.output_unit,
@@ -114,6 +115,7 @@ class IdentifiedFile:
             Quantity(names["output"], operator.output_unit, self.outputs),
             time_quantity(self.times),
             skip=self.identification.skip,
+            bands={} if band is None else {self.file.name: band},
         )
 
     def summary(self) -> dict[str, Any]:
@@ -669,6 +671,6 @@ def compare_models(
         Quantity(names[1], columns.units[names[1]], outputs),
         time_quantity(times),
         skip=first,
-        further=band_columns(examined),
+        bands={name: entry.band for name, entry in examined.items() if entry.band is not None},
     )
     return ComparedModels(comparisons, predictions, columns.assumptions, examined)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
 from bench.identification import Errors, measure_errors
+from bench.results.bands import BandedPrediction
 from bench.units import header_with_unit
 
 Floats = npt.NDArray[np.float64]
@@ -61,8 +62,8 @@ class Predictions:
         When each row was taken, where it is known.
     skip : int
         First rows, which drive the memory but count in no error.
-    further : sequence of (str, ndarray)
-        Heads and columns of shape (N,) that follow in the table, such as the ends of a prediction band.
+    bands : mapping of str to BandedPrediction
+        Prediction bands of those models that have one.
     """
 
     input: Quantity
@@ -71,7 +72,7 @@ class Predictions:
     measured: Quantity | None = None
     time: Quantity | None = None
     skip: int = 0
-    further: Sequence[tuple[str, Floats]] = ()
+    bands: Mapping[str, BandedPrediction] = field(default_factory=dict)
 
     def residuals(self) -> dict[str, Floats]:
         """Return measured minus predicted output by model, shape (N,) each; none without measurements."""
@@ -87,7 +88,7 @@ class Predictions:
         return {name: measure_errors(measured, values[self.skip :]) for name, values in self.predicted.items()}
 
     def table(self) -> list[tuple[str, Floats]]:
-        """Return the columns of a file with their heads: time, input, measured; predicted and residual; `further`.
+        """Return the columns of a file with their heads: time, input, measured; predicted and residual; bands.
 
         The model is named in the heads if there are several.
         """
@@ -100,4 +101,7 @@ class Predictions:
             columns.append((header_with_unit(f"{prefix}predicted", self.unit), values))
             if name in residuals:
                 columns.append((header_with_unit(f"{prefix}residual", self.unit), residuals[name]))
-        return [*columns, *self.further]
+        for name, band in self.bands.items():
+            prefix = f"{name} " if len(self.predicted) > 1 else ""
+            columns += [(f"{prefix}{head}", values) for head, values in band.columns(self.predicted[name])]
+        return columns

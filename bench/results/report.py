@@ -14,7 +14,7 @@ from bench.devices import Signal
 from bench.hysteresis import MemoryCurve
 from bench.journal import Record, Table, expected_steps, run_card
 from bench.lateness import lateness_lines
-from bench.model_file import ModelFile
+from bench.model_file import ModelFile, models_among
 from bench.printing import print_plain
 from bench.results.export import make_folder
 from bench.results.figures import (
@@ -92,7 +92,8 @@ def report_run(
         for line in lateness_lines(record.meta.get("lateness", {})):
             print_plain(console, line)
         figures = _draw_run(record, steps, folder, figure_format)
-        applied = apply_models(record, steps, [*models_of(record), *models]) if len(steps) else []
+        compared = [*models_of(record), *_given_with_band(record), *models]
+        applied = apply_models(record, steps, compared) if len(steps) else []
         comparison = {
             each.file.name: {**errors_json(each.errors), "unit": each.unit, "skipped": each.skip} for each in applied
         }
@@ -221,12 +222,28 @@ def _draw_run(record: Record, steps: Table, folder: Path, figure_format: str) ->
     return paths
 
 
+def _given_with_band(record: Record) -> list[ModelFile]:
+    """Return the models that a run was given which have a prediction band, for the signals of the run."""
+    names = {signal.name for signal in record.signals}
+    return [
+        file
+        for file in models_among(record.files(), str(record.path)).values()
+        if file.band is not None and {file.provenance.get("input"), file.provenance.get("output")} <= names
+    ]
+
+
 def _draw_errors(models: Sequence[ModelOnRun], folder: Path, figure_format: str) -> list[Path]:
     if not models:
         return []
     path = folder / f"errors.{figure_format}"
     residuals = {each.file.name: each.residuals for each in models}
-    plot_errors(path, residuals, error_label=with_unit("error", models[0].unit), skip=models[0].skip)
+    plot_errors(
+        path,
+        residuals,
+        error_label=with_unit("error", models[0].unit),
+        skip=models[0].skip,
+        bands={each.file.name: (each.band.label, each.band.half_widths) for each in models if each.band is not None},
+    )
     return [path]
 
 

@@ -105,11 +105,10 @@ class TestRows:
             Quantity("force", "N", np.full(3, 2.0)),
             Quantity("t", "s", np.arange(3.0)),
             skip=1,
-            further=[("b upper [N]", np.full(3, 1.5))],
         )
         heads = [head for head, _ in found.table()]
         assert heads[:3] == ["t [s]", "u [V]", "measured [N]"]
-        assert heads[3:] == ["a predicted [N]", "a residual [N]", "b predicted [N]", "b residual [N]", "b upper [N]"]
+        assert heads[3:] == ["a predicted [N]", "a residual [N]", "b predicted [N]", "b residual [N]"]
         assert {name: errors.rms for name, errors in found.errors().items()} == {"a": 2.0, "b": 1.0}
 
     def test_compared_rows_give_the_compared_errors(self, bench, tmp_path, loop, models):

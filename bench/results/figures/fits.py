@@ -68,6 +68,7 @@ def plot_errors(
     skip: int = 0,
     names: Mapping[str, str] | None = None,
     published: Mapping[str, float] | None = None,
+    bands: Mapping[str, tuple[str, Floats]] | None = None,
 ) -> None:
     """Draw each error (measured minus modelled, shape (N,)) over the index, one panel a model, on one scale.
 
@@ -81,6 +82,8 @@ def plot_errors(
         Names of the models by their titles, which decide the colours; the title itself if not given.
     published : mapping of str to float, optional
         Largest error that a paper states of a model, by its title: drawn as two lines.
+    bands : mapping of str to (str, ndarray), optional
+        As in `plot_fit`, by the titles.
     """
     with drawn(path, (6.0, 1.0 + 1.7 * len(errors))) as figure:
         panels = figure.subplots(len(errors), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
@@ -95,6 +98,9 @@ def plot_errors(
             most, rms = np.max(np.abs(error[skip:])), float(np.sqrt(np.mean(error[skip:] ** 2)))
             axes.set_title(f"{title}: max {most:.3g}, RMS {rms:.3g}", fontsize=9, loc="left")
             draw_published(axes, (published or {}).get(title), color)
+            if bands and title in bands:
+                _draw_band(axes, indices, *bands[title], color)
+                axes.legend(loc="upper right", fontsize=7.5)
         panels[-1].set_xlabel("index of the set-point")
 
 
@@ -122,7 +128,7 @@ def plot_fit(
     titles: Mapping[str, str],
     skip: int = 0,
     names: Mapping[str, str] | None = None,
-    bands: Mapping[str, Floats] | None = None,
+    bands: Mapping[str, tuple[str, Floats]] | None = None,
 ) -> None:
     """Draw measured and modelled outputs, and below them what each model leaves, on one scale.
 
@@ -138,8 +144,8 @@ def plot_fit(
         First samples, which count in no error: drawn in grey.
     names : mapping of str to str, optional
         Registered names by those of `modelled`, where they differ; they decide the colours.
-    bands : mapping of str to ndarray, optional
-        Half-widths of prediction bands by the same names, shape (N,) each; drawn about the residuals.
+    bands : mapping of str to (str, ndarray), optional
+        Labels and half-widths of prediction bands by the same names, shape (N,) each; drawn about the residuals.
     """
     apiece = len(modelled) <= _MOST_PANELS
     rows = len(modelled) if apiece else 1
@@ -160,7 +166,7 @@ def plot_fit(
                 bottom.plot(*outline(horizontal[early], residuals[early]), color=SKIPPED, linewidth=0.7, label="_")
                 top.plot(*outline(horizontal[early], values[early]), color=SKIPPED, label="_", **_MODEL)
             if bands and name in bands:
-                _draw_band(bottom, horizontal, bands[name], color)
+                _draw_band(bottom, horizontal, *bands[name], color)
             if horizontal.size <= _DENSE or not (np.diff(horizontal) >= 0.0).all():
                 draw_residuals(bottom, horizontal[skip:], residuals[skip:], color, titles[name])
             else:
@@ -178,7 +184,7 @@ def plot_fit(
                 axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, fontsize=7.5, markerscale=3.0)
         # Of what counts; the samples before may be far off.
         counted = np.concatenate([(measured - values)[skip:] for values in modelled.values()])
-        widths = [float(np.nanmax(width[skip:])) for width in (bands or {}).values()]
+        widths = [float(np.nanmax(width[skip:])) for _, width in (bands or {}).values()]
         least, most = (
             min([0.0, float(counted.min()), *(-w for w in widths)]),
             max([0.0, float(counted.max()), *widths]),
@@ -201,9 +207,8 @@ def draw_residuals(axes: Axes, horizontal: Floats, residuals: Floats, color: str
     )
 
 
-def _draw_band(axes: Axes, horizontal: Floats, widths: Floats, color: str) -> None:
+def _draw_band(axes: Axes, horizontal: Floats, label: str, widths: Floats, color: str) -> None:
     """Draw a band about zero: over rows or time as it is, over an input as the widest of each of many parts."""
-    label = "prediction band"
     if not (np.diff(horizontal) >= 0.0).all():
         edges = np.linspace(float(horizontal.min()), float(horizontal.max()), 101)
         parts = np.clip(np.searchsorted(edges, horizontal, side="right") - 1, 0, edges.size - 2)

@@ -106,7 +106,11 @@ def _fits(models: Sequence[ModelOnRun], times: Floats, scratch: Path, number: in
             error_label=with_unit("residual", unit),
             titles=titles,
             skip=first.skip,
-            bands={model.file.name: factor * model.band.half_widths for model in models if model.band is not None},
+            bands={
+                model.file.name: (model.band.label, factor * model.band.half_widths)
+                for model in models
+                if model.band is not None
+            },
         )
         over = first.inputs.title if kind == "loops" else "time"
         caption = (

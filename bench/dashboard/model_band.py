@@ -1,0 +1,297 @@
+"""The prediction band of a model while a run goes on: about its own prediction, and about the set-points.
+
+The model follows the measured input from its initial state, as a controller's does. It is the model of the file: what
+a controller has learnt, or what has moved in a session, shows as readings beside the band.
+"""
+
+from __future__ import annotations
+
+import math
+from bisect import bisect_right
+from collections.abc import Iterator, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+import rerun as rr
+
+from bench.control.tracking import widened
+from bench.dashboard.drawing import CAUTION, Colour
+from bench.dashboard.entries import Entry, Tick
+from bench.dashboard.recording import Floats, Recording, times
+from bench.devices import Signal
+from bench.hysteresis import Operator
+from bench.identification.bands import Band, input_half_widths
+from bench.journal import StepRecord
+from bench.model_file import ModelFile
+from bench.settling import Settled
+from bench.units import fitting_prefix
+
+_FIRST = 16
+"""Rows after which the class of the input is judged first; then whenever they are an eighth more."""
+
+_MODEL: Colour = (150, 110, 190)
+_WITHIN: Colour = (186, 156, 216)
+
+
+class Plotted(NamedTuple):
+    """Where a quantity is plotted: its column, path of the plot, and factor to the unit shown."""
+
+    column: int
+    path: str
+    factor: float
+
+
+class _Row(NamedTuple):
+    t: float
+    step: int
+    input: float
+    output: float
+    setpoint: float
+    reference: float
+    is_reading: bool
+
+
+class _Standing(NamedTuple):
+    """How it stands at a time: half-width, readings so far, those within the band, departures of the class.
+
+    The latter are None before the class is judged.
+    """
+
+    t: float
+    half_width: float
+    readings: int
+    covered: int
+    departures: tuple[str, ...] | None
+
+
+class ModelBand:
+    """The band of one model in a run; used by one thread at a time.
+
+    In a run under control it is there from the first tick of a controller on; in another one at every reading. Rows
+    without a plausible input are left out.
+
+    Parameters
+    ----------
+    name : str
+        Of the model.
+    operator : Operator
+        The model.
+    band : Band
+        Its band.
+    state : object
+        Its state at the start of the run.
+    drive : int
+        Column of its input.
+    response : Plotted
+        Its output.
+    setpoint : Plotted or None
+        The set-point of the input.
+    reference : int or None
+        Column of the reference, finite while a controller is at work: then outputs are drawn less the last reference.
+        None in a run without one.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        operator: Operator[Any],
+        band: Band,
+        state: Any,  # noqa: ANN401 - each operator has its own
+        *,
+        drive: int,
+        response: Plotted,
+        setpoint: Plotted | None = None,
+        reference: int | None = None,
+    ) -> None:
+        self._name, self._operator, self._band = name, operator, band
+        self._drive, self._response, self._setpoint, self._reference = drive, response, setpoint, reference
+        self._plausible = widened(*operator.input_range)
+        self._state = self._set_state = state
+        self._set, self._set_width = math.nan, math.nan
+        self._begun, self._last_reference = reference is None, 0.0
+        self._inputs = self._spreads = np.empty(0)
+        self._judged_at = _FIRST
+        self._departures: tuple[str, ...] | None = None
+        self._standings: list[_Standing] = []
+        self._drawn: list[tuple[str, list[rr.TimeColumn], Floats]] = []
+
+    @classmethod
+    def of(
+        cls,
+        models: Sequence[ModelFile],
+        signals: Sequence[Signal],
+        *,
+        drive: int,
+        response: Plotted,
+        setpoint: Plotted | None,
+        reference: int | None,
+    ) -> ModelBand | None:
+        """Return the band of a model of these signals; None if no model has one.
+
+        Under control it is that of the first such model, which the run was given; otherwise of the last one, which
+        was identified from the run.
+        """
+        ends = signals[drive], signals[response.column]
+        fitting = [
+            file
+            for file in models
+            if file.band is not None
+            and isinstance(file.model, Operator)
+            and (file.model.input_unit, file.model.output_unit) == tuple(signal.unit for signal in ends)
+        ]
+        if not fitting:
+            return None
+        file = fitting[-1 if reference is None else 0]
+        assert file.band is not None
+        state = file.operator.initial_state() if file.initial is None else file.initial
+        return cls(
+            file.name,
+            file.operator,
+            file.band,
+            state,
+            drive=drive,
+            response=response,
+            setpoint=setpoint,
+            reference=reference,
+        )
+
+    def draw(self, recording: Recording) -> None:
+        """Write how the lines look."""
+        level = f"{100.0 * self._band.level:g} %"
+        names = [f"− {level}", f"+ {level}", f"− {level}, other class", f"+ {level}, other class"]
+        looks: dict[str, Any] = {"colors": [_WITHIN, _WITHIN, CAUTION, CAUTION], "widths": [1.0] * 4}
+        if self._setpoint is not None:
+            recording.log(f"{self._setpoint.path}/setpoint_band", rr.SeriesLines(names=names, **looks))
+        looks = {"colors": [*looks["colors"], _MODEL], "widths": [1.0] * 5}
+        recording.log(f"{self._response.path}/band", rr.SeriesLines(names=[*names, "model alone"], **looks))
+
+    def see(self, entries: Sequence[Entry]) -> None:
+        """Take entries into account, in their order."""
+        before: list[_Row] = []
+        rows: list[_Row] = []
+        for row, at_work in self._rows(entries):
+            self._begun |= at_work
+            (rows if self._begun else before).append(row)
+        if before:
+            self._state = self._operator.advance(self._state, [row.input for row in before])
+            self._setpoint_widths(before, seen=False)
+        if not rows:
+            return
+        inputs = np.array([row.input for row in rows])
+        predicted = self._operator.evaluate(inputs, self._state)
+        spread = self._band.spread(self._operator, inputs, self._state)
+        self._state = self._operator.advance(self._state, inputs)
+        widths = self._band.pointwise * spread
+        verdicts = self._judged(inputs, spread)
+        self._stand(rows, predicted, widths, verdicts)
+        foreign = np.array([verdict != () for verdict in verdicts])
+        when = times([row.t for row in rows], [row.step for row in rows])
+        about = predicted - np.array([row.reference for row in rows])
+        table = np.column_stack([*_parted(about, widths, foreign), about])
+        self._drawn.append((f"{self._response.path}/band", when, self._response.factor * table))
+        if self._setpoint is not None:
+            setpoints = np.array([row.setpoint for row in rows])
+            table = np.column_stack(_parted(setpoints, self._setpoint_widths(rows), foreign))
+            self._drawn.append((f"{self._setpoint.path}/setpoint_band", when, self._setpoint.factor * table))
+
+    def write(self, recording: Recording) -> None:
+        """Write the lines of what was seen since the last call."""
+        for path, when, table in self._drawn:
+            recording.send_vectors(path, when, table)
+        self._drawn.clear()
+
+    def texts(self, t: float) -> Iterator[tuple[str, str]]:
+        """Yield name and value of what is known of the band at a time of the last entries seen, s."""
+        place = bisect_right(self._standings, t, key=lambda standing: standing.t) - 1
+        if place < 0:
+            return
+        standing = self._standings[place]
+        level, kind = f"{100.0 * self._band.level:g} % band", self._band.calibrated_on.kind
+        factor, unit = fitting_prefix(self._operator.output_unit, standing.half_width)
+        width = f"± {factor * standing.half_width:.3g} {unit}".rstrip()
+        yield f"{level} of {self._name}, calibrated on {kind}", width
+        if standing.readings:
+            share = 100.0 * standing.covered / standing.readings
+            yield f"of {standing.readings} readings within it", f"{share:.0f} %"
+        if standing.departures is None:
+            yield "whether the input is of its class", "not judged yet:"
+        elif standing.departures:
+            yield f"of the input, the band may cover less: {'; '.join(standing.departures)}", "other class"
+
+    def _rows(self, entries: Sequence[Entry]) -> Iterator[tuple[_Row, bool]]:
+        """Yield the rows of entries, and whether a controller is at work."""
+        low, high = self._plausible
+        for entry in entries:
+            if isinstance(entry, Tick):
+                t, is_reading = entry.t, False
+            elif isinstance(entry, StepRecord):
+                t, is_reading = entry.finished, entry.settled is not Settled.CONTROLLED
+            else:
+                continue
+            if self._reference is None and not is_reading:
+                continue
+            values = entry.values
+            if low <= values[self._drive] <= high:
+                setpoint = math.nan if self._setpoint is None else values[self._setpoint.column]
+                at_work = self._reference is not None and math.isfinite(values[self._reference])
+                if at_work:
+                    self._last_reference = values[self._reference or 0]
+                output = values[self._response.column]
+                row = _Row(t, entry.step, values[self._drive], output, setpoint, self._last_reference, is_reading)
+                yield row, at_work
+
+    def _judged(self, inputs: Floats, spread: Floats) -> list[tuple[str, ...] | None]:
+        """Return for each further row the departures from the class of the calibration that are known there."""
+        first = self._inputs.size
+        self._inputs = np.append(self._inputs, inputs)
+        self._spreads = np.append(self._spreads, spread)
+        verdicts: list[tuple[str, ...] | None] = []
+        while len(verdicts) < inputs.size:
+            count = first + len(verdicts) + 1
+            # Of so many rows, whatever was handed over at once.
+            if count == self._judged_at:
+                self._departures = self._band.departures(self._inputs[:count], self._spreads[:count])
+                self._judged_at = count + max(1, count // 8)
+            verdicts.append(self._departures)
+        return verdicts
+
+    def _stand(
+        self, rows: Sequence[_Row], predicted: Floats, widths: Floats, verdicts: Sequence[tuple[str, ...] | None]
+    ) -> None:
+        """Note how it stands at each row; what stood before the last row of the last call is forgotten."""
+        del self._standings[:-1]
+        readings, covered = self._standings[-1][2:4] if self._standings else (0, 0)
+        for row, output, width, verdict in zip(rows, predicted.tolist(), widths.tolist(), verdicts, strict=True):
+            if row.is_reading and math.isfinite(row.output):
+                readings += 1
+                covered += abs(row.output - output) <= width
+            self._standings.append(_Standing(row.t, width, readings, covered, verdict))
+
+    def _setpoint_widths(self, rows: Sequence[_Row], *, seen: bool = True) -> Floats:
+        """Return the half-width about the set-point of each row, if it is `seen`, and move the memory by them.
+
+        It is that of the last move, nan before the first one.
+        """
+        setpoints = np.array([row.setpoint for row in rows])
+        known = np.isfinite(setpoints)
+        places = np.flatnonzero(known)
+        moved = places[np.diff(setpoints[places], prepend=self._set) != 0.0]
+        widths = np.full(len(rows), np.nan)
+        if moved.size:
+            path = setpoints[moved]
+            if seen:
+                about = self._band.half_widths(self._operator, path, self._set_state)
+                found = input_half_widths(self._operator, path, about, self._set_state)
+                widths = np.append(self._set_width, found)[np.searchsorted(moved, np.arange(len(rows)), side="right")]
+            self._set_state = self._operator.advance(self._set_state, path)
+            self._set = float(path[-1])
+        else:
+            widths[:] = self._set_width
+        self._set_width = float(widths[-1])
+        return widths
+
+
+def _parted(middle: Floats, widths: Floats, foreign: npt.NDArray[np.bool_]) -> list[Floats]:
+    """Return lower and upper ends, each shape (N,), where the band is calibrated, then where it is not."""
+    return [np.where(where, middle + sign * widths, np.nan) for where in (~foreign, foreign) for sign in (-1.0, 1.0)]
