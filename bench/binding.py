@@ -23,7 +23,7 @@ A protocol names the slots that it needs and the kind of each, and takes its def
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Self
 
@@ -212,14 +212,18 @@ def bind(
     of the rig file are for messages. Raises ConfigurationError if a slot is not bound, or bound to something of
     another kind; names file, key and what is allowed.
     """
-    missing = [name for name in needs if name not in roles]
-    if missing:
+    check_bound(protocol, needs, roles, path)
+    return {name: _bind(protocol, name, kind, roles[name], devices, signals, path) for name, kind in needs.items()}
+
+
+def check_bound(protocol: str, needs: Iterable[str], roles: Mapping[str, RoleTable], path: str) -> None:
+    """Raise ConfigurationError, which names what is missing, if a rig file binds not all slots of a protocol."""
+    if missing := [name for name in needs if name not in roles]:
         bound = ", ".join(roles) or "none"
         raise ConfigurationError(
             f"{path}: protocol {protocol} needs {', '.join(f'[roles.{name}]' for name in missing)}; "
             f"the file binds: {bound}"
         )
-    return {name: _bind(protocol, name, kind, roles[name], devices, signals, path) for name, kind in needs.items()}
 
 
 def _bind(

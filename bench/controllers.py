@@ -81,15 +81,7 @@ class ControllerSetup:
 
         Raises ConfigurationError if neither says it.
         """
-        if self.dwell is not None:
-            return self.dwell
-        dynamics = self.model.dynamics
-        if dynamics is None or dynamics.time_constant == 0.0:
-            raise ConfigurationError(
-                f"controller {self.name}: nothing says how long the specimen takes to come to rest; give "
-                "[roles.drive] dwell = ... (s) in the rig file, or identify the model from a run with transients"
-            )
-        return _TO_REST * dynamics.time_constant
+        return time_to_rest(self.dwell, self.model, f"controller {self.name}")
 
     @property
     def start(self) -> Any:  # noqa: ANN401 - each operator has its own
@@ -157,6 +149,34 @@ class ControllerSpec:
     """Of a controller without feedback: returns the greatest RMS error of a model that still holds, output units."""
     misses: bool = False
     """Whether it may miss targets by design, as one for comparison; its errors then are not judged."""
+
+
+def time_to_rest(dwell: float | None, model: ModelFile, who: str) -> float:
+    """Return the time in which actuator and specimen come to rest at a set-point, s.
+
+    Parameters
+    ----------
+    dwell : float or None
+        As the rig file says; if it does not, the dynamics in the model file tell it.
+    model : ModelFile
+        The identified model.
+    who : str
+        Who needs it, for the message.
+
+    Raises
+    ------
+    ConfigurationError
+        If neither says it.
+    """
+    if dwell is not None:
+        return dwell
+    dynamics = model.dynamics
+    if dynamics is None or dynamics.time_constant == 0.0:
+        raise ConfigurationError(
+            f"{who}: nothing says how long the specimen takes to come to rest; give "
+            "[roles.drive] dwell = ... (s) in the rig file, or identify the model from a run with transients"
+        )
+    return _TO_REST * dynamics.time_constant
 
 
 def controller_names(task: str) -> tuple[str, ...]:
@@ -305,11 +325,11 @@ def _latched(setup: ControllerSetup) -> Latched | OppositeOutput:
         )
     options = dict(setup.options)
     correction = tuned(Latched.correction(setup.spans), options.pop("correction", {}))
-    numbers = setup.tuned(LatchParameters.scaled, options), correction
+    numbers = setup.tuned(partial(LatchParameters.scaled, dwell=setup.rest), options)
     if isinstance(inverse, FallingInverse):
         opposite: Any = inverse.opposite
-        return OppositeOutput(Latched(opposite, setup.start, setup.limits, *numbers))
-    return Latched(inverse, setup.start, setup.limits, *numbers)
+        return OppositeOutput(Latched(opposite, numbers, setup.start, setup.limits, correction))
+    return Latched(inverse, numbers, setup.start, setup.limits, correction)
 
 
 def _integral(setup: ControllerSetup) -> IntegralParameters:
@@ -353,7 +373,7 @@ CLOSED_LOOP_INVERSE = ControllerSpec(
 LATCHED = ControllerSpec(
     "backs off at the target, where the hysteresis holds the output",
     _latched,
-    numbers=lambda s: LatchParameters.scaled(s.spans),
+    numbers=lambda s: LatchParameters.scaled(s.spans, s.rest),
     tunable=("approach", "creep_gain", "creep_until", "fine_period"),
 )
 POLYNOMIAL = ControllerSpec("the look-up table of a model without memory", _look_up, misses=True)

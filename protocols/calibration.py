@@ -18,24 +18,18 @@ class CommonParameters(ProtocolParameters):
 class WeightParameters(CommonParameters):
     """Parameters of the calibration by weights."""
 
-    weights: NumberList = parameter(
-        "0.98, 2.94, 4.90, 6.86, 8.82, 4.90, 0.98", unit="N", help="dead weights, one after another"
-    )
+    weights: NumberList = parameter(..., unit="N", help="dead weights, one after another")
     tolerance: float = parameter(
-        0.5, unit="N", low=1e-3, high=1e3, help="farthest reading from the weight that is believed"
+        ..., unit="N", low=1e-3, high=1e3, help="farthest reading from the weight that is believed"
     )
 
 
 class BlockParameters(CommonParameters):
     """Parameters of the calibration by gauge blocks."""
 
-    positions: NumberList = parameter(
-        "-0.014, -0.010, -0.006, -0.002, 0.002, 0.006, 0.010, 0.014, 0.008, 0, -0.008",
-        unit="m",
-        help="positions that the blocks give, one after another",
-    )
+    positions: NumberList = parameter(..., unit="m", help="positions that the blocks give, one after another")
     tolerance: float = parameter(
-        1e-3, unit="m", low=1e-6, high=1.0, help="farthest reading from the position that is believed"
+        ..., unit="m", low=1e-6, high=1.0, help="farthest reading from the position that is believed"
     )
 
 

@@ -148,8 +148,8 @@ def reset(slots: Slots, setpoint: float, minimum: float, *, load: float = 0.0, w
     return reading
 
 
-def reset_unknown_memory(parameters: ControlledParameters, slots: Slots) -> Part[Reading]:
-    """Reset the memory of a specimen of which nothing is known, and say so in the log."""
+def reset_unknown_memory(parameters: ControlledParameters, slots: Slots, minimum: float) -> Part[Reading]:
+    """Reset the memory of a specimen of which nothing is known, for a least time (s), and say so in the log."""
     setpoint = parameters.reset
     why = f"the memory of the specimen is unknown: it is reset to negative saturation at {setpoint:g} "
-    return (yield from reset(slots, setpoint, 8.0, load=parameters.load, why=why + slots["drive"].unit))
+    return (yield from reset(slots, setpoint, minimum, load=parameters.load, why=why + slots["drive"].unit))

@@ -7,7 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from bench.binding import RoleTable
 from bench.control.model_filters import ADAPTATIONS, AdaptationName
+from bench.controllers import time_to_rest
 from bench.identification.excitation import ramps
 from bench.identification.recalibration import Kind, parse_kinds, recalibrate
 from bench.model_file import ModelFile
@@ -19,9 +21,6 @@ SESSION = "session"
 
 ADAPTED = "adapted"
 """Name of the corrected model among those of the run."""
-
-# Where the rig file has none for its drive, s: protocols that take no other readings need none.
-_DWELL = 8.0
 
 
 class SessionParameters(ControlledParameters):
@@ -37,11 +36,11 @@ class SessionParameters(ControlledParameters):
         120, unit="1", low=10, high=10000, help="readings for that, on one loop from `reset` to `hottest` and back"
     )
     recalibrate_dwell: float = parameter(
-        from_slot("drive", "dwell", fallback=_DWELL),
+        from_slot("drive", "dwell", fallback=0.0),
         unit="s",
-        low=0.01,
+        low=0,
         high=3600,
-        help="hold before each of these readings",
+        help="hold before each of these readings; 0 for the time in which the specimen of the model comes to rest",
     )
     adaptation: AdaptationName = parameter(
         "off",
@@ -70,29 +69,38 @@ def begin_session(
 
     With `kinds` the drive visits known set-points on one loop of its range, and returns to the reset. What moved is
     estimated from all readings there, and noted. Raises ValueError if the readings do not tell it, or the input of
-    such a model cannot be shifted.
+    such a model cannot be shifted; ConfigurationError if nothing says how long the specimen takes to come to rest.
     """
     if "input-offset" in kinds:
         # A model that cannot be corrected is refused before anything moves.
         model.operator.shifted(0.0)
-    reading = yield from reset_unknown_memory(parameters, slots)
+    drive, response = slots["drive"], slots["response"]
+    least = _least_reset(drive.table, model)
+    dwell = parameters.recalibrate_dwell or (time_to_rest(None, model, "recalibrate") if kinds else 0.0)
+    reading = yield from reset_unknown_memory(parameters, slots, least)
     if not kinds:
         return reading, model
-    drive, response = slots["drive"], slots["response"]
     low, high = parameters.reset, parameters.hottest
     state = model.operator.saturated_state(-1, reading[drive.signal])
     inputs, outputs = [reading[drive.signal]], [reading[response.signal]]
     yield Phase("session: known set-points")
     for target in ramps([low, high, low], 2.0 * abs(high - low) / parameters.recalibrate_readings)[1:].tolist():
-        reading = yield Step({drive.device: target}, Dwell(parameters.recalibrate_dwell), label=SESSION)
+        reading = yield Step({drive.device: target}, Dwell(dwell), label=SESSION)
         inputs.append(reading[drive.signal])
         outputs.append(reading[response.signal])
     found = recalibrate(model.operator, np.array(inputs), np.array(outputs), kinds, state=state)
     texts = ", ".join(f"{kind} {text}" for kind, text in found.texts(drive.unit, response.unit))
     yield Note(f"session: {texts}, from {found.rows} readings at known set-points; the model is corrected by it")
     corrected = found.corrected(model.operator)
-    reading = yield from reset(slots, low, 8.0)
+    reading = yield from reset(slots, low, least)
     return reading, replace(model, model=corrected, memory=None, band=None)
+
+
+def _least_reset(drive: RoleTable, model: ModelFile) -> float:
+    """Return how long the memory is reset at least, s; 0 where the rig file has a rule for it alone."""
+    if drive.dwell is None and drive.reset is not None:
+        return 0.0
+    return time_to_rest(drive.dwell, model, "reset")
 
 
 def keep_adapted(controller: Any, model: ModelFile) -> Part[None]:  # noqa: ANN401 - of a target or a reference

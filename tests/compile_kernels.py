@@ -36,6 +36,7 @@ from bench.transients.response import late_parts
 from bench.twin.specimen import Dynamics, Specimen
 from rigs.hybrid.control import HybridController, MidRangingParameters
 from rigs.hybrid.design import Design
+from rigs.hybrid.estimates import ThermalNoise
 from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel, identify_polynomial
 
 
@@ -100,7 +101,12 @@ def hybrid_controller() -> None:
     plays = PrandtlIshlinskii(np.array([0.0, 10.0]), np.full(2, 1e-7), input_range=(-40.0, 40.0))
     polynomial = identify_polynomial(rises, -7e-6 * rises, 2).model
     model = HybridModel(Design().network(), polynomial, plays, PUBLISHED_DYNAMICS)
-    controller = HybridController(model, lambda _: 0.0, MidRangingParameters(every=1))
+    noise = ThermalNoise(thermistor=1.0, deflection=1.0, base=1.0, tip=1.0, heat=1.0, offset=1.0)
+    parameters = MidRangingParameters(
+        period=5e-3, every=1, maximum_current=0.1, gain=1.0, integral_time=1.0, lead=1.0, window=1.0, filter_time=1.0,
+        integral=1.0, stroke=1e-6, approach=1e-6, noise=noise,
+    )  # fmt: skip
+    controller = HybridController(model, lambda _: 0.0, parameters)
     for deflection in (0.0, math.nan, math.nan):
         controller.update(0.0, (deflection, 22.0, 22.0))
 

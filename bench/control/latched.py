@@ -28,7 +28,7 @@ _UNLOCKED = 3
 
 @dataclass(frozen=True)
 class LatchParameters:
-    """Numbers of the latched controller; defaults for the film of Zhang et al. 2013 (°C, 1/m)."""
+    """Numbers of the latched controller."""
 
     approach: float
     """How far before the target, in output units, the approach by the model ends."""
@@ -63,23 +63,23 @@ class LatchParameters:
     end_margin: float
     """Within this distance of the outputs at saturation, in output units, and beyond them, the incremental inverse
     alone is used."""
+    creep_horizon: float
+    """Time in which the creep reaches a target that the model has further ahead than the creep would come, as after a
+    turn, s; `creep_fast` limits it."""
+    creep_limit: float
+    """Longest creep, s."""
+    settle: float
+    """Time after stepping back before locking is decided, s."""
+    fine_period: float
+    """Time between moves of the fine loop, s."""
     approach_done: float = 1.8
     """Multiple of `approach` before the target at which the approach is over."""
     approach_corrections: int = 8
     """Greatest number of corrections of an approach."""
-    creep_horizon: float = 4.0
-    """Time in which the creep reaches a target that the model has further ahead than the creep would come, as after a
-    turn, s; `creep_fast` limits it."""
-    creep_limit: float = 60.0
-    """Longest creep, s."""
     tries: int = 10
     """Greatest number of approaches, each from the other side, before falling back."""
-    settle: float = 1.0
-    """Time after stepping back before locking is decided, s."""
     fine_moves: int = 5
     """Number of moves of the fine loop."""
-    fine_period: float = 1.0
-    """Time between moves of the fine loop, s."""
     fine_gain: float = 1.0
     """Part of the estimated error that one move takes away, 0 to 2."""
 
@@ -96,17 +96,17 @@ class LatchParameters:
             raise ValueError(f"fine_gain: expected less than 2, where the loop is unstable, got {self.fine_gain}")
 
     @classmethod
-    def scaled(cls, spans: Spans) -> LatchParameters:
-        """Return the defaults for a model, in proportion to its ranges; times suit an input that arrives in 1 s."""
+    def scaled(cls, spans: Spans, dwell: float) -> LatchParameters:
+        """Return the defaults for a model and an actuator that comes to rest within `dwell` (s)."""
         u, y = spans
         return cls(
             approach=1.3e-2 * y,
-            arrival=Arrival(tolerance=1.6e-3 * u, hold=0.2),
-            creep_least=2.4e-4 * u,
-            creep_most=1.9e-3 * u,
-            creep_gain=0.09 * u / y,
+            arrival=Arrival(tolerance=1.6e-3 * u, hold=dwell / 40.0, patience=1.875 * dwell),
+            creep_least=1.92e-3 * u / dwell,
+            creep_most=1.52e-2 * u / dwell,
+            creep_gain=0.72 * u / y / dwell,
             creep_offset=9.5e-4 * y,
-            creep_fast=4.8e-3 * u,
+            creep_fast=3.84e-2 * u / dwell,
             creep_until=1.75e-3 * y,
             step_back=8e-3 * u,
             nearest=1.3e-3 * u,
@@ -116,6 +116,10 @@ class LatchParameters:
             walk_variance=(5e-5 * y) ** 2,
             reading_variance=(2e-4 * y) ** 2,
             end_margin=2.6e-3 * y,
+            creep_horizon=0.5 * dwell,
+            creep_limit=7.5 * dwell,
+            settle=dwell / 8.0,
+            fine_period=dwell / 8.0,
         )
 
 
@@ -138,10 +142,10 @@ class Latched(Correcting):
     inverse : Inverse
         Exact inverse of the identified model, which must have a reversible part: its slope is what a
         locked actuator answers with.
-    state, limits
-        As in `OpenLoopInverse`.
     parameters : LatchParameters
         Numbers of the lock.
+    state, limits
+        As in `OpenLoopInverse`.
     correction : CorrectionParameters
         Numbers of the incremental inverse, where that is used.
 
@@ -159,16 +163,15 @@ class Latched(Correcting):
     def __init__(
         self,
         inverse: PreisachInverse,
+        parameters: LatchParameters,
         state: MemoryCurve | None = None,
         limits: tuple[float, float] | None = None,
-        parameters: LatchParameters | None = None,
         correction: CorrectionParameters | None = None,
     ) -> None:
         if inverse.operator.reversible is None:
             raise ValueError("inverse: expected a model with a reversible part, by which a locked output is moved")
-        spans = Spans.of(inverse.operator)
-        super().__init__(inverse, state, limits, correction or Latched.correction(spans))
-        self._parameters = parameters or LatchParameters.scaled(spans)
+        super().__init__(inverse, state, limits, correction or Latched.correction(Spans.of(inverse.operator)))
+        self._parameters = parameters
         self._poll = self._parameters.arrival.poll
         self._saturated = sorted(inverse.operator.evaluate(inverse.operator.levels[[0, -1]]).tolist())
         self._operator = inverse.operator

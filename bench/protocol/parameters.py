@@ -10,7 +10,7 @@ from typing import Any, Literal, cast, get_args, get_origin, get_type_hints
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import PydanticUndefined
 
-from bench.binding import RoleTable, Slots, rate_unit
+from bench.binding import RoleTable, Slots, check_bound, rate_unit
 from bench.devices import Device, Signal
 from bench.errors import ConfigurationError
 from bench.protocol.changes import ParameterChange
@@ -276,6 +276,9 @@ class ProtocolDefinition:
                 raise ConfigurationError(
                     f"{path}: protocols.{self.name}.{name}: there is no such parameter; there are: {known}"
                 )
+        if roles is not None:
+            # Before the parameters, whose defaults then are missing too.
+            check_bound(self.name, self.slots, roles, path)
         merged = self._from_roles(roles or {}) | dict(defaults or {}) | dict(settings)
         try:
             parameters = self.parameters.model_validate(merged)
@@ -364,6 +367,8 @@ class ProtocolDefinition:
                 given = "is missing" if problem["type"] == "missing" else f"= {problem['input']!r} is not allowed"
                 if problem["type"] == "missing" and isinstance(source := self._extra(name).get("default"), FromSlot):
                     given += f" (the rig file does not say {source.text})"
+                elif problem["type"] == "missing" and not self._extra(name).get("file"):
+                    given += f" (nor does the rig file say it: [protocols.{self.name}] {name} = ...)"
                 yield (
                     f"{from_file.get(name, '')}protocol {self.name}: parameter {name} {given}; "
                     f"allowed: {entry.allowed}{unit} ({problem['msg']})"

@@ -12,9 +12,9 @@ from protocols.hybrid import THERMAL, WITNESS
 class Parameters(ProtocolParameters):
     """What can be set."""
 
-    cooling: float = parameter(-0.11, unit="A", low=-1, high=0, help="lowest current, which cools most")
-    heating: float = parameter(0.09, unit="A", low=0, high=1, help="highest current")
-    period: float = parameter(1000.0, unit="s", low=10, high=36000, help="time of one sweep there and back")
+    cooling: float = parameter(..., unit="A", low=-1, high=0, help="lowest current, which cools most")
+    heating: float = parameter(..., unit="A", low=0, high=1, help="highest current")
+    period: float = parameter(..., unit="s", low=10, high=36000, help="time of one sweep there and back")
     sweeps: int = parameter(2, unit="1", low=1, high=100, help="sweeps")
     rate: float = parameter(10.0, unit="Hz", low=0.1, high=1000, help="samples in a second")
 

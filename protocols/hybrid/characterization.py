@@ -12,6 +12,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from bench.binding import RoleTable
 from bench.control.loops import Playback
 from bench.protocol import (
     Dwell,
@@ -22,6 +23,7 @@ from bench.protocol import (
     Slots,
     Step,
     Views,
+    from_slot,
     parameter,
     protocol,
 )
@@ -55,8 +57,8 @@ def _play(
 class CurrentSineParameters(ProtocolParameters):
     """What can be set."""
 
-    amplitude: float = parameter(0.1, unit="A", low=0.001, high=1, help="amplitude of the current")
-    frequencies: NumberList = parameter("0.001", unit="Hz", help="frequencies, one after another")
+    amplitude: float = parameter(..., unit="A", low=0.001, high=1, help="amplitude of the current")
+    frequencies: NumberList = parameter(..., unit="Hz", help="frequencies, one after another")
     periods: int = parameter(2, unit="1", low=2, high=100, help="periods at each; the first is the transient")
     rate: float = parameter(0.5, unit="Hz", low=0.01, high=100, help="samples in a second")
 
@@ -86,9 +88,9 @@ def current_sine(parameters: CurrentSineParameters, slots: Slots) -> Messages:
 class CurrentStepsParameters(ProtocolParameters):
     """What can be set."""
 
-    levels: NumberList = parameter("-0.1, -0.05, -0.025, 0.1", unit="A", help="currents, one after another")
-    on: float = parameter(600.0, unit="s", low=1, high=36000, help="how long each is held")
-    off: float = parameter(900.0, unit="s", low=1, high=36000, help="how long the current is off after each")
+    levels: NumberList = parameter(..., unit="A", help="currents, one after another")
+    on: float = parameter(..., unit="s", low=1, high=36000, help="how long each is held")
+    off: float = parameter(..., unit="s", low=1, high=36000, help="how long the current is off after each")
     rate: float = parameter(1.0, unit="Hz", low=0.01, high=100, help="samples in a second")
 
 
@@ -120,11 +122,11 @@ def current_steps(parameters: CurrentStepsParameters, slots: Slots) -> Messages:
 class ThermomechanicalParameters(ProtocolParameters):
     """What can be set."""
 
-    coldest: float = parameter(-0.15, unit="A", low=-1, high=0, help="lowest current, which cools most")
-    hottest: float = parameter(0.1, unit="A", low=0, high=1, help="highest current")
+    coldest: float = parameter(..., unit="A", low=-1, high=0, help="lowest current, which cools most")
+    hottest: float = parameter(..., unit="A", low=0, high=1, help="highest current")
     levels: int = parameter(9, unit="1", low=2, high=1000, help="currents on each way")
     dwell: float = parameter(
-        240.0, unit="s", low=1, high=36000, help="hold at each before the reading", changeable=True
+        ..., unit="s", low=1, high=36000, help="hold at each before the reading", changeable=True
     )
 
 
@@ -142,10 +144,18 @@ def thermomechanical(parameters: ThermomechanicalParameters, slots: Slots) -> Me
         yield Step({slots["coarse"].device: float(current)}, Dwell(parameters.dwell), label="sample")
 
 
+def _decreasing(fine: RoleTable) -> tuple[float, ...] | None:
+    return None if fine.high is None else tuple(part * fine.high for part in (1.0, 1.0, 0.75, 0.5, 0.25))
+
+
 class PiezoLoopsParameters(ProtocolParameters):
     """What can be set."""
 
-    amplitudes: NumberList = parameter("40, 40, 30, 20, 10", unit="V", help="amplitude of each cycle")
+    amplitudes: NumberList = parameter(
+        from_slot("fine", _decreasing, "its highest voltage twice, and three quarters, half and a quarter of it"),
+        unit="V",
+        help="amplitude of each cycle",
+    )
     frequency: float = parameter(0.1, unit="Hz", low=1e-3, high=10, help="cycles in a second")
     rate: float = parameter(50.0, unit="Hz", low=1, high=1e5, help="samples in a second")
 
@@ -179,7 +189,7 @@ def piezo_loops(parameters: PiezoLoopsParameters, slots: Slots) -> Messages:
 class PiezoStepParameters(ProtocolParameters):
     """What can be set."""
 
-    voltage: float = parameter(40.0, unit="V", low=-1000, high=1000, help="height of the step")
+    voltage: float = parameter(from_slot("fine", "high"), unit="V", low=-1000, high=1000, help="height of the step")
     rest: float = parameter(0.02, unit="s", low=0, high=10, help="time at 0 V before it")
     duration: float = parameter(0.3, unit="s", low=1e-3, high=100, help="time after it")
     rate: float = parameter(20e3, unit="Hz", low=10, high=1e6, help="samples in a second")
@@ -214,9 +224,9 @@ def piezo_step(parameters: PiezoStepParameters, slots: Slots) -> Messages:
 class ExcitationParameters(ProtocolParameters):
     """What can be set."""
 
-    current: float = parameter(0.08, unit="A", low=0, high=1, help="amplitude of the current")
-    current_frequency: float = parameter(1e-3, unit="Hz", low=1e-5, high=1, help="frequency of the current")
-    voltage: float = parameter(30.0, unit="V", low=0, high=1000, help="amplitude of the voltage")
+    current: float = parameter(..., unit="A", low=0, high=1, help="amplitude of the current")
+    current_frequency: float = parameter(..., unit="Hz", low=1e-5, high=1, help="frequency of the current")
+    voltage: float = parameter(..., unit="V", low=0, high=1000, help="amplitude of the voltage")
     voltage_frequency: float = parameter(0.05, unit="Hz", low=1e-4, high=10, help="frequency of the voltage")
     duration: float = parameter(2000.0, unit="s", low=1, high=36000, help="how long")
     rate: float = parameter(2.0, unit="Hz", low=0.01, high=1000, help="samples in a second")

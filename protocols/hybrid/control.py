@@ -9,8 +9,19 @@ from typing import Literal
 from bench.control.references import AddedSine, Reference, SmoothMoves, staircase
 from bench.controllers import ControllerSetup, make_controller
 from bench.model_file import load_model
-from bench.protocol import FixedRate, Messages, Note, Phase, ProtocolParameters, Slots, parameter, protocol
+from bench.protocol import (
+    FixedRate,
+    Messages,
+    Note,
+    Phase,
+    ProtocolParameters,
+    Slots,
+    from_slot,
+    parameter,
+    protocol,
+)
 from bench.protocol.number_list import NumberList
+from bench.tuning_file import Tuning
 from protocols.hybrid import BOTH_LOOPS, FINE, FINE_OVER_TIME, SENSORS, THERMAL, WITNESS
 
 ControllerName = Literal["hybrid", "hybrid-low-pass", "open-loop", "thermal-feedback"]
@@ -20,8 +31,8 @@ REST = 5.0
 """Time at the start before the reference begins to move, s."""
 APPROACH = 200.0
 """Longest time in which the tip comes from where it rests to the beginning of the reference, s."""
-REACH = 199e-6
-"""Farthest position of either sign, m; the displacement sensor sees no farther."""
+MID_RANGING = "mid-ranging"
+"""Table of `tuning` with the numbers that the controllers of both parts share."""
 
 
 class Parameters(ProtocolParameters):
@@ -32,15 +43,14 @@ class Parameters(ProtocolParameters):
     )
     controller: ControllerName = parameter("hybrid", unit="", help="which controller")
     reference: ReferenceName = parameter("moves", unit="", help="what is followed")
-    positions: NumberList = parameter(
-        "60e-6, -50e-6, 90e-6, 85e-6, -120e-6, 0", unit="m", help="of moves: positions, one after another"
-    )
-    low: float = parameter(-50e-6, unit="m", low=-REACH, high=REACH, help="lowest position of the others")
-    high: float = parameter(50e-6, unit="m", low=-REACH, high=REACH, help="highest position of the others")
+    reach: float = parameter(..., unit="m", help="farthest position of either sign that the response sees")
+    positions: NumberList = parameter(..., unit="m", help="of moves: positions, one after another")
+    low: float = parameter(..., unit="m", help="lowest position of the others")
+    high: float = parameter(..., unit="m", help="highest position of the others")
     steps: int = parameter(5, unit="1", low=1, high=1000, help="steps of a staircase each way")
-    speed: float = parameter(3e-6, unit="m/s", low=1e-9, high=1e-4, help="greatest speed of the reference")
+    speed: float = parameter(..., unit="m/s", low=1e-9, high=1e-4, help="greatest speed of the reference")
     hold: float = parameter(60.0, unit="s", low=0, high=36000, help="time at each position")
-    amplitude: float = parameter(1e-6, unit="m", low=0, high=9e-6, help="amplitude of the sine on a ramp")
+    amplitude: float = parameter(..., unit="m", low=0, help="amplitude of the sine on a ramp")
     frequency: float = parameter(1.0, unit="Hz", low=1e-3, high=20, help="frequency of the sine on a ramp")
     rate: float = parameter(200.0, unit="Hz", low=50, high=1000, help="samples in a second")
     record_rate: float = parameter(50.0, unit="Hz", low=0.01, high=1000, help="recorded samples in a second")
@@ -48,13 +58,20 @@ class Parameters(ProtocolParameters):
         0.0, unit="s", low=0, high=0.06, help="time by which the response is read late, as its calibration finds it"
     )
     probe: float = parameter(
-        0.1e-6,
+        ...,
         unit="m",
         low=0,
-        high=1e-6,
         help="height of the square wave at the start, by which the lateness is checked; 0 for no check",
     )
     witness: bool = parameter(False, unit="", help="whether the sensor `witness` beside the loop is recorded too")
+    current: float = parameter(
+        from_slot("coarse", "high"), unit="A", low=1e-3, help="greatest current of either sign"
+    )
+    tuning: Tuning = parameter(
+        {},
+        unit="",
+        help=f"numbers of the controllers: table {MID_RANGING} those of all, one of a controller's name its own",
+    )
 
 
 @protocol(needs=THERMAL | FINE, may_use=WITNESS, controls="response", views=BOTH_LOOPS)
@@ -65,12 +82,15 @@ def hybrid_control(parameters: Parameters, slots: Slots) -> Messages:
     position, a staircase from `low` to `high` and back, a slow ramp there and back, the same with a sine on top, or
     a hold at 0. Where the tip rests far from 0, as in a warm room, a smooth move to 0 comes first.
     """
-    reference, duration = _reference(parameters)
-    controller = make_controller(
-        "hybrid",
-        parameters.controller,
-        _setup(parameters, reference, lateness=parameters.lateness, probe=parameters.probe),
-    )
+    p = parameters
+    reference, duration = _reference(p)
+    numbers = p.tuning.get(MID_RANGING, {}) | p.tuning.get(p.controller, {})
+    limits = (-p.current, p.current)
+    setup = _setup(p, reference, limits, numbers=numbers, lateness=p.lateness, probe=p.probe)
+    controller = make_controller("hybrid", p.controller, setup)
+    for name, height in (("amplitude", p.amplitude), ("probe", p.probe)):
+        if height > (stroke := numbers["stroke"]):
+            raise ValueError(f"{name} = {height:g}: expected at most the stroke of the piezo part, {stroke:g} m")
     accuracy = slots["response"].accuracy
     if accuracy is None:
         yield Note("the response is not calibrated: how far its readings are from the true deflection is not known")
@@ -96,11 +116,14 @@ class StepParameters(ProtocolParameters):
     model: str = parameter(
         ..., unit="", help="file of a hybrid model, as `bench identify-hybrid` writes it", file=True
     )
-    step: float = parameter(5e-6, unit="m", low=-9e-6, high=9e-6, help="height of the step")
+    step: float = parameter(..., unit="m", help="height of the step")
+    stroke: float = parameter(
+        ..., unit="m", help="largest deflection of either sign that the piezo part is asked for"
+    )
     rest: float = parameter(0.05, unit="s", low=0, high=10, help="time at the deflection of the start before it")
     duration: float = parameter(0.2, unit="s", low=1e-3, high=100, help="time after it")
     rate: float = parameter(20e3, unit="Hz", low=2000, high=1e6, help="samples in a second")
-    integral: float = parameter(300.0, unit="1/s", low=1, high=1000, help="gain of the loop's integral")
+    integral: float = parameter(..., unit="1/s", low=1, high=1000, help="gain of the loop's integral")
     witness: bool = parameter(False, unit="", help="whether the sensor `witness` beside the loop is recorded too")
 
 
@@ -112,9 +135,9 @@ def fine_step(parameters: StepParameters, slots: Slots) -> Messages:
     virtual clock. A step beyond the stroke, less a reserve for the loop, is refused; one that overshoots ends the
     run.
     """
-    setup = _setup(
-        parameters, lambda t: parameters.step if t >= parameters.rest else 0.0, integral=parameters.integral
-    )
+    p = parameters
+    limits = (-math.inf, math.inf)
+    setup = _setup(p, lambda t: p.step if t >= p.rest else 0.0, limits, integral=p.integral, stroke=p.stroke)
     controller = make_controller("hybrid-fine", "notch", setup)
     low, high = controller.reach
     if not low <= parameters.step <= high:
@@ -142,10 +165,12 @@ def _watched(parameters: Parameters | StepParameters, slots: Slots) -> tuple[str
     return (slots["witness"].signal,)
 
 
-def _setup(parameters: Parameters | StepParameters, reference: Reference, **options: float) -> ControllerSetup:
+def _setup(
+    parameters: Parameters | StepParameters, reference: Reference, limits: tuple[float, float], **options: object
+) -> ControllerSetup:
     return ControllerSetup(
         model=load_model(Path(parameters.model), "hybrid"),
-        limits=(-math.inf, math.inf),
+        limits=limits,
         options={"reference": reference, "rate": parameters.rate, **options},
     )
 
@@ -153,9 +178,10 @@ def _setup(parameters: Parameters | StepParameters, reference: Reference, **opti
 def moves_of(parameters: Parameters) -> SmoothMoves:
     """Return the moves that a reference consists of, without its sine."""
     p = parameters
+    for name, places in (("positions", p.positions), ("low", (p.low,)), ("high", (p.high,))):
+        if max(map(abs, places)) > p.reach:
+            raise ValueError(f"{name}: expected numbers from {-p.reach:g} to {p.reach:g} m, as far as reach says")
     if p.reference == "moves":
-        if max(map(abs, p.positions)) > REACH:
-            raise ValueError(f"positions: expected numbers from {-REACH:g} to {REACH:g} m")
         return SmoothMoves([0.0, *p.positions], p.speed, hold=p.hold)
     if p.reference == "staircase":
         return staircase(p.low, p.high, p.steps, p.speed, hold=p.hold)

@@ -24,6 +24,7 @@ from bench.protocol import (
     Slots,
     Step,
     Views,
+    from_slot,
     parameter,
     protocol,
 )
@@ -73,7 +74,7 @@ class Controlled(ProtocolParameters):
 class LengthParameters(Controlled, ResetParameters):
     """Parameters."""
 
-    load: float = parameter(4.90, unit="N", low=0.05, high=100, help="weight on the muscle")
+    load: float = parameter(from_slot("load", "rest"), unit="N", low=0.05, high=100, help="weight on the muscle")
     change: float = parameter(
         0.0, unit="N", low=0, high=100, help="added weight for five targets in ten; 0 for a constant one"
     )
@@ -107,13 +108,13 @@ def length_control(parameters: LengthParameters, slots: Slots) -> Messages:
     # Before anything moves: it may refuse the model.
     controller = _make_controller(parameters, file, _hung(model, state, parameters.load), "length", high - low)
     yield from reset_under_weights(parameters, slots)
-    yield from hang(slots, parameters.load)
+    yield from hang(parameters, slots, parameters.load)
     yield Phase(parameters.controller)
     errors: list[float] = []
     for i, target in enumerate(_targets(parameters, low, high)):
         if parameters.change and i and i % _TARGETS_AT_A_LOAD == 0:
             heavier = i // _TARGETS_AT_A_LOAD % 2 == 1
-            yield from hang(slots, parameters.load + parameters.change * heavier)
+            yield from hang(parameters, slots, parameters.load + parameters.change * heavier)
         errors.append((yield from _reach(parameters, slots, controller, target, "response", ("force",))))
     yield _summary(parameters.controller, np.array(errors) * 1e3, "mm")
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bench.protocol import Dwell, Messages, Phase, Slots, Step, Views, parameter, protocol
+from bench.protocol import Dwell, Messages, Phase, Slots, Step, Views, from_slot, parameter, protocol
 from bench.protocol.number_list import NumberList
 from protocols.muscles.parts import (
     ON_STAGE,
@@ -12,19 +12,25 @@ from protocols.muscles.parts import (
     StageParameters,
     drive_to,
     fasten,
+    over_range,
     reset_on_stage,
     stretch,
 )
 
-_TOLERANCE = 0.05
+_STRETCHED = 1.0 / 6.0
+"""Error of a force that the stage sets, as a part of the pretension."""
 
 
 class Parameters(StageParameters):
     """Parameters."""
 
-    voltages: NumberList = parameter("0, 0.6, 1.2, 1.8, 2.4, 3", unit="V", help="voltages, one after another")
-    smallest_force: float = parameter(0.3, unit="N", low=0.1, high=100, help="where the muscle is just taut")
-    largest_force: float = parameter(10.5, unit="N", low=0.2, high=100, help="where the stage turns")
+    voltages: NumberList = parameter(over_range("drive", 6), unit="V", help="voltages, one after another")
+    smallest_force: float = parameter(
+        from_slot("force", "low"), unit="N", low=0.1, high=100, help="where the muscle is just taut"
+    )
+    largest_force: float = parameter(
+        from_slot("force", "high"), unit="N", low=0.2, high=100, help="where the stage turns"
+    )
     points: int = parameter(12, unit="1", low=2, high=1000, help="forces on the way up; one less on the way down")
 
 
@@ -40,12 +46,12 @@ def length_force(parameters: Parameters, slots: Slots) -> Messages:
         raise ValueError("smallest_force must be below largest_force")
     up = np.linspace(parameters.smallest_force, parameters.largest_force, parameters.points)
     forces = [*up, *up[-2::-1]]
-    yield from fasten(slots)
+    yield from fasten(parameters, slots)
     for voltage in parameters.voltages:
         yield from reset_on_stage(parameters, slots)
         yield Phase(f"length over force at {voltage:g} V")
         yield Step({slots["stage"].device: parameters.slack}, Dwell(5.0))
         yield drive_to(slots, voltage, parameters.dwell, "")
         for force in forces:
-            yield from stretch(slots, float(force), tolerance=_TOLERANCE)
+            yield from stretch(parameters, slots, float(force), tolerance=_STRETCHED)
             yield Step({}, Dwell(parameters.dwell), label=SAMPLE)

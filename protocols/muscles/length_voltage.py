@@ -11,10 +11,10 @@ from bench.protocol.number_list import NumberList
 from protocols.muscles.force_voltage import scaled_steps
 from protocols.muscles.parts import (
     LENGTH_LOOPS,
-    LOADS,
     ON_WEIGHTS,
     ResetParameters,
     hang,
+    over_range,
     reset_under_weights,
     sample_voltages,
 )
@@ -23,9 +23,7 @@ from protocols.muscles.parts import (
 class Loaded(ResetParameters):
     """Parameters of either sequence of voltages."""
 
-    loads: NumberList = parameter(
-        ", ".join(f"{load:g}" for load in LOADS), unit="N", help="dead loads, one after another"
-    )
+    loads: NumberList = parameter(over_range("load", 5), unit="N", help="dead loads, one after another")
 
 
 class Parameters(Loaded):
@@ -69,6 +67,6 @@ def _under_loads(parameters: Loaded, slots: Slots, voltages: Sequence[float]) ->
         raise ValueError(f"loads = {loads}: expected positive loads")
     for load in parameters.loads:
         yield from reset_under_weights(parameters, slots)
-        yield from hang(slots, load)
+        yield from hang(parameters, slots, load)
         yield Phase(f"length over voltage at {load:g} N")
         yield from sample_voltages(parameters, slots, voltages)

@@ -10,7 +10,11 @@ Systems, 2017, sections II-A and V-A.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
+import numpy as np
+
+from bench.binding import RoleTable
 from bench.control.approach import Approach
 from bench.devices import Actuator, Signal
 from bench.protocol import (
@@ -27,6 +31,7 @@ from bench.protocol import (
     parameter,
     unit_of,
 )
+from bench.protocol.number_list import NumberList
 from protocols.preparation import DRIVE_AND_RESPONSE, SETTLE_LOAD, Part, prompt_for
 
 SAMPLE = "sample"
@@ -41,15 +46,22 @@ ON_STAGE = {**DRIVE_AND_RESPONSE, "force": Signal, "stage": Actuator}
 LENGTH_LOOPS = Views((("drive", "response"),), over_time=("response", "drive", "force"))
 """What is worth seeing where the muscle carries weights."""
 
-LOADS = (0.98, 2.94, 4.90, 6.86, 8.82)
-"""Dead loads, N (Zhang and Yip 2017, section II-A)."""
-
-_COOL_SECONDS = 20.0
-_STIFFNESSES = (0.8e3, 12e3)
-"""Least and greatest stiffness of muscle and frame together that are believed, N/m."""
-_LARGEST_STEP = 0.2e-3
-"""Longest step of the stage, m. Where a slack muscle becomes taut, its stiffness doubles within one."""
 _STRETCH_TIMEOUT = 900.0
+_STRETCHED = 0.1
+"""Error of a force that the stage sets, as a part of the pretension."""
+_HUNG = 0.5, 0.02
+"""Difference of the force from a weight that hangs, as parts of the pretension and of the weight, together."""
+_FASTENED = -1.0, 3.0
+"""Least and greatest force in a muscle that was fastened at its resting length, as parts of the pretension."""
+
+
+def over_range(slot: str, count: int) -> Any:  # noqa: ANN401 - stands for a default of any type
+    """Return a default for `parameter`: a number of values, evenly over the range of a slot, to three digits."""
+
+    def take(table: RoleTable) -> tuple[float | None, ...] | None:
+        return None if table.range is None else tuple(table.at(part) for part in np.linspace(0.0, 1.0, count))
+
+    return from_slot(slot, take, f"{count} over the range of {slot}")
 
 
 class ResetParameters(ProtocolParameters):
@@ -66,14 +78,33 @@ class ResetParameters(ProtocolParameters):
         help="hold at each set-point before the reading",
         changeable=True,
     )
-    pretension: float = parameter(0.3, unit="N", low=0.05, high=10, help="force under which the memory is reset")
+    pretension: float = parameter(
+        from_slot("force", "rest"), unit="N", low=0.05, high=10, help="force under which the memory is reset"
+    )
+    cooling: float = parameter(
+        from_slot("cooling", "dwell"), unit="s", low=0, high=3600, help="time in which the muscle cools down by a fan"
+    )
 
 
 class StageParameters(ResetParameters):
     """Parameters where the stage stretches the muscle."""
 
     slack: float = parameter(
-        -6e-3, unit="m", low=-0.1, high=0, help="position of the stage at which the muscle is slack at any voltage"
+        from_slot("stage", "low"),
+        unit="m",
+        low=-0.1,
+        high=0,
+        help="position of the stage at which the muscle is slack at any voltage",
+    )
+    stiffnesses: NumberList = parameter(
+        ..., unit="N/m", help="least and greatest stiffness of muscle and frame together that are believed"
+    )
+    largest_step: float = parameter(
+        from_slot("stage", "increment"),
+        unit="m",
+        low=1e-6,
+        high=1e-2,
+        help="longest step of the stage; where a slack muscle becomes taut, its stiffness doubles within one",
     )
 
 
@@ -82,9 +113,10 @@ def drive_to(slots: Slots, value: float, seconds: float, label: str) -> Step:
     return Step({slots["drive"].device: value}, Dwell(seconds), label=label)
 
 
-def hang(slots: Slots, load: float) -> Part[Reading]:
+def hang(parameters: ResetParameters, slots: Slots, load: float) -> Part[Reading]:
     """Prompt for a load (N) on the muscle, and verify it with the load cell."""
-    return (yield from prompt_for(slots["load"], load, 0.15 + 0.02 * load))
+    some, part = _HUNG
+    return (yield from prompt_for(slots["load"], load, some * parameters.pretension + part * load))
 
 
 def reset_under_weights(parameters: ResetParameters, slots: Slots) -> Part[Reading]:
@@ -93,40 +125,55 @@ def reset_under_weights(parameters: ResetParameters, slots: Slots) -> Part[Readi
     The muscle cools before the weight is changed, as a hot one must not be touched.
     """
     yield Phase("reset")
-    yield from cool(slots, 0.5)
-    yield from hang(slots, parameters.pretension)
+    yield from cool(parameters, slots, 0.5)
+    yield from hang(parameters, slots, parameters.pretension)
     yield drive_to(slots, parameters.highest, parameters.dwell, "reset")
-    return (yield from cool(slots, parameters.dwell))
+    return (yield from cool(parameters, slots, parameters.dwell))
 
 
-def cool(slots: Slots, seconds: float) -> Part[Reading]:
+def cool(parameters: ResetParameters, slots: Slots, seconds: float) -> Part[Reading]:
     """Go to 0 with the fan on, then let the muscle stand without it for a time (s)."""
     drive, fan = slots["drive"].device, slots["cooling"].device
-    yield Step({drive: 0.0, fan: 1.0}, Dwell(_COOL_SECONDS), label="reset")
+    yield Step({drive: 0.0, fan: 1.0}, Dwell(parameters.cooling), label="reset")
     reading = yield Step({fan: 0.0}, Dwell(seconds), label="reset")
     return reading
 
 
-def fasten(slots: Slots) -> Part[Reading]:
+def fasten(parameters: StageParameters, slots: Slots) -> Part[Reading]:
     """Prompt for the end of the cold muscle to be fastened to the stage."""
     yield Step({slots["drive"].device: 0.0, slots["stage"].device: 0.0}, Dwell(5.0), label="fasten")
+    least, greatest = (part * parameters.pretension for part in _FASTENED)
     reading = yield Prompt(
         text="Take the weight off and fasten the end of the muscle to the stage, where both stand at 0 m",
         task="stage",
         value=0.0,
         settle=SETTLE_LOAD,
         signal=slots["force"].signal,
-        low=-0.3,
-        high=1.0,
+        low=least,
+        high=greatest,
     )
     return reading
 
 
-def stretch(slots: Slots, force: float, *, tolerance: float = 0.03, duration: float = 0.0) -> Part[Reading]:
-    """Stretch the muscle until it pulls with a force (N); or hold that force for a time (s)."""
+def stretch(
+    parameters: StageParameters, slots: Slots, force: float, *, tolerance: float = _STRETCHED, duration: float = 0.0
+) -> Part[Reading]:
+    """Stretch the muscle until it pulls with a force (N); or hold that force for a time (s).
+
+    The tolerance is a part of the pretension. Raises ValueError if the stiffnesses are not two positive numbers.
+    """
+    if len(parameters.stiffnesses) != 2:
+        raise ValueError(f"stiffnesses: expected two numbers, got {len(parameters.stiffnesses)}")
+    least, greatest = parameters.stiffnesses
     stage = slots["stage"]
     reading = yield Control(
-        task=Approach(force, slopes=_STIFFNESSES, largest_step=_LARGEST_STEP, tolerance=tolerance, duration=duration),
+        task=Approach(
+            force,
+            slopes=(least, greatest),
+            largest_step=parameters.largest_step,
+            tolerance=tolerance * parameters.pretension,
+            duration=duration,
+        ),
         actuator=stage.device,
         drive=stage.signal,
         response=slots["force"].signal,
@@ -138,13 +185,13 @@ def stretch(slots: Slots, force: float, *, tolerance: float = 0.03, duration: fl
 
 def prepare_on_stage(parameters: StageParameters, slots: Slots, cycles: int) -> Part[Reading]:
     """Fasten the muscle, reset it, condition it by cycles of the voltage, and stretch it to the pretension."""
-    yield from fasten(slots)
+    yield from fasten(parameters, slots)
     yield from reset_on_stage(parameters, slots)
     yield Phase("conditioning")
     for _ in range(cycles):
         yield drive_to(slots, parameters.highest, parameters.dwell, CONDITIONING)
         yield drive_to(slots, 0.0, parameters.dwell, CONDITIONING)
-    return (yield from stretch(slots, parameters.pretension))
+    return (yield from stretch(parameters, slots, parameters.pretension))
 
 
 def reset_on_stage(parameters: StageParameters, slots: Slots) -> Part[Reading]:
@@ -152,11 +199,11 @@ def reset_on_stage(parameters: StageParameters, slots: Slots) -> Part[Reading]:
     yield Phase("reset")
     yield Step({slots["stage"].device: parameters.slack}, Dwell(5.0), label="reset")
     yield drive_to(slots, parameters.highest, parameters.dwell, "reset")
-    yield from stretch(slots, parameters.pretension)
+    yield from stretch(parameters, slots, parameters.pretension)
     # Without the fan: the stage has to keep up with the muscle.
     yield drive_to(slots, 0.0, 0.1, "reset")
-    yield from stretch(slots, parameters.pretension, duration=parameters.dwell + _COOL_SECONDS)
-    return (yield from stretch(slots, parameters.pretension))
+    yield from stretch(parameters, slots, parameters.pretension, duration=parameters.dwell + parameters.cooling)
+    return (yield from stretch(parameters, slots, parameters.pretension))
 
 
 def sample_voltages(parameters: ResetParameters, slots: Slots, voltages: Sequence[float]) -> Part[Reading]:

@@ -12,10 +12,10 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass, fields, replace
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, dataclass, fields
 from functools import partial
-from typing import TYPE_CHECKING, Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar
 
 import numpy as np
 
@@ -25,7 +25,8 @@ from bench.control.references import ApproachedReference, Reference
 from bench.control.tracking import Trace, check_positive
 from bench.controllers import ControllerSetup, ControllerSpec
 from bench.deferred import DeferredModule
-from bench.errors import ConvergenceError
+from bench.errors import ConfigurationError, ConvergenceError
+from protocols.hybrid.control import MID_RANGING
 from rigs.hybrid.estimates import (
     Bending,
     LowPass,
@@ -43,8 +44,8 @@ if TYPE_CHECKING:
 else:
     kernels = DeferredModule("rigs.hybrid._kernels")
 
-STROKE = 9e-6
-"""Largest deflection of either sign that the piezo part is asked for, m."""
+T = TypeVar("T")
+
 _NEAR = 0.5
 """Part of the stroke within which the piezo part takes the tip to the beginning of the reference at once."""
 _AT_REST = 0.2
@@ -59,8 +60,8 @@ _JUDGED = 5.0
 """Time over which it is, s."""
 _HOLDS = 0.12
 """Part of the stroke that the model alone may err by there, RMS."""
-_THERMAL_GAIN = 3e4
-"""Heat fed back per missing deflection where there is no piezo part, W/m."""
+_NEW_CURRENT = 0.02
+"""Time between two currents, s."""
 
 
 class _Preview:
@@ -107,32 +108,54 @@ class _Preview:
         return self._smoothed.popleft(), ahead, rate
 
 
-@dataclass(frozen=True)
+def _made(kind: type[T], table: str, given: Mapping[str, Any], **further: float) -> T:
+    """Return numbers of a controller, made from a table of the rig file; `further` are not of that."""
+    where = f"[protocols.hybrid-control.tuning.{MID_RANGING}]"
+    if not isinstance(given, Mapping):
+        raise ConfigurationError(f"{where} {table.removesuffix('.')} = {given!r}: expected a table of numbers")
+    known = [each for each in fields(kind) if each.name not in further]  # type: ignore[arg-type]
+    missing = [table + each.name for each in known if each.default is MISSING and each.name not in given]
+    if missing:
+        raise ConfigurationError(
+            f"nothing says of this cantilever: {', '.join(missing)}; give them in the rig file, {where}"
+        )
+    if unknown := given.keys() - {each.name for each in known}:
+        names = ", ".join(table + each.name for each in known)
+        raise ConfigurationError(f"{where} {table}{min(unknown)}: there is no such number; there are: {names}")
+    try:
+        return kind(**given, **further)
+    except (TypeError, ValueError) as error:
+        raise ConfigurationError(f"{where} {table}{error}") from None
+
+
+@dataclass(frozen=True, kw_only=True)
 class MidRangingParameters:
     """Settings of the mid-ranging controllers."""
 
-    period: float = 5e-3
+    period: float
     """Time between two calls, s."""
-    every: int = 4
+    every: int
     """Calls per new current."""
-    gain: float = 1.6e4
-    """Heat fed back per missing deflection of the thermal part, W/m."""
-    integral_time: float = 40.0
-    """Time constant of the integral in that feedback, s."""
-    lead: float = 1.0
-    """Time by which the heat leads the reference, s: the lag of the bending behind the base."""
-    window: float = 4.0
-    """Time over which the reference is smoothed for the thermal part, s."""
-    maximum_current: float = 0.15
+    maximum_current: float
     """Greatest current of either sign, A."""
-    filter_time: float = 0.15
+    gain: float
+    """Heat fed back per missing deflection of the thermal part, W/m."""
+    integral_time: float
+    """Time constant of the integral in that feedback, s."""
+    lead: float
+    """Time by which the heat leads the reference, s: the lag of the bending behind the base."""
+    window: float
+    """Time over which the reference is smoothed for the thermal part, s."""
+    filter_time: float
     """Time constant of the low-pass that estimates the thermal part in place of a Kalman filter, s."""
-    integral: float = 25.0
+    integral: float
     """Gain of the piezo part's integral, 1/s, below half the rate of the calls."""
-    stroke: float = STROKE
+    stroke: float
     """Greatest deflection of either sign that the piezo part is asked for, m."""
-    approach: float = 3e-6
+    approach: float
     """Top speed of the move to the beginning of the reference, where that is far from the start, m/s."""
+    noise: ThermalNoise
+    """Of the Kalman filter."""
     lateness: float = 0.0
     """Time by which the deflection is read late, as the calibration of its sensor finds it, s."""
     probe: float = 0.0
@@ -148,9 +171,26 @@ class MidRangingParameters:
             raise ValueError(f"integral: expected less than {0.5 / self.period:g} 1/s, got {self.integral}")
 
     @classmethod
-    def at_rate(cls, rate: float) -> Self:
-        """Return the settings for a number of calls per second, with a new current every 20 ms or call."""
-        return cls(period=1.0 / rate, every=max(1, round(0.02 * rate)))
+    def at_rate(cls, rate: float, numbers: Mapping[str, Any], **further: float) -> Self:
+        """Return the settings for a number of calls per second, with a new current every 20 ms or call.
+
+        Parameters
+        ----------
+        rate : float
+            Hz.
+        numbers : mapping
+            Those of this cantilever, as a table of the rig file; `noise` is one by itself.
+        further : float
+            The others.
+
+        Raises
+        ------
+        ConfigurationError
+            If a number is missing, there is no such number, or its value is not allowed.
+        """
+        noise = _made(ThermalNoise, "noise.", numbers.get("noise", {}))
+        every = max(1, round(_NEW_CURRENT * rate))
+        return _made(cls, "", {**numbers, "noise": noise}, period=1.0 / rate, every=every, **further)
 
     @property
     def samples_late(self) -> float:
@@ -343,24 +383,21 @@ class HybridController(_MidRanging):
         Settings of the loops.
     estimator : {"unscented", "low-pass"}
         Estimate of the thermal part: a Kalman filter of the thermal state, or a low-pass.
-    noise : ThermalNoise
-        Variances of the Kalman filter.
     """
 
     def __init__(
         self,
         model: HybridModel,
         reference: Reference,
-        parameters: MidRangingParameters | None = None,
+        parameters: MidRangingParameters,
         *,
         estimator: Literal["unscented", "low-pass"] = "unscented",
-        noise: ThermalNoise | None = None,
     ) -> None:
-        p = parameters or MidRangingParameters()
+        p = parameters
 
         def estimate(bending: Bending, network: ReducedNetwork) -> ThermalEstimate:
             if estimator == "unscented":
-                return UnscentedEstimate(bending, network, noise or ThermalNoise(), p.period, p.every, p.lateness)
+                return UnscentedEstimate(bending, network, p.noise, p.period, p.every, p.lateness)
             if estimator == "low-pass":
                 return LowPass(bending, p.share(p.period))
             raise ValueError(f"estimator: expected unscented or low-pass, got {estimator!r}")
@@ -380,10 +417,8 @@ class OpenLoopHybrid(_MidRanging):
     """Since when the reference rests, s."""
     _squares, _count = 0.0, 0
 
-    def __init__(
-        self, model: HybridModel, reference: Reference, parameters: MidRangingParameters | None = None
-    ) -> None:
-        p = parameters or MidRangingParameters()
+    def __init__(self, model: HybridModel, reference: Reference, parameters: MidRangingParameters) -> None:
+        p = parameters
         super().__init__(model, reference, p, lambda bending, _: Thermistor(bending, p.share(p.period * p.every)))
 
     def update(self, t: float, measured: tuple[float, ...]) -> tuple[float, float]:
@@ -415,36 +450,40 @@ class OpenLoopHybrid(_MidRanging):
 class ThermalFeedback(_MidRanging):
     """Thermal part alone, fed forward and fed back from the deflection; the voltage stays 0.
 
-    Parameters as `HybridController`; the default gain is higher, as no piezo part does the rest.
+    Parameters as `HybridController`; the gain can be higher, as no piezo part does the rest.
     """
 
-    def __init__(
-        self, model: HybridModel, reference: Reference, parameters: MidRangingParameters | None = None
-    ) -> None:
-        p = parameters or MidRangingParameters(gain=_THERMAL_GAIN)
+    def __init__(self, model: HybridModel, reference: Reference, parameters: MidRangingParameters) -> None:
+        p = parameters
         super().__init__(model, reference, p, lambda bending, _: LowPass(bending, p.share(p.period)), piezo=False)
 
 
-def make_fine(model: HybridModel, reference: Reference, rate: float = 20e3, *, integral: float = 300.0) -> NotchLoop:
-    """Return the loop of the piezo part alone, at a rate (Hz) that resolves the resonance; integral gain in 1/s."""
+def make_fine(model: HybridModel, reference: Reference, parameters: NotchLoopParameters) -> NotchLoop:
+    """Return the loop of the piezo part alone, at a rate that resolves the resonance."""
     dynamics = model.dynamics
-    parameters = NotchLoopParameters(rate=rate, integral=integral, stroke=STROKE)
     return NotchLoop(model.hysteresis, dynamics.frequency, dynamics.damping, reference, parameters)
 
 
-def _mid_ranging(summary: str, controller: Callable[..., _MidRanging], **settings: Any) -> ControllerSpec:  # noqa: ANN401 - as each field
-    """Return a controller of the class for the registry, with the settings that differ from those of the rate.
+def _mid_ranging(summary: str, controller: Callable[..., _MidRanging]) -> ControllerSpec:
+    """Return a controller of the class for the registry.
 
-    Options of its setup: `reference` (callable, m), `rate` (Hz), `lateness` (s) and `probe` (m).
+    Options of its setup: `reference` (callable, m), `rate` (Hz), `numbers` (see `MidRangingParameters.at_rate`),
+    `lateness` (s) and `probe` (m). Its limits are those of the current, the lower one the negative of the upper.
     """
 
     def make(setup: ControllerSetup) -> _MidRanging:
         options = setup.options
-        known = {name: options[name] for name in ("lateness", "probe")}
-        parameters = replace(MidRangingParameters.at_rate(options["rate"]), **known, **settings)
+        further = {name: options[name] for name in ("lateness", "probe")} | {"maximum_current": setup.limits[1]}
+        parameters = MidRangingParameters.at_rate(options["rate"], options["numbers"], **further)
         return controller(setup.model.model, options["reference"], parameters)
 
     return ControllerSpec(summary, make)
+
+
+def _fine(setup: ControllerSetup) -> NotchLoop:
+    options = setup.options
+    parameters = NotchLoopParameters(**{name: options[name] for name in ("rate", "integral", "stroke")})
+    return make_fine(setup.model.model, options["reference"], parameters)
 
 
 HYBRID = _mid_ranging("mid-ranging of thermal and piezo part, with a Kalman filter", HybridController)
@@ -452,8 +491,5 @@ HYBRID_LOW_PASS = _mid_ranging(
     "mid-ranging of thermal and piezo part, with a low-pass", partial(HybridController, estimator="low-pass")
 )
 OPEN_LOOP = _mid_ranging("the inverse of the model, without the deflection sensor", OpenLoopHybrid)
-THERMAL_FEEDBACK = _mid_ranging("feedback to the thermal part alone", ThermalFeedback, gain=_THERMAL_GAIN)
-NOTCH = ControllerSpec(
-    "the piezo part alone, with a notch at its resonance",
-    lambda s: make_fine(s.model.model, s.options["reference"], s.options["rate"], integral=s.options["integral"]),
-)
+THERMAL_FEEDBACK = _mid_ranging("feedback to the thermal part alone", ThermalFeedback)
+NOTCH = ControllerSpec("the piezo part alone, with a notch at its resonance", _fine)

@@ -212,12 +212,12 @@ class ThermalNoise:
         Random walk of the deflection off the polynomial, m/√s.
     """
 
-    thermistor: float = 0.02
-    deflection: float = 10e-9
-    base: float = 1e-3
-    tip: float = 2e-4
-    heat: float = 2e-3
-    offset: float = 3e-9
+    thermistor: float
+    deflection: float
+    base: float
+    tip: float
+    heat: float
+    offset: float
 
     def __post_init__(self) -> None:
         check_positive(self)

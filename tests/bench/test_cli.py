@@ -103,9 +103,9 @@ class TestHelp:
     @pytest.mark.parametrize(
         ("protocol", "parameters"),
         [
-            ("force-voltage", {"points": ("37", "1"), "pretension": ("0.3", "N"), "slack": ("-0.006", "m")}),
-            ("length-voltage", {"points": ("37", "1"), "loads": ("0.98, 2.94, 4.9, 6.86, 8.82", "N")}),
-            ("length-force", {"voltages": ("0, 0.6, 1.2, 1.8, 2.4, 3", "V"), "largest_force": ("10.5", "N")}),
+            ("force-voltage", {"points": ("37", "1"), "pretension": ("the rig's: `rest` of force", "N")}),
+            ("length-voltage", {"points": ("37", "1"), "loads": ("the rig's: 5 over the range of load", "N")}),
+            ("length-force", {"voltages": ("the rig's: 6 over the range of drive", "V")}),
             ("length-verification", {"points": ("18", "1"), "sequence_seed": ("1", "1")}),
             ("length-control", {"model": ("must be given", ""), "controller": ("closed-loop-inverse", "")}),
             ("force-control", {"model": ("must be given", ""), "conditioning": ("2", "1")}),
@@ -840,14 +840,23 @@ class TestHelpOfTheHybrid:
     @pytest.mark.parametrize(
         ("protocol", "parameters"),
         [
-            ("current-sine", {"amplitude": ("0.1", "A"), "frequencies": ("0.001", "Hz"), "periods": ("2", "1")}),
-            ("current-steps", {"levels": ("-0.1, -0.05, -0.025, 0.1", "A"), "on": ("600.0", "s")}),
-            ("thermomechanical", {"coldest": ("-0.15", "A"), "levels": ("9", "1"), "dwell": ("240.0", "s")}),
-            ("piezo-loops", {"amplitudes": ("40, 40, 30, 20, 10", "V"), "frequency": ("0.1", "Hz")}),
-            ("piezo-step", {"voltage": ("40.0", "V"), "rate": ("20000.0", "Hz")}),
-            ("hybrid-excitation", {"current": ("0.08", "A"), "voltage": ("30.0", "V")}),
-            ("hybrid-control", {"model": ("must be given", ""), "speed": ("3e-06", "m/s"), "witness": ("False", "")}),
-            ("fine-step", {"model": ("must be given", ""), "step": ("5e-06", "m")}),
+            (
+                "current-sine",
+                {"amplitude": ("must be given", "A"), "frequencies": ("must be given", "Hz"), "periods": ("2", "1")},
+            ),
+            ("current-steps", {"levels": ("must be given", "A"), "on": ("must be given", "s")}),
+            (
+                "thermomechanical",
+                {"coldest": ("must be given", "A"), "levels": ("9", "1"), "dwell": ("must be given", "s")},
+            ),
+            ("piezo-loops", {"frequency": ("0.1", "Hz")}),
+            ("piezo-step", {"voltage": ("the rig's: `high` of fine", "V"), "rate": ("20000.0", "Hz")}),
+            ("hybrid-excitation", {"current": ("must be given", "A"), "voltage": ("must be given", "V")}),
+            (
+                "hybrid-control",
+                {"model": ("must be given", ""), "speed": ("must be given", "m/s"), "witness": ("False", "")},
+            ),
+            ("fine-step", {"model": ("must be given", ""), "step": ("must be given", "m")}),
         ],
     )
     def test_of_the_protocols(self, bench, tmp_path, protocol, parameters):

@@ -100,7 +100,10 @@ class TestParse:
         assert f"allowed: {allowed}" in message
 
     def test_a_missing_one_is_named(self):
-        with pytest.raises(ConfigurationError, match="parameter needed is missing; allowed: 0 to 4 A"):
+        with pytest.raises(
+            ConfigurationError,
+            match=r"parameter needed is missing \(nor does .*\[protocols\.ramp\] needed = .*; allowed: 0 to 4 A",
+        ):
             ramp.parse({})
 
     def test_all_that_is_wrong_is_said_at_once(self):

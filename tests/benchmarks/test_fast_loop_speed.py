@@ -10,7 +10,7 @@ import pytest
 from numba import njit
 
 from bench.clock import VirtualClock
-from bench.control.notch_loop import notch
+from bench.control.notch_loop import NotchLoopParameters, notch
 from bench.control.tracking import Trace
 from bench.engine import Engine
 from bench.hysteresis import Polynomial, PrandtlIshlinskii
@@ -48,7 +48,8 @@ def make_controller():
     )
     polynomial = Polynomial([-7.363e-6 * 25.0], (-25.0, 25.0))
     model = HybridModel(Design().network(), polynomial, hysteresis, PUBLISHED_DYNAMICS)
-    return make_fine(model, lambda t: STEP if t >= 0.05 else 0.0, rate=RATE)
+    parameters = NotchLoopParameters(rate=RATE, integral=300.0, stroke=9e-6)
+    return make_fine(model, lambda t: STEP if t >= 0.05 else 0.0, parameters)
 
 
 @njit

@@ -17,7 +17,7 @@ from bench.control.baselines import IntegralControl, IntegralParameters, LookUp
 from bench.control.dynamics import ActuatorDynamics, IdentifiedDynamics, ResponseDynamics
 from bench.control.estimators import DisturbanceEstimator, DriftEstimator, agility_for
 from bench.control.following import ClosedLoopFollower, FollowingParameters, IntegralFollower, OpenLoopFollower
-from bench.control.latched import Latched
+from bench.control.latched import Latched, LatchParameters
 from bench.control.loops import FollowReference
 from bench.control.model_filters import model_filter
 from bench.control.notch_loop import NotchLoop, NotchLoopParameters
@@ -261,6 +261,10 @@ def predictive(dynamics, **options):
     return found | {"horizon": [follower.horizon], "lags": [lag.surprise for lag in follower._lags]}
 
 
+def latched(operator):
+    return Latched(operator.inverse(), LatchParameters.scaled(Spans.of(operator), 8.0))
+
+
 def spans():
     return Spans.of(film())
 
@@ -283,8 +287,8 @@ SCENES = {
     "closed loop, learning": lambda: reaching(
         ClosedLoopInverse(film().inverse(), adaptation=model_filter("density", film())), Plant(film())
     ),
-    "latched": lambda: reaching(Latched(film().inverse()), Plant(film(), gain=1.0, lag=0.1), most=400),
-    "latched, off by a gain": lambda: reaching(Latched(film().inverse()), Plant(film(), gain=0.9, lag=0.1), most=250),
+    "latched": lambda: reaching(latched(film()), Plant(film(), gain=1.0, lag=0.1), most=400),
+    "latched, off by a gain": lambda: reaching(latched(film()), Plant(film(), gain=0.9, lag=0.1), most=250),
     "look-up": lambda: reaching(LookUp(Polynomial([3.0, 0.4], (0.0, 10.0), 5.0), wait=8.0), Plant(film())),
     "integral": lambda: reaching(
         IntegralControl((0.0, 10.0), IntegralParameters.scaled(spans(), 8.0)), Plant(film())

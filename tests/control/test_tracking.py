@@ -32,7 +32,8 @@ INTEGRAL = IntegralParameters(0.005, 0.5, 8.0)
 LATCH = LatchParameters(
     approach=25.0, arrival=Arrival(0.1, hold=0.2), creep_least=0.015, creep_most=0.12, creep_gain=0.003,
     creep_offset=1.8, creep_fast=0.3, creep_until=3.3, step_back=0.5, nearest=0.08, farthest=1.1, lock_within=4.5,
-    accept=1.5, walk_variance=1e-2, reading_variance=0.14, end_margin=5.0,
+    accept=1.5, walk_variance=1e-2, reading_variance=0.14, end_margin=5.0, creep_horizon=4.0, creep_limit=60.0,
+    settle=1.0, fine_period=1.0,
 )  # fmt: skip
 NUMBERS = {
     "open": {"wait": 8.0},
@@ -458,7 +459,10 @@ class TestLatched:
     @pytest.mark.parametrize("target", [100.0, 900.0, 1500.0])
     def test_locks_where_the_output_hardly_answers(self, models, target):
         model = with_wide_loops(models.film)
-        actuator, controller = IdealActuator(model), Latched(PreisachInverse(model))
+        actuator, controller = (
+            IdealActuator(model),
+            Latched(PreisachInverse(model), LatchParameters.scaled(Spans.of(model), 8.0)),
+        )
         actuator.disturbance = 20.0
         actuator.reach(controller, target)
         assert controller.locked
@@ -518,7 +522,7 @@ class TestLatched:
     def test_needs_a_reversible_part(self):
         levels = uniform_levels(0.0, 1.0, 4)
         with pytest.raises(ValueError, match="reversible"):
-            Latched(PreisachInverse(Preisach(levels, np.ones(10))))
+            Latched(PreisachInverse(Preisach(levels, np.ones(10))), LATCH)
         assert reversible_slope(Preisach(levels, np.ones(10)), 0.5) == 0.0
 
     def test_slope_behind_a_reversal(self, models):
@@ -608,8 +612,8 @@ class TestTuning:
     @pytest.mark.parametrize(
         "scaled",
         [
-            *(each.scaled for each in (CorrectionParameters, FollowingParameters, LatchParameters, Arrival)),
-            partial(IntegralParameters.scaled, dwell=8.0),
+            *(each.scaled for each in (CorrectionParameters, FollowingParameters, Arrival)),
+            *(partial(each.scaled, dwell=8.0) for each in (IntegralParameters, LatchParameters)),
         ],
     )
     def test_other_units_of_the_same_model_change_nothing_but_the_units(self, scaled):

@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
+from bench.control.notch_loop import NotchLoopParameters
 from bench.control.references import AddedSine, SmoothMoves, staircase
+from bench.errors import ConfigurationError
 from bench.identification.dynamics import identify_dynamics
+from bench.rig_file import load_rig
 from rigs.hybrid.control import (
     HybridController,
     MidRangingParameters,
@@ -18,16 +21,28 @@ from rigs.hybrid.control import (
     make_fine,
 )
 from rigs.hybrid.design import Design
-from rigs.hybrid.estimates import Bending, LowPass, ReducedNetwork, ThermalNoise, UnscentedEstimate
+from rigs.hybrid.estimates import Bending, LowPass, ReducedNetwork, UnscentedEstimate
 from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel, identify_pi, identify_polynomial
 from rigs.hybrid.network_identification import identify_network
 from sim_devices.plants.hybrid import HybridCantilever
 from sim_devices.plants.hybrid_parameters import HybridParameters
 
 MICRO, NANO = 1e-6, 1e-9
+TUNING = load_rig("hybrid").protocols["hybrid-control"]["tuning"]
+MID_RANGING = TUNING["mid-ranging"]
 PERIOD, FAST = 5e-3, 5e-5
 SPEED = 3 * MICRO
 NOISE = (10 * NANO, 0.02, 0.02)
+
+
+def settings(**changes):
+    return MidRangingParameters.at_rate(1.0 / PERIOD, {**MID_RANGING, **changes}, maximum_current=0.15)
+
+
+def fine(model, reference, rate=20e3, integral=300.0):
+    return make_fine(
+        model, reference, NotchLoopParameters(rate=rate, integral=integral, stroke=MID_RANGING["stroke"])
+    )
 
 
 def plant_of(*seed, **parameters):
@@ -174,7 +189,7 @@ RANGE = SmoothMoves([0.0, 85 * MICRO, -120 * MICRO, 0.0], SPEED, hold=20.0)
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.seeds) for seed in (1, 2, 3))])
 def test_holds_and_moves_over_more_than_200_micrometres(model, seed):
-    run = follow(HybridController(model, RANGE), RANGE, RANGE.duration, seed)
+    run = follow(HybridController(model, RANGE, settings()), RANGE, RANGE.duration, seed)
     rms, greatest = run.holds(RANGE)
     assert rms < 6 * NANO
     assert greatest < 30 * NANO
@@ -188,7 +203,7 @@ def test_holds_and_moves_over_more_than_200_micrometres(model, seed):
 def test_kalman_filter_is_at_least_as_good_as_a_low_pass(model):
     moves = SmoothMoves([0.0, 40 * MICRO, -50 * MICRO], SPEED, hold=15.0)
     runs = {
-        name: follow(HybridController(model, moves, estimator=name), moves, moves.duration, 5)
+        name: follow(HybridController(model, moves, settings(), estimator=name), moves, moves.duration, 5)
         for name in ("unscented", "low-pass")
     }
     for part in (Run.holds, Run.moves):
@@ -201,8 +216,12 @@ def test_kalman_filter_is_at_least_as_good_as_a_low_pass(model):
 def test_comparisons_are_far_worse(model):
     moves = SmoothMoves([0.0, 40 * MICRO, -50 * MICRO], SPEED, hold=20.0)
     hybrid, thermal, blind = (
-        follow(make(model, moves), moves, moves.duration, 6)
-        for make in (HybridController, ThermalFeedback, OpenLoopHybrid)
+        follow(make(model, moves, settings(**changes)), moves, moves.duration, 6)
+        for make, changes in (
+            (HybridController, {}),
+            (ThermalFeedback, TUNING["thermal-feedback"]),
+            (OpenLoopHybrid, {}),
+        )
     )
     # Feedback alone gets there at last, the piezo part is what follows; without the sensor the model's error stays.
     assert 10 * hybrid.moves(moves)[0] < thermal.moves(moves)[0] < 3 * MICRO
@@ -214,7 +233,7 @@ def test_comparisons_are_far_worse(model):
 @pytest.mark.parametrize("seed", range(4))
 def test_fine_step(model, seed, offset):
     for size in (5 * MICRO, -5 * MICRO):
-        settling, overshoot, rest = step_response(make_fine(model, step(size)), size, seed, resonance_offset=offset)
+        settling, overshoot, rest = step_response(fine(model, step(size)), size, seed, resonance_offset=offset)
         assert settling < 12e-3
         assert overshoot < 0.01
         assert rest < 4 * NANO
@@ -227,7 +246,7 @@ def test_fine_step_where_the_thermal_part_has_gone(model, current):
     plant.drive(current)
     plant.advance(600.0)
     place, size = plant.deflection, 5 * MICRO
-    controller = make_fine(model, step(place + size, 0.1, place))
+    controller = fine(model, step(place + size, 0.1, place))
     noise = NOISE[0] * np.random.default_rng(9).standard_normal(8000)
     deflections = []
     for k, each in enumerate(noise.tolist()):
@@ -243,7 +262,7 @@ def test_fine_step_where_the_thermal_part_has_gone(model, current):
 def test_fine_loop_needs_its_notch(model):
     # With zeros damped as the poles are, it is none; half the gain then rings already.
     without = replace(model, dynamics=replace(model.dynamics, damping=0.7))
-    controller = make_fine(without, step(5 * MICRO), integral=150.0)
+    controller = fine(without, step(5 * MICRO), integral=150.0)
     settling, overshoot, _ = step_response(controller, 5 * MICRO, 0)
     assert settling > 20e-3
     assert overshoot > 0.015
@@ -254,24 +273,24 @@ def test_fine_loop_needs_its_notch(model):
 def test_step_of_the_room_by_5_kelvin(model, seed, change, place):
     moves = SmoothMoves([0.0, place], SPEED, hold=40.0)
     at = moves.duration - 30.0
-    run = follow(HybridController(model, moves), moves, moves.duration, seed, room=(at, change))
+    run = follow(HybridController(model, moves, settings()), moves, moves.duration, seed, room=(at, change))
     assert run.worst(at) < 120 * NANO
     assert run.worst(at + 15.0) < 30 * NANO
 
 
 def test_staircase(model):
     stairs = staircase(-20 * MICRO, 20 * MICRO, 2, SPEED, hold=10.0, blend=5.0)
-    run = follow(HybridController(model, stairs), stairs, stairs.duration, 2)
+    run = follow(HybridController(model, stairs, settings()), stairs, stairs.duration, 2)
     assert run.holds(stairs)[0] < 6 * NANO
     assert run.moves(stairs)[0] < 10 * NANO
 
 
 def test_slow_ramp_and_a_sine_on_it(model):
     ramp = SmoothMoves([0.0, 20 * MICRO], 0.5 * MICRO, hold=10.0)
-    run = follow(HybridController(model, ramp), ramp, 40.0, 3)
+    run = follow(HybridController(model, ramp, settings()), ramp, 40.0, 3)
     assert run.rms(run.t > 1.0) < 6 * NANO
     sine = AddedSine(ramp, 2 * MICRO, 1.0)
-    run = follow(HybridController(model, sine), sine, 40.0, 3)
+    run = follow(HybridController(model, sine, settings()), sine, 40.0, 3)
     assert run.rms(run.t > 3.0) < 60 * NANO
     # The thermal part does not take part in the sine.
     assert np.abs(run.currents).max() < 0.05
@@ -287,7 +306,7 @@ def test_errors_of_the_model_do_not_matter_much(model):
         reference=21.0,
     )
     moves = SmoothMoves([0.0, 40 * MICRO, -50 * MICRO], SPEED, hold=20.0)
-    run = follow(HybridController(wrong, moves), moves, moves.duration, 4)
+    run = follow(HybridController(wrong, moves, settings()), moves, moves.duration, 4)
     assert run.holds(moves)[0] < 10 * NANO
     assert run.moves(moves)[0] < 30 * NANO
 
@@ -298,7 +317,7 @@ def test_errors_of_the_model_do_not_matter_much(model):
 @pytest.mark.parametrize("estimator", ["unscented", "low-pass"])
 def test_a_jump_beyond_the_limits_comes_in_without_overshoot(model, estimator):
     reference = step(60 * MICRO, 5.0)
-    run = follow(HybridController(model, reference, estimator=estimator), reference, 40.0, 0)
+    run = follow(HybridController(model, reference, settings(), estimator=estimator), reference, 40.0, 0)
     assert np.abs(run.currents).max() == 0.15
     assert np.abs(run.voltages).max() <= 40.0
     late = run.t > 5.1
@@ -309,7 +328,7 @@ def test_a_jump_beyond_the_limits_comes_in_without_overshoot(model, estimator):
 def test_what_is_out_of_reach_does_not_wind_up(model):
     # Far beyond what the current can do, and back.
     reference = SmoothMoves([0.0, 180 * MICRO, 60 * MICRO], 20 * MICRO, hold=60.0, blend=1.0)
-    run = follow(HybridController(model, reference), reference, reference.duration, 0)
+    run = follow(HybridController(model, reference, settings()), reference, reference.duration, 0)
     assert run.worst(20.0, 60.0) > 10 * MICRO
     assert np.abs(run.currents).max() == 0.15
     assert np.abs(run.voltages).max() <= 40.0
@@ -319,7 +338,7 @@ def test_what_is_out_of_reach_does_not_wind_up(model):
 def test_fine_integral_does_not_wind_up(model):
     # 30 µm is out of reach of the piezo part; from there back to 2 µm in no more than the usual time. Not as long as
     # the loop would bear it.
-    controller = make_fine(model, step(2 * MICRO, 0.04, 30 * MICRO))
+    controller = fine(model, step(2 * MICRO, 0.04, 30 * MICRO))
     plant = plant_of(8, 0, ambient_sd=0.0)
     deflections, voltages = [], []
     for k in range(round(0.14 / FAST)):
@@ -335,7 +354,7 @@ def test_fine_integral_does_not_wind_up(model):
 
 def test_current_is_new_every_fourth_sample_and_time_counts_from_the_first(model):
     reference = SmoothMoves([0.0, 20 * MICRO], SPEED)
-    one, other = HybridController(model, reference), HybridController(model, reference)
+    one, other = HybridController(model, reference, settings()), HybridController(model, reference, settings())
     rng = np.random.default_rng(0)
     currents, shifted = [], []
     for k in range(200):
@@ -351,7 +370,7 @@ def test_current_is_new_every_fourth_sample_and_time_counts_from_the_first(model
 @pytest.mark.parametrize("estimator", ["unscented", "low-pass"])
 def test_missing_readings_hold_and_are_got_over(model, estimator):
     moves = SmoothMoves([0.0, 30 * MICRO], SPEED, hold=30.0)
-    controller = HybridController(model, moves, estimator=estimator)
+    controller = HybridController(model, moves, settings(), estimator=estimator)
     plant, rng = plant_of(6, 0), np.random.default_rng(3)
     # Nothing at the start, and nothing for 0.3 s in the middle of the move.
     assert controller.update(0.0, (math.nan, 22.0, 22.0)) == (0.0, 0.0)
@@ -375,7 +394,7 @@ def test_missing_readings_hold_and_are_got_over(model, estimator):
 
 
 def test_fine_loop_holds_at_a_missing_reading(model):
-    controller = make_fine(model, step(1 * MICRO, 0.0))
+    controller = fine(model, step(1 * MICRO, 0.0))
     assert controller.update(0.0, (math.nan,)) == (0.0,)
     first = [controller.update(FAST * k, (0.0, 25.0)) for k in range(1, 4)]
     assert first[0] != first[2]
@@ -392,8 +411,11 @@ def test_fine_loop_holds_at_a_missing_reading(model):
 def test_traces(model):
     place = 20 * MICRO
     moves = SmoothMoves([0.0, place], SPEED, hold=20.0)
-    kalman, plain = HybridController(model, moves), HybridController(model, moves, estimator="low-pass")
-    blind = OpenLoopHybrid(model, moves)
+    kalman, plain = (
+        HybridController(model, moves, settings()),
+        HybridController(model, moves, settings(), estimator="low-pass"),
+    )
+    blind = OpenLoopHybrid(model, moves, settings())
     for controller in (kalman, plain, blind):
         follow(controller, moves, moves.duration, 0)
         assert controller.trace.reference == place
@@ -467,7 +489,7 @@ def test_kalman_filter_finds_deflection_and_offset(room):
     truth = network.simulate(currents, step_time, room, start=np.full(4, room)) - 22.0
     deflection = np.array([bending.deflection(tip) for tip in truth[:, 3].tolist()]) + 0.3 * MICRO
     reduced = ReducedNetwork(network, 22.0)
-    kalman = UnscentedEstimate(bending, reduced, ThermalNoise(), PERIOD, 4)
+    kalman = UnscentedEstimate(bending, reduced, settings().noise, PERIOD, 4)
     plain = LowPass(bending, -math.expm1(-PERIOD / 0.15))
     errors = []
     for k in range(count):
@@ -494,7 +516,7 @@ def test_kalman_filter_finds_deflection_and_offset(room):
 
 
 def test_kalman_filter_is_that_of_an_independent_package():
-    noise, rng, every = ThermalNoise(), np.random.default_rng(2), 4
+    noise, rng, every = settings().noise, np.random.default_rng(2), 4
     rises = np.linspace(-20.0, 25.0, 12)
     bending = Bending(identify_polynomial(rises, MICRO * (-7.4 * rises - 0.05 * rises**2), 2).model)
     reduced = ReducedNetwork(Design().network(), 22.0)
@@ -544,23 +566,42 @@ def folded():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: MidRangingParameters(gain=-1.0), "gain: expected a positive"),
-        (lambda: MidRangingParameters(integral=100.0), "integral: expected less than 100 1/s"),
-        (lambda: ThermalNoise(heat=0.0), "heat: expected a positive"),
+        (lambda: settings(gain=-1.0), "gain: expected a positive"),
+        (lambda: settings(integral=100.0), "integral: expected less than 100 1/s"),
+        (lambda: settings(noise=3), "noise = 3: expected a table of numbers"),
+        (
+            lambda: settings(noise={"heat": 2e-3}),
+            "nothing says of this cantilever: noise.thermistor, noise.deflection",
+        ),
+        (lambda: settings(stork=9e-6), "stork: there is no such number; there are: gain, "),
+        (
+            lambda: MidRangingParameters.at_rate(200.0, {"noise": MID_RANGING["noise"]}, maximum_current=0.1),
+            r"gain, .*, stroke, approach; give them in the rig file, \[protocols\.hybrid-control\.tuning",
+        ),
+        (lambda: settings(noise={**MID_RANGING["noise"], "heat": 0.0}), "heat: expected a positive"),
     ],
 )
 def test_wrong_input_is_named(make, message):
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ConfigurationError, match=message):
         make()
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda m: make_fine(m, RANGE, rate=1e3), "frequency: expected rad/s between"),
-        (lambda m: HybridController(m, RANGE, estimator="none"), "estimator: expected unscented or low-pass"),
-        (lambda m: HybridController(m, RANGE).update(0.0, (0.0, 22.0)), "measured: expected deflection and two"),
-        (lambda m: HybridController(replace(m, polynomial=folded()), RANGE), "polynomial: expected one that rises"),
+        (lambda m: fine(m, RANGE, rate=1e3), "frequency: expected rad/s between"),
+        (
+            lambda m: HybridController(m, RANGE, settings(), estimator="none"),
+            "estimator: expected unscented or low-pass",
+        ),
+        (
+            lambda m: HybridController(m, RANGE, settings()).update(0.0, (0.0, 22.0)),
+            "measured: expected deflection and two",
+        ),
+        (
+            lambda m: HybridController(replace(m, polynomial=folded()), RANGE, settings()),
+            "polynomial: expected one that rises",
+        ),
     ],
 )
 def test_wrong_input_of_a_controller_is_named(model, make, message):
@@ -571,6 +612,6 @@ def test_wrong_input_of_a_controller_is_named(model, make, message):
 def test_published_dynamics_do_as_well(model):
     """The published dynamics serve where the resonance was not measured."""
     published = replace(model, dynamics=PUBLISHED_DYNAMICS)
-    settling, overshoot, _ = step_response(make_fine(published, step(5 * MICRO)), 5 * MICRO, 1)
+    settling, overshoot, _ = step_response(fine(published, step(5 * MICRO)), 5 * MICRO, 1)
     assert settling < 12e-3
     assert overshoot < 0.01

@@ -66,8 +66,9 @@ def files(tmp_path_factory):
 
 
 def parsed(protocol, settings):
-    definition = find_protocol(protocol)
-    return definition, definition.parse({key: str(value) for key, value in settings.items()})
+    definition, rig = find_protocol(protocol), load_rig(PLAIN)
+    texts = {key: str(value) for key, value in settings.items()}
+    return definition, definition.parse(texts, rig.roles, rig.protocols.get(protocol))
 
 
 @cache
@@ -341,11 +342,11 @@ class TestRefused:
                 "positions = '1e-6 2e-6' is not allowed",
             ),
             ("hybrid-control", {"positions": "5e-6, -2e-4"}, "expected numbers from -0.000199 to 0.000199 m"),
-            ("hybrid-control", {"low": "-2e-4"}, "low = '-2e-4' is not allowed; allowed: -0.000199 to 0.000199 m"),
+            ("hybrid-control", {"low": "-2e-4"}, "low: expected numbers from -0.000199 to 0.000199 m"),
             ("hybrid-control", {"reference": "staircase", "low": "1e-6", "high": "1e-6"}, "low, high: expected"),
-            ("hybrid-control", {"amplitude": "1e-5"}, "amplitude = '1e-5' is not allowed; allowed: 0 to 9e-06 m"),
+            ("hybrid-control", {"amplitude": "1e-5"}, "amplitude = 1e-05: expected at most the stroke of the piezo"),
             ("hybrid-control", {"rate": "20"}, "rate = '20' is not allowed; allowed: 50 to 1000 Hz"),
-            ("fine-step", {"step": "1e-5"}, "step = '1e-5' is not allowed; allowed: -9e-06 to 9e-06 m"),
+            ("fine-step", {"step": "1e-5"}, "reaches -8.55e-06 to 8.55e-06 m within a fast loop, got 1e-05 m"),
             ("fine-step", {"step": "8.9e-6"}, "reaches -8.55e-06 to 8.55e-06 m within a fast loop, got 8.9e-06 m"),
             ("fine-step", {"step": "-8.9e-6"}, "reaches -8.55e-06 to 8.55e-06 m within a fast loop, got -8.9e-06 m"),
             ("fine-step", {"rate": "1000"}, "rate = '1000' is not allowed; allowed: 2000 to 1e+06 Hz"),
