@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
@@ -202,19 +202,13 @@ class FitProblem:
             return found
         return replace(found, coefficients=0.0 - found.coefficients, bias=0.0 - found.bias)
 
-    def reshaped(self, outputs: Floats, respond: Callable[[Floats], Floats]) -> FitProblem:
-        """Return the problem with the shape of the operator that fits outputs best behind what `respond` does.
-
-        `respond` takes and returns columns of a regressor, shape (N, K).
-        """
-        measured = outputs if self.orientation > 0 else -outputs
-        template = fit_shape(
-            self.template, self.spec.constrained, self.start, self.inputs, measured, self.weights, self.skip, 0.0,
-            respond,
-        )  # fmt: skip
+    def with_shape(self, values: Sequence[float]) -> FitProblem:
+        """Return the problem with other shape parameters of the operator."""
+        template = self.template.with_shape(values)
         state = self.start(template)
-        regressor = template.regressor(self.inputs, state)
-        return replace(self, template=template, state=state, regressor=regressor, known=None)
+        return replace(
+            self, template=template, state=state, regressor=template.regressor(self.inputs, state), known=None
+        )
 
     def cost(self, fit: Fit) -> float:
         """Return the weighted sum of squares that a fit leaves."""

@@ -63,7 +63,6 @@ def fit_shape(
     weights: Floats,
     skip: int,
     smoothing: float,
-    respond: Callable[[Floats], Floats] | None = None,
 ) -> Operator[Any]:
     """Return the operator with the shape parameters that fit best; the operator itself if it has none.
 
@@ -81,8 +80,6 @@ def fit_shape(
         Number of first samples left out of the cost.
     smoothing : float
         Weight of the roughness penalty.
-    respond : callable, optional
-        Returns what the outputs show of the columns of the regressor, shape (N, K), such as behind a lag.
     """
     shape = template.shape_parameters()
     if not shape.names:
@@ -96,8 +93,6 @@ def fit_shape(
     def residuals(values: Floats) -> Floats:
         operator = template.with_shape(values.tolist())
         regressor = operator.regressor(inputs, start(operator))
-        if respond is not None:
-            regressor = Regressor.of_columns(respond(regressor.dense()))
         found = fit_operator(constrained, operator, regressor, outputs, weights, skip, smoothing)
         return roots * (outputs - found.bias - regressor.product(found.coefficients))[skip:]
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from itertools import product
 from typing import Any, Literal, NamedTuple
 
@@ -36,10 +35,9 @@ CHOICE = ("lag", "resonance", "delay", "creep", "drift")
 
 # What cannot stand beside each other.
 _EXCLUSIVE = ({"lag", "resonance"}, {"creep", "kelvin-voigt"}, {"drift", "fading-drift"})
-# Numbers of a regressor up to which the shape of the operator is found anew with what follows it, and how often.
-_RESHAPED, _RESHAPES = 500_000, 5
-# Relative gain of the cost at which that ends.
-_GAIN_OF_SHAPE = 1e-4
+# Numbers of a regressor up to which the shape of the operator is found anew with what follows it, and the relative
+# step of its differences.
+_RESHAPED, _STEP_OF_SHAPE = 500_000, 1e-6
 # Part by which an element must lower the RMS error, if nobody asked for it. A drift belongs to one record only.
 _WORTH, _WORTH_OF_DRIFT = 0.005, 0.2
 # Greatest regressor, numbers; 400 MB.
@@ -203,6 +201,11 @@ class Search:
         response = part.respond(self.times, (self.columns @ found.coefficients[:count])[:, None])[0][:, 0]
         drift = self.drifts(elements, time) @ found.coefficients[count:]
         return float(np.sum((self.roots * (self.static.outputs - found.bias - response - drift)) ** 2))
+
+    def sign(self, found: Fit) -> Literal[1, -1]:
+        """Return the sign of the operator's coefficients that are constrained."""
+        signed = found.coefficients[: self.columns.shape[1]][self.static.template.nonnegative()]
+        return -1 if (signed < 0.0).any() else 1
 
     def basis(self, found: Fit) -> Floats:
         """Return the operator's columns over which the search projects, shape (N, r)."""
@@ -378,7 +381,6 @@ def identify_hammerstein(
     drift = float(found.fit.coefficients[count]) if found.fit.coefficients.size > count else 0.0
     operator = problem.template.with_coefficients(found.fit.coefficients[:count], found.fit.bias)
     model = Hammerstein(operator, part, drift, time)
-    sign: Literal[1, -1] = -1 if (found.fit.coefficients[:count][problem.template.nonnegative()] < 0.0).any() else 1
     state = HammersteinState(problem.state)
     predicted = model.evaluate(moments, sequence, state)
     return Identification(
@@ -391,7 +393,7 @@ def identify_hammerstein(
         skip=problem.skip,
         initial_state=state,
         warnings=tuple(warnings),
-        orientation=NAMES[sign] if has_orientation(problem.spec, problem.template) else None,
+        orientation=NAMES[search.sign(found.fit)] if has_orientation(problem.spec, problem.template) else None,
     )
 
 
@@ -471,6 +473,12 @@ def choose_elements(search: Search, among: Sequence[str] = CHOICE) -> tuple[Sear
         if not gain > max(-2.0 * math.log1p(-worth), more * chance):
             break
         search, found = reshaped, best
+        # Beside what was added, an earlier element may be worth no more than chance.
+        for element in [name for name in found.elements if name not in added]:
+            fewer = tuple(name for name in found.elements if name != element)
+            reshaped, best = _reshaped(search, _best(search, fewer, found, rounds=1))
+            if not _log_cost(best) - _log_cost(found) > max(_count(found) - _count(best), 1) * chance:
+                search, found, among = reshaped, best, [name for name in among if name != element]
     return search, min(_best(search, found.elements), found, key=lambda each: each.cost)
 
 
@@ -486,28 +494,50 @@ def _count(found: Found) -> int:
 def _reshaped(search: Search, found: Found) -> tuple[Search, Found]:
     """Return search and parameters with the operator's shape fitted together with them.
 
-    A shape that was found without what follows the operator has taken some of that for hysteresis. Shape and
-    parameters are fitted in turns.
+    A shape that was found without what follows the operator has taken some of that for hysteresis. Both are varied at
+    once: in turns they would creep along the valley in which one stands for the other.
     """
-    if not search.static.template.shape_parameters().names or search.columns.size > _RESHAPED:
+    from scipy.optimize import least_squares
+
+    shape = search.static.template.shape_parameters()
+    if not shape.names or search.columns.size > _RESHAPED:
         return search, found
-    for _ in range(_RESHAPES):
-        part, time = search.linear(search.parameters(found.elements), found.values)
-        drift = search.drifts(found.elements, time) @ found.fit.coefficients[search.columns.shape[1] :]
-        static = search.static.reshaped(search.static.outputs - drift, partial(_respond, part, search.times))
-        other = replace(search, static=static, columns=static.regressor.dense())
-        fitted = other.fit(found.elements, found.values)
-        again = _best(other, found.elements, replace(found, fit=fitted), rounds=1)
-        gained = found.cost - again.cost
-        if gained > 0.0:
-            search, found = other, again
-        if not gained > _GAIN_OF_SHAPE * found.cost:
-            break
-    return search, found
+    parameters, count = search.parameters(found.elements), len(shape.names)
+    low = np.array([*shape.low, *(each.low for each in parameters)])
+    high = np.array([*shape.high, *(each.high for each in parameters)])
+    sign = search.sign(found.fit)
 
+    def at(values: Floats) -> tuple[FitProblem, Fit, Floats]:
+        static = search.static.with_shape(values[:count].tolist())
+        part, time = search.linear(parameters, values[count:])
+        columns = part.respond(search.times, static.regressor.dense())[0]
+        drifts = search.drifts(found.elements, time)
+        fitted = search.fit_columns(columns, drifts, search.static.weights, sign)
+        predicted = fitted.bias + np.column_stack([columns, drifts]) @ fitted.coefficients
+        return static, fitted, search.roots * (search.static.outputs - predicted)
 
-def _respond(part: LinearPart, times: Floats, columns: Floats) -> Floats:
-    return part.respond(times, columns)[0]
+    def residuals(values: Floats) -> Floats:
+        return at(values)[2]
+
+    end = least_squares(
+        residuals,
+        np.clip([*shape.values, *found.values], low, high),
+        bounds=(low, high),
+        x_scale="jac",
+        ftol=1e-10,
+        xtol=1e-10,
+        gtol=1e-10,
+        diff_step=np.full(low.size, _STEP_OF_SHAPE),
+        max_nfev=_EVALUATIONS,
+    )
+    static, fitted, rest = at(end.x)
+    cost = float(rest @ rest)
+    if not cost < found.cost:
+        return search, found
+    other = replace(search, static=static, columns=static.regressor.dense())
+    freedom = max(search.times.size - fitted.coefficients.size - end.x.size - 1, 1)
+    deviations = _deviations(np.asarray(end.jac), cost / freedom)[count:]
+    return other, Found(found.elements, np.asarray(end.x[count:]), fitted, cost, deviations)
 
 
 def _best(search: Search, elements: tuple[str, ...], before: Found | None = None, rounds: int = _ROUNDS) -> Found:
@@ -608,8 +638,12 @@ def _search(
     )
     values = np.asarray(end.x)
     freedom = max(search.times.size - basis.shape[1] - values.size - 1, 1)
-    slopes = np.asarray(end.jac)
-    covariance = np.linalg.pinv(slopes.T @ slopes) * 2.0 * end.cost / freedom
-    flat = np.linalg.norm(slopes, axis=0) <= 1e-12 * max(float(np.linalg.norm(slopes)), 1e-300)
-    deviations = np.where(flat, np.inf, np.sqrt(np.diag(covariance)))
+    deviations = _deviations(np.asarray(end.jac), 2.0 * end.cost / freedom)
     return values, deviations, 2.0 * float(end.cost)
+
+
+def _deviations(slopes: Floats, variance: float) -> Floats:
+    """Return standard deviations of parameters; infinite where the residuals do not depend on one."""
+    covariance = np.linalg.pinv(slopes.T @ slopes) * variance
+    flat = np.linalg.norm(slopes, axis=0) <= 1e-12 * max(float(np.linalg.norm(slopes)), 1e-300)
+    return np.where(flat, np.inf, np.sqrt(np.diag(covariance)))

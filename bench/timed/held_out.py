@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
-from typing import Literal
 
 import numpy as np
 
@@ -97,7 +96,7 @@ class HeldOutInTime:
             return []
         columns, drifts = search.responses(found.elements, found.values)
         constrained = search.static.template.nonnegative()
-        sign: Literal[1, -1] = -1 if (found.fit.coefficients[: columns.shape[1]][constrained] < 0.0).any() else 1
+        sign = search.sign(found.fit)
         trained = []
 
         def leave_out(fold: Fold) -> tuple[float, float]:

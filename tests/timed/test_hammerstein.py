@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from bench.hysteresis import PrandtlIshlinskii, Preisach, uniform_levels
+from bench.hysteresis import BoucWen, PrandtlIshlinskii, Preisach, uniform_levels
 from bench.identification import identify, measure_errors, ramps
 from bench.identification.evaluation import Candidate, Measurements
 from bench.timed import Hammerstein, LinearPart, identify_in_time, logarithmic_creep
@@ -122,6 +122,21 @@ def test_a_piezo_at_two_rates_is_predicted_at_the_faster():
     by_hand = min(held_out(dynamics=text) for text in ("lag", "resonance", "resonance,creep"))
     assert chosen <= 1.2 * by_hand
     assert chosen < 0.5 * alone
+
+
+def test_a_shape_and_a_lag_at_one_rate_are_found_together():
+    rng = np.random.default_rng(0)
+    turns = np.concatenate([[-1.0, 1.0], rng.uniform(-1.0, 1.0, 30)])
+    lengths = np.concatenate([[0.0], np.cumsum(np.abs(np.diff(turns)))])
+    inputs = np.interp(np.linspace(0.0, lengths[-1], 900), lengths, turns)
+    times = 1e-3 * np.arange(inputs.size)
+    plant = Hammerstein(BoucWen(0.6, 1.0, beta=3.0, gamma=3.0, exponent=1.5), LinearPart(lag=(1.5e-3, 0.0)))
+    outputs = plant.evaluate(times, inputs)
+    outputs += 0.01 * np.ptp(outputs) * rng.standard_normal(outputs.size)
+    found = identify_in_time("hammerstein", times, inputs, outputs, static="bouc-wen").model
+    # Nothing but the lag: a delay that stood for it in the first step is left out again.
+    assert found.linear.delay == 0.0
+    assert found.linear.lag == (pytest.approx(1.5e-3, rel=0.2), 0.0)
 
 
 def test_cells_that_only_rows_left_out_have_moved_stay_at_zero():
