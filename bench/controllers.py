@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
 from bench import registry
 from bench.control.baselines import IntegralControl, IntegralParameters, LookUp
+from bench.control.dynamics import ResponseDynamics
 from bench.control.following import ClosedLoopFollower, FollowingParameters, IntegralFollower, OpenLoopFollower
 from bench.control.latched import Latched, LatchParameters
 from bench.control.model_filters import AdaptationName, ModelFilter, model_filter
@@ -35,8 +36,6 @@ S = TypeVar("S", Supervised, SupervisedFollower)
 
 _TO_REST = 10.0
 """Time constants in which a specimen comes to rest to the sensor's noise."""
-_LAGS = 2.5
-"""Lags of the response behind an input that has arrived, after which a reading shows the error of the model."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -113,6 +112,11 @@ class ControllerSetup:
             return model_filter(self.adaptation, self.model.operator)
         except ValueError as error:
             raise DataError(f"controller {self.name}: {error}") from None
+
+    @property
+    def response(self) -> ResponseDynamics | None:
+        """How the specimen follows its drive; None if the model's data did not show it."""
+        return None if self.model.dynamics is None else self.model.dynamics.response
 
     @property
     def spans(self) -> Spans:
@@ -311,9 +315,9 @@ def _look_up(setup: ControllerSetup) -> LookUp:
 
 def _correction(setup: ControllerSetup) -> CorrectionParameters:
     found = CorrectionParameters.scaled(setup.spans)
-    further = 0.0 if setup.model.dynamics is None else _LAGS * setup.model.dynamics.response.lag
-    arrival = found.arrival
-    return replace(found, arrival=replace(arrival, hold=arrival.hold + further, patience=arrival.patience + further))
+    response = setup.response
+    further = 0.0 if response is None else _TO_REST * response.lag
+    return replace(found, arrival=replace(found.arrival, patience=found.arrival.patience + further))
 
 
 def _latched(setup: ControllerSetup) -> Latched | OppositeOutput:
@@ -357,7 +361,9 @@ def _holds(setup: ControllerSetup) -> float:
 
 OPEN_LOOP_INVERSE = ControllerSpec(
     "the inverse of the model, without feedback",
-    lambda s: OpenLoopInverse(s.inverse(), s.start, s.limits, wait=_wait(s), adaptation=s.model_filter()),
+    lambda s: OpenLoopInverse(
+        s.inverse(), s.start, s.limits, wait=_wait(s), adaptation=s.model_filter(), response=s.response
+    ),
     adapts=True,
     numbers=lambda s: _Settling(s.rest),
     tunable=("wait",),
@@ -365,7 +371,9 @@ OPEN_LOOP_INVERSE = ControllerSpec(
 )
 CLOSED_LOOP_INVERSE = ControllerSpec(
     "the inverse of the model, corrected by the measured disturbance",
-    lambda s: ClosedLoopInverse(s.inverse(), s.start, s.limits, s.tuned(lambda _: _correction(s)), s.model_filter()),
+    lambda s: ClosedLoopInverse(
+        s.inverse(), s.start, s.limits, s.tuned(lambda _: _correction(s)), s.model_filter(), s.response
+    ),
     adapts=True,
     numbers=_correction,
     tunable=("close_enough", "walk_variance", "arrival.tolerance", "arrival.hold"),

@@ -55,8 +55,8 @@ class LookUp(Scripted):
         predicted = self._table.operator.evaluate([self._measured]).item() if known else math.nan
         return Trace(reference=self._reference, predicted=predicted)
 
-    def _observe(self, measured_input: float) -> bool:
-        known = super()._observe(measured_input)
+    def _observe(self, t: float, measured_input: float) -> bool:
+        known = super()._observe(t, measured_input)
         if known:
             self._measured = measured_input
         return known

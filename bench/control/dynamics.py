@@ -80,6 +80,36 @@ class ResponseDynamics:
     shares: tuple[float, ...] = ()
     times: tuple[float, ...] = ()
 
+    def level(self, value: float) -> float:
+        """Return what of an input the lag acts on, with its sign: its `power`."""
+        return value if self.power == 1.0 else value * abs(value)
+
+    def of_level(self, level: float) -> float:
+        """Return the input of a level."""
+        return level if self.power == 1.0 else math.copysign(math.sqrt(abs(level)), level)
+
+
+class SeenInput:
+    """The input as the hysteresis sees it, behind the lag of the response; at rest at the first reading.
+
+    Parameters
+    ----------
+    response : ResponseDynamics
+        With a lag.
+    """
+
+    def __init__(self, response: ResponseDynamics) -> None:
+        self._response = response
+        self._level = self._time = math.nan
+
+    def take(self, t: float, measured: float) -> float:
+        """Take a reading of the input at a time (s), which it has had since the last one; return what is seen."""
+        level, passed = self._response.level(measured), t - self._time
+        if not math.isnan(passed):
+            level += (self._level - level) * math.exp(-max(passed, 0.0) / self._response.lag)
+        self._level, self._time = level, t
+        return self._response.of_level(level)
+
 
 @dataclass(frozen=True)
 class IdentifiedDynamics:

@@ -51,14 +51,14 @@ class FollowingParameters:
 class _Follower(ControllerBase, ABC):
     """What the followers share: one step at a fixed rate."""
 
-    def update(self, t: float, measured_input: float, output: float, reference: float) -> float:  # noqa: ARG002
+    def update(self, t: float, measured_input: float, output: float, reference: float) -> float:
         """Take in a reading and return the set-point for the coming period; see `Follower.update`.
 
         A missing reading is nan. Raises ValueError if the reference is not finite.
         """
         before, self._reference = self._reference, _checks.number("reference", reference)
         step = 0.0 if math.isnan(before) else reference - before
-        if self._observe(measured_input):
+        if self._observe(t, measured_input):
             self._setpoint = self._clip(self._answer_to(step, output))
         return self._setpoint
 

@@ -194,8 +194,8 @@ class Latched(Correcting):
             "each, as behind a reversal the specimen does not move as its model says"
         )
 
-    def _observe(self, measured_input: float) -> bool:
-        known = super()._observe(measured_input)
+    def _observe(self, t: float, measured_input: float) -> bool:
+        known = super()._observe(t, measured_input)
         if known and self.extreme is not None:
             # A plate that runs on takes the extreme with it.
             self.extreme = max(self._direction * self.extreme, self._direction * measured_input) * self._direction

@@ -137,7 +137,7 @@ class PredictiveFollower(ControllerBase):
             walk_variance=p.walk_variance, reading_variance=p.reading_variance
         )
         actuator, response = dynamics.actuator, dynamics.response
-        self._gain, self._offset, self._power = actuator.gain, actuator.offset, response.power
+        self._gain, self._offset, self._response = actuator.gain, actuator.offset, response
         step = p.period / _PARTS
         self._order, self._most = actuator.order, actuator.rate * step
         lags = response.lag * _LAGS if response.lag > 0.0 else np.zeros(1)
@@ -215,9 +215,9 @@ class PredictiveFollower(ControllerBase):
                 for lag in self._lags:
                     first = math.isnan(self._place)
                     kept = 0.0 if first else lag.remains ** (max(passed, 0.0) / period * _PARTS)
-                    level = _powered(measured, self._power)
+                    level = self._response.level(measured)
                     lag.level = level + (lag.level - level) * kept if kept else level
-                    lag.stream.step(_rooted(lag.level, self._power))
+                    lag.stream.step(self._response.of_level(lag.level))
                     lag.disturbance = math.nan
                 self._place, self._velocity = measured, 0.0
             return
@@ -233,9 +233,9 @@ class PredictiveFollower(ControllerBase):
         self._place, self._velocity = float(path[-1]), velocity
         for lag in self._lags:
             for position in path.tolist():
-                level = _powered(position, self._power)
+                level = self._response.level(position)
                 lag.level = level + (lag.level - level) * lag.remains
-                lag.stream.step(_rooted(lag.level, self._power))
+                lag.stream.step(self._response.of_level(lag.level))
 
     def _choose(self, output: float) -> None:
         """Take the lag whose disturbance changes least from reading to reading, if it is clearly another one."""
@@ -255,7 +255,7 @@ class PredictiveFollower(ControllerBase):
         """Write what the drive does and what the specimen sees; return its last place and velocity."""
         place, velocity, _ = kernels.drive(
             np.array([self._place, self._velocity, self._lag.level]), setpoints, source, self._steps, self._order,
-            self._most, self._lag.remains, self._power, positions, seen,
+            self._most, self._lag.remains, self._response.power, positions, seen,
         )  # fmt: skip
         return place, velocity
 
@@ -313,11 +313,3 @@ def _reach(met: bool, target: float, output: float) -> Reach:
     if met:
         return Reach.MET
     return Reach.TOO_HIGH if target > output else Reach.TOO_LOW
-
-
-def _powered(value: float, power: float) -> float:
-    return value if power == 1.0 else value * abs(value)
-
-
-def _rooted(level: float, power: float) -> float:
-    return level if power == 1.0 else math.copysign(math.sqrt(abs(level)), level)

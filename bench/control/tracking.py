@@ -7,7 +7,8 @@ a fixed rate with a reference that moves.
 Rules for all of them:
 
 * Set-points are clipped to the model's operating range and to `limits`. Integrators stop there too.
-* The memory of the hysteresis (`state`) follows the measured input of every call, not the set-point.
+* The memory of the hysteresis (`state`) follows the measured input of every call, not the set-point. A controller
+  that knows a lag of the response lets it follow the input behind that lag, so that it is right on the way, too.
 * A missing reading (nan or infinite) moves nothing: the set-point is held, the script waits for the next
   complete reading, estimators are not updated. A missing output does not keep the memory from following
   the measured input. Controllers with a hysteresis model also take for missing what is further outside the
@@ -28,6 +29,7 @@ from collections.abc import Generator
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple, Protocol
 
+from bench.control.dynamics import ResponseDynamics, SeenInput
 from bench.control.estimators import DisturbanceEstimator
 from bench.control.model_filters import ModelFilter
 from bench.control.overshoot import Overshoot, Passing
@@ -46,6 +48,8 @@ _LONGEST_PART = 100
 """Readings after which to go on without a peak."""
 _SIGNIFICANT = 0.01
 """Part of the range of set-points that a move must have for its overshoot to be learned."""
+_AT_REST = 0.5
+"""What is left of a move when the specimen is at rest, in errors that are close enough."""
 _ON_TIME = 1e-6
 """Difference of times that are equal, s."""
 # Part of the output at stake within which a clipped answer still counts as met.
@@ -224,6 +228,7 @@ class ControllerBase:
 
     _estimator: DisturbanceEstimator | None = None
     _inverse: Inverse[Any]
+    _seen: SeenInput | None = None
 
     def __init__(
         self,
@@ -292,13 +297,13 @@ class ControllerBase:
     def _clip(self, setpoint: float) -> float:
         return min(max(setpoint, self._low), self._high)
 
-    def _observe(self, measured_input: float) -> bool:
+    def _observe(self, t: float, measured_input: float) -> bool:
         """Move the memory by what the actuator did; return whether there is something to go by."""
         low, high = self._plausible_input
         if not (math.isfinite(measured_input) and low <= measured_input <= high):
             return False
         if self._memory is not None:
-            self._move(measured_input)
+            self._move(measured_input if self._seen is None else self._seen.take(t, measured_input))
         if not self._started:
             # Without a memory, the first reading says where the actuator is.
             self._setpoint, self._started = self._clip(measured_input), True
@@ -370,8 +375,11 @@ class Scripted(ControllerBase, ABC):
         model: Operator[Any] | None = None,
         state: Any = None,  # noqa: ANN401
         adaptation: ModelFilter | None = None,
+        response: ResponseDynamics | None = None,
     ) -> None:
         super().__init__(input_range, limits, model, state, adaptation)
+        if response is not None and response.lag > 0.0:
+            self._seen = SeenInput(response)
         self._overshoot = Overshoot(_SIGNIFICANT * (self._high - self._low))
 
     def aim(self, target: float, t: float, measured_input: float, output: float) -> Command:
@@ -404,7 +412,7 @@ class Scripted(ControllerBase, ABC):
         """
         if math.isnan(self._reference):
             raise RuntimeError("update: expected a target first, by aim")
-        known = self._observe(measured_input)
+        known = self._observe(t, measured_input)
         if not known or (self._needs_output and not self._is_known(output)):
             return Command(self._setpoint, self._poll, self._done)
         reading = Sample(t, measured_input, output)
@@ -449,8 +457,17 @@ class Scripted(ControllerBase, ABC):
             self._overshoot.learn(way, place * (1.0 + share) - 1.0)
         return Passing(start, start + way, self._overshoot, in_one=not share)
 
-    def _arrive(self, setpoint: float, arrival: Arrival) -> Move:
-        """Go to a set-point and return the reading with which the actuator has arrived."""
+    def _still_to_come(self, measured_input: float) -> float:
+        """Return how far the model's output is from what the input leads to, output units; 0 without a lag."""
+        if self._seen is None or self._model is None:
+            return 0.0
+        return abs(float(self._model.evaluate((measured_input,), self.state)[-1]) - self._modelled())
+
+    def _arrive(self, setpoint: float, arrival: Arrival, at_rest: float = math.inf) -> Move:
+        """Go to a set-point and return the reading with which the actuator has arrived.
+
+        The specimen has, too, to `at_rest` of its output.
+        """
         passing = yield from self._head_for(setpoint)
         # Clocks start with the first reading: until then readings may have been missing.
         started = since = math.nan
@@ -464,7 +481,8 @@ class Scripted(ControllerBase, ABC):
             else:
                 since = math.nan
             # Times are sums of floats.
-            if reading.time - since >= arrival.hold - 1e-9 or reading.time - started >= arrival.patience:
+            held = reading.time - since >= arrival.hold - 1e-9 and self._still_to_come(reading.input) <= at_rest
+            if held or reading.time - started >= arrival.patience:
                 passing.learn()
                 return reading
 
@@ -487,6 +505,8 @@ class OpenLoopInverse(Scripted):
         Time for the actuator to settle after each set-point, s.
     adaptation : ModelFilter or None
         What corrects the model by the output after each wait.
+    response : ResponseDynamics or None
+        Of the specimen: its memory follows the input behind the lag.
     """
 
     _needs_output = False
@@ -499,10 +519,11 @@ class OpenLoopInverse(Scripted):
         *,
         wait: float,
         adaptation: ModelFilter | None = None,
+        response: ResponseDynamics | None = None,
     ) -> None:
         if not 0.0 < wait < math.inf:
             raise ValueError(f"wait: expected a positive number of seconds, got {wait}")
-        super().__init__(inverse.operator.input_range, limits, inverse.operator, state, adaptation)
+        super().__init__(inverse.operator.input_range, limits, inverse.operator, state, adaptation, response)
         self._inverse = inverse
         self._wait = wait
 
@@ -575,8 +596,9 @@ class Correcting(Scripted):
         limits: tuple[float, float] | None = None,
         parameters: CorrectionParameters | None = None,
         adaptation: ModelFilter | None = None,
+        response: ResponseDynamics | None = None,
     ) -> None:
-        super().__init__(inverse.operator.input_range, limits, inverse.operator, state, adaptation)
+        super().__init__(inverse.operator.input_range, limits, inverse.operator, state, adaptation, response)
         self._inverse = inverse
         self._correction = parameters = parameters or CorrectionParameters.scaled(Spans.of(inverse.operator))
         self._poll = parameters.arrival.poll
@@ -586,12 +608,12 @@ class Correcting(Scripted):
 
     def _towards(self, target: float) -> Move:
         """Go where the model's output is `target`, through saturation if necessary."""
-        arrival = self._correction.arrival
+        arrival, at_rest = self._correction.arrival, _AT_REST * self._correction.close_enough
         first, *rest = self._answer(self._inverse.invert(self.state, target), target)
-        reading = yield from self._arrive(first, arrival)
+        reading = yield from self._arrive(first, arrival, at_rest)
         if rest:
             (second,) = self._answer(self._inverse.invert(self.state, target), target)[-1:]
-            reading = yield from self._arrive(second, arrival)
+            reading = yield from self._arrive(second, arrival, at_rest)
         return reading
 
     def _correct(self, target: float) -> Move:
@@ -624,6 +646,8 @@ class ClosedLoopInverse(Correcting):
         Numbers of the loop.
     adaptation : ModelFilter or None
         What corrects the model by the output at each correction.
+    response : ResponseDynamics or None
+        Of the specimen: its memory follows the input behind the lag, and readings count when it is at rest.
     """
 
     def _run(self, target: float, reading: Sample) -> Script:  # noqa: ARG002

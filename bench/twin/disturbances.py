@@ -28,10 +28,13 @@ _SLOPES = 3
 """Classes of the slope of the response."""
 _LONGEST = 4000.0
 """Part of a run that is simulated, s."""
+_QUICKEST = 0.2
+"""Least correlation time of wander and drift, s."""
 _FEWEST = 12
 """Fewest differences of a class that counts."""
-_SETTLED = 4.0
-"""Time constants of actuator and lag after which the set-point counts as reached."""
+_SETTLED, _LAGGED = 4.0, 6.0
+"""Time constants of the actuator and lags after which the set-point counts as reached. Behind a lag the response of a
+steep model still moves by more than its noise, which would be taken for wander."""
 _NEAR = 2e-3
 """Share of the range of the drive over which the slope is taken."""
 _LEAST_OF_HOLD = 3
@@ -186,10 +189,12 @@ def identify_disturbances(
     weights = np.sqrt(np.minimum(counts[used], 200.0))
     span = float(np.ptp(np.concatenate([r.driven for r in recordings])))
     height = float(np.ptp(np.concatenate([r.responded for r in recordings])))
+    # The specimen sees nothing of its drive that is quicker than the lag before it.
+    shortest = max(_QUICKEST, dynamics.response.lag)
 
     def trial(numbers: Floats) -> tuple[Wander, Wander]:
         wander, wander_time, drift, drift_time = np.exp(np.clip(numbers, -30.0, 12.0)).tolist()
-        return Wander(wander * span, wander_time), Wander(drift * height, drift_time)
+        return Wander(wander * span, max(wander_time, shortest)), Wander(drift * height, drift_time)
 
     def cost(numbers: Floats) -> float:
         wander, drift = trial(numbers)
@@ -199,7 +204,7 @@ def identify_disturbances(
             totals += _squares(part.pairs, part.simulate(disturbed, _SEED + number))[0]
         found = np.log(np.maximum(totals[used] / counts[used] + white, 1e-300))
         penalty = float(np.sum(np.maximum(numbers[[1, 3]] - math.log(3000.0), 0.0) ** 2)) + float(
-            np.sum(np.maximum(math.log(0.2) - numbers[[1, 3]], 0.0) ** 2)
+            np.sum(np.maximum(math.log(_QUICKEST) - numbers[[1, 3]], 0.0) ** 2)
         )
         return float(np.sum((weights * (found - target)) ** 2)) + 100.0 * penalty
 
@@ -342,7 +347,7 @@ def _settled(recording: Recording, dynamics: Dynamics) -> NDArray[np.bool_]:
     actuator, response = dynamics.actuator, dynamics.response
     constant = 0.0 if actuator.order == 0 else max(1.0, 2.0 * actuator.damping) / actuator.frequency
     moves = np.abs(np.diff(recording.setpoints, prepend=recording.driven[0]))[recording.last_change]
-    needed = _SETTLED * (constant + response.lag) + actuator.delay + moves / actuator.rate
+    needed = _SETTLED * constant + _LAGGED * response.lag + actuator.delay + moves / actuator.rate
     return np.asarray(recording.since_change > np.maximum(needed, 0.5))
 
 
