@@ -25,7 +25,8 @@ from bench.clock import VirtualClock, wall_time
 from bench.errors import BenchError, DeviceError
 from bench.model_file import ModelFile, load_model
 from bench.protocol import ProtocolDefinition, find_protocol
-from bench.results.models import IdentifiedFile, InvertedTargets, identify_file, invert_targets
+from bench.results.inverted import InvertedTargets, invert_targets
+from bench.results.models import IdentifiedFile, identify_file
 from bench.results.models import predict as predict_file
 from bench.results.reading.options import ReadingOptions
 from bench.results.report import PAGE_NAME, report_run
@@ -244,13 +245,18 @@ def predict(
 
 
 def invert(
-    model: Model, targets: npt.ArrayLike, *, initial: str | None = None, continue_memory: bool = False
+    model: Model,
+    targets: npt.ArrayLike,
+    *,
+    times: npt.ArrayLike | None = None,
+    initial: str | None = None,
+    continue_memory: bool = False,
 ) -> InvertedTargets:
     """Return the set-points that bring a model's output to one target after another; see `InvertedTargets`.
 
     Parameters
     ----------
-    model, initial, continue_memory
+    model, times, initial, continue_memory
         As for `predict`.
     targets : array_like, shape (N,)
         Targets in the unit of the model's output.
@@ -259,9 +265,12 @@ def invert(
     ------
     DataError
         If a model file cannot be read, or the model has several inputs.
+    ConfigurationError
+        If a model with time has no times or another one has, or it has no inverse at these times.
     """
     values = np.asarray(targets, dtype=np.float64)
-    return invert_targets(_model(model), values, initial=initial, continue_memory=continue_memory)
+    moments = None if times is None else np.asarray(times, dtype=np.float64)
+    return invert_targets(_model(model), values, initial=initial, continue_memory=continue_memory, times=moments)
 
 
 def load(path: str | Path) -> RunFolder | ModelFile:

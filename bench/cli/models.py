@@ -331,6 +331,7 @@ def invert(
     ],
     column: Annotated[str, typer.Option("--column", metavar="NAME", help="Column with the targets.")],
     out: Annotated[Path, typer.Option(metavar="FILE.csv", help="File for the set-points.")] = Path("setpoints.csv"),
+    time_column: TimeColumn = None,
     policy: Annotated[
         PolicyOption,
         typer.Option(help="Choice among several solutions: nearest, or the paper's direction rule."),
@@ -346,37 +347,49 @@ def invert(
     Writes a CSV file, a row a target: `target`, `passing` (a set-point to pass before, where the target is met
     only after saturation), `setpoint`, `predicted` (the model's output there) and `flag` (`met`, `too high` or
     `too low`; what cannot be met is clamped to the nearest reachable value). If the model has a prediction band, also
-    its ends for the set-point, by the local slope, and for the output there.
+    its ends for the set-point, by the local slope, and for the output there. Of models with time `hammerstein`
+    without a delay is inverted, at the times of the targets (`--time`); `time` is the first column then.
     """
     from bench.model_file import load_model
     from bench.results.bands import invert_band
     from bench.results.data import read_columns, write_csv
-    from bench.results.models import check_unit, invert_targets
+    from bench.results.inverted import invert_targets
+    from bench.results.models import check_unit
     from bench.results.starting_state import starting_state
+    from bench.results.times import read_times
     from bench.units import header_with_unit
 
     check_outputs(out=out, json_file=json_file, read=(model_path, file))
     model = load_model(model_path)
     with show_patience(f"reading {file.name}"):
-        columns = read_columns(file, [column], options=reading)
+        columns = read_columns(file, [name for name in (column, time_column) if name], options=reading)
     print_assumptions(file.name, columns.assumptions)
-    units = (model.operator.input_unit, model.operator.output_unit)
+    units = (model.response.input_unit, model.response.output_unit)
     check_unit(units[1], columns.units[column], column)
     found = invert_targets(
-        model, columns.values[column], policy=policy.value, initial=initial, continue_memory=continue_memory
+        model,
+        columns.values[column],
+        policy=policy.value,
+        initial=initial,
+        continue_memory=continue_memory,
+        times=read_times(columns, time_column) if time_column else None,
     )
+    for warning in found.warnings():
+        warn(warning)
     start = starting_state(model, initial=initial, continue_memory=continue_memory)
     banded = invert_band(model, found.setpoints, found.passing, start.state)
     bands = banded.columns(found.setpoints, found.predicted, units[0]) if banded else []
-    header = [
-        header_with_unit(name, unit)
-        for name, unit in (
-            ("target", units[1]), ("passing", units[0]), ("setpoint", units[0]), ("predicted", units[1]), ("flag", "")
-        )
-    ]  # fmt: skip
     passing = ["" if value != value else value for value in found.passing.tolist()]
-    written: list[Any] = [found.targets, passing, found.setpoints, found.predicted, list(found.flags)]
-    write_csv(out, [*header, *(head for head, _ in bands)], [*written, *(values for _, values in bands)])
+    written: list[tuple[str, Any]] = [
+        *([] if found.times is None else [(header_with_unit("time", "s"), found.times)]),
+        (header_with_unit("target", units[1]), found.targets),
+        (header_with_unit("passing", units[0]), passing),
+        (header_with_unit("setpoint", units[0]), found.setpoints),
+        (header_with_unit("predicted", units[1]), found.predicted),
+        ("flag", list(found.flags)),
+        *bands,
+    ]
+    write_csv(out, [head for head, _ in written], [values for _, values in written])
     if banded is not None:
         print_band(banded.outputs)
     counts = {flag: found.flags.count(flag) for flag in ("met", "too high", "too low")}

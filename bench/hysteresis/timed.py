@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from bench.hysteresis import _checks
 from bench.hysteresis._checks import Floats
 from bench.hysteresis.documents import Model
+from bench.hysteresis.inverse import Policy
 
 S = TypeVar("S")
 
@@ -58,6 +59,31 @@ class TimedModel(Model, ABC, Generic[S]):
         ValueError
             If a sequence is empty, not finite, not of equal length, or the times do not increase.
         """
+
+    def follow(
+        self,
+        times: ArrayLike,  # noqa: ARG002
+        targets: ArrayLike,  # noqa: ARG002
+        state: S | None = None,  # noqa: ARG002
+        policy: Policy = "nearest",  # noqa: ARG002
+    ) -> Floats:
+        """Return the inputs that bring the output to one target after another, shape (N,).
+
+        A target out of reach is given the input that comes closest. Times and state as for `run`.
+
+        Parameters
+        ----------
+        targets : array_like, shape (N,)
+            Output units.
+        policy : {"nearest", "paper"}
+            Which answer is taken where there are several; see `Inverse`.
+
+        Raises
+        ------
+        ValueError
+            If the model has no inverse, or none at these times, or a sequence is unfit.
+        """
+        raise ValueError(f"a model of the kind {self.kind} has no inverse")
 
     @abstractmethod
     def initial_state(self) -> S:

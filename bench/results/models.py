@@ -16,8 +16,6 @@ from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import (
     Coverage,
     Operator,
-    Policy,
-    Reach,
     TimedModel,
     find_model,
 )
@@ -413,67 +411,6 @@ def predict(
     """
     start = starting_state(model, initial=initial, continue_memory=continue_memory)
     return bind_times(model, times).evaluate(inputs, start.state)
-
-
-@dataclass(frozen=True)
-class InvertedTargets:
-    """Set-points that bring a model's output to one target after another.
-
-    Attributes
-    ----------
-    targets : ndarray, shape (N,)
-        Output units.
-    setpoints : ndarray, shape (N,)
-        Input units.
-    passing : ndarray, shape (N,)
-        Set-point to pass before it, where the target is met only after saturation; nan where there is none.
-    predicted : ndarray, shape (N,)
-        Output of the model at `setpoints`, output units.
-    flags : tuple of str
-        By target: `met`, `too high` or `too low`. What is not met is clamped to the nearest reachable value.
-    """
-
-    targets: Floats
-    setpoints: Floats
-    passing: Floats
-    predicted: Floats
-    flags: tuple[str, ...]
-
-
-def invert_targets(
-    model: ModelFile,
-    targets: Floats,
-    *,
-    policy: Policy = "nearest",
-    initial: str | None = None,
-    continue_memory: bool = False,
-) -> InvertedTargets:
-    """Invert a model for a sequence of targets.
-
-    Parameters
-    ----------
-    model : ModelFile
-        Any model of one input: Preisach and Prandtl-Ishlinskii models are inverted exactly with their memory, a
-        polynomial by its look-up table, others numerically.
-    targets : ndarray, shape (N,)
-        Output units, finite.
-    policy : {"nearest", "paper"}
-        Which answer is taken where there are several.
-    initial, continue_memory
-        The state before the first target, as for `starting_state`.
-
-    Raises
-    ------
-    DataError
-        If it is a model of several inputs.
-    """
-    start = starting_state(model, initial=initial, continue_memory=continue_memory)
-    found = model.operator.inverse(policy).follow(targets, start.state)
-    flags = tuple(
-        (Reach.MET if met else Reach.TOO_HIGH if target > output else Reach.TOO_LOW).value
-        for met, target, output in zip(found.met.tolist(), targets.tolist(), found.outputs.tolist(), strict=True)
-    )
-    return InvertedTargets(targets, found.setpoints, found.saturating, found.outputs, flags)
 
 
 def check_unit(expected: str, unit: str, column: str) -> None:

@@ -14,11 +14,12 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bench.hysteresis import Operator, _checks, operator_from_json
+from bench.hysteresis import Operator, Policy, _checks, operator_from_json
 from bench.hysteresis._checks import Floats
 from bench.hysteresis.density import Density
 from bench.hysteresis.documents import Parts
 from bench.hysteresis.timed import TimedModel, check_sequence
+from bench.timed.linear_inverse import bring_responses
 from bench.timed.linear_parts import FilterState, LinearPart
 
 
@@ -120,11 +121,9 @@ class Hammerstein(TimedModel[HammersteinState]):
         clock, sequence = check_sequence(times, inputs=inputs)
         state = self.initial_state() if state is None else state
         values = self.static.evaluate(sequence, state.memory) - self.static.bias
-        knots = state.knots
-        elapsed, filters, known = clock - clock[0], None, 0
+        knots, elapsed = state.knots, _elapsed(clock, state)
+        filters, known = None, 0
         if knots is not None:
-            gap = clock[0] - state.clock if clock[0] > state.clock else clock[1] - clock[0]
-            elapsed = np.concatenate([knots.times, knots.times[-1] + gap + elapsed])
             values = np.concatenate([knots.values, values])
             filters, known = knots.filters, len(knots.times)
         response = self.linear.respond(elapsed, values[:, None], filters)[0][known:, 0]
@@ -137,6 +136,32 @@ class Hammerstein(TimedModel[HammersteinState]):
         _, (value, rate, crept) = self.linear.respond(times[: first + 1], values[: first + 1, None], filters)
         at_first = FilterState(float(value[0]), float(rate[0]), tuple(crept[:, 0].tolist()))
         return Knots(tuple(times[first:].tolist()), tuple(values[first:].tolist()), at_first)
+
+    def follow(
+        self,
+        times: ArrayLike,
+        targets: ArrayLike,
+        state: HammersteinState | None = None,
+        policy: Policy = "nearest",
+    ) -> Floats:
+        """Return the inputs that bring the output to targets, shape (N,); see `TimedModel.follow`.
+
+        A target that needs two inputs at a time, the first at saturation, is given the last of them alone.
+        """
+        clock, wanted = check_sequence(times, targets=targets)
+        state = self.initial_state() if state is None else state
+        knots, elapsed = state.knots, _elapsed(clock, state)
+        stream, bias = self.static.inverse(policy).stream(state.memory), self.static.bias
+        found: list[float] = []
+
+        def bring(value: float) -> float:
+            found.append(stream.find(value + bias))
+            return stream.move(found[-1]) - bias
+
+        before = None if knots is None else (knots.values[-1], knots.filters)
+        responses = wanted - bias - self.drift_after(elapsed[-wanted.size :])
+        bring_responses(self.linear, elapsed, responses, before, bring)
+        return np.array(found)
 
     def initial_state(self) -> HammersteinState:
         """Return the initial state of the operator."""
@@ -217,3 +242,12 @@ class Hammerstein(TimedModel[HammersteinState]):
             )
             knots = Knots(tuple(times), tuple(values), FilterState(value, rate, tuple(crept)))
         return HammersteinState(self.static.state_from_json(memory), _checks.number("memory", clock), knots)
+
+
+def _elapsed(clock: Floats, state: HammersteinState) -> Floats:
+    """Return times since the start of the record, s: those of the knots of a state, then those of a sequence."""
+    elapsed: Floats = clock - clock[0]
+    if state.knots is None:
+        return elapsed
+    gap = float(clock[0] - state.clock if clock[0] > state.clock else clock[1] - clock[0])
+    return np.concatenate([state.knots.times, state.knots.times[-1] + gap + elapsed])
