@@ -52,7 +52,7 @@ class BandedPrediction:
     @property
     def label(self) -> str:
         """The band in a figure; marked where the inputs are of another class than that of the calibration."""
-        return f"{100 * self.band.level:g} % band" + (", other class of input" if self.departures else "")
+        return f"{100 * self.band.level:g} % prediction band" + (", other class of input" if self.departures else "")
 
     def coverage(self, residuals: Floats) -> float:
         """Return the share of residuals, shape (n,), of the last n rows that lie within the band, 0 to 1."""

@@ -44,12 +44,17 @@ def test_a_rig_without_a_dwell_leaves_it_to_the_dynamics():
             time_at_target(setup(unknown, dwell=None))
 
 
-def test_a_reading_waits_for_the_lag_behind_an_input_that_has_arrived():
+def test_the_closed_loop_knows_the_lag_and_has_ten_of_them_to_arrive():
     slow = replace(PREISACH, dynamics=IdentifiedDynamics(response=ResponseDynamics(lag=4.0)))
     numbers = controller_spec("target", "closed-loop-inverse").numbers
     here, there = (numbers(setup(model)).arrival for model in (PREISACH, slow))
-    assert there.hold - here.hold == there.patience - here.patience == pytest.approx(10.0)
-    assert there.tolerance == here.tolerance
+    assert there == replace(here, patience=here.patience + 40.0)
+    for name in ("closed-loop-inverse", "open-loop-inverse"):
+        controller = make_controller("target", name, setup(slow))
+        low, high = controller.limits
+        controller.aim(0.5 * sum(slow.operator.output_range()), 0.0, low, 0.0)
+        controller.update(0.1, high, 0.0)
+        assert slow.operator.present_input(controller.state) < low + 0.05 * (high - low)
 
 
 @pytest.mark.parametrize("task", ["target", "follow"])

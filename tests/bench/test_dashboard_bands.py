@@ -257,5 +257,5 @@ def test_a_run_under_control_records_it(bench, tmp_path):
     assert "of 6 readings within it" in panel
     # The page and its figures have it, too.
     assert bench("report", path.parent, "--figures", "svg")[0] == 0
-    assert "90 % band" in (path.parent / "report" / "errors.svg").read_text(encoding="utf-8")
+    assert "90 % prediction band" in (path.parent / "report" / "errors.svg").read_text(encoding="utf-8")
     assert "prediction band of preisach-nonmonotonic" in (path.parent / "report.html").read_text(encoding="utf-8")

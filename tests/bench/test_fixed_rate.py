@@ -109,9 +109,9 @@ class Bench:
         self.interrupts = Interrupts()
         self.watcher = Watcher()
 
-    def run(self, *messages):
+    def run(self, *messages, **settings):
         definition = messages[0] if hasattr(messages[0], "generator") else define(*messages)
-        parameters = definition.parameters()
+        parameters = definition.parameters(**settings)
         signals = (*self.rig.signals, *TRACES, LATENESS)
         if definition.controls in [signal.name for signal in self.rig.signals]:
             signals = (*self.rig.signals, *trace_signals(definition, self.rig.description, {}))
@@ -691,7 +691,7 @@ class TestTwentyKilohertz:
 
     def test_every_sample_is_there(self, tmp_path):
         b = Bench(tmp_path, "hybrid")
-        outcome = b.run(find_protocol("piezo-step"))
+        outcome = b.run(find_protocol("piezo-step"), voltage=40.0)
         assert outcome.status == "completed", outcome.reason
         assert outcome.safe_state == dict.fromkeys(b.devices, "safe")
         samples = b.samples()
