@@ -10,6 +10,7 @@ from bench.control.references import AddedSine, Reference, SmoothMoves, staircas
 from bench.controllers import ControllerSetup, make_controller
 from bench.model_file import load_model
 from bench.protocol import (
+    Caution,
     FixedRate,
     Messages,
     Note,
@@ -108,6 +109,8 @@ def hybrid_control(parameters: Parameters, slots: Slots) -> Messages:
         label=parameters.reference,
         put_off=APPROACH,
     )
+    if notice := controller.take_notice():
+        yield Caution(notice)
 
 
 class StepParameters(ProtocolParameters):

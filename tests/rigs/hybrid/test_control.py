@@ -10,7 +10,7 @@ from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
 from bench.control.notch_loop import NotchLoopParameters
 from bench.control.references import AddedSine, SmoothMoves, staircase
-from bench.errors import ConfigurationError
+from bench.errors import ConfigurationError, ConvergenceError
 from bench.identification.dynamics import identify_dynamics
 from bench.rig_file import load_rig
 from rigs.hybrid.control import (
@@ -157,6 +157,15 @@ def follow(controller, reference, duration, seed, room=None, **parameters):
         rows.append((t, error, plant.deflection - reference(t + PERIOD / 2), current, voltage))
         plant.advance(PERIOD / 2)
     return Run(*np.array(rows).T)
+
+
+def resting(model, error):
+    """Return an open loop after 45 s with a reference that rests, while the deflection is off by an error (m)."""
+    controller = OpenLoopHybrid(model, lambda _: 0.0, settings())
+    controller.update(0.0, (0.0, 22.0, 22.0))
+    for k in range(1, round(45.0 / PERIOD)):
+        controller.update(k * PERIOD, (error, 22.0, 22.0))
+    return controller
 
 
 def step_response(controller, size, seed, at=0.1, duration=0.4, **parameters):
@@ -403,6 +412,23 @@ def test_fine_loop_holds_at_a_missing_reading(model):
     assert trace.reference == 1 * MICRO
     assert trace.predicted == 0.0
     assert -1 * MICRO < trace.disturbance < 0.0
+
+
+@pytest.mark.parametrize(
+    ("part", "said"),
+    [(0.07, ""), (0.09, "its error at rest is 8.1e-07 m RMS, and that of a model that holds at most 1.1e-06")],
+)
+def test_an_open_loop_that_errs_is_warned_of(model, part, said):
+    controller = resting(model, part * MID_RANGING["stroke"])
+    notice = controller.take_notice()
+    assert bool(notice) == bool(said)
+    assert said in notice
+    assert not controller.take_notice()
+
+
+def test_an_open_loop_whose_model_does_not_hold_ends(model):
+    with pytest.raises(ConvergenceError, match="the model does not hold for this specimen: its error at rest is"):
+        resting(model, 0.13 * MID_RANGING["stroke"])
 
 
 # Traces.

@@ -18,7 +18,7 @@ from bench.errors import ConfigurationError, ConvergenceError, DataError
 from bench.hysteresis import Polynomial, PrandtlIshlinskii
 from bench.journal import Record
 from bench.model_file import ModelFile
-from bench.protocol import FixedRate, Step, find_protocol, plan
+from bench.protocol import Caution, FixedRate, Step, find_protocol, plan
 from bench.rig import Rig
 from bench.rig_file import load_rig
 from bench.runs import Run, carry_out
@@ -301,6 +301,16 @@ class TestReferences:
         assert abs(current) <= 0.15
         assert abs(voltage) <= 40.0
         assert (voltage == 0.0) or name != "thermal-feedback"
+
+    @pytest.mark.parametrize(("error", "said"), [(0.7e-6, []), (0.75e-6, [Caution])])
+    def test_an_open_loop_that_errs_is_warned_of(self, files, error, said):
+        settings = {"model": files["hybrid"], "controller": "open-loop", "reference": "hold"}
+        definition, parameters = parsed("hybrid-control", settings)
+        messages = definition.start(parameters, slots_of("hybrid-control"))
+        loop = next(message for message in messages if isinstance(message, FixedRate))
+        for k in range(round(30.0 * loop.rate)):
+            loop.controller.update(k / loop.rate, (error if k else 0.0, 22.0, 22.0))
+        assert [type(message) for message in messages] == said
 
     @pytest.mark.parametrize(("rate", "record_rate", "every"), [(200, 200, 1), (200, 1000, 1), (100, 3, 33)])
     def test_as_many_samples_as_wanted_are_recorded(self, files, rate, record_rate, every):
