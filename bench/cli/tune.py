@@ -37,8 +37,8 @@ def tune_(
     ] = None,
     seeds: Annotated[int, typer.Option(min=1, max=100, help="Sessions of each run.")] = 2,
     checks: Annotated[
-        int, typer.Option(min=1, max=100, help="Further sessions, in which the result has to be better as well.")
-    ] = 4,
+        int, typer.Option(min=2, max=100, help="Further sessions, in which the result has to be better as well.")
+    ] = 8,
     rounds: Annotated[int, typer.Option(min=1, max=10, help="How often each number is changed.")] = 2,
     workers: Annotated[
         int | None, typer.Option(min=1, help="Worker processes; as many as cores if not given.")
@@ -48,11 +48,11 @@ def tune_(
 ) -> None:
     """Tune a controller for a specimen, by runs on its emulated twin.
 
-    The numbers of the controller are changed one after another. What counts is the RMS error in percent of the range
-    of the targets, and the time at each; half by the model as it is, half by the worst of models by which the
-    specimen has another gain or time constant, so that what is chosen has margins of stability. If it is not better
-    in sessions that the search has not seen, the numbers stay as they are. Use the file by
-    `bench run ... --set tuning=FILE`.
+    The numbers of the controller are changed one after another. What counts is the RMS error, and a quarter as much
+    the time at each target, as multiples of those before; half by the model as it is, half by the worst of models by
+    which the specimen has another gain or time constant, so that what is chosen has margins of stability. If it is
+    not better in sessions that the search has not seen, by more than chance, the numbers stay as they are. Use the
+    file by `bench run ... --set tuning=FILE`.
     """
     from bench.tuning.tune import tune
 

@@ -77,6 +77,8 @@ class TuningRuns:
         Sessions of each run.
     first_seed : int
         Seed of the first session; the others follow.
+    scale : tuple of float, optional
+        RMS error and seconds at a target by which the cost is counted; those of the first trial if not given.
     """
 
     task: Task
@@ -87,6 +89,7 @@ class TuningRuns:
     settings: Mapping[str, str]
     seeds: int = 1
     first_seed: int = 0
+    scale: tuple[float, float] | None = None
     failures: list[str] = field(default_factory=list)
     _count: int = 0
 
@@ -104,7 +107,10 @@ class TuningRuns:
             model.save(self._models[name])
 
     def __call__(self, candidates: Sequence[Numbers]) -> list[Trial]:
-        """Return trials of some numbers; their runs go on beside each other."""
+        """Return trials of some numbers; their runs go on beside each other.
+
+        Raises BenchError if those of the first trial fail with the model as it is.
+        """
         started = [(numbers, self._start(numbers)) for numbers in candidates]
         return [self._trial(numbers, runs) for numbers, runs in started]
 
@@ -135,32 +141,30 @@ class TuningRuns:
             except BenchError as error:
                 self.failures.append(f"{key[0]}, {dict(numbers)}: {error}")
                 reached[key] = None
-        scores: dict[str, list[tuple[float, float, float]]] = {}
+        scores: dict[str, list[tuple[float, float]]] = {}
         for (name, seed), results in reached.items():
             scores.setdefault(name, []).append(_score(results, reached[_AS_IDENTIFIED, seed]))
-        means = {name: np.mean(each, axis=0).tolist() for name, each in scores.items()}
-        cost, rms, seconds = means.pop(_AS_IDENTIFIED)
-        return Trial(
-            numbers,
-            0.5 * (cost + max(each[0] for each in means.values())),
-            rms,
-            seconds,
-            max(each[1] for each in means.values()),
-        )
+        rms, seconds = np.mean(scores[_AS_IDENTIFIED], axis=0).tolist()
+        if self.scale is None:
+            if not math.isfinite(rms):
+                raise BenchError(f"the controller fails with the numbers to begin with: {self.failures[0]}")
+            self.scale = rms, seconds
+        costs = {name: float(np.mean([cost_of(*each, self.scale) for each in runs])) for name, runs in scores.items()}
+        cost = 0.5 * (costs.pop(_AS_IDENTIFIED) + max(costs.values()))
+        return Trial(numbers, cost, rms, seconds, max(float(np.mean(scores[name], axis=0)[0]) for name in costs))
 
 
-def _score(results: TargetResults | None, nominal: TargetResults | None) -> tuple[float, float, float]:
-    """Return cost, RMS error and seconds a target of a run, by the targets that the specimen can reach.
+def _score(results: TargetResults | None, nominal: TargetResults | None) -> tuple[float, float]:
+    """Return RMS error and seconds a target of a run, by the targets that the specimen can reach.
 
     Another model may draw targets beyond them: the range is that of the run with the model as it is.
     """
     if results is None or nominal is None:
-        return math.inf, math.inf, math.nan
+        return math.inf, math.nan
     low, high = float(nominal.targets.min()), float(nominal.targets.max())
     within = (results.targets >= low) & (results.targets <= high)
     rms = float(np.sqrt(np.mean((results.outputs - results.targets)[within] ** 2)))
-    seconds = float(results.seconds[within].mean())
-    return cost_of(rms, seconds, high - low), rms, seconds
+    return rms, float(results.seconds[within].mean())
 
 
 def start_of(task: Task, rig: str, numbers: Any, tunable: Sequence[str]) -> Numbers:  # noqa: ANN401 - a dataclass

@@ -1,10 +1,11 @@
 """The search for the numbers of a controller: one after another, by the cost of runs on an emulated rig.
 
-The cost of numbers is `error + TIME_WEIGHT * seconds`: the RMS error in percent of the range of the targets, and the
-seconds at each target. It is the mean of that with the model as it is, and of the worst of that with models by which
-the specimen has another gain, by the factor `MARGIN` to either side, and another time constant of its response. So
-numbers that are best on the specimen as identified but fail beside it, by too little margin of stability, are not
-chosen. A controller that does not converge, or reaches no target in its time, has no cost at all.
+The cost of numbers is `error + TIME_WEIGHT * time`: the RMS error and the seconds at each target, each as a multiple
+of that of the numbers to begin with, so that neither hides the other. It is the mean of that with the model as it is,
+and of the worst of that with models by which the specimen has another gain, by the factor `MARGIN` to either side,
+and another time constant of its response. So numbers that are best on the specimen as identified but fail beside it,
+by too little margin of stability, are not chosen. A run of a controller that does not converge, or reaches no target
+in its time, costs `FAILED`: a search can begin with numbers that fail, but does not end with them.
 """
 
 from __future__ import annotations
@@ -14,14 +15,22 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
+import numpy as np
+
 from bench.control.dynamics import IdentifiedDynamics
 from bench.hysteresis import Operator, TwoStage
 from bench.model_file import ModelFile
 
 MARGIN = 1.25
 """Factor of the gain, and of the time constant, by which the specimen may differ from its model."""
-TIME_WEIGHT = 0.02
-"""Percent of the range of the targets that a second at each target costs."""
+TIME_WEIGHT = 0.25
+"""Part of the RMS error of the first numbers that costs as much as their time."""
+FAILED = 1000.0
+"""Cost of a run that failed, beyond that of any that did not."""
+WORST = 1.25
+"""Factor by which the greatest RMS error of the sessions may grow with better numbers."""
+ERRORS = 2.0
+"""Standard errors of the mean by which better numbers cost less in the same sessions."""
 FACTOR = 1.7
 """By how much a number is raised and lowered at first."""
 FINALISTS = 3
@@ -43,13 +52,13 @@ class Trial:
     numbers : mapping
         The numbers, as in a tuning file.
     cost : float
-        See the module; infinite if a run failed.
+        See the module.
     rms : float
-        With the model as it is, output units.
+        With the model as it is, output units; infinite if a run failed.
     seconds : float
         At each target, s.
     worst : float
-        RMS with the worst of the other models, output units.
+        RMS with the worst of the other models, output units; infinite if a run failed.
     """
 
     numbers: Numbers
@@ -57,6 +66,11 @@ class Trial:
     rms: float
     seconds: float
     worst: float
+
+    @property
+    def failed(self) -> bool:
+        """Whether a run failed."""
+        return not (math.isfinite(self.rms) and math.isfinite(self.worst))
 
 
 Evaluate = Callable[[Sequence[Numbers]], list[Trial]]
@@ -93,9 +107,9 @@ def _slower(dynamics: IdentifiedDynamics, factor: float) -> IdentifiedDynamics:
     return replace(dynamics, response=replace(dynamics.response, lag=factor * dynamics.response.lag))
 
 
-def cost_of(rms: float, seconds: float, span: float) -> float:
-    """Return the cost of one run: RMS error and range of the targets in output units, s at each target."""
-    return 100.0 * rms / span + TIME_WEIGHT * seconds
+def cost_of(rms: float, seconds: float, scale: tuple[float, float]) -> float:
+    """Return the cost of one run, by RMS error and seconds at each target, and those of the numbers to begin with."""
+    return rms / scale[0] + TIME_WEIGHT * seconds / scale[1] if math.isfinite(rms) else FAILED
 
 
 def search(
@@ -140,16 +154,27 @@ def confirm(trials: Sequence[Trial], sessions: Sequence[Evaluate]) -> tuple[Tria
     """Return trials of the first numbers of a search and of its best, means over sessions that it has not seen.
 
     The best `FINALISTS` of the others take part, even if none was better in the search: a session may flatter the
-    first numbers as well. Others are better if they are so in each session; if none are, the first ones are the best.
-    Of trials of the same cost the first takes part: a number between them plays no part for this specimen.
+    first numbers as well. Others are better if their cost, session by session, is less by more than `ERRORS` standard
+    errors of the mean, and their greatest RMS error is at most `WORST` times that of the first ones; if none are, the
+    first ones are the best. Of trials of the same cost the first takes part: a number between them plays no part for
+    this specimen.
     """
     start, *others = trials
-    by_cost = {each.cost: each for each in reversed(others) if math.isfinite(each.cost)}
+    by_cost = {each.cost: each for each in reversed(others) if not each.failed}
     numbers = [start.numbers, *(by_cost[cost].numbers for cost in sorted(by_cost)[:FINALISTS])]
     first, *found = zip(*(evaluate(numbers) for evaluate in sessions), strict=True)
-    better = [each for each in found if all(a.cost < b.cost for a, b in zip(each, first, strict=True))]
-    before, *after = map(_mean, [first, *better])
+    before, *after = map(_mean, [first, *(each for each in found if _better(each, first))])
     return before, min(after, key=lambda each: each.cost, default=before)
+
+
+def _better(trials: Sequence[Trial], first: Sequence[Trial]) -> bool:
+    differences = np.array([a.cost - b.cost for a, b in zip(trials, first, strict=True)])
+    error = differences.std(ddof=1) / math.sqrt(len(differences))
+    return (
+        not any(each.failed for each in trials)
+        and float(differences.mean()) < -ERRORS * float(error)
+        and max(each.rms for each in trials) <= WORST * max(each.rms for each in first)
+    )
 
 
 def _mean(trials: Sequence[Trial]) -> Trial:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.metadata
-import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from hashlib import sha256
@@ -19,7 +18,7 @@ from bench.hysteresis import TwoStage
 from bench.model_file import load_model
 from bench.rig_file import load_rig
 from bench.tuning.runs import Task, TuningRuns, start_of, task_of
-from bench.tuning.search import MARGIN, TIME_WEIGHT, Trial, confirm, search
+from bench.tuning.search import ERRORS, MARGIN, TIME_WEIGHT, WORST, Trial, confirm, search
 from bench.tuning_file import tuning_text
 
 
@@ -78,7 +77,7 @@ def tune(
     protocol: str | None = None,
     settings: Sequence[str] = (),
     seeds: int = 2,
-    checks: int = 4,
+    checks: int = 8,
     rounds: int = 2,
     workers: int | None = None,
     folder: Path = Path("recordings/tuning"),
@@ -86,8 +85,8 @@ def tune(
 ) -> Tuned:
     """Tune a controller; parameters as the options of `bench tune`.
 
-    Of the best numbers of the search those are taken that are best in sessions that it has not seen, and better than
-    the first ones in each.
+    Of the best numbers of the search those are taken that are best in sessions that it has not seen, and better there
+    than the first ones by `bench.tuning.search.confirm`.
 
     Raises
     ------
@@ -96,7 +95,7 @@ def tune(
     DataError
         If the model cannot be used.
     BenchError
-        If the runs fail with the numbers to begin with.
+        If the runs fail with the numbers to begin with and the model as it is, or with all numbers beside it.
     """
     from bench.workers import Workers
 
@@ -134,15 +133,18 @@ def tune(
         trials.append(trial)
         text = f"{len(trials):3}  cost {trial.cost:.4g}  RMS {trial.rms:.4g}  {dict(trial.numbers)}"
         shown.print(text, highlight=False, markup=False)
+        if len(trials) == 1 and trial.failed:
+            begun = f"the search begins with numbers that fail: {runs.failures[0]}"
+            shown.print(begun, highlight=False, markup=False)
 
     # What each of many runs says of itself would hide what the search says.
     with Workers(workers, title=f"tune {controller}") as pool:
         runs = TuningRuns(task, on, file, folder, pool, given, seeds)
         best = search(begin, spec.tunable, runs, tell, rounds)
-        if not math.isfinite(best.cost):
+        if best.failed:
             raise BenchError(f"the controller fails with all numbers that were tried: {runs.failures[0]}")
         unseen = [
-            TuningRuns(task, on, file, folder / f"check-{seed}", pool, given, first_seed=seed)
+            TuningRuns(task, on, file, folder / f"check-{seed}", pool, given, first_seed=seed, scale=runs.scale)
             for seed in range(seeds, seeds + checks)
         ]
         first, best = confirm(trials, unseen)
@@ -153,8 +155,10 @@ def tune(
         "twin": on,
         "protocol": task.protocol,
         "settings": ", ".join(settings),
-        "cost": f"0.5 (as identified + worst margin) of RMS in % of the range + {TIME_WEIGHT:g} s a target; "
-        f"margins: gain and time constant by {MARGIN:g} to either side",
+        "cost": f"0.5 (as identified + worst margin) of RMS + {TIME_WEIGHT:g} time a target, as multiples of those "
+        f"before; margins: gain and time constant by {MARGIN:g} to either side",
+        "better": f"cost less by more than {ERRORS:g} standard errors in the same sessions, "
+        f"greatest RMS at most {WORST:g} times that before",
         "cost_before": first.cost,
         "cost_after": best.cost,
         "rms_before": first.rms,

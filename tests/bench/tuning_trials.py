@@ -5,8 +5,8 @@
 Each rig is characterized once. Each controller is tuned for the model, and brings its output to its targets in
 sessions whose noise and targets the tuning has not seen, with the numbers of model and rig file and with those of the
 tuning file. The table, for docs/reference/tuning.md, has median and worst over the sessions of the RMS error, and the
-median of the cost of one run by `bench tune`; then what supply and sensor of a muscle leave, and in how many sessions
-the cost with the tuning file is not the greater one. Exits with 1 if a median is worse with it.
+median of the cost of one run by `bench tune`, as multiples of today's means; then what supply and sensor of a muscle
+leave, and in how many sessions the cost with the tuning file is not greater. Exits with 1 if a median is worse with it.
 """
 
 from __future__ import annotations
@@ -135,8 +135,9 @@ def compared(case: Case, model: Path, tuning: str, folder: Path, sessions: int, 
     for run in runs:
         reached = reached_targets(run.result(), case.signal)
         rms = float(np.sqrt(np.mean((reached.outputs - reached.targets) ** 2)))
-        found.append((rms, cost_of(rms, float(reached.seconds.mean()), float(np.ptp(reached.targets)))))
-    return np.array(found).reshape(2, sessions, 2)
+        found.append((rms, float(reached.seconds.mean())))
+    scale = np.mean(found[:sessions], axis=0).tolist()
+    return np.array([(rms, cost_of(rms, seconds, scale)) for rms, seconds in found]).reshape(2, sessions, 2)
 
 
 def main() -> int:
