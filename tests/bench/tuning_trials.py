@@ -6,7 +6,7 @@ Each rig is characterized once. Each controller is tuned for the model, and brin
 sessions whose noise and targets the tuning has not seen, with the numbers of model and rig file and with those of the
 tuning file. The table, for docs/reference/tuning.md, has median and worst over the sessions of the RMS error, and the
 median of the cost of one run by `bench tune`, as multiples of today's means; then what supply and sensor of a muscle
-leave, and in how many sessions the cost with the tuning file is not greater. Exits with 1 if a median is worse with it.
+leave, and in how many sessions the cost with the tuning file is not greater. Exits with 1 if a median is worse.
 """
 
 from __future__ import annotations
