@@ -29,7 +29,7 @@ from bench.identification import identify
 from bench.identification.cholesky_factor import CholeskyFactor
 from bench.identification.collapse import collapse
 from bench.identification.least_squares import fit
-from bench.timed import BoucWenOscillator, Hammerstein, LinearPart, PreisachOscillator
+from bench.timed import BoucWenOscillator, Hammerstein, LinearPart, PreisachOscillator, RateDependentPlays
 from bench.transients.actuator import identify_actuator
 from bench.transients.recording import Recording
 from bench.transients.response import late_parts
@@ -146,6 +146,9 @@ def timed() -> None:
     BoucWenOscillator(1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0, (0.0, 1.0), "linear").evaluate(times, inputs)
     force = Preisach(uniform_levels(-1.0, 1.0, 4), np.zeros(10), reversible=QuadraticTerm(1.0))
     PreisachOscillator(1.0, 1.0, force, 0.0, (0.0, 1.0), "linear").evaluate(times, inputs)
+    slow = RateDependentPlays(np.array([0.0, 0.2]), np.array([0.0, 0.5]), np.ones(2), (0.0, 1.0))
+    slow.columns(times, inputs)
+    slow.follow(times, slow.evaluate(times, inputs))
 
 
 def laboratories() -> None:

@@ -140,8 +140,8 @@ def _value(text: str) -> Any:  # noqa: ANN401 - a number, numbers or a word
 
 
 def inverse_of(spec: ModelSpec) -> str:
-    """Return how the operators of a model are inverted: exact, by a table, or numerical; none with time."""
-    return "none" if spec.template is None else str(getattr(spec.model, "inverse_method", ""))
+    """Return how a model is inverted: exact, by a table, numerical, or none."""
+    return str(getattr(spec.model, "inverse_method", "none"))
 
 
 def options_json(spec: ModelSpec) -> dict[str, dict[str, str]]:

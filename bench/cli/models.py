@@ -348,7 +348,8 @@ def invert(
     only after saturation), `setpoint`, `predicted` (the model's output there) and `flag` (`met`, `too high` or
     `too low`; what cannot be met is clamped to the nearest reachable value). If the model has a prediction band, also
     its ends for the set-point, by the local slope, and for the output there. Of models with time `hammerstein`
-    without a delay is inverted, at the times of the targets (`--time`); `time` is the first column then.
+    without a delay and `rate-dependent-plays` are inverted, at the times of the targets (`--time`); `time` is the
+    first column then.
     """
     from bench.model_file import load_model
     from bench.results.bands import invert_band

@@ -33,9 +33,12 @@ class TimedModel(Model, ABC, Generic[S]):
     starts : tuple of str
         The words by which `start` knows states before a first sample; "skip" is the initial state where the first
         samples do not count.
+    inverse_method : str
+        How `follow` finds inputs: none, or exact.
     """
 
     starts: ClassVar[tuple[str, ...]] = ()
+    inverse_method: ClassVar[str] = "none"
 
     input_range: tuple[float, float]
     input_unit: str

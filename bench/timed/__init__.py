@@ -5,6 +5,7 @@ from bench.timed.hammerstein import Hammerstein, HammersteinState
 from bench.timed.linear_parts import FilterState, LinearPart, logarithmic_creep
 from bench.timed.oscillator import BoucWenOscillator, OscillatorState
 from bench.timed.preisach_oscillator import PreisachOscillator, PreisachOscillatorState
+from bench.timed.rate_dependent_plays import PlaysState, RateDependentPlays
 
 __all__ = [
     "BoucWenOscillator",
@@ -13,8 +14,10 @@ __all__ = [
     "HammersteinState",
     "LinearPart",
     "OscillatorState",
+    "PlaysState",
     "PreisachOscillator",
     "PreisachOscillatorState",
+    "RateDependentPlays",
     "identify_in_time",
     "logarithmic_creep",
 ]

@@ -82,6 +82,7 @@ class Hammerstein(TimedModel[HammersteinState]):
 
     kind: ClassVar[str] = "hammerstein"
     starts: ClassVar[tuple[str, ...]] = ("negative", "positive", "skip")
+    inverse_method: ClassVar[str] = "exact"
     parts: ClassVar[Parts] = {"static": operator_from_json, "linear": LinearPart.from_json}
 
     static: Operator[Any]

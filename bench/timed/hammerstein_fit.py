@@ -26,6 +26,7 @@ from bench.identification.measures import measure_errors
 from bench.identification.orientation import NAMES, Orientation, has_orientation
 from bench.timed.hammerstein import Hammerstein, HammersteinState
 from bench.timed.linear_parts import LinearPart, logarithmic_creep
+from bench.timed.parsimony import WORTH, chance_of, check_size, deviations_of, is_worth
 
 ELEMENTS = ("lag", "resonance", "delay", "creep", "kelvin-voigt", "drift", "fading-drift")
 """What can follow the operator: see `identify_hammerstein`."""
@@ -38,10 +39,8 @@ _EXCLUSIVE = ({"lag", "resonance"}, {"creep", "kelvin-voigt"}, {"drift", "fading
 # Numbers of a regressor up to which the shape of the operator is found anew with what follows it, and the relative
 # step of its differences.
 _RESHAPED, _STEP_OF_SHAPE = 500_000, 1e-6
-# Part by which an element must lower the RMS error, if nobody asked for it. A drift belongs to one record only.
-_WORTH, _WORTH_OF_DRIFT = 0.005, 0.2
-# Greatest regressor, numbers; 400 MB.
-_LARGEST = 50_000_000
+# Part by which a drift, which belongs to one record only, must lower the RMS error.
+_WORTH_OF_DRIFT = 0.2
 # Rounds of search and constrained fit, and the relative gain of the cost at which they end.
 _ROUNDS, _GAIN = 6, 1e-7
 _STARTS, _EVALUATIONS = 3, 40
@@ -429,12 +428,7 @@ def set_up_search(
     problem = set_up_problem(
         static, inputs, outputs, weights, skip, 0.0, initial, dict(options), orientation=orientation
     )
-    if math.prod(problem.regressor.shape) > _LARGEST:
-        rows, count = problem.regressor.shape
-        size = 8e-9 * rows * count
-        raise ValueError(
-            f"{rows} rows and {count} coefficients take {size:.1f} GB; give fewer levels, or every nth row"
-        )
+    check_size(*problem.regressor.shape, "levels")
     # The output of a lag may fall while the operator rises: the sign is found with the linear part.
     oriented = has_orientation(problem.spec, problem.template)
     signs: tuple[Literal[1, -1], ...] = (1, -1) if oriented and orientation == "auto" else (problem.orientation,)
@@ -450,7 +444,7 @@ def choose_elements(search: Search, among: Sequence[str] = CHOICE) -> tuple[Sear
     """
     found = _best(search, ())
     used = max(int(np.count_nonzero(search.roots)), 1)
-    chance = 2.0 * math.log(used) / used
+    chance = chance_of(used)
     shortest, longest = search.creep_span
     while found.cost > 0.0:
         basis, trials = search.principal[:, :_FREE], []
@@ -468,9 +462,7 @@ def choose_elements(search: Search, among: Sequence[str] = CHOICE) -> tuple[Sear
             reshaped, best = _reshaped(search, _best(search, least.elements, found, rounds=1))
         added = set(best.elements) - set(found.elements)
         more = max(_count(best) - _count(found), 1)
-        gain = _log_cost(found) - _log_cost(best)
-        worth = _WORTH_OF_DRIFT if "drift" in added else _WORTH
-        if not gain > max(-2.0 * math.log1p(-worth), more * chance):
+        if not is_worth(found.cost, best.cost, more, used, _WORTH_OF_DRIFT if "drift" in added else WORTH):
             break
         search, found = reshaped, best
         # Beside what was added, an earlier element may be worth no more than chance.
@@ -536,7 +528,7 @@ def _reshaped(search: Search, found: Found) -> tuple[Search, Found]:
         return search, found
     other = replace(search, static=static, columns=static.regressor.dense())
     freedom = max(search.times.size - fitted.coefficients.size - end.x.size - 1, 1)
-    deviations = _deviations(np.asarray(end.jac), cost / freedom)[count:]
+    deviations = deviations_of(np.asarray(end.jac), cost / freedom)[count:]
     return other, Found(found.elements, np.asarray(end.x[count:]), fitted, cost, deviations)
 
 
@@ -638,12 +630,5 @@ def _search(
     )
     values = np.asarray(end.x)
     freedom = max(search.times.size - basis.shape[1] - values.size - 1, 1)
-    deviations = _deviations(np.asarray(end.jac), 2.0 * end.cost / freedom)
+    deviations = deviations_of(np.asarray(end.jac), 2.0 * end.cost / freedom)
     return values, deviations, 2.0 * float(end.cost)
-
-
-def _deviations(slopes: Floats, variance: float) -> Floats:
-    """Return standard deviations of parameters; infinite where the residuals do not depend on one."""
-    covariance = np.linalg.pinv(slopes.T @ slopes) * variance
-    flat = np.linalg.norm(slopes, axis=0) <= 1e-12 * max(float(np.linalg.norm(slopes)), 1e-300)
-    return np.where(flat, np.inf, np.sqrt(np.diag(covariance)))

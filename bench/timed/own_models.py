@@ -9,6 +9,8 @@ from bench.timed.oscillator import BoucWenOscillator
 from bench.timed.oscillator_fit import identify_bouc_wen_oscillator
 from bench.timed.preisach_oscillator import PreisachOscillator
 from bench.timed.preisach_oscillator_fit import identify_preisach_oscillator
+from bench.timed.rate_dependent_plays import RateDependentPlays
+from bench.timed.rate_dependent_plays_fit import identify_rate_dependent_plays
 
 HAMMERSTEIN = ModelSpec(
     "an operator, then lag or resonance, delay, creep and drift; needs the time of each row",
@@ -24,4 +26,9 @@ PREISACH_OSCILLATOR = ModelSpec(
     "a mass on a damper and a Preisach force with a spring; needs the time of each row",
     PreisachOscillator,
     fit_in_time=identify_preisach_oscillator,
+)
+RATE_DEPENDENT_PLAYS = ModelSpec(
+    "weighted plays whose thresholds grow with their rate, for loops that widen with it; needs the time of each row",
+    RateDependentPlays,
+    fit_in_time=identify_rate_dependent_plays,
 )

@@ -29,6 +29,7 @@ _OF_MODELS = {
     "maxwell-slip": "#44aa99",
     "polynomial-plays": "#aa4499",
     "hammerstein": "#a0522d",
+    "rate-dependent-plays": "#6b8e23",
     "preisach-oscillator": "#4b6fa5",
     "bouc-wen-oscillator": "#c04070",
     "two-stage": "#d55e00",

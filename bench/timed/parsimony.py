@@ -1,0 +1,54 @@
+"""What searches for the parameters of models with time share: size, worth of a parameter, standard deviations."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from bench.hysteresis._checks import Floats
+
+WORTH = 0.005
+"""Part by which something that nobody asked for must lower the RMS error."""
+
+# Greatest regressor, numbers; 400 MB.
+_LARGEST = 50_000_000
+
+
+def check_size(rows: int, count: int, fewer: str) -> None:
+    """Raise ValueError if a regressor of rows and coefficients is too large; `fewer` names what to give less of."""
+    if rows * count > _LARGEST:
+        size = 8e-9 * rows * count
+        raise ValueError(
+            f"{rows} rows and {count} coefficients take {size:.1f} GB; give fewer {fewer}, or every nth row"
+        )
+
+
+def is_worth(before: float, after: float, parameters: int, used: int, worth: float = WORTH) -> bool:
+    """Return whether parameters lower a sum of squares by more than they would by chance.
+
+    Parameters
+    ----------
+    before, after : float
+        The sums of squares, > 0 and >= 0.
+    parameters : int
+        How many more there are.
+    used : int
+        Number of samples that count.
+    worth : float
+        Least part by which they must lower the RMS error, too.
+    """
+    gain = math.log(max(before, 1e-300)) - math.log(max(after, 1e-300))
+    return gain > max(-2.0 * math.log1p(-worth), parameters * chance_of(used))
+
+
+def chance_of(used: int) -> float:
+    """Return by how much a parameter lowers the logarithm of a sum of squares over `used` samples by chance."""
+    return 2.0 * math.log(used) / used
+
+
+def deviations_of(slopes: Floats, variance: float) -> Floats:
+    """Return standard deviations of parameters; infinite where the residuals do not depend on one."""
+    covariance = np.linalg.pinv(slopes.T @ slopes) * variance
+    flat = np.linalg.norm(slopes, axis=0) <= 1e-12 * max(float(np.linalg.norm(slopes)), 1e-300)
+    return np.where(flat, np.inf, np.sqrt(np.diag(covariance)))
