@@ -14,12 +14,17 @@ CONTROLLED = {table.name: table for table in ROBUSTNESS.runs if "model" in table
 
 
 @pytest.fixture(scope="module")
-def renewal():
+def of_docs():
     sys.path.insert(0, str(ROOT / "docs"))
     try:
-        yield importlib.import_module("renew_controllers")
+        yield importlib.import_module
     finally:
         sys.path.remove(str(ROOT / "docs"))
+
+
+@pytest.fixture(scope="module")
+def renewal(of_docs):
+    return of_docs("renew_controllers")
 
 
 def row(status="completed", reason="", rms="2e-6", **more):
@@ -93,3 +98,40 @@ def test_followers_have_a_row_for_each_rig_and_reference(renewal):
         "| `hybrid`, nm | sine, 6 s | 15 / 15 | 15 / 15 |",
         "| `sma`, µm | file | 0.015 / 0.015 | 0.015 / 0.015 |",
     ]
+
+
+def test_the_table_of_the_choice_shows_each_ratio_and_counts_those_within_the_bound(of_docs):
+    table = of_docs("renew_selection").table
+    outcome = of_docs("selection_quality").Outcome
+
+    def found(error):
+        return outcome("duhem, degree 5", error, "duhem, degree 7", 1.0, 3.0, 9.0)
+
+    shown = table(
+        {("duhem", "mixed"): found(1.1), ("duhem", "drift"): found(1.3), ("butterfly", "mixed"): found(1.0)}
+    )
+    assert shown.splitlines() == [
+        "| record | duhem | butterfly |",
+        "| --- | --- | --- |",
+        "| mixed | 1.10 / 1.00, 1.10 | 1.00 / 1.00, 1.00 |",
+        "| drift | 1.30 / 1.00, **1.30** |  |",
+        "",
+        "Within 1.2 times the best: 2 of 3.",
+    ]
+
+
+def test_a_case_is_measured_once_in_one_state_of_the_code(of_docs, tmp_path, monkeypatch):
+    renewal = of_docs("renew_selection")
+    measured = []
+
+    def choose(one):
+        measured.append(one)
+        return renewal.Outcome("a", 2.0, "b", 1.0, 3.0, 9.0)
+
+    monkeypatch.setattr(renewal, "choose", choose)
+    found = [renewal.outcome(tmp_path, "duhem", "60 samples", lambda: "case") for _ in range(2)]
+    assert measured == ["case"]
+    assert found[0] == found[1]
+    monkeypatch.setattr(renewal, "STATE", "another")
+    renewal.outcome(tmp_path, "duhem", "60 samples", lambda: "case")
+    assert len(measured) == 2

@@ -1,0 +1,242 @@
+"""Records on which the model that `bench identify` chooses is compared with the best of a grid of settings.
+
+Each is of one kind, from a plant of its own structure, with noise of 1 % of the range. Errors are those on other
+random reversals, without noise, in % of the range. The grid is what somebody could set by hand who knew the errors:
+no choice from the record alone can always reach it.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.hysteresis import identifiable_models
+from bench.identification.by_name import set_up_problem
+from bench.identification.evaluation import Candidate, Measurements
+from bench.identification.selection import select
+from bench.results.selection import MOST_ROWS
+from bench.timed import identify_in_time
+from bench.timed.held_out import HeldOutInTime
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "identification"))
+
+from hysteretic_plants import PLANTS, butterfly, damped, random_reversals, settled, through
+
+Floats = NDArray[np.float64]
+
+KINDS = (
+    "damped", "mixed", "falling", "virgin", "positive start", "minor loops", "drift", "missing", "60 samples",
+    "100 Hz after 20 Hz", "major loop",
+)  # fmt: skip
+CASES = [*product(PLANTS, KINDS), *product(("butterfly",), ("mixed", "drift"))]
+ROWS = 1500
+MEASURED = ("another session", "re-zeroed", "negated", "first 60 rows")
+"""Kinds of cases of measured sessions."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """A record and another sequence with the true outputs."""
+
+    inputs: Floats
+    outputs: Floats
+    others: Floats
+    truth: Floats
+    continues: bool = False
+    rezeroed: bool = False
+    step: float | None = None
+    """Between rows, s, for models with time."""
+    other_step: float = 0.0
+
+    def error(self, one: Candidate) -> float:
+        """Return the error of a candidate on the other sequence, % of the range."""
+        known = Measurements.of(self.inputs, self.outputs).known if one.initial == "skip" else 0
+        if self.step is not None and one.model == "hammerstein":
+            signs = {} if one.orientation == "auto" else {"orientation": one.orientation}
+            model = identify_in_time(
+                one.model, self.step * np.arange(self.inputs.size), self.inputs, self.outputs, skip=known,
+                initial=one.initial, **signs, **one.options,
+            ).model  # fmt: skip
+            return self._error(model.evaluate(self.other_step * np.arange(self.others.size), self.others))
+        problem = set_up_problem(
+            one.model, self.inputs, self.outputs, None, known, one.smoothing or 0.0, one.initial, dict(one.options),
+            orientation=one.orientation,
+        )  # fmt: skip
+        penalties = problem.regularization(one.smoothing, None if one.smoothing is None else 0.0)
+        found = problem.fit(penalties.smoothing, ridge=penalties.ridge)
+        model = problem.template.with_coefficients(found.coefficients, found.bias)
+        state = model.advance(problem.state, self.inputs) if self.continues else None
+        return self._error(model.evaluate(self.others, state))
+
+    def _error(self, predicted: Floats) -> float:
+        errors = self.truth - predicted
+        # What came before another sequence is unknown, until it has overwritten it.
+        errors = errors if self.continues else errors[Measurements.of(self.others, self.truth).known :]
+        errors = errors - errors.mean() if self.rezeroed else errors
+        return float(100.0 * np.sqrt(np.mean(errors**2)) / np.ptp(self.truth))
+
+
+def case(kind: str, plant_name: str, seed: int) -> Case:
+    """Return a record of one kind from one plant."""
+    rng = np.random.default_rng(seed)
+    raw = butterfly if plant_name == "butterfly" else PLANTS[plant_name]
+    plant = partial(settled, raw)
+    others, mixed = random_reversals(rng, ROWS, 60), random_reversals(rng, ROWS, 40)
+
+    def noisy(outputs: Floats) -> Floats:
+        return outputs + 0.01 * np.ptp(outputs) * rng.standard_normal(outputs.size)
+
+    usual = Case(mixed, noisy(plant(mixed)), others, plant(others))
+    if kind == "damped":
+        return replace(usual, inputs=damped(ROWS, 30), outputs=noisy(plant(damped(ROWS, 30))))
+    if kind == "falling":
+        return replace(usual, outputs=-usual.outputs, truth=-usual.truth)
+    if kind == "virgin":
+        return replace(usual, outputs=noisy(raw(mixed)))
+    if kind == "positive start":
+        return replace(usual, inputs=-mixed, outputs=noisy(plant(np.append(1.0, -mixed))[1:]))
+    if kind == "minor loops":
+        first, second = (through([0.0, *rng.uniform(-0.5, 0.5, 50)], ROWS) for _ in range(2))
+        whole = plant(np.concatenate([[1.0], first, second]))[1:]
+        return Case(first, noisy(whole[:ROWS]), second, whole[ROWS:], continues=True)
+    if kind == "drift":
+        drift = 0.05 * np.ptp(usual.truth) * np.linspace(0.0, 1.0, ROWS)
+        truth = usual.truth + drift
+        return replace(usual, outputs=usual.outputs + drift, truth=truth, rezeroed=True, step=0.01, other_step=0.01)
+    if kind == "100 Hz after 20 Hz":
+        slow = 1.0 / (20 * 2 * ROWS / 40)
+        outputs, truth = (lagged(plant(each), step) for each, step in ((mixed, slow), (others, slow / 5.0)))
+        return Case(mixed, noisy(outputs), others, truth, step=slow, other_step=slow / 5.0)
+    if kind == "major loop":
+        ends = through([0.0, *[1.0, -1.0] * 10], ROWS)
+        return replace(usual, inputs=ends, outputs=noisy(plant(ends)))
+    if kind == "missing":
+        kept = np.sort(rng.permutation(ROWS)[: ROWS * 4 // 5])
+        return replace(usual, inputs=mixed[kept], outputs=usual.outputs[kept])
+    if kind == "60 samples":
+        few = random_reversals(rng, 60, 8)
+        return replace(usual, inputs=few, outputs=noisy(plant(few)))
+    return usual
+
+
+def measured_case(folder: Path, kind: str) -> Case:
+    """Return a case of two measured sessions: identification.csv and validation.csv with time, input and output."""
+    first, second = (
+        np.loadtxt(folder / f"{name}.csv", delimiter=",", skiprows=1) for name in ("identification", "validation")
+    )
+    usual = Case(first[:, 1], first[:, 2], second[:, 1], second[:, 2], rezeroed="re-zeroed" in kind)
+    if "negated" in kind:
+        return replace(usual, outputs=-usual.outputs, truth=-usual.truth)
+    if "first 60 rows" in kind:
+        return replace(usual, inputs=usual.inputs[:60], outputs=usual.outputs[:60])
+    return usual
+
+
+def lagged(outputs: Floats, step: float, time_constant: float = 1e-3) -> Floats:
+    """Return the response of a first-order lag that is settled at first, to straight lines between the samples."""
+    kept, found = np.exp(-step / time_constant), outputs.copy()
+    for n in range(1, outputs.size):
+        # The lag follows a ramp at a distance of its slope times the time constant.
+        behind = (outputs[n] - outputs[n - 1]) / step * time_constant
+        found[n] = outputs[n] - behind + (found[n - 1] - outputs[n - 1] + behind) * kept
+    return found
+
+
+def grid_in_time() -> Iterator[Candidate]:
+    """Yield the settings of models with time that are tried by hand."""
+    statics: list[dict[str, object]] = [
+        {"static": "preisach", "levels": 10},
+        {"static": "preisach", "levels": 20},
+        {"static": "prandtl-ishlinskii", "plays": 15},
+        {"static": "generalized-prandtl-ishlinskii"},
+        {"static": "bouc-wen"},
+        *({"static": "duhem", "degree": degree} for degree in (3, 5, 7)),
+    ]
+    for static, elements, memory in product(statics, ("drift", "lag", "delay", "creep"), (None, "skip")):
+        yield Candidate("hammerstein", {**static, "dynamics": elements}, "auto", memory)
+
+
+def grid() -> Iterator[Candidate]:
+    """Yield the settings that are tried by hand."""
+    kinds, memories, signs = ("none", "linear", "polynomial"), (None, "positive", "skip"), ("rising", "falling")
+    for levels, kind, memory in product((10, 20, 40), kinds, memories):
+        options = {"levels": levels, "reversible": kind}
+        for weight, sign in product((0.0, 1e-2, 1.0), signs):
+            yield Candidate("preisach", options, sign, memory, weight)
+        yield Candidate("preisach-signed", options, "auto", memory, None)
+    for plays, zones, sign, memory in product((5, 15, 30), (0, 4), signs, (None, "skip")):
+        yield Candidate("prandtl-ishlinskii", {"plays": plays, "dead_zones": zones}, sign, memory)
+    for degree, plays, memory in product((1, 3, 5), (2, 3, 5), (None, "skip")):
+        yield Candidate("polynomial-plays", {"degree": degree, "plays": plays}, "auto", memory)
+    for degree in (1, 3, 5, 8, 12):
+        yield Candidate("polynomial", {"degree": degree}, "auto")
+    others: list[tuple[str, dict[str, object]]] = [
+        ("bouc-wen", {}),
+        ("generalized-prandtl-ishlinskii", {}),
+        *(("duhem", {"degree": degree}) for degree in (3, 5, 7)),
+        *(("krasnoselskii-pokrovskii", {"levels": levels}) for levels in (10, 20)),
+        *(("maxwell-slip", {"elements": elements}) for elements in (5, 15)),
+    ]
+    for (model, options), memory in product(others, memories):
+        yield Candidate(model, options, "auto", memory)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What was chosen for a case, beside the best by hand; errors in % of the range."""
+
+    chosen: str
+    error: float
+    best: str
+    least: float
+    simple: float
+    """Error of a cubic with three plays."""
+    seconds: float
+    """CPU time of the choice."""
+
+    @property
+    def ratio(self) -> float:
+        """Error of the choice by that of the best."""
+        return self.error / self.least
+
+
+def choose(one: Case) -> Outcome:
+    """Choose a model for a case, and find the best by hand."""
+    measured = Measurements.of(one.inputs, one.outputs)
+    in_time = None
+    if one.step is not None:
+        in_time = HeldOutInTime(measured, one.step * np.arange(one.inputs.size), one.inputs.size)
+    begin = time.process_time()
+    found = select(measured.thinned(MOST_ROWS), tuple(identifiable_models()), in_time=in_time)
+    seconds = time.process_time() - begin
+    chosen = found.chosen.candidate
+    by_hand = [chosen, *grid(), *(each.candidate for each in found.evaluations if each.blocks)]
+    by_hand += grid_in_time() if one.step is not None else ()
+
+    def error(candidate: Candidate) -> float:
+        # Of a setting that a record does not allow, somebody would try another.
+        try:
+            return one.error(candidate)
+        except ValueError:
+            return float("inf")
+
+    errors = [error(candidate) for candidate in by_hand]
+    least = int(np.argmin(errors))
+    simple = one.error(Candidate("polynomial-plays", {"degree": 3, "plays": 3}, "auto"))
+    return Outcome(describe(chosen), errors[0], describe(by_hand[least]), errors[least], simple, seconds)
+
+
+def describe(one: Candidate) -> str:
+    """Return a model with its settings in a line."""
+    settings = [f"{name} {value}" for name, value in one.options.items()]
+    settings += [f"start {one.initial}"] if one.initial else []
+    settings += [f"smooth {one.smoothing:g}"] if one.smoothing else []
+    return ", ".join([one.model, *settings])
