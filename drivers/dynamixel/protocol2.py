@@ -136,13 +136,14 @@ class ServoLine:
                 self._received.clear()
                 forget_received(self._port)
                 self._port.write(request)
-                problem, error, content = self._answer(length)
+                problem, answer = self._answer(length)
                 if problem == "":
                     self.answered = True
+                    error = answer[0]
                     self.alert = bool(error & _ALERT)
                     if error & ~_ALERT:
                         raise RefusedError(error & ~_ALERT)
-                    return content
+                    return answer[1:]
             self._expect_late()
         except (serial.SerialException, OSError) as error:
             raise lost_line(self._device, self._settings, error) from None
@@ -152,8 +153,8 @@ class ServoLine:
         """Take note that an answer to what is sent now may come late."""
         self._quiet_at = self._clock.now() + _LATEST * self._settings.timeout
 
-    def _answer(self, length: int) -> tuple[str, int, bytes]:
-        """Return what is wrong with the answer, if anything, its error byte and its content."""
+    def _answer(self, length: int) -> tuple[str, bytes]:
+        """Return what is wrong with the answer, if anything; its error byte and its content."""
         ended = False
         if not self._received:
             # As a rule the answer comes whole, and nothing else does.
@@ -161,7 +162,7 @@ class ServoLine:
             data = self._port.read(expected)
             whole = len(data) == expected and data.startswith(self._answer_head(length))
             if whole and not data[8] & ~_ALERT and crc(data[:-2]) == data[-2] | data[-1] << 8:
-                return "", data[8], data[9:-2]
+                return "", data[8:-2]
             self._received += data
             ended = len(data) < expected
         return self._search_answer(length, ended)
@@ -173,25 +174,27 @@ class ServoLine:
             head = self._heads[length] = _HEADER + struct.pack("<BHB", self._settings.id, length + 4, _STATUS)
         return head
 
-    def _search_answer(self, length: int, ended: bool) -> tuple[str, int, bytes]:
+    def _search_answer(self, length: int, ended: bool) -> tuple[str, bytes]:
         """Look for the answer among what has come and comes; `ended` is whether the line has just been silent."""
         for _ in range(_MOST_STRAY_PACKETS):
             packet = self._read_packet(_SHORTEST_ANSWER + length, ended)
             ended = False
             if packet is None:
-                return self._silence, 0, b""
+                return self._silence, b""
             if packet == b"":
-                return "damaged answer", 0, b""
+                return "damaged answer", b""
             if packet[4] != self._settings.id or packet[_HEAD] != _STATUS:
                 continue
-            body = packet[_HEAD:-2].replace(b"\xff\xff\xfd\xfd", b"\xff\xff\xfd")
-            error, content = body[1] if len(body) > 1 else 0, body[2:]
-            if error & ~_ALERT == _CRC_ERROR:
-                return STATUS_ERRORS[_CRC_ERROR], 0, b""
-            if not error & ~_ALERT and len(content) != length:
-                return f"answer of {len(content)} instead of {length} bytes", 0, b""
-            return "", error, content
-        return "only packets of others", 0, b""
+            answer = packet[_HEAD + 1 : -2].replace(b"\xff\xff\xfd\xfd", b"\xff\xff\xfd")
+            if not answer:
+                return "answer without an error number", b""
+            error = answer[0] & ~_ALERT
+            if error == _CRC_ERROR:
+                return STATUS_ERRORS[_CRC_ERROR], b""
+            if not error and len(answer) != 1 + length:
+                return f"answer of {len(answer) - 1} instead of {length} bytes", b""
+            return "", answer
+        return "only packets of others", b""
 
     def _read_packet(self, expected: int, ended: bool) -> bytes | None:
         """Return the next packet, None after silence, nothing for a damaged one.

@@ -1347,6 +1347,22 @@ def test_heads_that_are_none_are_passed_over(script, servo, clock, head, request
     assert requests == 2 or clock.now() - before < 0.02
 
 
+@pytest.mark.parametrize(("instruction", "parameters", "length"), [(0x01, "", 3), (0x03, "620005", 0)])
+@pytest.mark.parametrize(("noise", "requests"), [(1023, 1), (1024, 2)])
+def test_less_than_a_kilobyte_of_noise_is_passed_over(script, clock, instruction, parameters, length, noise, requests):
+    line = ServoLine("servo", make_settings(), clock)
+    script.instead = [lambda _sent, right: b"\x00" * noise + right]
+    line.ask(instruction, bytes.fromhex(parameters), length)
+    assert len(script.received) == requests
+
+
+def test_an_acknowledgement_without_an_error_number_is_asked_for_again(script, clock):
+    line = ServoLine("servo", make_settings(), clock)
+    script.instead = [packet(1, 0x55)]
+    line.order(0x03, bytes.fromhex("620005"))
+    assert len(script.received) == 2
+
+
 def test_noise_without_end_is_over_after_a_kilobyte(script, servo, clock):
     script.instead = [b"\x00" * 3000] * 3
     before = clock.now()
