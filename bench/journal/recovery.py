@@ -130,8 +130,8 @@ def _state(
     table: str, good: Mapping[Any, Entry], bad: Sequence[Any], whole: Mapping[Any, Entry], count: int | None
 ) -> TableState:
     added = len(whole) - len(good)
-    lacking = {key for key in bad if key not in good} | (set(whole) - set(good))
-    missing = {key for key in bad if key not in whole}
+    lacking = set(bad) | (set(whole) - set(good))
+    missing = set(bad) - set(whole)
     if table in FIRST:
         start = FIRST[table]
         numbers = [*whole, *(key for key in bad if isinstance(key, int)), start - 1]
