@@ -27,6 +27,7 @@ def test_inverse_by_samples_equals_the_inverse_operator(wanted):
     stroke = 9 * MICRO
     bounded = np.clip(MICRO * np.array(wanted), max(low - operator.bias, -stroke), min(high - operator.bias, stroke))
     inverse = PlayInverse(operator, stroke)
+    assert inverse.output == 0.0
     voltages = []
     for each, within in zip(wanted, bounded, strict=True):
         voltages.append(inverse.input(each * MICRO))

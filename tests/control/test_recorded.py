@@ -6,6 +6,7 @@ The numbers of the studies stay what they are only if those of the controllers d
 
 import json
 import math
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from bench.control.latched import Latched, LatchParameters
 from bench.control.loops import FollowReference
 from bench.control.model_filters import model_filter
 from bench.control.notch_loop import NotchLoop, NotchLoopParameters
-from bench.control.predictive import PredictiveFollower
+from bench.control.predictive import PredictionParameters, PredictiveFollower
 from bench.control.references import (
     AddedSine,
     ApproachedReference,
@@ -63,14 +64,18 @@ def mixed(model):
 
 
 class Plant:
-    """A model behind an input with a lag, or of second order, with an offset and noise of the output."""
+    """A model behind an input with a lag, or of second order, with an offset and noise of the output.
 
-    def __init__(self, model, *, gain=1.04, offset=1.5, lag=0.4, damping=0.0, seed=5):
+    The model may lag behind the input as well, by `behind` (s).
+    """
+
+    def __init__(self, model, *, gain=1.04, offset=1.5, lag=0.4, behind=0.0, damping=0.0, seed=5):
         self.model, self.gain, self.offset = model, gain, offset
-        self.lag, self.damping = lag, damping
+        self.lag, self.behind, self.damping = lag, behind, damping
         self.rng = np.random.default_rng(seed)
         self.state = model.initial_state()
         self.place, self.speed, self.t = self.state.input, 0.0, 0.0
+        self.seen = self.place
 
     def wait(self, setpoint, seconds):
         steps = max(1, round(seconds / 0.05))
@@ -82,7 +87,8 @@ class Plant:
                 self.place += dt * self.speed
             else:
                 self.place = setpoint + math.exp(-dt / self.lag) * (self.place - setpoint)
-            self.state = self.state.step(self.place)
+            self.seen = self.place + (math.exp(-dt / self.behind) * (self.seen - self.place) if self.behind else 0.0)
+            self.state = self.state.step(self.seen)
         self.t += seconds
 
     def read(self):
@@ -269,6 +275,26 @@ def spans():
     return Spans.of(film())
 
 
+def numbers():
+    """Return what the controllers take for a model if nothing else is said, and for an actuator that rests in 8 s."""
+    scaled = {
+        "closed loop": CorrectionParameters.scaled(spans()),
+        "following": FollowingParameters.scaled(spans()),
+        "predictive": PredictionParameters.scaled(spans(), 0.5),
+        "integral": IntegralParameters.scaled(spans(), 8.0),
+        "latched": LatchParameters.scaled(spans(), 8.0),
+        "latched, correction": Latched.correction(spans()),
+    }
+    return {
+        f"{controller}: {name}": list(value.values()) if isinstance(value, dict) else [value]
+        for controller, parameters in scaled.items()
+        for name, value in asdict(parameters).items()
+    }
+
+
+BEHIND = ResponseDynamics(lag=0.8)
+
+
 SCENES = {
     "open loop": lambda: reaching(OpenLoopInverse(film().inverse(), wait=1.5), Plant(film())),
     "open loop, overshooting": lambda: reaching(
@@ -289,6 +315,13 @@ SCENES = {
     ),
     "latched": lambda: reaching(latched(film()), Plant(film(), gain=1.0, lag=0.1), most=400),
     "latched, off by a gain": lambda: reaching(latched(film()), Plant(film(), gain=0.9, lag=0.1), most=250),
+    "open loop behind a lag": lambda: reaching(
+        OpenLoopInverse(film().inverse(), wait=1.5, response=BEHIND), Plant(film(), behind=0.8)
+    ),
+    "closed loop behind a lag": lambda: reaching(
+        ClosedLoopInverse(film().inverse(), response=BEHIND), Plant(film(), behind=0.8)
+    ),
+    "numbers": numbers,
     "look-up": lambda: reaching(LookUp(Polynomial([3.0, 0.4], (0.0, 10.0), 5.0), wait=8.0), Plant(film())),
     "integral": lambda: reaching(
         IntegralControl((0.0, 10.0), IntegralParameters.scaled(spans(), 8.0)), Plant(film())

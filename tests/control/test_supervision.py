@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bench.control.following import ClosedLoopFollower, OpenLoopFollower
-from bench.control.supervision import TARGETS, Supervised, SupervisedFollower
+from bench.control.supervision import SAMPLES, TARGETS, Supervised, SupervisedFollower
 from bench.control.tracking import ClosedLoopInverse, Command, CorrectionParameters, OpenLoopInverse, Trace
 from bench.control.tuning import Spans
 from bench.errors import ConvergenceError
@@ -140,10 +140,10 @@ def test_the_open_loop_goes_on_only_where_it_would_have_been_better():
     assert "leaves an error" in kept.take_notice()
 
 
-def missing(errors, **options):
+def missing(errors, disturbance=0.02, **options):
     """Have a controller err at target after target, in parts of the range; return its supervision."""
     inner = Contrary()
-    inner.trace = Trace(disturbance=0.02)
+    inner.trace = Trace(disturbance=disturbance)
     controller = Supervised(inner, LIMITS, 1.0, **options)
     for n, error in enumerate([*errors, 0.0]):
         controller.aim(error, float(n), 0.0, 0.0)
@@ -156,6 +156,32 @@ def test_one_missed_target_of_five_is_warned_of_and_two_end_the_run(options):
     assert "error is 0.134 RMS" in controller.take_notice()
     with pytest.raises(ConvergenceError, match=r"over 5 targets its error but for the greatest is 0\.15 RMS"):
         missing([0.0, 0.3, 0.0, 0.3, 0.0], **options)
+
+
+def verdict(error, disturbance, **options):
+    try:
+        return "warned of" if missing([error] * TARGETS, disturbance, **options).take_notice() else "borne"
+    except ConvergenceError:
+        return "the end"
+
+
+@pytest.mark.parametrize(
+    ("threshold", "disturbance", "options", "below", "above"),
+    [
+        (0.008, math.nan, {}, "borne", "warned of"),
+        (0.02, 0.0, {}, "warned of", "the end"),
+        (0.03, 0.03, {}, "warned of", "the end"),
+        (2.7 * 0.01, 0.01, {}, "warned of", "the end"),
+        (0.03, math.nan, {"holds": 0.03}, "borne", "the end"),
+        (0.05, math.nan, {"holds": 0.05}, "borne", "the end"),
+        (0.06, math.nan, {"holds": 0.1}, "borne", "warned of"),
+        (0.1, math.nan, {"holds": 0.1}, "warned of", "the end"),
+        (0.1, math.nan, {"holds": 0.2}, "borne", "warned of"),
+    ],
+)
+def test_errors_are_borne_warned_of_or_the_end_by_thresholds(threshold, disturbance, options, below, above):
+    assert verdict(threshold, disturbance, **options) == below
+    assert verdict(threshold * (1.0 + 1e-6), disturbance, **options) == above
 
 
 def test_a_specimen_that_changes_is_noticed_at_the_second_target_that_is_missed():
@@ -174,7 +200,7 @@ def test_targets_that_cannot_be_met_do_not_count():
     assert controller.take_notice() == "the target 0.1 cannot be met within the limits: missed by 10 % of the range"
 
 
-@pytest.mark.parametrize(("error", "options"), [(0.009, {}), (0.1, {"holds": 0.03})])
+@pytest.mark.parametrize(("error", "options"), [(0.01, {}), (0.1, {"holds": 0.03})])
 def test_a_target_that_is_nearly_met_or_by_an_open_loop_is_not_named(error, options):
     inner = Contrary()
     inner.reach = Reach.TOO_LOW
@@ -293,6 +319,55 @@ def test_a_follower_that_errs_by_more_than_its_model_is_stopped_or_replaced():
     follow(replaced, specimen, 300.0)
     assert replaced.gave_up
     assert follow(replaced, specimen, 300.0) < 0.15
+
+
+class Erring:
+    """A follower that is off by what its test says."""
+
+    state, reach = None, Reach.MET
+
+    def __init__(self, disturbance):
+        self.trace = Trace(disturbance=disturbance)
+
+    def update(self, *_):
+        return 0.0
+
+
+def verdict_of_samples(error, disturbance, samples=SAMPLES, **options):
+    """Return what becomes of a follower that errs at so many samples of a reference that moves at every second."""
+    controller = SupervisedFollower(Erring(disturbance), LIMITS, 1.0, **options)
+    reference = math.nan
+    try:
+        for k in range(2 * samples):
+            # What the output does while the reference stands does not count.
+            output, reference = (9.0, reference) if k % 2 else (reference + error, float(k % 4 == 0))
+            controller.update(float(k), 0.5, output, reference)
+        controller.update(math.nan, 0.5, reference + error, 0.5)
+    except ConvergenceError:
+        return "the end"
+    return "warned of" if controller.take_notice() else "borne"
+
+
+@pytest.mark.parametrize(
+    ("threshold", "disturbance", "options", "below", "above"),
+    [
+        (0.008, math.nan, {}, "borne", "warned of"),
+        (0.02, 0.0, {}, "warned of", "the end"),
+        (0.0225, 0.01, {}, "warned of", "the end"),
+        (0.075, math.nan, {"holds": 0.05}, "warned of", "the end"),
+        (0.06, math.nan, {"holds": 0.05}, "borne", "warned of"),
+    ],
+)
+def test_errors_of_a_follower_are_borne_warned_of_or_the_end_by_thresholds(
+    threshold, disturbance, options, below, above
+):
+    assert verdict_of_samples(threshold * (1.0 - 1e-6), disturbance, **options) == below
+    assert verdict_of_samples(threshold * (1.0 + 1e-6), disturbance, **options) == above
+    assert verdict_of_samples(1.0, disturbance, SAMPLES - 1, **options) == "borne"
+
+
+def test_a_follower_whose_model_errs_as_much_is_only_warned_of():
+    assert verdict_of_samples(0.5, 0.5) == "warned of"
 
 
 def test_a_follower_that_foresees_goes_on_doing_so_and_others_need_not():
