@@ -1349,7 +1349,9 @@ def test_heads_that_are_none_are_passed_over(script, servo, clock, head, request
 
 @pytest.mark.parametrize(("instruction", "parameters", "length"), [(0x01, "", 3), (0x03, "620005", 0)])
 @pytest.mark.parametrize(("noise", "requests"), [(1023, 1), (1024, 2)])
-def test_less_than_a_kilobyte_of_noise_is_passed_over(script, clock, instruction, parameters, length, noise, requests):
+def test_less_than_a_kilobyte_of_noise_is_passed_over(
+    script, clock, instruction, parameters, length, noise, requests
+):
     line = ServoLine("servo", make_settings(), clock)
     script.instead = [lambda _sent, right: b"\x00" * noise + right]
     line.ask(instruction, bytes.fromhex(parameters), length)
