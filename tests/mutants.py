@@ -122,7 +122,9 @@ class Mutator(ast.NodeTransformer):
         if isinstance(node.value, bool):
             return self._change(node, f"{node.value} to {not node.value}", lambda: ast.Constant(not node.value))
         if isinstance(node.value, int | float):
-            return self._change(node, f"{node.value} to {node.value + 1}", lambda: ast.Constant(node.value + 1))
+            # One more is the same float, if it is large.
+            other = node.value + 1 if node.value + 1 != node.value else 2 * node.value
+            return self._change(node, f"{node.value} to {other}", lambda: ast.Constant(other))
         return node
 
     def visit_JoinedStr(self, node):

@@ -46,8 +46,7 @@ class Approach:
                 "largest_step, tolerance, period: expected positive numbers, duration ≥ 0, got "
                 f"{self.largest_step}, {self.tolerance}, {self.period}, {self.duration}"
             )
-        self._start = self._setpoint = self._step = 0.0
-        self._output = 0.0
+        self._start = self._setpoint = self._step = self._output = math.nan
         self.trace = Trace(reference=self.target)
 
     def begin(self, t: float, measured_input: float, output: float, *others: float) -> Command:

@@ -28,7 +28,7 @@ class LimitCycleWatch:
         self._lower = low + _END * (high - low)
         self._upper = high - _END * (high - low)
         self._reference = math.nan
-        self._side = 0
+        self._side: int
         self.swings = 0
 
     def note(self, setpoint: float, reference: float) -> bool:

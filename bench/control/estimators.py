@@ -6,6 +6,8 @@ import math
 
 import numpy as np
 
+from bench.hysteresis._checks import Floats
+
 
 def agility_for(*, drift: float, noise: float, period: float) -> float:
     """Return the agility with which a `DriftEstimator` can tell that a drift is below a limit.
@@ -61,8 +63,8 @@ class DriftEstimator:
     def __init__(self, *, noise: float, agility: float) -> None:
         if not (0 < noise < math.inf and 0 < agility < math.inf):
             raise ValueError(f"noise, agility: expected positive numbers, got {noise} and {agility}")
-        self._state = np.zeros(2)
-        self._covariance = np.eye(2)
+        self._state: Floats
+        self._covariance: Floats
         self._noise = noise
         self._agility = agility
         self._time: float | None = None

@@ -177,7 +177,7 @@ class Latched(Correcting):
         self._operator = inverse.operator
         self.extreme: float | None = None
         """The input behind which the output is locked, input units; None while it is not."""
-        self._direction: Direction = 1
+        self._direction: Direction
         self.tries = 0
         """Number of approaches to the present target."""
         self._unlocked = 0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Protocol, runtime_checkable
@@ -190,10 +191,8 @@ class FollowReference:
         self._reference = reference
         self._period = period
         self._samples = max(1, round(duration / period))
-        self._sample = 0
-        self._start = 0.0
-        self._setpoint = 0.0
-        self._now = 0.0
+        self._sample: int
+        self._start = self._setpoint = self._now = math.nan
 
     def begin(self, t: float, measured_input: float, output: float, *others: float) -> Command:  # noqa: ARG002
         """Set the first set-point."""

@@ -141,7 +141,7 @@ class NotchLoop:
         self._wanted = math.nan
         self._setpoint = self._inverse.input(0.0)
         self._measured = math.nan
-        self._height = 0.0
+        self._height = math.nan
         self._rate = p.rate
         self._beyond = self._stopped = 0
 

@@ -87,7 +87,7 @@ class _Lag:
     """One lag of the response: what remains of a distance after a step of time, its level, memory and evidence."""
 
     remains: float
-    level: float = 0.0
+    level: float = math.nan
     stream: Any = None
     disturbance: float = math.nan
     surprise: float = 0.0

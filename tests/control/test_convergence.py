@@ -15,6 +15,15 @@ def test_a_limit_cycle_at_full_stroke_is_noticed_at_its_sixth_swing():
     assert cycles([0.0, 3.0] * 4) == [False] * MOST_SWINGS + [True, True]
 
 
+def test_swings_are_counted_from_the_beginning_of_each_reference():
+    watch = LimitCycleWatch(0.0, 3.0)
+    counts = [watch.swings]
+    for setpoint, reference in ((3.0, 1.0), (0.0, 1.0), (3.0, 1.0), (0.0, 2.0), (3.0, 2.0), (0.0, math.nan)):
+        watch.note(setpoint, reference)
+        counts.append(watch.swings)
+    assert counts == [0, 0, 1, 2, 0, 1, 0]
+
+
 def test_what_lies_between_the_ends_does_not_end_a_swing():
     assert cycles([0.1, 1.5, 2.9, 1.2, 1.8] * 5).index(True) == 5 * MOST_SWINGS // 2
 

@@ -96,6 +96,38 @@ def test_a_delay_that_makes_it_overshoot_ends_it():
         follow(5.0, delay=40)
 
 
+@pytest.mark.parametrize(
+    ("height", "beyond", "samples", "ends"),
+    [
+        (5.0, 0.051, 11, True),
+        (-5.0, 0.051, 11, True),
+        (5.0, 0.051, 10, False),
+        (5.0, 0.05, 40, False),
+        (1.0, 0.3, 11, True),
+        (0.999, 0.3, 40, False),
+    ],
+)
+def test_more_than_5_percent_beyond_a_step_for_more_than_half_a_millisecond_end_it(height, beyond, samples, ends):
+    # Steps below 5 % of the stroke, here 20, are not judged.
+    parameters = NotchLoopParameters(rate=RATE, integral=300.0, stroke=10.0)
+    loop = NotchLoop(STIFF, PUBLISHED_DYNAMICS.frequency, 0.0039, lambda t: height * (t > 0.0), parameters)
+
+    def see(overshoot, times):
+        for _ in range(times):
+            see.sample += 1
+            loop.update(see.sample / RATE, (height * (1.0 + overshoot),))
+
+    see.sample = 0
+    loop.update(0.0, (0.0,))
+    see(beyond, min(samples, 10))
+    see(0.0, 1)
+    if ends:
+        with pytest.raises(ConvergenceError, match=f"beyond a step of {height:g}"):
+            see(beyond, samples)
+    else:
+        see(beyond, samples)
+
+
 def test_an_actuator_at_the_end_of_its_stroke_ends_it():
     with pytest.raises(ConvergenceError, match=r"at the end of its stroke, 2 short of the reference 9"):
         follow(9.0, delay=0, gain=0.7)
