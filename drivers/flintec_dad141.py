@@ -308,8 +308,7 @@ class _Line:
 
     def _note_answer(self) -> None:
         now = self._clock.now()
-        if now - self._answered_at > self.longest_silence:
-            self.longest_silence = now - self._answered_at
+        self.longest_silence = max(self.longest_silence, now - self._answered_at)
         self._silent_since = self._answered_at = now
 
     def _catch_up(self) -> None:

@@ -52,7 +52,7 @@ _AT_REST = 0.5
 """What is left of a move when the specimen is at rest, in errors that are close enough."""
 _ON_TIME = 1e-6
 """Difference of times that are equal, s."""
-# Part of the output at stake within which a clipped answer still counts as met.
+# Part of the output's range within which a clipped answer still counts as met.
 _CLOSE = 1e-9
 
 
@@ -255,7 +255,9 @@ class ControllerBase:
             self._memory, self._move = stream, stream.step
             present = model.present_input(stream.state)
             self._plausible_input = widened(*model.input_range)
-            self._plausible_output = widened(*model.output_range())
+            least, greatest = model.output_range()
+            self._plausible_output = widened(least, greatest)
+            self._close = _CLOSE * (greatest - least)
         self._setpoint = self._clip(present)
         self._started = model is not None
         self._reach = Reach.MET
@@ -347,7 +349,7 @@ class ControllerBase:
         self._reach = reach
         if setpoints != found and self._model is not None:
             short = target - float(self._model.evaluate(setpoints, self.state)[-1])
-            if abs(short) > _CLOSE * (abs(target) + 1.0):
+            if abs(short) > self._close:
                 self._reach = Reach.TOO_HIGH if short > 0.0 else Reach.TOO_LOW
         return setpoints
 

@@ -286,7 +286,7 @@ class LabJackT7:
                 with connection.lock:
                     if self._in_haste:
                         connection.client.wait_for(timeout)
-                    if self._owner and not self._unchecked:
+                    if self.checks_owner:
                         self._check_instrument(connection.client)
                     elif not is_new:
                         # The instrument may have restarted since the other devices last used it.
@@ -439,7 +439,7 @@ class LabJackT7:
             reply = self._again(error, packet.name, lambda client: client.request(packet.request, packet.size))
         values = packet.reply.unpack(reply)
         owner = values[-1]
-        if owner != self._owner and self._owner and not self._unchecked:
+        if owner != self._owner and self.checks_owner:
             self._check_owner(owner)
         return values[:-1]
 

@@ -8,7 +8,7 @@ from bench.engine import Engine
 from bench.errors import DeviceError, SettleTimeoutError
 from bench.interrupts import Interrupts
 from bench.journal import FILE_NAME, Journal, Record
-from bench.protocol import Arrived, Dwell, ProtocolParameters, Step, UntilSteady, plan, protocol
+from bench.protocol import Arrived, Dwell, Prompt, ProtocolParameters, Step, UntilSteady, plan, protocol
 from bench.rig import Rig
 from bench.rig_file import load_rig
 from bench.settling import Settled
@@ -58,6 +58,16 @@ class TestOnTheHeater:
     def test_nothing_sent_has_arrived(self, rig_file, tmp_path):
         _, records = run(tmp_path, rig_file(), Step({}, Arrived()))
         assert (records[0][0].settled, records[0][0].finished) == (Settled.ARRIVED, 0.0)
+
+    def test_what_was_sent_before_a_prompt_need_not_have_arrived_after_it(self, rig_file, tmp_path):
+        path = rig_file(("noise = 0.002", "noise = 0.002\ntime_constant = 100.0"))
+        by_hand = Prompt(
+            text="Turn it", task="turn", value=33.0, settle=Arrived(timeout=5.0), signal="probe_temperature",
+            low=0.0, high=90.0,
+        )  # fmt: skip
+        outcome, records = run(tmp_path, path, Step({"tec": 90.0}, Dwell(1.0)), by_hand)
+        assert outcome.status == "completed"
+        assert (records[1][0].settled, records[1][0].finished) == (Settled.ARRIVED, 1.0)
 
     def test_a_step_that_takes_too_long_is_recorded_and_ends_the_run(self, rig_file, tmp_path):
         path = rig_file(("noise = 0.002", "noise = 0.002\ntime_constant = 100.0"))

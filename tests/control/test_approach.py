@@ -96,10 +96,11 @@ class TestLoop:
         assert not command.done
         assert command.wait == 0.5
 
-    def test_what_is_met_is_not_moved(self):
-        command = approach(1.0).begin(0.0, 0.7e-3, 1.02)
-        assert command.done
-        assert command.setpoint == 0.7e-3
+    @pytest.mark.parametrize(("output", "met"), [(1.02, True), (1.25, True), (0.75, True), (1.25 + 1e-9, False)])
+    def test_what_is_met_is_not_moved(self, output, met):
+        command = approach(1.0, tolerance=0.25).begin(0.0, 0.7e-3, output)
+        assert command.done is met
+        assert (command.setpoint == 0.7e-3) is met
 
     def test_can_be_begun_again(self):
         loop = approach(1.0)

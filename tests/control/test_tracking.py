@@ -345,6 +345,24 @@ class TestReach:
         assert controller.reach is Reach.TOO_HIGH
         assert actuator.state.input == pytest.approx(NARROW[1], abs=0.05)
 
+    @pytest.mark.parametrize("unit", [1e-9, 1.0, 1e9])
+    @pytest.mark.parametrize(
+        ("beyond", "side", "reach"),
+        [(1e-8, 1, Reach.TOO_HIGH), (1e-8, -1, Reach.TOO_LOW), (1e-10, 1, Reach.MET), (1e-10, -1, Reach.MET)],
+    )
+    def test_what_the_limits_leave_short_is_judged_by_the_range_of_the_output(
+        self, models, unit, beyond, side, reach
+    ):
+        film = models.film.with_coefficients(unit * models.film.coefficients, unit * models.film.bias)
+        low, high = film.output_range()
+        state = film.saturated_state(-side, 20.0 if side > 0 else 84.0)
+        limit = 60.0 if side > 0 else 45.0
+        ends = (20.0, limit) if side > 0 else (limit, 84.0)
+        controller = OpenLoopInverse(PreisachInverse(film), state, ends, wait=1.0)
+        target = float(film.evaluate((limit,), state)[-1]) + side * beyond * (high - low)
+        controller.aim(target, 0.0, film.present_input(state), film.value(state))
+        assert controller.reach is reach
+
     @pytest.mark.parametrize("name", ["open", "closed"])
     def test_two_elements(self, models, name):
         """Above what the major descending branch ends in, the way is through saturation."""

@@ -2138,6 +2138,18 @@ def test_a_register_is_set_over_another_connection_if_the_former_has_ended(bench
     assert bench.t7.tdac_volts(0) == pytest.approx(1.0, abs=2e-3)
 
 
+def test_a_safe_state_does_not_ask_whose_the_instrument_is(bench, in_process):
+    sensor = connected(bench, in_process, T7PositionSensor, channels=(3,))
+    sensor._line.write(registers._OWNER, 1 + sensor._line._owner % 9)
+    packet = Packet.of([Span.of(TEST)])
+    with sensor._line.in_haste(unchecked=True):
+        assert sensor._line.read_packet(packet) == (0x00112233,)
+        assert sensor._line.read_spans([Span.of(TEST)]) == [[0x00112233]]
+    for read in (lambda: sensor._line.read_packet(packet), lambda: sensor._line.read_spans([Span.of(TEST)])):
+        with pytest.raises(DeviceError, match="another program has taken the LabJack T7"):
+            read()
+
+
 def test_every_request_of_a_closed_device_says_so(bench, in_process):
     supply = connected(bench, in_process, T7HighVoltageSupply, line=5)
     sensor = connected(bench, in_process, T7PositionSensor, channels=(3,))
