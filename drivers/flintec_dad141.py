@@ -354,8 +354,8 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
     def __init__(self, name: str, settings: DAD141Settings, clock: Clock, line: _Line) -> None:
         super().__init__(name, settings, clock, line)
         self._signal = f"{name}_force"
-        self._tared = False
-        self._tare = math.nan
+        self._tared: bool
+        self._tare: float
         self._restart = ""
         self._earlier_repeats = 0
         # Half a period of the filter's cut-off makes the noise of the readings nearly independent.

@@ -148,12 +148,12 @@ class PredictiveFollower(ControllerBase):
             passed = expm(step * np.array([[0.0, 1.0], [-(w**2), -2.0 * actuator.damping * w]]))
         else:
             passed = np.array([[math.exp(-w * step), 0.0], [0.0, 0.0]])
-        self._steps = np.vstack([passed, [min(actuator.rate, 1e300), 0.0]])
+        self._steps = np.vstack([passed, np.full(2, actuator.rate)])
         wanted = math.ceil((actuator.delay + _TIMES * (actuator.time_constant + response.lag)) / p.period)
         self.horizon = min(max(wanted, _FEWEST_PERIODS), _MOST_PERIODS)
         # Which set-point each step of time heeds: first those that were sent before, then those of the plan.
         ends = (np.arange(self.horizon * _PARTS) + 0.5) / _PARTS - actuator.delay / p.period
-        self._before = max(1, -math.floor(ends[0])) + 1
+        self._before = 1 - math.floor(ends[0])
         self._source = np.floor(ends).astype(np.int64) + self._before
         # What is held for a period stands for its middle, of an actuator that follows at once for its end.
         self._ahead = [dynamics.time_constant + part * p.period for part in (0.5, 1.0)]
@@ -162,8 +162,8 @@ class PredictiveFollower(ControllerBase):
         self._plan: Floats = np.full(self.horizon, self._setpoint)
         self._foreseen: Floats | None = None
         self._place = self._velocity = self._time = math.nan
-        bend = np.diff(np.eye(self.horizon + 1), n=2, axis=0)
-        self._bend = np.vstack([np.eye(1, self.horizon + 1, 1) - np.eye(1, self.horizon + 1), bend])
+        steps = np.diff(np.eye(self.horizon + 1), axis=0)
+        self._bend = np.diff(steps, axis=0, prepend=np.zeros_like(steps[:1]))
         self._bend *= p.smoothness * self._spans.output / self._spans.input
 
     def foresee(self, references: Floats) -> None:

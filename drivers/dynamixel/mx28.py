@@ -275,7 +275,7 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
         self._goal: int | None
         self._on: bool
         self._restarted: bool
-        self._tick = -1
+        self._tick: int | None = None
         self._read_at = -math.inf
         self._read_feedback = line.reading(_INDIRECT_DATA, _FEEDBACK.size)
 

@@ -259,7 +259,7 @@ class LabJackT7:
         self._address = port
         self._timeout = timeout
         self._owner = 0
-        self._serial_number = 0
+        self._serial_number: int
         self._in_haste = self._unchecked = self._gave_up = False
         self.repeats = 0
         """Number of requests that were repeated over another connection."""

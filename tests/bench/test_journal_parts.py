@@ -339,6 +339,8 @@ class TestBackground:
         monkeypatch.setattr(background, "_IDLE", 0.01)
         monkeypatch.setattr(keeper, "fold_in", folded.set)
         thread = Background(keeper, 30.0)
+        # One that hangs with its disk does not keep the process from ending.
+        assert thread._thread.daemon
         assert folded.wait(30.0)
         assert thread.stop()
 

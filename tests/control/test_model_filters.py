@@ -157,6 +157,31 @@ class TestBoth:
         return rms(errors[40:])
 
 
+@pytest.mark.parametrize("name", ["session", "density"])
+@pytest.mark.parametrize("signed", [False, True])
+def test_other_units_of_the_output_change_nothing_but_the_units(identified, name, signed):
+    """A model in nm and one in km learn the same."""
+    areas = np.ones(identified.coefficients.size)
+    areas[:40:3] = -0.3 if signed else 1.0
+    plain = identified.with_coefficients(areas * identified.coefficients, identified.bias)
+    found = [
+        (state, output + 60.0 * (number in (20, 21)))
+        for number, (state, output) in enumerate(readings(specimen(plain, **PERTURBED["all"]), 50))
+    ]
+    courses = []
+    for unit in (1.0, 2.0**-30, 2.0**30):
+        adaptation = model_filter(name, plain.with_coefficients(unit * plain.coefficients, unit * plain.bias))
+        course = []
+        for state, output in found:
+            changed = adaptation.update(state, unit * output)
+            value = adaptation.model.value(adaptation.model.shifted(0.0).initial_state()) / unit
+            course.append([changed, adaptation.taken, adaptation.refused, adaptation.uncertainty / unit, value])
+        courses.append(np.array(course))
+    assert courses[0][-1][1] > 40
+    for course in courses[1:]:
+        assert course == pytest.approx(courses[0], rel=1e-6, nan_ok=True)
+
+
 def test_refusals_that_lie_far_apart_do_not_begin_it_anew(identified):
     adaptation = SessionFilter(identified)
     moved = specimen(identified, offset=25.0)

@@ -287,8 +287,7 @@ class TestMissingReadings:
         controller = make(name, models)
         command = controller.aim(900.0, 0.0, math.nan, math.nan)
         assert not command.done
-        if name in WITH_MEMORY:
-            assert command.setpoint == LOW
+        assert command.setpoint == (LOW if name in WITH_MEMORY else 0.5 * (LOW + HIGH))
         moved = controller.update(0.1, 40.0, 100.0)
         assert moved.setpoint != command.setpoint
 
@@ -496,6 +495,16 @@ class TestLatched:
         commands = actuator.reach(controller, 900.0)
         assert commands[-1].done
         assert actuator.read()[1] == pytest.approx(900.0, abs=5.0)
+
+    @pytest.mark.parametrize(("share", "tried"), [(1.01, True), (0.99, False)])
+    def test_within_a_margin_of_saturation_it_does_not_try_to_lock(self, models, share, tried):
+        film = models.film
+        low, high = sorted(film.evaluate((film.levels[0], film.levels[-1])).tolist())
+        for target in (low + share * LATCH.end_margin, high - share * LATCH.end_margin):
+            controller = make("latched", models)
+            assert (controller.tries, controller.locked, controller.extreme) == (0, False, None)
+            controller.aim(target, 0.0, *IdealActuator(film).read())
+            assert (controller.tries > 0) is tried
 
     def test_near_saturation_it_is_the_incremental_inverse(self, models):
         actuator, controller = IdealActuator(models.film), make("latched", models)
