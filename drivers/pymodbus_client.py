@@ -172,8 +172,10 @@ class _BlockingClient(ModbusSerialClient):
             settings.port, baudrate=settings.baudrate, parity=parity, timeout=settings.timeout, retries=0
         )
         self.socket: Any = open_port(device, settings, parity=parity)
-        self._received = 0
-        self._request, self._expected = b"", 0
+        # Of the present request, from `expect` and `send` on.
+        self._received: int
+        self._request: bytes
+        self._expected: int
         self.stray: bytes | None = None
 
     def expect(self, request: bytes, expected: int) -> None:

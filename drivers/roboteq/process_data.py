@@ -23,7 +23,7 @@ from bench.errors import DeviceConnectionError, DeviceError
 from drivers.roboteq.canopen import AbortedError, Entry, NodeLine
 
 _VARIABLE = 16
-_MARK = Entry(0x2106, "user variable", signed=True)
+_MARK = Entry(0x2106, "user variable")
 _HIGHEST_MARK = 0x7FFF_FFFF
 _MOST_READINGS = 4
 

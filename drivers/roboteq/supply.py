@@ -167,7 +167,7 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
         self._channels = tuple(sorted(range(1, _MOST_CHANNELS + 1), key=lambda number: number != settings.channel))
         self._process_data: ProcessData | None = None
         self._known: dict[tuple[int, int], int] = {}
-        self._command = 0
+        self._command: int
         self._battery = math.nan
         self._commanded_at = -math.inf
         self._powered = self._obeyed = self._restarted = False
@@ -474,7 +474,7 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
 
         All of them after a silence, unless the last command was 0: so were those to the other channels.
         """
-        resumable = self._was_silent() and (self._command != 0 or self._commanded_at == -math.inf)
+        resumable = self._was_silent() and (self._commanded_at == -math.inf or self._command != 0)
         return self._channels if resumable else self._channels[:1]
 
     def _arrived(self, order: object) -> bool:
