@@ -348,13 +348,14 @@ def invert(
     only after saturation), `setpoint`, `predicted` (the model's output there) and `flag` (`met`, `too high` or
     `too low`; what cannot be met is clamped to the nearest reachable value). If the model has a prediction band, also
     its ends for the set-point, by the local slope, and for the output there. Of models with time `hammerstein`
-    without a delay and `rate-dependent-plays` are inverted, at the times of the targets (`--time`); `time` is the
-    first column then.
+    and `rate-dependent-plays` are inverted, at the times of the targets (`--time`); `time` is the first column then.
+    Behind a delay set-points are for the targets that come so much later, and flags also `near` (met but for
+    targets between the rows) and `too early` (before any set-point has an effect).
     """
     from bench.model_file import load_model
     from bench.results.bands import invert_band
     from bench.results.data import read_columns, write_csv
-    from bench.results.inverted import invert_targets
+    from bench.results.inverted import NEAR, TOO_EARLY, invert_targets
     from bench.results.models import check_unit
     from bench.results.starting_state import starting_state
     from bench.results.times import read_times
@@ -393,11 +394,12 @@ def invert(
     write_csv(out, [head for head, _ in written], [values for _, values in written])
     if banded is not None:
         print_band(banded.outputs)
-    counts = {flag: found.flags.count(flag) for flag in ("met", "too high", "too low")}
+    kinds = ("met", "too high", "too low", *((NEAR, TOO_EARLY) if found.delay else ()))
+    counts = {flag: found.flags.count(flag) for flag in kinds}
     two = sum(value != "" for value in passing)
     console.print(
-        f"{len(found.flags)} targets: {counts['met']} met, {counts['too high']} too high, "
-        f"{counts['too low']} too low; {two} by way of saturation: {out}",
+        f"{len(found.flags)} targets: {', '.join(f'{count} {flag}' for flag, count in counts.items())}; "
+        f"{two} by way of saturation: {out}",
         highlight=False,
         soft_wrap=True,
     )
@@ -407,9 +409,7 @@ def invert(
         {
             "model": model.name,
             "targets": len(found.flags),
-            "met": counts["met"],
-            "too_high": counts["too high"],
-            "too_low": counts["too low"],
+            **{flag.replace(" ", "_"): count for flag, count in counts.items()},
             "through_saturation": two,
             "largest_residual": float(max(met)) if met else None,
             "out": str(out),

@@ -44,6 +44,15 @@ class TimedModel(Model, ABC, Generic[S]):
     input_unit: str
     output_unit: str
 
+    @property
+    def delay(self) -> float:
+        """Time before which no input has an effect, s; 0 by default."""
+        return 0.0
+
+    def ahead(self, state: S) -> tuple[TimedModel[S], S]:
+        """Return the model whose output is that of this one a delay later, with its state; by default this one."""
+        return self, state
+
     @abstractmethod
     def run(self, times: ArrayLike, inputs: ArrayLike, state: S | None = None) -> tuple[Floats, S]:
         """Return the outputs of a sequence, shape (N,), and the state after it.

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
@@ -147,7 +147,8 @@ class Hammerstein(TimedModel[HammersteinState]):
     ) -> Floats:
         """Return the inputs that bring the output to targets, shape (N,); see `TimedModel.follow`.
 
-        A target that needs two inputs at a time, the first at saturation, is given the last of them alone.
+        A target that needs two inputs at a time, the first at saturation, is given the last of them alone. Behind a
+        delay there is no inverse from sample to sample: that of the model `ahead` is for the targets a delay later.
         """
         clock, wanted = check_sequence(times, targets=targets)
         state = self.initial_state() if state is None else state
@@ -163,6 +164,24 @@ class Hammerstein(TimedModel[HammersteinState]):
         responses = wanted - bias - self.drift_after(elapsed[-wanted.size :])
         bring_responses(self.linear, elapsed, responses, before, bring)
         return np.array(found)
+
+    @property
+    def delay(self) -> float:
+        """Delay of the linear part, s."""
+        return self.linear.delay
+
+    def ahead(self, state: HammersteinState) -> tuple[Hammerstein, HammersteinState]:
+        """Return the model without the delay and a state of it, the drift advanced; see `TimedModel.ahead`."""
+        prompt = replace(self.linear, delay=0.0)
+        drift = self.drift * math.exp(-self.delay / self.drift_time) if self.drift_time > 0.0 else self.drift
+        later = self.static.bias + float(self.drift_after(np.array([self.delay]))[0])
+        static = self.static.with_coefficients(self.static.coefficients, later)
+        model = replace(self, static=static, linear=prompt, drift=drift)
+        if state.knots is None:
+            return model, state
+        knots = state.knots
+        passed = model._knots(np.array(knots.times), np.array(knots.values), knots.filters)
+        return model, state._replace(knots=passed)
 
     def initial_state(self) -> HammersteinState:
         """Return the initial state of the operator."""

@@ -99,7 +99,7 @@ def test_ringing_is_warned_of_where_steps_are_short_beside_the_lag():
 @pytest.mark.parametrize(
     ("linear", "step", "message"),
     [
-        ({"delay": 0.01}, 0.002, r"a delay \(0.01 s\)"),
+        ({"delay": 0.038}, 0.002, r"delay of 0.038 s is as long as the 0.038 s of the targets"),
         ({"lag": (4e-4, 1e-5)}, 0.002, "the inverse is unstable"),
         ({"lag": (10.0, 0.0)}, 1e-5, "too short"),
     ],
@@ -108,6 +108,83 @@ def test_what_cannot_be_inverted_is_refused(linear, step, message):
     model = Hammerstein(preisach(np.random.default_rng(0)), LinearPart(**linear))
     with pytest.raises(ConfigurationError, match=f"^model m cannot be inverted: .*{message}"):
         invert_targets(ModelFile("m", model), np.linspace(0.0, 0.1, 20), times=step * np.arange(20))
+
+
+@pytest.mark.parametrize("drift", [{}, {"drift": 0.2}, {"drift": -0.3, "drift_time": 0.4}])
+def test_what_is_ahead_is_the_output_a_delay_later(drift):
+    rng = np.random.default_rng(4)
+    model = Hammerstein(preisach(rng), LinearPart(0.014, **PARTS["lag and creep"]), **drift)
+    t = 0.002 * np.arange(300)
+    u = np.sin(40.0 * t) * np.cos(9.0 * t)
+    prompt, state = model.ahead(model.initial_state())
+    np.testing.assert_allclose(prompt.evaluate(t, u, state)[:-7], model.evaluate(t, u)[7:], rtol=0.0, atol=1e-12)
+    _, later = model.run(t[:100], u[:100])
+    prompt, state = model.ahead(later)
+    outputs = model.evaluate(t[100:], u[100:], later)
+    np.testing.assert_allclose(prompt.evaluate(t[100:], u[100:], state)[:-7], outputs[7:], rtol=0.0, atol=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("drift", [{}, {"drift": 0.2}, {"drift": -0.3, "drift_time": 0.4}])
+@pytest.mark.parametrize("part", ["none", "lag", "lag and creep"])
+def test_targets_behind_a_delay_of_whole_steps_are_met_after_it(part, drift, seed):
+    rng = np.random.default_rng(seed)
+    model = Hammerstein(preisach(rng), LinearPart(0.014, **PARTS[part]), **drift)
+    low, high = model.static.output_range()
+    t = 5.0 + 0.002 * np.arange(400)
+    wanted = 0.5 * (low + high) + 0.2 * (high - low) * np.sin(9.0 * t) * np.cos(2.3 * t)
+    found = invert_targets(ModelFile("m", model), wanted, times=t)
+    assert found.flags == ("too early",) * 7 + ("met",) * 393
+    predicted = model.evaluate(t, found.setpoints)
+    np.testing.assert_allclose(predicted[7:], wanted[7:], rtol=0.0, atol=1e-9 * span(model))
+    # No set-point reaches the first targets, and the last ones reach none.
+    np.testing.assert_allclose(predicted[:7], predicted[0] + model.drift_after(t[:7] - t[0]), rtol=0.0, atol=1e-12)
+    np.testing.assert_array_equal(found.setpoints[-7:], found.setpoints[-8])
+    assert found.setpoints[-8] != found.setpoints[-9]
+    warning = found.warnings()[0]
+    assert "an effect after 0.014 s: on the first 7 targets" in warning
+    assert "the last 7 set-points" in warning
+
+
+def test_targets_behind_any_delay_are_met_but_for_the_interpolation():
+    rng = np.random.default_rng(0)
+    model = Hammerstein(preisach(rng), LinearPart(0.0131, **PARTS["lag and creep"]))
+    errors = []
+    for parts in (1, 4):
+        t = np.cumsum(np.repeat(np.random.default_rng(1).uniform(0.001, 0.003, 300) / parts, parts))
+        low, high = model.static.output_range()
+        wanted = 0.5 * (low + high) + 0.2 * (high - low) * np.sin(9.0 * t) * np.cos(2.3 * t)
+        wanted[t > 0.3] += span(model) * (t[t > 0.3] > 0.5)
+        found = invert_targets(ModelFile("m", model), wanted, times=t)
+        near = np.array([flag == "near" for flag in found.flags])
+        np.testing.assert_array_equal(np.array(found.flags) == "too early", t < t[0] + 0.0131)
+        assert {"met", "near", "too early"} >= set(np.array(found.flags)[t < 0.45])
+        # What is clamped is no matter of interpolation.
+        assert set(np.array(found.flags)[t > 0.52]) == {"too high"}
+        error = np.abs(found.predicted - wanted)[near].max()
+        assert any(f"{near.sum()} rows err by up to {error:.3g}" in text for text in found.warnings())
+        errors.append(
+            [np.abs(found.predicted - wanted)[(t > a) & (t < 0.45)].max() / span(model) for a in (0.02, 0.1)]
+        )
+    (first, smooth), (first_finer, smooth_finer) = errors
+    assert first < 1e-3
+    # Of first order in the steps after the kink of the first row, then of second.
+    assert first_finer < 0.3 * first
+    assert smooth_finer < 0.2 * smooth
+
+
+def test_targets_behind_a_delay_follow_on_from_a_state():
+    rng = np.random.default_rng(0)
+    model = Hammerstein(preisach(rng), LinearPart(0.014, **PARTS["lag and creep"]), drift=0.2)
+    t = 0.002 * np.arange(300)
+    u = 0.8 * np.sin(40.0 * t) * np.cos(9.0 * t)
+    whole = model.evaluate(t, u)
+    _, state = model.run(t[:100], u[:100])
+    file = ModelFile("m", model, memory=state)
+    found = invert_targets(file, whole[100:], times=t[100:], continue_memory=True)
+    np.testing.assert_allclose(found.setpoints[:-7], u[100:-7], rtol=0.0, atol=1e-6)
+    # What came before is what it was.
+    np.testing.assert_allclose(found.predicted, whole[100:], rtol=0.0, atol=1e-9 * span(model))
 
 
 @pytest.fixture
@@ -160,3 +237,17 @@ def test_time_belongs_to_models_with_time(bench, files, model, options, message)
     assert code != 0
     assert message in " ".join(text.split())
     assert not out.exists()
+
+
+def test_the_command_says_what_a_delay_leaves(bench, files):
+    rng = np.random.default_rng(0)
+    static = Preisach(uniform_levels(-1.0, 1.0, 6), rng.random(21) + 0.2, 0.3, input_unit="V", output_unit="µm")
+    ModelFile("late", Hammerstein(static, LinearPart(0.0052, (0.004, 0.0)))).save(files / "late.json")
+    setpoints, summary = files / "setpoints.csv", files / "inverted.json"
+    options = ("--time", "t", "--column", "displacement", "--out", setpoints, "--json", summary)
+    code, out, err = bench("invert", files / "late.json", files / "targets.csv", *options)
+    assert code == 0, err
+    counts = json.loads(summary.read_text())
+    assert counts["near"] + counts["too_early"] == 600
+    assert f"{counts['near']} near, {counts['too_early']} too early" in " ".join(out.split())
+    assert "an effect after 0.0052 s" in " ".join(err.split())
