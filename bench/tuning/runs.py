@@ -7,7 +7,7 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -55,6 +55,27 @@ def task_of(file: ModelFile, controller: str, protocol: str | None) -> Task:
     return Task(chosen, controller, FORCE if chosen == "force-control" else "response")
 
 
+class Scale(NamedTuple):
+    """RMS error (output units) and seconds at a target by which costs are counted.
+
+    Attributes
+    ----------
+    identified : tuple of float
+        With the model as it is.
+    others : tuple of float
+        The greatest with the models from which the specimen differs.
+    """
+
+    identified: tuple[float, float]
+    others: tuple[float, float]
+
+    @classmethod
+    def of(cls, identified: tuple[float, float], others: Sequence[tuple[float, float]]) -> Scale:
+        """Return that of the first numbers; what fails with them beside the model plays no part."""
+        good = [each for each in others if math.isfinite(each[0])] or [identified]
+        return cls(identified, (max(rms for rms, _ in good), max(seconds for _, seconds in good)))
+
+
 @dataclass
 class TuningRuns:
     """Carries out trials of a controller's numbers.
@@ -77,8 +98,8 @@ class TuningRuns:
         Sessions of each run.
     first_seed : int
         Seed of the first session; the others follow.
-    scale : tuple of float, optional
-        RMS error and seconds at a target by which the cost is counted; those of the first trial if not given.
+    scale : Scale, optional
+        By what the cost is counted; by the first trial if not given.
     """
 
     task: Task
@@ -89,7 +110,7 @@ class TuningRuns:
     settings: Mapping[str, str]
     seeds: int = 1
     first_seed: int = 0
-    scale: tuple[float, float] | None = None
+    scale: Scale | None = None
     failures: list[str] = field(default_factory=list)
     _count: int = 0
 
@@ -144,14 +165,21 @@ class TuningRuns:
         scores: dict[str, list[tuple[float, float]]] = {}
         for (name, seed), results in reached.items():
             scores.setdefault(name, []).append(_score(results, reached[_AS_IDENTIFIED, seed]))
-        rms, seconds = np.mean(scores[_AS_IDENTIFIED], axis=0).tolist()
+        means: dict[str, tuple[float, float]] = {
+            name: tuple(np.mean(runs, axis=0).tolist()) for name, runs in scores.items()
+        }
+        rms, seconds = means.pop(_AS_IDENTIFIED)
+        worst = max(each for each, _ in means.values())
         if self.scale is None:
             if not math.isfinite(rms):
                 raise BenchError(f"the controller fails with the numbers to begin with: {self.failures[0]}")
-            self.scale = rms, seconds
-        costs = {name: float(np.mean([cost_of(*each, self.scale) for each in runs])) for name, runs in scores.items()}
+            self.scale = Scale.of((rms, seconds), list(means.values()))
+        scales = dict.fromkeys(means, self.scale.others) | {_AS_IDENTIFIED: self.scale.identified}
+        costs = {
+            name: float(np.mean([cost_of(*each, scales[name]) for each in runs])) for name, runs in scores.items()
+        }
         cost = 0.5 * (costs.pop(_AS_IDENTIFIED) + max(costs.values()))
-        return Trial(numbers, cost, rms, seconds, max(float(np.mean(scores[name], axis=0)[0]) for name in costs))
+        return Trial(numbers, cost, rms, seconds, worst)
 
 
 def _score(results: TargetResults | None, nominal: TargetResults | None) -> tuple[float, float]:

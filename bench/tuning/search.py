@@ -3,9 +3,10 @@
 The cost of numbers is `error + TIME_WEIGHT * time`: the RMS error and the seconds at each target, each as a multiple
 of that of the numbers to begin with, so that neither hides the other. It is the mean of that with the model as it is,
 and of the worst of that with models by which the specimen has another gain, by the factor `MARGIN` to either side,
-and another time constant of its response. So numbers that are best on the specimen as identified but fail beside it,
-by too little margin of stability, are not chosen. A run of a controller that does not converge, or reaches no target
-in its time, costs `FAILED`: a search can begin with numbers that fail, but does not end with them.
+and another time constant of its response; there as a multiple of the worst of the numbers to begin with. So numbers
+that are best on the specimen as identified but fail beside it, by too little margin of stability, are not chosen. A
+run of a controller that does not converge, or reaches no target in its time, costs `FAILED`: a search can begin with
+numbers that fail, but does not end with them.
 """
 
 from __future__ import annotations
@@ -156,7 +157,8 @@ def confirm(trials: Sequence[Trial], sessions: Sequence[Evaluate]) -> tuple[Tria
     The best `FINALISTS` of the others take part, even if none was better in the search: a session may flatter the
     first numbers as well. Others are better if their cost, session by session, is less by more than `ERRORS` standard
     errors of the mean, and their greatest RMS error is at most `WORST` times that of the first ones; if none are, the
-    first ones are the best. Of trials of the same cost the first takes part: a number between them plays no part for
+    first ones are the best. Where the first numbers fail in a session, others need only cost no more in the rest, by
+    `ERRORS` standard errors. Of trials of the same cost the first takes part: a number between them plays no part for
     this specimen.
     """
     start, *others = trials
@@ -168,13 +170,16 @@ def confirm(trials: Sequence[Trial], sessions: Sequence[Evaluate]) -> tuple[Tria
 
 
 def _better(trials: Sequence[Trial], first: Sequence[Trial]) -> bool:
-    differences = np.array([a.cost - b.cost for a, b in zip(trials, first, strict=True)])
-    error = differences.std(ddof=1) / math.sqrt(len(differences))
-    return (
-        not any(each.failed for each in trials)
-        and float(differences.mean()) < -ERRORS * float(error)
-        and max(each.rms for each in trials) <= WORST * max(each.rms for each in first)
-    )
+    if any(each.failed for each in trials):
+        return False
+    both = [(a, b) for a, b in zip(trials, first, strict=True) if not b.failed]
+    if len(both) < 2:
+        return len(both) < len(first)
+    differences = np.array([a.cost - b.cost for a, b in both])
+    error = ERRORS * float(differences.std(ddof=1)) / math.sqrt(len(differences))
+    # That the first ones fail somewhere decides between numbers that cost the same elsewhere.
+    most = -error if len(both) == len(first) else error
+    return float(differences.mean()) < most and max(a.rms for a, _ in both) <= WORST * max(b.rms for _, b in both)
 
 
 def _mean(trials: Sequence[Trial]) -> Trial:

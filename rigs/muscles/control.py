@@ -70,13 +70,16 @@ class InverseControlParameters:
     """Power of the voltage that is lagged: 2 for heat, 1 for a pressure."""
     caution: float = 1.0
     """Factor of the slopes that are believed: the larger, the shorter are the moves of the closed loop."""
+    model_error: float = 0.02
+    """Change of the model's error within one period, as a part of what the output moves by over the range of the
+    voltage: the smaller, the more readings are averaged in closed loop."""
     duration: float = 20.0
     """Time for each target, s."""
     search: LagSearch = field(default_factory=LagSearch)
     """How other time constants are tried in closed loop."""
 
     def __post_init__(self) -> None:
-        check_positive(self, "period", "horizon", "caution", "duration")
+        check_positive(self, "period", "horizon", "caution", "model_error", "duration")
         Lag(self.time_constant)
         if self.power not in (1.0, 2.0):
             raise ValueError(f"power: expected 1 or 2, got {self.power}")
@@ -433,7 +436,7 @@ def _task(setup: ControllerSetup, kind: type[Task]) -> Task:
         raise DataError(f"the two-stage model has no inverse: {error}") from error
     noise = {} if setup.model.dynamics is None else setup.model.dynamics.noise
     state: TwoStageState = setup.start if setup.start is not None else inverse.model.initial_state()
-    return kind.of_model(inverse, state, setup.limits, noise)
+    return kind.of_model(inverse, state, setup.limits, noise, _timing(setup).model_error)
 
 
 def _holds(setup: ControllerSetup, kind: type[Task]) -> float:
@@ -453,7 +456,7 @@ def _with_inverse(summary: str, controller: Callable[..., MuscleController], kin
         lambda s: controller(_task(s, kind), _timing(s), s.state, s.limits),
         numbers=_timing,
         # The lead is by a number of periods.
-        tunable=("period+horizon", "horizon", "caution") if controller is MuscleClosedLoop else (),
+        tunable=("period+horizon", "horizon", "caution", "model_error") if controller is MuscleClosedLoop else (),
         holds=(lambda s: _holds(s, kind)) if controller is MuscleOpenLoop else None,
     )
 

@@ -14,8 +14,6 @@ from bench.errors import DataError
 from bench.hysteresis import TwoStageState, _checks
 from bench.hysteresis.coupled_stream import TwoStageStream
 
-_MODEL_ERROR = 0.02
-"""Change of the model's error within one period, as a part of the output's range."""
 _READING = 1e-3
 """Noise of one reading where it is not known, as a part of the output's range."""
 _BELIEVED = (0.7, 1.4)
@@ -65,9 +63,16 @@ class Task(ABC):
 
     @classmethod
     def of_model(
-        cls, inverse: TwoStageInverse, state: TwoStageState, limits: tuple[float, float], noise: Mapping[str, float]
+        cls,
+        inverse: TwoStageInverse,
+        state: TwoStageState,
+        limits: tuple[float, float],
+        noise: Mapping[str, float],
+        model_error: float,
     ) -> Self:
         """Return the task with numbers from the model and from the sensor's noise.
+
+        `model_error` is what the model's error changes by in one period, as a part of what the output moves by.
 
         The slopes are about the mean one of the major loop of the model, from the state (the muscle at rest under its
         load) on. By a steeper one the muscle would hardly move where it is flat, by a flatter one it would be driven
@@ -90,7 +95,7 @@ class Task(ABC):
             )
         least, greatest = sorted(part * rise / (high - low) for part in _BELIEVED)
         reading = noise.get(cls.quantity, 0.0) or _READING * abs(rise)
-        return cls(inverse, (_MODEL_ERROR * rise) ** 2, reading**2, (least, greatest), rise)
+        return cls(inverse, (model_error * rise) ** 2, reading**2, (least, greatest), rise)
 
     @abstractmethod
     def others(self, state: TwoStageState) -> tuple[float, ...]:

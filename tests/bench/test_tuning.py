@@ -100,6 +100,32 @@ def test_the_first_numbers_stay_if_none_is_better_in_other_sessions():
     assert best is first
 
 
+def test_one_session_in_which_the_first_numbers_fail_hides_no_other():
+    tried = []
+    search(NUMBERS, ("wait",), evaluate, tried.append)
+
+    def sessions(costs):
+        """Sessions in which the others cost so much, and the first numbers 1, or fail where it is None."""
+        return [
+            lambda candidates, cost=cost: [
+                Trial(each, cost or 1.0, 1.0, 1.0, 1.0)
+                if each is not NUMBERS
+                else (failed(each) if cost is None else Trial(each, 1.0, 1.0, 1.0, 1.0))
+                for each in candidates
+            ]
+            for cost in costs
+        ]
+
+    for costs, better in (
+        ([None, 0.9, 1.1, 1.0], True),
+        ([None, 1.2, 1.3, 1.2], False),
+        ([1.0, 0.9, 1.1, 1.0], False),
+        ([None, 1.2], True),
+    ):
+        first, best = confirm(tried, sessions(costs))
+        assert (best is not first) is better, costs
+
+
 def test_a_search_begins_with_numbers_that_fail_and_leaves_them():
     tried = []
     best = search({**NUMBERS, "wait": 2.0}, ("wait",), evaluate, tried.append)

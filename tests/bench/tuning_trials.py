@@ -118,7 +118,7 @@ def resolution(case: Case, model: Path) -> float:
     if kind is LengthTask:
         state, _ = file.model.step(state, state.voltage, load_rig(case.rig).roles["load"].rest)
     low, high = file.model.first.input_range
-    task = kind.of_model(TwoStageInverse(file.model), state, (low, high), file.dynamics.noise)
+    task = kind.of_model(TwoStageInverse(file.model), state, (low, high), file.dynamics.noise, model_error=1.0)
     # Of the mean slope; the error within a step is uniform.
     step = abs(task.rise) / (high - low) * STEP
     return math.hypot(step / math.sqrt(12.0), math.sqrt(task.reading_variance / READINGS))

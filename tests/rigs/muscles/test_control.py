@@ -163,14 +163,15 @@ TIMING = InverseControlParameters(5.0, 1.0, 2.0)
 """What transients of the wire tell, and a search for other time constants; then without."""
 KNOWN = InverseControlParameters(5.0, 1.0, 2.0, search=LagSearch(steps=0))
 NOISE = {"length": 0.02 * MILLIMETRE, "force": 0.02}
+MODEL_ERROR = 0.02
 
 
 def task(inverse, load):
     model = inverse.model
     start = model.initial_state()
     if load is None:
-        return ForceTask.of_model(inverse, start, LIMITS, NOISE)
-    return LengthTask.of_model(inverse, model.step(start, 0.0, load)[0], LIMITS, NOISE)
+        return ForceTask.of_model(inverse, start, LIMITS, NOISE, MODEL_ERROR)
+    return LengthTask.of_model(inverse, model.step(start, 0.0, load)[0], LIMITS, NOISE, MODEL_ERROR)
 
 
 def controllers(inverse, load):
@@ -564,7 +565,7 @@ def test_slopes_are_about_the_mean_one_of_the_major_loop_of_the_model(inverse):
     assert found.slopes[0] < found.rise / 3.0 < found.slopes[1] < 0.0
     assert math.sqrt(found.reading_variance) == NOISE["length"]
     with pytest.raises(DataError, match="does not rise with the voltage between 0 and 1e-09 V"):
-        ForceTask.of_model(inverse, model.initial_state(), (0.0, 1e-9), NOISE)
+        ForceTask.of_model(inverse, model.initial_state(), (0.0, 1e-9), NOISE, MODEL_ERROR)
 
 
 # What a controller knows comes from the model and its dynamics.
@@ -587,7 +588,9 @@ def test_no_number_of_a_specimen_stands_in_the_controllers():
         state = inverse.model.initial_state()
         found = {}
         for kind in (ForceTask, LengthTask):
-            known = kind.of_model(inverse, state, LIMITS, {"force": 0.02 * scale, "length": 1e-5 * scale})
+            known = kind.of_model(
+                inverse, state, LIMITS, {"force": 0.02 * scale, "length": 1e-5 * scale}, MODEL_ERROR
+            )
             found[kind.quantity] = (
                 [known.rise, *known.slopes],
                 [known.walk_variance, known.reading_variance],
@@ -613,7 +616,7 @@ def test_no_number_of_a_specimen_stands_in_the_controllers():
 def test_what_nothing_says_has_no_default():
     for kind in (InverseControlParameters, ProportionalIntegralParameters, ForceTask, LengthTask):
         defaults = {each.name for each in fields(kind) if each.default is not MISSING}
-        assert defaults <= {"power", "duration", "rise", "caution"}
+        assert defaults <= {"power", "duration", "rise", "caution", "model_error"}
 
 
 def test_a_model_without_dynamics_is_refused_unless_the_rig_file_gives_them(inverse):
