@@ -9,6 +9,7 @@ from bench.compiled import inlined, inner, kernel
 from bench.hysteresis import _kernels as memory
 
 Floats = NDArray[np.float64]
+Flags = NDArray[np.bool_]
 
 Corners = tuple[Floats, Floats, int]  # left edges and heights of the pieces, and how many count
 # Ends of the operating range, outputs at negative and positive saturation (at the ends of the plane), tolerance,
@@ -343,18 +344,20 @@ def follow(
     start: memory.Start,
     raw: float,
     targets: Floats,
-    stack: Floats,
-    indices: memory.Integers,
+    rooms: tuple[Floats, memory.Integers, Floats],
+    count: int,
+    rising: bool,
     found: Floats,
+    met: Flags,
     steps: memory.Integers,
-) -> None:
-    """Invert target after target, moving the memory along.
+) -> int:
+    """Invert target after target, moving the memory along; return the new number of extrema.
 
-    `found`, shape (3, N), is given the first set-points (NaN where one is enough), the last ones and the errors;
-    `stack` and `indices` are room for the pieces, shapes (3, size) and (2, size).
+    `rooms` are for the pieces, shapes (3, size) and (2, size), and for extrema, of which there are `count` already.
+    `found`, shape (3, N), is given the first set-points (NaN where one is enough), the last ones and the outputs.
     """
-    plane, terms, pieces = memory.borrow(plane, terms, stack, indices)
-    below = memory.borrowed(below)
+    plane, terms, pieces = memory.borrow(plane, terms, rooms[0], rooms[1])
+    below, extrema = memory.borrowed(below), memory.borrowed(rooms[2])
     left0, height0, present = start
     n = left0.size
     for p in range(n):
@@ -362,16 +365,20 @@ def follow(
         pieces[1][p] = height0[p]
     k, mass = memory.load(plane, pieces, n, present)
     for t in range(targets.size):
+        target = targets[t]
         value = memory.output_at(plane, below, offset, terms, raw, present, k, mass)
         place = n, present, k, mass
-        count, s1, s2, error, steps[t] = invert(
-            plane, below, offset, terms, ends, pieces, place, raw, value, targets[t]
+        setpoints, s1, s2, error, steps[t] = invert(
+            plane, below, offset, terms, ends, pieces, place, raw, value, target
         )
-        found[0, t] = s1 if count == 2 else np.nan
+        found[0, t] = s1 if setpoints == 2 else np.nan
         found[1, t] = s2
-        found[2, t] = error
-        for stage in range(2 - count, 2):
-            raw = s1 if stage == 0 else s2
+        found[2, t] = target + error
+        met[t] = abs(error) <= 2.0 * ends[4]
+        for stage in range(2 - setpoints, 2):
+            before, raw = raw, s1 if stage == 0 else s2
+            count, rising = memory.step_extrema(extrema, count, rising, before, raw)
             u = min(max(raw, plane[0][0]), plane[0][-1])
             n, k, mass = memory.move(plane, pieces, n, present, k, mass, u)
             present = u
+    return count

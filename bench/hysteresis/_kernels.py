@@ -73,6 +73,14 @@ def locate(levels: Floats, inverse_step: float, value: float) -> int:
 
 
 @inlined
+def locate_near(levels: Floats, inverse_step: float, value: float, guess: int) -> int:
+    """Return what `locate` does; at once if it is `guess`."""
+    if levels[guess] <= value < levels[guess + 1]:
+        return guess
+    return locate(levels, inverse_step, value)
+
+
+@inlined
 def bilinear(table: Floats, levels: Floats, b: float, j: int, a: float, i: int) -> float:
     x = b - levels[j]
     y = a - levels[i]
@@ -92,27 +100,36 @@ def reversible_value(terms: Terms, u: float) -> float:
     return value
 
 
+@inlined
+def step_extrema(extrema: Floats, count: int, rising: bool, present: float, value: float) -> tuple[int, bool]:
+    """Move the stack of extrema, with room for one more, from input `present` to `value`.
+
+    `rising` is the present branch. Returns the new count and branch.
+    """
+    if value > present:
+        if not rising:
+            extrema[count] = present
+            count += 1
+            rising = True
+        while count >= 2 and extrema[count - 2] <= value:
+            count -= 2
+    elif value < present:
+        if rising:
+            extrema[count] = present
+            count += 1
+            rising = False
+        while count >= 2 and extrema[count - 2] >= value:
+            count -= 2
+    return count, rising
+
+
 @kernel
-def advance_extrema(inputs: Floats, stack: Floats, count: int, present: float, saturation: int) -> int:
+def advance_extrema(inputs: Floats, stack: Floats, count: int, present: float, rising: bool) -> int:
     """Step the stack of extrema through `inputs`; return the new count."""
-    rising = (saturation < 0) == (count % 2 == 0)
+    stack = borrowed(stack)
     for n in range(inputs.size):
-        value = inputs[n]
-        if value > present:
-            if not rising:
-                stack[count] = present
-                count += 1
-                rising = True
-            while count >= 2 and stack[count - 2] <= value:
-                count -= 2
-        elif value < present:
-            if rising:
-                stack[count] = present
-                count += 1
-                rising = False
-            while count >= 2 and stack[count - 2] >= value:
-                count -= 2
-        present = value
+        count, rising = step_extrema(stack, count, rising, present, inputs[n])
+        present = inputs[n]
     return count
 
 
@@ -174,7 +191,7 @@ def move(
         while n > 0 and height[n - 1] <= u:
             n -= 1
             edge, edge_column, edge_mass = left[n], column[n], mass_left[n]
-        k = locate(levels, inverse_step, u)
+        k = locate_near(levels, inverse_step, u, k)
         left[n] = edge
         column[n] = edge_column
         mass_left[n] = edge_mass
@@ -182,7 +199,7 @@ def move(
         row[n] = k
         n += 1
     else:
-        k = locate(levels, inverse_step, u)
+        k = locate_near(levels, inverse_step, u, k)
         while n > 0 and left[n - 1] >= u:
             n -= 1
     mass = 0.0

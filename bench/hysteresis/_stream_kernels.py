@@ -135,16 +135,8 @@ def _move(words: Words, numbers: Floats, plane: memory.Plane, value: float) -> f
         return float(numbers[OUTPUT])
     extrema = carray(pointer(words[EXTREMA]), words[ROOM], np.float64)
     count = words[EXTREMUM_COUNT]
-    if (value > present) != ((words[SATURATION] < 0) == (count % 2 == 0)):
-        extrema[count] = present
-        count += 1
-    if value > present:
-        while count >= 2 and extrema[count - 2] <= value:
-            count -= 2
-    else:
-        while count >= 2 and extrema[count - 2] >= value:
-            count -= 2
-    words[EXTREMUM_COUNT] = count
+    rising = (words[SATURATION] < 0) == (count % 2 == 0)
+    words[EXTREMUM_COUNT], _ = memory.step_extrema(extrema, count, rising, present, value)
     numbers[INPUT] = value
     u = min(max(value, plane[0][0]), plane[0][-1])
     words[PIECE_COUNT], words[CELL], numbers[MASS] = memory.move(

@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bench.hysteresis import _checks
 from bench.hysteresis._checks import Floats
-from bench.hysteresis.memory import MemoryCurve
+from bench.hysteresis.memory import MemoryCurve, trusted_curve
 from bench.hysteresis.reach import Reach
 
 if TYPE_CHECKING:
@@ -441,19 +441,34 @@ class PreisachInverse(Inverse[MemoryCurve]):
         wanted = _checks.samples("targets", targets)
         before = self.operator.initial_state() if state is None else state
         start = self.operator._pieces(before)
-        room = 2 * wanted.size + start[0].size + 2
-        stack, indices = np.empty((3, room)), np.empty((2, room), dtype=np.int64)
-        found, iterations = np.empty((3, wanted.size)), np.empty(wanted.size, dtype=np.int64)
-        _kernels.follow(*self._constants, start, before.input, wanted, stack, indices, found, iterations)
-        first, last, errors = found
-        path = np.column_stack([first, last]).ravel()
+        count = len(before.extrema)
+        room = 2 * wanted.size + max(start[0].size, count) + 2
+        # One block, as the allocator gives back to the system several as large, whose pages then come anew each time.
+        block = np.empty((6, room))
+        extrema = block[5]
+        extrema[:count] = before.extrema
+        found, met = np.empty((3, wanted.size)), np.empty(wanted.size, dtype=np.bool_)
+        iterations = np.empty(wanted.size, dtype=np.int64)
+        count = _kernels.follow(
+            *self._constants,
+            start,
+            before.input,
+            wanted,
+            (block[:3], block[3:5].view(np.int64), extrema),
+            count,
+            before.rising,
+            found,
+            met,
+            iterations,
+        )
+        first, last, outputs = found
         return Following(
             setpoints=last,
             saturating=first,
-            outputs=wanted + errors,
-            met=np.abs(errors) <= 2.0 * self._ends[2],
+            outputs=outputs,
+            met=met,
             iterations=iterations,
-            state=before.advance(path[~np.isnan(path)]),
+            state=trusted_curve(tuple(extrema[:count].tolist()), float(last[-1]), before.saturation),
         )
 
     def nearest_input(

@@ -113,9 +113,7 @@ class MemoryCurve:
         sequence = _checks.samples("inputs", inputs)
         stack = np.empty(len(self.extrema) + sequence.size + 2)
         stack[: len(self.extrema)] = self.extrema
-        count = _kernels.advance_extrema(
-            sequence, stack, len(self.extrema), self.input, -1 if self.saturation < 0 else 1
-        )
+        count = _kernels.advance_extrema(sequence, stack, len(self.extrema), self.input, self.rising)
         return trusted_curve(tuple(stack[:count].tolist()), float(sequence[-1]), self.saturation)
 
     def staircase(self, low: float, high: float) -> tuple[list[float], list[float], float]:
