@@ -49,6 +49,19 @@ class Regressor:
             extra=np.ascontiguousarray(columns),
         )
 
+    @classmethod
+    def of_cells(cls, columns: Floats, extra: Floats) -> Regressor:
+        """Return a regressor of cells that may change in every row, shape (N, K), and dense columns, shape (N, q)."""
+        changes = np.diff(columns, axis=0, prepend=columns[:1])
+        changing = changes != 0.0
+        return cls(
+            base=columns[0].copy(),
+            starts=np.append(0, np.cumsum(np.count_nonzero(changing, axis=1))),
+            cells=np.nonzero(changing)[1].astype(np.int32),
+            changes=changes[changing],
+            extra=np.ascontiguousarray(extra),
+        )
+
     def merged(self, parents: NDArray[np.int64], count: int) -> Regressor:
         """Return the regressor whose sparse column p, of `count`, is the sum of the columns c with parents[c] = p."""
         return Regressor(

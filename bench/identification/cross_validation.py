@@ -186,6 +186,39 @@ def choose_smoothing(
     ValueError
         If there is nothing to try, a weight is wrong, or a fold has no sample that counts.
     """
+
+    def fitted(weight: float) -> Fitted:
+        return partial(fit_cells, layout, regressor, outputs, True, smoothing=weight)
+
+    return compare_smoothing(fitted, regressor, outputs, weights, smoothing, folds=folds, blocks=blocks)
+
+
+def compare_smoothing(
+    fitted: Callable[[float], Fitted],
+    regressor: Regressor,
+    outputs: Floats,
+    weights: Floats,
+    smoothing: Sequence[float],
+    *,
+    folds: int = 5,
+    blocks: int = 20,
+) -> CrossValidation:
+    """Return how well fits of given smoothing predict parts of their own data that were left out of them.
+
+    As `choose_smoothing`, for fits of any kind.
+
+    Parameters
+    ----------
+    fitted : callable
+        Takes a smoothing weight and returns what returns the fit for weights of the samples, shape (N,).
+    regressor, outputs, weights, smoothing, folds, blocks
+        As `choose_smoothing`; the regressor is that of the coefficients of the fits.
+
+    Raises
+    ------
+    ValueError
+        As `choose_smoothing`.
+    """
     if not len(smoothing):
         raise ValueError("smoothing: expected at least one weight, got none")
     counted = counted_weights(regressor.shape[0], weights, 0) > 0.0
@@ -195,8 +228,7 @@ def choose_smoothing(
     counts = np.where(counted, 1.0, 0.0)
     trials = []
     for weight in smoothing:
-        fitted = partial(fit_cells, layout, regressor, outputs, True, smoothing=weight)
-        trials.append(_trial(weight, None, fitted, regressor, outputs, weights, fold, counts))
+        trials.append(_trial(weight, None, fitted(weight), regressor, outputs, weights, fold, counts))
     return CrossValidation(tuple(trials))
 
 

@@ -43,7 +43,7 @@ from bench.results.predictions import Predictions, Quantity
 from bench.results.reading.options import ReadingOptions
 from bench.results.recalibrations import Session
 from bench.results.starting_state import StartingState, digest, starting_state
-from bench.results.times import bind_times, check_model_name, read_times, time_quantity
+from bench.results.times import bind_times, check_model_name, check_penalties, is_smoothed, read_times, time_quantity
 from bench.timed import identify_in_time
 from bench.transients.identification import Transients, identify_dynamics, identify_transients, read_transients
 
@@ -271,9 +271,11 @@ def identify_file(
         if columns.units[column]:
             options[key] = columns.units[column]
     trials: CrossValidation | None = None
-    if time_column is not None and (cross_validated or smoothing or ridge or band):
-        raise ConfigurationError(f"model {model} takes no --smoothing, --ridge, --cross-validate or --band")
     times = None if time_column is None else read_times(columns, time_column)
+    if times is not None:
+        smooth = SMOOTHING if cross_validated else smoothing or 0.0
+        check_penalties(model, smooth, ridge=ridge, levels_to_try=levels_to_try, band=band)
+        options |= {"smoothing": smooth} if smooth else {}
     try:
         if times is not None:
             found = identify_in_time(model, times, inputs, outputs, weights=weights, skip=skip, **options)
@@ -478,8 +480,8 @@ def _uniqueness(found: Identification[Any], resolution: Resolution | None) -> li
             f"the minimiser is not unique: {certificate.exchangeable} cells could replace others without "
             "changing the fit"
         )
-        # Models with time take no smoothing.
-        remedy = "give fewer --levels" if isinstance(found.model, TimedModel) else "they are resolved by --smoothing"
+        unsmoothed = isinstance(found.model, TimedModel) and not is_smoothed(found.model_name)
+        remedy = "give fewer --levels" if unsmoothed else "they are resolved by --smoothing"
         lines.append(("not unique", f"{text}; {remedy}"))
     return lines
 

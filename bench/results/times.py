@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -40,12 +41,27 @@ def check_model_name(model: str, time_column: str | None) -> None:
         raise ConfigurationError(f"--time: {model} is a model without time; with time there are: {', '.join(timed)}")
 
 
-def option_names(model: str) -> tuple[str, ...]:
-    """Return the names of the options of a model with time, but for those of an operator in it."""
+def is_smoothed(model: str) -> bool:
+    """Return whether a model with time takes a weight of smoothing."""
     fit = timed_models()[model].fit_in_time
     assert fit is not None
-    known = inspect.signature(fit).parameters.values()
-    return tuple(each.name for each in known if each.kind is each.KEYWORD_ONLY)
+    return "smoothing" in inspect.signature(fit).parameters
+
+
+def check_penalties(
+    model: str,
+    smoothing: float | Sequence[float],
+    *,
+    ridge: float | None,
+    levels_to_try: Sequence[int],
+    band: bool,
+) -> None:
+    """Raise ConfigurationError if a model with time does not take one of these; see `identify_file`."""
+    if ridge or band or (smoothing and not is_smoothed(model)):
+        others = "--ridge or" if is_smoothed(model) else "--smoothing, --ridge, --cross-validate or"
+        raise ConfigurationError(f"model {model} takes no {others} --band")
+    if levels_to_try:
+        raise ConfigurationError(f"--levels: model {model} takes one number; it is not chosen by cross-validation")
 
 
 def read_times(columns: Columns, name: str) -> Floats:

@@ -12,7 +12,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
-from typing import Any, Literal, NamedTuple
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -21,9 +21,12 @@ from bench.hysteresis import Regressor
 from bench.hysteresis._checks import Floats
 from bench.hysteresis.timed import check_sequence
 from bench.identification.by_name import FitProblem, Identification, Initial, set_up_problem
+from bench.identification.cross_validation import Fitted, Trial, compare_smoothing
 from bench.identification.least_squares import Fit, fit, fit_minimum_norm, one_thread
 from bench.identification.measures import measure_errors
+from bench.identification.options import OptionHelp
 from bench.identification.orientation import NAMES, Orientation, has_orientation
+from bench.identification.regularization import Regularization
 from bench.timed.hammerstein import Hammerstein, HammersteinState
 from bench.timed.linear_parts import LinearPart, logarithmic_creep
 from bench.timed.parsimony import WORTH, chance_of, check_size, deviations_of, is_worth
@@ -79,6 +82,8 @@ class Search:
         Square roots of the weights, 0 for rows left out.
     signs : tuple
         Signs of the operator's coefficients that are tried.
+    smoothing : float
+        Weight of the roughness penalty on the density of the operator, see `fit`.
     elapsed : ndarray, shape (N,)
         Since the first row, s.
     principal : ndarray, shape (N, r)
@@ -92,6 +97,7 @@ class Search:
     columns: Floats
     roots: Floats
     signs: tuple[Literal[1, -1], ...]
+    smoothing: float = 0.0
     elapsed: Floats = field(init=False)
     principal: Floats = field(init=False)
     step: float = field(init=False)
@@ -173,24 +179,38 @@ class Search:
         fits = [self.fit_columns(columns, drifts, self.static.weights, sign) for sign in self.signs]
         return min(fits, key=lambda each: self.cost(elements, values, each)) if len(fits) > 1 else fits[0]
 
-    def fit_columns(self, columns: Floats, drifts: Floats, weights: Floats, sign: Literal[1, -1]) -> Fit:
+    def fit_columns(
+        self,
+        columns: Floats,
+        drifts: Floats,
+        weights: Floats,
+        sign: Literal[1, -1],
+        smoothing: float | None = None,
+    ) -> Fit:
         """Return the coefficients of filtered columns and drift, with those of the operator of one sign."""
         problem = self.static
+        smoothing = self.smoothing if smoothing is None else smoothing
         # A filter leaves a trace of each cell in all later rows, even if none of those fitted moves it.
         fitted = columns[problem.skip :][weights[problem.skip :] > 0.0]
         columns = np.where(np.ptp(fitted, axis=0) >= _MOVED * np.ptp(columns, axis=0), columns, 0.0)
-        if not problem.spec.constrained:
-            regressor = Regressor.of_columns(np.column_stack([columns, drifts]))
+        cells, constrained = problem.regressor.base.size, problem.spec.constrained
+        turn = sign if constrained else 1
+        regressor = Regressor.of_cells(
+            turn * columns[:, :cells], np.column_stack([turn * columns[:, cells:], drifts])
+        )
+        if not constrained and not smoothing:
             return fit_minimum_norm(regressor, problem.outputs, weights=weights, skip=problem.skip)
         found = fit(
-            Regressor.of_columns(np.column_stack([sign * columns, drifts])),
+            regressor,
             problem.outputs,
-            nonnegative=np.concatenate([problem.template.nonnegative(), np.zeros(drifts.shape[1], dtype=bool)]),
+            nonnegative=constrained
+            & np.append(problem.template.nonnegative(), np.zeros(drifts.shape[1], dtype=bool)),
             weights=weights,
             skip=problem.skip,
+            smoothing=smoothing,
         )
         turned = found.coefficients.copy()
-        turned[: columns.shape[1]] *= sign
+        turned[: columns.shape[1]] *= turn
         return replace(found, coefficients=turned)
 
     def cost(self, elements: Sequence[str], values: Floats, found: Fit) -> float:
@@ -208,6 +228,10 @@ class Search:
 
     def basis(self, found: Fit) -> Floats:
         """Return the operator's columns over which the search projects, shape (N, r)."""
+        if self.smoothing:
+            # All cells are free then, and together they would take what follows the operator for hysteresis.
+            signal = self.columns @ found.coefficients[: self.columns.shape[1]]
+            return np.column_stack([signal, self.principal[:, :_FREE]])
         if self.static.spec.constrained:
             used = found.coefficients[: self.columns.shape[1]] != 0.0
             return self.columns[:, used]
@@ -317,8 +341,11 @@ def identify_hammerstein(
     skip: int = 0,
     initial: Initial | None = None,
     orientation: Orientation = "auto",
-    static: str = "preisach",
-    dynamics: str | None = None,
+    static: Annotated[str, OptionHelp("operator, the name of a model without time")] = "preisach",
+    dynamics: Annotated[str | None, OptionHelp("what follows it, with commas", "chosen by the data")] = None,
+    smoothing: Annotated[
+        float | Sequence[float], OptionHelp("weight of the roughness penalty on the density; of several the best")
+    ] = 0.0,
     **options: Any,  # noqa: ANN401 - those of the operator
 ) -> Identification[Any]:
     """Return the Hammerstein model that fits a measured sequence best in the least-squares sense.
@@ -347,6 +374,9 @@ def identify_hammerstein(
     dynamics : str or None
         Elements as listed above, separated by commas. None chooses among lag, resonance, delay, creep and drift: one
         after the other as long as it lowers the RMS error by 0.5 %, and more than its parameters would by chance.
+    smoothing : float or sequence of float
+        Weight of the roughness penalty on the density, see `fit`; 0 for an operator without one. Of several, the one
+        of the least error on blocks left out of the fit of the coefficients, see `cross_validate`.
     **options
         Those of the operator; see `identify`. A Preisach operator has a linear reversible part unless they say
         otherwise.
@@ -358,12 +388,29 @@ def identify_hammerstein(
     """
     moments, sequence, measured = check_sequence(times, inputs=inputs, outputs=outputs)
     chosen = None if dynamics is None else _elements(dynamics)
+    tried = [float(weight) for weight in np.atleast_1d(np.asarray(smoothing, dtype=np.float64))]
     problem, search = set_up_search(
-        moments, sequence, measured, weights, skip, initial, orientation, static=static, options=options
+        moments,
+        sequence,
+        measured,
+        weights,
+        skip,
+        initial,
+        orientation,
+        static=static,
+        options=options,
+        # What follows the operator hardly depends on the weight; without any a fine plane takes it for hysteresis.
+        smoothing=tried[len(tried) // 2],
     )
     warnings = list(problem.warnings())
+    penalties = Regularization(tried[0], 0.0) if any(tried) else None
     with one_thread():
         search, found = choose_elements(search) if chosen is None else _reshaped(search, _best(search, chosen))
+        if len(tried) > 1:
+            best = _cross_validated(search, found, tried)
+            penalties = Regularization(best.smoothing, 0.0, best.rms, best.spread, best.training_rms)
+            search = replace(search, smoothing=best.smoothing)
+            found = _best(search, found.elements, found)
     problem = search.static
     parameters = search.parameters(found.elements)
     for parameter, value, deviation in zip(parameters, found.values, found.deviations, strict=True):
@@ -392,6 +439,7 @@ def identify_hammerstein(
         skip=problem.skip,
         initial_state=state,
         warnings=tuple(warnings),
+        regularization=penalties,
         orientation=NAMES[search.sign(found.fit)] if has_orientation(problem.spec, problem.template) else None,
     )
 
@@ -421,20 +469,35 @@ def set_up_search(
     *,
     static: str,
     options: Mapping[str, Any],
+    smoothing: float = 0.0,
 ) -> tuple[FitProblem, Search]:
     """Return the problem of the operator alone, and the search for what follows it; see `identify_hammerstein`."""
     if static == "preisach":
         options = {"reversible": "linear", **options}
     problem = set_up_problem(
-        static, inputs, outputs, weights, skip, 0.0, initial, dict(options), orientation=orientation
+        static, inputs, outputs, weights, skip, smoothing, initial, dict(options), orientation=orientation
     )
+    if smoothing and not problem.regressor.base.size:
+        raise ValueError(f"smoothing: {static} has no cells of a density")
     check_size(*problem.regressor.shape, "levels")
     # The output of a lag may fall while the operator rises: the sign is found with the linear part.
     oriented = has_orientation(problem.spec, problem.template)
     signs: tuple[Literal[1, -1], ...] = (1, -1) if oriented and orientation == "auto" else (problem.orientation,)
     roots = np.sqrt(problem.weights)
     roots[: problem.skip] = 0.0
-    return problem, Search(times, problem, problem.regressor.dense(), roots, signs)
+    return problem, Search(times, problem, problem.regressor.dense(), roots, signs, smoothing)
+
+
+def _cross_validated(search: Search, found: Found, tried: Sequence[float]) -> Trial:
+    """Return the smoothing of the least error on blocks left out of the fit of the coefficients."""
+    columns, drifts = search.responses(found.elements, found.values)
+    sign = search.sign(found.fit)
+
+    def fitted(weight: float) -> Fitted:
+        return lambda weights: search.fit_columns(columns, drifts, weights, sign, weight)
+
+    regressor = Regressor.of_columns(np.column_stack([columns, drifts]))
+    return compare_smoothing(fitted, regressor, search.static.outputs, search.roots**2, tried).best
 
 
 def choose_elements(search: Search, among: Sequence[str] = CHOICE) -> tuple[Search, Found]:

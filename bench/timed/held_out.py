@@ -86,6 +86,7 @@ class HeldOutInTime:
             "auto",
             static=static.model,
             options=static.options,
+            smoothing=static.smoothing or 0.0,
         )
         if problem.skip > measured.known:
             raise ValueError(f"its memory is unknown until row {problem.skip}: too few rows are left")
@@ -114,7 +115,13 @@ class HeldOutInTime:
         options = {"static": static.model, **static.options, "dynamics": ",".join(found.elements)}
         return [
             Evaluation(
-                Candidate("hammerstein", options, NAMES[sign] if constrained.any() else "auto", static.initial),
+                Candidate(
+                    "hammerstein",
+                    options,
+                    NAMES[sign] if constrained.any() else "auto",
+                    static.initial,
+                    search.smoothing,
+                ),
                 blocks=tuple(error for error, _ in blocks),
                 units=tuple(error for error, _ in units),
                 training=float(np.mean(trained[: len(blocks)])),

@@ -139,6 +139,50 @@ def test_a_shape_and_a_lag_at_one_rate_are_found_together():
     assert found.linear.lag == (pytest.approx(1.5e-3, rel=0.2), 0.0)
 
 
+@pytest.mark.parametrize("static", ["preisach", "preisach-signed"])
+def test_smoothing_is_that_of_the_operators(static):
+    rng = np.random.default_rng(0)
+    t, u = record(rng)
+    y = Preisach(uniform_levels(-1.0, 1.0, 6), rng.random(21) + 0.2, 0.3).evaluate(u) + rng.normal(0.0, 0.02, t.size)
+    options = {"levels": 12, "reversible": "linear", "smoothing": 1e-2}
+    alone = identify(static, u, y, ridge=0.0, **options)
+    found = identify_in_time("hammerstein", t, u, y, static=static, dynamics="none", **options)
+    np.testing.assert_allclose(found.model.static.density, alone.model.density, atol=1e-8)
+    assert found.errors.rms == pytest.approx(alone.errors.rms, rel=1e-9)
+    assert found.regularization.smoothing == 1e-2
+
+
+def test_smoothing_chosen_on_blocks_left_out_predicts_better_from_a_fine_plane():
+    rng = np.random.default_rng(1)
+    # A density that falls from the diagonal, on a plane that is twice as fine.
+    i, j = np.tril_indices(60)
+    density = np.exp(-0.1 * (i - j) - 0.002 * (i + j - 50.0) ** 2)
+    plant = Hammerstein(Preisach(uniform_levels(-1.0, 1.0, 60), density), LinearPart(lag=(0.01, 0.0)))
+
+    def measured(turns):
+        inputs = ramps([0.0, *turns], 0.05)
+        times = 2e-3 * np.arange(inputs.size)
+        return times, inputs, plant.evaluate(times, inputs)
+
+    t, u, y = measured([-1.0, 1.0, *rng.uniform(-1.0, 1.0, 40)])
+    y += 0.02 * np.ptp(y) * rng.standard_normal(y.size)
+    later, fresh, truth = measured([-1.0, 1.0, *rng.uniform(-1.0, 1.0, 40)])
+
+    def held_out(smoothing):
+        options = {"levels": 30, "dynamics": "lag", "smoothing": smoothing}
+        found = identify_in_time("hammerstein", t, u, y, **options)
+        assert found.certificate.kkt_residual < 1e-10
+        return measure_errors(truth, found.model.evaluate(later, fresh)).rms, found.regularization
+
+    tried = (0.0, 1e-3, 1e-2, 1e-1)
+    errors = {weight: held_out(weight)[0] for weight in tried}
+    chosen, penalties = held_out(tried)
+    assert penalties.smoothing > 0.0
+    assert penalties.rms > penalties.training_rms > 0.0
+    assert chosen < 0.8 * errors[0.0]
+    assert chosen < 1.1 * min(errors.values())
+
+
 def test_cells_that_only_rows_left_out_have_moved_stay_at_zero():
     rng = np.random.default_rng(0)
     inputs = ramps([0.0, 10.0, 0.0, *rng.uniform(0.0, 10.0, 14)], 0.4)
@@ -173,6 +217,8 @@ def test_what_the_data_do_not_determine_is_said():
         ({"dynamics": "lag,resonance"}, "one of lag and resonance"),
         ({"dynamics": "none", "plays": 3}, "options of preisach"),
         ({"static": "hammerstein"}, "model_name"),
+        ({"static": "polynomial", "smoothing": 0.1}, "polynomial has no cells"),
+        ({"smoothing": -0.1}, "smoothing: expected a finite number >= 0"),
     ],
 )
 def test_wrong_options_are_refused(options, message):

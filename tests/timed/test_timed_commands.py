@@ -50,6 +50,7 @@ def oscillator(folder):
         (hammerstein, ("--model", "hammerstein", "--levels", 5, "--dynamics", "none", "--skip", 20)),
         (hammerstein, ("--model", "hammerstein", "--static", "polynomial", "--degree", 3, "--dynamics", "lag,drift")),
         (hammerstein, ("--model", "hammerstein", "--levels", 5, "--dynamics", "lag", "--initial", "positive")),
+        (hammerstein, ("--model", "hammerstein", "--levels", 8, "--dynamics", "lag", "--smoothing", 0.01)),
         (plays, ("--model", "rate-dependent-plays", "--plays", 10, "--option", "time_constants=1")),
         (plays, ("--model", "rate-dependent-plays", "--initial", "skip", "--maximum", 4)),
         pytest.param(oscillator, ("--model", "bouc-wen-oscillator"), marks=pytest.mark.seeds),
@@ -93,7 +94,6 @@ def test_time_stands_in_rows_figures_and_card(bench, tmp_path):
     options = ("--model", "hammerstein", "--levels", 5, "--dynamics", "lag", "--figures", tmp_path / "figures")
     code, _, text = bench("identify", data, *COLUMNS, *options, "--out", model, "--card", card)
     assert code == 0, text
-    assert "--smoothing" not in text
     assert (tmp_path / "figures" / "hammerstein-errors.png").is_file()
     times, drive, _ = np.loadtxt(data, delimiter=",", skiprows=1, unpack=True)
     rates = np.abs(np.diff(drive) / np.diff(1e-3 * times))
@@ -111,6 +111,23 @@ def test_time_stands_in_rows_figures_and_card(bench, tmp_path):
         assert head == "time [s],drive [V],measured [µm],predicted [µm],residual [µm]"
         written = np.loadtxt(path, delimiter=",", skiprows=1, usecols=0)
         np.testing.assert_allclose(written, 1e-3 * times, rtol=1e-12)
+
+
+def test_smoothing_is_chosen_by_cross_validation_and_refused_where_there_is_none(bench, tmp_path):
+    data, summary = hammerstein(tmp_path), tmp_path / "fit.json"
+    options = ("--model", "hammerstein", "--levels", 12, "--dynamics", "lag", "--cross-validate")
+    code, out, text = bench("identify", data, *COLUMNS, *options, "--json", summary)
+    assert code == 0, text
+    assert "on blocks left out" in " ".join(out.split())
+    assert json.loads(summary.read_text())["smoothing"] > 0.0
+    for model, option, words in (
+        ("hammerstein", "--band", "takes no --ridge or --band"),
+        ("rate-dependent-plays", "--cross-validate", "takes no --smoothing"),
+        ("preisach-oscillator", "--smoothing=0.1", "takes no --smoothing"),
+        ("hammerstein", "--levels=5,10", "takes one number"),
+    ):
+        code, _, text = bench("identify", data, *COLUMNS, "--model", model, option)
+        assert (code, words in " ".join(text.split())) == (2, True), text
 
 
 def test_times_are_read_in_their_unit(bench, tmp_path):
