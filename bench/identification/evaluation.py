@@ -47,6 +47,8 @@ class Candidate:
         Memory before the first sample, as `identify` takes it.
     smoothing : float or None
         Weight of the roughness penalty; None leaves it, and that of the size, to the fit of a density of either sign.
+    static : str or None
+        Of a model with time, the name of the operator that it is without time.
     """
 
     model: str
@@ -54,6 +56,12 @@ class Candidate:
     orientation: Orientation = "rising"
     initial: Initial | None = None
     smoothing: float | None = 0.0
+    static: str | None = None
+
+    @property
+    def operator(self) -> str:
+        """Name of the operator, also of a model with time."""
+        return self.static or self.model
 
 
 @dataclass(frozen=True, eq=False)

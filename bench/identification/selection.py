@@ -70,6 +70,8 @@ _FEWER = 2.0 / 3.0
 _DRIFTS, _FEWEST_OF_TREND = 0.15, 100
 # Turns of the input that say nothing of its minor loops, and moves that are none.
 _FEW_REVERSALS, _LEAST_MOVE = 4, 0.02
+# The operator whose plays may depend on the rate.
+PLAYS = "prandtl-ishlinskii"
 # Operators to which a linear part and a drift are added, and what of it is a lag.
 _IN_TIME = 2
 _LAGS = {"lag", "resonance", "delay"}
@@ -200,6 +202,9 @@ class InTime(Protocol):
 
     def evaluate(self, static: Candidate, gap: int) -> list[Evaluation]:
         """Return the errors of a model with time with a candidate's operator; none if time tells nothing."""
+
+    def evaluate_plays(self, static: Candidate, gap: int) -> list[Evaluation]:
+        """Return the errors of a candidate's plays with thresholds that grow with their rate; none likewise."""
 
 
 def select(
@@ -432,6 +437,8 @@ class _Search:
         tasks: list[tuple[str, Task]] = [
             ("hammerstein", partial(self.in_time.evaluate, each.candidate, gap)) for each in tried
         ]
+        if PLAYS in best and not self.in_time.has_one_rate():
+            tasks.append((PLAYS, partial(self.in_time.evaluate_plays, best[PLAYS].candidate, gap)))
         found = [one for each in self.carry(tasks) for one in each]
         self.given_up += [each for each in found if each.failure]
         # What is left out of the others decides.
@@ -439,8 +446,8 @@ class _Search:
         return [
             replace(
                 each,
-                determined=best[each.candidate.options["static"]].determined,
-                follows=best[each.candidate.options["static"]].follows,
+                determined=best[each.candidate.operator].determined,
+                follows=best[each.candidate.operator].follows,
                 units=each.units if units else (),
             )
             for each in found
@@ -471,7 +478,7 @@ class _Search:
             float(np.ptp(measured.outputs)),
             self._has_one_kind,
             self._reversals,
-            self._trend(chosen) if "static" not in chosen.candidate.options else None,
+            self._trend(chosen) if chosen.candidate.static is None else None,
             self.in_time is not None and self.in_time.has_one_rate(),
         )
 
@@ -498,7 +505,7 @@ class _Search:
         return [
             each
             for each in finalists
-            if "static" in each.candidate.options or not lagging or _UNBOUNDED**2 * _score(each).mean() < least
+            if each.candidate.static or not lagging or _UNBOUNDED**2 * _score(each).mean() < least
         ]
 
     def _trend(self, chosen: Evaluation) -> Trend | None:
@@ -532,14 +539,14 @@ class _Search:
             if each not in bounded
             and each.follows
             and each.free <= _FEWER * simplest.free
-            and each.candidate.options.get("static", each.candidate.model) in self._with_shape
+            and each.candidate.operator in self._with_shape
         ]
 
     def _is_bounded(self, each: Evaluation) -> bool:
         """Return whether signs bound the answer to other inputs, or it has no memory."""
         if _has_signs(each):
             return True
-        operator = find_model(each.candidate.options.get("static", each.candidate.model)).model
+        operator = find_model(each.candidate.operator).model
         # Beyond a single rise a polynomial is bounded by nothing, but for a straight line.
         return bool(operator.memoryless and (self._reversals >= _FEW_REVERSALS or each.free <= 1.0))
 
@@ -652,7 +659,7 @@ def is_within_one_standard_error(simple: Evaluation, best: Evaluation) -> bool:
         first, second = np.array(simple.blocks), np.array(best.blocks)
     difference = first - second
     allowed = float(np.std(difference, ddof=1) / np.sqrt(difference.size))
-    if "static" in simple.candidate.options or "static" not in best.candidate.options:
+    if simple.candidate.static or not best.candidate.static:
         allowed = max(allowed, (EQUAL**2 - 1.0) * second.mean())
     allowed = min(allowed, (_WORSE**2 - 1.0) * second.mean())
     return bool(difference.mean() <= allowed)

@@ -1,22 +1,27 @@
-"""Held-out errors of Hammerstein models, so that models with time can be compared with those without."""
+"""Held-out errors of models with time, so that they can be compared with those without."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from bench.hysteresis._checks import Floats
 from bench.identification.branches import turning_points
+from bench.identification.by_name import FitProblem
 from bench.identification.evaluation import Candidate, Evaluation, Measurements
 from bench.identification.folds import Fold
-from bench.identification.least_squares import one_thread
+from bench.identification.least_squares import Fit, one_thread
 from bench.identification.orientation import NAMES
 from bench.timed.hammerstein_fit import CHOICE, choose_elements, set_up_search
+from bench.timed.rate_dependent_plays_fit import PlaysSearch
 
 # Rows times coefficients of the operator up to which the choice of what follows it takes seconds.
 _MOST = 2_000_000
+# Rows times plays up to which the choice of their time constants does.
+_MOST_OF_PLAYS = 250_000
 # Moves from this part of the range on have a speed.
 _LEAST_MOVE = 0.02
 
@@ -64,67 +69,135 @@ class HeldOutInTime:
         gap : int
             Rows next to those tested that are not fitted, of the rows by which the others are compared.
         """
+        return self._carry_out("hammerstein", static, gap, self._behind)
+
+    def evaluate_plays(self, static: Candidate, gap: int) -> list[Evaluation]:
+        """Return the errors of a Prandtl-Ishlinskii candidate's plays, with thresholds that grow with their rate.
+
+        None if no time constant is worth it. Arguments as `evaluate`.
+        """
+        return self._carry_out("rate-dependent-plays", static, gap, self._at_rates)
+
+    def _carry_out(
+        self,
+        model: str,
+        static: Candidate,
+        gap: int,
+        work: Callable[[Measurements, Candidate], Evaluation | None],
+    ) -> list[Evaluation]:
         begin = time.process_time()
         scale = self.times.size / self.thinned
         measured = replace(self.measured, gap=round(gap * scale))
         try:
             with one_thread():
-                found = self._evaluate(measured, static)
+                found = work(measured, static)
         # What cannot follow one operator must not end the comparison of the others.
         except (ValueError, ArithmeticError, np.linalg.LinAlgError) as error:
-            found = [Evaluation(replace(static, model="hammerstein"), failure=str(error))]
-        return [replace(each, seconds=time.process_time() - begin) for each in found]
+            found = Evaluation(replace(static, model=model, static=static.model), failure=str(error))
+        return [] if found is None else [replace(found, seconds=time.process_time() - begin)]
 
-    def _evaluate(self, measured: Measurements, static: Candidate) -> list[Evaluation]:
+    def _behind(self, measured: Measurements, static: Candidate) -> Evaluation | None:
         problem, search = set_up_search(
             self.times,
             measured.inputs,
             measured.outputs,
-            measured.fitted.astype(np.float64),
-            measured.known if static.initial == "skip" else 0,
+            *self._fitted(measured, static),
             static.initial,
             "auto",
             static=static.model,
             options=static.options,
             smoothing=static.smoothing or 0.0,
         )
-        if problem.skip > measured.known:
-            raise ValueError(f"its memory is unknown until row {problem.skip}: too few rows are left")
+        _check_skipped(measured, problem)
         # At one rate, creep is hysteresis to the record: it would be found in place of a lag.
         slow = {"creep"} if self.has_one_rate() else set()
         search, found = choose_elements(search, [element for element in CHOICE if element not in slow])
         if not found.elements:
-            return []
+            return None
         columns, drifts = search.responses(found.elements, found.values)
-        constrained = search.static.template.nonnegative()
         sign = search.sign(found.fit)
-        trained = []
+        candidate = Candidate(
+            "hammerstein",
+            {"static": static.model, **static.options, "dynamics": ",".join(found.elements)},
+            NAMES[sign] if search.static.template.nonnegative().any() else "auto",
+            static.initial,
+            search.smoothing,
+            static.model,
+        )
+        return _left_out(
+            measured,
+            candidate,
+            np.column_stack([columns, drifts]),
+            lambda weights: search.fit_columns(columns, drifts, weights, sign),
+            problem.skip,
+            found.values.size,
+        )
 
-        def leave_out(fold: Fold) -> tuple[float, float]:
-            weights = fold.trained.astype(np.float64)
-            fit = search.fit_columns(columns, drifts, weights, sign)
-            count = columns.shape[1]
-            fitted = fit.bias + columns @ fit.coefficients[:count] + drifts @ fit.coefficients[count:]
-            errors = (measured.outputs - fitted) ** 2
-            weights[: problem.skip] = 0.0
-            trained.append(float(np.sqrt(weights @ errors / weights.sum())))
-            return float(errors[fold.tested].mean()), fit.certificate.passive + found.values.size
+    def _at_rates(self, measured: Measurements, static: Candidate) -> Evaluation | None:
+        options = {name: value for name, value in static.options.items() if name != "dead_zones"}
+        if options["plays"] * self.times.size > _MOST_OF_PLAYS:
+            return None
+        fitted = self._fitted(measured, static)
+        search = PlaysSearch.of(
+            self.times, measured.inputs, measured.outputs, *fitted, static.initial, "auto", **options
+        )
+        _check_skipped(measured, search.static)
+        found = search.choose()
+        if not found.lags.size:
+            return None
+        columns = search.columns(found.lags)
+        candidate = Candidate(
+            "rate-dependent-plays",
+            {**options, "time_constants": found.lags.size},
+            NAMES[search.static.orientation],
+            static.initial,
+            static=static.model,
+        )
+        return _left_out(
+            measured,
+            candidate,
+            columns,
+            lambda weights: search.fit_columns(columns, weights),
+            search.static.skip,
+            found.lags.size,
+        )
 
-        blocks = [leave_out(fold) for fold in measured.blocks()]
-        units = [leave_out(fold) for fold in measured.units()]
-        options = {"static": static.model, **static.options, "dynamics": ",".join(found.elements)}
-        return [
-            Evaluation(
-                Candidate(
-                    "hammerstein",
-                    options,
-                    NAMES[sign] if constrained.any() else "auto",
-                    static.initial,
-                    search.smoothing,
-                ),
-                blocks=tuple(error for error, _ in blocks),
-                units=tuple(error for error, _ in units),
-                training=float(np.mean(trained[: len(blocks)])),
-                free=float(np.mean([free for _, free in blocks])),
-            )
-        ]
+    def _fitted(self, measured: Measurements, static: Candidate) -> tuple[Floats, int]:
+        """Return the weights of the rows, and how many first ones are left out."""
+        return measured.fitted.astype(np.float64), measured.known if static.initial == "skip" else 0
+
+
+def _check_skipped(measured: Measurements, problem: FitProblem) -> None:
+    """Raise ValueError if rows that are tested depend on what came before the record."""
+    if problem.skip > measured.known:
+        raise ValueError(f"its memory is unknown until row {problem.skip}: too few rows are left")
+
+
+def _left_out(
+    measured: Measurements,
+    candidate: Candidate,
+    columns: Floats,
+    fit: Callable[[Floats], Fit],
+    skip: int,
+    parameters: int,
+) -> Evaluation:
+    """Return the errors over what is left out of fits of columns, shape (N, K), given by weights of the rows."""
+    trained = []
+
+    def leave_out(fold: Fold) -> tuple[float, float]:
+        weights = fold.trained.astype(np.float64)
+        found = fit(weights)
+        errors = (measured.outputs - found.bias - columns @ found.coefficients) ** 2
+        weights[:skip] = 0.0
+        trained.append(float(np.sqrt(weights @ errors / weights.sum())))
+        return float(errors[fold.tested].mean()), found.certificate.effective + parameters
+
+    blocks = [leave_out(fold) for fold in measured.blocks()]
+    units = [leave_out(fold) for fold in measured.units()]
+    return Evaluation(
+        candidate,
+        blocks=tuple(error for error, _ in blocks),
+        units=tuple(error for error, _ in units),
+        training=float(np.mean(trained[: len(blocks)])),
+        free=float(np.mean([free for _, free in blocks])),
+    )

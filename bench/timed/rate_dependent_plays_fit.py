@@ -19,7 +19,8 @@ from bench.hysteresis import PrandtlIshlinskii, Regressor
 from bench.hysteresis._checks import Floats
 from bench.hysteresis.timed import check_sequence
 from bench.identification.by_name import FitProblem, Identification, Initial, set_up_problem
-from bench.identification.least_squares import Fit, fit, one_thread
+from bench.identification.cell_layout import CellLayout
+from bench.identification.least_squares import Fit, fit_cells, one_thread
 from bench.identification.measures import measure_errors
 from bench.identification.options import OptionHelp
 from bench.identification.orientation import NAMES, Orientation
@@ -128,8 +129,11 @@ class PlaysSearch:
         """Return the weights of the plays for the problem's weights of samples, or others."""
         problem = self.static
         w = problem.weights if weights is None else weights
-        regressor = Regressor.of_columns(problem.orientation * columns)
-        found = fit(regressor, problem.outputs, weights=w, skip=problem.skip)
+        # Plays stand still most of the time: as cells, without a place in a plane, they are quickly fitted.
+        regressor = Regressor.of_cells(problem.orientation * columns, np.empty((columns.shape[0], 0)))
+        count = columns.shape[1]
+        layout = CellLayout(0, np.arange(count), np.zeros(count, dtype=np.int64))
+        found = fit_cells(layout, regressor, problem.outputs, weights=w, skip=problem.skip)
         return replace(found, coefficients=problem.orientation * found.coefficients)
 
     def at(self, lags: Floats) -> tuple[Fit, Floats]:

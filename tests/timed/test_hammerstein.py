@@ -152,6 +152,7 @@ def test_smoothing_is_that_of_the_operators(static):
     assert found.regularization.smoothing == 1e-2
 
 
+@pytest.mark.slow
 def test_smoothing_chosen_on_blocks_left_out_predicts_better_from_a_fine_plane():
     rng = np.random.default_rng(1)
     # A density that falls from the diagonal, on a plane that is twice as fine.
