@@ -835,6 +835,16 @@ def test_safe_that_is_not_confirmed_raises_after_everything_was_tried(script, su
         supply.safe()
 
 
+def test_safe_over_another_line_needs_no_emergency_stop(script, supply):
+    supply.set(6.0)
+    script.received.clear()
+    script.instead = [lambda _right: b""] * 3
+    supply.safe()
+    assert script.instead == []
+    assert (0x200C, 0, 1) not in script.orders()
+    assert script.orders()[-1] == (0x200E, 0, 1)
+
+
 def test_safe_of_a_silent_device_tries_everything(script, supply):
     script.silent = True
     with pytest.raises(DeviceError, match=r"does not confirm .*no answer"):
