@@ -616,12 +616,11 @@ class LabJackT7:
         self._gave_up = self._in_haste
         try:
             self.reopen()
-        except DeviceConnectionError:
-            raise failure from error
-        self.repeats += 1
-        try:
+            self.repeats += 1
             with self._lock:
                 return ask(self._client)
+        except DeviceConnectionError:
+            raise failure from error
         except RefusedError as refusal:
             raise self._refusal(refusal, doing) from refusal
         except OSError:

@@ -1039,6 +1039,11 @@ def test_safe_state_is_reached_in_haste_and_patience_comes_back(script, clock):
     assert clock.now() - before == pytest.approx(3.0, abs=0.05)
 
 
+def test_a_rescue_switches_off_and_disarms_the_watchdog(script, clock):
+    MeerstetterTEC.rescue("tec", make_settings(), clock)
+    assert script.orders() == ["VSC3500100000000", "VS07DA0100000000", "VS080C0100000000"]
+
+
 def test_patience_that_is_short_already_is_not_made_longer(script, clock):
     tec = connect(clock, timeout=0.05)
     script.silent = True

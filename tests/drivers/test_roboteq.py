@@ -835,6 +835,16 @@ def test_safe_that_is_not_confirmed_raises_after_everything_was_tried(script, su
         supply.safe()
 
 
+def test_safe_over_another_line_needs_no_emergency_stop(script, supply):
+    supply.set(6.0)
+    script.received.clear()
+    script.instead = [lambda _right: b""] * 3
+    supply.safe()
+    assert script.instead == []
+    assert (0x200C, 0, 1) not in script.orders()
+    assert script.orders()[-1] == (0x200E, 0, 1)
+
+
 def test_safe_of_a_silent_device_tries_everything(script, supply):
     script.silent = True
     with pytest.raises(DeviceError, match=r"does not confirm .*no answer"):
@@ -1691,15 +1701,19 @@ def test_command_that_is_acknowledged_too_late_counts_as_dropped(script, connect
     assert [value for index, _, value in script.orders()[-3:] if index == 0x2000] == [250, 0, 0]
 
 
+@pytest.mark.parametrize("code", [0x06090011, 0x06020000])
+def test_other_channels_that_are_not_there_do_not_matter_to_a_rescue(script, clock, code):
+    script.aborts = {(0x2000, 2): code, (0x2000, 3): code}
+    RoboteqSupply.rescue("supply", make_settings(), clock)
+    assert script.orders() == [(0x2000, 1, 0), (0x2000, 2, 0), (0x2000, 3, 0), (0x200E, 0, 1)]
+
+
 def test_refused_zero_after_a_gap(script, supply, clock):
     supply.set(6.0)
     clock.sleep(2.0)
     script.aborts[0x2000, 1] = 0x08000022
     with pytest.raises(DeviceError, match="refused 0 as its motor command"):
         supply.measure()
-    # Another channel that is not there is no matter.
-    script.aborts = {(0x2000, 2): 0x06090011, (0x2000, 3): 0x06020000}
-    supply.safe()
 
 
 @pytest.mark.parametrize(("channel", "code"), [(1, 0x06090011), (1, 0x08000022), (2, 0x08000022)])

@@ -212,6 +212,12 @@ def test_without_a_question_for_the_state_the_instrument_has_to_answer(stack):
     device.set(5.0)
     device.safe()
     assert lab.delivered[-1] == 0.0
+    lab.answer = lambda data, usual: b"" if b"IDN" in data else usual(data)
+    lab.requests.clear()
+    with pytest.raises(DeviceError, match="does not confirm"):
+        device.safe()
+    # It is asked once, and once more over another line.
+    assert lab.requests.count("*IDN?") == 2
     lab.instrument.unplug()
     with pytest.raises(DeviceError, match="does not confirm"):
         device.safe()
