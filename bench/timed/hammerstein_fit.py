@@ -26,6 +26,7 @@ from bench.identification.measures import measure_errors
 from bench.identification.options import OptionHelp
 from bench.identification.orientation import NAMES, Orientation, has_orientation
 from bench.identification.regularization import Regularization
+from bench.identification.trust import judge_fit
 from bench.timed.hammerstein import Hammerstein, HammersteinState
 from bench.timed.hammerstein_search import EVALUATIONS, FREE, Found, Search, find_best, search_ends
 from bench.timed.parsimony import WORTH, chance_of, check_size, deviations_of, is_worth
@@ -144,10 +145,12 @@ def identify_hammerstein(
     model = Hammerstein(operator, part, drift, time)
     state = HammersteinState(problem.state)
     predicted = model.evaluate(moments, sequence, state)
+    residuals = measured - predicted
+    warnings += judge_fit(problem, found.fit, residuals, initial=initial, smoothing=search.smoothing)
     return Identification(
         model_name="hammerstein",
         model=model,
-        residuals=measured - predicted,
+        residuals=residuals,
         errors=measure_errors(measured[problem.skip :], predicted[problem.skip :]),
         uncertainties=found.fit.uncertainties,
         certificate=found.fit.certificate,

@@ -24,6 +24,7 @@ from bench.identification.least_squares import Fit, fit_cells, one_thread
 from bench.identification.measures import measure_errors
 from bench.identification.options import OptionHelp
 from bench.identification.orientation import NAMES, Orientation
+from bench.identification.trust import judge_fit
 from bench.timed.parsimony import check_size, deviations_of, is_worth
 from bench.timed.rate_dependent_plays import PlaysState, RateDependentPlays
 
@@ -269,10 +270,12 @@ def identify_rate_dependent_plays(
         )
     model, state, first = search.model(found.lags, found.fit), search.state(found.lags), search.static.skip
     predicted = model.evaluate(moments, sequence, state)
+    residuals = measured - predicted
+    warnings += judge_fit(search.static, found.fit, residuals, initial=initial, smoothing=0.0)
     return Identification(
         model_name=model.kind,
         model=model,
-        residuals=measured - predicted,
+        residuals=residuals,
         errors=measure_errors(measured[first:], predicted[first:]),
         uncertainties=found.fit.uncertainties,
         certificate=found.fit.certificate,

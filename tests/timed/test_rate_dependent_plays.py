@@ -307,6 +307,18 @@ def test_plays_without_a_rate_are_given_none():
 
 
 @pytest.mark.parametrize(
+    ("model", "options"),
+    [("rate-dependent-plays", {"time_constants": 2}), ("hammerstein", {"levels": 10, "dynamics": "lag"})],
+)
+def test_few_samples_are_warned_of(model, options):
+    rng = np.random.default_rng(0)
+    t = np.arange(24.0)
+    u = np.sin(0.9 * t)
+    found = identify_in_time(model, t, u, u + 0.1 * rng.standard_normal(24), **options)
+    assert any("24 samples are few" in text for text in found.warnings)
+
+
+@pytest.mark.parametrize(
     ("options", "message"),
     [
         ({"time_constants": 4}, "time_constants: expected 0 to 3"),
