@@ -139,10 +139,35 @@ class PlaysSearch:
 
     def at(self, lags: Floats) -> tuple[Fit, Floats]:
         """Return the fit for given time constants, and its weighted residuals, shape (N - skip,)."""
-        problem, columns = self.static, self.columns(lags)
+        columns = self.columns(lags)
         found = self.fit_columns(columns)
-        errors = problem.outputs - found.bias - columns @ found.coefficients
-        return found, (np.sqrt(problem.weights) * errors)[problem.skip :]
+        return found, self._weighted(self.static.outputs - found.bias - columns @ found.coefficients)
+
+    def slopes(self, lags: Floats, found: Fit) -> Floats:
+        """Return the derivatives of the residuals by the logarithms of the time constants, shape (N - skip, J).
+
+        In the form of Kaufman: without what the free weights can take over.
+        """
+        count = self.template.thresholds.size
+        state = PlaysState(self.state(lags).plays[:count])
+
+        def output(place: int, lag: float) -> Floats:
+            weights = found.coefficients[(1 + place) * count : (2 + place) * count]
+            plays = replace(self.model(np.empty(0)), time_constants=np.full(count, lag), weights=weights, bias=0.0)
+            return plays.evaluate(self.times, self.static.inputs, state)
+
+        change = np.column_stack([
+            self._weighted(output(k, lag * (1.0 + _STEP)) - output(k, lag * (1.0 - _STEP))) / (2.0 * _STEP)
+            for k, lag in enumerate(lags.tolist())
+        ])  # fmt: skip
+        free = self.columns(lags)[:, found.coefficients != 0.0]
+        basis = np.linalg.qr(self._weighted(np.column_stack([free, np.ones(self.times.size)])))[0]
+        return np.asarray(basis @ (basis.T @ change) - change)
+
+    def _weighted(self, values: Floats) -> Floats:
+        """Return rows that count times the roots of their weights; shape (N, ...) becomes (N - skip, ...)."""
+        roots = np.sqrt(self.static.weights[self.static.skip :])
+        return (roots * values[self.static.skip :].T).T
 
     @property
     def bounds(self) -> tuple[float, float]:
@@ -155,25 +180,26 @@ class PlaysSearch:
         from scipy.optimize import least_squares
 
         low, high = self.bounds
-
-        def lags_at(values: Floats) -> Floats:
-            # Counted from 1 on, as the steps of differences are in proportion.
-            return np.exp(values + low - 1.0)
+        fits: dict[bytes, Fit] = {}
 
         def residuals(values: Floats) -> Floats:
-            return self.at(lags_at(values))[1]
+            fits[values.tobytes()], rest = self.at(np.exp(values))
+            return rest
+
+        def jacobian(values: Floats) -> Floats:
+            return self.slopes(np.exp(values), fits[values.tobytes()])
 
         end = least_squares(
             residuals,
-            np.clip(np.log(start) - low, 0.0, high - low) + 1.0,
-            bounds=(1.0, high - low + 1.0),
-            diff_step=np.full(start.size, _STEP),
+            np.clip(np.log(start), low, high),
+            jac=jacobian,
+            bounds=(low, high),
             ftol=_TOLERANCE,
             xtol=_TOLERANCE,
             gtol=_TOLERANCE,
             max_nfev=_EVALUATIONS,
         )
-        lags = np.sort(lags_at(end.x))
+        lags = np.sort(np.exp(end.x))
         found, rest = self.at(lags)
         cost = float(rest @ rest)
         freedom = max(rest.size - found.certificate.passive - lags.size - 1, 1)

@@ -14,6 +14,7 @@ from bench.model_file import ModelFile
 from bench.results.inverted import invert_targets
 from bench.timed import PlaysState, RateDependentPlays, identify_in_time
 from bench.timed.held_out import HeldOutInTime
+from bench.timed.rate_dependent_plays_fit import PlaysSearch
 
 seeds = st.integers(0, 10**6)
 
@@ -291,6 +292,24 @@ def test_a_time_constant_is_found_again(sign):
     assert numbers["time constant 1"] == pytest.approx(0.004, rel=0.02)
     assert found.orientation == ("rising" if sign > 0 else "falling")
     assert measure_errors(plant.evaluate(t, u), found.model.evaluate(t, u)).rms_percent < 0.05
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_slopes_of_the_search_give_the_gradient_of_the_cost(sign):
+    rng = np.random.default_rng(0)
+    t, u = cycles([2, 20, 60, 60], [1.0, 0.6, 0.9, 0.4], 500.0)
+    y = sign * activated(t, u) + rng.normal(0.0, 0.01, t.size)
+    search = PlaysSearch.of(t, u, y, rng.uniform(0.5, 2.0, t.size), 30, "negative", "auto", plays=8, origin=0.1)
+    lags = np.array([0.004, 0.05])
+    fit, rest = search.at(lags)
+
+    def cost(place, factor):
+        moved = lags.copy()
+        moved[place] *= factor
+        return 0.5 * float(np.sum(search.at(moved)[1] ** 2))
+
+    expected = [(cost(k, 1.0 + 1e-4) - cost(k, 1.0 - 1e-4)) / 2e-4 for k in range(2)]
+    np.testing.assert_allclose(search.slopes(lags, fit).T @ rest, expected, rtol=1e-4)
 
 
 def test_plays_without_a_rate_are_given_none():
