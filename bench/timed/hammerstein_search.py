@@ -15,7 +15,7 @@ from bench.hysteresis._checks import Floats
 from bench.identification.by_name import FitProblem
 from bench.identification.least_squares import Fit, fit, fit_minimum_norm
 from bench.timed.linear_parts import LinearPart, logarithmic_creep
-from bench.timed.parsimony import deviations_of
+from bench.timed.parsimony import deviations_of, moving
 
 EVALUATIONS = 40
 """Evaluations of a search."""
@@ -29,8 +29,6 @@ _STARTS = 3
 # Principal columns in the grid that a search starts from.
 _COARSE = 6
 _STEP = 1e-5
-# Part of the range of a column that the rows fitted must go through, or its coefficient would be noise.
-_MOVED = 0.01
 
 
 @dataclass(frozen=True)
@@ -167,9 +165,7 @@ class Search:
         """Return the coefficients of filtered columns and drift, with those of the operator of one sign."""
         problem = self.static
         smoothing = self.smoothing if smoothing is None else smoothing
-        # A filter leaves a trace of each cell in all later rows, even if none of those fitted moves it.
-        fitted = columns[problem.skip :][weights[problem.skip :] > 0.0]
-        columns = np.where(np.ptp(fitted, axis=0) >= _MOVED * np.ptp(columns, axis=0), columns, 0.0)
+        columns = moving(columns, weights, problem.skip)
         cells, constrained = problem.regressor.base.size, problem.spec.constrained
         turn = sign if constrained else 1
         regressor = Regressor.of_cells(

@@ -1,4 +1,4 @@
-"""What searches for the parameters of models with time share: size, worth of a parameter, standard deviations."""
+"""What fits of models with time share: size, columns that move, worth of parameters, their standard deviations."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ WORTH = 0.005
 
 # Greatest regressor, numbers; 400 MB.
 _LARGEST = 50_000_000
+# Part of the range of a column that the rows fitted must go through, or its coefficient would be noise.
+_MOVED = 0.01
 
 
 def check_size(rows: int, count: int, fewer: str) -> None:
@@ -22,6 +24,15 @@ def check_size(rows: int, count: int, fewer: str) -> None:
         raise ValueError(
             f"{rows} rows and {count} coefficients take {size:.1f} GB; give fewer {fewer}, or every nth row"
         )
+
+
+def moving(columns: Floats, weights: Floats, skip: int) -> Floats:
+    """Return columns, shape (N, K), with those at 0 that the rows fitted hardly move; weights, shape (N,), say which.
+
+    What relaxes leaves a trace of each move in all later rows, even if none of those fitted makes it.
+    """
+    fitted = columns[skip:][weights[skip:] > 0.0]
+    return np.where(np.ptp(fitted, axis=0) >= _MOVED * np.ptp(columns, axis=0), columns, 0.0)
 
 
 def is_worth(before: float, after: float, parameters: int, used: int, worth: float = WORTH) -> bool:

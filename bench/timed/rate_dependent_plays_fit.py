@@ -25,7 +25,7 @@ from bench.identification.measures import measure_errors
 from bench.identification.options import OptionHelp
 from bench.identification.orientation import NAMES, Orientation
 from bench.identification.trust import judge_fit
-from bench.timed.parsimony import check_size, deviations_of, is_worth
+from bench.timed.parsimony import check_size, deviations_of, is_worth, moving
 from bench.timed.rate_dependent_plays import PlaysState, RateDependentPlays
 
 # Most time constants that are tried if nobody says how many, and the first values of another one.
@@ -131,8 +131,9 @@ class PlaysSearch:
         problem = self.static
         w = problem.weights if weights is None else weights
         # Plays stand still most of the time: as cells, without a place in a plane, they are quickly fitted.
-        regressor = Regressor.of_cells(problem.orientation * columns, np.empty((columns.shape[0], 0)))
-        count = columns.shape[1]
+        cells = problem.orientation * moving(columns, w, problem.skip)
+        count = cells.shape[1]
+        regressor = Regressor.of_cells(cells, np.empty((cells.shape[0], 0)))
         layout = CellLayout(0, np.arange(count), np.zeros(count, dtype=np.int64))
         found = fit_cells(layout, regressor, problem.outputs, weights=w, skip=problem.skip)
         return replace(found, coefficients=problem.orientation * found.coefficients)

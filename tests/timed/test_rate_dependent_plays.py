@@ -312,6 +312,19 @@ def test_the_slopes_of_the_search_give_the_gradient_of_the_cost(sign):
     np.testing.assert_allclose(search.slopes(lags, fit).T @ rest, expected, rtol=1e-4)
 
 
+def test_plays_that_only_rows_left_out_have_moved_stay_at_zero():
+    t, u = cycles([10] * 6, [0.4, 0.4, 1.0, 0.4, 0.4, 0.4], 1000.0)
+    y = u + 0.01 * np.random.default_rng(0).standard_normal(u.size)
+    search = PlaysSearch.of(t, u, y, None, 0, None, "auto", plays=40)
+    columns = search.columns(np.array([1.0]))
+    # Without the large cycle, of the plays of which the small ones reach but the edge.
+    weights = np.where((t >= 0.2) & (t < 0.3), 0.0, 1.0)
+    moved = np.ptp(columns[weights > 0.0], axis=0) / np.ptp(columns, axis=0)
+    traces = (moved < 0.01) & (moved > 1e-9)
+    assert traces.any()
+    assert not search.fit_columns(columns, weights).coefficients[traces].any()
+
+
 def test_plays_without_a_rate_are_given_none():
     t, u = cycles([2, 2, 20, 20, 60, 60], [1.0, 0.5, 1.0, 0.4, 1.0, 0.7])
     y = PrandtlIshlinskii(np.arange(5) / 5.0, np.ones(5)).evaluate(u)
