@@ -230,7 +230,7 @@ class InterlockWatch:
 
     def __init__(self, interlocks: Iterable[Interlock], units: Mapping[str, str]) -> None:
         self._courses = tuple(_Course(interlock, units) for interlock in interlocks)
-        self._plain = tuple((each, each.plain, *each.quiet) for each in self._courses)
+        self._plain = tuple((each, each.plain, *each.quiet, each.stale) for each in self._courses)
         # Those with something that may act or is not over: mostly none.
         self._restless: list[_Course] = []
         self._latest = -math.inf
@@ -299,11 +299,16 @@ class InterlockWatch:
         self._latest = t = max(t, self._latest)
         found: list[Finding] = []
         restless: list[_Course] = []
-        for course, signal, low, high in self._plain:
-            if course.restless or not (signal and signal in values and low <= values[signal] <= high):
-                course.look(t, values, setpoints, found)
-                if course.restless:
-                    restless.append(course)
+        for course, signal, low, high, stale in self._plain:
+            if not course.restless and signal in values and low <= (value := values[signal]) <= high:
+                if stale is None:
+                    continue
+                if stale.last != value:
+                    stale.last, stale.first = value, t
+                    continue
+            course.look(t, values, setpoints, found)
+            if course.restless:
+                restless.append(course)
         self._restless = restless
         if found and self._tripped is None:
             self._tripped = next((finding for finding in found if finding.level is Level.SAFE), None)
@@ -328,6 +333,8 @@ class InterlockWatch:
 class _Criterion(ABC):
     """One thing that an interlock asks for; `since` is when it was violated first, None while it is met."""
 
+    over = ""  # what the signal does once it is met again
+
     def __init__(self, interlock: Interlock, units: Mapping[str, str], seconds: float) -> None:
         self._interlock = interlock
         self._unit = units.get(interlock.signal, "")
@@ -344,15 +351,17 @@ class _Criterion(ABC):
     def seen(self, t: float, since: float, value: float) -> str:
         """Return what was seen and what is allowed."""
 
-    @abstractmethod
     def back(self, t: float, since: float, value: float) -> str:
         """Return that it is over."""
+        return f"{self._interlock.label} = {value:.6g} {self._unit} {self.over} (after {t - since:.1f} s)"
 
 
 class _Range(_Criterion):
     def __init__(self, interlock: Interlock, units: Mapping[str, str], seconds: float) -> None:
         super().__init__(interlock, units, seconds)
         self._low, self._high = interlock.low, interlock.high
+        low, high = interlock.resume
+        self.over = f"is back within {low:g} to {high:g} {self._unit}"
 
     def look(self, t: float, value: float, setpoint: float | None) -> None:  # noqa: ARG002 - as of all
         if self.since is None:
@@ -369,16 +378,11 @@ class _Range(_Criterion):
             f"{self._interlock.low:g} to {self._interlock.high:g} {self._unit} (for {t - since:.1f} s)"
         )
 
-    def back(self, t: float, since: float, value: float) -> str:
-        low, high = self._interlock.resume
-        return (
-            f"{self._interlock.label} = {value:.6g} {self._unit} is back within "
-            f"{low:g} to {high:g} {self._unit} (after {t - since:.1f} s)"
-        )
-
 
 class _Near(_Criterion):
     """Whether the signal is within the warning band before a limit; it is over half a band further inside."""
+
+    over = "is far from its interlock again"
 
     def __init__(self, interlock: Interlock, units: Mapping[str, str]) -> None:
         super().__init__(interlock, units, 0.0)
@@ -407,18 +411,13 @@ class _Near(_Criterion):
             f"the interlock acts at {limit:g} {self._unit} (level {interlock.level})"
         )
 
-    def back(self, t: float, since: float, value: float) -> str:
-        return (
-            f"{self._interlock.label} = {value:.6g} {self._unit} is far from its interlock again "
-            f"(after {t - since:.1f} s)"
-        )
-
 
 class _Rate(_Criterion):
     """Mean rate from the newest reading that is as old as the window, or older, to the present one."""
 
     def __init__(self, interlock: Interlock, units: Mapping[str, str], fastest: float) -> None:
         super().__init__(interlock, units, interlock.seconds)
+        self._unit = _of_difference(self._unit)
         self._fastest = fastest
         self._readings: deque[tuple[float, float]] = deque()
         self._rate, self._span = 0.0, math.nan
@@ -444,31 +443,33 @@ class _Rate(_Criterion):
             self.since = t
 
     def seen(self, t: float, since: float, value: float) -> str:  # noqa: ARG002 - as of all
-        unit = f"{_of_difference(self._unit)}/s"
         return (
-            f"{self._interlock.label} changes by {self._rate:.3g} {unit} over {self._span:.3g} s; "
-            f"{self._fastest:g} {unit} is allowed (for {t - since:.1f} s)"
+            f"{self._interlock.label} changes by {self._rate:.3g} {self._unit}/s over {self._span:.3g} s; "
+            f"{self._fastest:g} {self._unit}/s is allowed (for {t - since:.1f} s)"
         )
 
     def back(self, t: float, since: float, value: float) -> str:  # noqa: ARG002 - as of all
-        unit = f"{_of_difference(self._unit)}/s"
-        return f"{self._interlock.label} changes by {self._rate:.3g} {unit} again (after {t - since:.1f} s)"
+        return f"{self._interlock.label} changes by {self._rate:.3g} {self._unit}/s again (after {t - since:.1f} s)"
 
 
 class _Stale(_Criterion):
+    """Whether the signal stands still; `last` is its last reading, and `first` when that came first, s."""
+
+    over = "moves again"
+
     def __init__(self, interlock: Interlock, units: Mapping[str, str], stale: float) -> None:
         super().__init__(interlock, units, stale)
-        self._last: float | None = None
-        self._first = math.nan
+        self.last: float | None = None
+        self.first = math.nan
 
     def look(self, t: float, value: float, setpoint: float | None) -> None:  # noqa: ARG002 - as of all
-        last = self._last
+        last = self.last
         # Readings that compare as different are; zeros and what is not a number have to be seen as bits.
         if last is not None and (value == last or value != value) and _bits(value) == _bits(last):
-            self.since = self._first
+            self.since = self.first
         else:
             # From its first reading on; the next one has to be equal before it counts.
-            self._last, self._first, self.since = value, t, None
+            self.last, self.first, self.since = value, t, None
 
     def seen(self, t: float, since: float, value: float) -> str:
         return (
@@ -476,12 +477,11 @@ class _Stale(_Criterion):
             f"{t - since:.1f} s are equal to the last bit; {self.seconds:g} s is allowed"
         )
 
-    def back(self, t: float, since: float, value: float) -> str:
-        return f"{self._interlock.label} = {value:.6g} {self._unit} moves again (after {t - since:.1f} s)"
-
 
 class _Follows(_Criterion):
     """Whether the signal leaves the value that it had when the set-point left its own."""
+
+    over = "follows again"
 
     def __init__(self, interlock: Interlock, units: Mapping[str, str], stuck: Stuck) -> None:
         super().__init__(interlock, units, stuck.within)
@@ -520,9 +520,6 @@ class _Follows(_Criterion):
             f"{self._interlock.setpoint} was set to {self._setpoint:g} {self._setpoint_unit} it has moved by "
             f"{abs(value - start):.3g}; at least {stuck.follows:g} is expected within {stuck.within:g} s"
         )
-
-    def back(self, t: float, since: float, value: float) -> str:
-        return f"{self._interlock.label} = {value:.6g} {self._unit} follows again (after {t - since:.1f} s)"
 
 
 class _Settling:
@@ -571,8 +568,11 @@ class _Course:
         self.quiet = max(interlock.low, interlock.unwarned[0]), min(interlock.high, interlock.unwarned[1])
         """Range in which neither range nor warning band has anything to say."""
         self._make_criteria()
-        self.plain = "" if self._further or interlock.settle or interlock.minus else self._signal
-        """The signal, if readings in the quiet range need no further look; empty otherwise."""
+        self.stale = next((each for each in self._further if isinstance(each, _Stale)), None)
+        # A set-point stands still, and is none while the output is off.
+        short = len(self._further) == (self.stale is not None) and not interlock.signal.endswith(SETPOINT)
+        self.plain = interlock.signal if short and not (interlock.settle or interlock.minus) else ""
+        """The signal, if readings in the quiet range that do not stand still need no further look; else empty."""
         self.active: list[Finding | None] = [None] * len(self._criteria)
         self._acted = [math.nan] * len(self._criteria)
 
