@@ -98,17 +98,15 @@ def outline(horizontal: Floats, vertical: Floats) -> tuple[Floats, Floats]:
     span = float(horizontal[-1] - horizontal[0]) or 1.0
     columns = np.minimum(((horizontal - horizontal[0]) / span * _COLUMNS).astype(np.int64), _COLUMNS - 1)
     starts = np.flatnonzero(np.diff(columns, prepend=-1))
-    kept = []
-    for start, end in zip(starts, [*starts[1:], horizontal.size], strict=True):
-        part = vertical[start:end]
-        known = np.isfinite(part)
-        # What is missing stays a gap.
-        kept += (
-            [start, end - 1]
-            if not known.any()
-            else sorted({start, start + int(np.nanargmin(part)), start + int(np.nanargmax(part)), end - 1})
-        )
-    return horizontal[kept], vertical[kept]
+    # What is missing stays a gap: a column without a number has its ends only.
+    kept = [starts, np.append(starts[1:], horizontal.size) - 1]
+    known = np.flatnonzero(np.isfinite(vertical))
+    by_value = known[np.lexsort((vertical[known], columns[known]))]
+    # The first and the last of each column in that order.
+    turns = np.flatnonzero(np.diff(columns[by_value], prepend=-1, append=-1))
+    kept += [by_value[turns[:-1]], by_value[turns[1:] - 1]]
+    chosen = np.unique(np.concatenate(kept))
+    return horizontal[chosen], vertical[chosen]
 
 
 def apart(horizontal: Floats, vertical: Floats) -> tuple[Floats, Floats]:
