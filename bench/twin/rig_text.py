@@ -128,7 +128,7 @@ def _emulation(twin: IdentifiedTwin, file: RigFile) -> Iterator[str]:
             "device": file.roles["drive"].device,
             "signal": first.drive,
             "rest": float(first.driven[0]),
-            "delay": actuator.delay,
+            "delay": _delay(twin, file),
             "frequency": actuator.frequency,
             "damping": actuator.damping,
             **({"rate": actuator.rate} if math.isfinite(actuator.rate) else {}),
@@ -157,6 +157,19 @@ def _emulation(twin: IdentifiedTwin, file: RigFile) -> Iterator[str]:
     yield from _table("emulation.unevenness", uneven, {"deviation": unit, "length": unit})
     for name, table in twin.signals.items():
         yield from _table(f"emulation.signals.{name}", table)
+
+
+def _delay(twin: IdentifiedTwin, file: RigFile) -> float:
+    """Return the delay of the drive, s, without what the lines of the twin take by themselves.
+
+    What was identified counts from when a set-point was about to be sent until all devices had been read.
+    """
+    delay, time = twin.actuator.dynamics.delay, twin.reading_time
+    if time is not None:
+        names = [each.name for each in file.devices]
+        read_later = len(names) - 1 - names.index(file.roles["drive"].device)
+        delay -= time.setpoint + time.quick * read_later / len(names)
+    return max(delay, 0.0)
 
 
 def _comments(twin: IdentifiedTwin) -> Iterator[str]:

@@ -2,6 +2,7 @@
 
 import json
 import math
+import tomllib
 from itertools import pairwise
 from pathlib import Path
 
@@ -91,6 +92,16 @@ def test_a_run_on_the_twin_is_as_long_and_goes_as_on_the_specimen(twin, measured
     assert np.abs(emulated["tec_temperature"] - real["tec_temperature"])[late].max() < 1.0
     span = np.ptp(real["curvature"])
     assert np.sqrt(np.mean((emulated["curvature"] - real["curvature"])[late] ** 2)) < 0.05 * span
+
+
+def test_what_lines_take_is_not_in_the_delay_as_well(twin):
+    """The set-point is sent within a part of what was identified, and the detector is read behind the drive."""
+    path, found = twin
+    content = tomllib.loads(path.read_text(encoding="utf-8"))
+    tec, psd = content["devices"]["tec"], content["devices"]["psd"]
+    assert min(tec["setpoint_time"], psd["quick_time"]) > 0.0
+    delay = content["emulation"]["drive"]["delay"]
+    assert delay + tec["setpoint_time"] + psd["quick_time"] == pytest.approx(found["actuator"]["delay"], abs=1e-4)
 
 
 def test_equal_seeds_give_equal_sessions(twin, tmp_path):
