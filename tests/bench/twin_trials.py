@@ -1,6 +1,6 @@
 """Trials of twins: tracking runs on a twin, beside those on the emulated plant that it was identified from.
 
-    python tests/bench/twin_trials.py [--rig vo2 ...] [--specimens 3] [--sessions 16] [--out FOLDER]
+    python tests/bench/twin_trials.py [--rig vo2 ...] [--specimens 3] [--sessions 24] [--out FOLDER]
 
 The plants of the packaged rigs are built differently from any twin. Each specimen is characterized once (creep,
 damped-oscillation, random-validation), in sessions of its own; the second run identifies the model of the controller,
@@ -36,7 +36,7 @@ MODELS: Mapping[str, Mapping[str, Any]] = {
 SETTINGS: Mapping[str, Mapping[str, Any]] = {"sma": {"adaptation": "session"}}
 """Of tracking: on sma the model of one characterization alone errs less than it does with feedback, so that the
 controller would be given up after a number of targets that is up to chance."""
-SESSIONS = {"vo2": 16, "sma": 4, "hybrid": 4}
+SESSIONS = {"vo2": 24, "sma": 4, "hybrid": 4}
 """Sessions of each plant and twin: on vo2 durations differ by 3 % from one to another, errors by 11 %."""
 SEEDED = {"vo2", "sma"}
 """Rigs whose specimens differ by a seed; of others it is the sessions alone that differ."""
