@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.compiled import inlined, inner, kernel, reordered
+from bench.hysteresis._kernels import borrowed
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -28,24 +29,30 @@ def row_start(row: int) -> int:
 _start = inlined(row_start)
 
 
+@inlined
+def _four_rows(factor: Floats, c: int) -> tuple[Floats, Floats, Floats, Floats]:
+    """Return rows c to c + 3 up to the diagonal of the last: they are of one block if 4 divides c."""
+    start = _start(c)
+    width = _start(c + 1) - start
+    return (
+        factor[start : start + c + 4],
+        factor[start + width : start + width + c + 4],
+        factor[start + 2 * width : start + 2 * width + c + 4],
+        factor[start + 3 * width : start + 3 * width + c + 4],
+    )
+
+
 @reordered
 def solve_lower(factor: Floats, size: int, right: Floats) -> None:
     """Replace each of a few right sides, the first `size` of a row, by the x with L x = right.
 
     Rows that are contiguous as a whole take a third of the time of those of a slice.
     """
+    factor, right = borrowed(factor), borrowed(right)
     whole = size - size % 4
     # Four rows at a time: one look at a right side then serves them all.
     for c in range(0, whole, 4):
-        start = _start(c)
-        # They are of one block.
-        width = _start(c + 1) - start
-        one, two, three, four = (
-            factor[start : start + c + 4],
-            factor[start + width : start + width + c + 4],
-            factor[start + 2 * width : start + 2 * width + c + 4],
-            factor[start + 3 * width : start + 3 * width + c + 4],
-        )
+        one, two, three, four = _four_rows(factor, c)
         for k in range(right.shape[0]):
             x = right[k]
             p, q, r, s = 0.0, 0.0, 0.0, 0.0
@@ -73,6 +80,7 @@ def solve_lower(factor: Floats, size: int, right: Floats) -> None:
 def solve_upper(factor: Floats, size: int, right: Floats) -> Floats:
     """Return the solution of Lᵀ x = right."""
     x = right[:size].copy()
+    factor = borrowed(factor)
     whole = size - size % 4
     for c in range(size - 1, whole - 1, -1):
         start = _start(c)
@@ -81,15 +89,7 @@ def solve_upper(factor: Floats, size: int, right: Floats) -> Floats:
             x[j] -= x[c] * factor[start + j]
     # Four rows at a time: one look at the solution then serves them all.
     for c in range(whole - 4, -1, -4):
-        start = _start(c)
-        width = _start(c + 1) - start
-        # Four rows are of one block.
-        one, two, three, four = (
-            factor[start : start + c + 4],
-            factor[start + width : start + width + c + 4],
-            factor[start + 2 * width : start + 2 * width + c + 4],
-            factor[start + 3 * width : start + 3 * width + c + 4],
-        )
+        one, two, three, four = _four_rows(factor, c)
         d = x[c + 3] / four[c + 3]
         e = (x[c + 2] - d * four[c + 2]) / three[c + 2]
         f = (x[c + 1] - d * four[c + 1] - e * three[c + 1]) / two[c + 1]

@@ -130,24 +130,26 @@ def gram_rows(
     sums = np.empty((_BLOCK, width))
     for first in range(0, new.size, width):
         count = min(width, new.size - first)
+        for n in range(samples):
+            for k in range(width):
+                tail[n, k] = 0.0
         for k in range(count):
             b = new[first + k]
             if b >= base.size:
                 continue
-            level = (base[b] - means[b]) / norms[b]
             scale = 1.0 / norms[b]
-            n = 0
+            tail[0, k] = scale * (base[b] - means[b])
             for e in range(starts[b], starts[b + 1]):
-                while n < rows[e]:
-                    tail[n, k] = weights[n] * level
-                    n += 1
-                level += values[e] * scale
-            while n < samples:
-                tail[n, k] = weights[n] * level
-                n += 1
+                tail[rows[e], k] += scale * values[e]
+        # Changes become values, and these their weighted sums over the samples behind: whole rows at a time.
+        for n in range(1, samples):
+            for k in range(width):
+                tail[n, k] += tail[n - 1, k]
+        for k in range(width):
+            tail[samples - 1, k] *= weights[samples - 1]
         for n in range(samples - 2, -1, -1):
             for k in range(width):
-                tail[n, k] += tail[n + 1, k]
+                tail[n, k] = weights[n] * tail[n, k] + tail[n + 1, k]
         last = known.size - new.size + first + count
         for begin in range(0, last, _BLOCK):
             end = min(begin + _BLOCK, last)

@@ -3,11 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from bench.deferred import DeferredModule
 from bench.hysteresis._checks import Floats
 from bench.identification.cell_layout import Flags, Indices
+
+# An import within a function would take as long as what is done with a few columns.
+if TYPE_CHECKING:
+    from scipy.linalg import blas, lapack
+
+    from bench.identification import _factor_kernels
+else:
+    blas, lapack = DeferredModule("scipy.linalg.blas"), DeferredModule("scipy.linalg.lapack")
+    _factor_kernels = DeferredModule("bench.identification._factor_kernels")
 
 # A column whose squared distance from the span of the passive ones falls below this part of its squared norm
 # counts as dependent on them: Cholesky pivots carry rounding errors of about 1e-13. Only if such columns are
@@ -35,29 +46,23 @@ class CholeskyFactor:
     @property
     def room(self) -> int:
         """Number of columns that can be appended at a time: those that end the present block."""
-        from bench.identification._factor_kernels import BLOCK
-
-        return BLOCK - self.size % BLOCK
+        return _factor_kernels.BLOCK - self.size % _factor_kernels.BLOCK
 
     def _blocks(self, size: int) -> Iterator[tuple[int, int, Floats]]:
         """Yield the first and the last row, exclusive, of each block of so many rows, and the block, a view."""
-        from bench.identification._factor_kernels import BLOCK, row_start
-
-        for first in range(0, size, BLOCK):
-            last = min(first + BLOCK, size)
-            start, width = row_start(first), first + BLOCK
+        for first in range(0, size, _factor_kernels.BLOCK):
+            last = min(first + _factor_kernels.BLOCK, size)
+            start, width = _factor_kernels.row_start(first), first + _factor_kernels.BLOCK
             # The last row may have no room but for itself.
             whole = self.packed[start : start + (last - first) * width]
             yield first, last, whole.reshape(last - first, width)[:, :last]
 
     def reserve(self, size: int) -> None:
         """Take memory for so many columns at once."""
-        from bench.identification._factor_kernels import row_start
-
-        if row_start(size) > self.packed.size:
+        if _factor_kernels.row_start(size) > self.packed.size:
             # Memory that nothing is written to takes none.
-            grown = np.empty(row_start(max(size + size // 2, 512)))
-            used = row_start(self.size)
+            grown = np.empty(_factor_kernels.row_start(max(size + size // 2, 512)))
+            used = _factor_kernels.row_start(self.size)
             grown[:used] = self.packed[:used]
             self.packed = grown
 
@@ -68,22 +73,17 @@ class CholeskyFactor:
 
         Return which were added: the others depend on the present ones and those added before them.
         """
-        from scipy.linalg.blas import dtrsv
-        from scipy.linalg.lapack import dpotrf
-
-        from bench.identification import _factor_kernels
-
         more, old = rows.shape[0], self.size
         cross, square = rows[:, :old], rows[:, old:]
-        least = self.threshold * np.diag(square)
+        least = self.threshold * square.diagonal()
         if old:
             self._solve_lower(rows)
             square -= cross @ cross.T
-        block, info = dpotrf(square.T, lower=0, clean=1)
+        block, info = lapack.dpotrf(square.T, lower=0, clean=1)
         block = block.T
         good = np.ones(more, dtype=bool)
         # Pivots below the threshold would pass as rounding noise.
-        if info or (np.diag(block) ** 2 < least).any():
+        if info or (block.diagonal() ** 2 < least).any():
             block = np.array(np.tril(square), order="C")
             _factor_kernels.factor_independent(block, least, good)
             cross, right = cross[good], right[good]
@@ -92,7 +92,7 @@ class CholeskyFactor:
         if not added:
             return good
         self.reserve(old + added)
-        self.half = np.concatenate([self.half, dtrsv(block.T, right - cross @ self.half, trans=1)])
+        self.half = np.concatenate([self.half, blas.dtrsv(block.T, right - cross @ self.half, trans=1)])
         self.size = old + added
         *_, (first, _, last) = self._blocks(self.size)
         last[old - first :, :old] = cross
@@ -101,10 +101,6 @@ class CholeskyFactor:
 
     def _solve_lower(self, right: Floats) -> None:
         """Replace right sides, the first `size` of each contiguous row, by the x with L x = right."""
-        from scipy.linalg.blas import dtrsm
-
-        from bench.identification import _factor_kernels
-
         if right.shape[0] <= _FEW:
             _factor_kernels.solve_lower(self.packed, self.size, right)
             return
@@ -114,7 +110,7 @@ class CholeskyFactor:
                 part -= right[:, :first] @ block[:, :first].T
             # Transposed, as BLAS wants it.
             corner = np.ascontiguousarray(block[:, first:]).T
-            part[:] = dtrsm(1.0, corner, np.ascontiguousarray(part).T, trans_a=1, overwrite_b=1).T
+            part[:] = blas.dtrsm(1.0, corner, np.ascontiguousarray(part).T, trans_a=1, overwrite_b=1).T
 
     def truncate(self, size: int) -> None:
         """Keep the first columns only."""
@@ -123,8 +119,6 @@ class CholeskyFactor:
 
     def delete(self, places: Indices) -> None:
         """Remove the columns at increasing places."""
-        from bench.identification import _factor_kernels
-
         for place in places[::-1]:
             _factor_kernels.delete_row(self.packed, self.size, place, self.half)
             self.size -= 1
@@ -132,22 +126,16 @@ class CholeskyFactor:
 
     def solution(self) -> Floats:
         """Return the solution for the columns' right side."""
-        from bench.identification import _factor_kernels
-
         return np.asarray(_factor_kernels.solve_upper(self.packed, self.size, self.half))
 
     def solve(self, right: Floats) -> Floats:
         """Return the solution for a right side."""
-        from bench.identification import _factor_kernels
-
         half = right.copy()
         _factor_kernels.solve_lower(self.packed, self.size, half[None, :])
         return np.asarray(_factor_kernels.solve_upper(self.packed, self.size, half))
 
     def length(self, places: Indices, values: Floats) -> float:
         """Return the norm in the outputs of a step that is zero but at increasing places."""
-        from bench.identification import _factor_kernels
-
         return float(np.linalg.norm(_factor_kernels.combined_rows(self.packed, places, values)))
 
     def condition(self, norm: float) -> float:
@@ -163,10 +151,8 @@ class CholeskyFactor:
 
     def invert(self) -> None:
         """Replace L by its inverse: the factor is used up."""
-        from scipy.linalg.lapack import dtrtri
-
         for first, last, block in self._blocks(self.size):
-            corner, _ = dtrtri(np.tril(block[:, first:]).T, lower=0)
+            corner, _ = lapack.dtrtri(np.tril(block[:, first:]).T, lower=0)
             if first:
                 left = np.zeros((last - first, first))
                 for begin, end, above in self._blocks(first):
@@ -176,8 +162,6 @@ class CholeskyFactor:
 
     def inverse_entries(self, first: Indices, second: Indices) -> Floats:
         """Return entries of the inverse of the Gram block, first[k] <= second[k], once `invert` was called."""
-        from bench.identification import _factor_kernels
-
         return np.asarray(_factor_kernels.products_of_columns(self.packed, self.size, first, second))
 
     def inverse_diagonal(self) -> Floats:

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import ArrayLike
 
+from bench.deferred import DeferredModule
 from bench.hysteresis import Regressor, _checks
 from bench.hysteresis._checks import Floats
 from bench.identification.cell_layout import CellLayout, Flags, Indices
@@ -19,6 +20,12 @@ from bench.identification.scaled_columns import ScaledColumns
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
+
+    from bench.hysteresis import _kernels as lists
+    from bench.identification import _kernels
+else:
+    lists = DeferredModule("bench.hysteresis._kernels")
+    _kernels = DeferredModule("bench.identification._kernels")
 
 _TOLERANCE = 1e-12
 # A part of the cost that is no gain but for rounding.
@@ -317,9 +324,6 @@ class _ActiveSet:
         *,
         absolute: bool = False,
     ) -> None:
-        from bench.hysteresis import _kernels as lists
-        from bench.identification import _kernels
-
         self.regressor, self.y, self.w, self.constrained, self.layout = regressor, y, w, constrained, layout
         self.cells = regressor.base.size
         count = regressor.shape[1]
@@ -398,8 +402,6 @@ class _ActiveSet:
 
         Shape (new, before + new).
         """
-        from bench.identification import _kernels
-
         known = np.concatenate([before, new])
         result = np.zeros((new.size, known.size))
         width = min(-(-new.size // 8) * 8, self.tails.size // self.w.size)
@@ -436,7 +438,8 @@ class _ActiveSet:
         self.factor.reserve(self.passive.size + columns.size)
         barred = [np.empty(0, dtype=np.int64)]
         while columns.size:
-            some, columns = np.split(columns, [self.factor.room])
+            room = self.factor.room
+            some, columns = columns[:room], columns[room:]
             rows = self.gram(some, self.passive)
             good = self.factor.append(rows, self.right[some])
             self.passive = np.concatenate([self.passive, some[good]])

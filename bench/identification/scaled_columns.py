@@ -7,13 +7,17 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from bench.deferred import DeferredModule
 from bench.hysteresis._checks import Floats
 from bench.identification.cell_layout import Indices
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
+    from bench.identification import _kernels
     from bench.identification._kernels import Columns
+else:
+    _kernels = DeferredModule("bench.identification._kernels")
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +53,6 @@ class ScaledColumns:
 
     def model(self, x: Floats) -> Floats:
         """Return A x, shape (N,)."""
-        from bench.identification import _kernels
-
         sparse = self.base.size
         chosen = np.flatnonzero(x[:sparse])
         factors = x[chosen] / self.norms[chosen]
@@ -59,8 +61,6 @@ class ScaledColumns:
 
     def products(self, residual: Floats) -> Floats:
         """Return AᵀW r of a residual, shape (K + q,)."""
-        from bench.identification import _kernels
-
         return np.asarray(_kernels.products(self.changes, self.norms, self.extra, self.weights, self.total, residual))
 
     def gram_product(self, x: Floats) -> Floats:
