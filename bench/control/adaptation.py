@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
 
@@ -68,7 +68,7 @@ class Adapter:
     policy: Literal["nearest", "paper"] = "nearest"
     output: float = math.nan
     error: float = math.nan
-    _scale: float = field(default=math.nan, repr=False)
+    _scale: float = math.nan
 
     def __post_init__(self) -> None:
         if not (self.model.density >= 0.0).all():

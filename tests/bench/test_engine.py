@@ -585,6 +585,7 @@ class TestControl:
         assert (outcome.status, outcome.steps) == ("completed", 1), outcome.reason
         b.assert_safe()
         np.testing.assert_allclose(np.diff(loop.times), 4.0)
+        assert outcome.lateness["reach"]["samples"] == len(loop.times) - 1
         with b.record() as run:
             (entry,) = run.step_records()
             assert entry.label == "reach"
@@ -593,6 +594,9 @@ class TestControl:
             assert run.steps()["probe_temperature"][0] == pytest.approx(50.0, abs=0.05)
             # A tick at each reading of the loop and the telemetry in between.
             assert len(run.telemetry()) == len(loop.times) + 7 * (len(loop.times) - 1)
+
+    def test_one_reading_is_not_late(self, bench):
+        assert bench().run(control(Integrator(50.0, tolerance=100.0))).lateness == {}
 
     def test_what_the_controller_thinks_is_recorded(self, bench):
         b = bench(traces=True)

@@ -1207,6 +1207,9 @@ def test_restart_is_told_until_the_servo_is_connected_again(script, servo, clock
         with pytest.raises(DeviceRestartedError, match="the servo has restarted"):
             action()
     connect(clock).measure()
+    # That another driver has set the servo up does not bring the turns back.
+    with pytest.raises(DeviceRestartedError, match="the servo has restarted"):
+        servo.measure()
     servo.reboot()
     servo.measure()
 

@@ -261,11 +261,21 @@ def test_a_look_at_the_filter_leaves_the_noise_as_it_was():
 )
 def test_the_pause_between_frames(bench, settings, pause):
     cell = bench.cell(**settings)
-    cell.glance()
-    begin = bench.clock.now()
+
+    def refuse(_address, _words):
+        raise RegisterError(2, "not here")
+
     cell.glance()
     wire = 23 * 10 / settings.get("baudrate", 115200)
-    assert bench.clock.now() - begin == pytest.approx(pause + wire)
+    for spoilt in (False, True):
+        if spoilt:
+            bench.bank.alter = refuse
+            with pytest.raises(DeviceError, match="illegal data address"):
+                cell.glance()
+            bench.bank.alter = lambda _, words: words
+        begin = bench.clock.now()
+        cell.glance()
+        assert bench.clock.now() - begin == pytest.approx(pause + wire)
 
 
 @pytest.mark.parametrize(

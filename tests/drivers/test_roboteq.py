@@ -1544,6 +1544,18 @@ def test_process_data_of_an_earlier_synchronization_are_not_taken(controller, sy
     assert synchronous.measure()["supply_current"] == 2.0
 
 
+def test_a_command_need_not_be_obeyed_at_once(controller, synchronous):
+    synchronous.set(6.0).wait()
+    synchronous.measure()
+    synchronous.set(3.0)
+    for command in (250, 125):
+        controller.objects[0x2101, 1] = (command, 2)
+        synchronous.measure()
+    controller.objects[0x2101, 1] = (250, 2)
+    with pytest.raises(DeviceError, match="its command was changed to 250 by another host, from 125"):
+        synchronous.measure()
+
+
 def test_command_of_another_host_has_to_come_twice(controller, synchronous):
     synchronous.set(6.0).wait()
     controller.spoilt = [damaged(3, 13)]
