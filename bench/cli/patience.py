@@ -8,7 +8,6 @@ from threading import Event, Thread
 
 from rich.console import Console
 from rich.errors import LiveError
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from bench.cli.console import console
 from bench.shares import shares_to
@@ -33,6 +32,9 @@ class PatienceDisplay:
     """
 
     def __init__(self, text: str, console: Console, patience: float = PATIENCE) -> None:
+        # Not at the start of each command: most show no bar.
+        from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
         self._progress = Progress(
             TextColumn("{task.description}"),
             BarColumn(),
