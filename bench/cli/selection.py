@@ -183,7 +183,7 @@ def _print_table(found: SelectedModel) -> None:
         _print_line(f"{cells[0]} {'  '.join(cells[1:])}".rstrip())
     more = len(selection.evaluations) - len(shown)
     _print_line(
-        "* chosen, the simplest within one standard error of the least error (+)"
+        "* chosen; + least error of those that may be, if that is another"
         + (f"; {more} more were worse or given up" if more > 0 else "")
     )
     _print_line(

@@ -14,7 +14,7 @@ from bench.hysteresis import PolynomialPlays
 from bench.hysteresis._checks import Floats
 from bench.identification.branches import turning_points
 from bench.identification.by_name import FitProblem, Initial, set_up_problem
-from bench.identification.folds import Flags, Fold, block_folds, unit_folds
+from bench.identification.folds import Flags, Fold, block_folds, correlated_rows, unit_folds
 from bench.identification.least_squares import Fit
 from bench.identification.orientation import Orientation
 from bench.identification.resolution import resolve
@@ -166,6 +166,13 @@ class Evaluation:
         Whether the rows determine all coefficients; known only where there is one kind of cycle.
     follows : bool
         Whether the output follows the input on smaller cycles as on the record; known only there.
+    misfit : float
+        RMS error of a fit to all rows, corrected for its free coefficients, output units; see `corrected`. Known
+        only where units were left out, and of models with time.
+    schwarz : float
+        The criterion of Schwarz of that fit; see `schwarz`.
+    uncorrelated : bool
+        Whether the residuals of that fit are uncorrelated from row to row; False where it is not known.
     """
 
     candidate: Candidate
@@ -178,6 +185,9 @@ class Evaluation:
     failure: str = ""
     determined: bool = True
     follows: bool = True
+    misfit: float = float("nan")
+    schwarz: float = float("nan")
+    uncorrelated: bool = False
 
     @property
     def rms(self) -> float:
@@ -235,6 +245,8 @@ def _evaluate(
         if np.sqrt(np.mean([each.tested for each in done])) <= hopeless:
             done += [trial.leave_out(fold) for fold in blocks[2:]]
         by_unit = [trial.leave_out(fold) for fold in units] if len(done) == len(blocks) else []
+        free = float(np.mean([each.free for each in done]))
+        residuals = trial.residuals()[measured.tested] if by_unit else None
     # A model of another package must not end the comparison of the others.
     except Exception as error:
         text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
@@ -245,7 +257,10 @@ def _evaluate(
         units=tuple(each.tested for each in by_unit),
         training=float(np.mean([each.training for each in done])),
         start=float(np.mean([each.start for each in done])),
-        free=float(np.mean([each.free for each in done])),
+        free=free,
+        misfit=float("nan") if residuals is None else corrected(residuals, free),
+        schwarz=float("nan") if residuals is None else schwarz(residuals, free),
+        uncorrelated=residuals is not None and correlated_rows(residuals, 2) <= 1,
         seconds=time.process_time() - begin,
     )
 
@@ -295,9 +310,27 @@ def _retreat(inputs: Floats, outputs: Floats) -> float:
 
 def residuals_of(measured: Measurements, candidate: Candidate) -> Floats:
     """Return measured less fitted outputs of a candidate that is fitted to all rows, shape (N,)."""
-    trial = _Trial(measured, candidate)
-    found = trial.fit(trial.problem)
-    return measured.outputs - found.bias - trial.problem.regressor.product(found.coefficients)
+    return _Trial(measured, candidate).residuals()
+
+
+def corrected(residuals: Floats, free: float) -> float:
+    """Return the RMS of residuals as others would be if errors are uncorrelated.
+
+    Generalized cross-validation: Golub, Heath and Wahba, Technometrics 21(2), 215-223, 1979. A bias is counted beside
+    the coefficients.
+    """
+    rows = residuals.size
+    return float(np.sqrt(np.mean(residuals**2))) / max(1.0 - (free + 1.0) / rows, 1.0 / rows)
+
+
+def schwarz(residuals: Floats, free: float) -> float:
+    """Return N log(mean square) + k log N of N residuals and k coefficients with the bias.
+
+    Ann. Statist. 6(2), 461-464, 1978; for uncorrelated errors.
+    """
+    rows = residuals.size
+    square = max(float(np.mean(residuals**2)), 1e-300)
+    return float(rows * np.log(square) + (free + 1.0) * np.log(rows))
 
 
 @dataclass(frozen=True)
@@ -341,6 +374,11 @@ class _Trial:
     def fit(self, problem: FitProblem, weights: Floats | None = None) -> Fit:
         """Return the coefficients for the problem's weights or others, with the penalties of the candidate."""
         return problem.fit(self.penalties.smoothing, weights, ridge=self.penalties.ridge)
+
+    def residuals(self) -> Floats:
+        """Return measured less fitted outputs of the fit to all rows, shape (N,)."""
+        found = self.fit(self.problem)
+        return self.measured.outputs - found.bias - self.problem.regressor.product(found.coefficients)
 
     def leave_out(self, fold: Fold) -> _LeftOut:
         """Fit without a fold; return the errors."""

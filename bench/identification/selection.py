@@ -6,10 +6,7 @@
 3. What is near the best is evaluated with whole units of the excitation left out, too.
 4. Of the smoothing weights the least error decides; among models, orders and reversible parts one of the simplest
    within one standard error of the best, from the differences fold by fold: always within 2 %, and never above 5 %.
-
-Source of the rule: Breiman, Friedman, Olshen, Stone, Classification and Regression Trees, 1984, section 3.4.3; its
-limits: Chen and Yang, Stat 10, e868, 2021 (the standard error is off by a factor of two either way, and a rule for
-structure often predicts worse), hence the bound.
+   Of few rows, and where residuals are uncorrelated, the criterion of Schwarz decides.
 """
 
 from __future__ import annotations
@@ -24,7 +21,6 @@ from typing import Any, NamedTuple, Protocol, TypeAlias
 import numpy as np
 
 from bench.hysteresis import ModelSpec, Operator, find_model
-from bench.hysteresis._checks import Floats
 from bench.identification.branches import turning_points
 from bench.identification.by_name import Initial
 from bench.identification.cross_validation import EQUAL
@@ -37,6 +33,15 @@ from bench.identification.evaluation import (
     residuals_of,
 )
 from bench.identification.folds import correlated_rows, has_one_kind
+from bench.identification.near_best import (
+    FEWER,
+    best_memory,
+    best_smoothing,
+    has_signs,
+    of_best_memory,
+    score,
+    simplest_near_best,
+)
 from bench.identification.orientation import Orientation, has_orientation
 
 Task: TypeAlias = Callable[[], list[Evaluation]]
@@ -50,6 +55,8 @@ SMOOTHING = (0.0, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 _HOPELESS = 3.0
 # A kind of no more coefficients than these at its finest costs little: its coarsest says nothing against it.
 _FEW_COEFFICIENTS = 60
+# Fewer rows say more by the fit to all than by what is left out.
+_FEW_ROWS = 100
 # Structures for which all smoothing weights are tried, and within which factor of the best error.
 _SMOOTHED = 4
 _REMEMBERED = 2
@@ -58,14 +65,10 @@ _NEAR = 2.0
 _GAIN = 0.98
 # Coefficients for each row up to which a finer order is tried.
 _MOST_COEFFICIENTS = 5
-# What the simplest may err more than the best, however large the standard error.
-_WORSE = 1.05
 # What no signs bound, on other inputs without units left out or at other rates, has to be so much better.
 _UNBOUNDED = 1.2
 # Of one kind of cycle, what the record leaves open of a model is tested by nothing: it has to be so much better.
 _UNDETERMINED = 2.0
-# Part of the coefficients of another from which a model is clearly simpler.
-_FEWER = 2.0 / 3.0
 # Part of the variance of the errors that a trend over the rows must be, to be no chance of neighbouring errors.
 _DRIFTS, _FEWEST_OF_TREND = 0.15, 100
 # Turns of the input that say nothing of its minor loops, and moves that are none.
@@ -123,7 +126,8 @@ class Selection:
     best : Evaluation
         That of the least held-out error.
     chosen : Evaluation
-        The simplest within one standard error of it.
+        The simplest within one standard error of it, or by the fit to all rows: where its residuals are uncorrelated,
+        of few rows, and of lags at one rate.
     gap : int
         Rows left out next to each block.
     rows : int
@@ -306,7 +310,7 @@ class _Search:
         for kind, found in zip(kinds, self.carry(tasks), strict=True):
             usable = [each for each in found if each.blocks]
             if usable:
-                result[kind] = _best_memory(usable)
+                result[kind] = best_memory(usable)
             else:
                 failures.append(found[0])
         self.given_up += failures
@@ -431,27 +435,32 @@ class _Search:
             if self._in_time_too(each.candidate):
                 best.setdefault(each.candidate.model, each)
         tried = list(best.values())[:_IN_TIME]
-        if not any(_has_signs(each) for each in tried):
-            tried += [each for each in best.values() if _has_signs(each)][:1]
+        if not any(has_signs(each) for each in tried):
+            tried += [each for each in best.values() if has_signs(each)][:1]
+        if self.in_time.has_one_rate():
+            # A reversible part jumps where the input turns, which a lag undoes: one stands for the other.
+            planes = [each for each in judged if each.candidate.options.get("reversible") == "none"]
+            planes = [each for each in planes if has_signs(each) and self._in_time_too(each.candidate)]
+            tried += [each for each in sorted(planes, key=lambda one: one.rms)[:1] if each not in tried]
+        # Without time, a drift or a lag hides what a finer order gains.
+        shaped = self._with_shape & {each.candidate.model for each in tried}
+        tried += [each for each in judged if each.candidate.model in shaped and each not in tried]
         gap = self.measured.gap
         tasks: list[tuple[str, Task]] = [
             ("hammerstein", partial(self.in_time.evaluate, each.candidate, gap)) for each in tried
         ]
+        judged_by = list(tried)
         if PLAYS in best and not self.in_time.has_one_rate():
             tasks.append((PLAYS, partial(self.in_time.evaluate_plays, best[PLAYS].candidate, gap)))
-        found = [one for each in self.carry(tasks) for one in each]
-        self.given_up += [each for each in found if each.failure]
+            judged_by.append(best[PLAYS])
+        found = [(each, one) for each, ones in zip(judged_by, self.carry(tasks), strict=True) for one in ones]
+        self.given_up += [one for _, one in found if one.failure]
         # What is left out of the others decides.
         units = bool(self.measured.units())
         return [
-            replace(
-                each,
-                determined=best[each.candidate.operator].determined,
-                follows=best[each.candidate.operator].follows,
-                units=each.units if units else (),
-            )
-            for each in found
-            if not each.failure
+            replace(one, determined=each.determined, follows=each.follows, units=one.units if units else ())
+            for each, one in found
+            if not one.failure
         ]
 
     def _in_time_too(self, candidate: Candidate) -> bool:
@@ -483,10 +492,22 @@ class _Search:
         )
 
     def _decide(self, finalists: list[Evaluation]) -> tuple[Evaluation, Evaluation]:
-        """Return the one of the least error, and the simplest near it, of those that may be chosen."""
+        """Return the one of the least error, and what is chosen of those that may be: the simplest near it.
+
+        The fit to all rows says more than what is left out of two records. Of few rows a block is much of what there
+        is: the criterion of Schwarz decides. At one rate the time constant of a lag is as wrong as the operator is,
+        and no row left out shows it: of models with a lag it is the one of the least misfit, whose operator biases
+        the time constant least.
+        """
         finalists = self._with_lag(finalists)
         judged = [each for each in finalists if each.units] or self._without_units(finalists)
-        return simplest_near_best(judged)
+        best, chosen = simplest_near_best(judged)
+        if self.in_time is not None and self.in_time.has_one_rate() and _lags(chosen):
+            alike = [each for each in judged if _lags(each) and has_signs(each) == has_signs(chosen)]
+            chosen = min(alike, key=lambda each: each.misfit)
+        elif chosen.units and int(self.measured.tested.sum()) < _FEW_ROWS:
+            chosen = min(judged, key=lambda each: each.schwarz)
+        return best, chosen
 
     def _with_lag(self, finalists: list[Evaluation]) -> list[Evaluation]:
         """Return the finalists; at one rate without those that leave time out, where signs ask for a lag.
@@ -496,16 +517,12 @@ class _Search:
         """
         if self.in_time is None or not self.in_time.has_one_rate():
             return finalists
-        lagging = [
-            _score(each).mean()
-            for each in finalists
-            if _has_signs(each) and _LAGS & set(str(each.candidate.options.get("dynamics")).split(","))
-        ]
+        lagging = [score(each).mean() for each in finalists if _lags(each) and has_signs(each)]
         least = min(lagging, default=float("inf"))
         return [
             each
             for each in finalists
-            if each.candidate.static or not lagging or _UNBOUNDED**2 * _score(each).mean() < least
+            if each.candidate.static or not lagging or _UNBOUNDED**2 * score(each).mean() < least
         ]
 
     def _trend(self, chosen: Evaluation) -> Trend | None:
@@ -538,13 +555,13 @@ class _Search:
             for each in determined
             if each not in bounded
             and each.follows
-            and each.free <= _FEWER * simplest.free
+            and each.free <= FEWER * simplest.free
             and each.candidate.operator in self._with_shape
         ]
 
     def _is_bounded(self, each: Evaluation) -> bool:
         """Return whether signs bound the answer to other inputs, or it has no memory."""
-        if _has_signs(each):
+        if has_signs(each):
             return True
         operator = find_model(each.candidate.operator).model
         # Beyond a single rise a polynomial is bounded by nothing, but for a straight line.
@@ -572,7 +589,7 @@ class _Search:
         sizes: dict[str, list[Evaluation]] = {}
         for each in self._whole(kind):
             sizes.setdefault(repr(sorted(each.candidate.options.items())), []).append(each)
-        return [best_smoothing(_of_best_memory(each)) for each in sizes.values()]
+        return [best_smoothing(of_best_memory(each)) for each in sizes.values()]
 
     def _best(self, kind: _Kind) -> Evaluation | None:
         """Return the best candidate of a kind."""
@@ -625,73 +642,13 @@ class _Search:
         return correlated_rows(residuals_of(self.measured, each.candidate)[self.measured.known :], max(1, block // 4))
 
 
-def _has_signs(each: Evaluation) -> bool:
-    return each.candidate.orientation != "auto"
+def _lags(each: Evaluation) -> bool:
+    """Return whether an operator is followed by a lag."""
+    return bool(_LAGS & set(str(each.candidate.options.get("dynamics")).split(",")))
 
 
 def _times(number: int) -> str:
     return "once" if number == 1 else f"{number} times"
-
-
-def simplest_near_best(judged: Sequence[Evaluation]) -> tuple[Evaluation, Evaluation]:
-    """Return the one of the least error, and the simplest within one standard error of it.
-
-    Those of up to half as many coefficients more are about as simple: of these it is the one of the least error.
-    """
-    best = min(judged, key=lambda each: _score(each).mean())
-    within = [each for each in judged if is_within_one_standard_error(each, best)]
-    fewest = min(each.free for each in within)
-    return best, min(
-        (each for each in within if _FEWER * each.free <= fewest),
-        key=lambda each: (_score(each).mean(), each.free),
-    )
-
-
-def is_within_one_standard_error(simple: Evaluation, best: Evaluation) -> bool:
-    """Return whether an error is within one standard error of the best, or 2 %, and at most 5 % above it.
-
-    The standard error is that of the differences fold by fold: what is hard to predict is so for both. To leave out
-    time the 2 % do not count: at the rates of the record a lag may hardly show, and at others be most of the error.
-    """
-    first, second = _score(simple), _score(best)
-    if first.size != second.size:
-        # Rows between those of the others make other folds of units; blocks are the same.
-        first, second = np.array(simple.blocks), np.array(best.blocks)
-    difference = first - second
-    allowed = float(np.std(difference, ddof=1) / np.sqrt(difference.size))
-    if simple.candidate.static or not best.candidate.static:
-        allowed = max(allowed, (EQUAL**2 - 1.0) * second.mean())
-    allowed = min(allowed, (_WORSE**2 - 1.0) * second.mean())
-    return bool(difference.mean() <= allowed)
-
-
-def best_smoothing(tries: Sequence[Evaluation]) -> Evaluation:
-    """Return the try of the least error; of several within 2 % of it the smoothest."""
-    least = min(each.rms for each in tries)
-    return max(
-        (each for each in tries if each.rms <= EQUAL * least),
-        key=lambda each: (each.candidate.smoothing or 0.0, -each.rms),
-    )
-
-
-def _of_best_memory(tries: Sequence[Evaluation]) -> list[Evaluation]:
-    """Return the tries from the initial memory of the best of them."""
-    memories: dict[Initial | None, list[Evaluation]] = {}
-    for each in tries:
-        memories.setdefault(each.candidate.initial, []).append(each)
-    chosen = _best_memory([min(each, key=lambda one: one.rms) for each in memories.values()])
-    return memories[chosen.candidate.initial]
-
-
-def _best_memory(tries: Sequence[Evaluation]) -> Evaluation:
-    """Return the try of the least error; of several within 2 % of it that of the least error in the first rows."""
-    least = min(each.rms for each in tries)
-    return min((each for each in tries if each.rms <= EQUAL * least), key=lambda each: each.start)
-
-
-def _score(each: Evaluation) -> Floats:
-    """Return the mean squared errors that decide, fold by fold: those of blocks, and of units where there are any."""
-    return np.array(each.blocks + each.units)
 
 
 def _kinds(model: str, spec: ModelSpec, given: Given) -> list[_Kind]:

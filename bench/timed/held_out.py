@@ -11,8 +11,8 @@ import numpy as np
 from bench.hysteresis._checks import Floats
 from bench.identification.branches import turning_points
 from bench.identification.by_name import FitProblem
-from bench.identification.evaluation import Candidate, Evaluation, Measurements
-from bench.identification.folds import Fold
+from bench.identification.evaluation import Candidate, Evaluation, Measurements, corrected, schwarz
+from bench.identification.folds import Fold, correlated_rows
 from bench.identification.least_squares import Fit, one_thread
 from bench.identification.orientation import NAMES
 from bench.timed.hammerstein_fit import CHOICE, choose_elements, set_up_search
@@ -194,10 +194,18 @@ def _left_out(
 
     blocks = [leave_out(fold) for fold in measured.blocks()]
     units = [leave_out(fold) for fold in measured.units()]
+    free = float(np.mean([free for _, free in blocks]))
+    weights = measured.fitted.astype(np.float64)
+    found = fit(weights)
+    weights[:skip] = 0.0
+    residuals = (measured.outputs - found.bias - columns @ found.coefficients)[weights > 0.0]
     return Evaluation(
         candidate,
         blocks=tuple(error for error, _ in blocks),
         units=tuple(error for error, _ in units),
         training=float(np.mean(trained[: len(blocks)])),
-        free=float(np.mean([free for _, free in blocks])),
+        free=free,
+        misfit=corrected(residuals, free),
+        schwarz=schwarz(residuals, free),
+        uncorrelated=correlated_rows(residuals, 2) <= 1,
     )

@@ -63,7 +63,7 @@ class Case:
             signs = {} if one.orientation == "auto" else {"orientation": one.orientation}
             model = identify_in_time(
                 one.model, self.step * np.arange(self.inputs.size), self.inputs, self.outputs, skip=known,
-                initial=one.initial, **signs, **one.options,
+                initial=one.initial, smoothing=one.smoothing or 0.0, **signs, **one.options,
             ).model  # fmt: skip
             return self._error(model.evaluate(self.other_step * np.arange(self.others.size), self.others))
         problem = set_up_problem(
@@ -152,16 +152,22 @@ def lagged(outputs: Floats, step: float, time_constant: float = 1e-3) -> Floats:
 
 def grid_in_time() -> Iterator[Candidate]:
     """Yield the settings of models with time that are tried by hand."""
-    statics: list[dict[str, object]] = [
+    planes = (
         {"static": "preisach", "levels": 10},
         {"static": "preisach", "levels": 20},
         {"static": "prandtl-ishlinskii", "plays": 15},
+    )
+    shapes: tuple[dict[str, object], ...] = (
         {"static": "generalized-prandtl-ishlinskii"},
         {"static": "bouc-wen"},
         *({"static": "duhem", "degree": degree} for degree in (3, 5, 7)),
-    ]
-    for static, elements, memory in product(statics, ("drift", "lag", "delay", "creep"), (None, "skip")):
-        yield Candidate("hammerstein", {**static, "dynamics": elements}, "auto", memory)
+    )
+    # A resonance after many columns takes long, and no record has one.
+    settings = [*product(planes, ("drift", "lag", "delay", "creep"))]
+    settings += product(shapes, ("drift", "lag", "resonance", "delay", "creep"))
+    for (static, elements), memory in product(settings, (None, "skip")):
+        for weight in (0.0, 0.1) if "levels" in static else (0.0,):
+            yield Candidate("hammerstein", {**static, "dynamics": elements}, "auto", memory, weight)
 
 
 def grid() -> Iterator[Candidate]:

@@ -9,13 +9,8 @@ from hysteretic_plants import bouc_wen, butterfly, duhem, jiles_atherton, random
 from bench.hysteresis import ModelSpec, Polynomial, PrandtlIshlinskii, Preisach, models, uniform_levels
 from bench.identification.by_name import set_up_problem
 from bench.identification.evaluation import Candidate, Evaluation, Measurements, evaluate
-from bench.identification.selection import (
-    Given,
-    best_smoothing,
-    is_within_one_standard_error,
-    select,
-    simplest_near_best,
-)
+from bench.identification.near_best import best_smoothing, is_within_one_standard_error, simplest_near_best
+from bench.identification.selection import Given, select
 from bench.timed import LinearPart
 from bench.timed.held_out import HeldOutInTime
 
@@ -56,6 +51,13 @@ class TestTheRuleOfOneStandardError:
         assert simplest_near_best(alike) == (alike[0], alike[0])
         clear = [*alike, evaluation([1.03] * 5, free=5.0)]
         assert simplest_near_best(clear) == (alike[0], clear[3])
+        # What left nothing but noise is compared by its fit.
+        free = replace(clear[0].candidate, orientation="auto")
+        adequate = [replace(clear[0], candidate=free, schwarz=-7.0, uncorrelated=True), *clear[1:3]]
+        adequate.append(replace(clear[3], schwarz=0.0))
+        assert simplest_near_best(adequate)[1] is adequate[0]
+        weak = [replace(adequate[0], schwarz=-5.0), *adequate[1:]]
+        assert simplest_near_best(weak)[1] is weak[3]
 
     def test_units_left_out_count_as_much_as_blocks(self):
         best = evaluation([1.0] * 5, [1.0] * 5)

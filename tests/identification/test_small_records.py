@@ -8,7 +8,8 @@ from hysteretic_plants import PLANTS, butterfly, duhem, random_reversals, settle
 
 from bench.hysteresis import identifiable_models
 from bench.identification import identify
-from bench.identification.evaluation import Candidate, Measurements
+from bench.identification.evaluation import Candidate, Measurements, corrected
+from bench.identification.near_best import simplest_near_best
 from bench.identification.selection import Given, select
 
 MOST = 1.5
@@ -42,6 +43,30 @@ def ratio(plant, seed, models, options):
     return error(chosen, inputs, outputs, others, truth) / error(simple, inputs, outputs, others, truth)
 
 
+def test_residuals_are_corrected_for_free_coefficients():
+    rng = np.random.default_rng(0)
+    columns = rng.standard_normal((50, 20))
+    new = []
+    for _ in range(200):
+        noise = rng.standard_normal(50)
+        fitted = columns @ np.linalg.lstsq(columns, noise, rcond=None)[0]
+        new.append((corrected(noise - fitted, 19), np.sqrt(1.0 + np.mean(fitted**2))))
+    expected, found = np.mean(new, axis=0)[::-1]
+    # The error on other noise at the same rows; the criterion is about a tenth too great at so many coefficients.
+    assert expected < found < 1.15 * expected
+
+
+def test_of_few_rows_the_fit_to_all_decides():
+    inputs, outputs, _, _ = records("duhem", 10)
+    found = select(Measurements.of(inputs, outputs), ("polynomial-plays", "prandtl-ishlinskii"))
+    judged = [each for each in found.evaluations if each.units]
+    assert found.chosen is min(judged, key=lambda each: each.schwarz)
+    many = np.repeat(inputs, 3)
+    noise = 0.01 * np.ptp(outputs) * np.random.default_rng(1).standard_normal(many.size)
+    longer = select(Measurements.of(many, np.repeat(outputs, 3) + noise), ("polynomial-plays", "prandtl-ishlinskii"))
+    assert longer.chosen is simplest_near_best([each for each in longer.evaluations if each.units])[1]
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("plant", ALL)
 def test_a_plane_that_is_asked_for_does_not_make_it_worse(plant):
@@ -71,3 +96,19 @@ def test_first_rows_that_alone_reach_an_end_of_the_range_are_not_left_out():
 @pytest.mark.parametrize("options", [{}, {"levels": 40}])
 def test_the_choice_among_all_models_is_no_worse(plant, seed, options):
     assert ratio(plant, seed, tuple(identifiable_models()), options) <= MOST
+
+
+@pytest.mark.seeds
+def test_the_fit_to_all_rows_chooses_better_than_blocks_left_out(capsys):
+    by_fit, by_blocks = [], []
+    for plant in ("duhem", "jiles-atherton"):
+        for seed in range(20, 30):
+            inputs, outputs, others, truth = records(plant, seed)
+            found = select(Measurements.of(inputs, outputs), tuple(identifiable_models()))
+            simplest = simplest_near_best([each for each in found.evaluations if each.units])[1]
+            by_fit.append(error(found.chosen.candidate, inputs, outputs, others, truth) / np.ptp(truth))
+            by_blocks.append(error(simplest.candidate, inputs, outputs, others, truth) / np.ptp(truth))
+    first, second = (100.0 * np.exp(np.mean(np.log(each))) for each in (by_fit, by_blocks))
+    with capsys.disabled():
+        print(f"\ngeometric means of {len(by_fit)}, % of the range: {first:.2f} by the fit, {second:.2f} by blocks")
+    assert first < second
