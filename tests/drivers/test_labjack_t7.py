@@ -2138,6 +2138,15 @@ def test_a_register_is_set_over_another_connection_if_the_former_has_ended(bench
     assert bench.t7.tdac_volts(0) == pytest.approx(1.0, abs=2e-3)
 
 
+def test_an_input_that_another_program_left_differential_is_read_against_ground(bench, in_process):
+    bench.t7.write_value("AIN4_NEGATIVE_CH", 5)
+    bench.volts |= {4: 0.5, 5: 0.25}
+    volts = {"volts_per_metre": 1.0, "position_limits": (-9.0, 9.0)}
+    sensor = connected(bench, in_process, T7PositionSensor, channels=(4,), **volts)
+    (position,) = sensor.measure().values()
+    assert position == pytest.approx(0.5, abs=1e-2)
+
+
 def test_a_safe_state_does_not_ask_whose_the_instrument_is(bench, in_process):
     sensor = connected(bench, in_process, T7PositionSensor, channels=(3,))
     sensor._line.write(registers._OWNER, 1 + sensor._line._owner % 9)
