@@ -18,15 +18,18 @@ from bench.model_file import ModelFile
 from bench.results.tracking import TargetResults
 from bench.rig_file import load_rig
 from bench.studies import Campaign, reached_targets
-from bench.tuning.search import Numbers, Trial, cost_of, perturbed_models
+from bench.tuning.search import GAIN_HIGH, MARGIN, Numbers, Trial, cost_of, perturbed_models
 
 if TYPE_CHECKING:
     from bench.runs import RunResult
     from bench.workers import Pending, Workers
 
 _AS_IDENTIFIED = "as-identified"
+_TARGETS = "target"
 FORCE = "force"
 """Slot of a rig whose force is controlled."""
+_WITHIN_REACH = 1.0 - 0.95 / MARGIN
+"""Part of a model's range, of a gain greater by `MARGIN`, that the specimen does not reach, and a twentieth more."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,7 @@ class Task:
     @property
     def kind(self) -> str:
         """The task of the controller in `bench.controllers`."""
-        return {"length-control": "coupled-length", "force-control": "coupled-force"}.get(self.protocol, "target")
+        return {"length-control": "coupled-length", "force-control": "coupled-force"}.get(self.protocol, _TARGETS)
 
 
 def task_of(file: ModelFile, controller: str, protocol: str | None) -> Task:
@@ -146,6 +149,9 @@ class TuningRuns:
                     self.rig, self.folder / f"{self._count:03}" / name, seed, live=False, workers=self.workers
                 )
                 settings = {"model": str(path), "controller": self.task.controller, "sequence_seed": str(seed + 1)}
+                if name == GAIN_HIGH and self.task.kind != _TARGETS:
+                    # Targets are drawn from the range of the model.
+                    settings["margin"] = f"{_WITHIN_REACH:g}"
                 if self._opened:
                     # It goes on where the model of another specimen does not hold.
                     settings["fallback"] = "open-loop"

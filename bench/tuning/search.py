@@ -24,6 +24,8 @@ from bench.model_file import ModelFile
 
 MARGIN = 1.25
 """Factor of the gain, and of the time constant, by which the specimen may differ from its model."""
+GAIN_HIGH = "gain-high"
+"""Name of the model of a greater gain than the specimen has."""
 TIME_WEIGHT = 0.25
 """Part of the RMS error of the first numbers that costs as much as their time."""
 FAILED = 1000.0
@@ -85,7 +87,7 @@ def perturbed_models(file: ModelFile, *, force: bool = False) -> dict[str, Model
     of its force.
     """
     found = {}
-    for name, gain in (("gain-high", MARGIN), ("gain-low", 1.0 / MARGIN)):
+    for name, gain in ((GAIN_HIGH, MARGIN), ("gain-low", 1.0 / MARGIN)):
         found[name] = replace(file, model=_scaled(file.model, gain, force), memory=None, initial=None, band=None)
     known = file.dynamics
     if known is not None and known.response.lag > 0.0:

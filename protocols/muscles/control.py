@@ -44,8 +44,6 @@ from protocols.preparation import Part
 
 Output = Literal["length", "force"]
 
-_MARGIN = 0.05
-"""Part of the model's range at either end where no target is drawn."""
 _TARGETS_AT_A_LOAD = 5
 _GRACE = 60.0
 
@@ -60,6 +58,9 @@ class Controlled(ProtocolParameters):
         "closed-loop-inverse", unit="", help="which controller", choices=lambda: controller_names("coupled-length")
     )
     count: int = parameter(40, unit="1", low=1, high=10000, help="number of targets, drawn from the model's range")
+    margin: float = parameter(
+        0.05, unit="1", low=0.0, high=0.45, help="part of the model's range at either end where no target is drawn"
+    )
     sequence_seed: int = parameter(1, unit="1", low=0, help="seed of the targets")
     tuning: Tuning = parameter(
         {}, unit="", help="numbers of controllers in place of those from the model: a tuning file, or tables"
@@ -99,7 +100,7 @@ def length_control(parameters: LengthParameters, slots: Slots) -> Messages:
     model: TwoStage = file.model
     state = model.initial_state()
     ranges = [
-        _range(model, _hung(model, state, load), parameters.highest, "length")
+        _range(model, _hung(model, state, load), parameters, "length")
         for load in (parameters.load, parameters.load + parameters.change)
     ]
     low, high = max(low for low, _ in ranges), min(high for _, high in ranges)
@@ -129,7 +130,7 @@ def force_control(parameters: ForceParameters, slots: Slots) -> Messages:
     file = _load_model(parameters.model)
     model: TwoStage = file.model
     state = model.initial_state()
-    low, high = _range(model, state, parameters.highest, "force")
+    low, high = _range(model, state, parameters, "force")
     controller = _make_controller(parameters, file, state, "force", high - low)
     yield from prepare_on_stage(parameters, slots, parameters.conditioning)
     yield Phase(parameters.controller)
@@ -179,9 +180,11 @@ def _hung(model: TwoStage, state: TwoStageState, load: float) -> TwoStageState:
     return model.step(state, state.voltage, load)[0]
 
 
-def _range(model: TwoStage, state: TwoStageState, highest: float, output: Output) -> tuple[float, float]:
+def _range(
+    model: TwoStage, state: TwoStageState, parameters: LengthParameters | ForceParameters, output: Output
+) -> tuple[float, float]:
     """Return the outputs (m or N) between the ends of a full cycle of the voltage, less a margin at either end."""
-    values = []
+    values, highest, margin = [], parameters.highest, parameters.margin
     under = f" under {state.force:g} N" if output == "length" else ""
     for voltage in (highest, 0.0):
         if output == "length":
@@ -193,7 +196,7 @@ def _range(model: TwoStage, state: TwoStageState, highest: float, output: Output
     low, high = min(values), max(values)
     if not low < high:
         raise ValueError(f"highest: up to {highest:g} V the model's {output} does not change{under}")
-    return low + _MARGIN * (high - low), high - _MARGIN * (high - low)
+    return low + margin * (high - low), high - margin * (high - low)
 
 
 def _targets(parameters: Controlled, low: float, high: float) -> list[float]:

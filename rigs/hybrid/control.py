@@ -65,6 +65,9 @@ _DOUBTED = 1.5
 sessions is 6.4 % of the stroke."""
 _NEW_CURRENT = 0.02
 """Time between two currents, s."""
+_TABLE = f"[protocols.hybrid-control.tuning.{MID_RANGING}]"
+_OF_THE_RUN = ("period", "every", "maximum_current", "noise")
+"""Settings that do not stand in that table; those of the noise have one of their own."""
 
 
 class _Preview:
@@ -113,22 +116,24 @@ class _Preview:
 
 def _made(kind: type[T], table: str, given: Mapping[str, Any], **further: float) -> T:
     """Return numbers of a controller, made from a table of the rig file; `further` are not of that."""
-    where = f"[protocols.hybrid-control.tuning.{MID_RANGING}]"
     if not isinstance(given, Mapping):
-        raise ConfigurationError(f"{where} {table.removesuffix('.')} = {given!r}: expected a table of numbers")
-    known = [each for each in fields(kind) if each.name not in further]  # type: ignore[arg-type]
-    missing = [table + each.name for each in known if each.default is MISSING and each.name not in given]
-    if missing:
-        raise ConfigurationError(
-            f"nothing says of this cantilever: {', '.join(missing)}; give them in the rig file, {where}"
-        )
-    if unknown := given.keys() - {each.name for each in known}:
-        names = ", ".join(table + each.name for each in known)
-        raise ConfigurationError(f"{where} {table}{min(unknown)}: there is no such number; there are: {names}")
+        raise ConfigurationError(f"{_TABLE} {table.removesuffix('.')} = {given!r}: expected a table of numbers")
+    known = [each.name for each in fields(kind) if each.name not in further]  # type: ignore[arg-type]
+    if unknown := given.keys() - set(known):
+        names = ", ".join(table + each for each in known)
+        raise ConfigurationError(f"{_TABLE} {table}{min(unknown)}: there is no such number; there are: {names}")
     try:
         return kind(**given, **further)
     except (TypeError, ValueError) as error:
-        raise ConfigurationError(f"{where} {table}{error}") from None
+        raise ConfigurationError(f"{_TABLE} {table}{error}") from None
+
+
+def _lacking(kind: type[Any], table: str, given: object) -> list[str]:
+    """Return the names of numbers that a table of the rig file has to have and lacks."""
+    if not isinstance(given, Mapping):
+        return []
+    needed = [each.name for each in fields(kind) if each.default is MISSING and each.name not in _OF_THE_RUN]
+    return [table + name for name in needed if name not in given]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -191,7 +196,12 @@ class MidRangingParameters:
         ConfigurationError
             If a number is missing, there is no such number, or its value is not allowed.
         """
-        noise = _made(ThermalNoise, "noise.", numbers.get("noise", {}))
+        noise = numbers.get("noise", {})
+        if missing := _lacking(cls, "", numbers) + _lacking(ThermalNoise, "noise.", noise):
+            raise ConfigurationError(
+                f"nothing says of this cantilever: {', '.join(missing)}; give them in the rig file, {_TABLE}"
+            )
+        noise = _made(ThermalNoise, "noise.", noise)
         every = max(1, round(_NEW_CURRENT * rate))
         return _made(cls, "", {**numbers, "noise": noise}, period=1.0 / rate, every=every, **further)
 

@@ -58,6 +58,9 @@ LOOPS: Mapping[str, Mapping[str, Any]] = {
 """How the model of a rig is identified from its damped oscillation; that of a muscle comes from three runs."""
 
 
+_CLOSED_LOOP = "closed-loop-inverse"
+
+
 class Case(NamedTuple):
     """What is tuned: rig, protocol, controller; the signal that counts, and the unit that is printed, in SI."""
 
@@ -70,21 +73,23 @@ class Case(NamedTuple):
 
     @property
     def name(self) -> str:
-        return f"{self.rig}/{self.protocol}" + f"/{self.controller}" * (self.controller == "latched")
+        return f"{self.rig}/{self.protocol}" + f"/{self.controller}" * (self.controller != _CLOSED_LOOP)
 
 
 CASES = (
-    Case("vo2", "tracking", "closed-loop-inverse", "curvature", "1/m"),
-    Case("vo2", "tracking", "latched", "curvature", "1/m"),
+    *(
+        Case("vo2", "tracking", controller, "curvature", "1/m")
+        for controller in (_CLOSED_LOOP, "open-loop-inverse", "latched")
+    ),
     *(
         case
         for rig in ("sma", "mckibben", "coiled-polymer")
         for case in (
-            Case(rig, "length-control", "closed-loop-inverse", LENGTH, "µm", 1e-6),
-            Case(rig, "force-control", "closed-loop-inverse", FORCE, "mN", 1e-3),
+            Case(rig, "length-control", _CLOSED_LOOP, LENGTH, "µm", 1e-6),
+            Case(rig, "force-control", _CLOSED_LOOP, FORCE, "mN", 1e-3),
         )
     ),
-    Case("hybrid", "tracking", "closed-loop-inverse", "displacement_position", "nm", 1e-9),
+    Case("hybrid", "tracking", _CLOSED_LOOP, "displacement_position", "nm", 1e-9),
 )
 
 

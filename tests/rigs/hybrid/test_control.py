@@ -604,6 +604,10 @@ def folded():
             lambda: MidRangingParameters.at_rate(200.0, {"noise": MID_RANGING["noise"]}, maximum_current=0.1),
             r"gain, .*, stroke, approach; give them in the rig file, \[protocols\.hybrid-control\.tuning",
         ),
+        (
+            lambda: MidRangingParameters.at_rate(200.0, {}, maximum_current=0.1),
+            r"cantilever: gain, .*, approach, noise\.heat, noise\.thermistor, noise\.deflection; give",
+        ),
         (lambda: settings(noise={**MID_RANGING["noise"], "heat": 0.0}), "heat: expected a positive"),
     ],
 )

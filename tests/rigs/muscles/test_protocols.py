@@ -194,8 +194,8 @@ class TestPlan:
 
     def test_targets_are_drawn_from_what_the_model_reaches(self, files):
         references = []
-        for seed in (1, 1, 2):
-            messages = dry("force-control", model=files["two-stage"], count=30, sequence_seed=seed)
+        for seed, margin in ((1, 0.05), (1, 0.05), (2, 0.05), (1, 0.25)):
+            messages = dry("force-control", model=files["two-stage"], count=30, sequence_seed=seed, margin=margin)
             reach = [m for m in messages if isinstance(m, Control) and m.actuator == "supply"]
             targets = []
             for message in reach:
@@ -206,6 +206,9 @@ class TestPlan:
         assert len(references[0]) == 30
         assert 0.3 < min(references[0]) < 3.0
         assert 8.0 < max(references[0]) < 11.2
+        # The same draws from a narrower range.
+        wide, narrow = (np.array(references[each]) for each in (0, 3))
+        np.testing.assert_allclose(narrow - narrow.mean(), (wide - wide.mean()) * 0.5 / 0.9)
 
 
 class TestRefused:
