@@ -568,8 +568,8 @@ class CorrectionParameters:
     arrival : Arrival
         When the actuator has arrived at a set-point.
     turn_back : float or None
-        Error below which no correction is made that must turn back, output units; `close_enough` if None or less. Such
-        a correction crosses a loop of the hysteresis, and may well end further off.
+        Error below which no correction is made that must turn back, output units; `close_enough` if None or less.
+        Such a correction crosses a loop of the hysteresis, and may well end further off.
     """
 
     close_enough: float
