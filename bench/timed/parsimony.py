@@ -60,6 +60,7 @@ def chance_of(used: int) -> float:
 
 def deviations_of(slopes: Floats, variance: float) -> Floats:
     """Return standard deviations of parameters; infinite where the residuals do not depend on one."""
-    covariance = np.linalg.pinv(slopes.T @ slopes) * variance
+    # Of the slopes themselves, as the inverse of their products may have negative variances by rounding.
+    variances = variance * np.sum(np.linalg.pinv(slopes) ** 2, axis=1)
     flat = np.linalg.norm(slopes, axis=0) <= 1e-12 * max(float(np.linalg.norm(slopes)), 1e-300)
-    return np.where(flat, np.inf, np.sqrt(np.diag(covariance)))
+    return np.where(flat, np.inf, np.sqrt(variances))

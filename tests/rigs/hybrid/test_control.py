@@ -606,7 +606,7 @@ def folded():
         ),
         (
             lambda: MidRangingParameters.at_rate(200.0, {}, maximum_current=0.1),
-            r"cantilever: gain, .*, approach, noise\.heat, noise\.thermistor, noise\.deflection; give",
+            r"cantilever: gain, .*, approach, noise\.thermistor, .*, noise\.offset; give",
         ),
         (lambda: settings(noise={**MID_RANGING["noise"], "heat": 0.0}), "heat: expected a positive"),
     ],
