@@ -320,11 +320,6 @@ def _correction(setup: ControllerSetup) -> CorrectionParameters:
     return replace(found, arrival=replace(found.arrival, patience=found.arrival.patience + further))
 
 
-def _tunable_correction(setup: ControllerSetup) -> CorrectionParameters:
-    found = _correction(setup)
-    return replace(found, turn_back=found.close_enough)
-
-
 def _latched(setup: ControllerSetup) -> Latched | OppositeOutput:
     inverse: Any = setup.inverse()
     if getattr(setup.model.operator, "reversible", None) is None:
@@ -380,8 +375,8 @@ CLOSED_LOOP_INVERSE = ControllerSpec(
         s.inverse(), s.start, s.limits, s.tuned(lambda _: _correction(s)), s.model_filter(), s.response
     ),
     adapts=True,
-    numbers=_tunable_correction,
-    tunable=("turn_back", "close_enough", "walk_variance", "arrival.tolerance", "arrival.hold"),
+    numbers=_correction,
+    tunable=("close_enough", "walk_variance", "arrival.tolerance", "arrival.hold"),
 )
 LATCHED = ControllerSpec(
     "backs off at the target, where the hysteresis holds the output",

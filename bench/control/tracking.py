@@ -558,7 +558,8 @@ class CorrectionParameters:
     corrections : int
         Greatest number of corrections after the first move.
     close_enough : float
-        Error below which no further correction is made, output units.
+        Error below which no further correction is made, output units: a correction that must turn back
+        crosses a loop of the hysteresis, and then may well end further off.
     walk_variance : float
         Variance by which the model's error changes between two corrections, output units squared. Three times
         the other lets the gain settle at 0.8; results change little over a decade.
@@ -567,9 +568,6 @@ class CorrectionParameters:
         input wanders unseen while it is read.
     arrival : Arrival
         When the actuator has arrived at a set-point.
-    turn_back : float or None
-        Error below which no correction is made that must turn back, output units; `close_enough` if None or less.
-        Such a correction crosses a loop of the hysteresis, and may well end further off.
     """
 
     close_enough: float
@@ -577,10 +575,9 @@ class CorrectionParameters:
     reading_variance: float
     arrival: Arrival
     corrections: int = 4
-    turn_back: float | None = None
 
     def __post_init__(self) -> None:
-        check_positive(self, "close_enough", "walk_variance", "reading_variance", "turn_back")
+        check_positive(self, "close_enough", "walk_variance", "reading_variance")
         if self.corrections < 0:
             raise ValueError(f"corrections: expected at least 0, got {self.corrections}")
 
@@ -623,25 +620,14 @@ class Correcting(Scripted):
 
     def _correct(self, target: float) -> Move:
         """Go to the target and correct by the disturbance that is measured where the actuator has come to."""
-        before = self._setpoint
         reading = yield from self._towards(target - self._estimator.value)
         for _ in range(self._correction.corrections):
             self._learn(reading.output)
             self._estimator.update(reading.output - self._modelled())
-            if self._is_close(target, target - reading.output, self._setpoint - before):
+            if abs(target - reading.output) <= self._correction.close_enough:
                 break
-            before = self._setpoint
             reading = yield from self._towards(target - self._estimator.value)
         return reading
-
-    def _is_close(self, target: float, error: float, moved: float) -> bool:
-        """Return whether an error (output units) is left as it is after the last move (input units)."""
-        if abs(error) <= self._correction.close_enough:
-            return True
-        if abs(error) > (self._correction.turn_back or 0.0):
-            return False
-        following, *_ = self._inverse.invert(self.state, target - self._estimator.value).setpoints
-        return (following - self._setpoint) * moved < 0.0
 
 
 class ClosedLoopInverse(Correcting):
