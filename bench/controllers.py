@@ -36,6 +36,8 @@ S = TypeVar("S", Supervised, SupervisedFollower)
 
 _TO_REST = 10.0
 """Time constants in which a specimen comes to rest to the sensor's noise."""
+_END_OF_PLANE = 0.005
+"""Part of a plane by which its lower end may lie below the set-point that saturates the specimen."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -432,5 +434,11 @@ def load_model_for(path: str, *, input_unit: str, output_unit: str) -> ModelFile
 
 
 def saturated_below(operator: Operator[Any], value: float) -> bool:
-    """Return whether an input brings a specimen of this model to negative saturation from any state."""
-    return operator.plane is None or (math.isfinite(value) and value <= operator.plane[0])
+    """Return whether an input brings a specimen of this model to negative saturation from any state.
+
+    To 0.5 % of the plane: where measured inputs set its ends, these are readings of set-points, with their noise.
+    """
+    if operator.plane is None:
+        return True
+    low, high = operator.plane
+    return math.isfinite(value) and value <= low + _END_OF_PLANE * (high - low)

@@ -1,14 +1,15 @@
 """Controllers by name: the numbers that a rig puts in place of their defaults."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from bench.control.dynamics import ActuatorDynamics, IdentifiedDynamics, ResponseDynamics
-from bench.controllers import ControllerSetup, controller_names, controller_spec, make_controller
+from bench.controllers import ControllerSetup, controller_names, controller_spec, make_controller, saturated_below
 from bench.errors import ConfigurationError
-from bench.hysteresis import Polynomial, Preisach, uniform_levels
+from bench.hysteresis import Polynomial, PrandtlIshlinskii, Preisach, uniform_levels
 from bench.model_file import ModelFile
 
 PREISACH = ModelFile("preisach", Preisach(uniform_levels(0.0, 3.0, 4), np.ones(10), input_range=(0.0, 3.0)))
@@ -71,3 +72,12 @@ def test_a_controller_that_does_not_exist_is_refused_with_those_that_do():
         ConfigurationError, match=r"there is no controller 'magic' for the task target; there are: .*latched"
     ):
         make_controller("target", "magic", setup())
+
+
+def test_a_reset_reaches_the_end_of_a_plane_to_the_noise_of_its_readings():
+    density = np.ones(10)
+    measured = Preisach(uniform_levels(-40.05, 40.05, 4), density, 0.0, None, (-40.05, 40.05), "V", "m")
+    assert saturated_below(measured, -40.0)
+    assert not saturated_below(measured, -39.6)
+    assert not saturated_below(measured, math.nan)
+    assert saturated_below(PrandtlIshlinskii([0.0], [1.0]), 0.0)
