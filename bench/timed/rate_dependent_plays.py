@@ -102,23 +102,16 @@ class RateDependentPlays(TimedModel[PlaysState]):
         """Return the outputs of a sequence, shape (N,), and the state after it; see `TimedModel.run`."""
         from bench.timed import _play_kernels
 
-        clock, sequence = check_sequence(times, inputs=inputs)
-        state = self.initial_state() if state is None else state
-        steps, before = _steps(clock, state)
-        plays = np.array(state.plays)
-        elements = self.thresholds.copy(), self.time_constants.copy()
-        total = _play_kernels.weighted_plays(sequence, steps, before, *elements, self.weights.copy(), plays)
-        return self.bias + total, PlaysState(tuple(plays.tolist()), (float(clock[-1]), float(sequence[-1])))
+        clock, sequence, plays = self._begin(times, state, inputs=inputs)
+        total = _play_kernels.weighted_plays(*sequence, *self._elements(), self.weights.copy(), plays)
+        return self.bias + total, PlaysState(tuple(plays.tolist()), (float(clock[-1]), float(sequence[0][-1])))
 
     def columns(self, times: ArrayLike, inputs: ArrayLike, state: PlaysState | None = None) -> Floats:
         """Return the plays sample by sample, shape (N, K), which the weights multiply; arguments as `run`."""
         from bench.timed import _play_kernels
 
-        clock, sequence = check_sequence(times, inputs=inputs)
-        state = self.initial_state() if state is None else state
-        steps, before = _steps(clock, state)
-        elements = self.thresholds.copy(), self.time_constants.copy()
-        return np.asarray(_play_kernels.plays(sequence, steps, before, *elements, np.array(state.plays)))
+        _, sequence, plays = self._begin(times, state, inputs=inputs)
+        return np.asarray(_play_kernels.plays(*sequence, *self._elements(), plays))
 
     def follow(
         self,
@@ -130,16 +123,24 @@ class RateDependentPlays(TimedModel[PlaysState]):
         """Return the inputs of the operating range that bring the output to targets; see `TimedModel.follow`."""
         from bench.timed import _play_kernels
 
-        clock, wanted = check_sequence(times, targets=targets)
-        state = self.initial_state() if state is None else state
-        steps, before = _steps(clock, state)
+        _, (wanted, steps, before), plays = self._begin(times, state, targets=targets)
         sign = -1.0 if (self.weights < 0.0).any() else 1.0
-        elements = self.thresholds.copy(), self.time_constants.copy(), sign * self.weights
+        elements = *self._elements(), sign * self.weights
         return np.asarray(
-            _play_kernels.inputs_for(
-                sign * (wanted - self.bias), steps, before, *self.input_range, *elements, np.array(state.plays)
-            )
+            _play_kernels.inputs_for(sign * (wanted - self.bias), steps, before, *self.input_range, *elements, plays)
         )
+
+    def _begin(
+        self, times: ArrayLike, state: PlaysState | None, **given: ArrayLike
+    ) -> tuple[Floats, tuple[Floats, Floats, float], Floats]:
+        """Return the times; the values given, their steps of time and the input before them; and the plays before."""
+        clock, values = check_sequence(times, **given)
+        state = self.initial_state() if state is None else state
+        return clock, (values, *_steps(clock, state)), np.array(state.plays)
+
+    def _elements(self) -> tuple[Floats, Floats]:
+        """Return thresholds and time constants as the kernels take them: arrays that may be written to."""
+        return self.thresholds.copy(), self.time_constants.copy()
 
     def initial_state(self) -> PlaysState:
         """Return the relaxed state: every play at the origin."""
