@@ -60,11 +60,8 @@ class CholeskyFactor:
     def reserve(self, size: int) -> None:
         """Take memory for so many columns at once."""
         if _factor_kernels.row_start(size) > self.packed.size:
-            # Memory that nothing is written to takes none.
-            grown = np.empty(_factor_kernels.row_start(max(size + size // 2, 512)))
-            used = _factor_kernels.row_start(self.size)
-            grown[:used] = self.packed[:used]
-            self.packed = grown
+            # In place: a copy would count in the memory of a large fit.
+            self.packed.resize(_factor_kernels.row_start(max(size + size // 16, 512)), refcheck=False)
 
     def append(self, rows: Floats, right: Floats) -> Flags:
         """Add at most `room` columns, given their products with the present ones and each other, and right sides.
