@@ -207,7 +207,9 @@ def identify_(
     for warning in found.warnings:
         warn(warning)
     print_rows(f"{model} from {names}", certificate_lines(found))
-    if (banded := predict_band(found.file, found.inputs, found.identification.initial_state)) is not None:
+    if (
+        banded := predict_band(found.file, found.inputs, found.identification.initial_state, found.times)
+    ) is not None:
         print_band(banded)
     tested = print_test(found, comparing, columns, reading)
     if out is not None:
@@ -379,7 +381,7 @@ def invert(
     for warning in found.warnings():
         warn(warning)
     start = starting_state(model, initial=initial, continue_memory=continue_memory)
-    banded = invert_band(model, found.setpoints, found.passing, start.state)
+    banded = invert_band(model, found.setpoints, found.passing, start.state, found.times)
     bands = banded.columns(found.setpoints, found.predicted, units[0]) if banded else []
     passing = ["" if value != value else value for value in found.passing.tolist()]
     written: list[tuple[str, Any]] = [

@@ -113,6 +113,10 @@ class TimedModel(Model, ABC, Generic[S]):
     def parameters(self) -> Mapping[str, tuple[float, str]]:
         """Return what a person should know of the model: number and unit by name."""
 
+    def structure(self) -> Mapping[str, Any]:
+        """Return the options of a fit that leave no part of this model to be chosen; by default none."""
+        return {}
+
     @abstractmethod
     def state_to_json(self, state: S) -> Any:  # noqa: ANN401 - any JSON that the model chooses
         """Return a state as JSON."""

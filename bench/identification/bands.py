@@ -13,13 +13,13 @@ It holds for inputs of the class on which it was calibrated (`ExcitationClass`);
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from bench.hysteresis import Operator, _checks
+from bench.hysteresis import Operator, TimedModel, _checks
 from bench.hysteresis._checks import Floats
 from bench.identification.branches import turning_points
 from bench.identification.by_name import FitProblem
@@ -28,6 +28,7 @@ from bench.identification.covariance import PredictionVariance, prediction_varia
 from bench.identification.excitation_class import LEAST_SWING, ExcitationClass
 from bench.identification.folds import near
 from bench.identification.least_squares import Fit
+from bench.shares import say_share, shares_to
 
 LEVEL = 0.9
 """Nominal coverage of a band, unless another is asked for."""
@@ -84,13 +85,18 @@ class Band:
     variance: PredictionVariance
     calibrated_on: ExcitationClass
 
-    def spread(self, operator: Operator[Any], inputs: Floats, state: Any = None) -> Floats:  # noqa: ANN401
+    def spread(
+        self,
+        operator: Operator[Any] | TimedModel[Any],
+        inputs: Floats,
+        state: Any = None,  # noqa: ANN401 - each operator has its own
+    ) -> Floats:
         """Return v, the standard deviation by which scores are divided, for a sequence of inputs, shape (N,).
 
         Parameters
         ----------
-        operator : Operator
-            The model to which the band belongs.
+        operator : Operator or TimedModel
+            The model to which the band belongs; of one with time v is the same everywhere.
         inputs : ndarray, shape (N,)
             Input units.
         state : object
@@ -101,6 +107,8 @@ class Band:
         ValueError
             If the inputs are empty or not finite, or the model has fewer coefficients than that of the band.
         """
+        if isinstance(operator, TimedModel):
+            return np.full(inputs.size, self.greatest)
         variance = self.variance.of(operator.regressor(inputs, state))
         return np.asarray(np.sqrt(self.variance.residual**2 + variance))
 
@@ -133,7 +141,7 @@ class Band:
             )
         return factor * self.spread(operator, inputs, state)
 
-    def departures(self, inputs: Floats, spread: Floats) -> tuple[str, ...]:
+    def departures(self, inputs: Floats, spread: Floats, times: Floats | None = None) -> tuple[str, ...]:
         """Return in which ways a sequence is not of the class of the calibration; none if the band holds for it.
 
         Beside those of `ExcitationClass.departures`: more than 10 % of the samples are worse determined by the data
@@ -145,13 +153,15 @@ class Band:
             Input units.
         spread : ndarray, shape (N,)
             What `spread` returns for them.
+        times : ndarray, shape (N,), or None
+            s, for a model with time.
 
         Raises
         ------
         ValueError
             If the inputs are empty or not finite.
         """
-        found = list(self.calibrated_on.departures(inputs))
+        found = list(self.calibrated_on.departures(inputs, times))
         worse = float((spread > 1.001 * self.greatest).mean())
         if worse > _OUTSIDE:
             found.append(f"{100 * worse:.0f} % of its rows rest on parts of the model that the data hardly determine")
@@ -227,52 +237,91 @@ def calibrate_band(problem: FitProblem, smoothing: float = 0.0, ridge: float = 0
     ValueError
         If the level is not between 0 and 1, or the samples are too few.
     """
-    if not 0.0 < level < 1.0:
-        raise ValueError(f"level: expected a number between 0 and 1, got {level}")
     used = np.flatnonzero(problem.weights > 0.0)
     used = used[used >= problem.skip]
     found = problem.fit(smoothing, ridge=ridge)
-    residuals = _residuals(problem, found)
     variance = prediction_variance(problem, found, smoothing, ridge)
     spread = np.sqrt(variance.residual**2 + variance.of(problem.regressor))
-    count = min(_BLOCKS, used.size // _FEWEST_ROWS)
-    if count < 2:
-        raise ValueError(f"band: {used.size} samples are too few to leave blocks of them out")
-    turns = turning_points(problem.inputs, LEAST_SWING * float(np.ptp(problem.inputs)))[1:-1]
-    block = _blocks(problem.inputs.size, used, count, turns)
-    lag = _correlation_lag(residuals[used], used.size // count // 2)
-    errors = np.full(problem.inputs.size, np.nan)
-    for fold in range(min(_FOLDS, count)):
-        left_out = (block >= 0) & (block % _FOLDS == fold)
-        if not left_out.any():
-            continue
-        weights = np.where(_with_gap(left_out, lag, turns), 0.0, problem.weights)
-        if np.count_nonzero(weights[problem.skip :]) < 2:
-            raise ValueError(f"band: {used.size} samples are too few to leave blocks of them out")
+
+    def leave_out(left_out: Flags) -> Floats:
+        weights = np.where(left_out, 0.0, problem.weights)
         other = problem.fit(smoothing, weights, ridge)
-        apart = _residuals(problem, other)
-        known = ~_extrapolated(problem, found, other, weights, variance.residual)
-        errors[left_out & known] = apart[left_out & known]
-    scored = np.isfinite(errors)
-    if not scored.any():
-        raise ValueError("band: each block of the samples moves parts of the model that no other moves")
-    scores = np.abs(errors) / np.maximum(spread, 1e-300)
-    independent = max(1, int(np.count_nonzero(scored)) // lag)
-    highest = [float(scores[(block == each) & scored].max()) for each in np.unique(block[scored])]
-    rank = math.ceil((len(highest) + 1) * level)
-    return Band(
-        level=level,
-        pointwise=_quantile(scores[scored], math.ceil((independent + 1) * level) / independent),
-        simultaneous=sorted(highest)[rank - 1] if rank <= len(highest) else None,
-        stretch=used.size // count,
-        rows=int(np.count_nonzero(scored)),
-        independent=independent,
-        blocks=len(highest),
-        held_out=float(np.sqrt(np.mean(errors[scored] ** 2))),
-        greatest=float(spread[used].max()),
-        variance=variance,
-        calibrated_on=ExcitationClass.of(problem.inputs[used]),
-    )
+        unknown = _extrapolated(problem, found, other, weights, variance.residual)
+        return np.where(unknown, np.nan, _residuals(problem, other))
+
+    calibrated_on = ExcitationClass.of(problem.inputs[used])
+    blocks = LeftOut(problem.inputs, used, _residuals(problem, found), spread, leave_out)
+    return blocks.calibrate(variance, calibrated_on, level)
+
+
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """Blocks of a sequence that are left out of fits, whose errors calibrate a band.
+
+    Parameters
+    ----------
+    inputs : ndarray, shape (N,)
+        Input units.
+    used : ndarray of int, shape (n,)
+        The rows that count.
+    residuals : ndarray, shape (N,)
+        Those of the fit to all of them, output units.
+    spread : ndarray, shape (N,)
+        The standard deviation v of each, output units.
+    leave_out : callable
+        Takes which rows are left out, shape (N,), and returns the errors of all by a fit without them, shape (N,),
+        output units; nan where that fit extrapolates.
+    """
+
+    inputs: Floats
+    used: Indices
+    residuals: Floats
+    spread: Floats
+    leave_out: Callable[[Flags], Floats]
+
+    def calibrate(self, variance: PredictionVariance, calibrated_on: ExcitationClass, level: float) -> Band:
+        """Return the band; arguments and errors as `Band` and `calibrate_band`."""
+        if not 0.0 < level < 1.0:
+            raise ValueError(f"level: expected a number between 0 and 1, got {level}")
+        used, spread = self.used, self.spread
+        count = min(_BLOCKS, used.size // _FEWEST_ROWS)
+        if count < 2:
+            raise ValueError(f"band: {used.size} samples are too few to leave blocks of them out")
+        turns = turning_points(self.inputs, LEAST_SWING * float(np.ptp(self.inputs)))[1:-1]
+        block = _blocks(self.inputs.size, used, count, turns)
+        lag = _correlation_lag(self.residuals[used], used.size // count // 2)
+        errors = np.full(self.inputs.size, np.nan)
+        for fold in range(min(_FOLDS, count)):
+            left_out = (block >= 0) & (block % _FOLDS == fold)
+            if not left_out.any():
+                continue
+            with_gap = _with_gap(left_out, lag, turns)
+            if np.count_nonzero(~with_gap[used]) < 2:
+                raise ValueError(f"band: {used.size} samples are too few to leave blocks of them out")
+            # What one fit says of itself would hide how many there are.
+            with shares_to(lambda *_: None):
+                errors[left_out] = self.leave_out(with_gap)[left_out]
+            say_share("calibrating the band", (fold + 1) / _FOLDS)
+        scored = np.isfinite(errors)
+        if not scored.any():
+            raise ValueError("band: each block of the samples moves parts of the model that no other moves")
+        scores = np.abs(errors) / np.maximum(spread, 1e-300)
+        independent = max(1, int(np.count_nonzero(scored)) // lag)
+        highest = [float(scores[(block == each) & scored].max()) for each in np.unique(block[scored])]
+        rank = math.ceil((len(highest) + 1) * level)
+        return Band(
+            level=level,
+            pointwise=_quantile(scores[scored], math.ceil((independent + 1) * level) / independent),
+            simultaneous=sorted(highest)[rank - 1] if rank <= len(highest) else None,
+            stretch=used.size // count,
+            rows=int(np.count_nonzero(scored)),
+            independent=independent,
+            blocks=len(highest),
+            held_out=float(np.sqrt(np.mean(errors[scored] ** 2))),
+            greatest=float(spread[used].max()),
+            variance=variance,
+            calibrated_on=calibrated_on,
+        )
 
 
 def input_half_widths(operator: Operator[Any], path: Floats, half_widths: Floats, state: Any = None) -> Floats:  # noqa: ANN401

@@ -26,10 +26,12 @@ _MOST = 0.8
 _FEWEST = 4
 _DECILES = np.linspace(0.0, 1.0, 11)
 # Factors of the two-sample Kolmogorov-Smirnov statistic. Independent samples of one distribution exceed 1.36 in 5 %
-# of the cases. Swings and distances of random reversals exceed theirs in 1 to 2 %, as measured; corners of the memory
-# depend on each other over many reversals, so that theirs is greater.
+# of the cases. Swings, distances and rates of random reversals exceed theirs in 1 to 2 %, as measured; corners of the
+# memory depend on each other over many reversals, so that theirs is greater.
 _SMIRNOV = 1.36
-_OF_SWINGS, _OF_REACHES, _OF_DEPTHS = 1.08, 0.9, 2.1
+_OF_SWINGS, _OF_REACHES, _OF_DEPTHS, _OF_RATES = 1.08, 0.9, 2.1, 0.6
+# Rates this close, as a factor, count as equal.
+_RATE = 1.25
 
 DAMPED = "damped oscillations"
 GROWING = "growing oscillations"
@@ -42,7 +44,7 @@ RAMPS = "single ramps"
 
 @dataclass(frozen=True)
 class ExcitationClass:
-    """What a sequence of inputs is like, as far as rate-independent memory can tell.
+    """What a sequence of inputs is like, as far as rate-independent memory can tell; with times its rates as well.
 
     Parameters
     ----------
@@ -64,6 +66,8 @@ class ExcitationClass:
         Deciles of the distances of the turning points from the middle of the range, parts of the range, 11 numbers.
     depths : tuple of float
         Deciles of the number of corners of the memory at the turning points, 11 numbers.
+    rates : tuple of float
+        Deciles of the mean speed of each swing, input units a second, 11 numbers; none where no times were given.
     """
 
     kind: str
@@ -77,10 +81,11 @@ class ExcitationClass:
     lows: tuple[float, ...]
     reaches: tuple[float, ...] = ()
     depths: tuple[float, ...] = ()
+    rates: tuple[float, ...] = ()
 
     @classmethod
-    def of(cls, inputs: ArrayLike) -> ExcitationClass:
-        """Return the class of a sequence of inputs, shape (N,).
+    def of(cls, inputs: ArrayLike, times: Floats | None = None) -> ExcitationClass:
+        """Return the class of a sequence of inputs, shape (N,), at times, s, if these matter.
 
         Raises ValueError if it is empty or not finite.
         """
@@ -103,6 +108,7 @@ class ExcitationClass:
             lows=_deciles(lower),
             reaches=_deciles(_reaches(points, low, high)),
             depths=_deciles(_depths(points)),
+            rates=() if times is None else _deciles(_rates(values, times)),
         )
 
     @property
@@ -110,13 +116,13 @@ class ExcitationClass:
         """Where the innermost swing lies, input units; the middle of the range without a swing."""
         return 0.5 * (self.highs[0] + self.lows[-1] if self.highs and self.lows else self.low + self.high)
 
-    def departures(self, inputs: ArrayLike) -> tuple[str, ...]:
+    def departures(self, inputs: ArrayLike, times: Floats | None = None) -> tuple[str, ...]:
         """Return in which ways other inputs, shape (N,), are not of this class; none if they are.
 
         They are of the class if they stay in its range (to 3 % of it), are of its kind, die out at the same place (to
         3 % of the range) if they are damped oscillations, and the distributions of the swings, of the turning points
         and of the corners of the memory differ by no more than those of two sequences of one kind (two-sample
-        Kolmogorov-Smirnov test on the deciles).
+        Kolmogorov-Smirnov test on the deciles). Where the class has rates and the inputs times, s, so do their rates.
 
         Raises ValueError if they are empty or not finite.
         """
@@ -153,6 +159,12 @@ class ExcitationClass:
             distance = _distance(deciles, sample, tolerance)
             if distance > limit:
                 found.append(f"its {name} are distributed otherwise (distance {distance:.2f}, allowed {limit:.2f})")
+        if self.rates and times is not None and (rates := _rates(values, times)).size:
+            known = tuple(np.log(self.rates).tolist())
+            limit = _OF_RATES * independent
+            if (distance := _distance(known, np.log(rates), float(np.log(_RATE)))) > limit:
+                usual = f"{np.median(rates):.3g} a second, not {self.rates[5]:.3g}"
+                found.append(f"it moves at about {usual} (distance {distance:.2f}, allowed {limit:.2f})")
         return tuple(found)
 
     def to_json(self) -> dict[str, Any]:
@@ -176,7 +188,7 @@ class ExcitationClass:
             raise ValueError(f"calibrated_on: expected a text for kind, got {found.kind!r}")
         for name in ("low", "high", "reversals", "minor", "contracting"):
             _checks.number(f"calibrated_on: {name}", getattr(found, name))
-        for name in ("swings", "highs", "lows", "reaches", "depths"):
+        for name in ("swings", "highs", "lows", "reaches", "depths", "rates"):
             deciles = getattr(found, name)
             if deciles and _checks.samples(f"calibrated_on: {name}", deciles).size != _DECILES.size:
                 raise ValueError(f"calibrated_on: {name}: expected {_DECILES.size} deciles, got {len(deciles)}")
@@ -186,6 +198,12 @@ class ExcitationClass:
 def _reversals(values: Floats) -> Floats:
     """Return the first input, the values at which the inputs turn, and the last one."""
     return values[turning_points(values, LEAST_SWING * float(np.ptp(values)))]
+
+
+def _rates(values: Floats, times: Floats) -> Floats:
+    """Return the mean speed of each swing, input units a second."""
+    turns = turning_points(values, LEAST_SWING * float(np.ptp(values)))
+    return np.abs(np.diff(values[turns])) / np.diff(times[turns])
 
 
 def _turning(points: Floats) -> tuple[Floats, Floats]:

@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from bench.identification import Identification
 from bench.identification.bands import Band, calibrate_band, input_half_widths
 from bench.identification.by_name import set_up_problem
 from bench.identification.regularization import Regularization
 from bench.model_file import ModelFile
+from bench.timed.bands import calibrate_band_in_time
 from bench.units import header_with_unit
 
 Floats = npt.NDArray[np.float64]
@@ -104,7 +106,12 @@ class BandedPrediction:
         }
 
 
-def predict_band(model: ModelFile, inputs: Floats, state: Any = None) -> BandedPrediction | None:  # noqa: ANN401
+def predict_band(
+    model: ModelFile,
+    inputs: Floats,
+    state: Any = None,  # noqa: ANN401 - each operator has its own
+    times: Floats | None = None,
+) -> BandedPrediction | None:
     """Return the band of a model's predictions for inputs, shape (N,); None if its file has none.
 
     Parameters
@@ -115,17 +122,19 @@ def predict_band(model: ModelFile, inputs: Floats, state: Any = None) -> BandedP
         In the unit of the model, finite.
     state : object
         State before the first row; None is the initial one.
+    times : ndarray, shape (N,), or None
+        s, for a model with time.
     """
     band = model.band
     if band is None:
         return None
-    operator = model.operator
+    operator = model.response
     spread = band.spread(operator, inputs, state)
     return BandedPrediction(
         band,
         band.pointwise * spread,
         None if band.simultaneous is None else band.simultaneous * spread,
-        band.departures(inputs, spread),
+        band.departures(inputs, spread, times),
         operator.output_unit,
     )
 
@@ -138,13 +147,14 @@ class BandedTargets:
     ----------
     outputs : BandedPrediction
         The band of the output at each set-point.
-    setpoints : ndarray, shape (N,)
+    setpoints : ndarray, shape (N,), or None
         Half-width about each set-point within which the target is met: that of the output over the local slope, in
-        input units; nan where that is more than the operating range, as the output hardly moves with the input.
+        input units; nan where that is more than the operating range, as the output hardly moves with the input. None
+        of a model with time, whose output depends on more than the last set-point.
     """
 
     outputs: BandedPrediction
-    setpoints: Floats
+    setpoints: Floats | None
 
     def columns(self, setpoints: Floats, predicted: Floats, unit: str) -> list[tuple[str, Floats | list[object]]]:
         """Return heads and values of both bands, the set-points in `unit`; empty cells where there is no slope."""
@@ -152,6 +162,8 @@ class BandedTargets:
         def shown(values: Floats) -> list[object]:
             return ["" if value != value else value for value in values.tolist()]
 
+        if self.setpoints is None:
+            return [*self.outputs.columns(predicted)]
         return [
             (header_with_unit("setpoint lower", unit), shown(setpoints - self.setpoints)),
             (header_with_unit("setpoint upper", unit), shown(setpoints + self.setpoints)),
@@ -159,7 +171,13 @@ class BandedTargets:
         ]
 
 
-def invert_band(model: ModelFile, setpoints: Floats, passing: Floats, state: Any = None) -> BandedTargets | None:  # noqa: ANN401
+def invert_band(
+    model: ModelFile,
+    setpoints: Floats,
+    passing: Floats,
+    state: Any = None,  # noqa: ANN401 - each operator has its own
+    times: Floats | None = None,
+) -> BandedTargets | None:
     """Return the band at set-points that an inverse found; None if the model's file has none.
 
     Parameters
@@ -172,9 +190,15 @@ def invert_band(model: ModelFile, setpoints: Floats, passing: Floats, state: Any
         Set-point to pass before each; nan where there is none.
     state : object
         State before the first target; None is the initial one.
+    times : ndarray, shape (N,), or None
+        s, for a model with time.
     """
     if model.band is None:
         return None
+    if times is not None:
+        outputs = predict_band(model, setpoints, state, times)
+        assert outputs is not None
+        return BandedTargets(outputs, None)
     both = np.column_stack([passing, setpoints]).ravel()
     taken = np.isfinite(both)
     places = (np.cumsum(taken) - 1)[1::2]
@@ -188,23 +212,27 @@ def invert_band(model: ModelFile, setpoints: Floats, passing: Floats, state: Any
 
 
 def calibrate(
-    model_name: str,
+    found: Identification[Any],
     inputs: Floats,
     outputs: Floats,
+    weights: Floats | None,
     skip: int,
     penalties: Regularization,
     options: Mapping[str, Any],
+    times: Floats | None,
 ) -> Band:
-    """Return the band of the model that `identify` finds with the same arguments; errors as `calibrate_band`."""
+    """Return the band of the model that was identified with the same arguments; errors as `calibrate_band`."""
+    if times is not None:
+        return calibrate_band_in_time(found, times, inputs, outputs, weights=weights, skip=skip, **options)
     own = dict(options)
     initial, orientation = own.pop("initial", None), own.pop("orientation", "auto")
     problem = set_up_problem(
-        model_name, inputs, outputs, None, skip, penalties.smoothing, initial, own, orientation=orientation
+        found.model_name, inputs, outputs, weights, skip, penalties.smoothing, initial, own, orientation=orientation
     )
     return calibrate_band(problem, penalties.smoothing, penalties.ridge)
 
 
-def band_json(model: ModelFile, inputs: Floats, state: Any) -> dict[str, Any]:  # noqa: ANN401
+def band_json(model: ModelFile, inputs: Floats, state: Any, times: Floats | None = None) -> dict[str, Any]:  # noqa: ANN401
     """Return the entry `band` of a result for programs; empty without a band. Arguments as `predict_band`."""
-    found = predict_band(model, inputs, state)
+    found = predict_band(model, inputs, state, times)
     return {} if found is None else {"band": {**found.to_json(), "held_out": found.band.held_out}}

@@ -105,7 +105,8 @@ def examine(
         if session is not None:
             raise ConfigurationError(f"--recalibrate: {model.name} is a model with time; it takes none")
         outputs = bind_times(model, times).evaluate(inputs, state)
-        return Examined(outputs, measured, None, None, (model.model.input_unit, model.model.output_unit), skip)
+        band = predict_band(model, inputs, state, times)
+        return Examined(outputs, measured, None, band, (model.model.input_unit, model.model.output_unit), skip)
     operator = model.operator
     units = operator.input_unit, operator.output_unit
     if session is None:

@@ -106,7 +106,8 @@ def model_card(
         "Certificate": _table(("", ""), certificate_lines(found)),
         "Limits of validity": _table(("", ""), _limits(found, rows.input, rows.time)),
     }
-    if (band := predict_band(found.file, found.inputs, found.identification.initial_state)) is not None:
+    band = predict_band(found.file, found.inputs, found.identification.initial_state, found.times)
+    if band is not None:
         held_out = f"{band.band.held_out:.4g} {band.unit}".rstrip()
         sections["Prediction band"] = _table(
             ("", ""), [*band.rows(), ("RMS error of the rows, each left out of the fit", held_out)]

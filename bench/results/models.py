@@ -30,6 +30,7 @@ from bench.identification import (
     identify,
     measure_errors,
 )
+from bench.identification.bands import Band
 from bench.identification.memory_tests import MemoryTest, check_congruency, check_return_points
 from bench.identification.options import check_options, model_options
 from bench.identification.regularization import Regularization
@@ -105,7 +106,7 @@ class IdentifiedFile:
     def predictions(self) -> Predictions:
         """Return the outputs of the model beside the measurements, as the fit has them."""
         operator, names = self.file.response, self.file.provenance
-        band = predict_band(self.file, self.inputs, self.identification.initial_state)
+        band = predict_band(self.file, self.inputs, self.identification.initial_state, self.times)
         return Predictions(
             Quantity(names["input"], operator.input_unit, self.inputs),
             operator.output_unit,
@@ -145,7 +146,7 @@ class IdentifiedFile:
             "return_points": self.return_points.to_json(),
             "congruency": self.congruency.to_json(),
             "warnings": list(self.warnings),
-            **band_json(self.file, self.inputs, found.initial_state),
+            **band_json(self.file, self.inputs, found.initial_state, self.times),
             **({"shape": shape} if (shape := _shape(operator)) else {}),
         }
 
@@ -274,7 +275,7 @@ def identify_file(
     times = None if time_column is None else read_times(columns, time_column)
     if times is not None:
         smooth = SMOOTHING if cross_validated else smoothing or 0.0
-        check_penalties(model, smooth, ridge=ridge, levels_to_try=levels_to_try, band=band)
+        check_penalties(model, smooth, ridge=ridge, levels_to_try=levels_to_try)
         options |= {"smoothing": smooth} if smooth else {}
     try:
         if times is not None:
@@ -310,7 +311,9 @@ def identify_file(
             memory = found.model.advance(found.initial_state, inputs)
             coverage = found.model.coverage(inputs, found.initial_state)
         penalties = found.regularization or Regularization(smoothing or 0.0, ridge or 0.0)
-        calibrated = calibrate(model, inputs, outputs, skip, penalties, options) if band else None
+        calibrated: Band | None = None
+        if band:
+            calibrated = calibrate(found, inputs, outputs, weights, skip, penalties, options, times)
     except ValueError as error:
         raise ConfigurationError(f"model {model}: {error}") from None
     if not fitted.all():

@@ -10,13 +10,14 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.errors import DataError
-from bench.hysteresis import Operator
+from bench.hysteresis import Operator, TimedModel
 from bench.identification import Errors, measure_errors
 from bench.journal import Record, Table
 from bench.model_file import ModelFile, parse_model
 from bench.results.bands import BandedPrediction, predict_band
 from bench.results.predictions import Quantity
 from bench.results.starting_state import starting_state
+from bench.results.times import bind_times
 
 Floats = npt.NDArray[np.float64]
 
@@ -52,7 +53,7 @@ class ModelOnRun:
     @property
     def unit(self) -> str:
         """Unit of the output."""
-        return self.file.operator.output_unit or self.measured.unit
+        return self.file.response.output_unit or self.measured.unit
 
     @property
     def residuals(self) -> Floats:
@@ -71,11 +72,13 @@ def models_of(record: Record) -> list[ModelFile]:
     Those of several inputs are left out, as their errors are those of several runs together.
     """
     files = [parse_model(content, f"{record.path}: model {name}") for name, content in record.models().items()]
-    return [file for file in files if isinstance(file.model, Operator)]
+    return [file for file in files if isinstance(file.model, Operator | TimedModel)]
 
 
 def apply_models(record: Record, steps: Table, models: Sequence[ModelFile]) -> list[ModelOnRun]:
     """Return what each model predicts of a run.
+
+    The time of a reading is the end of its step, unless a model with time was identified with another column.
 
     Raises
     ------
@@ -96,7 +99,9 @@ def apply_models(record: Record, steps: Table, models: Sequence[ModelFile]) -> l
     found = []
     for model, start, columns in prepared:
         driven, response = (Quantity(name, record.unit(name), steps[name]) for name in columns)
-        predicted = model.operator.evaluate(driven.values, start.state)
-        band = predict_band(model, driven.values, start.state)
+        clock = str(model.provenance.get("time"))
+        times = steps[clock if clock in steps.columns else "finished"]
+        predicted = bind_times(model, times).evaluate(driven.values, start.state)
+        band = predict_band(model, driven.values, start.state, times)
         found.append(ModelOnRun(model, driven, response, predicted, start.state, skip, band))
     return found

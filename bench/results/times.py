@@ -54,12 +54,11 @@ def check_penalties(
     *,
     ridge: float | None,
     levels_to_try: Sequence[int],
-    band: bool,
 ) -> None:
     """Raise ConfigurationError if a model with time does not take one of these; see `identify_file`."""
-    if ridge or band or (smoothing and not is_smoothed(model)):
-        others = "--ridge or" if is_smoothed(model) else "--smoothing, --ridge, --cross-validate or"
-        raise ConfigurationError(f"model {model} takes no {others} --band")
+    if ridge or (smoothing and not is_smoothed(model)):
+        others = "--ridge" if is_smoothed(model) else "--smoothing, --ridge or --cross-validate"
+        raise ConfigurationError(f"model {model} takes no {others}")
     if levels_to_try:
         raise ConfigurationError(f"--levels: model {model} takes one number; it is not chosen by cross-validation")
 

@@ -213,7 +213,7 @@ class Hammerstein(TimedModel[HammersteinState]):
         if self.linear.delay > 0.0:
             found["delay"] = self.linear.delay, "s"
         creep_times, strengths = self.linear.creep_times, self.linear.creep_strengths
-        if strengths.size > 1 and (strengths == strengths[0]).all():
+        if self.linear.creeps_by_logarithm:
             decades = math.log10(creep_times[1] / creep_times[0])
             found["creep per decade"] = 100.0 * float(strengths[0]) / decades, "%"
         else:
@@ -225,6 +225,20 @@ class Hammerstein(TimedModel[HammersteinState]):
         if self.drift_time > 0.0:
             found["drift time"] = self.drift_time, "s"
         return found
+
+    def structure(self) -> Mapping[str, Any]:
+        """Return what follows the operator, as `dynamics`."""
+        part = self.linear
+        elements = {
+            "resonance": part.lag[1] > 0.0,
+            "lag": part.lag[0] > 0.0 and part.lag[1] == 0.0,
+            "delay": part.delay > 0.0,
+            "creep": part.creeps_by_logarithm,
+            "kelvin-voigt": part.creep_times.size > 0 and not part.creeps_by_logarithm,
+            "drift": self.drift != 0.0 and self.drift_time == 0.0,
+            "fading-drift": self.drift_time > 0.0,
+        }
+        return {"dynamics": ",".join(name for name, is_there in elements.items() if is_there) or "none"}
 
     def state_to_json(self, state: HammersteinState) -> Any:  # noqa: ANN401
         """Return a state as JSON."""

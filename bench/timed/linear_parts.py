@@ -87,6 +87,11 @@ class LinearPart(Document):
         for name, values in sequences.items():
             object.__setattr__(self, name, values)
 
+    @property
+    def creeps_by_logarithm(self) -> bool:
+        """Whether the creep elements are a chain of equal strengths."""
+        return self.creep_strengths.size > 1 and bool((self.creep_strengths == self.creep_strengths[0]).all())
+
     def settled(self, value: float) -> FilterState:
         """Return the state after an input has stood for long."""
         return FilterState(value, 0.0, (value,) * self.creep_times.size)

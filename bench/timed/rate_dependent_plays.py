@@ -165,6 +165,10 @@ class RateDependentPlays(TimedModel[PlaysState]):
             found[f"part with time constant {number}"] = 100.0 * part, "%"
         return found
 
+    def structure(self) -> Mapping[str, Any]:
+        """Return the number of time constants."""
+        return {"time_constants": np.unique(self.time_constants[self.time_constants > 0.0]).size}
+
     def state_to_json(self, state: PlaysState) -> Any:  # noqa: ANN401
         """Return a state as JSON."""
         return {"plays": list(state.plays), "last": None if state.last is None else list(state.last)}

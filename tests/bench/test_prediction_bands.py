@@ -76,6 +76,16 @@ def test_a_file_without_band_is_as_it_was(bench, files, tmp_path):
     assert not any("lower" in head for head in read(tmp_path / "p.csv"))
 
 
+def test_rows_that_are_not_fitted_calibrate_no_band(bench, files, tmp_path):
+    path = tmp_path / "part.json"
+    arguments = ("--model", "prandtl-ishlinskii", "--train", "0:600", "--band", "--out", path)
+    code, _, text = bench("identify", files["training"], *ASKED, *arguments)
+    assert code == 0, text
+    band = json.loads(path.read_text())["band"]
+    assert 0 < band["rows"] <= 600
+    assert band["stretch"] == 30
+
+
 def test_the_file_stays_small_and_is_read_again(model):
     content = json.loads(model.read_text())
     assert model.stat().st_size < 200_000

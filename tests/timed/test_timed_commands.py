@@ -121,7 +121,7 @@ def test_smoothing_is_chosen_by_cross_validation_and_refused_where_there_is_none
     assert "on blocks left out" in " ".join(out.split())
     assert json.loads(summary.read_text())["smoothing"] > 0.0
     for model, option, words in (
-        ("hammerstein", "--band", "takes no --ridge or --band"),
+        ("hammerstein", "--ridge=0.1", "takes no --ridge"),
         ("rate-dependent-plays", "--cross-validate", "takes no --smoothing"),
         ("preisach-oscillator", "--smoothing=0.1", "takes no --smoothing"),
         ("hammerstein", "--levels=5,10", "takes one number"),

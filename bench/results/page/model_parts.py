@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from bench.hysteresis import MemoryCurve
+from bench.hysteresis import MemoryCurve, TimedModel
 from bench.identification.covariance import CoefficientUncertainties, coefficient_uncertainties
 from bench.model_file import ModelFile
 from bench.results.figures import plot_coverage, plot_densities, plot_fit
@@ -44,7 +44,8 @@ def models_section(models: Sequence[ModelOnRun], times: Floats, scratch: Path) -
         parts += _fits(group, times, scratch, i)
     parts += [part for model in models for part in _bands(model)]
     for i, model in enumerate(models):
-        parts += _details(model, scratch, i)
+        has_time = isinstance(model.file.model, TimedModel)
+        parts += _details_in_time(model, scratch, i) if has_time else _details(model, scratch, i)
     return PageSection("Loops and models", parts)
 
 
@@ -72,8 +73,9 @@ def _errors_table(models: Sequence[ModelOnRun]) -> PageTable:
         numbers = (errors.maximum, errors.rms, errors.average)
         factor, unit = fitting_prefix(model.unit, *numbers, least=0.1)
         cells = [f"{factor * number:.4g}" for number in numbers]
-        kind = model.file.operator.kind
-        rows.append((model.file.name, kind, *cells, "" if unit == "1" else unit, f"{errors.rms_percent:.2f}"))
+        rows.append(
+            (model.file.name, model.file.model.kind, *cells, "" if unit == "1" else unit, f"{errors.rms_percent:.2f}")
+        )
     heads = ("model", "kind", "max", "RMS", "mean absolute", "unit", "RMS / % of range")
     return PageTable(heads, rows, title="errors on this run", numbers_from=2)
 
@@ -154,6 +156,17 @@ def _details(model: ModelOnRun, scratch: Path, number: int) -> Iterator[PageFigu
             caption = f"What this run swept of the plane of {name}, and the memory at the end of the model's data"
             yield PageFigure(inlined(path, caption), f"{caption}.")
     yield _coefficients(model, found, cells)
+
+
+def _details_in_time(model: ModelOnRun, scratch: Path, number: int) -> Iterator[PageFigure | PageTable]:
+    for i, density in enumerate(model.file.model.densities()):
+        path = scratch / f"density-{number}-{i}.svg"
+        plot_densities(path, [density])
+        caption = f"Density of {model.file.name}"
+        yield PageFigure(inlined(path, caption), f"{caption}.")
+    rows = [(name, f"{value:.6g}", unit) for name, (value, unit) in model.file.model.parameters().items()]
+    heads = ("parameter", "value", "unit")
+    yield PageTable(heads, rows, title=f"parameters of {model.file.name}", numbers_from=1)
 
 
 def _coefficients(model: ModelOnRun, found: CoefficientUncertainties, cells: int) -> PageTable:
