@@ -103,7 +103,7 @@ class Fit:
         Output units.
     uncertainties : ndarray, shape (K + q,)
         Standard uncertainties from the residual variance with the passive set taken as known; 0 for
-        coefficients held at zero, NaN where there are no degrees of freedom or a minimum norm is taken.
+        coefficients held at zero, NaN where there are no degrees of freedom or many solutions of which one is taken.
         With smoothing they are the square roots of the diagonal of variance * (RᵀWR + penalty)⁻¹ on the passive
         set: what is left of the uncertainty if the penalty is taken as prior knowledge (Bayesian posterior), so
         they contain the smoothing's bias as far as the density is as smooth as the weight says. The variance
@@ -200,7 +200,7 @@ def fit_minimum_norm(
     ValueError
         As `fit`.
     """
-    from scipy.linalg import lstsq
+    from scipy.linalg import lstsq, qr, solve_triangular
 
     y, w = _cost(regressor, outputs, weights, skip)
     matrix = regressor.dense()[skip:]
@@ -217,6 +217,13 @@ def fit_minimum_norm(
         x, _, rank, singular = lstsq(matrix, target, cond=cutoff, lapack_driver="gelsd")
         residual = target - matrix @ x
         slope = matrix.T @ residual
+        uncertainties = np.full(x.size, np.nan)
+        spare = np.count_nonzero(w) - 1.0 - rank
+        # Of a lower rank there are other coefficients that fit as well.
+        if spare > 0.5 and rank == np.count_nonzero(swept):
+            (corner,) = qr(matrix[:, swept], mode="r")
+            inverse = solve_triangular(corner[:rank], np.eye(rank))
+            uncertainties[swept] = np.linalg.norm(residual) / np.sqrt(spare) * np.linalg.norm(inverse, axis=1)
     norms = np.linalg.norm(matrix, axis=0)
     scale = np.maximum(norms, 1e-12 * norms.max(initial=1e-300)) * max(float(np.linalg.norm(target)), 1e-300)
     kkt = float(np.abs(slope / scale)[swept].max(initial=0.0))
@@ -231,7 +238,7 @@ def fit_minimum_norm(
         converged=kkt <= 1e-8,
         effective=float(rank),
     )
-    return Fit(x, mean - float(means @ x), np.full(x.size, np.nan), certificate)
+    return Fit(x, mean - float(means @ x), uncertainties, certificate)
 
 
 def check_penalties(smoothing: float, ridge: float) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -443,7 +442,7 @@ def certificate_lines(identified: IdentifiedFile) -> Sequence[tuple[str, str]]:
     """Return what a person should know of a fit, as (name, text) pairs."""
     found, operator = identified.identification, identified.file.response
     unit = f" {operator.output_unit}" if operator.output_unit else ""
-    errors, certificate = found.errors, found.certificate
+    errors, certificate, largest = found.errors, found.certificate, _largest(found.uncertainties)
     if isinstance(operator, TimedModel):
         own = [(name, f"{value:.4g} {its}".rstrip()) for name, (value, its) in operator.parameters().items()]
     else:
@@ -459,7 +458,7 @@ def certificate_lines(identified: IdentifiedFile) -> Sequence[tuple[str, str]]:
         *([("orientation", f"{found.orientation} with the input")] if found.orientation else []),
         ("KKT residual", f"{certificate.kkt_residual:.1e}" + ("" if certificate.converged else " (NOT converged)")),
         ("condition", f"{certificate.condition:.2g}"),
-        ("largest uncertainty", f"{_largest(found.uncertainties) or math.nan:.2g} (1σ, of a coefficient)"),
+        ("largest uncertainty", "unknown" if largest is None else f"{largest:.2g} (1σ, of a coefficient)"),
         ("excitation", identified.coverage.summary() if identified.coverage else "no plane to be swept"),
         ("return points", identified.return_points.text),
         ("loops", identified.congruency.text),

@@ -297,6 +297,24 @@ def test_factor_follows_the_columns(seed, size):
     np.testing.assert_allclose(factor.inverse_diagonal(), np.diag(inverse), rtol=1e-6)
 
 
+def test_uncertainties_of_signed_coefficients_are_those_of_least_squares():
+    """From the definition: s² times the diagonal of the inverse of the centred, weighted Gram matrix."""
+    rng = np.random.default_rng(3)
+    operator = Preisach(uniform_levels(-1.0, 1.0, 4), np.zeros(10))
+    regressor = operator.regressor(ramps(rng.uniform(-1.0, 1.0, 40), 12))
+    rows = regressor.shape[0]
+    weights, outputs = rng.uniform(0.5, 2.0, rows), rng.normal(size=rows)
+    found = fit_minimum_norm(regressor, outputs, weights=weights)
+    matrix = np.column_stack([np.ones(rows), regressor.dense()])
+    inverse = np.linalg.inv(matrix.T @ (weights[:, None] * matrix))
+    x = inverse @ matrix.T @ (weights * outputs)
+    variance = weights @ (outputs - matrix @ x) ** 2 / (rows - matrix.shape[1])
+    np.testing.assert_allclose(found.coefficients, x[1:], rtol=1e-8)
+    np.testing.assert_allclose(found.uncertainties, np.sqrt(variance * np.diag(inverse))[1:], rtol=1e-8)
+    repeated = np.repeat(regressor.dense()[:, :1], 2, axis=1)
+    assert np.isnan(fit_minimum_norm(dense_problem(repeated), outputs).uncertainties).all()
+
+
 def test_minimum_norm_equals_the_pseudo_inverse():
     operator, _, _ = problem()
     rng = np.random.default_rng(3)
