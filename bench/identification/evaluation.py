@@ -169,8 +169,8 @@ class Evaluation:
     misfit : float
         RMS error of a fit to all rows, corrected for its free coefficients, output units; see `corrected`. Known
         only where units were left out, and of models with time.
-    schwarz : float
-        The criterion of Schwarz of that fit; see `schwarz`.
+    akaike : float
+        The corrected criterion of Akaike of that fit; see `akaike`.
     uncorrelated : bool
         Whether the residuals of that fit are uncorrelated from row to row; False where it is not known.
     """
@@ -186,7 +186,7 @@ class Evaluation:
     determined: bool = True
     follows: bool = True
     misfit: float = float("nan")
-    schwarz: float = float("nan")
+    akaike: float = float("nan")
     uncorrelated: bool = False
 
     @property
@@ -259,7 +259,7 @@ def _evaluate(
         start=float(np.mean([each.start for each in done])),
         free=free,
         misfit=float("nan") if residuals is None else corrected(residuals, free),
-        schwarz=float("nan") if residuals is None else schwarz(residuals, free),
+        akaike=float("nan") if residuals is None else akaike(residuals, free),
         uncorrelated=residuals is not None and correlated_rows(residuals, 2) <= 1,
         seconds=time.process_time() - begin,
     )
@@ -323,14 +323,17 @@ def corrected(residuals: Floats, free: float) -> float:
     return float(np.sqrt(np.mean(residuals**2))) / max(1.0 - (free + 1.0) / rows, 1.0 / rows)
 
 
-def schwarz(residuals: Floats, free: float) -> float:
-    """Return N log(mean square) + k log N of N residuals and k coefficients with the bias.
+def akaike(residuals: Floats, free: float) -> float:
+    """Return N log(mean square) + 2 N (k + 1) / (N − k − 2) of N residuals and k coefficients with the bias.
 
-    Ann. Statist. 6(2), 461-464, 1978; for uncorrelated errors.
+    Akaike's criterion, corrected for few rows; for uncorrelated errors. Infinite of too many coefficients. Source:
+    Hurvich and Tsai, Biometrika 76(2), 297-307, 1989.
     """
-    rows = residuals.size
+    rows, count = residuals.size, free + 1.0
+    if rows <= count + 2.0:
+        return float("inf")
     square = max(float(np.mean(residuals**2)), 1e-300)
-    return float(rows * np.log(square) + (free + 1.0) * np.log(rows))
+    return float(rows * np.log(square) + 2.0 * rows * (count + 1.0) / (rows - count - 2.0))
 
 
 @dataclass(frozen=True)

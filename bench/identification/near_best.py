@@ -19,8 +19,9 @@ from bench.identification.evaluation import Evaluation
 FEWER = 2.0 / 3.0
 """Part of the coefficients of another from which a model is clearly simpler."""
 
-# Difference of Schwarz's criterion that is strong evidence (Kass and Raftery, J. Am. Stat. Assoc. 90, 773, 1995).
-_STRONG = 6.0
+# Difference of Akaike's criterion from which the data support a model considerably less (Burnham and Anderson, Model
+# Selection and Multimodel Inference, 2002, section 2.6).
+_SUPPORTED = 4.0
 # What the simplest may err more than the best, however large the standard error.
 _WORSE = 1.05
 
@@ -40,7 +41,7 @@ def simplest_near_best(judged: Sequence[Evaluation]) -> tuple[Evaluation, Evalua
 
     Those of up to half as many coefficients more are about as simple: of these it is the one of the least error.
     Where residuals are uncorrelated, nothing is left to model, and the fits tell more than the folds: another without
-    signs, within one standard error, is preferred if the criterion of Schwarz is strong evidence for it.
+    signs, within one standard error, is preferred if the criterion of Akaike supports the simplest considerably less.
     """
     best = min(judged, key=lambda each: score(each).mean())
     within = [each for each in judged if is_within_one_standard_error(each, best)]
@@ -55,8 +56,19 @@ def simplest_near_best(judged: Sequence[Evaluation]) -> tuple[Evaluation, Evalua
     adequate = [
         each for each in within if each.uncorrelated and not has_signs(each) and bool(each.candidate.static) == timed
     ]
-    likeliest = min(adequate, key=lambda each: each.schwarz, default=simplest)
-    return best, likeliest if simplest.schwarz - likeliest.schwarz > _STRONG else simplest
+    likeliest = min(adequate, key=lambda each: each.akaike, default=simplest)
+    return best, simplest if _is_supported(simplest, likeliest) else likeliest
+
+
+def best_of_few_rows(judged: Sequence[Evaluation]) -> Evaluation:
+    """Return the one of the least error among those that the fit to all rows supports."""
+    likeliest = min(judged, key=lambda each: each.akaike)
+    return min((each for each in judged if _is_supported(each, likeliest)), key=lambda each: score(each).mean())
+
+
+def _is_supported(each: Evaluation, likeliest: Evaluation) -> bool:
+    """Return whether the criterion of Akaike speaks for a candidate about as much as for the likeliest."""
+    return each.akaike <= likeliest.akaike + _SUPPORTED
 
 
 def is_within_one_standard_error(simple: Evaluation, best: Evaluation) -> bool:

@@ -6,7 +6,7 @@
 3. What is near the best is evaluated with whole units of the excitation left out, too.
 4. Of the smoothing weights the least error decides; among models, orders and reversible parts one of the simplest
    within one standard error of the best, from the differences fold by fold: always within 2 %, and never above 5 %.
-   Of few rows, and where residuals are uncorrelated, the criterion of Schwarz decides.
+   Of few rows, and where residuals are uncorrelated, the criterion of Akaike has a say.
 """
 
 from __future__ import annotations
@@ -36,6 +36,7 @@ from bench.identification.folds import correlated_rows, has_one_kind
 from bench.identification.near_best import (
     FEWER,
     best_memory,
+    best_of_few_rows,
     best_smoothing,
     has_signs,
     of_best_memory,
@@ -338,8 +339,13 @@ class _Search:
                 before = min((each.rms for each in self.done[kind]), default=float("inf"))
                 self.done[kind] += found
                 now = min(each.rms for each in found)
-                if step >= kind.steps or not now < _GAIN * before or self._is_too_fine(kind, step):
+                gains = now < _GAIN * before or self._may_gain_in_time(kind)
+                if step >= kind.steps or not gains or self._is_too_fine(kind, step):
                     del going[kind]
+
+    def _may_gain_in_time(self, kind: _Kind) -> bool:
+        """Return whether a drift or a lag may hide what a finer order gains; all orders are tried behind it."""
+        return self.in_time is not None and kind.model in self._with_shape
 
     def _is_too_fine(self, kind: _Kind, step: int) -> bool:
         """Return whether a kind has many more coefficients than there are rows."""
@@ -495,9 +501,9 @@ class _Search:
         """Return the one of the least error, and what is chosen of those that may be: the simplest near it.
 
         The fit to all rows says more than what is left out of two records. Of few rows a block is much of what there
-        is: the criterion of Schwarz decides. At one rate the time constant of a lag is as wrong as the operator is,
-        and no row left out shows it: of models with a lag it is the one of the least misfit, whose operator biases
-        the time constant least.
+        is: the criterion of Akaike says what takes part. At one rate the time constant of a lag is as wrong as the
+        operator is, and no row left out shows it: of models with a lag it is the one of the least misfit, whose
+        operator biases the time constant least.
         """
         finalists = self._with_lag(finalists)
         judged = [each for each in finalists if each.units] or self._without_units(finalists)
@@ -506,7 +512,7 @@ class _Search:
             alike = [each for each in judged if _lags(each) and has_signs(each) == has_signs(chosen)]
             chosen = min(alike, key=lambda each: each.misfit)
         elif chosen.units and int(self.measured.tested.sum()) < _FEW_ROWS:
-            chosen = min(judged, key=lambda each: each.schwarz)
+            chosen = best_of_few_rows(judged)
         return best, chosen
 
     def _with_lag(self, finalists: list[Evaluation]) -> list[Evaluation]:

@@ -11,7 +11,7 @@ import numpy as np
 from bench.hysteresis._checks import Floats
 from bench.identification.branches import turning_points
 from bench.identification.by_name import FitProblem
-from bench.identification.evaluation import Candidate, Evaluation, Measurements, corrected, schwarz
+from bench.identification.evaluation import Candidate, Evaluation, Measurements, akaike, corrected
 from bench.identification.folds import Fold, correlated_rows
 from bench.identification.least_squares import Fit, one_thread
 from bench.identification.orientation import NAMES
@@ -206,6 +206,6 @@ def _left_out(
         training=float(np.mean(trained[: len(blocks)])),
         free=free,
         misfit=corrected(residuals, free),
-        schwarz=schwarz(residuals, free),
+        akaike=akaike(residuals, free),
         uncorrelated=correlated_rows(residuals, 2) <= 1,
     )

@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,7 +35,7 @@ Floats = NDArray[np.float64]
 
 KINDS = (
     "damped", "mixed", "falling", "virgin", "positive start", "minor loops", "drift", "missing", "60 samples",
-    "100 Hz after 20 Hz", "major loop",
+    "20 and 100 Hz", "100 Hz after 20 Hz", "major loop",
 )  # fmt: skip
 CASES = [*product(PLANTS, KINDS), *product(("butterfly",), ("mixed", "drift"))]
 ROWS = 1500
@@ -52,20 +53,23 @@ class Case:
     truth: Floats
     continues: bool = False
     rezeroed: bool = False
-    step: float | None = None
-    """Between rows, s, for models with time."""
-    other_step: float = 0.0
+    times: Floats | None = None
+    """Of the rows, s, for models with time."""
+    other_times: Floats | None = None
 
     def error(self, one: Candidate) -> float:
         """Return the error of a candidate on the other sequence, % of the range."""
         known = Measurements.of(self.inputs, self.outputs).known if one.initial == "skip" else 0
-        if self.step is not None and one.model == "hammerstein":
-            signs = {} if one.orientation == "auto" else {"orientation": one.orientation}
+        if one.static is not None or "dynamics" in one.options:
+            assert self.times is not None
+            assert self.other_times is not None
+            settings: dict[str, Any] = {} if one.orientation == "auto" else {"orientation": one.orientation}
+            settings |= {"smoothing": one.smoothing} if one.smoothing else {}
             model = identify_in_time(
-                one.model, self.step * np.arange(self.inputs.size), self.inputs, self.outputs, skip=known,
-                initial=one.initial, smoothing=one.smoothing or 0.0, **signs, **one.options,
+                one.model, self.times, self.inputs, self.outputs, skip=known, initial=one.initial, **settings,
+                **one.options,
             ).model  # fmt: skip
-            return self._error(model.evaluate(self.other_step * np.arange(self.others.size), self.others))
+            return self._error(model.evaluate(self.other_times, self.others))
         problem = set_up_problem(
             one.model, self.inputs, self.outputs, None, known, one.smoothing or 0.0, one.initial, dict(one.options),
             orientation=one.orientation,
@@ -107,14 +111,21 @@ def case(kind: str, plant_name: str, seed: int) -> Case:
         first, second = (through([0.0, *rng.uniform(-0.5, 0.5, 50)], ROWS) for _ in range(2))
         whole = plant(np.concatenate([[1.0], first, second]))[1:]
         return Case(first, noisy(whole[:ROWS]), second, whole[ROWS:], continues=True)
+    rows = np.arange(ROWS, dtype=np.float64)
     if kind == "drift":
         drift = 0.05 * np.ptp(usual.truth) * np.linspace(0.0, 1.0, ROWS)
         truth = usual.truth + drift
-        return replace(usual, outputs=usual.outputs + drift, truth=truth, rezeroed=True, step=0.01, other_step=0.01)
-    if kind == "100 Hz after 20 Hz":
-        slow = 1.0 / (20 * 2 * ROWS / 40)
-        outputs, truth = (lagged(plant(each), step) for each, step in ((mixed, slow), (others, slow / 5.0)))
-        return Case(mixed, noisy(outputs), others, truth, step=slow, other_step=slow / 5.0)
+        times = 0.01 * rows
+        return replace(
+            usual, outputs=usual.outputs + drift, truth=truth, rezeroed=True, times=times, other_times=times
+        )
+    if "100 Hz" in kind:
+        # 40 moves take 1 s at 20 Hz. Of both rates, the second half of the rows is the faster one.
+        slow, fast = rows / ROWS, rows / (5.0 * ROWS)
+        both = np.append(slow[: ROWS // 2], slow[ROWS // 2] + fast[: ROWS - ROWS // 2])
+        times, other_times = (both, both) if kind == "20 and 100 Hz" else (slow, fast)
+        outputs, truth = lagged(times, plant(mixed)), lagged(other_times, plant(others))
+        return Case(mixed, noisy(outputs), others, truth, times=times, other_times=other_times)
     if kind == "major loop":
         ends = through([0.0, *[1.0, -1.0] * 10], ROWS)
         return replace(usual, inputs=ends, outputs=noisy(plant(ends)))
@@ -140,13 +151,14 @@ def measured_case(folder: Path, kind: str) -> Case:
     return usual
 
 
-def lagged(outputs: Floats, step: float, time_constant: float = 1e-3) -> Floats:
+def lagged(times: Floats, outputs: Floats, time_constant: float = 1e-3) -> Floats:
     """Return the response of a first-order lag that is settled at first, to straight lines between the samples."""
-    kept, found = np.exp(-step / time_constant), outputs.copy()
-    for n in range(1, outputs.size):
+    steps, found = np.diff(times), outputs.copy()
+    slopes = np.diff(outputs) / steps
+    for n, (step, slope) in enumerate(zip(steps, slopes, strict=True)):
         # The lag follows a ramp at a distance of its slope times the time constant.
-        behind = (outputs[n] - outputs[n - 1]) / step * time_constant
-        found[n] = outputs[n] - behind + (found[n - 1] - outputs[n - 1] + behind) * kept
+        behind = slope * time_constant
+        found[n + 1] = outputs[n + 1] - behind + (found[n] - outputs[n] + behind) * np.exp(-step / time_constant)
     return found
 
 
@@ -218,14 +230,14 @@ def choose(one: Case) -> Outcome:
     """Choose a model for a case, and find the best by hand."""
     measured = Measurements.of(one.inputs, one.outputs)
     in_time = None
-    if one.step is not None:
-        in_time = HeldOutInTime(measured, one.step * np.arange(one.inputs.size), one.inputs.size)
+    if one.times is not None:
+        in_time = HeldOutInTime(measured, one.times, one.inputs.size)
     begin = time.process_time()
     found = select(measured.thinned(MOST_ROWS), tuple(identifiable_models()), in_time=in_time)
     seconds = time.process_time() - begin
     chosen = found.chosen.candidate
     by_hand = [chosen, *grid(), *(each.candidate for each in found.evaluations if each.blocks)]
-    by_hand += grid_in_time() if one.step is not None else ()
+    by_hand += grid_in_time() if one.times is not None else ()
 
     def error(candidate: Candidate) -> float:
         # Of a setting that a record does not allow, somebody would try another.

@@ -9,7 +9,12 @@ from hysteretic_plants import bouc_wen, butterfly, duhem, jiles_atherton, random
 from bench.hysteresis import ModelSpec, Polynomial, PrandtlIshlinskii, Preisach, models, uniform_levels
 from bench.identification.by_name import set_up_problem
 from bench.identification.evaluation import Candidate, Evaluation, Measurements, evaluate
-from bench.identification.near_best import best_smoothing, is_within_one_standard_error, simplest_near_best
+from bench.identification.near_best import (
+    best_of_few_rows,
+    best_smoothing,
+    is_within_one_standard_error,
+    simplest_near_best,
+)
 from bench.identification.selection import Given, select
 from bench.timed import LinearPart
 from bench.timed.held_out import HeldOutInTime
@@ -53,11 +58,20 @@ class TestTheRuleOfOneStandardError:
         assert simplest_near_best(clear) == (alike[0], clear[3])
         # What left nothing but noise is compared by its fit.
         free = replace(clear[0].candidate, orientation="auto")
-        adequate = [replace(clear[0], candidate=free, schwarz=-7.0, uncorrelated=True), *clear[1:3]]
-        adequate.append(replace(clear[3], schwarz=0.0))
+        adequate = [replace(clear[0], candidate=free, akaike=-5.0, uncorrelated=True), *clear[1:3]]
+        adequate.append(replace(clear[3], akaike=0.0))
         assert simplest_near_best(adequate)[1] is adequate[0]
-        weak = [replace(adequate[0], schwarz=-5.0), *adequate[1:]]
+        weak = [replace(adequate[0], akaike=-3.0), *adequate[1:]]
         assert simplest_near_best(weak)[1] is weak[3]
+
+    def test_of_few_rows_the_least_error_of_those_that_the_fit_supports_is_taken(self):
+        three = [
+            replace(evaluation([square] * 5), akaike=criterion)
+            for square, criterion in ((1.0, 4.1), (1.5, 3.9), (2.0, 0.0))
+        ]
+        assert best_of_few_rows(three) is three[1]
+        many = [replace(each, akaike=float("inf")) for each in three]
+        assert best_of_few_rows(many) is many[0]
 
     def test_units_left_out_count_as_much_as_blocks(self):
         best = evaluation([1.0] * 5, [1.0] * 5)

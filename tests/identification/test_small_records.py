@@ -8,8 +8,8 @@ from hysteretic_plants import PLANTS, butterfly, duhem, random_reversals, settle
 
 from bench.hysteresis import identifiable_models
 from bench.identification import identify
-from bench.identification.evaluation import Candidate, Measurements, corrected
-from bench.identification.near_best import simplest_near_best
+from bench.identification.evaluation import Candidate, Measurements, akaike, corrected
+from bench.identification.near_best import best_of_few_rows, simplest_near_best
 from bench.identification.selection import Given, select
 
 MOST = 1.5
@@ -56,11 +56,31 @@ def test_residuals_are_corrected_for_free_coefficients():
     assert expected < found < 1.15 * expected
 
 
-def test_of_few_rows_the_fit_to_all_decides():
+def test_the_criterion_of_akaike_orders_fits_as_new_rows_do():
+    """Kullback-Leibler information of fits of 5, 12 and 20 columns, of which five count, by its definition."""
+    rng = np.random.default_rng(0)
+    columns = rng.standard_normal((50, 20))
+    mean = columns[:, :5] @ np.ones(5)
+    found, expected = np.zeros((2, 200, 3))
+    for draw in range(200):
+        outputs = mean + rng.standard_normal(50)
+        for at, count in enumerate((5, 12, 20)):
+            used = np.column_stack([np.ones(50), columns[:, :count]])
+            fitted = used @ np.linalg.lstsq(used, outputs, rcond=None)[0]
+            square = np.mean((outputs - fitted) ** 2)
+            found[draw, at] = akaike(outputs - fitted, count)
+            # Twice the mean loss of a normal distribution of this variance about the fit.
+            expected[draw, at] = 50 * (np.log(square) + (1.0 + np.mean((mean - fitted) ** 2)) / square - 1.0)
+    differences = np.diff(np.mean(found, axis=0)), np.diff(np.mean(expected, axis=0))
+    np.testing.assert_allclose(*differences, rtol=0.1)
+    assert np.isinf(akaike(np.ones(10), 8.0))
+
+
+def test_of_few_rows_the_least_error_of_those_that_the_fit_to_all_supports_decides():
     inputs, outputs, _, _ = records("duhem", 10)
     found = select(Measurements.of(inputs, outputs), ("polynomial-plays", "prandtl-ishlinskii"))
     judged = [each for each in found.evaluations if each.units]
-    assert found.chosen is min(judged, key=lambda each: each.schwarz)
+    assert found.chosen is best_of_few_rows(judged)
     many = np.repeat(inputs, 3)
     noise = 0.01 * np.ptp(outputs) * np.random.default_rng(1).standard_normal(many.size)
     longer = select(Measurements.of(many, np.repeat(outputs, 3) + noise), ("polynomial-plays", "prandtl-ishlinskii"))
