@@ -264,6 +264,14 @@ class _Kind:
         return max((len(values) for _, values in self.sizes), default=1)
 
 
+class _InTimeWork(NamedTuple):
+    """Makes a model with time of an evaluated operator."""
+
+    name: str
+    evaluate: Callable[[Candidate, int], list[Evaluation]]
+    operator: Evaluation
+
+
 class _Search:
     def __init__(
         self, measured: Measurements, models: Sequence[str], given: Given, carry: Carry, in_time: InTime | None
@@ -451,22 +459,29 @@ class _Search:
         # Without time, a drift or a lag hides what a finer order gains.
         shaped = self._with_shape & {each.candidate.model for each in tried}
         tried += [each for each in judged if each.candidate.model in shaped and each not in tried]
-        gap = self.measured.gap
-        tasks: list[tuple[str, Task]] = [
-            ("hammerstein", partial(self.in_time.evaluate, each.candidate, gap)) for each in tried
-        ]
-        judged_by = list(tried)
+        works = [_InTimeWork("hammerstein", self.in_time.evaluate, each) for each in tried]
         if PLAYS in best and not self.in_time.has_one_rate():
-            tasks.append((PLAYS, partial(self.in_time.evaluate_plays, best[PLAYS].candidate, gap)))
-            judged_by.append(best[PLAYS])
-        found = [(each, one) for each, ones in zip(judged_by, self.carry(tasks), strict=True) for one in ones]
+            works.append(_InTimeWork(PLAYS, self.in_time.evaluate_plays, best[PLAYS]))
+        found = self._carry_in_time(works)
+        work, least = min(found, key=lambda one: one[1].rms, default=(None, None))
+        if work is not None and least is not None and self._may_skip and least.candidate.initial != "skip":
+            # Without time, a lag hides what memory the record begins with.
+            operator = replace(work.operator, candidate=replace(work.operator.candidate, initial="skip"))
+            found += self._carry_in_time([work._replace(operator=operator)])
+        return [one for _, one in found]
+
+    def _carry_in_time(self, works: Sequence[_InTimeWork]) -> list[tuple[_InTimeWork, Evaluation]]:
+        """Return what is evaluated with time, each beside the work that did so."""
+        tasks = [(work.name, partial(work.evaluate, work.operator.candidate, self.measured.gap)) for work in works]
+        found = [(work, one) for work, ones in zip(works, self.carry(tasks), strict=True) for one in ones]
         self.given_up += [one for _, one in found if one.failure]
         # What is left out of the others decides.
         units = bool(self.measured.units())
         return [
-            replace(one, determined=each.determined, follows=each.follows, units=one.units if units else ())
-            for each, one in found
+            (work, replace(one, determined=each.determined, follows=each.follows, units=one.units if units else ()))
+            for work, one in found
             if not one.failure
+            for each in [work.operator]
         ]
 
     def _in_time_too(self, candidate: Candidate) -> bool:
@@ -583,6 +598,11 @@ class _Search:
         return others + [each for each in finalists if each not in others and _UNBOUNDED * each.rms < least]
 
     @property
+    def _may_skip(self) -> bool:
+        """Whether `skip` is tried: a model must not extrapolate to what only the first rows reach."""
+        return self.given.initial is None and self.measured.covers_its_range()
+
+    @property
     def _folds(self) -> int:
         return len(self.measured.blocks())
 
@@ -621,8 +641,7 @@ class _Search:
             given = self.given.orientation
             orientations = ("rising", "falling") if given in (None, "auto") else (given,)
         memories: tuple[Initial | None, ...] = (None,)
-        # Without the first rows a model must not extrapolate to inputs that no other rows reach.
-        skipping: tuple[Initial, ...] = ("skip",) if self.measured.covers_its_range() else ()
+        skipping: tuple[Initial, ...] = ("skip",) if self._may_skip else ()
         if not template.memoryless:
             estimated: tuple[Initial, ...] = ("estimate",) if spec.estimate_state is not None else ()
             memories = (

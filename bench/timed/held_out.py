@@ -195,10 +195,9 @@ def _left_out(
     blocks = [leave_out(fold) for fold in measured.blocks()]
     units = [leave_out(fold) for fold in measured.units()]
     free = float(np.mean([free for _, free in blocks]))
-    weights = measured.fitted.astype(np.float64)
-    found = fit(weights)
-    weights[:skip] = 0.0
-    residuals = (measured.outputs - found.bias - columns @ found.coefficients)[weights > 0.0]
+    found = fit(measured.fitted.astype(np.float64))
+    # The same rows of all candidates, whether they begin with them or not.
+    residuals = (measured.outputs - found.bias - columns @ found.coefficients)[measured.tested]
     return Evaluation(
         candidate,
         blocks=tuple(error for error, _ in blocks),

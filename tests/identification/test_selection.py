@@ -193,6 +193,34 @@ def test_at_one_rate_a_lag_is_not_taken_for_hysteresis():
     assert found.chosen.candidate.options["dynamics"] == "lag"
 
 
+def with_a_lag(inputs, static):
+    """Return outputs behind a lag at two rates, and what evaluates models with time."""
+    times = np.cumsum(np.where(np.arange(inputs.size) < inputs.size // 2, 1.0, 0.1))
+    lag = LinearPart(0.0, (1.0, 0.0), np.empty(0), np.empty(0))
+    measured = Measurements.of(inputs, noisy(lag.respond(times, static[:, None])[0][:, 0]))
+    return measured, HeldOutInTime(measured, times, inputs.size)
+
+
+def test_behind_a_lag_it_is_found_too_that_the_memory_of_the_record_is_unknown():
+    inputs = random_reversals(np.random.default_rng(5), 300, 16)
+    measured, in_time = with_a_lag(inputs, bouc_wen(inputs))
+    found = select(measured, ("bouc-wen",), in_time=in_time)
+    static = [each for each in found.evaluations if each.candidate.static is None]
+    assert min(static, key=lambda each: each.rms).candidate.initial is None
+    assert found.chosen.candidate.initial == "skip"
+    assert found.chosen.candidate.options == {"static": "bouc-wen", "dynamics": "lag"}
+    kept = select(measured, ("bouc-wen",), Given(initial="positive"), in_time=in_time)
+    assert {each.candidate.initial for each in kept.evaluations} == {"positive"}
+
+
+def test_criteria_of_models_with_time_are_those_of_the_same_rows():
+    inputs = random_reversals(np.random.default_rng(5), 300, 16)
+    _, in_time = with_a_lag(inputs, settled(bouc_wen, inputs))
+    one = Candidate("bouc-wen", orientation="auto")
+    (whole,), (without,) = (in_time.evaluate(replace(one, initial=memory), 2) for memory in (None, "skip"))
+    assert whole.akaike == pytest.approx(without.akaike, abs=4.0)
+
+
 def test_few_reversals_and_a_trend_of_the_errors_are_warned_of():
     rise = np.interp(np.arange(60), [0, 50, 59], [0.0, 1.0, 0.8])
     found = select(Measurements.of(rise, noisy(rise)), ("polynomial",))
