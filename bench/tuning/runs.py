@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from bench.controllers import controller_spec
-from bench.errors import BenchError, ConfigurationError
+from bench.errors import AbortError, BenchError, ConfigurationError
 from bench.hysteresis import TwoStage
 from bench.model_file import ModelFile
 from bench.results.tracking import TargetResults
@@ -133,7 +133,8 @@ class TuningRuns:
     def __call__(self, candidates: Sequence[Numbers]) -> list[Trial]:
         """Return trials of some numbers; their runs go on beside each other.
 
-        Raises BenchError if those of the first trial fail with the model as it is.
+        Raises BenchError if those of the first trial fail with the model as it is, AbortError if the operator ended a
+        run.
         """
         started = [(numbers, self._start(numbers)) for numbers in candidates]
         return [self._trial(numbers, runs) for numbers, runs in started]
@@ -165,6 +166,8 @@ class TuningRuns:
         for key, run in runs.items():
             try:
                 reached[key] = reached_targets(run.result(), self._signal)
+            except AbortError:
+                raise
             except BenchError as error:
                 self.failures.append(f"{key[0]}, {dict(numbers)}: {error}")
                 reached[key] = None
@@ -207,10 +210,10 @@ def start_of(task: Task, rig: str, numbers: Any, tunable: Sequence[str]) -> Numb
     found: dict[str, Any] = dict(table)
     for name in (each for together in tunable for each in together.split("+")):
         outer, _, inner = name.rpartition(".")
+        default = getattr(getattr(numbers, outer) if outer else numbers, inner)
+        within = dict(found.get(outer, {})) if outer else found
+        # What a rig file gives without decimals need not be a whole number.
+        within[inner] = type(default)(within.get(inner, default))
         if outer:
-            within = dict(found.get(outer, {}))
-            within.setdefault(inner, getattr(getattr(numbers, outer), inner))
             found[outer] = within
-        else:
-            found.setdefault(name, getattr(numbers, name))
     return found

@@ -190,20 +190,28 @@ def _mean(trials: Sequence[Trial]) -> Trial:
 
 
 def multiplied(numbers: Numbers, name: str, factor: float) -> Numbers:
-    """Return numbers with one of them, or those of `NAME+NAME`, multiplied by a factor."""
+    """Return numbers with one of them, or those of `NAME+NAME`, multiplied by a factor.
+
+    A whole number stays one, and changes by 1 at least, but not to 0.
+    """
     for each in name.split("+"):
-        numbers = put(numbers, each, factor * get(numbers, each))
+        number = get(numbers, each)
+        value = factor * number
+        if isinstance(number, int):
+            value = max(1, math.ceil(value) if factor > 1.0 else math.floor(value))
+        numbers = put(numbers, each, value)
     return numbers
 
 
 def get(numbers: Numbers, name: str) -> float:
     """Return a number by its name, `TABLE.NAME` for one in a table."""
     table, _, last = name.rpartition(".")
-    return float((numbers[table] if table else numbers)[last])
+    value: float = (numbers[table] if table else numbers)[last]
+    return value
 
 
 def put(numbers: Numbers, name: str, value: float) -> Numbers:
-    """Return numbers with one of them replaced, rounded to four digits."""
+    """Return numbers with one of them replaced, rounded to four digits if it is no whole one."""
     table, _, last = name.rpartition(".")
-    rounded = float(f"{value:.4g}") if math.isfinite(value) else value
+    rounded = value if isinstance(value, int) or not math.isfinite(value) else float(f"{value:.4g}")
     return {**numbers, table: {**numbers[table], last: rounded}} if table else {**numbers, last: rounded}
