@@ -1,4 +1,4 @@
-"""The search for the numbers of a controller: one after another, by the cost of runs on an emulated rig.
+"""The search for the numbers of a controller: one by one and all together, by the cost of runs on an emulated rig.
 
 The cost of numbers is `error + TIME_WEIGHT * time`: the RMS error and the seconds at each target, each as a multiple
 of that of the numbers to begin with, so that neither hides the other. It is the mean of that with the model as it is,
@@ -40,6 +40,9 @@ FINALISTS = 3
 """How many sets of numbers of a search run in further sessions."""
 _FARTHEST = 4
 """How often a number is changed in the same direction in one round, as long as that is better."""
+_TOGETHER = 6
+"""How many sets of numbers are drawn at random about the best ones, all numbers changed, in each round; and as many
+again if one is better."""
 _ENOUGH = 0.99
 """Part of the cost below which a change is taken, as two runs of one controller differ a little."""
 
@@ -118,7 +121,9 @@ def cost_of(rms: float, seconds: float, scale: tuple[float, float]) -> float:
 def search(
     start: Numbers, names: Sequence[str], evaluate: Evaluate, tell: Callable[[Trial], None], rounds: int = 2
 ) -> Trial:
-    """Return the best numbers that are found by changing one after another.
+    """Return the best numbers that are found by changing one after another, and then all together at random.
+
+    What two numbers gain only together, as shorter waits with more corrections do, no change of one shows.
 
     Parameters
     ----------
@@ -136,6 +141,7 @@ def search(
     """
     (best,) = evaluate([start])
     tell(best)
+    rng = np.random.default_rng(0)
     for number in range(rounds):
         factor = FACTOR ** (1.0 / (number + 1))
         for name in names:
@@ -150,6 +156,20 @@ def search(
                 best = trials[steps.index(step)]
                 # On in the direction that was better.
                 steps = (step,)
+        for _ in range(2 if len(names) > 1 else 0):
+            drawn = []
+            for factors in factor ** rng.uniform(-1.0, 1.0, (_TOGETHER, len(names))):
+                numbers = best.numbers
+                for name, each in zip(names, factors.tolist(), strict=True):
+                    numbers = multiplied(numbers, name, each)
+                drawn.append(numbers)
+            trials = evaluate(drawn)
+            for trial in trials:
+                tell(trial)
+            found = min(trials, key=lambda trial: trial.cost)
+            if not found.cost < _ENOUGH * best.cost:
+                break
+            best = found
     return best
 
 

@@ -56,8 +56,8 @@ def test_the_search_comes_near_the_best_numbers_and_keeps_off_those_that_fail():
     assert get(best.numbers, "arrival.hold") == pytest.approx(1.0, rel=0.25)
     # A change that gains less than a hundredth is not taken.
     assert 0.99 * best.cost <= min(trial.cost for trial in seen)
-    # Two neighbours of each number in each round at least, and on where it is better.
-    assert 1 + 4 * 2 * 2 < len(seen) <= 1 + 4 * 2 * 5
+    # Two neighbours of each number and six draws in each round at least, and on where it is better.
+    assert 1 + 4 * (2 * 2 + 6) < len(seen) <= 1 + 4 * (2 * 5 + 12)
     waits = [get(trial.numbers, "wait") for trial in seen]
     assert waits[1:4] == pytest.approx([8.0 * FACTOR, 8.0 / FACTOR, 8.0 / FACTOR**2], rel=1e-3)
     assert NUMBERS == {"wait": 8.0, "arrival": {"hold": 0.4}}
@@ -71,6 +71,23 @@ def test_numbers_may_change_together():
         (pytest.approx(8.0 * FACTOR, rel=1e-3), pytest.approx(0.4 * FACTOR, rel=1e-3)),
         (pytest.approx(8.0 / FACTOR, rel=1e-3), pytest.approx(0.4 / FACTOR, rel=1e-3)),
     ]
+
+
+def test_numbers_that_gain_only_together_are_found():
+    def valley(candidates):
+        found = []
+        for numbers in candidates:
+            wait, hold = math.log(get(numbers, "wait") / 8.0), math.log(get(numbers, "arrival.hold") / 0.4)
+            cost = 3.0 - wait + 1.2 * abs(wait - hold)
+            found.append(Trial(numbers, cost, cost, 1.0, cost))
+        return found
+
+    names = ("wait", "arrival.hold")
+    tried = []
+    best = search(NUMBERS, names, valley, tried.append)
+    # One alone only costs more.
+    assert min(trial.cost for trial in tried[:5]) == tried[0].cost == 3.0
+    assert best.cost < 2.6
 
 
 def test_a_whole_number_stays_one_and_changes_by_one_at_least():

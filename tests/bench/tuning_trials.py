@@ -54,9 +54,8 @@ READINGS = 5
 """Readings at each target of a muscle."""
 UNSEEN = 1000
 """Seed of the first session that no tuning has seen."""
-SEARCHED, ROUNDS = ("count=20",), 1
-"""Settings and rounds of the search: fewer targets than in a session and each number changed once, for the sake of
-time."""
+SEARCHED = ("count=20",)
+"""Settings of the search: fewer targets than in a session, for the sake of time."""
 LOOPS: Mapping[str, Mapping[str, Any]] = {
     "vo2": {"model": "preisach-nonmonotonic", "levels": 20, "plane": (30.0, 70.0)},
     "hybrid": {"model": "preisach", "levels": 20},
@@ -107,7 +106,10 @@ _CLOSED_LOOP = "closed-loop-inverse"
 
 
 class Case(NamedTuple):
-    """What is tuned: rig, protocol, controller; the signal that counts, and the unit that is printed, in SI."""
+    """What is tuned: rig, protocol, controller; the signal that counts, and the unit that is printed, in SI.
+
+    `seeds` and `checks` are the sessions of each run of the search, and those in which its result is judged.
+    """
 
     rig: str
     protocol: str
@@ -115,6 +117,8 @@ class Case(NamedTuple):
     signal: str
     unit: str
     size: float = 1.0
+    seeds: int = 2
+    checks: int = 8
 
     @property
     def name(self) -> str:
@@ -123,7 +127,7 @@ class Case(NamedTuple):
 
 CASES = (
     *(
-        Case("vo2", "tracking", controller, "curvature", "1/m")
+        Case("vo2", "tracking", controller, "curvature", "1/m", seeds=6, checks=16)
         for controller in (_CLOSED_LOOP, "open-loop-inverse", "latched")
     ),
     *(
@@ -267,7 +271,7 @@ def main() -> int:
             if not tuning.exists():
                 found = tune(
                     model, case.rig, controller=case.controller, protocol=case.protocol, workers=given.workers,
-                    settings=SEARCHED, seeds=1, rounds=ROUNDS, folder=folder / "search", console=shown,
+                    settings=SEARCHED, seeds=case.seeds, checks=case.checks, folder=folder / "search", console=shown,
                 )  # fmt: skip
                 tuning.write_text(found.text(), encoding="utf-8")
                 (folder / "numbers.json").write_text(json.dumps(found.summary()), encoding="utf-8")
