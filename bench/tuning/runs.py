@@ -18,7 +18,7 @@ from bench.model_file import ModelFile
 from bench.results.tracking import TargetResults
 from bench.rig_file import load_rig
 from bench.studies import Campaign, reached_targets
-from bench.tuning.search import GAIN_HIGH, MARGIN, Numbers, Trial, cost_of, perturbed_models
+from bench.tuning.search import GAIN_HIGH, MARGIN, TIME_WEIGHT, Numbers, Trial, cost_of, perturbed_models
 
 if TYPE_CHECKING:
     from bench.runs import RunResult
@@ -103,6 +103,8 @@ class TuningRuns:
         Seed of the first session; the others follow.
     scale : Scale, optional
         By what the cost is counted; by the first trial if not given.
+    time_weight : float
+        Part of the RMS error of the first numbers that costs as much as their time, at least 0.
     """
 
     task: Task
@@ -114,6 +116,7 @@ class TuningRuns:
     seeds: int = 1
     first_seed: int = 0
     scale: Scale | None = None
+    time_weight: float = TIME_WEIGHT
     failures: list[str] = field(default_factory=list)
     _count: int = 0
 
@@ -185,7 +188,8 @@ class TuningRuns:
             self.scale = Scale.of((rms, seconds), list(means.values()))
         scales = dict.fromkeys(means, self.scale.others) | {_AS_IDENTIFIED: self.scale.identified}
         costs = {
-            name: float(np.mean([cost_of(*each, scales[name]) for each in runs])) for name, runs in scores.items()
+            name: float(np.mean([cost_of(*each, scales[name], self.time_weight) for each in runs]))
+            for name, runs in scores.items()
         }
         cost = 0.5 * (costs.pop(_AS_IDENTIFIED) + max(costs.values()))
         return Trial(numbers, cost, rms, seconds, worst)

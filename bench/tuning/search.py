@@ -1,6 +1,6 @@
 """The search for the numbers of a controller: one by one and all together, by the cost of runs on an emulated rig.
 
-The cost of numbers is `error + TIME_WEIGHT * time`: the RMS error and the seconds at each target, each as a multiple
+The cost of numbers is `error + time_weight * time`: the RMS error and the seconds at each target, each as a multiple
 of that of the numbers to begin with, so that neither hides the other. It is the mean of that with the model as it is,
 and of the worst of that with models by which the specimen has another gain, by the factor `MARGIN` to either side,
 and another time constant of its response; there as a multiple of the worst of the numbers to begin with. So numbers
@@ -27,7 +27,7 @@ MARGIN = 1.25
 GAIN_HIGH = "gain-high"
 """Name of the model of a greater gain than the specimen has."""
 TIME_WEIGHT = 0.25
-"""Part of the RMS error of the first numbers that costs as much as their time."""
+"""Part of the RMS error of the first numbers that costs as much as their time, unless another is given."""
 FAILED = 1000.0
 """Cost of a run that failed, beyond that of any that did not."""
 WORST = 1.25
@@ -113,9 +113,9 @@ def _slower(dynamics: IdentifiedDynamics, factor: float) -> IdentifiedDynamics:
     return replace(dynamics, response=replace(dynamics.response, lag=factor * dynamics.response.lag))
 
 
-def cost_of(rms: float, seconds: float, scale: tuple[float, float]) -> float:
+def cost_of(rms: float, seconds: float, scale: tuple[float, float], time_weight: float = TIME_WEIGHT) -> float:
     """Return the cost of one run, by RMS error and seconds at each target, and those of the numbers to begin with."""
-    return rms / scale[0] + TIME_WEIGHT * seconds / scale[1] if math.isfinite(rms) else FAILED
+    return rms / scale[0] + time_weight * seconds / scale[1] if math.isfinite(rms) else FAILED
 
 
 def search(

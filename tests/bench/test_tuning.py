@@ -204,6 +204,7 @@ def test_a_search_begins_with_numbers_that_fail_and_leaves_them():
 
 def test_the_cost_is_error_and_time_as_multiples_of_those_before():
     assert cost_of(2.0, 10.0, (4.0, 5.0)) == pytest.approx(0.5 + 0.25 * 2.0)
+    assert cost_of(2.0, 10.0, (4.0, 5.0), time_weight=1.0) == pytest.approx(0.5 + 2.0)
     assert cost_of(math.inf, math.nan, (4.0, 5.0)) == FAILED
     assert put(NUMBERS, "arrival.hold", 1.23456)["arrival"] == {"hold": 1.235}
 
