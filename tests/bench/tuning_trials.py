@@ -7,7 +7,7 @@ sessions whose noise and targets the tuning has not seen: with the constants by 
 model and rig file, and with those of the tuning file. The table, for docs/reference/tuning.md, has for each of the
 three median and worst of the RMS error over the sessions, and the mean time at a target; then in how many sessions
 the cost of `bench tune` is less with the tuning file than by hand, and what supply and sensor of a muscle leave. Of a
-controller that is given up it has after how many targets. Exits with 1 if tuned numbers cost no less than those by
+controller that is given up it has at which target. Exits with 1 if tuned numbers cost no less than those by
 hand in most sessions.
 """
 
@@ -34,7 +34,7 @@ from bench.model_file import load_model
 from bench.results.tracking import TargetResults, target_results
 from bench.rig_file import load_rig
 from bench.studies import Campaign, reached_targets
-from bench.tuning.search import cost_of
+from bench.tuning.search import TIME_WEIGHT, cost_of
 from bench.tuning.tune import tune
 from bench.workers import Workers
 from rigs.muscles.identification import (
@@ -63,15 +63,15 @@ LOOPS: Mapping[str, Mapping[str, Any]] = {
 """How the model of a rig is identified from its damped oscillation; that of a muscle comes from three runs."""
 
 BY_HAND: Mapping[str, Mapping[str, Any]] = {
-    "vo2/tracking": {
+    "vo2/closed-loop-inverse": {
         "close_enough": 5.0,
         "walk_variance": 3.0,
         "reading_variance": 1.0,
         "corrections": 3,
         "arrival": {"tolerance": 0.03},
     },
-    "vo2/tracking/open-loop-inverse": {"wait": 8.0},
-    "hybrid/tracking": {"corrections": 3, "arrival": {"tolerance": 0.1}},
+    "vo2/open-loop-inverse": {"wait": 8.0},
+    "hybrid/closed-loop-inverse": {"corrections": 3, "arrival": {"tolerance": 0.1}},
 }
 """Constants of the controllers before they took their numbers from model and rig file, in the units of the rig."""
 
@@ -108,7 +108,8 @@ _CLOSED_LOOP = "closed-loop-inverse"
 class Case(NamedTuple):
     """What is tuned: rig, protocol, controller; the signal that counts, and the unit that is printed, in SI.
 
-    `seeds` and `checks` are the sessions of each run of the search, and those in which its result is judged.
+    `seeds` and `checks` are the sessions of each run of the search, and those in which its result is judged;
+    `time_weight` is that of its cost.
     """
 
     rig: str
@@ -119,10 +120,13 @@ class Case(NamedTuple):
     size: float = 1.0
     seeds: int = 2
     checks: int = 8
+    time_weight: float = TIME_WEIGHT
 
     @property
     def name(self) -> str:
-        return f"{self.rig}/{self.protocol}" + f"/{self.controller}" * (self.controller != _CLOSED_LOOP)
+        controller = f"/{self.controller}" * (self.controller != _CLOSED_LOOP)
+        weight = f"/time-weight-{self.time_weight:g}" * (self.time_weight != TIME_WEIGHT)
+        return f"{self.rig}/{self.protocol}{controller}{weight}"
 
 
 CASES = (
@@ -130,6 +134,7 @@ CASES = (
         Case("vo2", "tracking", controller, "curvature", "1/m", seeds=6, checks=16)
         for controller in (_CLOSED_LOOP, "open-loop-inverse", "latched")
     ),
+    Case("vo2", "tracking", _CLOSED_LOOP, "curvature", "1/m", seeds=6, checks=16, time_weight=1.0),
     *(
         case
         for rig in ("sma", "mckibben", "coiled-polymer")
@@ -178,7 +183,11 @@ def task_of(case: Case, model: Path) -> tuple[Task, float]:
 def by_hand(case: Case, model: Path) -> Mapping[str, Any]:
     """Return the constants by hand, a muscle's as multiples of what its controller takes from the model."""
     if case.protocol == "tracking":
-        return BY_HAND[case.name]
+        # What is not here still stands in the rig file.
+        return (
+            BY_HAND.get(f"{case.rig}/{case.controller}")
+            or load_rig(case.rig).protocols["tracking"]["tuning"][case.controller]
+        )
     task, _ = task_of(case, model)
     wire = WIRE[case.signal]
     walk = math.sqrt(wire.ratio * task.reading_variance / task.walk_variance)
@@ -203,7 +212,7 @@ class Sessions(NamedTuple):
     values : ndarray, shape (N, 2)
         RMS error (SI) and seconds at a target; nan where the controller was given up.
     ended : list of int
-        After how many targets it was given up.
+        At which target it was given up, in each of those sessions; 1 is the first.
     """
 
     values: np.ndarray
@@ -213,8 +222,8 @@ class Sessions(NamedTuple):
         """Return median and worst error, in units of `size`, and the mean time, for the table."""
         if self.ended:
             low, high = min(self.ended), max(self.ended)
-            after = f"{low}" if low == high else f"{low} to {high}"
-            return [f"given up after {after} targets in {len(self.ended)} of {len(self.values)}", ""]
+            where = f"target {low}" if low == high else f"targets {low} to {high}"
+            return [f"given up at {where} in {len(self.ended)} of {len(self.values)}", ""]
         errors = self.values[:, 0] / size
         return [f"{np.median(errors):.3g} / {errors.max():.3g}", f"{self.values[:, 1].mean():.3g}"]
 
@@ -236,7 +245,7 @@ def tried(
         try:
             reached = reached_targets(run.result(), case.signal)
         except ConvergenceError:
-            found[name].ended.append(targets_before(campaign.folder, case.signal))
+            found[name].ended.append(1 + targets_before(campaign.folder, case.signal))
             continue
         rms = float(np.sqrt(np.mean((reached.outputs - reached.targets) ** 2)))
         found[name].values[seed - UNSEEN] = rms, float(reached.seconds.mean())
@@ -271,7 +280,8 @@ def main() -> int:
             if not tuning.exists():
                 found = tune(
                     model, case.rig, controller=case.controller, protocol=case.protocol, workers=given.workers,
-                    settings=SEARCHED, seeds=case.seeds, checks=case.checks, folder=folder / "search", console=shown,
+                    settings=SEARCHED, seeds=case.seeds, checks=case.checks, time_weight=case.time_weight,
+                    folder=folder / "search", console=shown,
                 )  # fmt: skip
                 tuning.write_text(found.text(), encoding="utf-8")
                 (folder / "numbers.json").write_text(json.dumps(found.summary()), encoding="utf-8")
@@ -284,7 +294,8 @@ def main() -> int:
                 hand, today, tuned = tried(case, model, tunings, folder, given.sessions, pool)
             scale = np.nanmean(today.values, axis=0).tolist()
             costs = [
-                [cost_of(rms, seconds, scale) for rms, seconds in each.values.tolist()] for each in (hand, tuned)
+                [cost_of(rms, seconds, scale, case.time_weight) for rms, seconds in each.values.tolist()]
+                for each in (hand, tuned)
             ]
             better = sum(after < before for before, after in zip(*costs, strict=True))
             worse += not better > given.sessions / 2
