@@ -40,6 +40,9 @@ def tune_(
         int, typer.Option(min=2, max=100, help="Further sessions, in which the result has to be better as well.")
     ] = 8,
     rounds: Annotated[int, typer.Option(min=1, max=10, help="How often each number is changed.")] = 2,
+    time_weight: Annotated[
+        float, typer.Option(min=0.0, help="Part of the RMS error before that costs as much as the time before.")
+    ] = 0.25,
     workers: Annotated[
         int | None, typer.Option(min=1, help="Worker processes; as many as cores if not given.")
     ] = None,
@@ -48,18 +51,18 @@ def tune_(
 ) -> None:
     """Tune a controller for a specimen, by runs on its emulated twin.
 
-    The numbers of the controller are changed one after another. What counts is the RMS error, and a quarter as much
-    the time at each target, as multiples of those before; half by the model as it is, half by the worst of models by
-    which the specimen has another gain or time constant, so that what is chosen has margins of stability. If it is
-    not better in sessions that the search has not seen, by more than chance, the numbers stay as they are. Use the
-    file by `bench run ... --set tuning=FILE`.
+    The numbers of the controller are changed one after another, and all together. What counts is the RMS error, and
+    by --time-weight the time at each target, as multiples of those before; half by the model as it is, half by the
+    worst of models by which the specimen has another gain or time constant, so that what is chosen has margins of
+    stability. If it is not better in sessions that the search has not seen, by more than chance, the numbers stay as
+    they are. Use the file by `bench run ... --set tuning=FILE`.
     """
     from bench.tuning.tune import tune
 
     check_outputs(out=out, json_file=json_file, read=[model])
     found = tune(
         model, rig, twin=twin, controller=controller, protocol=protocol, settings=settings or [], seeds=seeds,
-        checks=checks, rounds=rounds, workers=workers, folder=runs, console=console,
+        checks=checks, rounds=rounds, time_weight=time_weight, workers=workers, folder=runs, console=console,
     )  # fmt: skip
     out.write_text(found.text(), encoding="utf-8")
     print_rows(f"{controller} on {found.twin}", found.rows())

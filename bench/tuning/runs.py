@@ -12,13 +12,13 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from bench.controllers import controller_spec
-from bench.errors import BenchError, ConfigurationError
+from bench.errors import AbortError, BenchError, ConfigurationError
 from bench.hysteresis import TwoStage
 from bench.model_file import ModelFile
 from bench.results.tracking import TargetResults
 from bench.rig_file import load_rig
 from bench.studies import Campaign, reached_targets
-from bench.tuning.search import GAIN_HIGH, MARGIN, Numbers, Trial, cost_of, perturbed_models
+from bench.tuning.search import GAIN_HIGH, MARGIN, TIME_WEIGHT, Numbers, Trial, cost_of, perturbed_models
 
 if TYPE_CHECKING:
     from bench.runs import RunResult
@@ -103,6 +103,8 @@ class TuningRuns:
         Seed of the first session; the others follow.
     scale : Scale, optional
         By what the cost is counted; by the first trial if not given.
+    time_weight : float
+        Part of the RMS error of the first numbers that costs as much as their time, at least 0.
     """
 
     task: Task
@@ -114,6 +116,7 @@ class TuningRuns:
     seeds: int = 1
     first_seed: int = 0
     scale: Scale | None = None
+    time_weight: float = TIME_WEIGHT
     failures: list[str] = field(default_factory=list)
     _count: int = 0
 
@@ -133,7 +136,8 @@ class TuningRuns:
     def __call__(self, candidates: Sequence[Numbers]) -> list[Trial]:
         """Return trials of some numbers; their runs go on beside each other.
 
-        Raises BenchError if those of the first trial fail with the model as it is.
+        Raises BenchError if those of the first trial fail with the model as it is, AbortError if the operator ended a
+        run.
         """
         started = [(numbers, self._start(numbers)) for numbers in candidates]
         return [self._trial(numbers, runs) for numbers, runs in started]
@@ -165,6 +169,8 @@ class TuningRuns:
         for key, run in runs.items():
             try:
                 reached[key] = reached_targets(run.result(), self._signal)
+            except AbortError:
+                raise
             except BenchError as error:
                 self.failures.append(f"{key[0]}, {dict(numbers)}: {error}")
                 reached[key] = None
@@ -182,7 +188,8 @@ class TuningRuns:
             self.scale = Scale.of((rms, seconds), list(means.values()))
         scales = dict.fromkeys(means, self.scale.others) | {_AS_IDENTIFIED: self.scale.identified}
         costs = {
-            name: float(np.mean([cost_of(*each, scales[name]) for each in runs])) for name, runs in scores.items()
+            name: float(np.mean([cost_of(*each, scales[name], self.time_weight) for each in runs]))
+            for name, runs in scores.items()
         }
         cost = 0.5 * (costs.pop(_AS_IDENTIFIED) + max(costs.values()))
         return Trial(numbers, cost, rms, seconds, worst)
@@ -207,10 +214,10 @@ def start_of(task: Task, rig: str, numbers: Any, tunable: Sequence[str]) -> Numb
     found: dict[str, Any] = dict(table)
     for name in (each for together in tunable for each in together.split("+")):
         outer, _, inner = name.rpartition(".")
+        default = getattr(getattr(numbers, outer) if outer else numbers, inner)
+        within = dict(found.get(outer, {})) if outer else found
+        # What a rig file gives without decimals need not be a whole number.
+        within[inner] = type(default)(within.get(inner, default))
         if outer:
-            within = dict(found.get(outer, {}))
-            within.setdefault(inner, getattr(getattr(numbers, outer), inner))
             found[outer] = within
-        else:
-            found.setdefault(name, getattr(numbers, name))
     return found

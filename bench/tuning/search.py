@@ -1,6 +1,6 @@
-"""The search for the numbers of a controller: one after another, by the cost of runs on an emulated rig.
+"""The search for the numbers of a controller: one by one and all together, by the cost of runs on an emulated rig.
 
-The cost of numbers is `error + TIME_WEIGHT * time`: the RMS error and the seconds at each target, each as a multiple
+The cost of numbers is `error + time_weight * time`: the RMS error and the seconds at each target, each as a multiple
 of that of the numbers to begin with, so that neither hides the other. It is the mean of that with the model as it is,
 and of the worst of that with models by which the specimen has another gain, by the factor `MARGIN` to either side,
 and another time constant of its response; there as a multiple of the worst of the numbers to begin with. So numbers
@@ -27,7 +27,7 @@ MARGIN = 1.25
 GAIN_HIGH = "gain-high"
 """Name of the model of a greater gain than the specimen has."""
 TIME_WEIGHT = 0.25
-"""Part of the RMS error of the first numbers that costs as much as their time."""
+"""Part of the RMS error of the first numbers that costs as much as their time, unless another is given."""
 FAILED = 1000.0
 """Cost of a run that failed, beyond that of any that did not."""
 WORST = 1.25
@@ -40,6 +40,9 @@ FINALISTS = 3
 """How many sets of numbers of a search run in further sessions."""
 _FARTHEST = 4
 """How often a number is changed in the same direction in one round, as long as that is better."""
+_TOGETHER = 6
+"""How many sets of numbers are drawn at random about the best ones, all numbers changed, in each round; and as many
+again if one is better."""
 _ENOUGH = 0.99
 """Part of the cost below which a change is taken, as two runs of one controller differ a little."""
 
@@ -110,15 +113,17 @@ def _slower(dynamics: IdentifiedDynamics, factor: float) -> IdentifiedDynamics:
     return replace(dynamics, response=replace(dynamics.response, lag=factor * dynamics.response.lag))
 
 
-def cost_of(rms: float, seconds: float, scale: tuple[float, float]) -> float:
+def cost_of(rms: float, seconds: float, scale: tuple[float, float], time_weight: float = TIME_WEIGHT) -> float:
     """Return the cost of one run, by RMS error and seconds at each target, and those of the numbers to begin with."""
-    return rms / scale[0] + TIME_WEIGHT * seconds / scale[1] if math.isfinite(rms) else FAILED
+    return rms / scale[0] + time_weight * seconds / scale[1] if math.isfinite(rms) else FAILED
 
 
 def search(
     start: Numbers, names: Sequence[str], evaluate: Evaluate, tell: Callable[[Trial], None], rounds: int = 2
 ) -> Trial:
-    """Return the best numbers that are found by changing one after another.
+    """Return the best numbers that are found by changing one after another, and then all together at random.
+
+    What two numbers gain only together, as shorter waits with more corrections do, no change of one shows.
 
     Parameters
     ----------
@@ -136,6 +141,7 @@ def search(
     """
     (best,) = evaluate([start])
     tell(best)
+    rng = np.random.default_rng(0)
     for number in range(rounds):
         factor = FACTOR ** (1.0 / (number + 1))
         for name in names:
@@ -150,6 +156,20 @@ def search(
                 best = trials[steps.index(step)]
                 # On in the direction that was better.
                 steps = (step,)
+        for _ in range(2 if len(names) > 1 else 0):
+            drawn = []
+            for factors in factor ** rng.uniform(-1.0, 1.0, (_TOGETHER, len(names))):
+                numbers = best.numbers
+                for name, each in zip(names, factors.tolist(), strict=True):
+                    numbers = multiplied(numbers, name, each)
+                drawn.append(numbers)
+            trials = evaluate(drawn)
+            for trial in trials:
+                tell(trial)
+            found = min(trials, key=lambda trial: trial.cost)
+            if not found.cost < _ENOUGH * best.cost:
+                break
+            best = found
     return best
 
 
@@ -190,20 +210,28 @@ def _mean(trials: Sequence[Trial]) -> Trial:
 
 
 def multiplied(numbers: Numbers, name: str, factor: float) -> Numbers:
-    """Return numbers with one of them, or those of `NAME+NAME`, multiplied by a factor."""
+    """Return numbers with one of them, or those of `NAME+NAME`, multiplied by a factor.
+
+    A whole number stays one, and changes by 1 at least, but not to 0.
+    """
     for each in name.split("+"):
-        numbers = put(numbers, each, factor * get(numbers, each))
+        number = get(numbers, each)
+        value = factor * number
+        if isinstance(number, int):
+            value = max(1, math.ceil(value) if factor > 1.0 else math.floor(value))
+        numbers = put(numbers, each, value)
     return numbers
 
 
 def get(numbers: Numbers, name: str) -> float:
     """Return a number by its name, `TABLE.NAME` for one in a table."""
     table, _, last = name.rpartition(".")
-    return float((numbers[table] if table else numbers)[last])
+    value: float = (numbers[table] if table else numbers)[last]
+    return value
 
 
 def put(numbers: Numbers, name: str, value: float) -> Numbers:
-    """Return numbers with one of them replaced, rounded to four digits."""
+    """Return numbers with one of them replaced, rounded to four digits if it is no whole one."""
     table, _, last = name.rpartition(".")
-    rounded = float(f"{value:.4g}") if math.isfinite(value) else value
+    rounded = value if isinstance(value, int) or not math.isfinite(value) else float(f"{value:.4g}")
     return {**numbers, table: {**numbers[table], last: rounded}} if table else {**numbers, last: rounded}

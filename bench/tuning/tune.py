@@ -79,6 +79,7 @@ def tune(
     seeds: int = 2,
     checks: int = 8,
     rounds: int = 2,
+    time_weight: float = TIME_WEIGHT,
     workers: int | None = None,
     folder: Path = Path("recordings/tuning"),
     console: Console | None = None,
@@ -139,12 +140,22 @@ def tune(
 
     # What each of many runs says of itself would hide what the search says.
     with Workers(workers, title=f"tune {controller}") as pool:
-        runs = TuningRuns(task, on, file, folder, pool, given, seeds)
+        runs = TuningRuns(task, on, file, folder, pool, given, seeds, time_weight=time_weight)
         best = search(begin, spec.tunable, runs, tell, rounds)
         if best.failed:
             raise BenchError(f"the controller fails with all numbers that were tried: {runs.failures[0]}")
         unseen = [
-            TuningRuns(task, on, file, folder / f"check-{seed}", pool, given, first_seed=seed, scale=runs.scale)
+            TuningRuns(
+                task,
+                on,
+                file,
+                folder / f"check-{seed}",
+                pool,
+                given,
+                first_seed=seed,
+                scale=runs.scale,
+                time_weight=time_weight,
+            )
             for seed in range(seeds, seeds + checks)
         ]
         first, best = confirm(trials, unseen)
@@ -155,7 +166,7 @@ def tune(
         "twin": on,
         "protocol": task.protocol,
         "settings": ", ".join(settings),
-        "cost": f"0.5 (as identified + worst margin) of RMS + {TIME_WEIGHT:g} time a target, as multiples of those "
+        "cost": f"0.5 (as identified + worst margin) of RMS + {time_weight:g} time a target, as multiples of those "
         f"before; margins: gain and time constant by {MARGIN:g} to either side",
         "better": f"cost less by more than {ERRORS:g} standard errors in the same sessions, "
         f"greatest RMS at most {WORST:g} times that before",

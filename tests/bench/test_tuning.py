@@ -8,12 +8,26 @@ import pytest
 
 from bench.cli import main
 from bench.control.dynamics import IdentifiedDynamics, ResponseDynamics
-from bench.errors import ConfigurationError
+from bench.controllers import ControllerSetup, controller_spec
+from bench.errors import AbortError, ConfigurationError
 from bench.hysteresis import Preisach, TwoStage, uniform_levels
 from bench.model_file import ModelFile
 from bench.protocol import find_protocol
 from bench.rig_file import load_rig
-from bench.tuning.search import FACTOR, FAILED, MARGIN, Trial, confirm, cost_of, get, perturbed_models, put, search
+from bench.tuning.runs import Task, TuningRuns, start_of
+from bench.tuning.search import (
+    FACTOR,
+    FAILED,
+    MARGIN,
+    Trial,
+    confirm,
+    cost_of,
+    get,
+    multiplied,
+    perturbed_models,
+    put,
+    search,
+)
 from bench.tuning_file import load_tuning, tuning_text
 
 FILM = Preisach(uniform_levels(30.0, 70.0, 4), np.ones(10), 20.0, None, (21.0, 84.0), "°C", "1/m")
@@ -42,8 +56,8 @@ def test_the_search_comes_near_the_best_numbers_and_keeps_off_those_that_fail():
     assert get(best.numbers, "arrival.hold") == pytest.approx(1.0, rel=0.25)
     # A change that gains less than a hundredth is not taken.
     assert 0.99 * best.cost <= min(trial.cost for trial in seen)
-    # Two neighbours of each number in each round at least, and on where it is better.
-    assert 1 + 4 * 2 * 2 < len(seen) <= 1 + 4 * 2 * 5
+    # Two neighbours of each number and six draws in each round at least, and on where it is better.
+    assert 1 + 4 * (2 * 2 + 6) < len(seen) <= 1 + 4 * (2 * 5 + 12)
     waits = [get(trial.numbers, "wait") for trial in seen]
     assert waits[1:4] == pytest.approx([8.0 * FACTOR, 8.0 / FACTOR, 8.0 / FACTOR**2], rel=1e-3)
     assert NUMBERS == {"wait": 8.0, "arrival": {"hold": 0.4}}
@@ -57,6 +71,55 @@ def test_numbers_may_change_together():
         (pytest.approx(8.0 * FACTOR, rel=1e-3), pytest.approx(0.4 * FACTOR, rel=1e-3)),
         (pytest.approx(8.0 / FACTOR, rel=1e-3), pytest.approx(0.4 / FACTOR, rel=1e-3)),
     ]
+
+
+def test_numbers_that_gain_only_together_are_found():
+    def valley(candidates):
+        found = []
+        for numbers in candidates:
+            wait, hold = math.log(get(numbers, "wait") / 8.0), math.log(get(numbers, "arrival.hold") / 0.4)
+            cost = 3.0 - wait + 1.2 * abs(wait - hold)
+            found.append(Trial(numbers, cost, cost, 1.0, cost))
+        return found
+
+    names = ("wait", "arrival.hold")
+    tried = []
+    best = search(NUMBERS, names, valley, tried.append)
+    # One alone only costs more.
+    assert min(trial.cost for trial in tried[:5]) == tried[0].cost == 3.0
+    assert best.cost < 2.6
+
+
+def test_a_whole_number_stays_one_and_changes_by_one_at_least():
+    numbers = {"corrections": 4, "arrival": {"hold": 0.4}}
+    for factor, found in ((1.7, 7), (1.1, 5), (1.0 / 1.1, 3), (1.0 / 1.7, 2), (0.01, 1)):
+        assert multiplied(numbers, "corrections", factor) == {**numbers, "corrections": found}
+    assert multiplied(numbers, "corrections+arrival.hold", 1.5) == {"corrections": 6, "arrival": {"hold": 0.6}}
+
+
+def test_a_search_begins_with_the_numbers_of_the_rig_file_over_those_of_the_controller(tmp_path):
+    rig = tmp_path / "rig.toml"
+    tables = "[protocols.tracking.tuning.closed-loop-inverse]"
+    rig.write_text(f'extends = "vo2"\n{tables}\nclose_enough = 6\narrival = {{ tolerance = 0.02 }}\n')
+    spec = controller_spec("target", "closed-loop-inverse")
+    setup = ControllerSetup(model=ModelFile("preisach", FILM), limits=(21.0, 84.0))
+    task = Task("tracking", "closed-loop-inverse", "response")
+    found = start_of(task, str(rig), spec.numbers(setup), spec.tunable)
+    assert (found["close_enough"], found["corrections"], found["arrival"]["tolerance"]) == (6.0, 4, 0.02)
+    # What is given without decimals need not stay a whole number.
+    assert [type(found[name]) for name in ("close_enough", "corrections")] == [float, int]
+    assert found["arrival"]["hold"] == spec.numbers(setup).arrival.hold
+
+
+def test_the_operator_ends_a_search(tmp_path):
+    class Ended:
+        def result(self):
+            raise AbortError("ended by Ctrl-C")
+
+    task = Task("tracking", "closed-loop-inverse", "response")
+    runs = TuningRuns(task, "vo2", ModelFile("preisach", FILM), tmp_path, workers=None, settings={})
+    with pytest.raises(AbortError):
+        runs._trial(NUMBERS, {("as-identified", 0): Ended()})
 
 
 def test_the_best_in_sessions_that_the_search_has_not_seen_is_taken():
@@ -141,6 +204,7 @@ def test_a_search_begins_with_numbers_that_fail_and_leaves_them():
 
 def test_the_cost_is_error_and_time_as_multiples_of_those_before():
     assert cost_of(2.0, 10.0, (4.0, 5.0)) == pytest.approx(0.5 + 0.25 * 2.0)
+    assert cost_of(2.0, 10.0, (4.0, 5.0), time_weight=1.0) == pytest.approx(0.5 + 2.0)
     assert cost_of(math.inf, math.nan, (4.0, 5.0)) == FAILED
     assert put(NUMBERS, "arrival.hold", 1.23456)["arrival"] == {"hold": 1.235}
 

@@ -1,12 +1,14 @@
-"""Trials of `bench tune` on the packaged rigs: controllers with the numbers of today, and with those that were found.
+"""Trials of `bench tune` on the packaged rigs: controllers with constants by hand, today's numbers and tuned ones.
 
     python tests/bench/tuning_trials.py [--case mckibben/length-control ...] [--sessions 5] [--out FOLDER]
 
 Each rig is characterized once. Each controller is tuned for the model, and brings its output to its targets in
-sessions whose noise and targets the tuning has not seen, with the numbers of model and rig file and with those of the
-tuning file. The table, for docs/reference/tuning.md, has median and worst over the sessions of the RMS error, and the
-median of the cost of one run by `bench tune`, as multiples of today's means; then what supply and sensor of a muscle
-leave, and in how many sessions the cost with the tuning file is not greater. Exits with 1 if a median is worse.
+sessions whose noise and targets the tuning has not seen: with the constants by hand (`by_hand`), with the numbers of
+model and rig file, and with those of the tuning file. The table, for docs/reference/tuning.md, has for each of the
+three median and worst of the RMS error over the sessions, and the mean time at a target; then in how many sessions
+the cost of `bench tune` is less with the tuning file than by hand, and what supply and sensor of a muscle leave. Of a
+controller that is given up it has at which target. Exits with 1 if tuned numbers cost no less than those by
+hand in most sessions.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ import math
 import sys
 import tempfile
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,10 +28,13 @@ from rich.console import Console
 
 import bench
 from bench.control.two_stage_inverse import TwoStageInverse
+from bench.errors import ConvergenceError, DataError
+from bench.journal import Record
 from bench.model_file import load_model
+from bench.results.tracking import TargetResults, target_results
 from bench.rig_file import load_rig
 from bench.studies import Campaign, reached_targets
-from bench.tuning.search import cost_of
+from bench.tuning.search import TIME_WEIGHT, cost_of
 from bench.tuning.tune import tune
 from bench.workers import Workers
 from rigs.muscles.identification import (
@@ -40,7 +46,7 @@ from rigs.muscles.identification import (
     read_resting,
     read_series,
 )
-from rigs.muscles.tasks import ForceTask, LengthTask
+from rigs.muscles.tasks import ForceTask, LengthTask, Task
 
 STEP = 0.01
 """Step of the supply of the muscles, V: a thousandth of its 10 V."""
@@ -48,21 +54,63 @@ READINGS = 5
 """Readings at each target of a muscle."""
 UNSEEN = 1000
 """Seed of the first session that no tuning has seen."""
-SEARCHED, ROUNDS = ("count=20",), 1
-"""Settings and rounds of the search: fewer targets than in a session and each number changed once, for the sake of
-time."""
+SEARCHED = ("count=20",)
+"""Settings of the search: fewer targets than in a session, for the sake of time."""
 LOOPS: Mapping[str, Mapping[str, Any]] = {
     "vo2": {"model": "preisach-nonmonotonic", "levels": 20, "plane": (30.0, 70.0)},
     "hybrid": {"model": "preisach", "levels": 20},
 }
 """How the model of a rig is identified from its damped oscillation; that of a muscle comes from three runs."""
 
+BY_HAND: Mapping[str, Mapping[str, Any]] = {
+    "vo2/closed-loop-inverse": {
+        "close_enough": 5.0,
+        "walk_variance": 3.0,
+        "reading_variance": 1.0,
+        "corrections": 3,
+        "arrival": {"tolerance": 0.03},
+    },
+    "vo2/open-loop-inverse": {"wait": 8.0},
+    "hybrid/closed-loop-inverse": {"corrections": 3, "arrival": {"tolerance": 0.1}},
+}
+"""Constants of the controllers before they took their numbers from model and rig file, in the units of the rig."""
+
+
+class WireConstants(NamedTuple):
+    """Constants of length or force control, all found on the SMA wire, before they came from the model of the muscle.
+
+    The integration of a disturbance goes by the ratio of two variances: of the change of the model's error in one
+    period, and of one reading.
+    """
+
+    slope: float
+    ratio: float
+    numbers: Mapping[str, Any] = {
+        "time_constant": 5.0,
+        "power": 2.0,
+        "period": 1.0,
+        "horizon": 2.0,
+        "search": {"steps": 0, "margin": 0},
+    }
+
+
+# Least slope that is believed, m/V or N/V, half of the greatest; 2e-8 m² and a reading of 0.04 mm steps with 0.01 mm
+# of noise; 0.02 N² and 0.02 N of noise.
+WIRE = {
+    LENGTH: WireConstants(1e-3, 2e-8 / (0.04e-3**2 / 12.0 + 0.01e-3**2)),
+    FORCE: WireConstants(5.0, 2e-2 / 4e-4),
+}
+
 
 _CLOSED_LOOP = "closed-loop-inverse"
 
 
 class Case(NamedTuple):
-    """What is tuned: rig, protocol, controller; the signal that counts, and the unit that is printed, in SI."""
+    """What is tuned: rig, protocol, controller; the signal that counts, and the unit that is printed, in SI.
+
+    `seeds` and `checks` are the sessions of each run of the search, and those in which its result is judged;
+    `time_weight` is that of its cost.
+    """
 
     rig: str
     protocol: str
@@ -70,17 +118,23 @@ class Case(NamedTuple):
     signal: str
     unit: str
     size: float = 1.0
+    seeds: int = 2
+    checks: int = 8
+    time_weight: float = TIME_WEIGHT
 
     @property
     def name(self) -> str:
-        return f"{self.rig}/{self.protocol}" + f"/{self.controller}" * (self.controller != _CLOSED_LOOP)
+        controller = f"/{self.controller}" * (self.controller != _CLOSED_LOOP)
+        weight = f"/time-weight-{self.time_weight:g}" * (self.time_weight != TIME_WEIGHT)
+        return f"{self.rig}/{self.protocol}{controller}{weight}"
 
 
 CASES = (
     *(
-        Case("vo2", "tracking", controller, "curvature", "1/m")
+        Case("vo2", "tracking", controller, "curvature", "1/m", seeds=6, checks=16)
         for controller in (_CLOSED_LOOP, "open-loop-inverse", "latched")
     ),
+    Case("vo2", "tracking", _CLOSED_LOOP, "curvature", "1/m", seeds=6, checks=16, time_weight=1.0),
     *(
         case
         for rig in ("sma", "mckibben", "coiled-polymer")
@@ -113,36 +167,98 @@ def characterized(rig: str, folder: Path) -> Path:
     return model
 
 
-def resolution(case: Case, model: Path) -> float:
-    """Return the RMS error that steps of the supply and noise of the sensor leave at a muscle, SI."""
-    if case.protocol == "tracking":
-        return math.nan
+def task_of(case: Case, model: Path) -> tuple[Task, float]:
+    """Return the task of a muscle's controller at `model_error` = 1, and the range of its voltage, V."""
     file = load_model(model)
+    assert file.dynamics is not None
     state = file.model.initial_state()
     kind = {LENGTH: LengthTask, FORCE: ForceTask}[case.signal]
     if kind is LengthTask:
         state, _ = file.model.step(state, state.voltage, load_rig(case.rig).roles["load"].rest)
     low, high = file.model.first.input_range
-    task = kind.of_model(TwoStageInverse(file.model), state, (low, high), file.dynamics.noise, model_error=1.0)
+    inverse = TwoStageInverse(file.model)
+    return kind.of_model(inverse, state, (low, high), file.dynamics.noise, model_error=1.0), high - low
+
+
+def by_hand(case: Case, model: Path) -> Mapping[str, Any]:
+    """Return the constants by hand, a muscle's as multiples of what its controller takes from the model."""
+    if case.protocol == "tracking":
+        # What is not here still stands in the rig file.
+        return (
+            BY_HAND.get(f"{case.rig}/{case.controller}")
+            or load_rig(case.rig).protocols["tracking"]["tuning"][case.controller]
+        )
+    task, _ = task_of(case, model)
+    wire = WIRE[case.signal]
+    walk = math.sqrt(wire.ratio * task.reading_variance / task.walk_variance)
+    return {**wire.numbers, "caution": wire.slope / min(map(abs, task.slopes)), "model_error": walk}
+
+
+def resolution(case: Case, model: Path) -> float:
+    """Return the RMS error that steps of the supply and noise of the sensor leave at a muscle, SI."""
+    if case.protocol == "tracking":
+        return math.nan
+    task, voltage = task_of(case, model)
     # Of the mean slope; the error within a step is uniform.
-    step = abs(task.rise) / (high - low) * STEP
+    step = abs(task.rise) / voltage * STEP
     return math.hypot(step / math.sqrt(12.0), math.sqrt(task.reading_variance / READINGS))
 
 
-def compared(case: Case, model: Path, tuning: str, folder: Path, sessions: int, pool: Workers) -> np.ndarray:
-    """Return RMS error and cost without and with a tuning file, shape (2, sessions, 2)."""
-    runs = []
-    for name, given in (("today", {}), ("tuned", {"tuning": tuning})):
+class Sessions(NamedTuple):
+    """What sessions with one set of numbers gave.
+
+    Attributes
+    ----------
+    values : ndarray, shape (N, 2)
+        RMS error (SI) and seconds at a target; nan where the controller was given up.
+    ended : list of int
+        At which target it was given up, in each of those sessions; 1 is the first.
+    """
+
+    values: np.ndarray
+    ended: list[int]
+
+    def cells(self, size: float) -> list[str]:
+        """Return median and worst error, in units of `size`, and the mean time, for the table."""
+        if self.ended:
+            low, high = min(self.ended), max(self.ended)
+            where = f"target {low}" if low == high else f"targets {low} to {high}"
+            return [f"given up at {where} in {len(self.ended)} of {len(self.values)}", ""]
+        errors = self.values[:, 0] / size
+        return [f"{np.median(errors):.3g} / {errors.max():.3g}", f"{self.values[:, 1].mean():.3g}"]
+
+
+def tried(
+    case: Case, model: Path, tunings: Mapping[str, str], folder: Path, sessions: int, pool: Workers
+) -> list[Sessions]:
+    """Return unseen sessions with each of some tuning files or tables; an empty one is that of the rig file."""
+    runs = {}
+    for name, tuning in tunings.items():
         for seed in range(UNSEEN, UNSEEN + sessions):
-            settings = {"model": str(model), "controller": case.controller, "sequence_seed": str(seed)} | given
-            runs.append(Campaign(case.rig, folder / name, seed, False, pool).start(case.protocol, settings))
-    found = []
-    for run in runs:
-        reached = reached_targets(run.result(), case.signal)
+            settings = {"model": str(model), "controller": case.controller, "sequence_seed": str(seed)}
+            if tuning:
+                settings["tuning"] = tuning
+            campaign = Campaign(case.rig, folder / name / str(seed), seed, False, pool)
+            runs[name, seed] = campaign, campaign.start(case.protocol, settings)
+    found = {name: Sessions(np.full((sessions, 2), math.nan), []) for name in tunings}
+    for (name, seed), (campaign, run) in runs.items():
+        try:
+            reached = reached_targets(run.result(), case.signal)
+        except ConvergenceError:
+            found[name].ended.append(1 + targets_before(campaign.folder, case.signal))
+            continue
         rms = float(np.sqrt(np.mean((reached.outputs - reached.targets) ** 2)))
-        found.append((rms, float(reached.seconds.mean())))
-    scale = np.mean(found[:sessions], axis=0).tolist()
-    return np.array([(rms, cost_of(rms, seconds, scale)) for rms, seconds in found]).reshape(2, sessions, 2)
+        found[name].values[seed - UNSEEN] = rms, float(reached.seconds.mean())
+    return list(found.values())
+
+
+def targets_before(folder: Path, signal: str) -> int:
+    """Return how many targets were reached in the run of a folder, which was ended."""
+    results: TargetResults | None = None
+    for run in folder.iterdir():
+        with suppress(DataError), Record(run) as record:
+            results = target_results(record, signal)
+    return 0 if results is None else len(results.targets)
 
 
 def main() -> int:
@@ -164,23 +280,29 @@ def main() -> int:
             if not tuning.exists():
                 found = tune(
                     model, case.rig, controller=case.controller, protocol=case.protocol, workers=given.workers,
-                    settings=SEARCHED, seeds=1, rounds=ROUNDS, folder=folder / "search", console=shown,
+                    settings=SEARCHED, seeds=case.seeds, checks=case.checks, time_weight=case.time_weight,
+                    folder=folder / "search", console=shown,
                 )  # fmt: skip
                 tuning.write_text(found.text(), encoding="utf-8")
                 (folder / "numbers.json").write_text(json.dumps(found.summary()), encoding="utf-8")
+            tunings = {
+                "by-hand": json.dumps({case.controller: by_hand(case, model)}),
+                "today": "",
+                "tuned": str(tuning),
+            }
             with Workers(given.workers, title=case.name) as pool:
-                today, tuned = compared(case, model, str(tuning), folder, given.sessions, pool)
-            better = int((tuned[:, 1] <= today[:, 1]).sum())
-            worse += float(np.median(tuned[:, 1])) > float(np.median(today[:, 1]))
-            sizes = [each[:, 0] / case.size for each in (today, tuned)]
-            cells = [
-                *(f"{np.median(each):.3g} / {each.max():.3g}" for each in sizes),
-                *(f"{np.median(each[:, 1]):.3f}" for each in (today, tuned)),
-                f"{resolution(case, model) / case.size:.3g}",
+                hand, today, tuned = tried(case, model, tunings, folder, given.sessions, pool)
+            scale = np.nanmean(today.values, axis=0).tolist()
+            costs = [
+                [cost_of(rms, seconds, scale, case.time_weight) for rms, seconds in each.values.tolist()]
+                for each in (hand, tuned)
             ]
+            better = sum(after < before for before, after in zip(*costs, strict=True))
+            worse += not better > given.sessions / 2
+            cells = [cell for each in (hand, today, tuned) for cell in each.cells(case.size)]
+            cells += [f"{better} of {given.sessions}", f"{resolution(case, model) / case.size:.3g}"]
             shown.print(
-                f"| `{case.rig}` | {case.protocol}, {case.controller} | {case.unit} | {' | '.join(cells)} "
-                f"| {better} of {given.sessions} |",
+                f"| `{case.rig}` | {case.protocol}, {case.controller} | {case.unit} | {' | '.join(cells)} |",
                 highlight=False,
                 markup=False,
             )
