@@ -2,7 +2,8 @@
 
 `python docs/renew_selection.py FOLDER 0` measures all cases of seed 0, and keeps each in a file of the folder: a run
 that is stopped goes on there. A case that an earlier state of the code left is measured anew. `--measured` names a
-folder with two measured sessions, identification.csv and validation.csv.
+folder with two measured sessions, identification.csv and validation.csv. `--kind KIND` measures that kind of record
+over all seeds instead.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
+from statistics import median
 
 from renew_measured import put
 
@@ -73,6 +75,16 @@ def table(found: Mapping[tuple[str, str], Outcome]) -> str:
     return f"{rows}\n\nWithin {WITHIN:g} times the best: {within} of {len(found)}."
 
 
+def over_seeds(found: Mapping[str, list[Outcome]]) -> str:
+    """Return a row for each plant: median and greatest ratio over the seeds, and how many are within the bound."""
+    lines = ["| plant | median ratio | greatest | within |", "| --- | --- | --- | --- |"]
+    for plant, each in found.items():
+        ratios = [one.ratio for one in each]
+        within = sum(ratio <= WITHIN for ratio in ratios)
+        lines.append(f"| {plant} | {median(ratios):.2f} | {max(ratios):.2f} | {within} of {len(ratios)} |")
+    return "\n".join(lines)
+
+
 def cell(found: Outcome | None) -> str:
     """Return the errors of default and best by hand and their ratio, bold beyond the bound."""
     if found is None:
@@ -87,13 +99,21 @@ def main() -> None:
     parser.add_argument("folder", type=Path)
     parser.add_argument("seeds", type=int, nargs="*")
     parser.add_argument("--measured", type=Path)
+    parser.add_argument("--kind", choices=KINDS)
     given = parser.parse_args()
+
+    def of_seed(plant: str, kind: str, seed: int) -> Outcome:
+        return outcome(given.folder / str(seed), plant, kind, partial(case, kind, plant, seed))
+
     tables = {}
-    for seed in given.seeds:
-        tables[f"seed {seed}"] = table({
-            (plant, kind): outcome(given.folder / str(seed), plant, kind, partial(case, kind, plant, seed))
-            for plant, kind in CASES
-        })  # fmt: skip
+    if given.kind is not None:
+        plants = [plant for plant, kind in CASES if kind == given.kind]
+        tables[given.kind] = over_seeds(
+            {plant: [of_seed(plant, given.kind, seed) for seed in given.seeds] for plant in plants}
+        )
+    else:
+        for seed in given.seeds:
+            tables[f"seed {seed}"] = table({(plant, kind): of_seed(plant, kind, seed) for plant, kind in CASES})
     if given.measured is not None:
         name = given.measured.name.replace("_", " ")
         tables["measured"] = table({

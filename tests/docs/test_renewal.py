@@ -120,6 +120,16 @@ def test_the_table_of_the_choice_shows_each_ratio_and_counts_those_within_the_bo
     ]
 
 
+def test_the_table_over_seeds_shows_median_and_greatest_ratio(of_docs):
+    outcome = of_docs("selection_quality").Outcome
+    found = [outcome("a", error, "b", 2.0, 3.0, 9.0) for error in (2.0, 5.0, 2.2)]
+    assert of_docs("renew_selection").over_seeds({"duhem": found}).splitlines() == [
+        "| plant | median ratio | greatest | within |",
+        "| --- | --- | --- | --- |",
+        "| duhem | 1.10 | 2.50 | 2 of 3 |",
+    ]
+
+
 def test_a_case_is_measured_once_in_one_state_of_the_code(of_docs, tmp_path, monkeypatch):
     renewal = of_docs("renew_selection")
     measured = []
