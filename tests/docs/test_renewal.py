@@ -124,9 +124,9 @@ def test_the_table_over_seeds_shows_median_and_greatest_ratio(of_docs):
     outcome = of_docs("selection_quality").Outcome
     found = [outcome("a", error, "b", 2.0, 3.0, 9.0) for error in (2.0, 5.0, 2.2)]
     assert of_docs("renew_selection").over_seeds({"duhem": found}).splitlines() == [
-        "| plant | median ratio | greatest | within |",
-        "| --- | --- | --- | --- |",
-        "| duhem | 1.10 | 2.50 | 2 of 3 |",
+        "| plant | median ratio | greatest | within | by a cubic with plays |",
+        "| --- | --- | --- | --- | --- |",
+        "| duhem | 1.10 | 2.50 | 2 of 3 | 1.67 |",
     ]
 
 
