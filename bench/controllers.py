@@ -378,7 +378,7 @@ CLOSED_LOOP_INVERSE = ControllerSpec(
     ),
     adapts=True,
     numbers=_correction,
-    tunable=("corrections", "close_enough", "walk_variance", "arrival.tolerance", "arrival.hold"),
+    tunable=("close_enough", "walk_variance", "arrival.tolerance", "arrival.hold", "corrections"),
 )
 LATCHED = ControllerSpec(
     "backs off at the target, where the hysteresis holds the output",
