@@ -34,7 +34,7 @@ from bench.model_file import load_model
 from bench.results.tracking import TargetResults, target_results
 from bench.rig_file import load_rig
 from bench.studies import Campaign, reached_targets
-from bench.tuning.search import TIME_WEIGHT, cost_of
+from bench.tuning.search import cost_of
 from bench.tuning.tune import tune
 from bench.workers import Workers
 from rigs.muscles.identification import (
@@ -63,15 +63,15 @@ LOOPS: Mapping[str, Mapping[str, Any]] = {
 """How the model of a rig is identified from its damped oscillation; that of a muscle comes from three runs."""
 
 BY_HAND: Mapping[str, Mapping[str, Any]] = {
-    "vo2/closed-loop-inverse": {
+    "vo2/tracking": {
         "close_enough": 5.0,
         "walk_variance": 3.0,
         "reading_variance": 1.0,
         "corrections": 3,
         "arrival": {"tolerance": 0.03},
     },
-    "vo2/open-loop-inverse": {"wait": 8.0},
-    "hybrid/closed-loop-inverse": {"corrections": 3, "arrival": {"tolerance": 0.1}},
+    "vo2/tracking/open-loop-inverse": {"wait": 8.0},
+    "hybrid/tracking": {"corrections": 3, "arrival": {"tolerance": 0.1}},
 }
 """Constants of the controllers before they took their numbers from model and rig file, in the units of the rig."""
 
@@ -108,8 +108,7 @@ _CLOSED_LOOP = "closed-loop-inverse"
 class Case(NamedTuple):
     """What is tuned: rig, protocol, controller; the signal that counts, and the unit that is printed, in SI.
 
-    `seeds` and `checks` are the sessions of each run of the search, and those in which its result is judged;
-    `time_weight` is that of its cost.
+    `seeds` and `checks` are the sessions of each run of the search, and those in which its result is judged.
     """
 
     rig: str
@@ -120,21 +119,17 @@ class Case(NamedTuple):
     size: float = 1.0
     seeds: int = 2
     checks: int = 8
-    time_weight: float = TIME_WEIGHT
 
     @property
     def name(self) -> str:
-        controller = f"/{self.controller}" * (self.controller != _CLOSED_LOOP)
-        weight = f"/time-weight-{self.time_weight:g}" * (self.time_weight != TIME_WEIGHT)
-        return f"{self.rig}/{self.protocol}{controller}{weight}"
+        return f"{self.rig}/{self.protocol}" + f"/{self.controller}" * (self.controller != _CLOSED_LOOP)
 
 
 CASES = (
     *(
         Case("vo2", "tracking", controller, "curvature", "1/m", seeds=6, checks=16)
-        for controller in (_CLOSED_LOOP, "open-loop-inverse", "latched")
+        for controller in (_CLOSED_LOOP, "open-loop-inverse")
     ),
-    Case("vo2", "tracking", _CLOSED_LOOP, "curvature", "1/m", seeds=6, checks=16, time_weight=1.0),
     *(
         case
         for rig in ("sma", "mckibben", "coiled-polymer")
@@ -183,11 +178,7 @@ def task_of(case: Case, model: Path) -> tuple[Task, float]:
 def by_hand(case: Case, model: Path) -> Mapping[str, Any]:
     """Return the constants by hand, a muscle's as multiples of what its controller takes from the model."""
     if case.protocol == "tracking":
-        # What is not here still stands in the rig file.
-        return (
-            BY_HAND.get(f"{case.rig}/{case.controller}")
-            or load_rig(case.rig).protocols["tracking"]["tuning"][case.controller]
-        )
+        return BY_HAND[case.name]
     task, _ = task_of(case, model)
     wire = WIRE[case.signal]
     walk = math.sqrt(wire.ratio * task.reading_variance / task.walk_variance)
@@ -267,8 +258,7 @@ def found_numbers(case: Case, model: Path, folder: Path, workers: int | None, co
     if not tuning.exists():
         found = tune(
             model, case.rig, controller=case.controller, protocol=case.protocol, workers=workers, settings=SEARCHED,
-            seeds=case.seeds, checks=case.checks, time_weight=case.time_weight, folder=folder / "search",
-            console=console,
+            seeds=case.seeds, checks=case.checks, folder=folder / "search", console=console,
         )  # fmt: skip
         tuning.write_text(found.text(), encoding="utf-8")
         (folder / "numbers.json").write_text(json.dumps(found.summary()), encoding="utf-8")
@@ -300,7 +290,7 @@ def main() -> int:
                 hand, today, tuned = tried(case, model, tunings, folder, given.sessions, pool)
             scale = np.nanmean(today.values, axis=0).tolist()
             before, after = (
-                np.array([cost_of(rms, seconds, scale, case.time_weight) for rms, seconds in each.values.tolist()])
+                np.array([cost_of(rms, seconds, scale) for rms, seconds in each.values.tolist()])
                 for each in (hand, tuned)
             )
             worse += int((after > before).sum()) > given.sessions / 2
