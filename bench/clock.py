@@ -10,7 +10,6 @@ emulated ones that other processes use, run by themselves: on the wall clock or 
 from __future__ import annotations
 
 import math
-import threading
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
@@ -216,7 +215,6 @@ class VirtualClock(Clock):
         super().__init__()
         self.epoch = VIRTUAL_EPOCH
         self._now = 0.0
-        self._lock = threading.Lock()
 
     def now(self) -> float:
         """Return laboratory seconds since the clock was made."""
@@ -230,8 +228,7 @@ class VirtualClock(Clock):
     def sleep(self, seconds: float) -> None:
         """Jump ahead."""
         if 0.0 < seconds < _FOREVER:
-            with self._lock:
-                self._now += seconds
+            self._now += seconds
         else:
             _check_finite(seconds)
 
@@ -239,9 +236,8 @@ class VirtualClock(Clock):
         """Jump to `instant` exactly, free of the rounding that adding up differences would bring."""
         if not -math.inf < instant < math.inf:
             _check_finite(instant)
-        with self._lock:
-            if instant > self._now:
-                self._now = instant
+        if instant > self._now:
+            self._now = instant
 
 
 @dataclass(frozen=True)

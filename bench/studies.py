@@ -9,7 +9,7 @@ import itertools
 import tomllib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec
 
@@ -56,6 +56,8 @@ class Campaign:
         Who carries the runs out, and draws the figures.
     figure_format : {"png", "pdf", "svg"}
         Of the figures.
+    records : bool
+        Whether to make recordings.
     started : list of Pending
         The runs that were started so far, in the parts of this campaign as well.
     """
@@ -66,7 +68,9 @@ class Campaign:
     live: bool
     workers: Workers
     figure_format: str = "png"
+    records: bool = True
     started: list[Pending[RunResult]] = field(default_factory=list)
+    _recordings: dict[Path, Pending[list[Path]]] = field(default_factory=dict)
     _seeds: Iterator[int] = field(init=False)
     _whole: Campaign | None = None
 
@@ -76,7 +80,7 @@ class Campaign:
 
     def part(self, name: str, rig: str) -> Campaign:
         """Return a campaign on another rig, in a folder of its own below this one."""
-        return Campaign(rig, self.folder / name, self.seed, self.live, self.workers, self.figure_format, _whole=self)
+        return replace(self, rig=rig, folder=self.folder / name, started=[], _whole=self)
 
     @property
     def runs(self) -> list[RunResult]:
@@ -119,6 +123,27 @@ class Campaign:
         """Carry out one protocol and wait for its end; see `start`."""
         return self.start(protocol, settings, overrides).result()
 
+    def conclude(self, run: Pending[RunResult]) -> RunResult:
+        """Wait for the end of a run to which nothing will be added, and have its recording made.
+
+        Raises what its `result()` raises, see `start`.
+        """
+        # Here, as it takes a while to load and `bench list` reads the studies' names.
+        from bench.results.export import export_run
+
+        result = run.result()
+        folder = result.folder
+        if self.records and folder not in self._recordings:
+            self._recordings[folder] = self.workers.submit_aside(
+                f"recording of {folder.name}", export_run, folder, "rrd", None
+            )
+        return result
+
+    def recordings(self) -> list[Path]:
+        """Conclude all runs that were started; return their recordings, in the order of the runs."""
+        folders = [self.conclude(run).folder for run in self.started]
+        return [self._recordings[folder].result()[0] for folder in folders] if self.records else []
+
     def draw(self, name: str, plot: Callable[Concatenate[Path, P], None], *given: P.args, **named: P.kwargs) -> Path:
         """Have a figure drawn beside what goes on; return its file.
 
@@ -132,7 +157,7 @@ class Campaign:
             Its other arguments; can be pickled.
         """
         path = self.folder / "figures" / f"{name}.{self.figure_format}"
-        self.workers.submit_as(f"figure {name}", plot, path, *given, **named)
+        self.workers.submit_aside(f"figure {name}", plot, path, *given, **named)
         return path
 
 
@@ -330,20 +355,14 @@ def reproduce(
     except MissingExtraError as error:
         print_plain(console, f"no recordings: {error}")
         recorded = False
-    from bench.results.export import export_run
     from bench.workers import Workers
 
     stopwatch = Stopwatch()
     folder = out / f"reproduce-{name}-seed-{seed}"
     with Workers(1 if live else workers, console, name) as pool:
-        campaign = Campaign(rig or study.rig or "", folder, seed, live, pool, figure_format)
+        campaign = Campaign(rig or study.rig or "", folder, seed, live, pool, figure_format, recorded)
         found = study.carry_out(campaign)
-        exports = [
-            pool.submit_as(f"recording of {run.folder.name}", export_run, run.folder, "rrd", None)
-            for run in campaign.runs
-            if recorded
-        ]
-        recordings = [export.result()[0] for export in exports]
+        recordings = campaign.recordings()
     values = {
         "seed": seed,
         **found.values,

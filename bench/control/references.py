@@ -137,6 +137,12 @@ class SmoothMoves:
         # A move takes its time at top speed and one blend.
         ends = np.cumsum(np.abs(moves) / speed + blend + hold)
         self._starts: list[float] = [0.0, *ends.tolist()[:-1]]
+        cruises = [cruise / blend for cruise in self._cruises]
+        rises = [each * blend for each in self._speeds]
+        # Of each move: start, time at top speed in blends, places before and behind, rise in a blend at top speed.
+        self._moves: list[tuple[float, float, float, float, float]] = list(
+            zip(self._starts, cruises, self._places, self._places[1:], rises, strict=False)
+        )
         self.duration = float(ends[-1])
         """Time to the end of the last hold, s."""
 
@@ -147,14 +153,13 @@ class SmoothMoves:
     def __call__(self, t: float) -> float:
         """Return the position at a time (s), output units; it rests before the start and after the end."""
         # As `_move` and `_blended` do, without their calls: a fast loop asks several times for each sample.
-        k = bisect_right(self._starts, t, 1) - 1
-        blend = self._blend
-        x, cruise = (t - self._starts[k]) / blend, self._cruises[k] / blend
+        start, cruise, before, behind, rise = self._moves[bisect_right(self._starts, t, 1) - 1]
+        x = (t - start) / self._blend
         if x >= cruise + 1.0:
-            return self._places[k + 1]
+            return behind
         begun = x - 0.5 if x >= 1.0 else _blended(x)
         ended = _blended(x - cruise) if x > cruise else 0.0
-        return self._places[k] + self._speeds[k] * blend * (begun - ended)
+        return before + rise * (begun - ended)
 
     def rate(self, t: float) -> float:
         """Return the speed at a time (s), output units per second."""

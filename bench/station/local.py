@@ -111,7 +111,11 @@ class LocalStation(Station):
         def move(setpoints: Sequence[float]) -> None:
             if core.over:
                 core.raise_if_over()
-            changed = [each for each in zip(devices, setpoints, strict=True) if each[1] != each[0].setpoint]
+            changed = []
+            # A comprehension would be one call more.
+            for each in zip(devices, setpoints, strict=True):
+                if each[1] != each[0].setpoint:
+                    changed.append(each)
             # None is sent when another is wrong; of one alone `set` sees it by itself.
             if len(changed) > 1:
                 for actuator, value in changed:

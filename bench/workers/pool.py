@@ -34,6 +34,9 @@ _UNFINISHED = 40.0
 _LOOK = 0.5
 """Longest wait, s, during which Windows would not hear Ctrl-C."""
 
+_WORTH_LOADING = 4
+"""Tasks aside from which on a worker loads what they take, although another one has."""
+
 _ENDING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
 
 _ONE_THREAD = dict.fromkeys(
@@ -51,12 +54,21 @@ def available_cores() -> int:
 class Pending(Generic[T]):
     """The result of a task, sooner or later."""
 
-    def __init__(self, workers: Workers, number: int, name: str, call: Callable[[], T], order: Order | None) -> None:
+    def __init__(
+        self,
+        workers: Workers,
+        number: int,
+        name: str,
+        call: Callable[[], T],
+        order: Order | None,
+        queue: deque[Pending[Any]],
+    ) -> None:
         self.name = name
         self._workers = workers
         self._number = number
         self._call = call
         self._order = order
+        self._queue = queue
         self._deaths = 0
         self._is_done = False
         self._was_asked = False
@@ -75,7 +87,7 @@ class Pending(Generic[T]):
         return self._error
 
     def hurry(self) -> None:
-        """Have the task begun before all others that wait, as others depend on its result."""
+        """Have the task begun before all others of its kind that wait, as others depend on its result."""
         self._workers._put_first(self)
 
     def result(self) -> T:
@@ -122,6 +134,7 @@ class Workers:
         self._changed = threading.Condition()
         self._tasks: list[Pending[Any]] = []
         self._queue: deque[Pending[Any]] = deque()
+        self._aside: deque[Pending[Any]] = deque()
         self._threads: list[threading.Thread] = []
         self._processes: set[subprocess.Popen[bytes]] = set()
         self._free = 0
@@ -178,19 +191,34 @@ class Workers:
         TypeError, AttributeError, pickle.PicklingError
             If function or arguments cannot be sent to a worker process.
         """
+        return self._submit(self._queue, name, partial(function, *arguments, **keywords))
+
+    def submit_aside(
+        self, name: str, function: Callable[P, T], *arguments: P.args, **keywords: P.kwargs
+    ) -> Pending[T]:
+        """Have a function called that nobody waits for; parameters and errors are those of `submit_as`.
+
+        One of the workers carries such tasks out before all others, and the rest only if nothing else is left and
+        several of them wait: what they load takes as long as several of them.
+        """
+        return self._submit(self._aside, name, partial(function, *arguments, **keywords))
+
+    def _submit(self, queue: deque[Pending[Any]], name: str, call: partial[T]) -> Pending[T]:
         order = None
         if not self.in_process:
-            if getattr(function, "__module__", "") == "__main__":
-                raise TypeError(f"{name}: a worker process cannot import {function!r}; put it into a module")
-            order = Order.of(function, arguments, keywords)
-        task = Pending(self, len(self._tasks), name, partial(function, *arguments, **keywords), order)
+            if getattr(call.func, "__module__", "") == "__main__":
+                raise TypeError(f"{name}: a worker process cannot import {call.func!r}; put it into a module")
+            order = Order.of(call.func, call.args, call.keywords)
+        task = Pending(self, len(self._tasks), name, call, order, queue)
         with self._changed:
             self._tasks.append(task)
-            self._queue.append(task)
+            queue.append(task)
             self._changed.notify_all()
-            if not self.in_process and len(self._queue) > self._free and len(self._threads) < self.number:
+            waiting = len(self._queue) + len(self._aside)
+            if not self.in_process and waiting > self._free and len(self._threads) < self.number:
                 self._free += 1
-                self._threads.append(threading.Thread(target=self._serve, name=f"worker-{len(self._threads)}"))
+                number = len(self._threads)
+                self._threads.append(threading.Thread(target=self._serve, args=(number,), name=f"worker-{number}"))
                 self._threads[-1].start()
         self._display.add()
         return task
@@ -215,14 +243,14 @@ class Workers:
 
     def _put_first(self, task: Pending[Any]) -> None:
         with self._changed:
-            if task in self._queue:
-                self._queue.remove(task)
-                self._queue.appendleft(task)
+            if task in task._queue:
+                task._queue.remove(task)
+                task._queue.appendleft(task)
 
     def _wait_for(self, task: Pending[Any]) -> None:
         if self.in_process:
             while not task.done:
-                self._carry_out_here(self._queue.popleft())
+                self._carry_out_here((self._queue or self._aside).popleft())
         with self._changed:
             while not task.done:
                 self._changed.wait(_LOOK)
@@ -236,10 +264,10 @@ class Workers:
             task._error = error
         task._is_done = True
 
-    def _serve(self) -> None:
+    def _serve(self, number: int) -> None:
         """Have one worker process carry out task after task; another if it dies."""
         worker: _Worker | None = None
-        while (task := self._take()) is not None:
+        while (task := self._take(number)) is not None:
             self._display.begin(task._number, task.name)
             try:
                 worker = worker or self._start_worker()
@@ -261,22 +289,30 @@ class Workers:
                 raise EOFError("the end of all workers")
             return _Worker(Welcome(sys.argv, self._console.width), self._processes)
 
-    def _take(self) -> Pending[Any] | None:
-        """Return the next task, when there is one; None at the end."""
+    def _take(self, number: int) -> Pending[Any] | None:
+        """Return the next task of a worker, when there is one; None at the end."""
         with self._changed:
-            while not self._queue and not self._is_closing:
+            while (queue := self._next_queue(number)) is None and not self._is_closing:
                 self._changed.wait()
-            if self._is_closing:
+            if queue is None or self._is_closing:
                 return None
             self._free -= 1
-            return self._queue.popleft()
+            return queue.popleft()
+
+    def _next_queue(self, number: int) -> deque[Pending[Any]] | None:
+        """Return where the next task of a worker is; the first worker has those aside in front."""
+        if self._aside and number == 0:
+            return self._aside
+        if self._queue:
+            return self._queue
+        return self._aside if len(self._aside) >= _WORTH_LOADING else None
 
     def _mourn(self, task: Pending[Any], cause: object) -> bool:
         """Have the task of a dead worker process done again; return whether it has failed instead."""
         with self._changed:
             task._deaths += 1
             if task._deaths < ATTEMPTS and not self._is_closing:
-                self._queue.appendleft(task)
+                task._queue.appendleft(task)
                 self._free += 1
                 self._changed.notify_all()
                 return False

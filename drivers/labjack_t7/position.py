@@ -111,6 +111,8 @@ class T7PositionSensor(T7InputDevice[T7PositionSettings], PositionSensor):
     def __init__(self, name: str, settings: T7PositionSettings, clock: Clock, line: LabJackT7) -> None:
         super().__init__(name, settings, clock, line)
         self._signal = f"{name}_position"
+        self._readout, self._position_limits = settings.readout, settings.position_limits
+        self._zero_volts, self._volts_per_metre = settings.zero_volts, settings.volts_per_metre
 
     def safe(self) -> None:
         """Do nothing: a sensor is safe in any state."""
@@ -121,14 +123,13 @@ class T7PositionSensor(T7InputDevice[T7PositionSettings], PositionSensor):
         return values
 
     def _put(self, values: dict[str, float], voltages: Sequence[float], begin: int) -> None:
-        settings = self._settings
-        if settings.readout == "voltage":
-            position = (voltages[begin] - settings.zero_volts) / settings.volts_per_metre
-        elif settings.readout == "currents":
+        if self._readout == "voltage":
+            position = (voltages[begin] - self._zero_volts) / self._volts_per_metre
+        elif self._readout == "currents":
             position = self._from_currents(*voltages[begin : begin + 2])
         else:
             position = self._from_ratio(*voltages[begin : begin + 2])
-        low, high = settings.position_limits
+        low, high = self._position_limits
         if not low <= position <= high:
             raise DeviceError(
                 self.name,

@@ -83,7 +83,7 @@ class TECLine:
     def __init__(self, device: str, settings: TECLineSettings) -> None:
         self._device = device
         self._settings = settings
-        self._begin = b"#%02X" % settings.address
+        self._begin = f"#{settings.address:02X}"
         self._sequence = 0
         self._most_resends = RESENDS
         self.repeats = 0
@@ -136,13 +136,15 @@ class TECLine:
 
     def _exchange(self, request: str, digits: int, resends: int = RESENDS) -> bytes:
         sequence = self._sequence = (self._sequence + 1) & 0xFFFF
-        body = b"%b%04X%b" % (self._begin, sequence, request.encode("ascii"))
+        body = f"{self._begin}{sequence:04X}{request}".encode("ascii")
         end = b"%04X\r" % crc_hqx(body, 0)
         frame, head = body + end, b"!" + body[1:7]
-        resends = min(resends, self._most_resends)
+        if resends > self._most_resends:
+            resends = self._most_resends
         try:
             for attempt in range(1 + resends):
-                self.repeats += attempt > 0
+                if attempt:
+                    self.repeats += 1
                 answer = self._swap(frame)
                 if len(answer) == _ACKNOWLEDGE_LENGTH + digits and answer.startswith(head) and not self._received:
                     # A good answer that is all there is, as it mostly is on an emulated line.

@@ -201,8 +201,7 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         self._measured = Block(settings.channel, _OBJECT_TEMPERATURE, _SINK_TEMPERATURE, _CURRENT, _VOLTAGE, _STATUS)
         self._names = tuple(signal.name for signal in self.signals)
         self._sent = Status.completed(name, clock)
-        self._limits: dict[TECMode, Limits] = {}
-        """Those of the modes so far, as each set-point is compared with them."""
+        self._limits = self._limits_of(settings.mode)
 
     @classmethod
     def _open_line(cls, name: str, settings: TECSettings, clock: Clock) -> TECLine:  # noqa: ARG003
@@ -224,27 +223,25 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         self._write(_LIVE_CURRENT, 0.0)
         self._configured[_INPUT] = _CONTROLLER_INPUT if mode is TECMode.TEMPERATURE else _LIVE_INPUT
         self._write(_INPUT, self._configured[_INPUT])
-        self._mode = mode
+        self._mode, self._limits = mode, self._limits_of(mode)
         self._setpoint = math.nan
 
     @property
     def limits(self) -> Limits:
         """The allowed set-points: the settings' `temperature_limits` in °C, or ± `current_limit` in A."""
-        limits = self._limits.get(self._mode)
-        if limits is None:
-            if self._mode is TECMode.TEMPERATURE:
-                limits = Limits(*self._settings.temperature_limits, "°C")
-            else:
-                limits = Limits(-self._settings.current_limit, self._settings.current_limit, "A")
-            self._limits[self._mode] = limits
-        return limits
+        return self._limits
+
+    def _limits_of(self, mode: TECMode) -> Limits:
+        if mode is TECMode.TEMPERATURE:
+            return Limits(*self._settings.temperature_limits, "°C")
+        return Limits(-self._settings.current_limit, self._settings.current_limit, "A")
 
     def set(self, value: float) -> Status:
         """Control the object temperature in °C or the current in A, by mode; switches the output on if it is off.
 
         The status completes when the device reports the temperature stable; at once in current mode.
         """
-        limits = self.limits
+        limits = self._limits
         if not limits.low <= value <= limits.high:
             self.check(value)
         if self._on:

@@ -278,19 +278,20 @@ def _carry_out(campaign: Campaign) -> StudyResult:
     sweep_run = campaign.start("calibration-displacement", {"sweeps": "1"}, rig=WITNESSED)
     # A long run needs its result; left to the end, it would go on alone.
     sweep_run.hurry()
-    runs = _Runs(*(run.result() for run in started))
+    runs = _Runs(*(campaign.conclude(run) for run in started))
     figures = list(_draw_models(campaign, found, runs))
-    calibration = _calibrated(sweep_run.result().folder)
+    calibration = _calibrated(campaign.conclude(sweep_run).folder)
     calibrated = calibrated_rig(campaign.folder, calibration, WITNESSED)
     calibrated_run = _start(campaign, model, {"controller": "hybrid", "hold": f"{HOLD:g}"}, rig=calibrated)
     calibrated_run.hurry()
     sensor = displacement_characteristic(WITNESSED)
-    moves = {name: tracked(run.result().folder, sensor) for name, run in tracking_runs.items()}
+    moves = {name: tracked(campaign.conclude(run).folder, sensor) for name, run in tracking_runs.items()}
+    calibrated_moves = tracked(campaign.conclude(calibrated_run).folder, sensor, calibration)
     figures += _draw_control(campaign, moves)
-    references = {name: tracked(run.result().folder, sensor) for name, run in reference_runs.items()}
-    thermal = tracked(thermal_run.result().folder, sensor).shown
-    room = tracked(room_run.result().folder, sensor).measures(after=ROOM_STEP_TIME)
-    fine = {name: fine_step(run.result().folder, sensor) for name, run in fine_runs.items()}
+    thermal = tracked(campaign.conclude(thermal_run).folder, sensor).shown
+    references = {name: tracked(campaign.conclude(run).folder, sensor) for name, run in reference_runs.items()}
+    room = tracked(campaign.conclude(room_run).folder, sensor).measures(after=ROOM_STEP_TIME)
+    fine = {name: fine_step(campaign.conclude(run).folder, sensor) for name, run in fine_runs.items()}
 
     values: dict[str, Any] = {
         "geometry": dict(
@@ -310,7 +311,7 @@ def _carry_out(campaign: Campaign) -> StudyResult:
         "whole": _validate(found, runs.whole),
         "control": _control(moves["hybrid"], fine),
         "controllers": {name: each.summary() for name, each in moves.items()},
-        "calibrated": tracked(calibrated_run.result().folder, sensor, calibration).summary(),
+        "calibrated": calibrated_moves.summary(),
         "calibration": {
             "accuracy_nm": calibration.uncertainty * 1e9,
             "repeatability_nm": calibration.repeatability * 1e9,

@@ -218,8 +218,10 @@ class HybridCantilever(CooledPlant[HybridParameters]):
         ValueError
             If the voltage is out of range.
         """
-        self._check_voltage(start)
-        self._check_voltage(target)
+        highest = self._parameters.maximum_voltage
+        if not (-highest <= start <= highest and -highest <= target <= highest):
+            self._check_voltage(start)
+            self._check_voltage(target)
         self._elapsed = kernels.lead_voltage(start, target, steps, time_constant, self._elapsed, self._numbers)
         self._is_led, self._passed = steps > 0, 0.0
 

@@ -67,6 +67,24 @@ def test_a_task_in_a_hurry_is_begun_before_all_that_wait(text):
     assert begun == ["third", "first", "second"]
 
 
+def test_what_is_aside_comes_first_for_one_worker_and_last_for_one_alone(workers):
+    tasks = [workers.submit(worker_tasks.process, value) for value in range(20)]
+    aside = [workers.submit_aside("aside", worker_tasks.process, value) for value in range(3)]
+    assert len({task.result()[1] for task in aside}) == 1
+    assert {task.result()[0] for task in tasks} == set(range(20))
+    begun = []
+    with Workers(1) as alone:
+        alone.submit_aside("aside", begun.append, "aside")
+        alone.submit(begun.append, "task")
+    assert begun == ["task", "aside"]
+
+
+def test_much_that_is_aside_is_for_all_workers(workers, tmp_path):
+    # One alone would wait for ever.
+    for task in [workers.submit_aside("aside", worker_tasks.meet, tmp_path) for _ in range(5)]:
+        task.result()
+
+
 def test_results_come_in_the_order_in_which_they_are_taken_from_processes_that_go_on(workers):
     tasks = [workers.submit(worker_tasks.process, value) for value in range(20)]
     results = [task.result() for task in tasks]

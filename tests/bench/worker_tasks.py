@@ -53,6 +53,13 @@ def wait(folder):
     threading.Event().wait()
 
 
+def meet(folder):
+    """Wait until two processes are here."""
+    Path(folder, str(os.getpid())).touch()
+    while len(list(Path(folder).iterdir())) < 2:
+        threading.Event().wait(0.01)
+
+
 def run(folder):
     """Carry out a run of hours."""
     run = Run(
