@@ -114,15 +114,31 @@ def identify_actuator(recordings: Sequence[Recording], longest: float = LONGEST_
 
     parts = [_Part(each, min(longest, float(each.times[-1]))) for each in recordings]
     slow = _time_scale(recordings)
-    measured = np.concatenate([part.driven for part in parts])
     weights = np.concatenate([part.weights for part in parts])
 
-    def fitted(dynamics: ActuatorDynamics) -> tuple[Floats, float, float]:
+    def at_rest(positions: Sequence[Floats], of: Sequence[_Part]) -> tuple[Floats, float, float]:
         """Return what is left over, weighted, with gain and offset."""
-        positions = np.concatenate([part.positions(dynamics) for part in parts])
-        columns = weights[:, None] * np.column_stack([positions, np.ones(positions.size)])
-        (gain, offset), *_ = np.linalg.lstsq(columns, weights * measured, rcond=None)
-        return weights * measured - columns @ (gain, offset), float(gain), float(offset)
+        weights = np.concatenate([part.weights for part in of])
+        placed = np.concatenate(positions)
+        columns = weights[:, None] * np.column_stack([placed, np.ones(placed.size)])
+        measured = weights * np.concatenate([part.driven for part in of])
+        (gain, offset), *_ = np.linalg.lstsq(columns, measured, rcond=None)
+        return measured - columns @ (gain, offset), float(gain), float(offset)
+
+    def fitted(dynamics: ActuatorDynamics) -> tuple[Floats, float, float]:
+        """Return what is left over, weighted, with gain and offset over all runs.
+
+        What a sensor reads wrongly from run to run is no dynamics: each of several runs has a gain and an offset of
+        its own, from which follows, too, where its drive began.
+        """
+        positions = [part.positions(dynamics) for part in parts]
+        left, gain, offset = at_rest(positions, parts)
+        if len(parts) > 1:
+            own = [at_rest([each], [part])[1:] for each, part in zip(positions, parts, strict=True)]
+            begun = [replace(dynamics, gain=each[0], offset=each[1]) for each in own]
+            positions = [part.positions(each) for part, each in zip(parts, begun, strict=True)]
+            left = np.concatenate([at_rest([each], [part])[0] for each, part in zip(positions, parts, strict=True)])
+        return left, gain, offset
 
     def dynamics_of(names: Sequence[str], values: Floats) -> ActuatorDynamics:
         numbers = {
