@@ -34,6 +34,8 @@ _SIZE = 1e-3
 """Weight of the size of the density, against its roughness."""
 _PENALTIES = 10.0 ** np.arange(-7.0, 1.0)
 """Penalties that cross-validation tries, relative to the mean square of the columns."""
+_EDGES = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
+"""How many levels of either end of the plane may hold no hysterons, as cross-validation tries."""
 _FOLDS = 5
 _BLOCK = 40
 """Folds of the cross-validation, and rows that stay together in it."""
@@ -87,46 +89,78 @@ def identify_correction(
         input_unit=model.input_unit,
         output_unit=model.output_unit,
     )
-    nodes, roughness = _smooth_densities(levels)
-    parts = []
-    for each, kept in zip(inputs, np.split(chosen, np.cumsum([each.size for each in inputs])[:-1]), strict=True):
-        cells = template.regressor(each).dense()[kept]
-        parts.append(np.column_stack([nodes.T.dot(cells.T).T, np.ones(cells.shape[0]), cells @ own]))
-    columns, taken = np.split(np.concatenate(parts), [-1], axis=1)
+    rows = np.split(chosen, np.cumsum([each.size for each in inputs])[:-1])
+    cells = np.concatenate([template.regressor(each).dense()[kept] for each, kept in zip(inputs, rows, strict=True)])
     target = errors[chosen]
     # Beside the density of the model, and in place of it if it has one.
     replaced = [np.zeros(own.size), *([own] if own.any() else [])]
-    targets = np.column_stack([target, target + taken[:, 0]])[:, : len(replaced)]
-    penalty = np.zeros((columns.shape[1],) * 2)
-    penalty[:-1, :-1] = roughness * (float(np.mean(columns[:, :-1] ** 2)) * target.size or 1.0)
+    targets = np.column_stack([target + cells @ each for each in replaced])
     # Of matrices of this size, threads that wait for each other cost more than they save.
     with one_thread():
-        unknown = _held_out(columns, targets, penalty)
-    losses = np.sum(unknown**2, axis=1)
-    weight, which = (int(each) for each in np.unravel_index(np.argmin(losses), losses.shape))
-    if losses[weight, which] >= float(target @ target):
+        problem = _problem(levels, cells)
+        unknown = _held_out(*problem[1:], targets, _PENALTIES)
+        best = np.argmin(np.sum(unknown**2, axis=1), axis=0)
+        weights = _PENALTIES[best]
+        options = [(unknown[best[0], :, 0], problem)]
+        if own.any():
+            problem = _problem(levels, cells, _saturated(levels, cells, targets[:, [1]], weights[[1]]))
+            options.append((_held_out(*problem[1:], targets[:, [1]], weights[[1]])[0, :, 0], problem))
+    losses = [float(missed @ missed) for missed, _ in options]
+    which = int(np.argmin(losses))
+    if losses[which] >= float(target @ target):
         return Correction(None, float(np.sqrt(np.mean(target**2))), target)
-    gram, right = columns.T @ columns + _PENALTIES[weight] * penalty, columns.T @ targets[:, which]
+    missed, (nodes, columns, penalty) = options[which]
+    gram, right = columns.T @ columns + weights[which] * penalty, columns.T @ targets[:, which]
     # What takes the place of a density that is nowhere negative is so too.
     bounded = which == 1 and own.min() >= 0.0
     solution = _not_negative(gram, right) if bounded else np.asarray(np.linalg.solve(gram, right))
     left = targets[:, which] - columns @ solution
     operator = template.with_coefficients(nodes @ solution[:-1] - replaced[which], float(solution[-1]))
-    return Correction(operator, float(np.sqrt(np.mean(left**2))), unknown[weight, :, which])
+    return Correction(operator, float(np.sqrt(np.mean(left**2))), missed)
 
 
-def _held_out(columns: Floats, targets: Floats, penalty: Floats) -> Floats:
-    """Return the errors of cross-validation, by penalty, row and target."""
+def _problem(
+    levels: Floats, cells: Floats, saturated: tuple[float, float] = (0.0, 0.0)
+) -> tuple[csr_array, Floats, Floats]:
+    """Return what each node adds to the density of each cell, and to each row, and the penalty of all unknowns.
+
+    The last unknown is a constant. `saturated` is as `_saturated` returns it.
+    """
+    nodes, roughness = _smooth_densities(levels, saturated)
+    columns = np.column_stack([nodes.T.dot(cells.T).T, np.ones(cells.shape[0])])
+    penalty = np.zeros((columns.shape[1],) * 2)
+    penalty[:-1, :-1] = roughness * (float(np.mean(columns[:, :-1] ** 2)) * cells.shape[0] or 1.0)
+    return nodes, columns, penalty
+
+
+def _saturated(levels: Floats, cells: Floats, target: Floats, weight: Floats) -> tuple[float, float]:
+    """Return how many levels from the lower and the upper end of the plane hold no hysterons, by held-out errors.
+
+    There the density ends at once, which no smooth one does.
+    """
+    found = [0.0, 0.0]
+    for end in (0, 1):
+        losses = []
+        for edge in _EDGES:
+            found[end] = edge
+            _, columns, penalty = _problem(levels, cells, (found[0], found[1]))
+            losses.append(float(np.sum(_held_out(columns, penalty, target, weight) ** 2)))
+        found[end] = _EDGES[int(np.argmin(losses))]
+    return found[0], found[1]
+
+
+def _held_out(columns: Floats, penalty: Floats, targets: Floats, weights: Floats) -> Floats:
+    """Return the errors of cross-validation, by weight of the penalty, row and target."""
     from scipy.linalg import solve
 
     gram, right = columns.T @ columns, columns.T @ targets
     folds = (np.arange(targets.shape[0]) // _BLOCK) % _FOLDS
-    unknown = np.zeros((_PENALTIES.size, *targets.shape))
+    unknown = np.zeros((weights.size, *targets.shape))
     for fold in range(_FOLDS):
         out = folds == fold
         held = columns[out]
         kept, sums = gram - held.T @ held, right - held.T @ targets[out]
-        for number, weight in enumerate(_PENALTIES):
+        for number, weight in enumerate(weights):
             unknown[number, out] = targets[out] - held @ solve(kept + weight * penalty, sums, assume_a="pos")
     return unknown
 
@@ -156,10 +190,11 @@ def _refined(model: Operator[Any], plane: tuple[float, float]) -> tuple[Floats, 
     return levels, whole[upper // parts, lower // parts]
 
 
-def _smooth_densities(levels: Floats) -> tuple[csr_array, Floats]:
+def _smooth_densities(levels: Floats, saturated: tuple[float, float]) -> tuple[csr_array, Floats]:
     """Return what each node adds to the density of each cell, and the roughness of the nodes.
 
-    Nodes stand on a lattice of centres and widths, and between them the density is bilinear. Shapes (K, P), (P, P).
+    Nodes stand on a lattice of centres and widths, and between them the density is bilinear; beyond where the
+    specimen is saturated there is none. Shapes (K, P), (P, P).
     """
     from scipy.sparse import csr_array
 
@@ -171,8 +206,12 @@ def _smooth_densities(levels: Floats) -> tuple[csr_array, Floats]:
     nodes = np.linspace(0.0, 1.0, _CENTRES + 1)
     first, second = _shares(centres, nodes), _shares(widths, _WIDTHS)
     cells = np.arange(upper.size)
+    below, above = saturated
+    inside = np.clip(lower + 1.0 - below, 0.0, 1.0) * np.clip(levels.size - 1.0 - above - upper, 0.0, 1.0)
     entries = [
-        (share * other, cells, place * _WIDTHS.size + beside) for place, share in first for beside, other in second
+        (share * other * inside, cells, place * _WIDTHS.size + beside)
+        for place, share in first
+        for beside, other in second
     ]
     values, rows, columns = (np.concatenate(each) for each in zip(*entries, strict=True))
     size = nodes.size * _WIDTHS.size

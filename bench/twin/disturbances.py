@@ -20,12 +20,16 @@ from bench.hysteresis import Operator
 from bench.hysteresis._checks import Floats
 from bench.transients.actuator import MEDIAN_OF_DIFFERENCES, at_rows, latency
 from bench.transients.recording import Recording
-from bench.twin.specimen import Dynamics, Specimen, Wander
+from bench.twin.specimen import Dynamics, Specimen, Unevenness, Wander
 
 _LAGS = (0.3, 1.0, 3.0, 8.0, 20.0, 60.0)
 """Edges of the classes of the time between two rows, s."""
 _SLOPES = 3
 """Classes of the slope of the response."""
+_GAPS = (1, 2, 3, 6, 12, 25, 50, 100)
+"""From row to row of a pair, in rows of their kind."""
+_MIXED = 2
+"""Kind of the pairs of a quick row and the reading after it; 0 and 1 are those of quick rows and of readings."""
 _LONGEST = 4000.0
 """Part of a run that is simulated, s."""
 _QUICKEST = 0.2
@@ -45,6 +49,8 @@ _RARE, _SEEN = 0.05, 3
 """Greatest share of outliers, and their least number."""
 _QUANTILES = 9
 """How many of their quantiles are kept."""
+_SIMULATIONS = 20
+"""Whose mean is the effect of wander."""
 _SEED = 0
 """Of the simulations, the same for each trial."""
 
@@ -77,13 +83,14 @@ class Noise:
 
 @dataclass(frozen=True, eq=False)
 class _Pairs:
-    """Pairs of rows of one hold and kind: their rows, class (time, slope), and kind."""
+    """Pairs of rows of one hold: their rows, class (time, slope), kind, and direction of the move before the hold."""
 
     first: NDArray[np.int64]
     second: NDArray[np.int64]
     time: NDArray[np.int64]
     slope: NDArray[np.int64]
-    is_reading: NDArray[np.bool_]
+    kind: NDArray[np.int64]
+    direction: Floats
 
 
 def noise_of(recordings: Sequence[Recording], signal: str, dynamics: Dynamics, *, outliers: bool = False) -> Noise:
@@ -177,16 +184,14 @@ def identify_disturbances(
     parts = [Part(r, tuple(operators), dynamics) for r in recordings]
     _classify(parts)
     noise = _response_noise(parts, recordings, signal)
-    variances = np.array([noise.quick**2, noise.reading**2])
-    measured = [_squares(part.pairs, part.errors) for part in parts]
-    counts = np.sum([each[1] for each in measured], axis=0)
-    sums = np.sum([each[0] for each in measured], axis=0)
+    quick, reading = noise.quick**2, noise.reading**2
+    counts, squares, trends = _moments(parts, [part.errors for part in parts])
     used = counts >= _FEWEST
     if not used.any():
         return noise, Wander(), Wander()
-    target = np.log(np.maximum(sums[used] / counts[used], 1e-300))
-    white = 2.0 * np.broadcast_to(variances[None, None, :], counts.shape)[used]
-    weights = np.sqrt(np.minimum(counts[used], 200.0))
+    squares = np.maximum(squares[used], 1e-300)
+    white = np.broadcast_to([2.0 * quick, 2.0 * reading, quick + reading], counts.shape)[used]
+    weights = np.minimum(counts[used], 200.0)
     span = float(np.ptp(np.concatenate([r.driven for r in recordings])))
     height = float(np.ptp(np.concatenate([r.responded for r in recordings])))
     # The specimen sees nothing of its drive that is quicker than the lag before it.
@@ -199,14 +204,13 @@ def identify_disturbances(
     def cost(numbers: Floats) -> float:
         wander, drift = trial(numbers)
         disturbed = replace(dynamics, wander=wander, drift=drift)
-        totals = np.zeros_like(sums)
-        for number, part in enumerate(parts):
-            totals += _squares(part.pairs, part.simulate(disturbed, _SEED + number))[0]
-        found = np.log(np.maximum(totals[used] / counts[used] + white, 1e-300))
+        _, found, went = _moments(parts, [part.simulate(disturbed, _SEED + n) for n, part in enumerate(parts)])
+        ratios = np.maximum(found[used] + white, 1e-300) / squares
+        misses = np.log(ratios) ** 2 + (went - trends)[used] ** 2 / squares
         penalty = float(np.sum(np.maximum(numbers[[1, 3]] - math.log(3000.0), 0.0) ** 2)) + float(
             np.sum(np.maximum(math.log(_QUICKEST) - numbers[[1, 3]], 0.0) ** 2)
         )
-        return float(np.sum((weights * (found - target)) ** 2)) + 100.0 * penalty
+        return float(np.sum(weights * misses)) + 100.0 * penalty
 
     start = np.log([3e-4, 5.0, 1e-4, 100.0])
     simplex = np.vstack([start, start + np.diag([1.0, 1.0, 1.0, 1.0])])
@@ -218,6 +222,24 @@ def identify_disturbances(
     )
     wander, drift = trial(solved.x)
     return noise, wander, drift
+
+
+def mean_effects(
+    recordings: Sequence[Recording], operators: Sequence[Operator[Any]], dynamics: Dynamics
+) -> list[Floats]:
+    """Return what wander adds to the response at each row of each run, on average over simulations.
+
+    A specimen with hysteresis keeps the extremes of what it has seen: wander drives it on in the direction of the
+    last move, further the longer a hold is.
+    """
+    if not dynamics.wander.deviation:
+        return [np.zeros(r.times.size) for r in recordings]
+    wandering = replace(dynamics, drift=Wander(), unevenness=Unevenness())
+    effects = []
+    for r in recordings:
+        part = Part(r, tuple(operators), dynamics, math.inf)
+        effects.append(np.mean([part.simulate(wandering, _SEED + n) for n in range(_SIMULATIONS)], axis=0))
+    return effects
 
 
 class Part:
@@ -274,22 +296,24 @@ class Part:
         return slopes
 
     def pair(self, edges: Floats) -> _Pairs:
-        """Return the pairs of settled rows of the same hold and kind, by the time between them and by slope."""
+        """Return the pairs of settled rows of a hold, by kind, the time between them, and slope."""
         r, count = self._recording, self.still.size
-        firsts, seconds, kinds = [], [], []
         settled = _settled(r, self._dynamics)[:count]
-        for kind in (False, True):
-            rows = np.flatnonzero((r.is_reading[:count] == kind) & settled)
-            holds = r.last_change[rows]
-            for gap in (1, 2, 3, 6, 12, 25, 50, 100):
-                same = np.flatnonzero(holds[gap:] == holds[:-gap]) if rows.size > gap else np.empty(0, dtype=np.int64)
-                firsts.append(rows[same])
-                seconds.append(rows[same + gap])
-                kinds.append(np.full(same.size, kind))
-        first, second = np.concatenate(firsts), np.concatenate(seconds)
+        quick, readings = (np.flatnonzero((r.is_reading[:count] == kind) & settled) for kind in (False, True))
+        found = [(rows[:-gap], rows[gap:], kind) for kind, rows in enumerate((quick, readings)) for gap in _GAPS]
+        # Of a hold with a single reading, how it went on until that.
+        last = np.searchsorted(readings, quick)
+        found.append((quick[last < readings.size], readings[last[last < readings.size]], _MIXED))
+        pairs = []
+        for first, second, kind in found:
+            same = r.last_change[first] == r.last_change[second]
+            pairs.append((first[same], second[same], np.full(int(same.sum()), kind)))
+        first, second, kinds = (np.concatenate(each) for each in zip(*pairs, strict=True))
         time = np.searchsorted(_LAGS, r.times[second] - r.times[first])
         slope = np.searchsorted(edges, self.slopes[first])
-        return _Pairs(first, second, time, slope, np.concatenate(kinds))
+        moves = np.diff(r.setpoints, prepend=r.driven[0])
+        # Before the first change there was no move.
+        return _Pairs(first, second, time, slope, kinds, np.append(np.sign(moves), 0.0)[r.last_change[first]])
 
 
 def _classify(parts: Sequence[Part]) -> None:
@@ -300,23 +324,28 @@ def _classify(parts: Sequence[Part]) -> None:
         part.pairs = part.pair(edges)
 
 
-def _squares(pairs: _Pairs, values: Floats) -> tuple[Floats, Floats]:
-    """Return sum and number of the squared differences of pairs, by time, slope and kind."""
-    shape = (len(_LAGS) + 1, _SLOPES, 2)
-    place = np.ravel_multi_index((pairs.time, pairs.slope, pairs.is_reading.astype(np.int64)), shape)
-    squares = (values[pairs.second] - values[pairs.first]) ** 2
-    size = math.prod(shape)
-    return (
-        np.asarray(np.bincount(place, squares, size), dtype=np.float64).reshape(shape),
-        np.bincount(place, minlength=size).astype(float).reshape(shape),
-    )
+def _moments(parts: Sequence[Part], values: Sequence[Floats]) -> tuple[Floats, Floats, Floats]:
+    """Return number, mean square and mean of the differences of pairs, by time, slope and kind.
+
+    For the mean a difference counts in the direction of the move before the hold.
+    """
+    shape = (len(_LAGS) + 1, _SLOPES, _MIXED + 1)
+    sums = np.zeros((3, math.prod(shape)))
+    for part, each in zip(parts, values, strict=True):
+        pairs = part.pairs
+        place = np.ravel_multi_index((pairs.time, pairs.slope, pairs.kind), shape)
+        differences = each[pairs.second] - each[pairs.first]
+        for row, weights in enumerate((np.ones(place.size), differences**2, pairs.direction * differences)):
+            sums[row] += np.bincount(place, weights, sums.shape[1])
+    counts, squares, means = sums.reshape(3, *shape)
+    return counts, squares / np.maximum(counts, 1.0), means / np.maximum(counts, 1.0)
 
 
 def _response_noise(parts: Sequence[Part], recordings: Sequence[Recording], signal: str) -> Noise:
     """Return the noise of the response: of neighbouring rows in the class of slopes where they differ least."""
     found: list[float | None] = []
-    for kind in (True, False):
-        pairs = [(part, part.pairs, part.pairs.is_reading == kind) for part in parts]
+    for kind in (1, 0):
+        pairs = [(part, part.pairs, part.pairs.kind == kind) for part in parts]
         nearest = min((int(each.time[of].min()) for _, each, of in pairs if of.any()), default=0)
         deviations = []
         for slope in range(_SLOPES):

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from bench.control.dynamics import ResponseDynamics
 from bench.devices import Signal
 from bench.errors import DataError
 from bench.hysteresis import Operator
@@ -19,10 +20,10 @@ from bench.model_file import load_model
 from bench.rig_file import RigFile
 from bench.transients.actuator import IdentifiedActuator, grid_step, identify_actuator
 from bench.transients.recording import Recording
-from bench.twin.disturbances import Noise, identify_disturbances, noise_of
+from bench.twin.disturbances import Noise, identify_disturbances, mean_effects, noise_of
 from bench.twin.reading_time import ReadingTime, time_readings
 from bench.twin.recording import read_recording, slots_of_twin
-from bench.twin.response import IdentifiedResponse, identify_response
+from bench.twin.response import IdentifiedResponse, correct_response, identify_response
 from bench.twin.specimen import Dynamics, Unevenness, Wander
 from bench.twin.unevenness import identify_unevenness
 
@@ -228,8 +229,14 @@ def identify_twin(paths: Sequence[Path], file: RigFile, model: Path | None) -> I
     dynamics = Dynamics(grid_step(actuator.dynamics), actuator.dynamics, response.dynamics)
     noise, wander, drift = identify_disturbances(recordings, operators, dynamics, first.response)
     disturbed = replace(dynamics, wander=wander, drift=drift)
-    unevenness = identify_unevenness(recordings, response.unknown, operators, disturbed, noise)
-    drive_noise = noise_of(recordings, first.drive, dynamics, outliers=True)
+    # The readings had the effect of wander, too: the twin adds its own.
+    effects = mean_effects(recordings, operators, disturbed)
+    response = correct_response(response, recordings, operator, effects)
+    operators = [operator] if response.correction is None else [operator, response.correction]
+    unevenness = identify_unevenness(recordings, response.unknown, operators, disturbed, effects, noise)
+    # The drive stands still long before what lags behind it.
+    drive_alone = replace(dynamics, response=ResponseDynamics())
+    drive_noise = noise_of(recordings, first.drive, drive_alone, outliers=True)
     return IdentifiedTwin(
         recordings=recordings,
         model_name=name,

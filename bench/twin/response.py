@@ -8,7 +8,7 @@ part of the model's error that cross-validation finds again; see `bench.twin.cor
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -40,6 +40,9 @@ class IdentifiedResponse:
         output units.
     unknown : tuple of ndarray
         By run, the error at each reading of a step, of a correction that was made without it, output units.
+    inputs, errors : tuple of ndarray
+        By run, what the specimen saw of the drive at each row, input units; measured less modelled response, without
+        a correction, output units.
     """
 
     dynamics: ResponseDynamics
@@ -49,6 +52,8 @@ class IdentifiedResponse:
     rms_model: float
     rms: float
     unknown: tuple[Floats, ...]
+    inputs: tuple[Floats, ...]
+    errors: tuple[Floats, ...]
 
 
 def identify_response(
@@ -56,29 +61,50 @@ def identify_response(
 ) -> IdentifiedResponse:
     """Identify the response of a specimen, whose model and actuator are known."""
     dynamics, uncertainty = identify_lag(recordings, actuator, [model.evaluate] * len(recordings))
-    inputs, errors, offsets, readings = [], [], [], []
+    inputs, errors = [], []
     for r in recordings:
         drive = SimulatedDrive(r, actuator, float(r.times[-1]))
         seen = drive.behind(dynamics)
         outputs = model.evaluate(seen)
         whole = dynamics.gain * outputs + np.array(dynamics.shares) @ late_parts(outputs, drive.step, dynamics.times)
-        error = r.responded - drive.at_rows(whole)
-        offset = float(np.median(error[r.is_reading]))
         inputs.append(drive.at_rows(seen))
-        errors.append(error - offset)
-        offsets.append(offset)
-        readings.append(r.is_reading)
-    chosen = np.concatenate(readings)
-    left = np.concatenate(errors)
-    rms_model = float(np.sqrt(np.mean(left[chosen] ** 2)))
-    correction = identify_correction(model, inputs, left, chosen)
+        errors.append(r.responded - drive.at_rows(whole))
+    readings = [r.is_reading for r in recordings]
+    offsets = [float(np.median(error[chosen])) for error, chosen in zip(errors, readings, strict=True)]
+    left = np.concatenate([(e - o)[c] for e, o, c in zip(errors, offsets, readings, strict=True)])
+    rms_model = float(np.sqrt(np.mean(left**2)))
+    uncorrected = IdentifiedResponse(
+        dynamics, None, (), uncertainty, rms_model, rms_model, (), tuple(inputs), tuple(errors)
+    )
+    return correct_response(uncorrected, recordings, model, [np.zeros_like(error) for error in errors])
+
+
+def correct_response(
+    response: IdentifiedResponse, recordings: Sequence[Recording], model: Operator[Any], effects: Sequence[Floats]
+) -> IdentifiedResponse:
+    """Return a response whose correction gives what was measured together with what disturbances add on average.
+
+    Parameters
+    ----------
+    response : IdentifiedResponse
+        The response, with any correction.
+    recordings : sequence of Recording
+        The runs it was identified from.
+    model : Operator
+        The model.
+    effects : sequence of ndarray
+        What disturbances add to the response at each row of each run, on average, output units.
+    """
+    readings = [r.is_reading for r in recordings]
+    errors = [error - effect for error, effect in zip(response.errors, effects, strict=True)]
+    offsets = [float(np.median(error[chosen])) for error, chosen in zip(errors, readings, strict=True)]
+    left = np.concatenate([error - offset for error, offset in zip(errors, offsets, strict=True)])
+    correction = identify_correction(model, response.inputs, left, np.concatenate(readings))
     ends = np.cumsum([int(each.sum()) for each in readings])[:-1]
-    return IdentifiedResponse(
-        dynamics,
-        correction.operator,
-        tuple(offsets),
-        uncertainty,
-        rms_model,
-        correction.rms,
-        tuple(np.split(correction.unknown, ends)),
+    return replace(
+        response,
+        correction=correction.operator,
+        offsets=tuple(offsets),
+        rms=correction.rms,
+        unknown=tuple(np.split(correction.unknown, ends)),
     )

@@ -36,6 +36,7 @@ def identify_unevenness(
     unknown: Sequence[Floats],
     operators: Sequence[Operator[Any]],
     dynamics: Dynamics,
+    effects: Sequence[Floats],
     noise: Noise,
 ) -> Unevenness:
     """Return the unevenness that the run shows which the model knows least.
@@ -48,6 +49,8 @@ def identify_unevenness(
         Errors at the readings of each, of a model that was made without them.
     operators, dynamics
         The specimen as far as it is known, with wander and drift.
+    effects : sequence of ndarray
+        What wander adds to each row of each run on average, which the errors are without.
     noise : Noise
         Of the response.
     """
@@ -60,6 +63,7 @@ def identify_unevenness(
     recording = recordings[least]
     part = Part(recording, tuple(operators), dynamics, _LONGEST)
     rows = np.flatnonzero(recording.is_reading[: part.still.size])
+    effect = effects[least][rows]
     errors, slopes = unknown[least][: rows.size], part.slopes[rows]
     classes = np.searchsorted(np.quantile(slopes, np.arange(1, _SLOPES) / _SLOPES), slopes)
 
@@ -85,7 +89,7 @@ def identify_unevenness(
 
     def cost(numbers: Floats) -> float:
         uneven = replace(dynamics, unevenness=trial(numbers))
-        found = squares(part.simulate(uneven, _SEED)[rows]) + white
+        found = squares(part.simulate(uneven, _SEED)[rows] - effect) + white
         # Where the response is steep, errors are great and matter most.
         weights = np.sqrt(target[used] / target[used].max())
         return float(np.sum(weights * (np.log(found[used]) - np.log(target[used])) ** 2)) + 10.0 * max(

@@ -3,6 +3,7 @@
 import json
 import math
 import tomllib
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from bench.transients import _kernels
 from bench.transients.actuator import identify_actuator
 from bench.transients.recording import Recording
 from bench.twin.correction import identify_correction
-from bench.twin.disturbances import noise_of
+from bench.twin.disturbances import Part, identify_disturbances, mean_effects, noise_of
 from bench.twin.specimen import Dynamics, Specimen, Unevenness, Wander
 from bench.twin.write import write_twin
 from sim_devices.twin_laboratory import SpecimenPlant
@@ -236,6 +237,77 @@ def test_an_actuator_that_follows_at_once_has_no_delay():
     assert (found.order, found.delay) == (0, 0.0)
 
 
+def test_a_sensor_that_reads_otherwise_from_run_to_run_is_no_dynamics():
+    """Its gain differs by 0.15 %, far beyond its noise."""
+    rng = np.random.default_rng(4)
+    changes, setpoints = 3.0 + 0.581 * np.arange(200), rng.uniform(-40.0, 40.0, 200)
+    times = np.concatenate([[0.0, 2.0], changes[1:], [changes[-1] + 0.581]])
+    levels = np.concatenate([[-40.0, -40.0], setpoints])
+    runs = [
+        recording_from(times, gain * levels + rng.normal(0.0, 2e-3, times.size), changes, setpoints)
+        for gain in (1.0015, 1.0015, 1.0)
+    ]
+    found = identify_actuator(runs)
+    assert (found.dynamics.order, found.dynamics.delay) == (0, 0.0)
+    assert found.rms == pytest.approx(2e-3, rel=0.1)
+
+
+def test_outliers_of_the_drive_are_seen_however_slow_the_response_is(tmp_path):
+    """The supply's readings of its voltage are off by 1 % now and then, and the wire takes as long as most holds."""
+    short = {"increment": 0.5, "half_cycles": 6}
+    runs = [bench.run("damped-oscillation", "sma", out=tmp_path, seed=seed, **short) for seed in (1, 2)]
+    identified = bench.identify(bench.load(runs[0].folder), "preisach-signed", levels=8)
+    identified.file.save(tmp_path / "model.json")
+    twin = write_twin([run.folder for run in runs], "sma", tmp_path / "twin.toml", tmp_path / "model.json")
+    noise = twin.noise[0]
+    assert noise.relative_outliers
+    assert 0.003 < noise.outlier_share < 0.03
+    assert np.median(np.abs(noise.outliers)) == pytest.approx(0.01, rel=0.01)
+
+
+WANDER = Wander(0.05, 6.0)
+
+
+@pytest.fixture(scope="module")
+def wandering():
+    """A specimen, and a recording of it whose drive wanders."""
+    levels = uniform_levels(0.0, 40.0, 80)
+    upper, lower = np.tril_indices(80)
+    specimen = Preisach(levels, np.where((upper - lower > 3) & (upper - lower < 16), 1.0, 0.0))
+    swings = 20.0 + 20.0 * (-1.0) ** np.arange(12) * np.linspace(1.0, 0.1, 12)
+    setpoints = np.concatenate([np.arange(a, b, math.copysign(0.4, b - a)) for a, b in pairwise(swings.tolist())])
+    changes = 8.0 * np.arange(setpoints.size)
+    times = np.sort(np.concatenate([changes + each for each in (0.0, 2.0, 4.0, 6.0)])[1:])
+    plant = Specimen((specimen,), Dynamics(0.02, wander=WANDER), float(swings[0]), np.random.default_rng(5))
+    grid = 0.02 * np.arange(1, int(times[-1] / 0.02) + 2)
+    drive, response = plant.advance(setpoints[np.searchsorted(changes, grid - 1e-9, side="right") - 1])
+    rows = np.searchsorted(grid, times - 1e-9)
+    read = response[rows] + np.random.default_rng(6).normal(0.0, 0.1, times.size)
+    made = recording_from(times, drive[rows], changes, setpoints)
+    return specimen, replace(made, is_reading=times % 8.0 < 1e-9, columns={"drive": drive[rows], "response": read})
+
+
+def test_wander_is_known_by_how_holds_go_on(wandering):
+    specimen, recording = wandering
+    _, found, _ = identify_disturbances([recording], [specimen], Dynamics(0.02), "response")
+    for seconds in (0.5, 2.0, 6.0):
+        moved, real = (each.deviation * math.sqrt(1.0 - math.exp(-seconds / each.time)) for each in (found, WANDER))
+        assert moved == pytest.approx(real, rel=0.25)
+
+
+def test_what_wander_does_on_average_is_known(wandering):
+    """A specimen with hysteresis goes on in the direction of each move; simulations of other seeds say how far."""
+    specimen, recording = wandering
+    dynamics = Dynamics(0.02, wander=WANDER)
+    (effect,) = mean_effects([recording], [specimen], dynamics)
+    still = Part(recording, (specimen,), dynamics, math.inf).still
+    direction = np.sign(np.diff(recording.setpoints, prepend=40.0))[recording.last_change]
+    chosen = recording.is_reading
+    added = float(np.mean((direction * (recording.responded - still))[chosen]))
+    assert added > 0.3
+    assert np.mean((direction * effect)[chosen]) == pytest.approx(added, rel=0.2)
+
+
 def test_how_calls_divide_the_time_does_not_matter():
     play = PrandtlIshlinskii(np.array([0.0, 0.5]), np.array([1.0, 1.0]), input_range=(-2.0, 2.0))
     dynamics = Dynamics(
@@ -254,26 +326,43 @@ def test_how_calls_divide_the_time_does_not_matter():
     assert ends(1) == pytest.approx(ends(7), rel=1e-12)
 
 
-def test_the_answer_to_short_reversals_is_found_from_the_readings_after_turning_points():
-    """The specimen has no hysterons of a width below 1.5, which the cells of the model cannot say."""
-    levels = uniform_levels(0.0, 40.0, 80)
-    upper, lower = np.tril_indices(80)
-    specimen = Preisach(levels, np.where(upper - lower > 3, 1.0, 0.0))
-    coarse = uniform_levels(0.0, 40.0, 20)
-    up, down = np.tril_indices(20)
-    # The mean of each cell of four by four finer ones: by how many of them the gap is wider than the cell.
-    model = Preisach(coarse, np.where(up == down, 0.0, np.where(up - down == 1, 0.625, 1.0)))
+def corrected(fine, coarse):
+    """Return a specimen of 80 levels, a model of 20, and the correction from nested loops of the specimen."""
+    specimen = Preisach(uniform_levels(0.0, 40.0, 80), fine)
+    model = Preisach(uniform_levels(0.0, 40.0, 20), coarse)
     swings = 20.0 + 20.0 * (-1.0) ** np.arange(26) * np.linspace(1.0, 0.0, 26)
     inputs = np.concatenate([np.arange(a, b, math.copysign(0.35, b - a)) for a, b in pairwise(swings.tolist())])
     noise = np.random.default_rng(3).normal(0.0, 0.1, inputs.size)
     errors = specimen.evaluate(inputs) + noise - model.evaluate(inputs)
     found = identify_correction(model, [inputs], errors, np.ones(inputs.size, dtype=bool))
     assert found.operator is not None
+    return specimen, model, found.operator
+
+
+def test_a_specimen_may_be_saturated_before_the_end_of_the_plane():
+    """No hysteron switches on above 38.75, and the cells of the model go from 38 to 40."""
+    upper, _ = np.tril_indices(80)
+    ends = np.clip(77.5 - upper, 0.0, 1.0)
+    up, _ = np.tril_indices(20)
+    specimen, model, found = corrected(ends, np.where(up == 19, 1.5 / 4.0, 1.0))
+    rise = np.arange(0.0, 40.0, 0.1)
+    real, modelled = specimen.evaluate(rise), model.evaluate(rise)
+    left, near = real - modelled - found.evaluate(rise), rise > 37.5
+    assert np.ptp(left[near]) < 0.15 * np.ptp((real - modelled)[near])
+
+
+def test_the_answer_to_short_reversals_is_found_from_the_readings_after_turning_points():
+    """The specimen has no hysterons of a width below 1.5, which the cells of the model cannot say."""
+    upper, lower = np.tril_indices(80)
+    up, down = np.tril_indices(20)
+    # The mean of each cell of four by four finer ones: by how many of them the gap is wider than the cell.
+    cells = np.where(up == down, 0.0, np.where(up - down == 1, 0.625, 1.0))
+    specimen, model, found = corrected(np.where(upper - lower > 3, 1.0, 0.0), cells)
     ends = np.arange(10.3, 32.0, 1.9)
     answers = []
-    for operators in ((specimen,), (model,), (model, found.operator)):
+    for operators in ((specimen,), (model,), (model, found)):
         turns = [sum(each.evaluate([end, end - 1.5]) for each in operators) for end in ends.tolist()]
         answers.append(np.diff(turns)[:, 0])
-    real, modelled, corrected = answers
+    real, modelled, right = answers
     assert np.abs(real).max() < 1e-9
-    assert np.sqrt(np.mean(corrected**2)) < 0.3 * np.sqrt(np.mean(modelled**2))
+    assert np.sqrt(np.mean(right**2)) < 0.3 * np.sqrt(np.mean(modelled**2))
