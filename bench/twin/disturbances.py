@@ -30,6 +30,8 @@ _GAPS = (1, 2, 3, 6, 12, 25, 50, 100)
 """From row to row of a pair, in rows of their kind."""
 _MIXED = 2
 """Kind of the pairs of a quick row and the reading after it; 0 and 1 are those of quick rows and of readings."""
+_CLASSES = (len(_LAGS) + 1, _SLOPES, _MIXED + 1)
+"""Numbers of classes of pairs: by time, slope and kind."""
 _LONGEST = 4000.0
 """Part of a run that is simulated, s."""
 _QUICKEST = 0.2
@@ -83,14 +85,20 @@ class Noise:
 
 @dataclass(frozen=True, eq=False)
 class _Pairs:
-    """Pairs of rows of one hold: their rows, class (time, slope), kind, and direction of the move before the hold."""
+    """Pairs of rows of one hold: their rows, class (time, slope), kind, the hold, and the direction of its move."""
 
     first: NDArray[np.int64]
     second: NDArray[np.int64]
     time: NDArray[np.int64]
     slope: NDArray[np.int64]
     kind: NDArray[np.int64]
+    hold: NDArray[np.int64]
     direction: Floats
+
+    @property
+    def place(self) -> NDArray[np.int64]:
+        """Class of each pair, by time, slope and kind, as one number."""
+        return np.asarray(np.ravel_multi_index((self.time, self.slope, self.kind), _CLASSES))
 
 
 def noise_of(recordings: Sequence[Recording], signal: str, dynamics: Dynamics, *, outliers: bool = False) -> Noise:
@@ -185,13 +193,16 @@ def identify_disturbances(
     _classify(parts)
     noise = _response_noise(parts, recordings, signal)
     quick, reading = noise.quick**2, noise.reading**2
-    counts, squares, trends = _moments(parts, [part.errors for part in parts])
+    counts, variances, trends = _moments(parts, [part.errors for part in parts])
     used = counts >= _FEWEST
     if not used.any():
         return noise, Wander(), Wander()
-    squares = np.maximum(squares[used], 1e-300)
+    variances = np.maximum(variances[used], 1e-300)
     white = np.broadcast_to([2.0 * quick, 2.0 * reading, quick + reading], counts.shape)[used]
     weights = np.minimum(counts[used], 200.0)
+    # How a hold goes on says the same of wander only once, and a few holds go on as their drift happens to.
+    holds = _holds_of(parts)[used]
+    trusted = np.where(holds >= _FEWEST, np.minimum(holds, 200.0), 0.0)
     span = float(np.ptp(np.concatenate([r.driven for r in recordings])))
     height = float(np.ptp(np.concatenate([r.responded for r in recordings])))
     # The specimen sees nothing of its drive that is quicker than the lag before it.
@@ -205,12 +216,12 @@ def identify_disturbances(
         wander, drift = trial(numbers)
         disturbed = replace(dynamics, wander=wander, drift=drift)
         _, found, went = _moments(parts, [part.simulate(disturbed, _SEED + n) for n, part in enumerate(parts)])
-        ratios = np.maximum(found[used] + white, 1e-300) / squares
-        misses = np.log(ratios) ** 2 + (went - trends)[used] ** 2 / squares
+        ratios = np.maximum(found[used] + white, 1e-300) / variances
+        misses = weights * np.log(ratios) ** 2 + trusted * (went - trends)[used] ** 2 / variances
         penalty = float(np.sum(np.maximum(numbers[[1, 3]] - math.log(3000.0), 0.0) ** 2)) + float(
             np.sum(np.maximum(math.log(_QUICKEST) - numbers[[1, 3]], 0.0) ** 2)
         )
-        return float(np.sum(weights * misses)) + 100.0 * penalty
+        return float(np.sum(misses)) + 100.0 * penalty
 
     start = np.log([3e-4, 5.0, 1e-4, 100.0])
     simplex = np.vstack([start, start + np.diag([1.0, 1.0, 1.0, 1.0])])
@@ -312,8 +323,9 @@ class Part:
         time = np.searchsorted(_LAGS, r.times[second] - r.times[first])
         slope = np.searchsorted(edges, self.slopes[first])
         moves = np.diff(r.setpoints, prepend=r.driven[0])
+        hold = r.last_change[first]
         # Before the first change there was no move.
-        return _Pairs(first, second, time, slope, kinds, np.append(np.sign(moves), 0.0)[r.last_change[first]])
+        return _Pairs(first, second, time, slope, kinds, hold, np.append(np.sign(moves), 0.0)[hold])
 
 
 def _classify(parts: Sequence[Part]) -> None:
@@ -325,20 +337,29 @@ def _classify(parts: Sequence[Part]) -> None:
 
 
 def _moments(parts: Sequence[Part], values: Sequence[Floats]) -> tuple[Floats, Floats, Floats]:
-    """Return number, mean square and mean of the differences of pairs, by time, slope and kind.
+    """Return number, variance and mean of the differences of pairs, by time, slope and kind.
 
     For the mean a difference counts in the direction of the move before the hold.
     """
-    shape = (len(_LAGS) + 1, _SLOPES, _MIXED + 1)
-    sums = np.zeros((3, math.prod(shape)))
+    sums = np.zeros((3, math.prod(_CLASSES)))
     for part, each in zip(parts, values, strict=True):
         pairs = part.pairs
-        place = np.ravel_multi_index((pairs.time, pairs.slope, pairs.kind), shape)
+        place = pairs.place
         differences = each[pairs.second] - each[pairs.first]
         for row, weights in enumerate((np.ones(place.size), differences**2, pairs.direction * differences)):
             sums[row] += np.bincount(place, weights, sums.shape[1])
-    counts, squares, means = sums.reshape(3, *shape)
-    return counts, squares / np.maximum(counts, 1.0), means / np.maximum(counts, 1.0)
+    counts, squares, means = sums.reshape(3, *_CLASSES)
+    divisors = np.maximum(counts, 1.0)
+    return counts, squares / divisors - (means / divisors) ** 2, means / divisors
+
+
+def _holds_of(parts: Sequence[Part]) -> Floats:
+    """Return how many holds the pairs of each class are of, by time, slope and kind."""
+    found = np.zeros(math.prod(_CLASSES))
+    for part in parts:
+        place, _ = np.unique(np.column_stack([part.pairs.place, part.pairs.hold]), axis=0).T
+        found += np.bincount(place, minlength=found.size)
+    return found.reshape(_CLASSES)
 
 
 def _response_noise(parts: Sequence[Part], recordings: Sequence[Recording], signal: str) -> Noise:
