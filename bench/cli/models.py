@@ -155,7 +155,6 @@ def identify_(
     its steps are taken: `bench identify RUN --input voltage --output displacement --model preisach --out model.json`;
     `--table telemetry` takes those within its steps, as of a fast loop.
     """
-    from bench.results.bands import predict_band
     from bench.results.models import certificate_lines, identify_file
 
     check_outputs(out=out, card=card, figures=figures, json_file=json_file, read=files)
@@ -207,10 +206,8 @@ def identify_(
     for warning in found.warnings:
         warn(warning)
     print_rows(f"{model} from {names}", certificate_lines(found))
-    if (
-        banded := predict_band(found.file, found.inputs, found.identification.initial_state, found.times)
-    ) is not None:
-        print_band(banded)
+    if found.band is not None:
+        print_band(found.band)
     tested = print_test(found, comparing, columns, reading)
     if out is not None:
         found.file.save(out)

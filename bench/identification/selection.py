@@ -463,11 +463,12 @@ class _Search:
         if PLAYS in best and not self.in_time.has_one_rate():
             works.append(_InTimeWork(PLAYS, self.in_time.evaluate_plays, best[PLAYS]))
         found = self._carry_in_time(works)
-        work, least = min(found, key=lambda one: one[1].rms, default=(None, None))
-        if work is not None and least is not None and self._may_skip and least.candidate.initial != "skip":
+        if found and self._may_skip:
             # Without time, a lag hides what memory the record begins with.
-            operator = replace(work.operator, candidate=replace(work.operator.candidate, initial="skip"))
-            found += self._carry_in_time([work._replace(operator=operator)])
+            work, least = min(found, key=lambda one: one[1].rms)
+            if least.candidate.initial != "skip":
+                operator = replace(work.operator, candidate=replace(work.operator.candidate, initial="skip"))
+                found += self._carry_in_time([work._replace(operator=operator)])
         return [one for _, one in found]
 
     def _carry_in_time(self, works: Sequence[_InTimeWork]) -> list[tuple[_InTimeWork, Evaluation]]:
@@ -477,12 +478,12 @@ class _Search:
         self.given_up += [one for _, one in found if one.failure]
         # What is left out of the others decides.
         units = bool(self.measured.units())
-        return [
-            (work, replace(one, determined=each.determined, follows=each.follows, units=one.units if units else ()))
-            for work, one in found
-            if not one.failure
-            for each in [work.operator]
-        ]
+
+        def judged_alike(work: _InTimeWork, one: Evaluation) -> Evaluation:
+            determined, follows = work.operator.determined, work.operator.follows
+            return replace(one, determined=determined, follows=follows, units=one.units if units else ())
+
+        return [(work, judged_alike(work, one)) for work, one in found if not one.failure]
 
     def _in_time_too(self, candidate: Candidate) -> bool:
         """Return whether a candidate can be the operator of a model with time: a free plane would need penalties."""

@@ -230,9 +230,3 @@ def calibrate(
         found.model_name, inputs, outputs, weights, skip, penalties.smoothing, initial, own, orientation=orientation
     )
     return calibrate_band(problem, penalties.smoothing, penalties.ridge)
-
-
-def band_json(model: ModelFile, inputs: Floats, state: Any, times: Floats | None = None) -> dict[str, Any]:  # noqa: ANN401
-    """Return the entry `band` of a result for programs; empty without a band. Arguments as `predict_band`."""
-    found = predict_band(model, inputs, state, times)
-    return {} if found is None else {"band": {**found.to_json(), "held_out": found.band.held_out}}

@@ -16,7 +16,6 @@ from bench.errors import DataError
 from bench.hysteresis import MemoryCurve, Operator, TimedModel
 from bench.identification import Errors
 from bench.journal import Record
-from bench.results.bands import predict_band
 from bench.results.models import IdentifiedFile, certificate_lines
 from bench.results.predictions import Predictions, Quantity
 
@@ -106,8 +105,7 @@ def model_card(
         "Certificate": _table(("", ""), certificate_lines(found)),
         "Limits of validity": _table(("", ""), _limits(found, rows.input, rows.time)),
     }
-    band = predict_band(found.file, found.inputs, found.identification.initial_state, found.times)
-    if band is not None:
+    if (band := found.band) is not None:
         held_out = f"{band.band.held_out:.4g} {band.unit}".rstrip()
         sections["Prediction band"] = _table(
             ("", ""), [*band.rows(), ("RMS error of the rows, each left out of the fit", held_out)]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -35,7 +36,7 @@ from bench.identification.options import check_options, model_options
 from bench.identification.regularization import Regularization
 from bench.identification.resolution import Resolution, resolve
 from bench.model_file import ModelFile, load_model
-from bench.results.bands import band_json, calibrate, predict_band
+from bench.results.bands import BandedPrediction, calibrate, predict_band
 from bench.results.data import FEWEST_ROWS, check_excitation, check_variation, read_columns
 from bench.results.examined import Examined, examine
 from bench.results.joined_files import fitted_rows, read_files
@@ -102,10 +103,14 @@ class IdentifiedFile:
         """Return what a person should know of the fit."""
         return "\n".join([self.file.name, *(f"  {name:20} {text}" for name, text in certificate_lines(self))])
 
+    @cached_property
+    def band(self) -> BandedPrediction | None:
+        """The prediction band at the measurements; None if none was calibrated."""
+        return predict_band(self.file, self.inputs, self.identification.initial_state, self.times)
+
     def predictions(self) -> Predictions:
         """Return the outputs of the model beside the measurements, as the fit has them."""
-        operator, names = self.file.response, self.file.provenance
-        band = predict_band(self.file, self.inputs, self.identification.initial_state, self.times)
+        operator, names, band = self.file.response, self.file.provenance, self.band
         return Predictions(
             Quantity(names["input"], operator.input_unit, self.inputs),
             operator.output_unit,
@@ -145,7 +150,7 @@ class IdentifiedFile:
             "return_points": self.return_points.to_json(),
             "congruency": self.congruency.to_json(),
             "warnings": list(self.warnings),
-            **band_json(self.file, self.inputs, found.initial_state, self.times),
+            **({"band": {**band.to_json(), "held_out": band.band.held_out}} if (band := self.band) else {}),
             **({"shape": shape} if (shape := _shape(operator)) else {}),
         }
 
