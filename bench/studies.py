@@ -36,6 +36,8 @@ P = ParamSpec("P")
 
 _TELLING = 20
 """Longest setting that is part of a run's name, characters."""
+_OF_RUNS = "bench.compilation_display", "bench.runs"
+"""Modules that every run takes."""
 
 
 @dataclass
@@ -359,10 +361,14 @@ def reproduce(
 
     stopwatch = Stopwatch()
     folder = out / f"reproduce-{name}-seed-{seed}"
-    with Workers(1 if live else workers, console, name) as pool:
-        campaign = Campaign(rig or study.rig or "", folder, seed, live, pool, figure_format, recorded)
-        found = study.carry_out(campaign)
-        recordings = campaign.recordings()
+    with Workers(1 if live else workers, console, name, _OF_RUNS) as pool:
+        # Not before: a worker process loads its modules meanwhile.
+        from bench.compilation_display import CompilationDisplay
+
+        with CompilationDisplay(console, console):
+            campaign = Campaign(rig or study.rig or "", folder, seed, live, pool, figure_format, recorded)
+            found = study.carry_out(campaign)
+            recordings = campaign.recordings()
     values = {
         "seed": seed,
         **found.values,

@@ -13,6 +13,9 @@ from bench.clock import Clock
 from bench.devices import Actuator, Device, DriverSettings, Identity
 from bench.errors import DeviceConnectionError, DeviceError
 
+STATUS_AGE = 0.1
+"""Time after which `set` looks at the status of its instrument again, s: a fast loop sets more often than that."""
+
 _START_POLL = 0.1  # s
 
 

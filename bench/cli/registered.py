@@ -60,12 +60,12 @@ class RegisteredCommands(TyperGroup):
                 raise failure
 
             callback.__doc__ = f"Cannot be loaded: {error}"
-        one.command(cmd_name)(show_compilation()(callback))
+        one.command(cmd_name)(callback)
         return typer.main.get_command(one)
 
     def make_callback(self, name: str, part: Any) -> Callable[..., None]:  # noqa: ARG002, ANN401
-        """Return the function of a command whose entry point is `part`: that itself."""
-        callback: Callable[..., None] = part
+        """Return the function of a command whose entry point is `part`: that itself, with word of compilations."""
+        callback: Callable[..., None] = show_compilation()(part)
         return callback
 
 

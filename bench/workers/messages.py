@@ -10,10 +10,11 @@ from typing import IO, Any
 
 @dataclass(frozen=True)
 class Welcome:
-    """What a worker process has to know of the bench: its command line, and the width of its terminal."""
+    """What a worker process has to know: command line and width of the terminal, and what to load before a task."""
 
     command: list[str]
     width: int
+    modules: tuple[str, ...]
 
 
 @dataclass(frozen=True)

@@ -113,7 +113,8 @@ class Workers:
     of workers, as each has one thread of BLAS; the order in which they are taken is the caller's. A task whose worker
     process dies is done again; a task during which three die fails.
 
-    A worker process is started when a task finds none that is free, and lives until the end.
+    The first worker process is started at once, any other when a task finds none that is free. They live until the
+    end.
 
     Parameters
     ----------
@@ -124,13 +125,24 @@ class Workers:
         Where to print and to draw the progress; without it nothing is shown.
     title : str
         What the tasks are together, for the progress.
+    modules : tuple of str
+        Modules that the tasks take. The first worker process loads them before there is a task, beside what this
+        process loads.
     """
 
-    def __init__(self, number: int | None = None, console: Console | None = None, title: str = "all") -> None:
+    def __init__(
+        self,
+        number: int | None = None,
+        console: Console | None = None,
+        title: str = "all",
+        modules: tuple[str, ...] = (),
+    ) -> None:
         self.number = available_cores() if number is None else number
         self.in_process = self.number == 1
         self._console = Console(quiet=True) if console is None else console
         self._display = TasksDisplay(self._console, title)
+        self._modules = modules
+        self._first: _Worker | None = None
         self._changed = threading.Condition()
         self._tasks: list[Pending[Any]] = []
         self._queue: deque[Pending[Any]] = deque()
@@ -148,6 +160,8 @@ class Workers:
                 if hasattr(signal, name) and signal.getsignal(getattr(signal, name)) is not signal.SIG_IGN:
                     former = signal.signal(getattr(signal, name), self._interrupt)
                     self._stack.callback(signal.signal, getattr(signal, name), former)
+        if not self.in_process:
+            self._first = self._start_worker(self._modules)
         self._stack.enter_context(_one_thread())
         self._stack.enter_context(collecting_seldom())
         if self.in_process:
@@ -267,6 +281,8 @@ class Workers:
     def _serve(self, number: int) -> None:
         """Have one worker process carry out task after task; another if it dies."""
         worker: _Worker | None = None
+        if number == 0:
+            worker, self._first = self._first, None
         while (task := self._take(number)) is not None:
             self._display.begin(task._number, task.name)
             try:
@@ -282,12 +298,12 @@ class Workers:
         if worker is not None:
             worker.close()
 
-    def _start_worker(self) -> _Worker:
+    def _start_worker(self, modules: tuple[str, ...] = ()) -> _Worker:
         with self._changed:
             # After the end has begun nobody would end it.
             if self._is_closing:
                 raise EOFError("the end of all workers")
-            return _Worker(Welcome(sys.argv, self._console.width), self._processes)
+            return _Worker(Welcome(sys.argv, self._console.width, modules), self._processes)
 
     def _take(self, number: int) -> Pending[Any] | None:
         """Return the next task of a worker, when there is one; None at the end."""
@@ -348,6 +364,8 @@ class Workers:
                 process.kill()
         for thread in self._threads:
             thread.join()
+        if self._first is not None:
+            self._first.close()
 
 
 def _one_thread() -> AbstractContextManager[object]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import io
 import os
 import pickle
@@ -33,6 +34,10 @@ def main() -> None:
     threading.Thread(target=_listen, args=(orders, inbox), name="orders", daemon=True).start()
     console = Console(file=_Speaker(outbox), width=welcome.width, force_terminal=False)
     with collecting_seldom(), task_surroundings(console, lambda *how_far: outbox.put(Progress(*how_far))):
+        for module in welcome.modules:
+            # A task that takes it says what is wrong.
+            with suppress(Exception):
+                importlib.import_module(module)
         while (order := inbox.get()) is not None:
             outbox.put(_carry_out(order))
 

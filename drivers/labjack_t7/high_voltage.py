@@ -20,7 +20,7 @@ from bench.clock import Clock
 from bench.devices import Device, Limits, Status
 from bench.errors import DeviceError
 from bench.roles import VoltageSupply
-from drivers.device import Slope, attempt
+from drivers.device import STATUS_AGE, Slope, attempt
 from drivers.labjack_t7.inputs import RAIL, Channel, T7InputDevice, T7InputSettings
 from drivers.labjack_t7.lines import LINES, T7LineDevice, T7LineSettings
 from drivers.labjack_t7.registers import DAC, TDAC, Floats, LabJackT7, Target
@@ -28,7 +28,6 @@ from drivers.labjack_t7.registers import DAC, TDAC, Floats, LabJackT7, Target
 _DAC_REACH = (0.0, 5.0)  # V, datasheet 15.0
 _TDAC_REACH = (-10.0, 10.0)  # V, datasheet of the LJTick-DAC
 _STATUS_ON = 2.0  # V, from which on a status output is high, the level of TTL
-_STATUS_AGE = 0.1  # s, after which `set` looks at the status again
 _LOOKS, _LOOK_INTERVAL = 50, 0.01  # how often, and every how many s, a change of the status is looked for
 _LONGEST_WAIT = 100_000.0  # µs
 _DISCHARGED = 1.0  # V, below which an output counts as 0 V
@@ -146,7 +145,7 @@ class T7HighVoltageSupply(T7InputDevice[T7HighVoltageSettings], T7LineDevice[T7H
             self.check(value)
         if not self._enabled:
             self._switch_on()
-        elif self._clock.now() - self._looked >= _STATUS_AGE:
+        elif self._clock.now() - self._looked >= STATUS_AGE:
             self.glance()
         self._send(value)
         self._setpoint = float(value)
@@ -184,7 +183,7 @@ class T7HighVoltageSupply(T7InputDevice[T7HighVoltageSettings], T7LineDevice[T7H
             self.check(float(setpoints[~allowed][0]))
         if not self._enabled:
             self._switch_on()
-        elif self._clock.now() - self._looked >= _STATUS_AGE:
+        elif self._clock.now() - self._looked >= STATUS_AGE:
             self.glance()
         assert isinstance(sensor, T7InputDevice)
         spans = sensor.conversions

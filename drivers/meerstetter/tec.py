@@ -30,7 +30,7 @@ from bench.errors import (
     WatchdogError,
 )
 from bench.roles import TECAmplifier, TECMode
-from drivers.device import RecoverableDevice, attempt, watchdog_field
+from drivers.device import STATUS_AGE, RecoverableDevice, attempt, watchdog_field
 from drivers.meerstetter.device_errors import DEVICE_ERRORS, UNKNOWN_ERROR
 from drivers.meerstetter.mecom import (
     Block,
@@ -194,6 +194,8 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         """1 if a positive current heats, else -1; known from `connect` on, as the next two."""
         self._on: bool
         """Whether the driver has switched the output on."""
+        self._looked = -math.inf
+        """When `set` has last looked at the status of an output that is on, s."""
         self._reads_blocks: bool
         self._restarted = False
         self._configured: dict[Parameter, float] = {}
@@ -239,17 +241,19 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
     def set(self, value: float) -> Status:
         """Control the object temperature in °C or the current in A, by mode; switches the output on if it is off.
 
-        The status completes when the device reports the temperature stable; at once in current mode.
+        The status completes when the device reports the temperature stable; at once in current mode. That the output
+        is still on is looked at before, in current mode every 0.1 s, as a fast loop sets more often.
         """
         limits = self._limits
         if not limits.low <= value <= limits.high:
             self.check(value)
-        if self._on:
+        if not self._on:
+            self._check_restart()
+        elif self._mode is TECMode.TEMPERATURE or self._clock.now() - self._looked >= STATUS_AGE:
             status = self._ask("?VR", _STATUS, 8)
             if status != _RUNNING:
                 self._check_output(decode(self.name, _STATUS, status))
-        else:
-            self._check_restart()
+            self._looked = self._clock.now()
         repeats = self._line.repeats
         if self._mode is TECMode.TEMPERATURE:
             self._write(_LIVE_TARGET, value)

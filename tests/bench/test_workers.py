@@ -67,6 +67,19 @@ def test_a_task_in_a_hurry_is_begun_before_all_that_wait(text):
     assert begun == ["third", "first", "second"]
 
 
+def test_the_first_worker_has_loaded_modules_before_its_tasks():
+    with Workers(2, modules=("no_such_module", "wave")) as workers:
+        assert workers.submit(worker_tasks.is_loaded, "wave").result()
+        assert not workers.submit(worker_tasks.is_loaded, "netrc").result()
+
+
+def test_workers_without_a_task_end():
+    with Workers(2) as workers:
+        (process,) = workers._processes
+    assert process.returncode is not None
+    assert not workers._processes
+
+
 def test_what_is_aside_comes_first_for_one_worker_and_last_for_one_alone(workers):
     tasks = [workers.submit(worker_tasks.process, value) for value in range(20)]
     aside = [workers.submit_aside("aside", worker_tasks.process, value) for value in range(3)]

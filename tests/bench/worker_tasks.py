@@ -2,6 +2,7 @@
 
 import os
 import signal
+import sys
 import threading
 from pathlib import Path
 
@@ -16,6 +17,11 @@ from bench.workers import report, task_console
 def process(value):
     """Return the process as well."""
     return value, os.getpid()
+
+
+def is_loaded(module):
+    """Return whether a module was loaded before."""
+    return module in sys.modules
 
 
 def product(size):

@@ -3,6 +3,7 @@
 import math
 import struct
 from binascii import crc_hqx
+from itertools import pairwise
 
 import pytest
 from faulty_line import InPieces
@@ -332,6 +333,40 @@ def test_output_that_goes_off_by_itself_fails_the_status(script, tec):
     script.values[104] = 1
     with pytest.raises(DeviceError, match="switched off before it reached 40 °C"):
         status.wait()
+
+
+def test_a_fast_loop_of_currents_looks_at_the_output_every_tenth_of_a_second(script, clock):
+    tec = connect(clock, mode="current", baudrate=1_000_000)
+    tec.set(0.5)
+
+    def sets_of(seconds):
+        """Set a current every 20 ms; yield when, and what was sent for it."""
+        while clock.now() < seconds:
+            script.received.clear()
+            begun = clock.now()
+            tec.set(begun)
+            yield begun, [data[7:14] for data in script.received]
+            clock.sleep(0.02)
+
+    sent = dict(sets_of(2.0))
+    assert {requests[-1] for requests in sent.values()} == {b"VSC3510"}
+    looks = [instant for instant, requests in sent.items() if b"?VR0068" in requests]
+    gaps = [later - earlier for earlier, later in pairwise(looks)]
+    # A set-point and the wait behind it come on top.
+    assert 0.099 < min(gaps) <= max(gaps) < 0.122
+    script.values[50000] = 0
+    script.values[104] = 1
+    with pytest.raises(DeviceError, match="its output is off although it was switched on"):
+        list(sets_of(3.0))
+    assert clock.now() < 2.0 + 0.15
+
+
+def test_a_temperature_is_not_set_without_a_look_at_the_output(script, tec):
+    tec.set(40.0)
+    tec.set(41.0)
+    script.values[104] = 1
+    with pytest.raises(DeviceError, match="its output is off although it was switched on"):
+        tec.set(42.0)
 
 
 def test_change_of_mode_switches_off_first(script, tec):
