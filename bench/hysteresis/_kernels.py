@@ -505,15 +505,21 @@ def by_column(
     starts: Integers, cells: NDArray[np.int32], changes: Floats, columns: int
 ) -> tuple[Integers, NDArray[np.int32], Floats]:
     """Return the row differences column by column, rows increasing, entries of one row added up."""
+    samples = starts.size - 1
     offsets = np.zeros(columns + 1, np.int64)
-    for e in range(cells.size):
-        offsets[cells[e] + 1] += 1
+    latest = np.full(columns, -1)
+    for t in range(samples):
+        for e in range(starts[t], starts[t + 1]):
+            c = cells[e]
+            if latest[c] != t:
+                latest[c] = t
+                offsets[c + 1] += 1
     for c in range(columns):
         offsets[c + 1] += offsets[c]
     fill = offsets[:-1].copy()
-    rows = np.empty(cells.size, np.int32)
-    values = np.empty(cells.size)
-    for t in range(starts.size - 1):
+    rows = np.empty(offsets[columns], np.int32)
+    values = np.empty(offsets[columns])
+    for t in range(samples):
         for e in range(starts[t], starts[t + 1]):
             c = cells[e]
             at = fill[c]
@@ -523,17 +529,7 @@ def by_column(
                 rows[at] = t
                 values[at] = changes[e]
                 fill[c] = at + 1
-    # Close the gaps that merging left.
-    packed = np.empty(columns + 1, np.int64)
-    end = 0
-    for c in range(columns):
-        packed[c] = end
-        for at in range(offsets[c], fill[c]):
-            rows[end] = rows[at]
-            values[end] = values[at]
-            end += 1
-    packed[columns] = end
-    return packed, rows[:end].copy(), values[:end].copy()
+    return offsets, rows, values
 
 
 @kernel

@@ -60,8 +60,8 @@ class CholeskyFactor:
     def reserve(self, size: int) -> None:
         """Take memory for so many columns at once."""
         if _factor_kernels.row_start(size) > self.packed.size:
-            # In place: a copy would count in the memory of a large fit.
-            self.packed.resize(_factor_kernels.row_start(max(size + size // 16, 512)), refcheck=False)
+            # In place, and little more: a copy would count in the memory of a large fit.
+            self.packed.resize(_factor_kernels.row_start(max(size + 32, 512)), refcheck=False)
 
     def append(self, rows: Floats, right: Floats) -> Flags:
         """Add at most `room` columns, given their products with the present ones and each other, and right sides.

@@ -20,6 +20,7 @@ from bench.identification.by_name import FitProblem
 from bench.identification.cell_layout import CellLayout, Indices
 from bench.identification.excitation import ramps
 from bench.identification.least_squares import Fit, _ActiveSet, _cost, one_thread
+from bench.identification.scaled_columns import unit_of_penalties
 
 MOST_COLUMNS = 1500
 """Beyond so many free coefficients their covariance is left out: the uncertainty of a prediction then is constant."""
@@ -184,13 +185,15 @@ def _inverse_root(
     from scipy.linalg import eigh, solve_triangular
 
     regressor = problem.regressor
+    unit = unit_of_penalties(regressor, w) if any(penalties) else 1.0
     state = _ActiveSet(
         regressor,
         y,
         w,
         np.zeros(regressor.shape[1], dtype=bool),
         CellLayout.of(regressor.base.size),
-        *penalties,
+        penalties[0] * unit,
+        penalties[1] * unit,
     )
     if definite:
         state.enter(chosen)

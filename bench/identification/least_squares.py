@@ -16,7 +16,7 @@ from bench.identification.cell_layout import CellLayout, Flags, Indices
 from bench.identification.cholesky_factor import DEPENDENT, CholeskyFactor, estimated_norm
 from bench.identification.collapse import LONG, collapse
 from bench.identification.fit_progress import say_fit_progress
-from bench.identification.scaled_columns import ScaledColumns
+from bench.identification.scaled_columns import ScaledColumns, changing, mean_square, unit_of_penalties
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -179,8 +179,10 @@ def fit_cells(
     samples, left = int(np.count_nonzero(w)), 0.0
     if y.size >= LONG and (short := collapse(regressor, y, w)) is not None:
         regressor, y, w, left = short.regressor, short.outputs, short.weights, short.left
+    unit = unit_of_penalties(regressor, w) if smoothing or ridge else 1.0
     with one_thread():
-        return _ActiveSet(regressor, y, w, constrained, layout, smoothing, ridge).solve(samples, left)
+        state = _ActiveSet(regressor, y, w, constrained, layout, smoothing * unit, ridge * unit)
+        return state.solve(samples, left)
 
 
 def fit_minimum_norm(
@@ -246,19 +248,6 @@ def check_penalties(smoothing: float, ridge: float) -> None:
     for name, weight in (("smoothing", smoothing), ("ridge", ridge)):
         if not weight >= 0.0 or not np.isfinite(weight):
             raise ValueError(f"{name}: expected a finite number >= 0, got {weight}")
-
-
-def changing(norms: Floats, scale: Floats, total: float) -> Flags:
-    """Return which columns vary by more than the rounding of their means, given norms about these and a total weight.
-
-    `scale` is the size of each column.
-    """
-    return np.asarray(norms > 1e-11 * np.sqrt(total) * np.maximum(scale, 1e-300))
-
-
-def mean_square(norms: Floats) -> float:
-    """Return the unit of the penalties' weights, from the norms of the cells' columns that change."""
-    return float((norms**2).mean()) if norms.size else 1.0
 
 
 def _cost(regressor: Regressor, outputs: ArrayLike, weights: ArrayLike | None, skip: int) -> tuple[Floats, Floats]:
@@ -328,10 +317,15 @@ class _ActiveSet:
         layout: CellLayout,
         smoothing: float,
         ridge: float,
-        *,
-        absolute: bool = False,
+        parents: Indices | None = None,
     ) -> None:
         self.regressor, self.y, self.w, self.constrained, self.layout = regressor, y, w, constrained, layout
+        self.smoothing, self.ridge, self.parents = smoothing, ridge, parents
+        # Before the columns, which then take its place: the memory of both would count.
+        coarser = smoothing + ridge > 0.0 and constrained.any() and layout.order >= _COARSEST
+        self.start = self.coarse_densities() if coarser else None
+        if parents is not None:
+            regressor = regressor.merged(parents, layout.cells.size)
         self.cells = regressor.base.size
         count = regressor.shape[1]
         changes = lists.by_column(regressor.starts, regressor.cells, regressor.changes, self.cells)
@@ -348,18 +342,17 @@ class _ActiveSet:
         self.norms = np.where(self.swept, norms, np.sqrt(unit))
         self.usable = self.swept.copy()
         penalty: csr_array | None = None
-        self.smoothing, self.ridge = (smoothing, ridge) if absolute else (smoothing * unit, ridge * unit)
-        rough = self.smoothing > 0.0 and layout.order > 0
-        if rough or (self.ridge > 0.0 and self.cells):
+        rough = smoothing > 0.0 and layout.order > 0
+        if rough or (ridge > 0.0 and self.cells):
             from scipy.sparse import csr_array, eye_array
 
             penalty = csr_array((self.cells, self.cells))
             if rough:
                 penalty = layout.roughness()
-                penalty.data *= self.smoothing
+                penalty.data *= smoothing
                 self.usable[: self.cells] |= layout.layers == 0
             if self.ridge > 0.0:
-                penalty = csr_array(penalty + self.ridge * eye_array(self.cells))
+                penalty = csr_array(penalty + ridge * eye_array(self.cells))
             scale = 1.0 / self.norms[: self.cells]
             # In place: copies of it would count in the memory of a large fit.
             penalty.data *= np.repeat(scale, np.diff(penalty.indptr))
@@ -571,36 +564,35 @@ class _ActiveSet:
         return np.concatenate([dense, self.layout.crests(g[: self.cells], threshold)])
 
     def promising(self) -> Indices:
-        """Return the constrained columns that are likely to be passive in a smooth solution, and set their values.
-
-        They come from the solution on a plane of half the order, whose cost is that of the same density.
-        """
-        signed = self.constrained & self.usable
-        if self.layout.order < _COARSEST:
-            return np.flatnonzero(signed)
-        layout, parents = self.layout.coarser()
-        count = layout.cells.size
-        merged = self.regressor.merged(parents, count)
-        constrained = np.ones(merged.shape[1], dtype=bool)
-        constrained[parents[~self.constrained[: self.cells]]] = False
-        constrained[count:] = self.constrained[self.cells :]
-        # A Laplacian of twice the step is four times as great, on a quarter of the cells.
-        weights = 0.25 * self.smoothing, 4.0 * self.ridge
-        coarse = _ActiveSet(merged, self.y, self.w, constrained, layout, *weights, absolute=True)
-        coarse.minimise()
-        values = (coarse.x / coarse.norms)[:count]
-        chosen = signed.copy()
-        chosen[: self.cells] &= values[parents] > 0.0
-        self.x[: self.cells] = np.where(chosen[: self.cells], np.maximum(values[parents], 0.0), 0.0)
+        """Return the constrained columns that are likely to be passive in a smooth solution, and set their values."""
+        chosen = self.constrained & self.usable
+        if self.start is None:
+            return np.flatnonzero(chosen)
+        chosen[: self.cells] &= self.start > 0.0
+        self.x[: self.cells] = np.where(chosen[: self.cells], np.maximum(self.start, 0.0), 0.0)
         self.x *= self.norms
         found = np.flatnonzero(chosen)
         if found.size > _MANY:
             for _ in range(_ROUNDS):
                 self.approach()
-            found = np.flatnonzero(signed & (self.x > 0.0))
+            found = np.flatnonzero(self.constrained & self.usable & (self.x > 0.0))
             # What is small is the next to leave: cheaply, if it is among the last.
             found = found[np.argsort(-self.x[found], kind="stable")]
         return found
+
+    def coarse_densities(self) -> Floats:
+        """Return the density in each cell by the solution on a plane of half the order, whose cost is that of it."""
+        layout, merged = self.layout.coarser()
+        count = layout.cells.size
+        constrained = np.append(np.ones(count, dtype=bool), self.constrained[merged.size :])
+        constrained[merged[~self.constrained[: merged.size]]] = False
+        # A Laplacian of twice the step is four times as great, on a quarter of the cells.
+        weights = 0.25 * self.smoothing, 4.0 * self.ridge
+        # Of the columns as they were: those between would stay in memory.
+        parents = merged if self.parents is None else merged[self.parents]
+        coarse = _ActiveSet(self.regressor, self.y, self.w, constrained, layout, *weights, parents)
+        coarse.minimise()
+        return np.asarray((coarse.x / coarse.norms)[merged])
 
     def approach(self) -> None:
         """Lower the cost by conjugate gradients over the columns likely to be passive; cut what turns negative."""

@@ -17,8 +17,9 @@ import numpy as np
 from bench.hysteresis import Regressor
 from bench.hysteresis._checks import Floats
 from bench.identification.cell_layout import CellLayout
-from bench.identification.least_squares import changing, check_penalties, mean_square, one_thread
+from bench.identification.least_squares import check_penalties, one_thread
 from bench.identification.normal_equations import normal_equations
+from bench.identification.scaled_columns import unit_of_penalties
 
 SMOOTHING = tuple((10.0 ** np.arange(-6.0, 2.1)).tolist())
 """Weights of the roughness penalty that are tried; see `fit`."""
@@ -107,7 +108,7 @@ def choose_regularization(
         return Regularization(smoothing or 0.0, 1.0 if ridge is None else ridge)
     total = grams.sum(axis=0)
     cells = layout.cells.size
-    unit = _mean_square(regressor, weights, skip)
+    unit = unit_of_penalties(regressor, np.where(np.arange(weights.size) < skip, 0.0, weights))
     rough, plain = np.zeros_like(total), np.zeros_like(total)
     if layout.order:
         rough[:cells, :cells] = factor * unit * layout.roughness().toarray()
@@ -143,17 +144,6 @@ def _coarse(regressor: Regressor, layout: CellLayout) -> tuple[Regressor, CellLa
         # A Laplacian of twice the step is four times as great, on a quarter of the cells.
         rough, size = 0.25 * rough, 4.0 * size
     return regressor, layout, rough, size
-
-
-def _mean_square(regressor: Regressor, weights: Floats, skip: int) -> float:
-    """Return the mean squared norm about the mean of the columns that were swept."""
-    from bench.hysteresis import _kernels as lists
-    from bench.identification import _kernels
-
-    columns = lists.by_column(regressor.starts, regressor.cells, regressor.changes, regressor.base.size)
-    w = np.where(np.arange(weights.size) < skip, 0.0, weights)
-    norms = _kernels.moments(columns, regressor.base, w[::-1].cumsum()[::-1].copy())[1]
-    return mean_square(norms[changing(norms, np.abs(regressor.base), float(w.sum()))])
 
 
 def _errors(training: Floats, held_out: Floats, penalty: Floats) -> tuple[float, float]:

@@ -8,15 +8,18 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.deferred import DeferredModule
+from bench.hysteresis import Regressor
 from bench.hysteresis._checks import Floats
-from bench.identification.cell_layout import Indices
+from bench.identification.cell_layout import Flags, Indices
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
+    from bench.hysteresis import _kernels as lists
     from bench.identification import _kernels
     from bench.identification._kernels import Columns
 else:
+    lists = DeferredModule("bench.hysteresis._kernels")
     _kernels = DeferredModule("bench.identification._kernels")
 
 
@@ -89,3 +92,24 @@ class ScaledColumns:
             total=self.total,
             penalty=None if self.penalty is None else self.penalty[sparse][:, sparse],
         )
+
+
+def changing(norms: Floats, scale: Floats, total: float) -> Flags:
+    """Return which columns vary by more than the rounding of their means, given norms about these and a total weight.
+
+    `scale` is the size of each column.
+    """
+    return np.asarray(norms > 1e-11 * np.sqrt(total) * np.maximum(scale, 1e-300))
+
+
+def mean_square(norms: Floats) -> float:
+    """Return the mean square of norms, 1 if there are none."""
+    return float((norms**2).mean()) if norms.size else 1.0
+
+
+def unit_of_penalties(regressor: Regressor, weights: Floats) -> float:
+    """Return the mean squared norm about the mean of the columns of cells that change."""
+    columns = lists.by_column(regressor.starts, regressor.cells, regressor.changes, regressor.base.size)
+    remaining = weights[::-1].cumsum()[::-1].copy()
+    norms = _kernels.moments(columns, regressor.base, remaining)[1]
+    return mean_square(norms[changing(norms, np.abs(regressor.base), float(remaining[0]))])
