@@ -13,8 +13,8 @@ Flags = NDArray[np.bool_]
 
 Corners = tuple[Floats, Floats, int]  # left edges and heights of the pieces, and how many count
 # Ends of the operating range, outputs at negative and positive saturation (at the ends of the plane), tolerance,
-# whether the nearest answer is wanted, whether the operator is monotone.
-Ends = tuple[float, float, float, float, float, bool, bool]
+# steepest fall of the output with a rising input, whether the nearest answer is wanted.
+Ends = tuple[float, float, float, float, float, float, bool]
 Place = tuple[int, float, int, float]  # number of pieces, input within the plane, its cell, and the mass up to it
 
 _ALL = 2**62
@@ -259,11 +259,11 @@ def invert(
 ) -> tuple[int, float, float, float, int]:
     """Return number of set-points, the first, the last, the error at the last, and the segments walked.
 
-    Of a `monotone` operator the output rises with the input for every memory: one walk finds all solutions.
+    If the output never falls with a rising input, whatever the memory, one walk finds all solutions.
     """
-    low, high, minus, plus, tolerance, nearest, monotone = ends
+    low, high, minus, plus, tolerance, fall, nearest = ends
     corners = pieces[0], pieces[1], place[0]
-    if monotone:
+    if fall == 0.0:
         direction = 1 if target > value else -1
         end = high if direction > 0 else low
         levels = plane[0]
@@ -283,9 +283,11 @@ def invert(
     x1, e1, steps = _walk_on(plane, terms, ahead, corners, u, value, target, tolerance, first, np.inf, _ALL)
     met = abs(e1) <= tolerance
     preferred = not nearest and ((first > 0 and target <= plus) or (first < 0 and target >= minus))
-    if met and (x1 == u or preferred):
-        return 1, x1, x1, e1, steps
     reach = abs(x1 - u) if met else np.inf
+    # The other way, no nearer target is met where the output cannot come that far.
+    alone = low <= u <= high and fall * reach < abs(target - value) - tolerance
+    if met and (x1 == u or preferred or alone):
+        return 1, x1, x1, e1, steps
     x2, e2, k2 = _walk_on(plane, terms, behind, corners, u, value, target, tolerance, -first, reach, _ALL)
     steps += k2
     met2 = abs(e2) <= tolerance

@@ -27,13 +27,13 @@ Words = NDArray[np.int64]
 # Words of a stream of a Preisach operator: addresses of its arrays, their sizes, and its counters.
 NUMBERS, LEVELS, TABLE, BELOW, BREAKS, QUADRATICS, EXTREMA, PIECES, INDICES = range(9)
 LEVEL_COUNT, BREAK_COUNT, ROOM, EXTREMUM_COUNT, PIECE_COUNT, CELL, SATURATION = range(9, 16)
-NEAREST, MONOTONE, WALKED = range(16, 19)
-WORD_COUNT = 19
+NEAREST, WALKED = range(16, 18)
+WORD_COUNT = 18
 # Its numbers. The input as it is and within the plane, the mass up to it, and the output; then of the inverse, see
 # `_inverse_kernels.Ends`, and what it found: set-points (the first is nan where one is enough) and error.
 INVERSE_STEP, OFFSET, INPUT, PRESENT, MASS, OUTPUT = range(6)
-LOW, HIGH, MINUS, PLUS, TOLERANCE, FIRST, LAST, ERROR = range(6, 14)
-NUMBER_COUNT = 14
+LOW, HIGH, MINUS, PLUS, TOLERANCE, FALL, FIRST, LAST, ERROR = range(6, 15)
+NUMBER_COUNT = 15
 
 # Words of a stream of plays. The single-valued maps: number of thresholds, -1 for none, and address of thresholds,
 # intercepts and slopes, one behind the other.
@@ -174,8 +174,8 @@ def _find(words: Words, numbers: Floats, plane: memory.Plane, target: float) -> 
         numbers[MINUS],
         numbers[PLUS],
         numbers[TOLERANCE],
+        numbers[FALL],
         words[NEAREST] != 0,
-        words[MONOTONE] != 0,
     )
     count, first, last, error, walked = inverse.invert(
         plane,

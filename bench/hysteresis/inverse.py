@@ -34,7 +34,7 @@ Policy: TypeAlias = Literal["nearest", "paper"]
 # As the compiled walks take them, see `_inverse_kernels.Ends`.
 _Plane: TypeAlias = tuple[Floats, float, Floats]
 _Terms: TypeAlias = tuple[Floats, Floats]
-_Ends: TypeAlias = tuple[float, float, float, float, float, bool, bool]
+_Ends: TypeAlias = tuple[float, float, float, float, float, float, bool]
 
 # Part of the output scale within which a target counts as met.
 _TOLERANCE = 2e-13
@@ -384,7 +384,7 @@ class PreisachInverse(Inverse[MemoryCurve]):
     def _retuned(self, operator: Preisach, ends: tuple[float, float, float]) -> PreisachInverse:
         """Return the inverse of an operator with another nonnegative density on the same levels."""
         other = object.__new__(PreisachInverse)
-        other.__dict__.update(operator=operator, policy=self.policy, _ends=ends, _monotone=self._monotone)
+        other.__dict__.update(operator=operator, policy=self.policy, _ends=ends, _fall=self._fall)
         return other
 
     @cached_property
@@ -397,15 +397,15 @@ class PreisachInverse(Inverse[MemoryCurve]):
         return minus, plus, _TOLERANCE * max(magnitude, abs(minus), abs(plus))
 
     @cached_property
-    def _monotone(self) -> bool:
-        """Whether the output can only rise with the input."""
-        return self.operator.rises()
+    def _fall(self) -> float:
+        """Steepest fall of the output with a rising input."""
+        return self.operator.steepest_fall()
 
     @cached_property
     def _constants(self) -> tuple[_Plane, Floats, float, _Terms, _Ends]:
         t, (minus, plus, tolerance) = self.operator.lattice, self._ends
         low, high = self.operator.input_range
-        ends = (low, high, minus, plus, tolerance, self.policy == "nearest", self._monotone)
+        ends = (low, high, minus, plus, tolerance, self._fall, self.policy == "nearest")
         return t.plane, t.below, t.offset, t.terms, ends
 
     def invert(self, state: MemoryCurve, target: float) -> Inversion[MemoryCurve]:

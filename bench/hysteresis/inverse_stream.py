@@ -100,10 +100,10 @@ class PreisachInverseStream(InverseStream[MemoryCurve]):
         self._forward = forward = PreisachStream(inverse.operator, state)
         self._find, self._follow = compiled_step("find"), compiled_step("follow")
         self._address, self._numbers, self._places = forward._address, forward._numbers, forward._kernels
-        *ends, nearest, monotone = inverse._constants[-1]
+        *ends, nearest = inverse._constants[-1]
         self._numbers[self._places.LOW : self._places.LOW + len(ends)] = ends
         self._numbers[self._places.FIRST : self._places.ERROR + 1] = math.nan
-        forward._words[self._places.NEAREST], forward._words[self._places.MONOTONE] = nearest, monotone
+        forward._words[self._places.NEAREST] = nearest
         self._target = math.nan
 
     def find(self, target: float) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -373,7 +374,14 @@ class Preisach(Operator[MemoryCurve]):
 
     def rises(self) -> bool:
         """Return whether the output can only rise with the input, with every memory."""
-        return bool((self.density >= 0.0).all() and min(self._reversible_slopes()) >= 0.0)
+        return self.steepest_fall() == 0.0
+
+    def steepest_fall(self) -> float:
+        """Return a bound on how much the output falls by unit of a rising input, within the operating range.
+
+        That of the reversible part, >= 0, in output units by input unit; infinity if a density is negative.
+        """
+        return -min(self._reversible_slopes()) if (self.density >= 0.0).all() else math.inf
 
     def falls(self) -> bool:
         """Return whether the output can only fall while the input rises, with every memory."""
