@@ -171,13 +171,15 @@ def combined_rows(factor: Floats, places: Integers, values: Floats) -> Floats:
 
 @kernel
 def products_of_columns(factor: Floats, size: int, first: Integers, second: Integers) -> Floats:
-    """Return the products of columns first[k] <= second[k] of a lower triangular matrix."""
-    result = np.zeros(first.size)
+    """Return the products of columns first[k] <= second[k] of a lower triangular matrix; `second` does not fall."""
+    factor, result = borrowed(factor), np.zeros(first.size)
+    reached = 0
     for c in range(size):
-        start = _start(c)
-        for k in range(first.size):
-            if second[k] <= c:
-                result[k] += factor[start + first[k]] * factor[start + second[k]]
+        while reached < second.size and second[reached] <= c:
+            reached += 1
+        row = factor[_start(c) :]
+        for k in range(reached):
+            result[k] += row[np.uint64(first[k])] * row[np.uint64(second[k])]
     return result
 
 

@@ -158,7 +158,10 @@ class CholeskyFactor:
             block[:, first:] = corner.T
 
     def inverse_entries(self, first: Indices, second: Indices) -> Floats:
-        """Return entries of the inverse of the Gram block, first[k] <= second[k], once `invert` was called."""
+        """Return entries of the inverse of the Gram block, once `invert` was called.
+
+        first[k] <= second[k] <= second[k + 1].
+        """
         return np.asarray(_factor_kernels.products_of_columns(self.packed, self.size, first, second))
 
     def inverse_diagonal(self) -> Floats:

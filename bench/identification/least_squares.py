@@ -646,8 +646,8 @@ class _ActiveSet:
             return diagonal, float(passive.size)
         inside = np.flatnonzero(passive < self.cells)
         block = penalty[passive[inside]][:, passive[inside]].tocoo()
-        below = block.row < block.col
-        inverse = self.factor.inverse_entries(inside[block.row[below]], inside[block.col[below]])
+        below = block.col < block.row
+        inverse = self.factor.inverse_entries(inside[block.col[below]], inside[block.row[below]])
         # What smoothness determines the data do not.
         smooth = float(block.diagonal() @ diagonal[inside]) + 2.0 * float(block.data[below] @ inverse)
         return diagonal, passive.size - smooth

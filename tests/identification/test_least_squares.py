@@ -291,7 +291,7 @@ def test_factor_follows_the_columns(seed, size):
             assert factor.condition(norm) == pytest.approx(expected, rel=1e-6)
     factor.invert()
     inverse = np.linalg.inv(block)
-    first, second = np.triu_indices(chosen.size)
+    second, first = np.tril_indices(chosen.size)
     entries = factor.inverse_entries(first, second)
     np.testing.assert_allclose(entries, inverse[first, second], rtol=1e-6, atol=1e-9 * np.abs(inverse).max(initial=0))
     np.testing.assert_allclose(factor.inverse_diagonal(), np.diag(inverse), rtol=1e-6)
