@@ -22,12 +22,10 @@ from renew_measured import put
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "benchmarks"))
 
-from selection_quality import CASES, KINDS, MEASURED, Case, Outcome, case, choose, measured_case
+from selection_quality import CASES, KINDS, MEASURED, WITHIN, Case, Outcome, case, choose, measured_case
 
 ROOT = Path(__file__).parents[1]
 PAGE = ROOT / "docs" / "reference" / "model-selection.md"
-WITHIN = 1.2
-"""Ratio of the error of the default to that of the best by hand that is to be reached."""
 
 
 def state() -> str:
@@ -56,9 +54,10 @@ def outcome(folder: Path, plant: str, kind: str, one: Callable[[], Case]) -> Out
 
 
 def show(what: str, found: Outcome) -> None:
-    """Print a case, with what was chosen and what is best by hand."""
+    """Print a case, with what was chosen, what is best by hand, and how many settings come near that."""
     print(
-        f"{what:36}{found.error:6.2f} /{found.least:6.2f}  {found.ratio:5.2f}  {found.seconds:5.1f} s  "
+        f"{what:36}{found.error:6.2f} /{found.least:6.2f}  {found.ratio:5.2f}  {found.near:3} of {found.tried} near  "
+        f"{found.seconds:5.1f} s  "
         f"{found.chosen} | {found.best}",
         flush=True,
     )
@@ -94,10 +93,11 @@ def over_seeds(found: Mapping[str, list[Outcome]]) -> str:
 
 
 def cell(found: Outcome | None) -> str:
-    """Return the errors of default and best by hand and their ratio, bold beyond the bound."""
+    """Return the errors of default and best by hand and their ratio; beyond the bound with how much is within it."""
     if found is None:
         return ""
-    ratio = f"{found.ratio:.2f}" if found.ratio <= WITHIN else f"**{found.ratio:.2f}**"
+    beyond = f"**{found.ratio:.2f}** ({found.near} of {found.tried})"
+    ratio = f"{found.ratio:.2f}" if found.ratio <= WITHIN else beyond
     return f"{found.error:.2f} / {found.least:.2f}, {ratio}"
 
 

@@ -39,6 +39,8 @@ KINDS = (
 )  # fmt: skip
 CASES = [*product(PLANTS, KINDS), *product(("butterfly",), ("mixed", "drift"))]
 ROWS = 1500
+WITHIN = 1.2
+"""Ratio of the error of the default to that of the best by hand that is to be reached."""
 MEASURED = ("another session", "re-zeroed", "negated", "first 60 rows")
 """Kinds of cases of measured sessions."""
 
@@ -217,6 +219,10 @@ class Outcome:
     least: float
     simple: float
     """Error of a cubic with three plays."""
+    near: int
+    """Different errors of settings by hand that are within `WITHIN` times the best."""
+    tried: int
+    """All different errors: settings that mean the same to a record count once."""
     seconds: float
     """CPU time of the choice."""
 
@@ -249,7 +255,10 @@ def choose(one: Case) -> Outcome:
     errors = [error(candidate) for candidate in by_hand]
     least = int(np.argmin(errors))
     simple = one.error(Candidate("polynomial-plays", {"degree": 3, "plays": 3}, "auto"))
-    return Outcome(describe(chosen), errors[0], describe(by_hand[least]), errors[least], simple, seconds)
+    different = {float(f"{each:.4g}") for each in errors if np.isfinite(each)}
+    near = sum(each <= WITHIN * errors[least] for each in different)
+    best = describe(by_hand[least])
+    return Outcome(describe(chosen), errors[0], best, errors[least], simple, near, len(different), seconds)
 
 
 def describe(one: Candidate) -> str:

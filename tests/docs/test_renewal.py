@@ -105,7 +105,7 @@ def test_the_table_of_the_choice_shows_each_ratio_and_counts_those_within_the_bo
     outcome = of_docs("selection_quality").Outcome
 
     def found(error):
-        return outcome("duhem, degree 5", error, "duhem, degree 7", 1.0, 3.0, 9.0)
+        return outcome("duhem, degree 5", error, "duhem, degree 7", 1.0, 3.0, 2, 263, 9.0)
 
     shown = table(
         {("duhem", "mixed"): found(1.1), ("duhem", "drift"): found(1.3), ("butterfly", "mixed"): found(1.0)}
@@ -114,7 +114,7 @@ def test_the_table_of_the_choice_shows_each_ratio_and_counts_those_within_the_bo
         "| record | duhem | butterfly |",
         "| --- | --- | --- |",
         "| mixed | 1.10 / 1.00, 1.10 | 1.00 / 1.00, 1.00 |",
-        "| drift | 1.30 / 1.00, **1.30** |  |",
+        "| drift | 1.30 / 1.00, **1.30** (2 of 263) |  |",
         "",
         "Within 1.2 times the best: 2 of 3.",
     ]
@@ -122,7 +122,7 @@ def test_the_table_of_the_choice_shows_each_ratio_and_counts_those_within_the_bo
 
 def test_the_table_over_seeds_shows_median_and_greatest_ratio(of_docs):
     outcome = of_docs("selection_quality").Outcome
-    found = [outcome("a", error, "b", 2.0, 3.0, 9.0) for error in (2.0, 5.0, 2.2)]
+    found = [outcome("a", error, "b", 2.0, 3.0, 1, 263, 9.0) for error in (2.0, 5.0, 2.2)]
     assert of_docs("renew_selection").over_seeds({"duhem": found}).splitlines() == [
         "| plant | median ratio | greatest | within | by a cubic with plays |",
         "| --- | --- | --- | --- | --- |",
@@ -136,7 +136,7 @@ def test_a_case_is_measured_once_in_one_state_of_the_code(of_docs, tmp_path, mon
 
     def choose(one):
         measured.append(one)
-        return renewal.Outcome("a", 2.0, "b", 1.0, 3.0, 9.0)
+        return renewal.Outcome("a", 2.0, "b", 1.0, 3.0, 1, 263, 9.0)
 
     monkeypatch.setattr(renewal, "choose", choose)
     found = [renewal.outcome(tmp_path, "duhem", "60 samples", lambda: "case") for _ in range(2)]
