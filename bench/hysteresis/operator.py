@@ -162,6 +162,10 @@ class Operator(Model, ABC, Generic[S]):
         """Return the parameters that identification varies beside the coefficients; by default none."""
         return Shape()
 
+    def count_beside_coefficients(self) -> int:
+        """Return the number of parameters that identification finds beside the coefficients: by default the shape."""
+        return len(self.shape_parameters().values)
+
     def with_shape(self, values: Sequence[float]) -> Self:
         """Return the same operator with other shape parameters, shape (n,)."""
         if len(values):

@@ -213,6 +213,10 @@ class PrandtlIshlinskii(Operator[PlayState]):
             return replace(self, weights=values, bias=bias)
         return replace(self, after=DeadZones(self.after.thresholds, values), bias=bias)
 
+    def count_beside_coefficients(self) -> int:
+        """Return the number of weights found before the slopes of dead zones, which have the scale."""
+        return 0 if self.after is None else max(int(np.count_nonzero(self.weights)) - 1, 0)
+
     def initial_state(self) -> PlayState:
         """Return the relaxed state: every play at zero, the input at the origin."""
         return (0.0,) * self.thresholds.size

@@ -29,6 +29,8 @@ _COVERED = 0.95
 _DETERMINED = 0.9
 # Part of the travel of an output on smaller cycles that may be against the input's beyond what the record's is.
 _RETREAT = 0.01
+# Part of the output's range that smaller cycles may go beyond it: those of a stable equation hardly do.
+_BEYOND = 0.25
 
 
 @dataclass(frozen=True)
@@ -168,7 +170,7 @@ class Evaluation:
         Whether the output follows the input on smaller cycles as on the record; known only there.
     misfit : float
         RMS error of a fit to all rows, corrected for its free coefficients, output units; see `corrected`. Known
-        only where units were left out, and of models with time.
+        only where units were left out, of models with time, and near the best where there is one kind of cycle.
     akaike : float
         The corrected criterion of Akaike of that fit; see `akaike`.
     uncorrelated : bool
@@ -251,26 +253,25 @@ def _evaluate(
     except Exception as error:
         text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
         return Evaluation(candidate, failure=text, seconds=time.process_time() - begin)
-    return Evaluation(
+    evaluated = Evaluation(
         candidate,
         blocks=tuple(each.tested for each in done),
         units=tuple(each.tested for each in by_unit),
         training=float(np.mean([each.training for each in done])),
         start=float(np.mean([each.start for each in done])),
         free=free,
-        misfit=float("nan") if residuals is None else corrected(residuals, free),
-        akaike=float("nan") if residuals is None else akaike(residuals, free),
-        uncorrelated=residuals is not None and correlated_rows(residuals, 2) <= 1,
-        seconds=time.process_time() - begin,
     )
+    judged = evaluated if residuals is None else with_fit(evaluated, residuals)
+    return replace(judged, seconds=time.process_time() - begin)
 
 
 def judge_determined(measured: Measurements, evaluated: Evaluation) -> list[Evaluation]:
-    """Return an evaluation with whether the rows determine its coefficients, and its output follows smaller cycles.
+    """Return an evaluation with what the fit to all rows says, for a record of one kind of cycle.
 
+    That is its misfit, whether the rows determine its coefficients, and whether its output follows smaller cycles.
     The rank must be nine tenths of the coefficients or more; signs and penalties, which choose among what fits alike,
     are left out of account. A model without signs must follow the input on smaller cycles as it does on the record:
-    the output moves the other way by no more of its travel.
+    the output moves the other way by no more of its travel, and does not run far beyond its range.
     """
     trial = _Trial(measured, evaluated.candidate)
     problem = trial.problem
@@ -284,8 +285,21 @@ def judge_determined(measured: Measurements, evaluated: Evaluation) -> list[Eval
         fitted = model.evaluate(measured.inputs, problem.state)[measured.tested]
         cycles = _smaller_cycles(measured.inputs)
         after = model.evaluate(cycles, model.advance(problem.state, measured.inputs))
-        follows = _retreat(cycles, after) <= _retreat(measured.inputs[measured.tested], fitted) + _RETREAT
-    return [replace(evaluated, determined=determined, follows=follows)]
+        beyond = max(float(after.max() - fitted.max()), float(fitted.min() - after.min()))
+        follows = beyond <= _BEYOND * float(np.ptp(fitted))
+        follows &= _retreat(cycles, after) <= _retreat(measured.inputs[measured.tested], fitted) + _RETREAT
+    judged = replace(evaluated, determined=determined, follows=follows)
+    return [with_fit(judged, trial.residuals()[measured.tested])]
+
+
+def with_fit(evaluated: Evaluation, residuals: Floats) -> Evaluation:
+    """Return an evaluation with the criteria of the residuals of a fit to all rows."""
+    return replace(
+        evaluated,
+        misfit=corrected(residuals, evaluated.free),
+        akaike=akaike(residuals, evaluated.free),
+        uncorrelated=correlated_rows(residuals, 2) <= 1,
+    )
 
 
 def _smaller_cycles(inputs: Floats) -> Floats:
@@ -395,6 +409,6 @@ class _Trial:
             tested=float(errors[fold.tested].mean()),
             training=float(np.sqrt(errors[trained].mean())),
             start=float(np.sqrt(errors[first].mean())) if first.any() else 0.0,
-            free=len(problem.template.shape_parameters().values)
+            free=problem.template.count_beside_coefficients()
             + (effective if np.isfinite(effective := found.certificate.effective) else found.certificate.passive),
         )

@@ -11,8 +11,8 @@ import numpy as np
 from bench.hysteresis._checks import Floats
 from bench.identification.branches import turning_points
 from bench.identification.by_name import FitProblem
-from bench.identification.evaluation import Candidate, Evaluation, Measurements, akaike, corrected
-from bench.identification.folds import Fold, correlated_rows
+from bench.identification.evaluation import Candidate, Evaluation, Measurements, with_fit
+from bench.identification.folds import Fold
 from bench.identification.least_squares import Fit, one_thread
 from bench.identification.orientation import NAMES
 from bench.timed.hammerstein_fit import CHOICE, choose_elements, set_up_search
@@ -130,7 +130,7 @@ class HeldOutInTime:
             np.column_stack([columns, drifts]),
             lambda weights: search.fit_columns(columns, drifts, weights, sign),
             problem.skip,
-            found.values.size,
+            found.values.size + search.static.template.count_beside_coefficients(),
         )
 
     def _at_rates(self, measured: Measurements, static: Candidate) -> Evaluation | None:
@@ -194,17 +194,14 @@ def _left_out(
 
     blocks = [leave_out(fold) for fold in measured.blocks()]
     units = [leave_out(fold) for fold in measured.units()]
-    free = float(np.mean([free for _, free in blocks]))
     found = fit(measured.fitted.astype(np.float64))
     # The same rows of all candidates, whether they begin with them or not.
     residuals = (measured.outputs - found.bias - columns @ found.coefficients)[measured.tested]
-    return Evaluation(
+    evaluated = Evaluation(
         candidate,
         blocks=tuple(error for error, _ in blocks),
         units=tuple(error for error, _ in units),
         training=float(np.mean(trained[: len(blocks)])),
-        free=free,
-        misfit=corrected(residuals, free),
-        akaike=akaike(residuals, free),
-        uncorrelated=correlated_rows(residuals, 2) <= 1,
+        free=float(np.mean([free for _, free in blocks])),
     )
+    return with_fit(evaluated, residuals)
