@@ -34,9 +34,9 @@ from bench.identification.evaluation import (
 )
 from bench.identification.folds import correlated_rows, has_one_kind
 from bench.identification.near_best import (
-    FEWER,
     best_memory,
     best_of_few_rows,
+    best_of_one_kind,
     best_smoothing,
     has_signs,
     of_best_memory,
@@ -128,7 +128,7 @@ class Selection:
         That of the least held-out error.
     chosen : Evaluation
         The simplest within one standard error of it, or by the fit to all rows: where its residuals are uncorrelated,
-        of few rows, and of lags at one rate.
+        of few rows, of one kind of cycle, and of lags at one rate.
     gap : int
         Rows left out next to each block.
     rows : int
@@ -419,7 +419,7 @@ class _Search:
     def with_units(self, finalists: list[Evaluation]) -> list[Evaluation]:
         """Return the finalists, those near the best with whole units of the excitation left out too.
 
-        Where there is one kind of cycle, it is found instead whether the rows determine their coefficients.
+        Where there is one kind of cycle, it is found instead what the fit to all rows says of them.
         """
         least = min(each.rms for each in finalists)
         if self._has_one_kind:
@@ -516,14 +516,16 @@ class _Search:
     def _decide(self, finalists: list[Evaluation]) -> tuple[Evaluation, Evaluation]:
         """Return the one of the least error, and what is chosen of those that may be: the simplest near it.
 
-        The fit to all rows says more than what is left out of two records. Of few rows a block is much of what there
-        is: the criterion of Akaike says what takes part. At one rate the time constant of a lag is as wrong as the
-        operator is, and no row left out shows it: of models with a lag it is the one of the least misfit, whose
-        operator biases the time constant least.
+        The fit to all rows says more than what is left out of three records. Of one kind of cycle, the rows that are
+        left out are like those that are fitted. Of few rows a block is much of what there is: the criterion of Akaike
+        says what takes part. At one rate the time constant of a lag is as wrong as the operator is, and no row left
+        out shows it: of models with a lag it is the one of the least misfit, whose operator biases the time constant
+        least.
         """
         finalists = self._with_lag(finalists)
-        judged = [each for each in finalists if each.units] or self._without_units(finalists)
-        best, chosen = simplest_near_best(judged)
+        bounded, others = self._of_one_kind(finalists)
+        judged = bounded + others or [each for each in finalists if each.units] or self._bounded(finalists)
+        best, chosen = best_of_one_kind(bounded, others) if bounded else simplest_near_best(judged)
         if self.in_time is not None and self.in_time.has_one_rate() and _lags(chosen):
             alike = [each for each in judged if _lags(each) and has_signs(each) == has_signs(chosen)]
             chosen = min(alike, key=lambda each: each.misfit)
@@ -557,29 +559,20 @@ class _Search:
         slope = float(place @ errors / (place @ place))
         return Trend(slope, float(slope**2 * (place @ place) / np.sum((errors - errors.mean()) ** 2)))
 
-    def _without_units(self, finalists: list[Evaluation]) -> list[Evaluation]:
-        """Return the finalists that may be chosen where no cycles could be left out.
+    def _of_one_kind(self, finalists: list[Evaluation]) -> tuple[list[Evaluation], list[Evaluation]]:
+        """Return what a record of one kind of cycle determines and signs bound, and what else it determines.
 
-        Of one kind of cycle, these are what the record determines and signs bound, else what it determines, unless
-        they err many times more. A differential equation, which has no signs, must follow smaller cycles and take
-        clearly fewer coefficients than what would be chosen of these.
+        Both err at most twice as much as the best; both are empty of other records. A differential equation, which
+        has no signs, must follow smaller cycles.
         """
         least = min(each.rms for each in finalists)
-        determined = [each for each in finalists if each.determined and each.rms <= _UNDETERMINED * least]
-        if not self._has_one_kind or not determined:
-            return self._bounded(finalists)
+        near = [each for each in finalists if self._has_one_kind and each.rms <= _UNDETERMINED * least]
+        determined = [each for each in near if each.determined]
         bounded = [each for each in determined if self._is_bounded(each)]
-        if not bounded:
-            return determined
-        simplest = simplest_near_best(bounded)[1]
-        return bounded + [
-            each
-            for each in determined
-            if each not in bounded
-            and each.follows
-            and each.free <= FEWER * simplest.free
-            and each.candidate.operator in self._with_shape
-        ]
+        others = [each for each in determined if each not in bounded]
+        if bounded:
+            others = [each for each in others if each.follows and each.candidate.operator in self._with_shape]
+        return bounded, others
 
     def _is_bounded(self, each: Evaluation) -> bool:
         """Return whether signs bound the answer to other inputs, or it has no memory."""
@@ -645,9 +638,11 @@ class _Search:
         skipping: tuple[Initial, ...] = ("skip",) if self._may_skip else ()
         if not template.memoryless:
             estimated: tuple[Initial, ...] = ("estimate",) if spec.estimate_state is not None else ()
-            memories = (
-                (None, "positive", *estimated, *skipping) if self.given.initial is None else (self.given.initial,)
-            )
+            # Plays, springs and differential equations begin relaxed.
+            relaxed = template.initial_state() != template.saturated_state(-1)
+            negative: tuple[Initial, ...] = ("negative",) if relaxed else ()
+            memories = (None, *negative, "positive", *estimated, *skipping)
+            memories = memories if self.given.initial is None else (self.given.initial,)
         self._memories[kind] = memories
         if template.shape_parameters().names:
             self._with_shape.add(kind.model)

@@ -11,6 +11,7 @@ from bench.identification.by_name import set_up_problem
 from bench.identification.evaluation import Candidate, Evaluation, Measurements, evaluate
 from bench.identification.near_best import (
     best_of_few_rows,
+    best_of_one_kind,
     best_smoothing,
     is_within_one_standard_error,
     simplest_near_best,
@@ -67,11 +68,27 @@ class TestTheRuleOfOneStandardError:
     def test_of_few_rows_the_least_error_of_those_that_the_fit_supports_is_taken(self):
         three = [
             replace(evaluation([square] * 5), akaike=criterion)
-            for square, criterion in ((1.0, 4.1), (1.5, 3.9), (2.0, 0.0))
+            for square, criterion in ((1.0, 10.1), (1.5, 9.9), (2.0, 0.0))
         ]
         assert best_of_few_rows(three) is three[1]
         many = [replace(each, akaike=float("inf")) for each in three]
         assert best_of_few_rows(many) is many[0]
+
+    def test_of_one_kind_of_cycle_what_leaves_only_noise_is_chosen_and_the_best_if_nothing_does(self):
+        def fitted(square, free, criterion, adequate=True):
+            return replace(evaluation([square] * 5, free=free), akaike=criterion, uncorrelated=adequate)
+
+        rough, fine = fitted(1.2, 5.0, 60.0, adequate=False), fitted(1.01, 20.0, 3.9)
+        equation = fitted(1.0, 15.0, 0.0)
+        assert best_of_one_kind([rough, fine], [equation]) == (equation, fine)
+        # Signs no longer bound what the data support considerably more.
+        better = replace(equation, akaike=-0.2)
+        assert best_of_one_kind([rough, fine], [better]) == (better, better)
+        # So little noise in so many coefficients says nothing.
+        many = replace(better, free=21.0)
+        assert best_of_one_kind([rough, fine], [many])[1] is fine
+        correlated = [replace(each, uncorrelated=False) for each in (rough, fine, better)]
+        assert best_of_one_kind(correlated[:2], correlated[2:]) == (correlated[2], correlated[1])
 
     def test_units_left_out_count_as_much_as_blocks(self):
         best = evaluation([1.0] * 5, [1.0] * 5)
@@ -155,7 +172,7 @@ def test_of_one_kind_of_cycle_a_model_is_chosen_that_the_record_determines():
 
 
 @pytest.mark.seeds
-def test_of_one_kind_of_cycle_a_differential_equation_is_chosen_that_takes_clearly_fewer_coefficients():
+def test_of_one_kind_of_cycle_a_differential_equation_is_chosen_that_the_fit_supports_more():
     inputs = through([0.0, *[1.0, -1.0] * 6], 1000)
     measured = Measurements.of(inputs, noisy(settled(bouc_wen, inputs), 0.01))
     # Sampled turning points do not all reach the ends.
@@ -294,6 +311,27 @@ def test_penalties_of_all_rows_are_nearly_those_of_each_fold(plant, seed, capsys
             f"\n{plant.__name__} {seed}: penalties of each fold, error {ratio:.3f} times that with those of all rows"
         )
     assert 0.85 <= ratio <= 1.15
+
+
+def test_weights_of_plays_before_dead_zones_are_counted():
+    plant = PrandtlIshlinskii([0.0, 0.2, 0.4], [1.0, 0.5, 0.5], input_range=(-1.0, 1.0))
+    outputs = noisy(plant.evaluate(INPUTS))
+    with_zones = Candidate("prandtl-ishlinskii", {"plays": 5, "dead_zones": 4})
+    (found,) = evaluate(Measurements.of(INPUTS, outputs), [with_zones])
+    problem = set_up_problem("prandtl-ishlinskii", INPUTS, outputs, None, 0, 0.0, None, dict(with_zones.options))
+    plays = np.count_nonzero(problem.template.weights)
+    assert plays > 1
+    # A factor can be moved from the plays to the slopes.
+    assert found.free == pytest.approx(5 + plays - 1, abs=0.5)
+
+
+def test_plays_may_begin_at_negative_saturation():
+    before = np.array([0.0, 1.0, -1.0])
+    plant = PrandtlIshlinskii([0.0, 0.3, 0.6], [1.0, 0.5, 0.7], input_range=(-1.0, 1.0))
+    inputs = through([0.2, -0.3, 0.5, -0.6, 1.0, -1.0, 0.4, -0.2, 0.8, -0.7], 300)
+    outputs = plant.evaluate(np.append(before, inputs))[before.size :]
+    found = select(Measurements.of(inputs, noisy(outputs)), ("prandtl-ishlinskii",))
+    assert found.chosen.candidate.initial == "negative"
 
 
 def test_what_is_left_out_still_drives_the_memory():
