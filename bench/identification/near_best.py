@@ -19,9 +19,9 @@ from bench.identification.evaluation import Evaluation
 # Part of the coefficients of another from which a model is clearly simpler.
 _FEWER = 2.0 / 3.0
 
-# Differences of Akaike's criterion from which the data support a model considerably less, and essentially not at all
-# (Burnham and Anderson, Model Selection and Multimodel Inference, 2002, section 2.6).
-_LESS_SUPPORTED, _NOT_SUPPORTED = 4.0, 10.0
+# Differences of Akaike's criterion at which the data support a model considerably less: from, to (Burnham and
+# Anderson, Model Selection and Multimodel Inference, 2002, section 2.6).
+_LESS_FROM, _LESS_TO = 4.0, 7.0
 # What the simplest may err more than the best, however large the standard error.
 _WORSE = 1.05
 
@@ -57,41 +57,30 @@ def simplest_near_best(judged: Sequence[Evaluation]) -> tuple[Evaluation, Evalua
         each for each in within if each.uncorrelated and not has_signs(each) and bool(each.candidate.static) == timed
     ]
     likeliest = min(adequate, key=lambda each: each.akaike, default=simplest)
-    return best, simplest if _is_supported(simplest, likeliest) else likeliest
+    supported = simplest.akaike <= likeliest.akaike + _LESS_FROM
+    return best, simplest if supported else likeliest
 
 
 def best_of_one_kind(bounded: Sequence[Evaluation], others: Sequence[Evaluation]) -> tuple[Evaluation, Evaluation]:
     """Return the one of the least error of those that may be chosen from one kind of cycle, and what is chosen.
 
-    Blocks that are left out are like those that are fitted, so that the fit to all rows tells as much. What leaves
-    no more than noise is chosen: the likeliest of those that are bounded and supported about as much as any, else
-    another, which must not have more coefficients than the simplest of those. If nothing does, it is the bounded one
-    of the least error. Time is left out where the simplest leaves it out.
+    Blocks that are left out are like those that are fitted: a little more error tells nothing of other inputs. Chosen
+    is the one of the least error of those whose fit leaves no more than noise; if none does, of the bounded. Others
+    must not have more coefficients than the simplest of the bounded, which also decides whether time is left out.
     """
     simplest = simplest_near_best(bounded)[1]
     few = [each for each in others if each.free <= simplest.free]
-    best = min((*bounded, *few), key=lambda each: score(each).mean())
-    # The criterion compares fits to the same rows.
-    alike = [each for each in bounded if bool(each.candidate.static) == bool(simplest.candidate.static)]
-    few = [each for each in few if bool(each.candidate.static) == bool(simplest.candidate.static)]
-    adequate = [each for each in alike + few if each.uncorrelated]
-    if not adequate:
-        return best, min(alike, key=lambda each: score(each).mean())
-    likeliest = min(adequate, key=lambda each: each.akaike)
-    supported = [each for each in adequate if each in alike and _is_supported(each, likeliest)]
-    return best, min(supported, key=lambda each: each.akaike, default=likeliest)
+    alike = [each for each in (*bounded, *few) if bool(each.candidate.static) == bool(simplest.candidate.static)]
+    adequate = [each for each in alike if each.uncorrelated] or [each for each in alike if each in bounded]
+    best, chosen = (min(each, key=lambda one: score(one).mean()) for each in ((*bounded, *few), adequate))
+    return best, chosen
 
 
 def best_of_few_rows(judged: Sequence[Evaluation]) -> Evaluation:
-    """Return the one of the least error among those that the fit to all rows supports at all."""
+    """Return the one of the least error among those that the fit to all rows supports."""
     least = min(each.akaike for each in judged)
-    supported = (each for each in judged if each.akaike <= least + _NOT_SUPPORTED)
+    supported = (each for each in judged if each.akaike <= least + _LESS_TO)
     return min(supported, key=lambda each: score(each).mean())
-
-
-def _is_supported(each: Evaluation, likeliest: Evaluation) -> bool:
-    """Return whether the criterion of Akaike speaks for a candidate about as much as for the likeliest."""
-    return each.akaike <= likeliest.akaike + _LESS_SUPPORTED
 
 
 def is_within_one_standard_error(simple: Evaluation, best: Evaluation) -> bool:
