@@ -97,7 +97,7 @@ class TwinLaboratory(EmulatedLaboratory):
     Settings: ClassVar[type[LaboratorySettings]] = TwinLaboratorySettings
 
     def __init__(self, settings: TwinLaboratorySettings, clock: Clock, seed: int) -> None:
-        specimen_stream, session_stream, reading_stream = np.random.default_rng(seed).spawn(3)
+        specimen_stream, session_stream, reading_stream, self._rng = np.random.default_rng(seed).spawn(4)
         drive, response = settings.drive, settings.response
         self._settings = settings
         self._session = settings.session_offset * float(session_stream.standard_normal())
@@ -167,7 +167,8 @@ class TwinLaboratory(EmulatedLaboratory):
         """Take what a device sets from now on; nan for one that is off."""
         self._outputs[device] = value
         if device == self._settings.drive.device:
-            self.plant.set(self._at_rest if math.isnan(value) else value)
+            exactly = math.isnan(value)
+            self.plant.set(self._at_rest if exactly else self._settings.setpoints.inexact(value, self._rng))
 
     def _source(self, signal: str, noise: NoiseTable) -> Callable[[], float]:
         """Return what gives the true value of a signal."""

@@ -57,6 +57,12 @@ def move(
     return position, velocity
 
 
+@inner
+def signed_power(value: float, power: float) -> float:
+    """Return |value|^power with the sign of the value."""
+    return value if power == 1.0 else math.copysign(abs(value) ** power, value)
+
+
 @kernel
 def hold_back(lagged: float, positions: Floats, seen: Floats, step: float, lag: float, power: float) -> float:
     """Write what an operator behind a lag sees of each position to `seen`; return the last |x|^power.
@@ -68,10 +74,9 @@ def hold_back(lagged: float, positions: Floats, seen: Floats, step: float, lag: 
         return lagged
     remains = math.exp(-step / lag)
     for k in range(positions.size):
-        position = positions[k]
-        source = position if power == 1.0 else math.copysign(abs(position) ** power, position)
+        source = signed_power(positions[k], power)
         lagged = source + (lagged - source) * remains
-        seen[k] = lagged if power == 1.0 else math.copysign(abs(lagged) ** (1.0 / power), lagged)
+        seen[k] = signed_power(lagged, 1.0 / power)
     return lagged
 
 
@@ -94,13 +99,13 @@ def follow(
 ) -> None:
     """Move the drive by as many grid steps as there are set-points; write what the operator sees to `out`.
 
-    Actuator and lag are as for `move` and `hold_back`. Rows of `out`: what the actuator did, and that with the lag
-    before the operator, the wander and the unevenness. Rows of `normals` are standard normal numbers: for the wander,
+    Actuator and lag are as for `move` and `hold_back`. Rows of `out`: what the actuator did; and that with the
+    wander, behind the lag, and with the unevenness. Rows of `normals` are standard normal numbers: for the wander,
     and for the unevenness.
     """
-    before, drift, place = state[0], state[3], state[4]
+    before, lagged, drift, place = state[0], state[2], state[3], state[4]
     state[0], state[1] = move(state[0], state[1], setpoints, out[0], step, frequency, damping, rate)
-    state[2] = hold_back(state[2], out[0], out[1], step, lag, power)
+    remains = math.exp(-step / lag) if lag > 0.0 else 0.0
     decay = math.exp(-step / wander_time)
     kick = wander * math.sqrt(1.0 - decay * decay)
     for k in range(setpoints.size):
@@ -110,8 +115,10 @@ def follow(
             kept = math.exp(-abs(position - before) / uneven_length)
             place = kept * place + uneven * math.sqrt(1.0 - kept * kept) * normals[1, k]
         before = position
-        out[1, k] = out[1, k] + drift + place
-    state[3], state[4] = drift, place
+        source = signed_power(position + drift, power)
+        lagged = source + (lagged - source) * remains
+        out[1, k] = signed_power(lagged, 1.0 / power) + place
+    state[2], state[3], state[4] = lagged, drift, place
 
 
 @kernel

@@ -51,13 +51,13 @@ class Correction:
         Gives what of the errors repeats; None if nothing does.
     rms : float
         Error that is left, output units.
-    unknown : ndarray
-        The error at each reading, of a correction that was made without it, output units.
+    left : ndarray
+        That error at each reading, output units.
     """
 
     operator: Operator[Any] | None
     rms: float
-    unknown: Floats
+    left: Floats
 
 
 def identify_correction(
@@ -109,14 +109,14 @@ def identify_correction(
     which = int(np.argmin(losses))
     if losses[which] >= float(target @ target):
         return Correction(None, float(np.sqrt(np.mean(target**2))), target)
-    missed, (nodes, columns, penalty) = options[which]
+    nodes, columns, penalty = options[which][1]
     gram, right = columns.T @ columns + weights[which] * penalty, columns.T @ targets[:, which]
     # What takes the place of a density that is nowhere negative is so too.
     bounded = which == 1 and own.min() >= 0.0
     solution = _not_negative(gram, right) if bounded else np.asarray(np.linalg.solve(gram, right))
     left = targets[:, which] - columns @ solution
     operator = template.with_coefficients(nodes @ solution[:-1] - replaced[which], float(solution[-1]))
-    return Correction(operator, float(np.sqrt(np.mean(left**2))), missed)
+    return Correction(operator, float(np.sqrt(np.mean(left**2))), left)
 
 
 def _problem(

@@ -38,7 +38,7 @@ _QUICKEST = 0.2
 """Least correlation time of wander and drift, s."""
 _FEWEST = 12
 """Fewest differences of a class that counts."""
-_SETTLED, _LAGGED = 4.0, 6.0
+_SETTLED, _LAGGED = 4.0, 4.0
 """Time constants of the actuator and lags after which the set-point counts as reached. Behind a lag the response of a
 steep model still moves by more than its noise, which would be taken for wander."""
 _NEAR = 2e-3
@@ -47,6 +47,8 @@ _LEAST_OF_HOLD = 3
 """Readings of a hold whose middle counts."""
 _FAR, _DIGITS = 6.0, 1.5
 """Distance of an outlier from that middle, in standard deviations and in last digits."""
+_MOST, _MOST_OF_DIFFERENCES = 0.9, 1.6449 * math.sqrt(2.0)
+"""A quantile of differences, and what it is of those of normal numbers of a standard deviation of 1."""
 _RARE, _SEEN = 0.05, 3
 """Greatest share of outliers, and their least number."""
 _QUANTILES = 9
@@ -104,27 +106,47 @@ class _Pairs:
 def noise_of(recordings: Sequence[Recording], signal: str, dynamics: Dynamics, *, outliers: bool = False) -> Noise:
     """Return the noise of a signal that stands still within holds, such as what is read of the drive."""
     holds = [hold for r in recordings for hold in _holds(r, signal, dynamics)]
-    resolution = _resolution(np.concatenate([hold.values for hold in holds])) if holds else 0.0
-    off = [np.zeros(hold.values.size, dtype=bool) for hold in holds]
-    far, levels = np.empty(0), np.empty(0)
-    if outliers and holds:
-        off = _outliers(holds, resolution)
-        far = np.concatenate([h.values[o] - h.middle for h, o in zip(holds, off, strict=True)])
-        levels = np.concatenate([np.full(int(o.sum()), h.middle) for h, o in zip(holds, off, strict=True)])
+    if not holds:
+        return Noise()
+    # Outliers that are in proportion to what is read are no multiples of its last digit.
+    still = [hold.values for hold in holds if np.ptp(hold.values) == 0.0]
+    values = np.concatenate(still if 2 * len(still) > len(holds) else [hold.values for hold in holds])
+    resolution = _resolution(values)
+    off, limit = [np.zeros(hold.values.size, dtype=bool) for hold in holds], 0.0
+    if outliers:
+        off, limit = _outliers(holds, resolution)
     found = []
     for kind in (True, False):
         kept = [h.values[(h.is_reading == kind) & ~o] for h, o in zip(holds, off, strict=True)]
-        found.append(_deviation(np.concatenate([np.diff(each) for each in kept])) if kept else None)
-    noise = _noise(found, resolution)
-    if far.size < _SEEN:
+        found.append(_deviation(np.concatenate([np.diff(each) for each in kept])))
+    errors = np.concatenate([hold.values - hold.middle for hold in holds])
+    levels = np.concatenate([np.full(hold.values.size, hold.middle) for hold in holds])
+    return with_outliers(_noise(found, resolution), errors, levels, np.concatenate(off), limit)
+
+
+def with_outliers(noise: Noise, errors: Floats, levels: Floats, off: NDArray[np.bool_], limit: float) -> Noise:
+    """Return noise with outliers.
+
+    Parameters
+    ----------
+    noise : Noise
+        The noise without.
+    errors, levels : ndarray, shape (N,)
+        By how much each value is off, and what it should be.
+    off : ndarray of bool, shape (N,)
+        Which of them are outliers.
+    limit : float
+        A smaller error would not have been seen as one.
+    """
+    if int(off.sum()) < _SEEN:
         return noise
-    relative = _is_relative(far, levels)
-    sizes = far / levels if relative else far
+    relative = _is_relative(errors[off], levels[off])
+    sizes = errors[off] / levels[off] if relative else errors[off]
+    seen = off | (np.abs(levels) * float(np.median(np.abs(sizes))) > limit) if relative else np.ones_like(off)
     quantiles = np.quantile(sizes, (np.arange(_QUANTILES) + 0.5) / _QUANTILES)
-    count = sum(hold.values.size for hold in holds)
     return replace(
         noise,
-        outlier_share=far.size / count,
+        outlier_share=float(np.mean(off[seen])),
         outliers=tuple(quantiles.tolist()),
         relative_outliers=relative,
     )
@@ -150,8 +172,11 @@ def _holds(recording: Recording, signal: str, dynamics: Dynamics) -> list[_Hold]
     return [_Hold(values[part], recording.is_reading[part]) for part in parts if part.size >= _LEAST_OF_HOLD]
 
 
-def _outliers(holds: Sequence[_Hold], resolution: float) -> list[NDArray[np.bool_]]:
-    """Return which readings of each hold are off: rare ones, each alone between two that are not."""
+def _outliers(holds: Sequence[_Hold], resolution: float) -> tuple[list[NDArray[np.bool_]], float]:
+    """Return which readings of each hold are off, and from which distance on they count as such.
+
+    They are rare, and each is alone between two that are not off.
+    """
     distances = [np.abs(hold.values - hold.middle) for hold in holds]
     limits = {}
     for kind in (True, False):
@@ -167,8 +192,8 @@ def _outliers(holds: Sequence[_Hold], resolution: float) -> list[NDArray[np.bool
         found.append(off & ~beside)
     count = sum(int(each.sum()) for each in found)
     if not _SEEN <= count <= _RARE * sum(each.size for each in found):
-        return [np.zeros_like(each) for each in found]
-    return found
+        found = [np.zeros_like(each) for each in found]
+    return found, max(limits.values())
 
 
 def _is_relative(far: Floats, levels: Floats) -> bool:
@@ -199,18 +224,17 @@ def identify_disturbances(
         return noise, Wander(), Wander()
     variances = np.maximum(variances[used], 1e-300)
     white = np.broadcast_to([2.0 * quick, 2.0 * reading, quick + reading], counts.shape)[used]
-    weights = np.minimum(counts[used], 200.0)
+    holds, independent = (each[used] for each in evidence(parts))
+    # The logarithm of a mean of n independent squares is uncertain by the square root of 2 / n.
+    weights = 0.5 * np.minimum(independent, 200.0)
     # How a hold goes on says the same of wander only once, and a few holds go on as their drift happens to.
-    holds = _holds_of(parts)[used]
     trusted = np.where(holds >= _FEWEST, np.minimum(holds, 200.0), 0.0)
     span = float(np.ptp(np.concatenate([r.driven for r in recordings])))
     height = float(np.ptp(np.concatenate([r.responded for r in recordings])))
-    # The specimen sees nothing of its drive that is quicker than the lag before it.
-    shortest = max(_QUICKEST, dynamics.response.lag)
 
     def trial(numbers: Floats) -> tuple[Wander, Wander]:
         wander, wander_time, drift, drift_time = np.exp(np.clip(numbers, -30.0, 12.0)).tolist()
-        return Wander(wander * span, max(wander_time, shortest)), Wander(drift * height, drift_time)
+        return Wander(wander * span, max(wander_time, _QUICKEST)), Wander(drift * height, drift_time)
 
     def cost(numbers: Floats) -> float:
         wander, drift = trial(numbers)
@@ -272,6 +296,7 @@ class Part:
         quiet = replace(dynamics, wander=Wander(), drift=Wander())
         self.still = self._run(quiet, None)
         count = self.still.size
+        self.times = recording.times[:count]
         self.errors = recording.responded[:count] - self.still
         self.slopes = self._local_slopes(count)
         self.pairs: _Pairs
@@ -353,13 +378,24 @@ def _moments(parts: Sequence[Part], values: Sequence[Floats]) -> tuple[Floats, F
     return counts, squares / divisors - (means / divisors) ** 2, means / divisors
 
 
-def _holds_of(parts: Sequence[Part]) -> Floats:
-    """Return how many holds the pairs of each class are of, by time, slope and kind."""
-    found = np.zeros(math.prod(_CLASSES))
+def evidence(parts: Sequence[Part]) -> tuple[Floats, Floats]:
+    """Return of how many holds the pairs of each class are, and how many of the pairs are independent.
+
+    Both by time, slope and kind. Of one hold, pairs are independent as far as they do not overlap in time.
+    """
+    holds, independent = np.zeros(math.prod(_CLASSES)), np.zeros(math.prod(_CLASSES))
     for part in parts:
-        place, _ = np.unique(np.column_stack([part.pairs.place, part.pairs.hold]), axis=0).T
-        found += np.bincount(place, minlength=found.size)
-    return found.reshape(_CLASSES)
+        pairs, times = part.pairs, part.times
+        keys, members = np.unique(np.column_stack([pairs.place, pairs.hold]), axis=0, return_inverse=True)
+        begins, ends = times[pairs.first], times[pairs.second]
+        first, last = np.full(len(keys), np.inf), np.zeros(len(keys))
+        np.minimum.at(first, members, begins)
+        np.maximum.at(last, members, ends)
+        counts = np.bincount(members)
+        fitting = (last - first) * counts / np.bincount(members, ends - begins)
+        holds += np.bincount(keys[:, 0], minlength=holds.size)
+        independent += np.bincount(keys[:, 0], np.minimum(fitting, counts), independent.size)
+    return holds.reshape(_CLASSES), independent.reshape(_CLASSES)
 
 
 def _response_noise(parts: Sequence[Part], recordings: Sequence[Recording], signal: str) -> Noise:
@@ -405,9 +441,7 @@ def _deviation(differences: Floats) -> float | None:
     """Return the standard deviation of the numbers of which these are differences; None of too few."""
     if differences.size < _FEWEST:
         return None
-    return float(np.median(np.abs(differences)) / MEDIAN_OF_DIFFERENCES) or float(
-        np.sqrt(np.mean(differences**2) / 2.0)
-    )
+    return float(np.quantile(np.abs(differences), _MOST)) / _MOST_OF_DIFFERENCES
 
 
 def _resolution(values: Floats) -> float:

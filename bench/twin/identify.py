@@ -11,7 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from bench.control.dynamics import ResponseDynamics
 from bench.devices import Signal
 from bench.errors import DataError
 from bench.hysteresis import Operator
@@ -24,7 +23,9 @@ from bench.twin.disturbances import Noise, identify_disturbances, mean_effects, 
 from bench.twin.reading_time import ReadingTime, time_readings
 from bench.twin.recording import read_recording, slots_of_twin
 from bench.twin.response import IdentifiedResponse, correct_response, identify_response
+from bench.twin.setpoints import identify_setpoints
 from bench.twin.specimen import Dynamics, Unevenness, Wander
+from bench.twin.tables import InexactTable
 from bench.twin.unevenness import identify_unevenness
 
 _MODELS: Mapping[str, Mapping[str, Any]] = {
@@ -52,6 +53,8 @@ class IdentifiedTwin:
         The hysteresis.
     actuator, response, noise, wander, drift, unevenness, reading_time
         What was identified beside it; the noise is of drive and response.
+    setpoints : Noise
+        How exactly set-points are carried out.
     offset : float
         Standard deviation of the response from session to session, output units.
     signals : mapping of str to dict
@@ -68,6 +71,7 @@ class IdentifiedTwin:
     actuator: IdentifiedActuator
     response: IdentifiedResponse
     noise: tuple[Noise, Noise]
+    setpoints: Noise
     wander: Wander
     drift: Wander
     unevenness: Unevenness
@@ -102,6 +106,13 @@ class IdentifiedTwin:
 
         def number(value: float, unit: str, spread: float | None = None) -> str:
             return f"{value:.4g}{'' if spread is None else f' ± {spread:.2g}'} {unit}".rstrip()
+
+        def outliers(noise: Noise, unit: str, what: str) -> list[tuple[str, str]]:
+            if not noise.outliers:
+                return []
+            most = max(map(abs, noise.outliers))
+            size = f"{100.0 * most:.2g} % of it" if noise.relative_outliers else number(most, unit)
+            return [("  outliers", f"{100.0 * noise.outlier_share:.2g} % of the {what}, by up to {size}")]
 
         order = ("follows at once", "first order", "second order")[dynamics.order]
         rows = [
@@ -140,10 +151,10 @@ class IdentifiedTwin:
             rows.append(
                 (name, f"{number(noise.reading, unit)} of a reading, {number(noise.quick, unit)} of a quick one")
             )
-            if noise.outliers:
-                most = max(map(abs, noise.outliers))
-                size = f"{100.0 * most:.2g} % of it" if noise.relative_outliers else number(most, unit)
-                rows.append(("  outliers", f"{100.0 * noise.outlier_share:.2g} % of the readings, by up to {size}"))
+            rows += outliers(noise, unit, "readings")
+        if self.setpoints.resolution:
+            rows.append(("steps of the set-points", number(self.setpoints.resolution, drive)))
+            rows += outliers(self.setpoints, drive, "set-points")
         for name, wander, unit in (
             ("wander of the drive", self.wander, drive),
             ("drift of the response", self.drift, response),
@@ -181,6 +192,7 @@ class IdentifiedTwin:
                 "times": list(slow.times),
             },
             "noise": {"drive": vars(self.noise[0]), "response": vars(self.noise[1])},
+            "setpoints": inexact(self.setpoints),
             "wander": vars(self.wander),
             "drift": vars(self.drift),
             "unevenness": vars(self.unevenness),
@@ -224,19 +236,23 @@ def identify_twin(paths: Sequence[Path], file: RigFile, model: Path | None) -> I
                     f"model file {model}: its {what} is in {unit or 'no unit'}, that of the runs in {expected}"
                 )
     actuator = identify_actuator(recordings)
-    response = identify_response(recordings, actuator.dynamics, operator)
+    # The drive stands still long before what lags behind it.
+    drive_noise = noise_of(
+        recordings, first.drive, Dynamics(grid_step(actuator.dynamics), actuator.dynamics), outliers=True
+    )
+    setpoints, carried_out = identify_setpoints(recordings, actuator.dynamics, drive_noise, operator)
+    response = identify_response(carried_out, actuator.dynamics, operator)
     operators = [operator] if response.correction is None else [operator, response.correction]
     dynamics = Dynamics(grid_step(actuator.dynamics), actuator.dynamics, response.dynamics)
-    noise, wander, drift = identify_disturbances(recordings, operators, dynamics, first.response)
+    noise, wander, drift = identify_disturbances(carried_out, operators, dynamics, first.response)
     disturbed = replace(dynamics, wander=wander, drift=drift)
     # The readings had the effect of wander, too: the twin adds its own.
-    effects = mean_effects(recordings, operators, disturbed)
-    response = correct_response(response, recordings, operator, effects)
+    effects = mean_effects(carried_out, operators, disturbed)
+    response = correct_response(response, carried_out, operator, effects)
     operators = [operator] if response.correction is None else [operator, response.correction]
-    unevenness = identify_unevenness(recordings, response.unknown, operators, disturbed, effects, noise)
-    # The drive stands still long before what lags behind it.
-    drive_alone = replace(dynamics, response=ResponseDynamics())
-    drive_noise = noise_of(recordings, first.drive, drive_alone, outliers=True)
+    unevenness = identify_unevenness(
+        carried_out, response.of_model, response.left, operators, disturbed, effects, noise
+    )
     return IdentifiedTwin(
         recordings=recordings,
         model_name=name,
@@ -244,6 +260,7 @@ def identify_twin(paths: Sequence[Path], file: RigFile, model: Path | None) -> I
         actuator=actuator,
         response=response,
         noise=(drive_noise, noise),
+        setpoints=setpoints,
         wander=wander,
         drift=drift,
         unevenness=unevenness,
@@ -352,9 +369,7 @@ def _signals(
             setpoint = f"{device}_setpoint"
             if device != driving and not followed and units.get(setpoint) == signal.unit:
                 table["follows"], followed = device, True
-            found[name] = table | {
-                key: list(each) if isinstance(each, tuple) else each for key, each in vars(noise).items()
-            }
+            found[name] = table | {"reading": noise.reading, "quick": noise.quick} | inexact(noise)
     return found
 
 
@@ -363,6 +378,12 @@ def _converted(noise: Noise, conversion: Sequence[tuple[float, float]], own: Noi
     pairs = np.array(conversion)
     slope = abs(float((pairs[-1, 1] - pairs[0, 1]) / (pairs[-1, 0] - pairs[0, 0])))
     return Noise(noise.reading * slope, noise.quick * slope, own.resolution)
+
+
+def inexact(noise: Noise) -> dict[str, Any]:
+    """Return the keys of an `InexactTable`."""
+    found = {key: value for key, value in vars(noise).items() if key in InexactTable.model_fields}
+    return found | {"outliers": list(noise.outliers)}
 
 
 def _difference(unit: str) -> str:

@@ -38,8 +38,8 @@ class IdentifiedResponse:
     rms_model, rms : float
         Error of the model with its dynamics over the readings of steps, and what is left over with the correction,
         output units.
-    unknown : tuple of ndarray
-        By run, the error at each reading of a step, of a correction that was made without it, output units.
+    of_model, left : tuple of ndarray
+        By run, the error of the model at each reading of a step, and what of it is left over, output units.
     inputs, errors : tuple of ndarray
         By run, what the specimen saw of the drive at each row, input units; measured less modelled response, without
         a correction, output units.
@@ -51,7 +51,8 @@ class IdentifiedResponse:
     lag_uncertainty: float
     rms_model: float
     rms: float
-    unknown: tuple[Floats, ...]
+    of_model: tuple[Floats, ...]
+    left: tuple[Floats, ...]
     inputs: tuple[Floats, ...]
     errors: tuple[Floats, ...]
 
@@ -74,7 +75,7 @@ def identify_response(
     left = np.concatenate([(e - o)[c] for e, o, c in zip(errors, offsets, readings, strict=True)])
     rms_model = float(np.sqrt(np.mean(left**2)))
     uncorrected = IdentifiedResponse(
-        dynamics, None, (), uncertainty, rms_model, rms_model, (), tuple(inputs), tuple(errors)
+        dynamics, None, (), uncertainty, rms_model, rms_model, (), (), tuple(inputs), tuple(errors)
     )
     return correct_response(uncorrected, recordings, model, [np.zeros_like(error) for error in errors])
 
@@ -106,5 +107,6 @@ def correct_response(
         correction=correction.operator,
         offsets=tuple(offsets),
         rms=correction.rms,
-        unknown=tuple(np.split(correction.unknown, ends)),
+        of_model=tuple(np.split(left[np.concatenate(readings)], ends)),
+        left=tuple(np.split(correction.left, ends)),
     )

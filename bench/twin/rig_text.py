@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.rig_file import RigFile
-from bench.twin.identify import IdentifiedTwin, measured_signals, model_json
+from bench.twin.identify import IdentifiedTwin, inexact, measured_signals, model_json
 from bench.twin.specimen import Wander
 
 _FASTEST_LINE = 100_000_000
@@ -137,6 +137,8 @@ def _emulation(twin: IdentifiedTwin, file: RigFile) -> Iterator[str]:
         },
         {"rest": drive, "delay": "s", "frequency": "rad/s", "rate": f"{drive}/s".replace("°C", "K"), "offset": drive},
     )
+    if twin.setpoints.resolution:
+        yield from _table("emulation.setpoints", inexact(twin.setpoints), {"resolution": drive})
     yield from _table(
         "emulation.response",
         {

@@ -110,9 +110,10 @@ class Specimen:
         position = (start - actuator.offset) / actuator.gain
         wander = rng.standard_normal() * dynamics.wander.deviation if rng is not None else 0.0
         self._drift = rng.standard_normal() * dynamics.drift.deviation if rng is not None else 0.0
-        lagged = math.copysign(abs(position) ** response.power, position)
         place = rng.standard_normal() * dynamics.unevenness.deviation if rng is not None else 0.0
         gain = actuator.gain
+        disturbed = position + wander / gain
+        lagged = math.copysign(abs(disturbed) ** response.power, disturbed)
         self._state = np.array([position, 0.0, lagged, wander / gain, place / gain])
         seen = start + wander + place
         self._memories = [operator.step(operator.initial_state(), seen)[0] for operator in operators]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any, Self
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from bench.control.dynamics import ActuatorDynamics, ResponseDynamics
@@ -67,17 +68,29 @@ class UnevennessTable(_Table):
     length: float = Field(default=1.0, gt=0, description="travel after which it is forgotten, input units")
 
 
-class NoiseTable(_Table):
+class InexactTable(_Table):
+    """How exactly something is read or carried out."""
+
+    resolution: float = Field(default=0.0, ge=0, description="last digit; 0 for none")
+    outlier_share: float = Field(default=0.0, ge=0, le=1, description="share of values that are further off")
+    outliers: tuple[float, ...] = Field(default=(), description="by how much these are off, quantiles")
+    relative_outliers: bool = Field(default=False, description="whether they are shares of the value")
+
+    def inexact(self, value: float, rng: np.random.Generator) -> float:
+        """Return what becomes of a value."""
+        if self.outliers and rng.random() < self.outlier_share:
+            size = float(rng.choice(self.outliers))
+            return value * (1.0 + size) if self.relative_outliers else value + size
+        return round(value / self.resolution) * self.resolution if self.resolution else value
+
+
+class NoiseTable(InexactTable):
     """How a signal is read: `[emulation.signals.NAME]`."""
 
     level: float = Field(default=0.0, description="what it reads, where nothing moves it")
     follows: str = Field(default="", description="device whose set-point it follows; none if empty")
     reading: float = Field(default=0.0, ge=0, description="noise of a reading, standard deviation")
     quick: float = Field(default=0.0, ge=0, description="noise of a quick reading, standard deviation")
-    resolution: float = Field(default=0.0, ge=0, description="last digit of a reading; 0 for none")
-    outlier_share: float = Field(default=0.0, ge=0, le=1, description="share of readings that are further off")
-    outliers: tuple[float, ...] = Field(default=(), description="by how much these are off, quantiles")
-    relative_outliers: bool = Field(default=False, description="whether they are shares of what is read")
 
 
 class DriveTable(_Table):
@@ -146,6 +159,7 @@ class TwinTable(LaboratorySettings):
         default=0.0, ge=0, description="standard deviation of the response from session to session, output units"
     )
     drive: DriveTable
+    setpoints: InexactTable = InexactTable()
     response: ResponseTable
     wander: WanderTable = WanderTable()
     drift: WanderTable = WanderTable()

@@ -33,7 +33,8 @@ _SEED = 1000
 
 def identify_unevenness(
     recordings: Sequence[Recording],
-    unknown: Sequence[Floats],
+    of_model: Sequence[Floats],
+    left: Sequence[Floats],
     operators: Sequence[Operator[Any]],
     dynamics: Dynamics,
     effects: Sequence[Floats],
@@ -45,8 +46,8 @@ def identify_unevenness(
     ----------
     recordings : sequence of Recording
         The runs.
-    unknown : sequence of ndarray
-        Errors at the readings of each, of a model that was made without them.
+    of_model, left : sequence of ndarray
+        Errors of the model at the readings of each, and what the correction leaves of them.
     operators, dynamics
         The specimen as far as it is known, with wander and drift.
     effects : sequence of ndarray
@@ -59,12 +60,13 @@ def identify_unevenness(
     long = [i for i, each in enumerate(recordings) if np.unique(each.setpoints).size >= _FEWEST_HOLDS]
     if not long:
         return Unevenness()
-    least = max(long, key=lambda i: float(np.std(unknown[i])))
+    least = max(long, key=lambda i: float(np.std(of_model[i])))
     recording = recordings[least]
     part = Part(recording, tuple(operators), dynamics, _LONGEST)
     rows = np.flatnonzero(recording.is_reading[: part.still.size])
     effect = effects[least][rows]
-    errors, slopes = unknown[least][: rows.size], part.slopes[rows]
+    errors, slopes = of_model[least][: rows.size], part.slopes[rows]
+    explained = errors - left[least][: rows.size]
     classes = np.searchsorted(np.quantile(slopes, np.arange(1, _SLOPES) / _SLOPES), slopes)
 
     def squares(values: Floats) -> Floats:
@@ -78,7 +80,8 @@ def identify_unevenness(
                     found[i, slope] = float(np.mean((values[first + gap] - values[first]) ** 2))
         return found
 
-    target = squares(errors)
+    # With what is explained, the twin differs from the model as much as the specimen does.
+    target = np.maximum(squares(errors) - squares(explained), 0.0)
     used = np.isfinite(target) & (target > 0.0)
     white = noise.reading**2 * np.array([2.0] * len(_GAPS) + [1.0])[:, None] * np.ones(_SLOPES)
     span = float(np.ptp(recording.driven))

@@ -108,11 +108,7 @@ class EmulatedTwin(EmulatedInstrument):
 
     def _read(self, name: str, *, quick: bool) -> float:
         true, noise = self._meters[name]
-        value = true() + self._draw(noise.quick if quick else noise.reading)
-        if noise.outliers and self._rng.random() < noise.outlier_share:
-            size = float(self._rng.choice(noise.outliers))
-            return value * (1.0 + size) if noise.relative_outliers else value + size
-        return round(value / noise.resolution) * noise.resolution if noise.resolution else value
+        return noise.inexact(true() + self._draw(noise.quick if quick else noise.reading), self._rng)
 
 
 class TwinServer(WireServer):

@@ -21,8 +21,10 @@ from bench.transients import _kernels
 from bench.transients.actuator import identify_actuator
 from bench.transients.recording import Recording
 from bench.twin.correction import identify_correction
-from bench.twin.disturbances import Part, identify_disturbances, mean_effects, noise_of
+from bench.twin.disturbances import Noise, Part, evidence, identify_disturbances, mean_effects, noise_of
+from bench.twin.setpoints import identify_setpoints
 from bench.twin.specimen import Dynamics, Specimen, Unevenness, Wander
+from bench.twin.unevenness import identify_unevenness
 from bench.twin.write import write_twin
 from sim_devices.twin_laboratory import SpecimenPlant
 
@@ -176,8 +178,8 @@ def recording_of(dynamics, noise=0.0):
     levels = np.concatenate([[0.0], setpoints])
     held = levels[np.searchsorted(changes + dynamics.delay, grid * np.arange(out.shape[1]), side="right")]
     _kernels.follow(
-        np.zeros(5), held, np.zeros((2, held.size)), out, grid, dynamics.frequency, dynamics.damping, dynamics.rate,
-        0.0, 1.0, 0.0, 1.0, 0.0, 1.0,
+        np.zeros(_kernels.STATE_SIZE), held, np.zeros((2, held.size)), out, grid, dynamics.frequency,
+        dynamics.damping, dynamics.rate, 0.0, 1.0, 0.0, 1.0, 0.0, 1.0,
     )  # fmt: skip
     drive = np.interp(times, grid * np.arange(1, held.size + 1), out[0], left=0.0) + noise * rng.standard_normal(
         times.size
@@ -226,6 +228,33 @@ def test_outliers_in_proportion_to_the_drive_are_told_from_others(relative):
     assert noise.outlier_share == pytest.approx(float(off.mean()), rel=0.1)
     assert np.abs(noise.outliers) == pytest.approx(0.01 if relative else 0.03, rel=0.1)
     assert noise.reading == pytest.approx(1e-4, rel=0.1)
+
+
+@pytest.mark.parametrize("carried_out", [True, False])
+def test_set_points_that_are_not_carried_out_exactly_are_seen(carried_out):
+    """A supply gives steps of 0.01, and one voltage in 25 is off by 1 %; or all of that is in its readings alone."""
+    rng = np.random.default_rng(7)
+    changes, setpoints = 10.0 * np.arange(400), rng.uniform(2.0, 5.0, 400)
+    times = np.arange(1.0, 4000.0, 1.0)
+    off = rng.random(400) < 0.04
+    levels = np.round(setpoints * (1.0 + 0.01 * off * rng.choice([-1.0, 1.0], 400)) / 0.01) * 0.01
+    hold = np.searchsorted(changes, times - 1e-9, side="right") - 1
+    play = PrandtlIshlinskii(np.array([0.0, 0.5]), np.array([1.0, 1.0]), input_range=(0.0, 6.0))
+    seen = levels if carried_out else setpoints
+    recording = recording_from(times, levels[hold], changes, setpoints)
+    response = play.evaluate(seen)[hold] + rng.normal(0.0, 0.01, times.size)
+    recording = replace(recording, columns={"drive": levels[hold], "response": response})
+    noise = noise_of([recording], "drive", Dynamics(0.02), outliers=True)
+    found, (corrected,) = identify_setpoints([recording], ActuatorDynamics(), noise, play)
+    assert noise.resolution == pytest.approx(0.01)
+    if not carried_out:
+        assert found == Noise()
+        return
+    assert corrected.setpoints == pytest.approx(levels)
+    assert found.resolution == pytest.approx(0.01)
+    assert found.outlier_share == pytest.approx(float(off.mean()), rel=0.2)
+    assert found.relative_outliers
+    assert np.abs(found.outliers) == pytest.approx(0.01, rel=0.3)
 
 
 def test_an_actuator_that_follows_at_once_has_no_delay():
@@ -306,6 +335,38 @@ def test_what_wander_does_on_average_is_known(wandering):
     added = float(np.mean((direction * (recording.responded - still))[chosen]))
     assert added > 0.3
     assert np.mean((direction * effect)[chosen]) == pytest.approx(added, rel=0.2)
+
+
+def test_pairs_that_overlap_are_not_independent(wandering):
+    """Of rows of a hold of 100 s, 50 and 25 s apart, two to four pairs follow one another."""
+    specimen, _ = wandering
+    times = np.arange(0.5, 200.0, 0.5)
+    recording = recording_from(
+        times, np.where(times < 100.0, 10.0, 20.0), np.array([0.0, 100.0]), np.array([10.0, 20.0])
+    )
+    part = Part(recording, (specimen,), Dynamics(0.02))
+    part.pairs = part.pair(np.array([np.inf, np.inf]))
+    holds, independent = evidence([part])
+    far = np.searchsorted([0.3, 1.0, 3.0, 8.0, 20.0, 60.0], 50.0)
+    assert holds[far, 0, 1] == 2.0
+    assert 4.0 < independent[far, 0, 1] < 8.0
+    assert np.sum(part.pairs.time == far) > 400
+
+
+def test_the_unevenness_is_what_the_correction_does_not_explain(wandering):
+    specimen, recording = wandering
+    real = Unevenness(0.3, 4.0)
+    dynamics = Dynamics(0.02)
+    part = Part(recording, (specimen,), dynamics, math.inf)
+    rows = recording.is_reading
+    left = part.simulate(replace(dynamics, unevenness=real), 3)[rows]
+    explained = 2.0 * np.std(left) * np.sin(np.arange(left.size) / 5.0)
+    found = identify_unevenness(
+        [recording], [explained + left], [left], [specimen], dynamics, [0.0 * recording.times], Noise()
+    )
+    for travel in (1.0, 4.0, 16.0):
+        moved, wanted = (each.deviation * math.sqrt(1.0 - math.exp(-travel / each.length)) for each in (found, real))
+        assert moved == pytest.approx(wanted, rel=0.35)
 
 
 def test_how_calls_divide_the_time_does_not_matter():
