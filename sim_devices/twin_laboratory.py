@@ -167,8 +167,8 @@ class TwinLaboratory(EmulatedLaboratory):
         """Take what a device sets from now on; nan for one that is off."""
         self._outputs[device] = value
         if device == self._settings.drive.device:
-            exactly = math.isnan(value)
-            self.plant.set(self._at_rest if exactly else self._settings.setpoints.inexact(value, self._rng))
+            inexact = self._settings.setpoints.inexact
+            self.plant.set(self._at_rest if math.isnan(value) else inexact(value, self._rng))
 
     def _source(self, signal: str, noise: NoiseTable) -> Callable[[], float]:
         """Return what gives the true value of a signal."""

@@ -381,7 +381,7 @@ class Preisach(Operator[MemoryCurve]):
 
         That of the reversible part, >= 0, in output units by input unit; infinity if a density is negative.
         """
-        return -min(self._reversible_slopes()) if (self.density >= 0.0).all() else math.inf
+        return float(-min(self._reversible_slopes())) if (self.density >= 0.0).all() else math.inf
 
     def falls(self) -> bool:
         """Return whether the output can only fall while the input rises, with every memory."""

@@ -126,7 +126,7 @@ class Workers:
     title : str
         What the tasks are together, for the progress.
     modules : tuple of str
-        Modules that the tasks take. The first worker process loads them before there is a task, beside what this
+        Modules that the tasks take. A worker process loads them before its first task, the first one beside what this
         process loads.
     """
 
@@ -161,7 +161,7 @@ class Workers:
                     former = signal.signal(getattr(signal, name), self._interrupt)
                     self._stack.callback(signal.signal, getattr(signal, name), former)
         if not self.in_process:
-            self._first = self._start_worker(self._modules)
+            self._first = self._start_worker()
         self._stack.enter_context(_one_thread())
         self._stack.enter_context(collecting_seldom())
         if self.in_process:
@@ -298,12 +298,12 @@ class Workers:
         if worker is not None:
             worker.close()
 
-    def _start_worker(self, modules: tuple[str, ...] = ()) -> _Worker:
+    def _start_worker(self) -> _Worker:
         with self._changed:
             # After the end has begun nobody would end it.
             if self._is_closing:
                 raise EOFError("the end of all workers")
-            return _Worker(Welcome(sys.argv, self._console.width, modules), self._processes)
+            return _Worker(Welcome(sys.argv, self._console.width, self._modules), self._processes)
 
     def _take(self, number: int) -> Pending[Any] | None:
         """Return the next task of a worker, when there is one; None at the end."""
