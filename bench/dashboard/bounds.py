@@ -11,7 +11,7 @@ import numpy as np
 import rerun as rr
 
 from bench.dashboard.drawing import ALARM, CAUTION, LIMIT, Colour
-from bench.dashboard.recording import Floats, Recording, times
+from bench.dashboard.recording import Floats, Ints, Recording, times
 from bench.devices import Signal
 from bench.interlocks import SETPOINT, Interlock, Level
 
@@ -109,11 +109,11 @@ class BoundLines:
         self._since: float | None = None
         self._drawn: dict[int, float] = {}
 
-    def write(self, recording: Recording, t: Sequence[float], step: Sequence[int], values: Floats) -> None:
+    def write(self, recording: Recording, t: Floats, step: Ints, values: Floats) -> None:
         """Draw what is near to values, shape (times, signals), in the unit of the signals."""
         if not self._bounds or not np.isfinite(values).any():
             return
-        since = self._since = t[0] if self._since is None else self._since
+        since = self._since = float(t[0]) if self._since is None else self._since
         self._low, self._high = min(self._low, np.nanmin(values)), max(self._high, np.nanmax(values))
         reach = _NEAR * (self._high - self._low)
         for i, bound in enumerate(self._bounds):
@@ -125,7 +125,7 @@ class BoundLines:
                 self._line(recording, path, since, 0, bound)
                 self._drawn[i] = since
             if t[-1] - self._drawn[i] > _LAG * (t[-1] - since):
-                self._line(recording, path, float(t[-1]), step[-1], bound)
+                self._line(recording, path, float(t[-1]), int(step[-1]), bound)
                 self._drawn[i] = float(t[-1])
 
     def _line(self, recording: Recording, path: str, t: float, step: int, bound: Bound) -> None:

@@ -8,11 +8,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 import rerun as rr
 import rerun.blueprint as rrb
 
 from bench.dashboard.drawing import Colour, time_view
-from bench.dashboard.entries import End, Entry, Tick
+from bench.dashboard.entries import End, Part, Ticks
 from bench.dashboard.recording import Floats, Recording, times
 from bench.dashboard.signal_plots import find_column, likely_magnitude
 from bench.devices import Signal
@@ -95,9 +96,9 @@ class ControlPlots:
         beside = find_column(signals, WITNESS, witness) if witness else None
         return cls(output, tuple(traces), extent, *unit, *error_unit, witness=beside)
 
-    def is_at_work(self, values: Sequence[float]) -> bool:
-        """Return whether a controller was at work when a tick was taken."""
-        return math.isfinite(values[self.traces[0]])
+    def is_at_work(self, values: Floats) -> npt.NDArray[np.bool_]:
+        """Return for values, a row each tick, whether a controller was at work when it was taken."""
+        return np.isfinite(values[:, self.traces[0]])
 
     def series(self, values: Floats) -> dict[str, Floats]:
         """Return what is plotted of ticks: by plot, one row a tick, one column a line, in its unit."""
@@ -197,26 +198,36 @@ class Errors:
         self._read_at = (0.0, 0)
         self._range: float | None = None
 
-    def see(self, entry: Entry) -> None:
-        """Take a tick, a finished step, or the end into account."""
-        if isinstance(entry, Tick | StepRecord):
-            reference, output = entry.values[self._plots.traces[0]], entry.values[self._plots.output]
-            if math.isfinite(reference):
-                self._end_target()
-                self.target = reference
-                if math.isfinite(output):
-                    self.now = output - reference
-                    self._recent.append(self.now)
-                if self._plots.witness is not None and math.isfinite(seen := entry.values[self._plots.witness]):
-                    self._witnessed.append(seen - reference)
-            elif isinstance(entry, StepRecord) and entry.settled is not Settled.CONTROLLED:
-                if not (math.isfinite(self.target) and math.isfinite(output)):
-                    return
+    def see(self, part: Part) -> None:
+        """Take ticks, a finished step, or the end into account."""
+        if isinstance(part, Ticks):
+            self._see_control(part.values)
+        elif isinstance(part, StepRecord):
+            output = part.values[self._plots.output]
+            if math.isfinite(part.values[self._plots.traces[0]]):
+                self._see_control(np.array([part.values]))
+            elif part.settled is not Settled.CONTROLLED and math.isfinite(self.target) and math.isfinite(output):
                 self._readings.append(output)
-                self._read_at = entry.finished, entry.step
+                self._read_at = part.finished, part.step
                 self.now = self._mean_error()
-        elif isinstance(entry, End):
+        elif isinstance(part, End):
             self._end_target()
+
+    def _see_control(self, values: Floats) -> None:
+        """Take the rows into account at which a controller was at work."""
+        at_work = values[self._plots.is_at_work(values)]
+        if not len(at_work):
+            return
+        self._end_target()
+        references = at_work[:, self._plots.traces[0]]
+        self.target = float(references[-1])
+        errors = at_work[:, self._plots.output] - references
+        if (known := errors[np.isfinite(errors)]).size:
+            self._recent.extend(known[-_RECENT_TICKS:].tolist())
+            self.now = self._recent[-1]
+        if self._plots.witness is not None:
+            errors = at_work[:, self._plots.witness] - references
+            self._witnessed.extend(errors[np.isfinite(errors)][-_RECENT_TICKS:].tolist())
 
     def _mean_error(self) -> float:
         return sum(self._readings) / len(self._readings) - self.target

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
 from types import MappingProxyType
 from typing import Any
 
@@ -126,11 +125,13 @@ def lines(strips: Any, colour: Colour | Sequence[Colour], points: float, order: 
     return rr.LineStrips2D(strips, colors=colour, radii=rr.Radius.ui_points(points), draw_order=order)
 
 
-def strips_at_once(strips: Sequence[Sequence[tuple[float, float]]]) -> pa.Array:
-    """Return lines as one array, which Rerun would make from one array a line."""
-    points = np.array(list(chain.from_iterable(strips)), dtype=np.float32)
-    ends = np.cumsum([0, *map(len, strips)], dtype=np.int32)
-    vectors = Vec2DBatch(points).as_arrow_array()
+def strips_at_once(points: Floats, lengths: Sequence[int]) -> pa.Array:
+    """Return lines as one array, which Rerun would make from one array a line.
+
+    `points`, shape (points, 2), are those of all lines, `lengths` the number of points of each.
+    """
+    ends = np.cumsum([0, *lengths], dtype=np.int32)
+    vectors = Vec2DBatch(points.astype(np.float32)).as_arrow_array()
     return pa.ListArray.from_arrays(pa.array(ends), vectors, type=LineStrip2DBatch._ARROW_DATATYPE)
 
 

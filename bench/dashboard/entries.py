@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
 
 from bench.hysteresis import Density
 from bench.hysteresis.documents import Model
@@ -18,6 +22,40 @@ class Tick(NamedTuple):
     t: float
     step: int
     values: Sequence[float]
+
+
+@dataclass(frozen=True, eq=False)
+class Ticks:
+    """Ticks that follow one another, as columns.
+
+    Attributes
+    ----------
+    t : ndarray, shape (ticks,)
+        Laboratory time, s.
+    step : ndarray of int64, shape (ticks,)
+        Step number.
+    values : ndarray, shape (ticks, signals)
+    """
+
+    t: npt.NDArray[np.float64]
+    step: npt.NDArray[np.int64]
+    values: npt.NDArray[np.float64]
+
+    @classmethod
+    def of(cls, ticks: Sequence[Tick]) -> Ticks:
+        """Return single ticks, one or more, as columns."""
+        t, step, values = zip(*ticks, strict=True)
+        return cls(np.array(t, dtype=np.float64), np.array(step, dtype=np.int64), np.array(values, dtype=np.float64))
+
+    def __len__(self) -> int:
+        return self.t.size
+
+    def __iter__(self) -> Iterator[Tick]:
+        return map(Tick, self.t.tolist(), self.step.tolist(), self.values.tolist())
+
+    def part(self, first: int, end: int) -> Ticks:
+        """Return the ticks from the number `first` to before `end`."""
+        return Ticks(self.t[first:end], self.step[first:end], self.values[first:end])
 
 
 @dataclass(frozen=True)
@@ -44,3 +82,71 @@ class End:
 
 
 Entry: TypeAlias = Tick | StepRecord | Event | ModelDensity | End
+Part: TypeAlias = Ticks | StepRecord | Event | ModelDensity | End
+"""An entry, or ticks that follow one another."""
+
+
+def in_parts(entries: Iterable[Entry | Part]) -> list[Part]:
+    """Return entries in their order, ticks that follow one another as columns."""
+    parts: list[Part] = []
+    ticks: list[Tick] = []
+    for entry in entries:
+        if isinstance(entry, Tick):
+            ticks.append(entry)
+            continue
+        if ticks:
+            parts.append(Ticks.of(ticks))
+            ticks = []
+        parts.append(entry)
+    return [*parts, Ticks.of(ticks)] if ticks else parts
+
+
+def merged(ticks: Ticks, steps: Sequence[StepRecord], events: Sequence[Event]) -> list[Part]:
+    """Return what happened in order: of one instant, the ticks of a step, its end, then events."""
+    order = np.lexsort((ticks.step, ticks.t))
+    ticks = Ticks(ticks.t[order], ticks.step[order], ticks.values[order])
+    dated: list[tuple[tuple[float, float], StepRecord | Event]]
+    dated = [((step.finished, step.step), step) for step in steps]
+    dated += [((event.t, math.inf), event) for event in events]
+    dated.sort(key=lambda each: each[0])
+    parts: list[Part] = []
+    first = 0
+    for (t, step), each in dated:
+        begin, end = ticks.t.searchsorted(t), ticks.t.searchsorted(t, "right")
+        before = int(begin + ticks.step[begin:end].searchsorted(step, "right"))
+        if before > first:
+            parts.append(ticks.part(first, before))
+            first = before
+        parts.append(each)
+    return [*parts, ticks.part(first, len(ticks))] if first < len(ticks) else parts
+
+
+def single(parts: Iterable[Part]) -> Iterator[Entry]:
+    """Yield each entry by itself."""
+    for part in parts:
+        if isinstance(part, Ticks):
+            yield from part
+        else:
+            yield part
+
+
+def portions(parts: Iterable[Part], most: int) -> Iterator[list[Part]]:
+    """Yield parts in portions of so many entries at most."""
+    portion: list[Part] = []
+    count = 0
+    for part in parts:
+        first, length = 0, size(part)
+        while first < length:
+            taken = min(length - first, most - count)
+            portion.append(part.part(first, first + taken) if isinstance(part, Ticks) else part)
+            first, count = first + taken, count + taken
+            if count == most:
+                yield portion
+                portion, count = [], 0
+    if portion:
+        yield portion
+
+
+def size(part: Part) -> int:
+    """Return the number of entries of a part."""
+    return len(part) if isinstance(part, Ticks) else 1

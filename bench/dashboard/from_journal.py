@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from types import TracebackType
@@ -10,7 +9,7 @@ from typing import Self
 
 import numpy as np
 
-from bench.dashboard.entries import End, Entry, Tick, densities_of
+from bench.dashboard.entries import End, Entry, Part, Ticks, densities_of, in_parts, merged, portions, single, size
 from bench.dashboard.live import CHUNK_ROWS
 from bench.dashboard.writer import Writer
 from bench.errors import ConfigurationError, DataError
@@ -27,7 +26,7 @@ def rebuild(record: Record, path: Path) -> None:
     writer = _writer_of(record, models)
     writer.open(path, None)
     try:
-        _write(writer, _Tail().entries(record))
+        _write(writer, _Tail().parts(record))
         writer.write(densities_of(models))
         writer.write(_end_of(record))
         writer.arrange()
@@ -84,25 +83,25 @@ class JournalView:
         with Record(self._run) as record:
             # Whether it has ended first: what is read then is all.
             end = _end_of(record)
-            self._show(self._tail.entries(record))
+            self._show(self._tail.parts(record))
         self._show(end)
         return end[0].status if end else ""
 
     def entries(self) -> list[tuple[float, Entry]]:
         """Return all of the run, each entry behind its laboratory time in s, for `show`."""
         with Record(self._run) as record:
-            entries = [(time_of(entry), entry) for entry in self._tail.entries(record)]
+            entries = [(time_of(entry), entry) for entry in single(self._tail.parts(record))]
             return entries + [(entries[-1][0] if entries else 0.0, end) for end in _end_of(record)]
 
     def show(self, entries: Sequence[Entry]) -> None:
         """Show entries; viewers get them at once."""
-        self._show(entries)
+        self._show(in_parts(entries))
 
-    def _show(self, entries: Sequence[Entry]) -> None:
-        if entries:
-            _write(self._writer, entries)
+    def _show(self, parts: Sequence[Part]) -> None:
+        if parts:
+            _write(self._writer, parts)
             self._writer.arrange()
-        self._writer.recording.follow_viewer(len(entries))
+        self._writer.recording.follow_viewer(sum(map(size, parts)))
 
 
 class _Tail:
@@ -111,24 +110,20 @@ class _Tail:
     def __init__(self) -> None:
         self._ticks, self._step, self._events = 0, -1, 0
 
-    def entries(self, record: Record) -> list[Entry]:
+    def parts(self, record: Record) -> list[Part]:
         """Return what the engine reported of a run since the last call, in its order."""
         telemetry = record.telemetry(self._ticks)
         steps = list(record.step_records(self._step))
         events = record.events(self._events)
-        rows = np.column_stack([telemetry[signal.name] for signal in record.signals]).tolist()
-        times, numbers = telemetry["t"].tolist(), telemetry["step"].astype(np.int64).tolist()
-        # Of what happened in one instant, the ticks of a step come first, then its end, then what follows from it.
-        dated: list[tuple[tuple[float, float, int], Entry]] = [
-            ((t, step, 0), Tick(t, step, row)) for t, step, row in zip(times, numbers, rows, strict=True)
-        ]
-        dated += [((step.finished, step.step, 1), step) for step in steps]
-        dated += [((event.t, math.inf, 0), event) for event in events]
-        dated.sort(key=lambda entry: entry[0])
-        self._ticks += len(times)
+        ticks = Ticks(
+            telemetry["t"],
+            telemetry["step"].astype(np.int64),
+            np.column_stack([telemetry[signal.name] for signal in record.signals]),
+        )
+        self._ticks += len(ticks)
         self._step = steps[-1].step if steps else self._step
         self._events += len(events)
-        return [entry for _, entry in dated]
+        return merged(ticks, steps, events)
 
 
 def time_of(entry: Entry) -> float:
@@ -153,9 +148,9 @@ def _writer_of(record: Record, models: list[ModelFile]) -> Writer:
         raise DataError(f"{record.path}: the metadata of its dashboard is damaged: {error}") from error
 
 
-def _write(writer: Writer, entries: Sequence[Entry]) -> None:
-    for start in range(0, len(entries), CHUNK_ROWS):
-        writer.write(entries[start : start + CHUNK_ROWS])
+def _write(writer: Writer, parts: Sequence[Part]) -> None:
+    for portion in portions(parts, CHUNK_ROWS):
+        writer.write(portion)
 
 
 def _end_of(record: Record) -> list[End]:

@@ -17,13 +17,12 @@ class SignalMemory:
     """The memory curve of a signal, in a column of the values."""
 
     def __init__(self, column: int) -> None:
-        self._column = column
+        self.columns = [column]
         self.curve: MemoryCurve | None = None
         """None before the first reading."""
 
-    def see(self, values: Sequence[float]) -> None:
+    def see(self, x: float) -> None:
         """Let the signal move the memory."""
-        x = values[self._column]
         if math.isfinite(x):
             self.curve = self.curve.step(x) if self.curve else MemoryCurve.from_negative_saturation(x)
 
@@ -40,14 +39,13 @@ class StageMemory:
     """
 
     def __init__(self, model: Coupled[Any], columns: tuple[int, int]) -> None:
-        self._model, self._columns = model, columns
+        self._model, self.columns = model, list(columns)
         self._state: Any = model.initial_state()
         self.curve: MemoryCurve | None = None
         """None before the first reading, and for operators without one."""
 
-    def see(self, values: Sequence[float]) -> None:
+    def see(self, voltage: float, force: float) -> None:
         """Let the model follow a reading."""
-        voltage, force = (values[column] for column in self._columns)
         if math.isfinite(voltage) and math.isfinite(force):
             self._state, _ = self._model.step(self._state, voltage, force)
             second = getattr(self._state, "second", None)

@@ -17,7 +17,7 @@ import rerun as rr
 
 from bench.control.tracking import widened
 from bench.dashboard.drawing import CAUTION, Colour
-from bench.dashboard.entries import Entry, Tick
+from bench.dashboard.entries import Part, Tick, Ticks, single
 from bench.dashboard.recording import Floats, Recording, times
 from bench.devices import Signal
 from bench.hysteresis import Operator
@@ -166,11 +166,11 @@ class ModelBand:
         looks = {"colors": [*looks["colors"], _MODEL], "widths": [1.0] * 5}
         recording.log(f"{self._response.path}/band", rr.SeriesLines(names=[*names, "model alone"], **looks))
 
-    def see(self, entries: Sequence[Entry]) -> None:
-        """Take entries into account, in their order."""
+    def see(self, parts: Sequence[Part]) -> None:
+        """Take parts into account, in their order."""
         before: list[_Row] = []
         rows: list[_Row] = []
-        for row, at_work in self._rows(entries):
+        for row, at_work in self._rows(parts):
             self._begun |= at_work
             (rows if self._begun else before).append(row)
         if before:
@@ -219,10 +219,12 @@ class ModelBand:
         elif standing.departures:
             yield f"of the input, the band may cover less: {'; '.join(standing.departures)}", "other class"
 
-    def _rows(self, entries: Sequence[Entry]) -> Iterator[tuple[_Row, bool]]:
-        """Yield the rows of entries, and whether a controller is at work."""
+    def _rows(self, parts: Sequence[Part]) -> Iterator[tuple[_Row, bool]]:
+        """Yield the rows of parts, and whether a controller is at work."""
         low, high = self._plausible
-        for entry in entries:
+        if self._reference is None:
+            parts = [part for part in parts if not isinstance(part, Ticks)]
+        for entry in single(parts):
             if isinstance(entry, Tick):
                 t, is_reading = entry.t, False
             elif isinstance(entry, StepRecord):

@@ -11,7 +11,7 @@ import rerun as rr
 
 from bench.dashboard.bounds import Bound, nearest
 from bench.dashboard.control import Errors
-from bench.dashboard.entries import End, Entry, Tick
+from bench.dashboard.entries import End, Part, Ticks
 from bench.dashboard.model_band import ModelBand
 from bench.dashboard.recording import Recording, times
 from bench.dashboard.signal_plots import likely_magnitude
@@ -75,21 +75,34 @@ class Numbers:
         """What the run is doing, or how it ended."""
         return self._state
 
-    def see(self, entry: Entry) -> None:
-        """Take an entry into account, and keep the panel of its time where it is due."""
-        if isinstance(entry, Tick):
-            self._t, self._step, self._values = entry
-        elif isinstance(entry, StepRecord):
-            self._t, self._step, self._values = entry.finished, entry.step, entry.values
-            self._steps = entry.step + 1
-        elif isinstance(entry, Event):
-            self._t = max(self._t, entry.t)
-            if entry.kind == "phase":
-                self._phase = entry.text
-            elif entry.kind in ("pause", "resume"):
-                self._state = "paused" if entry.kind == "pause" else "running"
-        elif isinstance(entry, End):
-            self._state, self._reason = entry.status, entry.reason
+    def cut(self, part: Part) -> Iterator[Part]:
+        """Yield a part; ticks in pieces that end where a panel is due, if `see` takes each before the next."""
+        if not isinstance(part, Ticks):
+            yield part
+            return
+        first = 0
+        while first < len(part):
+            due = part.t[first:] - self._last >= self.interval
+            end = first + int(due.argmax()) + 1 if due.any() else len(part)
+            yield part.part(first, end)
+            first = end
+
+    def see(self, part: Part) -> None:
+        """Take a part into account, and keep the panel of its time where it is due."""
+        if isinstance(part, Ticks):
+            self._t, self._step = float(part.t[-1]), int(part.step[-1])
+            self._values = part.values[-1].tolist()
+        elif isinstance(part, StepRecord):
+            self._t, self._step, self._values = part.finished, part.step, part.values
+            self._steps = part.step + 1
+        elif isinstance(part, Event):
+            self._t = max(self._t, part.t)
+            if part.kind == "phase":
+                self._phase = part.text
+            elif part.kind in ("pause", "resume"):
+                self._state = "paused" if part.kind == "pause" else "running"
+        elif isinstance(part, End):
+            self._state, self._reason = part.status, part.reason
             self._last = -math.inf
         else:
             return

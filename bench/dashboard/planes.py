@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import rerun as rr
@@ -12,7 +12,7 @@ from bench.dashboard.drawing import FAINT, INK, MARKER, Frame, line_style, lines
 from bench.dashboard.entries import ModelDensity
 from bench.dashboard.memories import SignalMemory, StageMemory, memory_of
 from bench.dashboard.recording import Floats, Recording, times
-from bench.dashboard.xy_plots import Point
+from bench.dashboard.xy_plots import Points
 from bench.devices import Signal
 from bench.hysteresis.density import density_unit
 from bench.layout import DashboardLayout
@@ -59,20 +59,20 @@ class Planes:
             lattice = [[(low, value), (value, value), (value, high)] for value in inner]
             recording.log("plane/data/lattice", lines(lattice, FAINT, 0.5, -15.0))
 
-    def write(self, recording: Recording, points: Sequence[Point], drawn: Collection[int]) -> None:
+    def write(self, recording: Recording, points: Points, drawn: Sequence[int]) -> None:
         """Draw the memory curves at the points whose numbers are `drawn`; all points move that of the first input."""
         shown = frozenset(drawn)
-        curves: dict[str, list[tuple[int, Floats]]] = {path: [] for path in self._memories}
-        for k, (_, _, values, _) in enumerate(points):
-            for path, memory in self._memories.items():
-                # What only a model knows takes long, and a point that is not drawn differs too little.
-                if k in shown or path == "plane":
-                    memory.see(values)
+        for path, memory in self._memories.items():
+            corners: list[tuple[int, Floats]] = []
+            # What only a model knows takes long, and a point that is not drawn differs too little.
+            numbers = range(points.t.size) if path == "plane" else drawn
+            for k, values in zip(numbers, points.values[np.ix_(numbers, memory.columns)].tolist(), strict=True):
+                memory.see(*values)
                 if k in shown and memory.curve is not None:
-                    curves[path].append((k, memory.curve.corners(*self._extents[path])))
-        for path, corners in curves.items():
+                    corners.append((k, memory.curve.corners(*self._extents[path])))
             if corners:
-                when = times([points[k][0] for k, _ in corners], [points[k][1] for k, _ in corners])
+                seen = [k for k, _ in corners]
+                when = times(points.t[seen], points.step[seen])
                 strips = [each for _, each in corners]
                 recording.send(f"{path}/data/memory", when, rr.LineStrips2D.columns(strips=strips))
                 ends = [each[-1] for each in strips]

@@ -17,6 +17,7 @@ import rerun.blueprint as rrb
 from bench.errors import ConfigurationError
 
 Floats = npt.NDArray[np.float64]
+Ints = npt.NDArray[np.int64]
 
 LOOPBACK = "127.0.0.1"
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import rerun as rr
 
 from bench.dashboard.drawing import Colour
-from bench.dashboard.entries import Entry, Tick
+from bench.dashboard.entries import Part, Ticks
 from bench.dashboard.recording import Recording, times
 from bench.journal import Event, StepRecord
 
@@ -48,7 +48,7 @@ class Timeline:
         """Give the states their colours."""
         recording.log("state/run", rr.StateConfiguration(values=list(_STATES), colors=list(_STATES.values())))
 
-    def write(self, recording: Recording, entries: Sequence[Entry]) -> None:
+    def write(self, recording: Recording, parts: Sequence[Part]) -> None:
         """Write events, and the changes that events and steps bring."""
         events: list[tuple[int, Event]] = []
         changes: dict[str, list[tuple[float, int, str]]] = {"run": [], "phase": []}
@@ -58,7 +58,7 @@ class Timeline:
                 self._states[lane] = state
                 changes[lane].append((t, step, state))
 
-        for entry in entries:
+        for entry in parts:
             if isinstance(entry, StepRecord):
                 enter("run", entry.started, entry.step, _NOT_SETTLED if entry.settled.failed else _RUNNING)
                 self._step, self.t = entry.step + 1, entry.finished
@@ -69,8 +69,8 @@ class Timeline:
                     enter("phase", entry.t, self._step, entry.text)
                 enter("run", entry.t, self._step, _state_after(entry))
                 self.t = entry.t
-            elif isinstance(entry, Tick):
-                self.t = max(self.t, entry.t)
+            elif isinstance(entry, Ticks):
+                self.t = max(self.t, float(entry.t.max()))
         _write_events(recording, events)
         for lane, changed in changes.items():
             if changed:

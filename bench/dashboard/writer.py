@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from bench.configuration_errors import problems
 from bench.dashboard.arrangement import Arranged, blueprint, seldom
 from bench.dashboard.bounds import BoundLines, bounds_of
 from bench.dashboard.control import TRACE_NAMES, WITNESS, ControlPlots, Errors
-from bench.dashboard.entries import End, Entry, ModelDensity, Tick, densities_of
+from bench.dashboard.entries import End, Entry, ModelDensity, Part, Ticks, densities_of, in_parts
 from bench.dashboard.lateness_plot import LatenessPlot
 from bench.dashboard.model_band import ModelBand, Plotted
 from bench.dashboard.numbers import LIVE_SECONDS, Numbers
@@ -25,7 +25,7 @@ from bench.dashboard.planes import Planes
 from bench.dashboard.recording import Recording, times
 from bench.dashboard.signal_plots import plots_by_unit
 from bench.dashboard.timeline import Timeline
-from bench.dashboard.xy_plots import Point, XYPlots
+from bench.dashboard.xy_plots import Points, XYPlots
 from bench.devices import Signal
 from bench.errors import ConfigurationError
 from bench.interlocks import SETPOINT
@@ -105,35 +105,34 @@ class Writer:
             self._numbers.interval = LIVE_SECONDS
             self.arrange()
 
-    def write(self, entries: Sequence[Entry]) -> None:
+    def write(self, entries: Sequence[Entry | Part]) -> None:
         """Write entries in the order in which they happened."""
+        parts = in_parts(entries)
         if self._band is not None:
-            self._band.see(entries)
+            self._band.see(parts)
             self._band.write(self.recording)
-        for entry in entries:
-            if isinstance(entry, ModelDensity) and self._planes is not None:
-                self._planes.draw_density(self.recording, entry)
-            elif isinstance(entry, End):
-                self.recording.set_property("outcome", {"status": entry.status, "reason": entry.reason})
-                self._lateness.draw(self.recording, entry.lateness)
-                if entry.lateness:
-                    lines = "\n".join(lateness_lines(entry.lateness))
+        for part in parts:
+            if isinstance(part, ModelDensity) and self._planes is not None:
+                self._planes.draw_density(self.recording, part)
+            elif isinstance(part, End):
+                self.recording.set_property("outcome", {"status": part.status, "reason": part.reason})
+                self._lateness.draw(self.recording, part.lateness)
+                if part.lateness:
+                    lines = "\n".join(lateness_lines(part.lateness))
                     text = f"{self._card}\n\n```text\n{lines}\n```\n"
                     self.recording.log("card", rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
-            if self._errors is not None:
-                self._errors.see(entry)
-            self._numbers.see(entry)
-        ticks = [entry for entry in entries if isinstance(entry, Tick)]
-        self._write_values("signals", ticks)
-        readings = [Tick(e.finished, e.step, e.values) for e in entries if isinstance(e, StepRecord)]
-        self._write_values("readings", readings)
-        if self._plots is not None and self._planes is not None:
-            points = list(self._points(entries))
+            for piece in self._numbers.cut(part):
+                if self._errors is not None:
+                    self._errors.see(piece)
+                self._numbers.see(piece)
+        self._write_values("signals", [part for part in parts if isinstance(part, Ticks)])
+        self._write_values("readings", [_readings_of(part) for part in parts if isinstance(part, StepRecord)])
+        if self._plots is not None and self._planes is not None and (points := self._points(parts)) is not None:
             self._planes.write(self.recording, points, self._plots.write(self.recording, points))
         if self._errors is not None:
             self._errors.write(self.recording)
         self._numbers.write(self.recording)
-        self._timeline.write(self.recording, entries)
+        self._timeline.write(self.recording, parts)
 
     def arrange(self) -> None:
         """Arrange the views anew if what they have to show has changed."""
@@ -152,11 +151,11 @@ class Writer:
         """Report a problem of the dashboard itself in the log."""
         self._timeline.warn(self.recording, text)
 
-    def _write_values(self, kind: str, rows: Sequence[Tick]) -> None:
+    def _write_values(self, kind: str, rows: Sequence[Ticks]) -> None:
         if not rows:
             return
-        t, step, values = zip(*rows, strict=True)
-        when, table = times(t, step), np.array(values, dtype=np.float64)
+        t, step = np.concatenate([each.t for each in rows]), np.concatenate([each.step for each in rows])
+        when, table = times(t, step), np.concatenate([each.values for each in rows])
         for plot in self._signals:
             self.recording.send_vectors(f"{kind}/{plot.path}", when, plot.series(table))
             self._note(f"{kind}/{plot.path}", table[:, plot.columns])
@@ -192,24 +191,34 @@ class Writer:
         if name not in self._filled and np.any(np.nan_to_num(values)):
             self._filled.add(name)
 
-    def _points(self, entries: Sequence[Entry]) -> Iterator[Point]:
-        """Yield the points of the XY plots: each reading and, under control and in a fast loop, each tick."""
-        for entry in entries:
-            if isinstance(entry, StepRecord):
-                yield entry.finished, entry.step, entry.values, True
-            elif isinstance(entry, Tick):
-                if self._lateness_column is not None and math.isfinite(entry.values[self._lateness_column]):
-                    yield entry.t, entry.step, self._with_commands(entry.values), False
-                elif self._control is not None and self._control.is_at_work(entry.values):
-                    yield *entry, False
+    def _points(self, parts: Sequence[Part]) -> Points | None:
+        """Return the points of the XY plots: each reading and, under control and in a fast loop, each tick."""
+        found = []
+        for part in parts:
+            if isinstance(part, StepRecord):
+                found.append((_readings_of(part), True))
+            elif isinstance(part, Ticks) and len(shown := self._shown(part)):
+                found.append((shown, False))
+        if not found:
+            return None
+        return Points(
+            np.concatenate([each.t for each, _ in found]),
+            np.concatenate([each.step for each, _ in found]),
+            np.concatenate([each.values for each, _ in found]),
+            np.concatenate([np.full(len(each), is_reading) for each, is_reading in found]),
+        )
 
-    def _with_commands(self, values: Sequence[float]) -> Sequence[float]:
-        """Return values of a sample of a fast loop, which reads no actuator, with what the actuators were set to."""
-        with_commands = list(values)
+    def _shown(self, ticks: Ticks) -> Ticks:
+        """Return the ticks that the XY plots show; a fast loop reads no actuator: there is what it was set to."""
+        samples = np.zeros(len(ticks), dtype=np.bool_)
+        if self._lateness_column is not None:
+            samples |= np.isfinite(ticks.values[:, self._lateness_column])
+        shown = samples if self._control is None else samples | self._control.is_at_work(ticks.values)
+        values = ticks.values[shown]
         for column, setpoint in self._commanded.items():
-            if math.isfinite(values[setpoint]):
-                with_commands[column] = values[setpoint]
-        return with_commands
+            commanded = samples[shown] & np.isfinite(values[:, setpoint])
+            values[commanded, column] = values[commanded, setpoint]
+        return Ticks(ticks.t[shown], ticks.step[shown], values)
 
     def _blueprint(
         self, filled: frozenset[str], error_range: float | None, bright: float, state: str
@@ -238,6 +247,11 @@ class Writer:
                 state=state,
             )
         )
+
+
+def _readings_of(record: StepRecord) -> Ticks:
+    """Return the readings of a step, at its end."""
+    return Ticks(np.array([record.finished]), np.array([record.step]), np.array([record.values], dtype=np.float64))
 
 
 def _commanded(signals: Sequence[Signal], columns: Collection[int]) -> dict[int, int]:

@@ -10,13 +10,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import chain
 
+import numpy as np
+import numpy.typing as npt
 import rerun as rr
 import rerun.blueprint as rrb
 
 from bench.dashboard.bounds import Bound
 from bench.dashboard.drawing import Colour, Frame, line_style, lines, point_style, strips_at_once, xy_view
-from bench.dashboard.recording import Recording, times
+from bench.dashboard.recording import Floats, Ints, Recording, times
 from bench.dashboard.signal_plots import find_column
 from bench.devices import Signal
 from bench.layout import DashboardLayout
@@ -37,8 +41,25 @@ _FALLING: Colour = (58, 132, 232)
 _Line = list[tuple[float, float]]
 
 
-Point = tuple[float, int, Sequence[float], bool]
-"""Time (s), step, values, and whether it is a reading after settling, not a tick under control."""
+@dataclass(frozen=True, eq=False)
+class Points:
+    """Points of the plots, as columns.
+
+    Attributes
+    ----------
+    t : ndarray, shape (points,)
+        Laboratory time, s.
+    step : ndarray of int64, shape (points,)
+        Step number.
+    values : ndarray, shape (points, signals)
+    is_reading : ndarray of bool, shape (points,)
+        Whether it is a reading after settling, not a tick under control.
+    """
+
+    t: Floats
+    step: Ints
+    values: Floats
+    is_reading: npt.NDArray[np.bool_]
 
 
 class XYPlots:
@@ -116,7 +137,7 @@ class XYPlots:
             colours.append(bound.colour)
         recording.log(f"{track.path}/data/bounds", lines(strips, colours, 1.0, 5.0))
 
-    def write(self, recording: Recording, points: Sequence[Point]) -> list[int]:
+    def write(self, recording: Recording, points: Points) -> list[int]:
         """Draw the plots to further points; return the numbers of those at which the first was drawn."""
         drawn: list[int] = []
         for track in self._tracks:
@@ -125,17 +146,19 @@ class XYPlots:
                 drawn = [k for k, _ in shown]
             if not shown:
                 continue
-            if track.reach(shown):
-                self._draw_axes(recording, track)
-            when = times([points[k][0] for k, _ in shown], [points[k][1] for k, _ in shown])
             strips = [line for _, line in shown]
+            path = np.array(list(chain.from_iterable(strips)))
+            if track.reach(path):
+                self._draw_axes(recording, track)
+            drawable = strips_at_once(path, [len(line) for line in strips])
+            numbers = [k for k, _ in shown]
+            when = times(points.t[numbers], points.step[numbers])
             colours = [_RISING if line[-1][0] >= line[0][0] else _FALLING for line in strips]
             ends = [line[-1] for line in strips]
-            drawable = strips_at_once(strips)
             if self._fades:
                 recent = rr.LineStrips2D.columns(strips=drawable, colors=colours)
                 recording.send(f"{track.path}/data/recent", when, recent)
-                colours = [_pale(colour) for colour in colours]
+                colours = [_FADED[colour] for colour in colours]
             recording.send(f"{track.path}/data/path", when, rr.LineStrips2D.columns(strips=drawable, colors=colours))
             recording.send(f"{track.path}/data/now", when, rr.Points2D.columns(positions=ends))
         return drawn
@@ -158,6 +181,9 @@ def _pale(colour: Colour) -> Colour:
     return red, green, blue
 
 
+_FADED = {colour: _pale(colour) for colour in (_RISING, _FALLING)}
+
+
 class _Track:
     """One plot of column y over column x below the entity `path`, and the line since the point drawn last.
 
@@ -178,25 +204,23 @@ class _Track:
         low, high = self._ends
         return high - low > self._least_move
 
-    def reach(self, shown: Sequence[tuple[int, _Line]]) -> bool:
-        """Let the frame grow to lines; return whether it did."""
+    def reach(self, path: Floats) -> bool:
+        """Let the frame grow to points, shape (points, 2); return whether it did."""
         before = self.frame
-        x, y = zip(*(point for _, line in shown for point in line), strict=True)
-        self._ends = min(self._ends[0], *x), max(self._ends[1], *x)
-        self.frame = before.grown((min(x), max(x)), (min(y), max(y)))
+        (low, bottom), (high, top) = path.min(axis=0).tolist(), path.max(axis=0).tolist()
+        self._ends = min(self._ends[0], low), max(self._ends[1], high)
+        self.frame = before.grown((low, high), (bottom, top))
         return self.frame is not before
 
-    def lines(self, points: Sequence[Point]) -> list[tuple[int, _Line]]:
+    def lines(self, points: Points) -> list[tuple[int, _Line]]:
         """Return the points that are drawn, by their numbers, and the line to each from the one before."""
+        known = np.flatnonzero(np.isfinite(points.values[:, [self.x, self.y]]).all(axis=1))
+        columns = points.t, points.values[:, self.x], points.values[:, self.y], points.is_reading
         # Tens of thousands of points: without a call for each.
-        column_x, column_y = self.x, self.y
         visible_x, visible_y = self._visible
         line, drawn = self._line, self._drawn
         shown = []
-        for k, (t, _, values, is_reading) in enumerate(points):
-            x, y = values[column_x], values[column_y]
-            if not (math.isfinite(x) and math.isfinite(y)):
-                continue
+        for k, t, x, y, is_reading in zip(known.tolist(), *(each[known].tolist() for each in columns), strict=True):
             if not line:
                 line = [(x, y)]
             if not is_reading:

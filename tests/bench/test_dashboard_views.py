@@ -12,7 +12,7 @@ from bench.binding import RoleTable, Slot
 from bench.dashboard.bounds import bounds_of, nearest
 from bench.dashboard.control import ControlPlots, Errors
 from bench.dashboard.drawing import Frame
-from bench.dashboard.entries import End, Tick
+from bench.dashboard.entries import End, Tick, in_parts
 from bench.dashboard.writer import Writer
 from bench.devices import Signal
 from bench.journal import Event, StepRecord
@@ -77,8 +77,8 @@ def targets(errors: list[float], disturbance: float = 1.0) -> list[object]:
 
 def seen(entries: list[object]) -> Errors:
     errors = Errors(ControlPlots.of(SIGNALS, "curvature", None))
-    for entry in entries:
-        errors.see(entry)  # type: ignore[arg-type]
+    for part in in_parts(entries):  # type: ignore[arg-type]
+        errors.see(part)
     return errors
 
 
@@ -238,8 +238,8 @@ def test_the_error_that_a_witness_sees_is_told_from_the_noise_of_the_sensor(tmp_
         for i, (noise, error) in enumerate(zip(noisy, true, strict=True))
     ]
     errors = Errors(ControlPlots.of(signals, "curvature", None, "witness_curvature"))
-    for entry in entries:
-        errors.see(entry)
+    for part in in_parts(entries):
+        errors.see(part)
     assert errors.rms()[1] == pytest.approx(30.0)
     assert errors.rms_of_witness() == pytest.approx(3.0)
     meta = {**META, "controls": "curvature", "slots": {"witness": {"device": "", "signal": "witness_curvature"}}}
