@@ -1,16 +1,18 @@
-"""Noise of the readings, and what drive and response do while the set-point stands.
+"""Noise of the readings, and what of a specimen no model knows: wander, drift, unevenness.
 
-Everything is found within holds: there the set-point, and with it the model, stand still. Noise is the difference of
-neighbouring rows where the response depends least on the drive. Wander of the drive as the specimen sees it, and
-drift of the response, are those with which a simulation shows the mean squares of differences that were measured, by
-the time between two rows and by the slope of the response.
+They are those with which simulations show the mean squares of differences that were measured. Within holds, where the
+set-point and with it the model stand still, that is noise, wander of the drive as the specimen sees it, and drift of
+the response. From hold to hold there is also the error of the model on a history that it was not identified from: it
+changes as the drive moves, and stands while that stands. A wander of minutes looks the same from hold to hold, so
+that all are found together.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -32,10 +34,22 @@ _MIXED = 2
 """Kind of the pairs of a quick row and the reading after it; 0 and 1 are those of quick rows and of readings."""
 _CLASSES = (len(_LAGS) + 1, _SLOPES, _MIXED + 1)
 """Numbers of classes of pairs: by time, slope and kind."""
-_LONGEST = 4000.0
-"""Part of a run that is simulated, s."""
-_QUICKEST = 0.2
-"""Least correlation time of wander and drift, s."""
+_STEP = 0.05
+"""Least step of the grid of time of simulations, s; finer ones change nothing that is settled."""
+_FROM_HOLD_TO_HOLD = (1, 2, 3, 5, 8, 12, 20, 40, 100)
+"""From reading to reading of a pair, whatever the holds."""
+_FEWEST_HOLDS = 30
+"""Set-points of a run whose error says something of other histories."""
+_START = (0.8, 0.8, 1e-3, 30.0, 1e-4, 0.2, 1e-3, 0.1)
+_LEAST = (0.01, 0.01, 1e-7, 0.2, 1e-7, 0.01, 1e-7, 1e-3)
+_GREATEST = (1.0, 1.0, 1.0, 3000.0, 1.0, 1.0, 1.0, 2.0)
+"""Noise, quick and of readings, as shares of what neighbouring rows differ by; deviation and correlation of wander,
+drift and unevenness. The time of the wander is in s, that of the drift a share of the longest hold: a slower one is
+the error of the model. All others are shares of the range."""
+_SHARES = 2
+"""How many of them are of noise."""
+_UNIT = 1e-9
+"""Of which these are multiples; their logarithms are then far from 0, as steps in proportion to them have to be."""
 _FEWEST = 12
 """Fewest differences of a class that counts."""
 _SETTLED, _LAGGED = 4.0, 4.0
@@ -47,16 +61,14 @@ _LEAST_OF_HOLD = 3
 """Readings of a hold whose middle counts."""
 _FAR, _DIGITS = 6.0, 1.5
 """Distance of an outlier from that middle, in standard deviations and in last digits."""
-_MOST, _MOST_OF_DIFFERENCES = 0.9, 1.6449 * math.sqrt(2.0)
-"""A quantile of differences, and what it is of those of normal numbers of a standard deviation of 1."""
+_MOST, _BEYOND = 0.9, 2.5
+"""A quantile of differences; those beyond so many times that are no noise."""
 _RARE, _SEEN = 0.05, 3
 """Greatest share of outliers, and their least number."""
 _QUANTILES = 9
 """How many of their quantiles are kept."""
-_SIMULATIONS = 20
-"""Whose mean is the effect of wander."""
-_SEED = 0
-"""Of the simulations, the same for each trial."""
+_TRIALS, _SIMULATIONS = 2, 20
+"""Simulations of each trial, the same random numbers in all; those whose mean is the effect of wander."""
 
 
 @dataclass(frozen=True)
@@ -209,54 +221,153 @@ def _is_relative(far: Floats, levels: Floats) -> bool:
 
 
 def identify_disturbances(
-    recordings: Sequence[Recording], operators: Sequence[Operator[Any]], dynamics: Dynamics, signal: str
-) -> tuple[Noise, Wander, Wander]:
-    """Return the noise of the response, the wander of the drive, and the drift of the response."""
-    from scipy.optimize import minimize
+    recordings: Sequence[Recording],
+    operators: Sequence[Operator[Any]],
+    dynamics: Dynamics,
+    signal: str,
+    of_model: Sequence[Floats],
+    left: Sequence[Floats],
+) -> tuple[Noise, Wander, Wander, Unevenness]:
+    """Return the noise of the response, the wander of the drive, the drift of the response, and the unevenness.
+
+    Parameters
+    ----------
+    recordings : sequence of Recording
+        The runs.
+    operators, dynamics
+        The specimen as far as it is known.
+    signal : str
+        The response.
+    of_model, left : sequence of ndarray
+        Errors of the model at the readings of each run, and what the correction leaves of them, output units.
+    """
+    from scipy.optimize import least_squares
 
     parts = [Part(r, tuple(operators), dynamics) for r in recordings]
     _classify(parts)
-    noise = _response_noise(parts, recordings, signal)
-    quick, reading = noise.quick**2, noise.reading**2
+    most = _response_noise(parts, recordings, signal)
     counts, variances, trends = _moments(parts, [part.errors for part in parts])
     used = counts >= _FEWEST
-    if not used.any():
-        return noise, Wander(), Wander()
     variances = np.maximum(variances[used], 1e-300)
-    white = np.broadcast_to([2.0 * quick, 2.0 * reading, quick + reading], counts.shape)[used]
+    kinds = np.broadcast_to(np.arange(_MIXED + 1), counts.shape)[used]
     holds, independent = (each[used] for each in evidence(parts))
-    # The logarithm of a mean of n independent squares is uncertain by the square root of 2 / n.
-    weights = 0.5 * np.minimum(independent, 200.0)
+    # The logarithm of a mean of n independent squares is uncertain by the square root of 2 / n, and holds differ.
+    weights = 1.0 / np.sqrt(2.0 / np.maximum(independent, 1.0) + 1.0 / holds)
     # How a hold goes on says the same of wander only once, and a few holds go on as their drift happens to.
-    trusted = np.where(holds >= _FEWEST, np.minimum(holds, 200.0), 0.0)
+    trusted = np.sqrt(np.where(holds >= _FEWEST, holds, 0.0) / variances)
+    errors = _errors_of_model(parts, recordings, of_model, left)
     span = float(np.ptp(np.concatenate([r.driven for r in recordings])))
     height = float(np.ptp(np.concatenate([r.responded for r in recordings])))
+    longest = max(float(np.max(r.since_change, where=r.last_change >= 0, initial=1.0)) for r in recordings)
+    if errors is None and not used.any():
+        return most, Wander(), Wander(), Unevenness()
+    start, low, high = (np.log(np.array(each) / _UNIT) for each in (_START, _LEAST, _GREATEST))
 
-    def trial(numbers: Floats) -> tuple[Wander, Wander]:
-        wander, wander_time, drift, drift_time = np.exp(np.clip(numbers, -30.0, 12.0)).tolist()
-        return Wander(wander * span, max(wander_time, _QUICKEST)), Wander(drift * height, drift_time)
-
-    def cost(numbers: Floats) -> float:
-        wander, drift = trial(numbers)
-        disturbed = replace(dynamics, wander=wander, drift=drift)
-        _, found, went = _moments(parts, [part.simulate(disturbed, _SEED + n) for n, part in enumerate(parts)])
-        ratios = np.maximum(found[used] + white, 1e-300) / variances
-        misses = weights * np.log(ratios) ** 2 + trusted * (went - trends)[used] ** 2 / variances
-        penalty = float(np.sum(np.maximum(numbers[[1, 3]] - math.log(3000.0), 0.0) ** 2)) + float(
-            np.sum(np.maximum(math.log(_QUICKEST) - numbers[[1, 3]], 0.0) ** 2)
+    def trial(numbers: Floats) -> tuple[Noise, Dynamics]:
+        quick, reading, wander, wander_time, drift, drift_time, uneven, length = (_UNIT * np.exp(numbers)).tolist()
+        return replace(most, quick=quick * most.quick, reading=reading * most.reading), replace(
+            dynamics,
+            wander=Wander(wander * span, wander_time),
+            drift=Wander(drift * height, drift_time * longest),
+            unevenness=Unevenness(uneven * span, length * span) if errors is not None else Unevenness(),
         )
-        return float(np.sum(misses)) + 100.0 * penalty
 
-    start = np.log([3e-4, 5.0, 1e-4, 100.0])
-    simplex = np.vstack([start, start + np.diag([1.0, 1.0, 1.0, 1.0])])
-    solved = minimize(
-        cost,
-        start,
-        method="Nelder-Mead",
-        options={"maxfev": 90, "initial_simplex": simplex, "xatol": 0.02, "fatol": 0.1},
+    @lru_cache(maxsize=2)
+    def simulated(disturbed: Dynamics) -> tuple[Floats, Floats, Floats]:
+        # Other random numbers in each run, the same in each trial.
+        found = [
+            [part.simulate(disturbed, len(parts) * number + n) for n, part in enumerate(parts)]
+            for number in range(_TRIALS)
+        ]
+        moments = [_moments(parts, each) for each in found]
+        squares, went = (np.mean([each[i][used] for each in moments], axis=0) for i in (1, 2))
+        between = np.empty(0) if errors is None else np.mean([errors.squares(each) for each in found], axis=0)
+        return squares, went, between
+
+    def misses(numbers: Floats) -> Floats:
+        noise, disturbed = trial(numbers)
+        squares, went, between = simulated(disturbed)
+        rounding = noise.resolution**2 / 12.0
+        quick, reading = noise.quick**2 + rounding, noise.reading**2 + rounding
+        white = np.array([2.0 * quick, 2.0 * reading, quick + reading])
+        within = weights * np.log(np.maximum(squares + white[kinds], 1e-300) / variances)
+        if errors is not None:
+            between = errors.misses(between + white[1])
+        # What noise can be is noise, and not a quick drift.
+        shares = numbers[:_SHARES] - high[:_SHARES]
+        return np.concatenate([within, trusted * (went - trends[used]), between, shares])
+
+    solved = least_squares(
+        misses, start, bounds=(low, high), diff_step=np.full(start.size, 0.01), max_nfev=25, xtol=1e-3, ftol=1e-3
     )
-    wander, drift = trial(solved.x)
-    return noise, wander, drift
+    noise, found = trial(solved.x)
+    return noise, found.wander, found.drift, found.unevenness
+
+
+class _Errors:
+    """Mean squares of the differences of a model's errors at two readings of a run, by gap and slope.
+
+    Parameters
+    ----------
+    parts : sequence of Part
+        All runs.
+    run : int
+        The run whose errors count.
+    of_model, left : ndarray
+        Errors of the model at its readings, and what the correction leaves of them.
+    """
+
+    def __init__(self, parts: Sequence[Part], run: int, of_model: Floats, left: Floats) -> None:
+        self._run, part = run, parts[run]
+        self._rows = part.readings
+        slopes = part.slopes[self._rows]
+        self._classes = np.searchsorted(np.quantile(slopes, np.arange(1, _SLOPES) / _SLOPES), slopes)
+        # With what is explained, the twin differs from the model as much as the specimen does.
+        target = self._of_readings(of_model) - self._of_readings(of_model - left)
+        self._used = np.isfinite(target) & (target > 0.0)
+        self._target = target[self._used]
+        # Where the response is steep, errors are great and matter most.
+        weights = np.sqrt(0.5 * self._counts() / np.array(_FROM_HOLD_TO_HOLD)[:, None])[self._used]
+        self._weights = weights * np.sqrt(self._target / np.max(self._target, initial=0.0))
+
+    def squares(self, values: Sequence[Floats]) -> Floats:
+        """Return the mean squares of what simulations add to the rows of each run."""
+        return self._of_readings(values[self._run][self._rows])[self._used]
+
+    def misses(self, squares: Floats) -> Floats:
+        """Return by how much mean squares differ from those of the errors, weighted."""
+        return np.asarray(self._weights * np.log(squares / self._target))
+
+    def _pairs(self) -> Iterator[tuple[int, int, NDArray[np.int64]]]:
+        """Yield number of the gap, class of the slope, and the first readings of the pairs."""
+        for number, gap in enumerate(_FROM_HOLD_TO_HOLD):
+            for slope in range(_SLOPES):
+                yield number, slope, np.flatnonzero(self._classes[:-gap] == slope)
+
+    def _counts(self) -> Floats:
+        counts = np.zeros((len(_FROM_HOLD_TO_HOLD), _SLOPES))
+        for number, slope, first in self._pairs():
+            counts[number, slope] = first.size
+        return counts
+
+    def _of_readings(self, values: Floats) -> Floats:
+        squares = np.full((len(_FROM_HOLD_TO_HOLD), _SLOPES), np.nan)
+        for number, slope, first in self._pairs():
+            if first.size >= _FEWEST:
+                differences = values[first + _FROM_HOLD_TO_HOLD[number]] - values[first]
+                squares[number, slope] = float(np.mean(differences**2))
+        return squares
+
+
+def _errors_of_model(
+    parts: Sequence[Part], recordings: Sequence[Recording], of_model: Sequence[Floats], left: Sequence[Floats]
+) -> _Errors | None:
+    """Return the errors in the run that the model knows least, of those that say something of other histories."""
+    long = [i for i, each in enumerate(recordings) if np.unique(each.setpoints).size >= _FEWEST_HOLDS]
+    if not long:
+        return None
+    run = max(long, key=lambda i: float(np.std(of_model[i])))
+    return _Errors(parts, run, of_model[run], left[run])
 
 
 def mean_effects(
@@ -272,33 +383,27 @@ def mean_effects(
     wandering = replace(dynamics, drift=Wander(), unevenness=Unevenness())
     effects = []
     for r in recordings:
-        part = Part(r, tuple(operators), dynamics, math.inf)
-        effects.append(np.mean([part.simulate(wandering, _SEED + n) for n in range(_SIMULATIONS)], axis=0))
+        part = Part(r, tuple(operators), dynamics)
+        effects.append(np.mean([part.simulate(wandering, n) for n in range(_SIMULATIONS)], axis=0))
     return effects
 
 
 class Part:
     """A run, simulated without disturbances, and the pairs of its rows within holds."""
 
-    def __init__(
-        self,
-        recording: Recording,
-        operators: tuple[Operator[Any], ...],
-        dynamics: Dynamics,
-        longest: float = _LONGEST,
-    ) -> None:
+    def __init__(self, recording: Recording, operators: tuple[Operator[Any], ...], dynamics: Dynamics) -> None:
         self._recording, self._operators, self._dynamics = recording, operators, dynamics
-        self._end = min(longest, float(recording.times[-1]))
+        self._step = max(dynamics.step, _STEP)
         first = float(recording.driven[0])
         initial = (first - dynamics.actuator.offset) / dynamics.actuator.gain
         self._first = first
-        self._setpoints = recording.on_grid(dynamics.step, initial, self._end)
+        self._setpoints = recording.on_grid(self._step, initial, float(recording.times[-1]))
         quiet = replace(dynamics, wander=Wander(), drift=Wander())
         self.still = self._run(quiet, None)
-        count = self.still.size
-        self.times = recording.times[:count]
-        self.errors = recording.responded[:count] - self.still
-        self.slopes = self._local_slopes(count)
+        self.times = recording.times
+        self.readings = np.flatnonzero(recording.is_reading)
+        self.errors = recording.responded - self.still
+        self.slopes = self._local_slopes()
         self.pairs: _Pairs
 
     def simulate(self, dynamics: Dynamics, seed: int) -> Floats:
@@ -306,20 +411,19 @@ class Part:
         return self._run(dynamics, np.random.default_rng(seed)) - self.still
 
     def _run(self, dynamics: Dynamics, rng: np.random.Generator | None) -> Floats:
-        specimen = Specimen(self._operators, dynamics, self._first, rng)
+        specimen = Specimen(self._operators, replace(dynamics, step=self._step), self._first, rng)
         before = specimen.response
         _, response = specimen.advance(self._setpoints)
-        times = self._recording.times
-        return at_rows(times[times <= self._end], response, before, dynamics.step, latency(dynamics.actuator))
+        return at_rows(self._recording.times, response, before, self._step, latency(dynamics.actuator))
 
-    def _local_slopes(self, count: int) -> Floats:
+    def _local_slopes(self) -> Floats:
         """Return by how much the model's response depends on the drive at each row, by its greater slope."""
         r, model = self._recording, self._operators[0]
         near = _NEAR * float(np.ptp(r.driven))
-        slopes = np.zeros(count)
+        slopes = np.zeros(r.times.size)
         state, last = model.initial_state(), -2
         changes = r.last_change
-        for row in range(count):
+        for row in range(slopes.size):
             if changes[row] != last:
                 last = changes[row]
                 place = float(r.driven[row]) if last < 0 else float(r.setpoints[last])
@@ -333,9 +437,9 @@ class Part:
 
     def pair(self, edges: Floats) -> _Pairs:
         """Return the pairs of settled rows of a hold, by kind, the time between them, and slope."""
-        r, count = self._recording, self.still.size
-        settled = _settled(r, self._dynamics)[:count]
-        quick, readings = (np.flatnonzero((r.is_reading[:count] == kind) & settled) for kind in (False, True))
+        r = self._recording
+        settled = _settled(r, self._dynamics)
+        quick, readings = (np.flatnonzero((r.is_reading == kind) & settled) for kind in (False, True))
         found = [(rows[:-gap], rows[gap:], kind) for kind, rows in enumerate((quick, readings)) for gap in _GAPS]
         # Of a hold with a single reading, how it went on until that.
         last = np.searchsorted(readings, quick)
@@ -419,13 +523,10 @@ def _response_noise(parts: Sequence[Part], recordings: Sequence[Recording], sign
 
 def _noise(found: Sequence[float | None], resolution: float) -> Noise:
     """Return the noise of readings and quick readings; where one is not known, it is that of the other."""
-    reading, quick = found
+    # Rounding comes on top of it.
+    reading, quick = (None if each is None else math.sqrt(max(each**2 - resolution**2 / 12.0, 0.0)) for each in found)
     known = reading if reading is not None else quick if quick is not None else 0.0
-    return Noise(
-        known if reading is None else reading,
-        known if quick is None else quick,
-        resolution,
-    )
+    return Noise(known if reading is None else reading, known if quick is None else quick, resolution)
 
 
 def _settled(recording: Recording, dynamics: Dynamics) -> NDArray[np.bool_]:
@@ -441,7 +542,8 @@ def _deviation(differences: Floats) -> float | None:
     """Return the standard deviation of the numbers of which these are differences; None of too few."""
     if differences.size < _FEWEST:
         return None
-    return float(np.quantile(np.abs(differences), _MOST)) / _MOST_OF_DIFFERENCES
+    sizes = np.abs(differences)
+    return float(np.sqrt(0.5 * np.mean(sizes[sizes <= _BEYOND * np.quantile(sizes, _MOST)] ** 2)))
 
 
 def _resolution(values: Floats) -> float:

@@ -24,7 +24,6 @@ from bench.twin.correction import identify_correction
 from bench.twin.disturbances import Noise, Part, evidence, identify_disturbances, mean_effects, noise_of
 from bench.twin.setpoints import identify_setpoints
 from bench.twin.specimen import Dynamics, Specimen, Unevenness, Wander
-from bench.twin.unevenness import identify_unevenness
 from bench.twin.write import write_twin
 from sim_devices.twin_laboratory import SpecimenPlant
 
@@ -318,7 +317,8 @@ def wandering():
 
 def test_wander_is_known_by_how_holds_go_on(wandering):
     specimen, recording = wandering
-    _, found, _ = identify_disturbances([recording], [specimen], Dynamics(0.02), "response")
+    errors = Part(recording, (specimen,), Dynamics(0.02)).errors[recording.is_reading]
+    _, found, *_ = identify_disturbances([recording], [specimen], Dynamics(0.02), "response", [errors], [errors])
     for seconds in (0.5, 2.0, 6.0):
         moved, real = (each.deviation * math.sqrt(1.0 - math.exp(-seconds / each.time)) for each in (found, WANDER))
         assert moved == pytest.approx(real, rel=0.25)
@@ -329,7 +329,7 @@ def test_what_wander_does_on_average_is_known(wandering):
     specimen, recording = wandering
     dynamics = Dynamics(0.02, wander=WANDER)
     (effect,) = mean_effects([recording], [specimen], dynamics)
-    still = Part(recording, (specimen,), dynamics, math.inf).still
+    still = Part(recording, (specimen,), dynamics).still
     direction = np.sign(np.diff(recording.setpoints, prepend=40.0))[recording.last_change]
     chosen = recording.is_reading
     added = float(np.mean((direction * (recording.responded - still))[chosen]))
@@ -353,20 +353,50 @@ def test_pairs_that_overlap_are_not_independent(wandering):
     assert np.sum(part.pairs.time == far) > 400
 
 
+UNEVENNESS = Unevenness(0.3, 4.0)
+
+
 def test_the_unevenness_is_what_the_correction_does_not_explain(wandering):
     specimen, recording = wandering
-    real = Unevenness(0.3, 4.0)
     dynamics = Dynamics(0.02)
-    part = Part(recording, (specimen,), dynamics, math.inf)
-    rows = recording.is_reading
-    left = part.simulate(replace(dynamics, unevenness=real), 3)[rows]
+    part = Part(recording, (specimen,), dynamics)
+    uneven = part.simulate(replace(dynamics, unevenness=UNEVENNESS), 3)
+    read = part.still + uneven + np.random.default_rng(4).normal(0.0, 0.1, uneven.size)
+    made = replace(recording, columns={**recording.columns, "response": read})
+    left = (read - part.still)[recording.is_reading]
     explained = 2.0 * np.std(left) * np.sin(np.arange(left.size) / 5.0)
-    found = identify_unevenness(
-        [recording], [explained + left], [left], [specimen], dynamics, [0.0 * recording.times], Noise()
-    )
+    _, wander, _, found = identify_disturbances([made], [specimen], dynamics, "response", [explained + left], [left])
     for travel in (1.0, 4.0, 16.0):
-        moved, wanted = (each.deviation * math.sqrt(1.0 - math.exp(-travel / each.length)) for each in (found, real))
+        moved, wanted = (
+            each.deviation * math.sqrt(1.0 - math.exp(-travel / each.length)) for each in (found, UNEVENNESS)
+        )
         assert moved == pytest.approx(wanted, rel=0.35)
+    assert wander.deviation * math.sqrt(1.0 - math.exp(-8.0 / wander.time)) < 0.1 * UNEVENNESS.deviation
+
+
+def test_a_slow_wander_is_told_from_what_the_model_does_not_know(wandering):
+    """From reading to reading a wander of minutes looks as unevenness does; within holds it goes on."""
+    specimen, recording = wandering
+    real, dynamics = Wander(0.3, 60.0), Dynamics(0.02)
+    part = Part(recording, (specimen,), dynamics)
+    read = part.still + part.simulate(replace(dynamics, wander=real), 3)
+    read += np.random.default_rng(4).normal(0.0, 0.1, read.size)
+    made = replace(recording, columns={**recording.columns, "response": read})
+    left = (read - part.still)[recording.is_reading]
+    _, found, _, uneven = identify_disturbances([made], [specimen], dynamics, "response", [left], [left])
+    for seconds in (6.0, 60.0):
+        moved, wanted = (each.deviation * math.sqrt(1.0 - math.exp(-seconds / each.time)) for each in (found, real))
+        assert moved == pytest.approx(wanted, rel=0.35)
+    assert uneven.deviation < 0.5 * real.deviation
+
+
+def test_noise_is_what_readings_of_few_digits_scatter_by():
+    """Between two digits a normal noise of a third of one; a quantile of differences is 0 or a whole digit."""
+    rng = np.random.default_rng(8)
+    times = 0.1 * np.arange(1, 4001)
+    read = np.round(0.3 + rng.normal(0.0, 0.5, times.size))
+    made = recording_from(times, read, np.array([0.0]), np.array([0.3]))
+    assert noise_of([made], "drive", Dynamics(0.02)).reading == pytest.approx(0.5, rel=0.05)
 
 
 def test_how_calls_divide_the_time_does_not_matter():
