@@ -167,8 +167,12 @@ class TwinLaboratory(EmulatedLaboratory):
         """Take what a device sets from now on; nan for one that is off."""
         self._outputs[device] = value
         if device == self._settings.drive.device:
-            inexact = self._settings.setpoints.inexact
-            self.plant.set(self._at_rest if math.isnan(value) else inexact(value, self._rng))
+            self.plant.set(self._at_rest if math.isnan(value) else self._carried_out(value))
+
+    def _carried_out(self, setpoint: float) -> float:
+        """Return what becomes of a set-point; one that is off by far has the steps of the others."""
+        setpoints = self._settings.setpoints
+        return setpoints.rounded(setpoints.inexact(setpoint, self._rng))
 
     def _source(self, signal: str, noise: NoiseTable) -> Callable[[], float]:
         """Return what gives the true value of a signal."""

@@ -1,11 +1,13 @@
 """How exactly an actuator carries out its set-points: in steps, and rarely one that is off by far.
 
 It shows where the readings of a hold are all equal but for outliers. Whether the specimen sees what is read, or what
-was set, is seen by which of both its response follows.
+was set, is seen by which of both its response follows. An actuator that goes by its own readings has their outliers
+in its set-points, too.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -17,6 +19,9 @@ from bench.hysteresis import Operator
 from bench.hysteresis._checks import Floats
 from bench.transients.recording import Recording
 from bench.twin.disturbances import Noise, with_outliers
+
+_CHANCE = 3.0
+"""Standard deviations by which a count of outliers may differ from what is expected."""
 
 
 def identify_setpoints(
@@ -49,7 +54,22 @@ def identify_setpoints(
     meant = np.concatenate(expected)
     errors = np.concatenate(levels) - meant
     limit = noise.resolution
-    return with_outliers(Noise(resolution=limit), errors, meant, np.abs(errors) > limit, limit), carried_out
+    off = np.abs(errors) > limit
+    found = with_outliers(Noise(resolution=limit), errors, meant, off, limit)
+    if found.outliers and _explains(noise, int(off.sum()), meant, limit):
+        # There are many more readings, and they say how often and by how much.
+        found = replace(noise, reading=0.0, quick=0.0, resolution=limit)
+    return found, carried_out
+
+
+def _explains(readings: Noise, count: int, levels: Floats, limit: float) -> bool:
+    """Return whether a count of values further off than a limit agrees with the outliers of readings."""
+    if not readings.outliers:
+        return False
+    size = float(np.median(np.abs(readings.outliers)))
+    sizes = size * np.abs(levels) if readings.relative_outliers else np.full_like(levels, size)
+    expected = readings.outlier_share * int((sizes > limit).sum())
+    return abs(count - expected) <= _CHANCE * math.sqrt(expected)
 
 
 def _levels(recording: Recording) -> Floats:

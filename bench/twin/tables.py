@@ -81,6 +81,10 @@ class InexactTable(_Table):
         if self.outliers and rng.random() < self.outlier_share:
             size = float(rng.choice(self.outliers))
             return value * (1.0 + size) if self.relative_outliers else value + size
+        return self.rounded(value)
+
+    def rounded(self, value: float) -> float:
+        """Return the nearest multiple of the last digit."""
         return round(value / self.resolution) * self.resolution if self.resolution else value
 
 

@@ -256,6 +256,29 @@ def test_set_points_that_are_not_carried_out_exactly_are_seen(carried_out):
     assert np.abs(found.outliers) == pytest.approx(0.01, rel=0.3)
 
 
+@pytest.mark.parametrize(("share", "alike"), [(0.012, True), (0.06, False)])
+def test_outliers_of_few_set_points_are_those_of_the_readings_if_these_explain_them(share, alike):
+    """A supply reads its battery when it sets a voltage and when it reads one: 1 % off in 12 of 1000."""
+    rng = np.random.default_rng(3)
+    changes, setpoints = 10.0 * np.arange(600), rng.uniform(2.0, 5.0, 600)
+    times = np.arange(1.0, 6000.0, 1.0)
+    hold = np.searchsorted(changes, times - 1e-9, side="right") - 1
+
+    def reading(values, often):
+        return values * (1.0 + 0.01 * (rng.random(values.size) < often) * rng.choice([-1.0, 1.0], values.size))
+
+    levels = np.round(reading(setpoints, share) / 0.01) * 0.01
+    play = PrandtlIshlinskii(np.array([0.0, 0.5]), np.array([1.0, 1.0]), input_range=(0.0, 6.0))
+    made = recording_from(times, levels[hold], changes, setpoints)
+    made = replace(made, columns={"drive": reading(levels[hold], 0.012), "response": play.evaluate(levels)[hold]})
+    noise = noise_of([made], "drive", Dynamics(0.02), outliers=True)
+    found, _ = identify_setpoints([made], ActuatorDynamics(), noise, play)
+    assert noise.relative_outliers
+    assert (found.outliers == noise.outliers) is alike
+    assert found.outlier_share == pytest.approx(share, rel=0.3)
+    assert found.resolution == pytest.approx(0.01)
+
+
 def test_an_actuator_that_follows_at_once_has_no_delay():
     """Readings that are complete as the next set-point is sent saw the one before."""
     changes, setpoints = np.arange(1.0, 16.0) * 0.497, np.tile([1.0, 3.0, 2.0], 5)
