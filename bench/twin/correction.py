@@ -52,7 +52,8 @@ class Correction:
     rms : float
         Error that is left, output units.
     left : ndarray
-        That error at each reading, output units.
+        That error at each reading, output units; of readings that the correction was not identified from, as it
+        follows others the closer, the fewer they are.
     """
 
     operator: Operator[Any] | None
@@ -114,7 +115,7 @@ def identify_correction(
     # What takes the place of a density that is nowhere negative is so too.
     bounded = which == 1 and own.min() >= 0.0
     solution = _not_negative(gram, right) if bounded else np.asarray(np.linalg.solve(gram, right))
-    left = targets[:, which] - columns @ solution
+    left = options[which][0]
     operator = template.with_coefficients(nodes @ solution[:-1] - replaced[which], float(solution[-1]))
     return Correction(operator, float(np.sqrt(np.mean(left**2))), left)
 

@@ -227,8 +227,11 @@ def identify_disturbances(
     signal: str,
     of_model: Sequence[Floats],
     left: Sequence[Floats],
-) -> tuple[Noise, Wander, Wander, Unevenness]:
-    """Return the noise of the response, the wander of the drive, the drift of the response, and the unevenness.
+) -> tuple[Noise, Wander, Wander]:
+    """Return the noise of the response, the wander of the drive, and the drift of the response.
+
+    An unevenness is found with them, so that it is not taken for wander; `identify_unevenness` finds it again, when
+    the correction is known without the effect of the wander.
 
     Parameters
     ----------
@@ -260,7 +263,7 @@ def identify_disturbances(
     height = float(np.ptp(np.concatenate([r.responded for r in recordings])))
     longest = max(float(np.max(r.since_change, where=r.last_change >= 0, initial=1.0)) for r in recordings)
     if errors is None and not used.any():
-        return most, Wander(), Wander(), Unevenness()
+        return most, Wander(), Wander()
     start, low, high = (np.log(np.array(each) / _UNIT) for each in (_START, _LEAST, _GREATEST))
 
     def trial(numbers: Floats) -> tuple[Noise, Dynamics]:
@@ -301,7 +304,7 @@ def identify_disturbances(
         misses, start, bounds=(low, high), diff_step=np.full(start.size, 0.01), max_nfev=25, xtol=1e-3, ftol=1e-3
     )
     noise, found = trial(solved.x)
-    return noise, found.wander, found.drift, found.unevenness
+    return noise, found.wander, found.drift
 
 
 class _Errors:

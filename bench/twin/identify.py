@@ -26,6 +26,7 @@ from bench.twin.response import IdentifiedResponse, correct_response, identify_r
 from bench.twin.setpoints import identify_setpoints
 from bench.twin.specimen import Dynamics, Unevenness, Wander
 from bench.twin.tables import InexactTable
+from bench.twin.unevenness import identify_unevenness
 
 _MODELS: Mapping[str, Mapping[str, Any]] = {
     "preisach": {"reversible": "linear"},
@@ -243,12 +244,17 @@ def identify_twin(paths: Sequence[Path], file: RigFile, model: Path | None) -> I
     response = identify_response(carried_out, actuator.dynamics, operator)
     operators = [operator] if response.correction is None else [operator, response.correction]
     dynamics = Dynamics(grid_step(actuator.dynamics), actuator.dynamics, response.dynamics)
-    noise, wander, drift, unevenness = identify_disturbances(
+    noise, wander, drift = identify_disturbances(
         carried_out, operators, dynamics, first.response, response.of_model, response.left
     )
     # The readings had the effect of wander, too: the twin adds its own.
     effects = mean_effects(carried_out, operators, replace(dynamics, wander=wander))
     response = correct_response(response, carried_out, operator, effects)
+    operators = [operator] if response.correction is None else [operator, response.correction]
+    disturbed = replace(dynamics, wander=wander, drift=drift)
+    unevenness = identify_unevenness(
+        carried_out, response.of_model, response.left, operators, disturbed, effects, noise
+    )
     return IdentifiedTwin(
         recordings=recordings,
         model_name=name,

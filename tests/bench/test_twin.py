@@ -24,6 +24,7 @@ from bench.twin.correction import identify_correction
 from bench.twin.disturbances import Noise, Part, evidence, identify_disturbances, mean_effects, noise_of
 from bench.twin.setpoints import identify_setpoints
 from bench.twin.specimen import Dynamics, Specimen, Unevenness, Wander
+from bench.twin.unevenness import identify_unevenness
 from bench.twin.write import write_twin
 from sim_devices.twin_laboratory import SpecimenPlant
 
@@ -341,7 +342,7 @@ def wandering():
 def test_wander_is_known_by_how_holds_go_on(wandering):
     specimen, recording = wandering
     errors = Part(recording, (specimen,), Dynamics(0.02)).errors[recording.is_reading]
-    _, found, *_ = identify_disturbances([recording], [specimen], Dynamics(0.02), "response", [errors], [errors])
+    _, found, _ = identify_disturbances([recording], [specimen], Dynamics(0.02), "response", [errors], [errors])
     for seconds in (0.5, 2.0, 6.0):
         moved, real = (each.deviation * math.sqrt(1.0 - math.exp(-seconds / each.time)) for each in (found, WANDER))
         assert moved == pytest.approx(real, rel=0.25)
@@ -376,25 +377,22 @@ def test_pairs_that_overlap_are_not_independent(wandering):
     assert np.sum(part.pairs.time == far) > 400
 
 
-UNEVENNESS = Unevenness(0.3, 4.0)
-
-
 def test_the_unevenness_is_what_the_correction_does_not_explain(wandering):
     specimen, recording = wandering
-    dynamics = Dynamics(0.02)
+    real, dynamics = Unevenness(0.3, 4.0), Dynamics(0.02)
     part = Part(recording, (specimen,), dynamics)
-    uneven = part.simulate(replace(dynamics, unevenness=UNEVENNESS), 3)
+    uneven = part.simulate(replace(dynamics, unevenness=real), 3)
     read = part.still + uneven + np.random.default_rng(4).normal(0.0, 0.1, uneven.size)
     made = replace(recording, columns={**recording.columns, "response": read})
     left = (read - part.still)[recording.is_reading]
-    explained = 2.0 * np.std(left) * np.sin(np.arange(left.size) / 5.0)
-    _, wander, _, found = identify_disturbances([made], [specimen], dynamics, "response", [explained + left], [left])
+    errors = 2.0 * np.std(left) * np.sin(np.arange(left.size) / 5.0) + left
+    _, wander, _ = identify_disturbances([made], [specimen], dynamics, "response", [errors], [left])
+    assert wander.deviation * math.sqrt(1.0 - math.exp(-8.0 / wander.time)) < 0.1 * real.deviation
+    nothing = [0.0 * recording.times]
+    found = identify_unevenness([made], [errors], [left], [specimen], dynamics, nothing, Noise(reading=0.1))
     for travel in (1.0, 4.0, 16.0):
-        moved, wanted = (
-            each.deviation * math.sqrt(1.0 - math.exp(-travel / each.length)) for each in (found, UNEVENNESS)
-        )
+        moved, wanted = (each.deviation * math.sqrt(1.0 - math.exp(-travel / each.length)) for each in (found, real))
         assert moved == pytest.approx(wanted, rel=0.35)
-    assert wander.deviation * math.sqrt(1.0 - math.exp(-8.0 / wander.time)) < 0.1 * UNEVENNESS.deviation
 
 
 def test_a_slow_wander_is_told_from_what_the_model_does_not_know(wandering):
@@ -406,11 +404,10 @@ def test_a_slow_wander_is_told_from_what_the_model_does_not_know(wandering):
     read += np.random.default_rng(4).normal(0.0, 0.1, read.size)
     made = replace(recording, columns={**recording.columns, "response": read})
     left = (read - part.still)[recording.is_reading]
-    _, found, _, uneven = identify_disturbances([made], [specimen], dynamics, "response", [left], [left])
+    _, found, _ = identify_disturbances([made], [specimen], dynamics, "response", [left], [left])
     for seconds in (6.0, 60.0):
         moved, wanted = (each.deviation * math.sqrt(1.0 - math.exp(-seconds / each.time)) for each in (found, real))
         assert moved == pytest.approx(wanted, rel=0.35)
-    assert uneven.deviation < 0.5 * real.deviation
 
 
 def test_noise_is_what_readings_of_few_digits_scatter_by():
