@@ -134,7 +134,7 @@ def test_a_view_follows_a_journal_and_knows_its_end(ended: Path) -> None:
         assert view.follow() == "completed"
         # Nothing twice.
         with Record(ended) as record:
-            assert view._tail.entries(record) == []
+            assert view._tail.parts(record) == []
 
 
 def test_a_replay_takes_its_time(ended: Path, tmp_path: Path) -> None:
