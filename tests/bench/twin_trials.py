@@ -1,6 +1,6 @@
 """Trials of twins: tracking runs on a twin, beside those on the emulated plant that it was identified from.
 
-    python tests/bench/twin_trials.py [--rig vo2 ...] [--specimens 3] [--sessions 24] [--out FOLDER]
+    python tests/bench/twin_trials.py [--rig vo2 ...] [--specimens 0 1 2] [--sessions 24] [--out FOLDER]
 
 The plants of the packaged rigs are built differently from any twin. Each specimen is characterized once (creep,
 damped-oscillation, random-validation), in sessions of its own; the second run identifies the model of the controller,
@@ -94,7 +94,7 @@ def main() -> None:
     """Make the trials, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--rig", nargs="+", choices=[*MODELS], default=[*MODELS])
-    parser.add_argument("--specimens", type=int, default=3)
+    parser.add_argument("--specimens", nargs="+", type=int, default=[0, 1, 2])
     parser.add_argument("--sessions", type=int, help="of each plant and twin; default: " + str(dict(SESSIONS)))
     parser.add_argument("--out", type=Path)
     arguments = parser.parse_args()
@@ -103,7 +103,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as temporary:
         for rig in arguments.rig:
             changes: dict[str, list[float]] = {name: [] for name in GOALS}
-            for specimen in range(arguments.specimens):
+            for specimen in arguments.specimens:
                 folder = (arguments.out or Path(temporary)) / f"{rig}-{specimen}"
                 plant, twin = trial(rig, specimen, folder, arguments.sessions or SESSIONS[rig])
                 for column, name in enumerate(GOALS):
