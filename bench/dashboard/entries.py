@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
+from bench.dashboard.recording import Floats, Ints
 from bench.hysteresis import Density
 from bench.hysteresis.documents import Model
 from bench.journal import Event, StepRecord
@@ -37,9 +37,18 @@ class Ticks:
     values : ndarray, shape (ticks, signals)
     """
 
-    t: npt.NDArray[np.float64]
-    step: npt.NDArray[np.int64]
-    values: npt.NDArray[np.float64]
+    t: Floats
+    step: Ints
+    values: Floats
+
+    @classmethod
+    def joined(cls, pieces: Sequence[Ticks]) -> Ticks:
+        """Return one or more pieces, one behind the other."""
+        return cls(
+            np.concatenate([each.t for each in pieces]),
+            np.concatenate([each.step for each in pieces]),
+            np.concatenate([each.values for each in pieces]),
+        )
 
     @classmethod
     def of(cls, ticks: Sequence[Tick]) -> Ticks:
@@ -130,9 +139,9 @@ def single(parts: Iterable[Part]) -> Iterator[Entry]:
             yield part
 
 
-def portions(parts: Iterable[Part], most: int) -> Iterator[list[Part]]:
+def portions(parts: Iterable[Entry | Part], most: int) -> Iterator[list[Entry | Part]]:
     """Yield parts in portions of so many entries at most."""
-    portion: list[Part] = []
+    portion: list[Entry | Part] = []
     count = 0
     for part in parts:
         first, length = 0, size(part)
@@ -147,6 +156,6 @@ def portions(parts: Iterable[Part], most: int) -> Iterator[list[Part]]:
         yield portion
 
 
-def size(part: Part) -> int:
+def size(part: Entry | Part) -> int:
     """Return the number of entries of a part."""
     return len(part) if isinstance(part, Ticks) else 1

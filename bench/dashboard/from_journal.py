@@ -9,7 +9,7 @@ from typing import Self
 
 import numpy as np
 
-from bench.dashboard.entries import End, Entry, Part, Ticks, densities_of, in_parts, merged, portions, single, size
+from bench.dashboard.entries import End, Entry, Part, Ticks, densities_of, merged, portions, single, size
 from bench.dashboard.live import CHUNK_ROWS
 from bench.dashboard.writer import Writer
 from bench.errors import ConfigurationError, DataError
@@ -95,9 +95,9 @@ class JournalView:
 
     def show(self, entries: Sequence[Entry]) -> None:
         """Show entries; viewers get them at once."""
-        self._show(in_parts(entries))
+        self._show(entries)
 
-    def _show(self, parts: Sequence[Part]) -> None:
+    def _show(self, parts: Sequence[Entry | Part]) -> None:
         if parts:
             _write(self._writer, parts)
             self._writer.arrange()
@@ -148,7 +148,7 @@ def _writer_of(record: Record, models: list[ModelFile]) -> Writer:
         raise DataError(f"{record.path}: the metadata of its dashboard is damaged: {error}") from error
 
 
-def _write(writer: Writer, parts: Sequence[Part]) -> None:
+def _write(writer: Writer, parts: Sequence[Entry | Part]) -> None:
     for portion in portions(parts, CHUNK_ROWS):
         writer.write(portion)
 

@@ -65,14 +65,14 @@ class Planes:
         for path, memory in self._memories.items():
             corners: list[tuple[int, Floats]] = []
             # What only a model knows takes long, and a point that is not drawn differs too little.
-            numbers = range(points.t.size) if path == "plane" else drawn
-            for k, values in zip(numbers, points.values[np.ix_(numbers, memory.columns)].tolist(), strict=True):
+            numbers = range(len(points.rows)) if path == "plane" else drawn
+            for k, values in zip(numbers, points.rows.values[np.ix_(numbers, memory.columns)].tolist(), strict=True):
                 memory.see(*values)
                 if k in shown and memory.curve is not None:
                     corners.append((k, memory.curve.corners(*self._extents[path])))
             if corners:
                 seen = [k for k, _ in corners]
-                when = times(points.t[seen], points.step[seen])
+                when = times(points.rows.t[seen], points.rows.step[seen])
                 strips = [each for _, each in corners]
                 recording.send(f"{path}/data/memory", when, rr.LineStrips2D.columns(strips=strips))
                 ends = [each[-1] for each in strips]

@@ -154,8 +154,9 @@ class Writer:
     def _write_values(self, kind: str, rows: Sequence[Ticks]) -> None:
         if not rows:
             return
-        t, step = np.concatenate([each.t for each in rows]), np.concatenate([each.step for each in rows])
-        when, table = times(t, step), np.concatenate([each.values for each in rows])
+        joined = Ticks.joined(rows)
+        t, step, table = joined.t, joined.step, joined.values
+        when = times(t, step)
         for plot in self._signals:
             self.recording.send_vectors(f"{kind}/{plot.path}", when, plot.series(table))
             self._note(f"{kind}/{plot.path}", table[:, plot.columns])
@@ -201,12 +202,8 @@ class Writer:
                 found.append((shown, False))
         if not found:
             return None
-        return Points(
-            np.concatenate([each.t for each, _ in found]),
-            np.concatenate([each.step for each, _ in found]),
-            np.concatenate([each.values for each, _ in found]),
-            np.concatenate([np.full(len(each), is_reading) for each, is_reading in found]),
-        )
+        are_readings = np.concatenate([np.full(len(each), is_reading) for each, is_reading in found])
+        return Points(Ticks.joined([each for each, _ in found]), are_readings)
 
     def _shown(self, ticks: Ticks) -> Ticks:
         """Return the ticks that the XY plots show; a fast loop reads no actuator: there is what it was set to."""

@@ -20,7 +20,8 @@ import rerun.blueprint as rrb
 
 from bench.dashboard.bounds import Bound
 from bench.dashboard.drawing import Colour, Frame, line_style, lines, point_style, strips_at_once, xy_view
-from bench.dashboard.recording import Floats, Ints, Recording, times
+from bench.dashboard.entries import Ticks
+from bench.dashboard.recording import Floats, Recording, times
 from bench.dashboard.signal_plots import find_column
 from bench.devices import Signal
 from bench.layout import DashboardLayout
@@ -43,22 +44,17 @@ _Line = list[tuple[float, float]]
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Points of the plots, as columns.
+    """Points of the plots.
 
     Attributes
     ----------
-    t : ndarray, shape (points,)
-        Laboratory time, s.
-    step : ndarray of int64, shape (points,)
-        Step number.
-    values : ndarray, shape (points, signals)
+    rows : Ticks
+        One a point.
     is_reading : ndarray of bool, shape (points,)
         Whether it is a reading after settling, not a tick under control.
     """
 
-    t: Floats
-    step: Ints
-    values: Floats
+    rows: Ticks
     is_reading: npt.NDArray[np.bool_]
 
 
@@ -152,7 +148,7 @@ class XYPlots:
                 self._draw_axes(recording, track)
             drawable = strips_at_once(path, [len(line) for line in strips])
             numbers = [k for k, _ in shown]
-            when = times(points.t[numbers], points.step[numbers])
+            when = times(points.rows.t[numbers], points.rows.step[numbers])
             colours = [_RISING if line[-1][0] >= line[0][0] else _FALLING for line in strips]
             ends = [line[-1] for line in strips]
             if self._fades:
@@ -214,8 +210,9 @@ class _Track:
 
     def lines(self, points: Points) -> list[tuple[int, _Line]]:
         """Return the points that are drawn, by their numbers, and the line to each from the one before."""
-        known = np.flatnonzero(np.isfinite(points.values[:, [self.x, self.y]]).all(axis=1))
-        columns = points.t, points.values[:, self.x], points.values[:, self.y], points.is_reading
+        values = points.rows.values
+        known = np.flatnonzero(np.isfinite(values[:, [self.x, self.y]]).all(axis=1))
+        columns = points.rows.t, values[:, self.x], values[:, self.y], points.is_reading
         # Tens of thousands of points: without a call for each.
         visible_x, visible_y = self._visible
         line, drawn = self._line, self._drawn

@@ -10,7 +10,7 @@ that all are found together.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -22,24 +22,21 @@ from bench.hysteresis import Operator
 from bench.hysteresis._checks import Floats
 from bench.transients.actuator import MEDIAN_OF_DIFFERENCES, at_rows, latency
 from bench.transients.recording import Recording
+from bench.twin.differences import SLOPES, Differences, least_known
 from bench.twin.specimen import Dynamics, Specimen, Unevenness, Wander
 
 _LAGS = (0.3, 1.0, 3.0, 8.0, 20.0, 60.0)
 """Edges of the classes of the time between two rows, s."""
-_SLOPES = 3
-"""Classes of the slope of the response."""
 _GAPS = (1, 2, 3, 6, 12, 25, 50, 100)
 """From row to row of a pair, in rows of their kind."""
 _MIXED = 2
 """Kind of the pairs of a quick row and the reading after it; 0 and 1 are those of quick rows and of readings."""
-_CLASSES = (len(_LAGS) + 1, _SLOPES, _MIXED + 1)
+_CLASSES = (len(_LAGS) + 1, SLOPES, _MIXED + 1)
 """Numbers of classes of pairs: by time, slope and kind."""
 _STEP = 0.05
 """Least step of the grid of time of simulations, s; finer ones change nothing that is settled."""
 _FROM_HOLD_TO_HOLD = (1, 2, 3, 5, 8, 12, 20, 40, 100)
 """From reading to reading of a pair, whatever the holds."""
-_FEWEST_HOLDS = 30
-"""Set-points of a run whose error says something of other histories."""
 _START = (0.8, 0.8, 1e-3, 30.0, 1e-4, 0.2, 1e-3, 0.1)
 _LEAST = (0.01, 0.01, 1e-7, 0.2, 1e-7, 0.01, 1e-7, 1e-3)
 _GREATEST = (1.0, 1.0, 1.0, 3000.0, 1.0, 1.0, 1.0, 2.0)
@@ -275,6 +272,7 @@ def identify_disturbances(
             unevenness=Unevenness(uneven * span, length * span) if errors is not None else Unevenness(),
         )
 
+    # Trials of other shares of noise take the same simulations.
     @lru_cache(maxsize=2)
     def simulated(disturbed: Dynamics) -> tuple[Floats, Floats, Floats]:
         # Other random numbers in each run, the same in each trial.
@@ -323,54 +321,30 @@ class _Errors:
     def __init__(self, parts: Sequence[Part], run: int, of_model: Floats, left: Floats) -> None:
         self._run, part = run, parts[run]
         self._rows = part.readings
-        slopes = part.slopes[self._rows]
-        self._classes = np.searchsorted(np.quantile(slopes, np.arange(1, _SLOPES) / _SLOPES), slopes)
+        self._differences = Differences(part.slopes[self._rows], _FROM_HOLD_TO_HOLD)
         # With what is explained, the twin differs from the model as much as the specimen does.
-        target = self._of_readings(of_model) - self._of_readings(of_model - left)
+        target = self._differences.squares(of_model) - self._differences.squares(of_model - left)
         self._used = np.isfinite(target) & (target > 0.0)
         self._target = target[self._used]
         # Where the response is steep, errors are great and matter most.
-        weights = np.sqrt(0.5 * self._counts() / np.array(_FROM_HOLD_TO_HOLD)[:, None])[self._used]
+        weights = np.sqrt(0.5 * self._differences.counts() / np.array(_FROM_HOLD_TO_HOLD)[:, None])[self._used]
         self._weights = weights * np.sqrt(self._target / np.max(self._target, initial=0.0))
 
     def squares(self, values: Sequence[Floats]) -> Floats:
         """Return the mean squares of what simulations add to the rows of each run."""
-        return self._of_readings(values[self._run][self._rows])[self._used]
+        return self._differences.squares(values[self._run][self._rows])[self._used]
 
     def misses(self, squares: Floats) -> Floats:
         """Return by how much mean squares differ from those of the errors, weighted."""
         return np.asarray(self._weights * np.log(squares / self._target))
-
-    def _pairs(self) -> Iterator[tuple[int, int, NDArray[np.int64]]]:
-        """Yield number of the gap, class of the slope, and the first readings of the pairs."""
-        for number, gap in enumerate(_FROM_HOLD_TO_HOLD):
-            for slope in range(_SLOPES):
-                yield number, slope, np.flatnonzero(self._classes[:-gap] == slope)
-
-    def _counts(self) -> Floats:
-        counts = np.zeros((len(_FROM_HOLD_TO_HOLD), _SLOPES))
-        for number, slope, first in self._pairs():
-            counts[number, slope] = first.size
-        return counts
-
-    def _of_readings(self, values: Floats) -> Floats:
-        squares = np.full((len(_FROM_HOLD_TO_HOLD), _SLOPES), np.nan)
-        for number, slope, first in self._pairs():
-            if first.size >= _FEWEST:
-                differences = values[first + _FROM_HOLD_TO_HOLD[number]] - values[first]
-                squares[number, slope] = float(np.mean(differences**2))
-        return squares
 
 
 def _errors_of_model(
     parts: Sequence[Part], recordings: Sequence[Recording], of_model: Sequence[Floats], left: Sequence[Floats]
 ) -> _Errors | None:
     """Return the errors in the run that the model knows least, of those that say something of other histories."""
-    long = [i for i, each in enumerate(recordings) if np.unique(each.setpoints).size >= _FEWEST_HOLDS]
-    if not long:
-        return None
-    run = max(long, key=lambda i: float(np.std(of_model[i])))
-    return _Errors(parts, run, of_model[run], left[run])
+    run = least_known(recordings, of_model)
+    return None if run is None else _Errors(parts, run, of_model[run], left[run])
 
 
 def mean_effects(
@@ -463,7 +437,7 @@ class Part:
 def _classify(parts: Sequence[Part]) -> None:
     """Divide the pairs of all parts into classes of the slope that hold as many rows each."""
     every = np.concatenate([part.slopes for part in parts])
-    edges = np.quantile(every, np.arange(1, _SLOPES) / _SLOPES)
+    edges = np.quantile(every, np.arange(1, SLOPES) / SLOPES)
     for part in parts:
         part.pairs = part.pair(edges)
 
@@ -512,7 +486,7 @@ def _response_noise(parts: Sequence[Part], recordings: Sequence[Recording], sign
         pairs = [(part, part.pairs, part.pairs.kind == kind) for part in parts]
         nearest = min((int(each.time[of].min()) for _, each, of in pairs if of.any()), default=0)
         deviations = []
-        for slope in range(_SLOPES):
+        for slope in range(SLOPES):
             differences = [
                 part.errors[each.second[chosen]] - part.errors[each.first[chosen]]
                 for part, each, of in pairs

@@ -247,11 +247,11 @@ def identify_twin(paths: Sequence[Path], file: RigFile, model: Path | None) -> I
     noise, wander, drift = identify_disturbances(
         carried_out, operators, dynamics, first.response, response.of_model, response.left
     )
+    disturbed = replace(dynamics, wander=wander, drift=drift)
     # The readings had the effect of wander, too: the twin adds its own.
-    effects = mean_effects(carried_out, operators, replace(dynamics, wander=wander))
+    effects = mean_effects(carried_out, operators, disturbed)
     response = correct_response(response, carried_out, operator, effects)
     operators = [operator] if response.correction is None else [operator, response.correction]
-    disturbed = replace(dynamics, wander=wander, drift=drift)
     unevenness = identify_unevenness(
         carried_out, response.of_model, response.left, operators, disturbed, effects, noise
     )

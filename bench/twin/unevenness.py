@@ -17,17 +17,12 @@ import numpy as np
 from bench.hysteresis import Operator
 from bench.hysteresis._checks import Floats
 from bench.transients.recording import Recording
+from bench.twin.differences import SLOPES, Differences, least_known
 from bench.twin.disturbances import Noise, Part
 from bench.twin.specimen import Dynamics, Unevenness
 
 _GAPS = (1, 3, 10, 30, 100)
 """Readings from one to the other of a pair."""
-_SLOPES = 3
-_FEWEST_HOLDS = 30
-"""Set-points of a run whose error says something of other histories."""
-_FEWEST = 12
-_LONGEST = 8000.0
-"""Part of a run that is simulated, s."""
 _SEED = 1000
 
 
@@ -57,33 +52,24 @@ def identify_unevenness(
     """
     from scipy.optimize import minimize
 
-    long = [i for i, each in enumerate(recordings) if np.unique(each.setpoints).size >= _FEWEST_HOLDS]
-    if not long:
+    least = least_known(recordings, of_model)
+    if least is None:
         return Unevenness()
-    least = max(long, key=lambda i: float(np.std(of_model[i])))
     recording = recordings[least]
     part = Part(recording, tuple(operators), dynamics)
-    rows = np.flatnonzero(recording.is_reading[: part.still.size])
+    rows = part.readings
     effect = effects[least][rows]
-    errors, slopes = of_model[least][: rows.size], part.slopes[rows]
-    explained = errors - left[least][: rows.size]
-    classes = np.searchsorted(np.quantile(slopes, np.arange(1, _SLOPES) / _SLOPES), slopes)
+    errors = of_model[least]
+    explained = errors - left[least]
+    differences = Differences(part.slopes[rows], _GAPS)
 
     def squares(values: Floats) -> Floats:
-        found = np.full((len(_GAPS) + 1, _SLOPES), np.nan)
-        for slope in range(_SLOPES):
-            if (classes == slope).sum() >= _FEWEST:
-                found[-1, slope] = float(np.var(values[classes == slope]))
-            for i, gap in enumerate(_GAPS):
-                first = np.flatnonzero(classes[:-gap] == slope) if rows.size > gap else np.empty(0, dtype=np.int64)
-                if first.size >= _FEWEST:
-                    found[i, slope] = float(np.mean((values[first + gap] - values[first]) ** 2))
-        return found
+        return np.vstack([differences.squares(values), differences.variances(values)])
 
     # With what is explained, the twin differs from the model as much as the specimen does.
     target = np.maximum(squares(errors) - squares(explained), 0.0)
     used = np.isfinite(target) & (target > 0.0)
-    white = noise.reading**2 * np.array([2.0] * len(_GAPS) + [1.0])[:, None] * np.ones(_SLOPES)
+    white = noise.reading**2 * np.array([2.0] * len(_GAPS) + [1.0])[:, None] * np.ones(SLOPES)
     span = float(np.ptp(recording.driven))
 
     def trial(numbers: Floats) -> Unevenness:
