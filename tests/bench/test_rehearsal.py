@@ -95,15 +95,20 @@ class TestRehearsal:
 
     @pytest.mark.parametrize("protocol_name", ["tracking", "following"])
     def test_a_run_under_control_takes_as_long_as_rehearsed(self, make, console, model, protocol_name):
+        """Those of another session differ by what it draws at random: on this film by 4 %, one standard deviation."""
         settings = {"model": model, **({"readings": 1} if protocol_name == "tracking" else {"duration": 60})}
-        definition = find_protocol(protocol_name)
         # The model is one of curvature itself, not of what a detector with errors makes of it.
-        common = {"rig": "vo2", "overrides": {"emulation.sensors": "ideal"}}
-        run = make(definition=definition, settings=settings, clock="virtual", seed=7, **common)
-        rehearsal = foresee(make(definition=definition, settings=settings, clock="wall", **common), console)
-        outcome = carry_out(run, console).outcome
+        common = {"definition": find_protocol(protocol_name), "settings": settings, "rig": "vo2",
+                  "overrides": {"emulation.sensors": "ideal"}}  # fmt: skip
+
+        def rehearsed(seed):
+            return foresee(make(clock="wall", seed=seed, **common), console).seconds
+
+        outcome = carry_out(make(clock="virtual", seed=7, **common), console).outcome
         assert outcome.status == "completed"
-        assert rehearsal.seconds == pytest.approx(outcome.laboratory_seconds, rel=0.02)
+        assert rehearsed(7) == pytest.approx(outcome.laboratory_seconds, rel=0.02)
+        others = [rehearsed(seed) for seed in range(5)]
+        assert np.median(others) == pytest.approx(outcome.laboratory_seconds, rel=0.12)
 
     def test_margins_are_those_to_devices_and_interlocks(self, make, console):
         rehearsal = foresee(make(settings={"start": 40.0}), console)

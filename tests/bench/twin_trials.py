@@ -34,7 +34,7 @@ MODELS: Mapping[str, Mapping[str, Any]] = {
     "hybrid": {"model": "prandtl-ishlinskii"},
 }
 SESSIONS = {"vo2": 24, "sma": 24, "hybrid": 8}
-"""Sessions of each plant and twin: on vo2 and sma durations differ by 3 to 4 %, errors by 11 %."""
+"""Sessions of each plant and twin: on vo2 and sma durations differ by 3 to 6 %, errors by 8 to 11 %."""
 SEEDED = {"vo2", "sma"}
 """Rigs whose specimens differ by a seed; of others it is the sessions alone that differ."""
 GOALS = {"duration, s": 0.02, "RMS error, base unit": 0.3}
