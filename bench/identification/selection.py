@@ -562,16 +562,16 @@ class _Search:
     def _of_one_kind(self, finalists: list[Evaluation]) -> tuple[list[Evaluation], list[Evaluation]]:
         """Return what a record of one kind of cycle determines and signs bound, and what else it determines.
 
-        Both err at most twice as much as the best; both are empty of other records. A differential equation, which
-        has no signs, must follow smaller cycles.
+        Both err at most twice as much as the best; both are empty of other records. What has no signs must follow
+        smaller cycles; beside the bounded only differential equations count.
         """
         least = min(each.rms for each in finalists)
         near = [each for each in finalists if self._has_one_kind and each.rms <= _UNDETERMINED * least]
         determined = [each for each in near if each.determined]
         bounded = [each for each in determined if self._is_bounded(each)]
-        others = [each for each in determined if each not in bounded]
+        others = [each for each in determined if each not in bounded and each.follows]
         if bounded:
-            others = [each for each in others if each.follows and each.candidate.operator in self._with_shape]
+            others = [each for each in others if each.candidate.operator in self._with_shape]
         return bounded, others
 
     def _is_bounded(self, each: Evaluation) -> bool:
@@ -583,7 +583,11 @@ class _Search:
         return bool(operator.memoryless and (self._reversals >= _FEW_REVERSALS or each.free <= 1.0))
 
     def _bounded(self, finalists: list[Evaluation]) -> list[Evaluation]:
-        """Return the finalists without those of a plane and free signs, unless these are clearly better."""
+        """Return the finalists without those of a plane and free signs, unless these are clearly better.
+
+        What is known not to follow smaller cycles is left out as well, unless nothing else is there.
+        """
+        finalists = [each for each in finalists if each.follows] or finalists
         free = {
             kind.model for kind in self.kinds if self._has_plane.get(kind) and not find_model(kind.model).constrained
         }

@@ -5,13 +5,15 @@
 First one run of vo2 that is killed many times in a row, then single kills on every rig. Each run has to have the
 steps of the uninterrupted one, and coefficients of a model within one standard uncertainty of it: RMS, in σ of the
 two fits. Where the noise is not white that σ is too small; then it may not be farther than two uninterrupted runs
-with other noise are at most. The last line says how many did.
+with other noise are at most. A run that was over before it was killed says nothing, and is made again. The last line
+says how many did.
 """
 
 from __future__ import annotations
 
 import argparse
 import random
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -20,7 +22,7 @@ from itertools import combinations
 from pathlib import Path
 from typing import Any
 
-from killing import distance, finished_steps, kill_after
+from killing import EndedFirstError, distance, finished_steps, kill_after
 from rich.console import Console
 from rich.table import Table
 
@@ -80,6 +82,8 @@ def _trial(rig: str, whole: Path, kills: int, moments: random.Random, out: Path)
         # A kill comes some time after the step: in a hold, in a commit, or on the way back.
         try:
             folder = kill_after(step, out, *command, delay=moments.uniform(0.0, 0.03))
+        except EndedFirstError:
+            raise
         except AssertionError as error:
             return killed, str(error)
         killed.append(finished_steps(out))
@@ -103,9 +107,13 @@ def main() -> int:
         rigs = [CAMPAIGN, *(singles[i % len(singles)] for i in range(asked.trials))]
         apart = {rig: _apart(rig, folders) for rig, folders in wholes.items()}
         for number, rig in enumerate(rigs):
-            out = Path(scratch) / f"trial-{number}"
-            whole = wholes[rig][0]
-            killed, problem = _trial(rig, whole, 1 if number else asked.kills, moments, out)
+            out, whole = Path(scratch) / f"trial-{number}", wholes[rig][0]
+            while True:
+                try:
+                    killed, problem = _trial(rig, whole, 1 if number else asked.kills, moments, out)
+                    break
+                except EndedFirstError:
+                    shutil.rmtree(out)
             steps, total = finished_steps(out), finished_steps(whole.parent)
             away = float("nan")
             if not problem:

@@ -169,6 +169,25 @@ def test_of_one_kind_of_cycle_a_model_is_chosen_that_the_record_determines():
     assert not any(each.determined for each in planes if each.rms < 1.5 * found.chosen.rms)
 
 
+def test_of_one_kind_of_cycle_an_equation_that_runs_away_on_smaller_ones_is_never_chosen():
+    """Not even if it is the only model that the record determines, as of a sine with little noise."""
+    radii = np.linspace(0.0, 0.7, 60)
+    weights = np.exp(-radii / 0.2)
+    states, outputs = np.zeros(60), []
+    inputs = -np.cos(np.linspace(0.0, 16.0 * np.pi, 1000))
+    for value in inputs:
+        low, high = np.tanh(1.2 * value - 0.2) - radii, np.tanh(value + 0.15) + radii
+        states = np.maximum(low, np.minimum(high, states))
+        outputs.append(weights @ states)
+    measured = Measurements.of(inputs, noisy(np.array(outputs), 0.001))
+    found = select(measured, ("preisach", "duhem"), Given({"levels": 20, "degree": 7}))
+    assert found.has_one_kind
+    equation = next(each for each in found.evaluations if each.candidate.model == "duhem" and not each.follows)
+    assert equation.determined
+    assert equation.rms < 1.5 * found.chosen.rms
+    assert found.chosen.candidate.model == "preisach"
+
+
 @pytest.mark.seeds
 def test_of_one_kind_of_cycle_a_differential_equation_is_chosen_that_leaves_no_more_than_noise():
     inputs = through([0.0, *[1.0, -1.0] * 6], 1000)
