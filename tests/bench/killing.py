@@ -20,7 +20,7 @@ LONG = 120.0
 
 
 class EndedFirstError(AssertionError):
-    """A run was over before it was killed."""
+    """A run was completed before it was killed."""
 
 
 def finished_steps(folder: Path) -> int:
@@ -67,7 +67,7 @@ def kill_after(
     Raises
     ------
     EndedFirstError
-        If the run was over before it was killed, as may be on a busy machine.
+        If the run was completed before it was killed, as may be on a busy machine.
     """
     code = f"from bench.cli import main; main({list(command)!r})"
     process = subprocess.Popen(
@@ -78,8 +78,10 @@ def kill_after(
     )
     start = time.monotonic()
     while finished_steps(folder) < steps:
-        if process.poll() is not None:
-            raise EndedFirstError(f"it ended before it was killed: {process.stderr.read().decode()}")
+        ended = process.poll()
+        if ended == 0:
+            raise EndedFirstError("it was completed before it was killed")
+        assert ended is None, f"it failed before it was killed: {process.stderr.read().decode()}"
         assert time.monotonic() - start < LONG, f"{steps} steps not within {LONG:g} s"
         time.sleep(0.002)
     time.sleep(delay)
@@ -88,7 +90,7 @@ def kill_after(
     (journal,) = folder.glob(f"**/{FILE_NAME}")
     with Record(journal.parent) as record:
         if record.status == "completed":
-            raise EndedFirstError("it ended before it was killed")
+            raise EndedFirstError("it was completed before it was killed")
     return journal.parent
 
 

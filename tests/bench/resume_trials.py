@@ -5,8 +5,8 @@
 First one run of vo2 that is killed many times in a row, then single kills on every rig. Each run has to have the
 steps of the uninterrupted one, and coefficients of a model within one standard uncertainty of it: RMS, in σ of the
 two fits. Where the noise is not white that σ is too small; then it may not be farther than two uninterrupted runs
-with other noise are at most. A run that was over before it was killed says nothing, and is made again. The last line
-says how many did.
+with other noise are at most. A run that was completed before it was killed says nothing, and is made again. The
+last line says how many did.
 """
 
 from __future__ import annotations
