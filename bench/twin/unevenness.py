@@ -69,6 +69,10 @@ def identify_unevenness(
     # With what is explained, the twin differs from the model as much as the specimen does.
     target = np.maximum(squares(errors) - squares(explained), 0.0)
     used = np.isfinite(target) & (target > 0.0)
+    if not used.any():
+        return Unevenness()
+    # Where the response is steep, errors are great and matter most.
+    weights, wanted = np.sqrt(target[used] / target[used].max()), np.log(target[used])
     white = noise.reading**2 * np.array([2.0] * len(_GAPS) + [1.0])[:, None] * np.ones(SLOPES)
     span = float(np.ptp(recording.driven))
 
@@ -79,9 +83,7 @@ def identify_unevenness(
     def cost(numbers: Floats) -> float:
         uneven = replace(dynamics, unevenness=trial(numbers))
         found = squares(part.simulate(uneven, _SEED)[rows] - effect) + white
-        # Where the response is steep, errors are great and matter most.
-        weights = np.sqrt(target[used] / target[used].max())
-        return float(np.sum(weights * (np.log(found[used]) - np.log(target[used])) ** 2)) + 10.0 * max(
+        return float(np.sum(weights * (np.log(found[used]) - wanted) ** 2)) + 10.0 * max(
             float(numbers[1]) - math.log(2.0), 0.0
         )
 

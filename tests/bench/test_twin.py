@@ -395,6 +395,15 @@ def test_the_unevenness_is_what_the_correction_does_not_explain(wandering):
         assert moved == pytest.approx(wanted, rel=0.35)
 
 
+def test_a_model_that_knows_everything_has_no_unevenness(wandering):
+    specimen, recording = wandering
+    errors = np.zeros(int(recording.is_reading.sum()))
+    found = identify_unevenness(
+        [recording], [errors], [errors], [specimen], Dynamics(0.02), [0.0 * recording.times], Noise()
+    )
+    assert found.deviation == 0.0
+
+
 def test_a_slow_wander_is_told_from_what_the_model_does_not_know(wandering):
     """From reading to reading a wander of minutes looks as unevenness does; within holds it goes on."""
     specimen, recording = wandering
