@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import itertools
 import tomllib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -22,13 +22,14 @@ from bench import registry
 from bench.clock import Stopwatch
 from bench.errors import BenchError, ConfigurationError, DataError
 from bench.extras import MissingExtraError, check_extra
-from bench.journal import Record
+from bench.journal import Record, add_model
 from bench.printing import print_plain
 from bench.protocol import find_protocol
 from bench.results.published import Published
 from bench.results.tracking import TargetResults, target_results
 
 if TYPE_CHECKING:
+    from bench.model_file import ModelFile
     from bench.runs import RunResult
     from bench.workers import Pending, Workers
 
@@ -38,6 +39,8 @@ _TELLING = 20
 """Longest setting that is part of a run's name, characters."""
 _OF_RUNS = "bench.compilation_display", "bench.runs"
 """Modules that every run takes."""
+_OF_RESULTS = "matplotlib.figure", "bench.dashboard"
+"""Modules that figures and recordings take."""
 
 
 @dataclass
@@ -361,7 +364,7 @@ def reproduce(
 
     stopwatch = Stopwatch()
     folder = out / f"reproduce-{name}-seed-{seed}"
-    with Workers(1 if live else workers, console, name, _OF_RUNS) as pool:
+    with Workers(1 if live else workers, console, name, _OF_RUNS, _OF_RESULTS) as pool:
         # Not before: a worker process loads its modules meanwhile.
         from bench.compilation_display import CompilationDisplay
 
@@ -382,6 +385,17 @@ def reproduce(
         table.print(values, console)
     _print_end(values, console)
     return values
+
+
+def keep_models(run: RunResult, files: Iterable[ModelFile]) -> None:
+    """Put models into the record of a run that they were identified from; the last one is what its recording shows.
+
+    Raises DataError if a file cannot be written.
+    """
+    with Record(run.folder) as record:
+        finished = float(record.meta["finished"])
+    for file in files:
+        add_model(run.folder, file.name, finished, file.to_json())
 
 
 def reached_targets(run: RunResult, signal: str) -> TargetResults:

@@ -19,6 +19,12 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+# Before the folder of the tests is on the path: it has folders of the same names.
+import drivers  # noqa: F401
+import protocols  # noqa: F401
+import rigs  # noqa: F401
+import sim_devices  # noqa: F401
+
 sys.path.append(str(Path(__file__).parent))
 from regression_bands import RECORDED_SEED, beyond_the_bands
 from warm_popen import WarmPopen

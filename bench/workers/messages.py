@@ -10,11 +10,12 @@ from typing import IO, Any
 
 @dataclass(frozen=True)
 class Welcome:
-    """What a worker process has to know: command line and width of the terminal, and what to load before a task."""
+    """What a worker process has to know: command line, width of the terminal, and modules; see `Workers`."""
 
     command: list[str]
     width: int
     modules: tuple[str, ...]
+    aside: tuple[str, ...]
 
 
 @dataclass(frozen=True)

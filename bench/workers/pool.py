@@ -10,7 +10,7 @@ import sys
 import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, ExitStack, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from functools import partial
 from types import FrameType, TracebackType
 from typing import Any, Generic, ParamSpec, Self, TypeVar
@@ -34,8 +34,11 @@ _UNFINISHED = 40.0
 _LOOK = 0.5
 """Longest wait, s, during which Windows would not hear Ctrl-C."""
 
-_WORTH_LOADING = 4
+_WORTH_LOADING = 8
 """Tasks aside from which on a worker loads what they take, although another one has."""
+
+_AT_ONCE = 2
+"""Worker processes that are started before there is a task: what several cores are taken for has at least two."""
 
 _ENDING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
 
@@ -113,8 +116,8 @@ class Workers:
     of workers, as each has one thread of BLAS; the order in which they are taken is the caller's. A task whose worker
     process dies is done again; a task during which three die fails.
 
-    The first worker process is started at once, any other when a task finds none that is free. They live until the
-    end.
+    The first two worker processes are started at once, any other when a task finds none that is free. They live until
+    the end.
 
     Parameters
     ----------
@@ -126,8 +129,10 @@ class Workers:
     title : str
         What the tasks are together, for the progress.
     modules : tuple of str
-        Modules that the tasks take. A worker process loads them before its first task, the first one beside what this
-        process loads.
+        Modules that the tasks take. A worker process loads them before its first task, the first ones beside what
+        this process loads.
+    aside : tuple of str
+        Modules that the tasks aside take. A worker process loads them when it has nothing else to do.
     """
 
     def __init__(
@@ -136,13 +141,14 @@ class Workers:
         console: Console | None = None,
         title: str = "all",
         modules: tuple[str, ...] = (),
+        aside: tuple[str, ...] = (),
     ) -> None:
         self.number = available_cores() if number is None else number
         self.in_process = self.number == 1
         self._console = Console(quiet=True) if console is None else console
         self._display = TasksDisplay(self._console, title)
-        self._modules = modules
-        self._first: _Worker | None = None
+        self._welcome = Welcome(sys.argv, self._console.width, modules, aside)
+        self._ready: list[_Worker] = []
         self._changed = threading.Condition()
         self._tasks: list[Pending[Any]] = []
         self._queue: deque[Pending[Any]] = deque()
@@ -150,6 +156,7 @@ class Workers:
         self._threads: list[threading.Thread] = []
         self._processes: set[subprocess.Popen[bytes]] = set()
         self._free = 0
+        self._is_held = False
         self._is_closing = False
         self._stack = ExitStack()
 
@@ -161,7 +168,7 @@ class Workers:
                     former = signal.signal(getattr(signal, name), self._interrupt)
                     self._stack.callback(signal.signal, getattr(signal, name), former)
         if not self.in_process:
-            self._first = self._start_worker()
+            self._ready += [self._start_worker() for _ in range(min(_AT_ONCE, self.number))]
         self._stack.enter_context(_one_thread())
         self._stack.enter_context(collecting_seldom())
         if self.in_process:
@@ -237,6 +244,18 @@ class Workers:
         self._display.add()
         return task
 
+    @contextmanager
+    def together(self) -> Iterator[None]:
+        """Have no task begun within the block; then the one that was hurried is the first, whatever came before."""
+        with self._changed:
+            self._is_held = True
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._is_held = False
+                self._changed.notify_all()
+
     def as_completed(self, tasks: Iterable[Pending[T]]) -> Iterator[Pending[T]]:
         """Yield tasks as they are finished, those that raised as well.
 
@@ -280,9 +299,8 @@ class Workers:
 
     def _serve(self, number: int) -> None:
         """Have one worker process carry out task after task; another if it dies."""
-        worker: _Worker | None = None
-        if number == 0:
-            worker, self._first = self._first, None
+        with self._changed:
+            worker = self._ready.pop() if self._ready else None
         while (task := self._take(number)) is not None:
             self._display.begin(task._number, task.name)
             try:
@@ -303,7 +321,7 @@ class Workers:
             # After the end has begun nobody would end it.
             if self._is_closing:
                 raise EOFError("the end of all workers")
-            return _Worker(Welcome(sys.argv, self._console.width, self._modules), self._processes)
+            return _Worker(self._welcome, self._processes)
 
     def _take(self, number: int) -> Pending[Any] | None:
         """Return the next task of a worker, when there is one; None at the end."""
@@ -317,6 +335,8 @@ class Workers:
 
     def _next_queue(self, number: int) -> deque[Pending[Any]] | None:
         """Return where the next task of a worker is; the first worker has those aside in front."""
+        if self._is_held:
+            return None
         if self._aside and number == 0:
             return self._aside
         if self._queue:
@@ -364,8 +384,8 @@ class Workers:
                 process.kill()
         for thread in self._threads:
             thread.join()
-        if self._first is not None:
-            self._first.close()
+        for worker in self._ready:
+            worker.close()
 
 
 def _one_thread() -> AbstractContextManager[object]:

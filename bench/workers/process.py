@@ -11,6 +11,7 @@ import signal
 import sys
 import threading
 import traceback
+from collections import deque
 from contextlib import suppress
 from typing import IO
 
@@ -35,10 +36,9 @@ def main() -> None:
     console = Console(file=_Speaker(outbox), width=welcome.width, force_terminal=False)
     with collecting_seldom(), task_surroundings(console, lambda *how_far: outbox.put(Progress(*how_far))):
         for module in welcome.modules:
-            # A task that takes it says what is wrong.
-            with suppress(Exception):
-                importlib.import_module(module)
-        while (order := inbox.get()) is not None:
+            _load(module)
+        aside = deque(welcome.aside)
+        while (order := _next_order(inbox, aside)) is not None:
             outbox.put(_carry_out(order))
 
 
@@ -65,6 +65,19 @@ def _listen(orders: IO[bytes], inbox: queue.SimpleQueue[Order | None]) -> None:
     else:
         # Wakes the main thread as well.
         os.kill(os.getpid(), signal.SIGTERM)
+
+
+def _next_order(inbox: queue.SimpleQueue[Order | None], modules: deque[str]) -> Order | None:
+    """Return the next order; load modules while there is none."""
+    while modules and inbox.empty():
+        _load(modules.popleft())
+    return inbox.get()
+
+
+def _load(module: str) -> None:
+    # A task that takes it says what is wrong.
+    with suppress(Exception):
+        importlib.import_module(module)
 
 
 def _carry_out(order: Order) -> Result:

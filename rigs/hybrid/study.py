@@ -243,8 +243,8 @@ def _carry_out(campaign: Campaign) -> StudyResult:
     ]
     # Identified beside the runs that it does not need.
     _, steps, static, loops, step, _, _ = started
-    network = network_of(steps.result().folder)
-    sources = [run.result().folder for run in (steps, static, loops, step)]
+    network = network_of(campaign.conclude(steps).folder)
+    sources = [campaign.conclude(run).folder for run in (steps, static, loops, step)]
     found = identify_hybrid(*sources, network=network)
     model = campaign.folder / "hybrid.json"
     hybrid_file(found, sources).save(model)

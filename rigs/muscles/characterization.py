@@ -6,7 +6,7 @@ Memory Alloy Actuators*, Robotics: Science and Systems, 2017; here "Zhang and Yi
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,10 +16,9 @@ import numpy.typing as npt
 
 from bench.hysteresis import TwoStage
 from bench.identification.two_stage import CoupledIdentification, Series, measure_series
-from bench.journal import add_model
 from bench.model_file import ModelFile
 from bench.results.figures import Curve, plot_panels
-from bench.studies import Campaign, ResultTable
+from bench.studies import Campaign, ResultTable, keep_models
 from rigs.muscles.identification import (
     MODELS,
     ModelName,
@@ -70,6 +69,16 @@ PAPER: Mapping[tuple[str, ModelName], str] = {
 
 
 @dataclass(frozen=True)
+class Measurements:
+    """The run with the ends held and those of the length, and what they measured."""
+
+    force: Path
+    lengths: Sequence[Path]
+    resting: Resting
+    series: Sequence[Series]
+
+
+@dataclass(frozen=True)
 class Characterization:
     """What the four runs of a characterization measured, and the models that were identified from three of them."""
 
@@ -88,12 +97,6 @@ class Characterization:
                 result[key][json_key(name)] = errors_json(value)
         return result
 
-    def keep_model(self, campaign: Campaign) -> None:
-        """Put the two-stage model into the record of every run of a campaign, for the view of its densities."""
-        content = ModelFile("two-stage", self.models["two-stage"].model).to_json()
-        for run in campaign.runs:
-            add_model(run.folder, "two-stage", 0.0, content)
-
 
 def json_key(name: str) -> str:
     """Return a name as it is a key in the JSON."""
@@ -102,15 +105,64 @@ def json_key(name: str) -> str:
 
 def start_runs(campaign: Campaign) -> dict[str, Pending[RunResult]]:
     """Start the four protocols of a muscle; the campaign's seed chooses the random voltages of the verification."""
-    return {
-        protocol: campaign.start(protocol, settings)
-        for protocol, settings in {
-            "force-voltage": {},
-            "length-voltage": {},
-            "length-force": {},
-            "length-verification": {"sequence_seed": str(campaign.seed + 1)},
-        }.items()
-    }
+    with campaign.workers.together():
+        runs = {
+            protocol: campaign.start(protocol, settings)
+            for protocol, settings in {
+                "force-voltage": {},
+                "length-voltage": {},
+                "length-force": {},
+                "length-verification": {"sequence_seed": str(campaign.seed + 1)},
+            }.items()
+        }
+        # The longest one, and the models wait for it.
+        runs["length-force"].hurry()
+    return runs
+
+
+def measure(runs: Mapping[str, Pending[RunResult]]) -> Measurements:
+    """Return what the runs of a muscle measured from which its models are identified.
+
+    Raises BenchError if one of them did not complete.
+    """
+    force, *lengths = (
+        runs[protocol].result().folder for protocol in ("force-voltage", "length-voltage", "length-force")
+    )
+    return Measurements(force, lengths, read_resting(force), [one for run in lengths for one in read_series(run)])
+
+
+def identify_models(measured: Measurements, folder: Path) -> Iterator[tuple[ModelName, CoupledIdentification[Any]]]:
+    """Yield each model with its name, that of the controllers first; its file is in the folder then.
+
+    Raises BenchError if a model cannot be identified.
+    """
+    dynamics = None
+    for name in MODELS:
+        found = identify_muscle(name, measured.resting, measured.series)
+        is_two_stage = found.model.kind == TwoStage.kind
+        if is_two_stage and dynamics is None:
+            # The models of two stages have the same first one, which is all that counts here.
+            dynamics = identify_muscle_dynamics(found.model, measured.force, measured.lengths)
+        sources = [measured.force, *measured.lengths]
+        muscle_file(name, found, sources, dynamics if is_two_stage else None).save(folder / f"{name}.json")
+        yield name, found
+
+
+def conclude(
+    campaign: Campaign,
+    runs: Mapping[str, Pending[RunResult]],
+    measured: Measurements,
+    models: Mapping[ModelName, CoupledIdentification[Any]],
+) -> Characterization:
+    """Return the characterization of a muscle; its runs get the two-stage model, for the view of its densities.
+
+    Raises BenchError if a run did not complete.
+    """
+    for run in runs.values():
+        keep_models(run.result(), [ModelFile("two-stage", models["two-stage"].model)])
+        campaign.conclude(run)
+    verification = read_series(runs["length-verification"].result().folder)
+    return Characterization(measured.resting, measured.series, verification, models)
 
 
 def characterize(campaign: Campaign, runs: Mapping[str, Pending[RunResult]]) -> Characterization:
@@ -121,17 +173,8 @@ def characterize(campaign: Campaign, runs: Mapping[str, Pending[RunResult]]) -> 
     BenchError
         If a run did not complete, or a model cannot be identified.
     """
-    folders = {protocol: run.result().folder for protocol, run in runs.items()}
-    resting = read_resting(folders["force-voltage"])
-    lengths = [folders["length-voltage"], folders["length-force"]]
-    series = [one for run in lengths for one in read_series(run)]
-    models = {name: identify_muscle(name, resting, series) for name in MODELS}
-    # The models of two stages have the same first one, which is all that counts here.
-    dynamics = identify_muscle_dynamics(models["two-stage"].model, folders["force-voltage"], lengths)
-    for name, found in models.items():
-        known = dynamics if found.model.kind == TwoStage.kind else None
-        muscle_file(name, found, [folders["force-voltage"], *lengths], known).save(campaign.folder / f"{name}.json")
-    return Characterization(resting, series, read_series(folders["length-verification"]), models)
+    measured = measure(runs)
+    return conclude(campaign, runs, measured, dict(identify_models(measured, campaign.folder)))
 
 
 def errors_table(title: str, path: str = "{}", *, beside_paper: bool = False) -> ResultTable:

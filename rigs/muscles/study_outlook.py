@@ -34,7 +34,6 @@ def carry_out(campaign: Campaign) -> StudyResult:
     runs = {key: start_runs(part) for key, part in parts.items()}
     for key, part in parts.items():
         measured = characterize(part, runs[key])
-        measured.keep_model(part)
         values[key] = measured.errors_json()
         figures += _draw(part, measured)
     return StudyResult(values, TABLES, tuple(figures))

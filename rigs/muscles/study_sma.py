@@ -31,9 +31,11 @@ from rigs.muscles.characterization import (
     PAPER,
     TITLES,
     Characterization,
-    characterize,
+    conclude,
     errors_table,
+    identify_models,
     json_key,
+    measure,
     plot_lengths,
     start_runs,
 )
@@ -131,7 +133,10 @@ def carry_out(campaign: Campaign) -> StudyResult:
     characterizing = start_runs(campaign)
     # Loaded while they run.
     truth = true_quantities(campaign.rig)
-    measured = characterize(campaign, characterizing)
+    measured = measure(characterizing)
+    identified = identify_models(measured, campaign.folder)
+    # The sessions wait for the first model; the others are identified beside them.
+    first = next(identified)
     common = {"model": str(campaign.folder / "two-stage.json"), "sequence_seed": str(campaign.seed + 1)}
     runs = {
         key: {
@@ -142,22 +147,22 @@ def carry_out(campaign: Campaign) -> StudyResult:
         }
         for key, session in CONTROL.items()
     }
-    figures = _draw(campaign, measured)
+    found = conclude(campaign, characterizing, measured, dict([first, *identified]))
+    figures = _draw(campaign, found)
     reached = {
         key: {
-            controller: reached_targets(run.result(), CONTROL[key].controlled.signal)
+            controller: reached_targets(campaign.conclude(run), CONTROL[key].controlled.signal)
             for controller, run in entry.items()
         }
         for key, entry in runs.items()
     }
     figures += _draw_control(campaign, reached)
-    measured.keep_model(campaign)
     return StudyResult(
         {
-            **measured.errors_json(),
+            **found.errors_json(),
             "kkt": {
-                json_key(name): max(certificate.kkt_residual for certificate in found.certificates.values())
-                for name, found in measured.models.items()
+                json_key(name): max(certificate.kkt_residual for certificate in model.certificates.values())
+                for name, model in found.models.items()
             },
             "control": {
                 key: {

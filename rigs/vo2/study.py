@@ -17,14 +17,14 @@ import numpy.typing as npt
 from bench.errors import DataError
 from bench.hysteresis import MemoryCurve
 from bench.identification import measure_errors
-from bench.journal import Record, add_model
+from bench.journal import Record
 from bench.results.figures import plot_densities, plot_errors, plot_fit, plot_sequence_and_errors, plot_tracking
 from bench.results.models import IdentifiedFile, errors_json, identify_file, predict, transients_of
 from bench.results.prediction_figures import errors_text
 from bench.results.published import Published
 from bench.results.tracking import FollowingResult, TargetResults, following_result
 from bench.rig_file import load_rig
-from bench.studies import Campaign, ResultTable, Study, StudyResult, reached_targets, true_errors
+from bench.studies import Campaign, ResultTable, Study, StudyResult, keep_models, reached_targets, true_errors
 from rigs.vo2.curvature import CantileverCurvature, curvature_to_deflection, deflection_to_curvature
 
 if TYPE_CHECKING:
@@ -251,23 +251,20 @@ def carry_out(campaign: Campaign) -> StudyResult:
         inputs, outputs = steps[INPUT], steps[OUTPUT]
     predictions = {key: predict(model.file, inputs) for key, model in models.items()}
     figures = _draw_models(campaign, models, inputs, outputs, predictions)
+    for run in (characterization, validation):
+        # The proposed model last: the recording shows the density of the newest.
+        keep_models(
+            run.result(),
+            [found.file for key, found in reversed(models.items()) if MODELS[key].validation is not None],
+        )
+        campaign.conclude(run)
     slowest = reached_targets(tracking_runs["latched"].result(), OUTPUT).summary()["seconds_per_target"]
     tracking_runs[EQUAL_TIME] = tracking(
         EQUAL_TIME, {"protocols.tracking.tuning.integral.duration": str(math.ceil(2.0 * slowest) / 2.0)}
     )
-    reached = {key: reached_targets(run.result(), OUTPUT) for key, run in tracking_runs.items()}
-    followed = {key: _followed(run.result()) for key, run in following_runs.items()}
+    reached = {key: reached_targets(campaign.conclude(run), OUTPUT) for key, run in tracking_runs.items()}
+    followed = {key: _followed(campaign.conclude(run)) for key, run in following_runs.items()}
     figures += _draw_control(campaign, reached, followed)
-
-    for run in (characterization.result(), validation.result()):
-        with Record(run.folder) as record:
-            finished = float(record.meta["finished"])
-        # The proposed model last: the recording shows the density of the newest.
-        for key, found in reversed(models.items()):
-            if MODELS[key].validation is not None:
-                add_model(run.folder, found.file.name, finished, found.file.to_json())
-    for controlled in (*tracking_runs.values(), *following_runs.values()):
-        add_model(controlled.result().folder, PROPOSED, 0.0, models["nonmonotonic"].file.to_json())
     return StudyResult(
         {
             "session_offset": sign * SESSION_OFFSET,

@@ -67,6 +67,25 @@ def test_a_task_in_a_hurry_is_begun_before_all_that_wait(text):
     assert begun == ["third", "first", "second"]
 
 
+def test_of_tasks_submitted_together_the_one_in_a_hurry_is_the_first_although_workers_are_free(tmp_path):
+    with Workers(2) as workers:
+        # One of the two has something to do until the end.
+        waiting = workers.submit(worker_tasks.meet, tmp_path)
+        with workers.together():
+            tasks = [workers.submit(worker_tasks.ordinal) for _ in range(3)]
+            tasks[2].hurry()
+            assert not any(task.done for task in tasks)
+        first, second, third = (task.result() for task in tasks)
+        assert third < first < second
+        workers.submit(worker_tasks.meet, tmp_path).result()
+        waiting.result()
+
+
+def test_workers_load_what_tasks_aside_take_while_there_is_none():
+    with Workers(2, aside=("no_such_module", "wave")) as workers:
+        wait_until(lambda: workers.submit(worker_tasks.is_loaded, "wave").result())
+
+
 def test_the_first_worker_has_loaded_modules_before_its_tasks():
     with Workers(2, modules=("no_such_module", "wave")) as workers:
         assert workers.submit(worker_tasks.is_loaded, "wave").result()
@@ -75,8 +94,9 @@ def test_the_first_worker_has_loaded_modules_before_its_tasks():
 
 def test_workers_without_a_task_end():
     with Workers(2) as workers:
-        (process,) = workers._processes
-    assert process.returncode is not None
+        processes = list(workers._processes)
+    assert len(processes) == 2
+    assert all(process.returncode is not None for process in processes)
     assert not workers._processes
 
 
@@ -94,7 +114,7 @@ def test_what_is_aside_comes_first_for_one_worker_and_last_for_one_alone(workers
 
 def test_much_that_is_aside_is_for_all_workers(workers, tmp_path):
     # One alone would wait for ever.
-    for task in [workers.submit_aside("aside", worker_tasks.meet, tmp_path) for _ in range(5)]:
+    for task in [workers.submit_aside("aside", worker_tasks.meet, tmp_path) for _ in range(10)]:
         task.result()
 
 

@@ -1,5 +1,6 @@
 """Tasks of the tests, in a module that worker processes can import."""
 
+import itertools
 import os
 import signal
 import sys
@@ -13,10 +14,17 @@ from bench.protocol import find_protocol
 from bench.runs import Run, carry_out
 from bench.workers import report, task_console
 
+_ordinals = itertools.count()
+
 
 def process(value):
     """Return the process as well."""
     return value, os.getpid()
+
+
+def ordinal():
+    """Return how many such tasks this process carried out before."""
+    return next(_ordinals)
 
 
 def is_loaded(module):
