@@ -63,7 +63,7 @@ SHORT: dict[str, dict[str, Any]] = {
     "hybrid-control": {"hold": 10.0},
     # A model of few samples may be worse than none.
     "tracking": {"count": 12, "controller": "closed-loop-inverse", "fallback": "open-loop"},
-    "following": {"duration": 200.0, "period": 100.0, "controller": "open-loop-inverse"},
+    "following": {"duration": 200.0, "period": 100.0, "controller": "open-loop-inverse", "fallback": "open-loop"},
 }
 """Parameters of the protocols that no study carries out on a rig."""
 
