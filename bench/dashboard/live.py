@@ -10,7 +10,7 @@ from types import MappingProxyType, TracebackType
 from typing import Any, Self
 
 from bench.clock import WallClock
-from bench.dashboard.entries import End, Entry, Tick, densities_of
+from bench.dashboard.entries import End, Entry, Part, Tick, densities_of, portions
 from bench.dashboard.writer import Writer
 from bench.devices import Signal
 from bench.journal import Event, StepRecord
@@ -190,8 +190,8 @@ class Dashboard:
 
     def _write_file(self, writer: Writer) -> None:
         entries, self._for_file = self._for_file, []
-        for start in range(0, len(entries), CHUNK_ROWS):
-            self._write(writer, entries[start : start + CHUNK_ROWS])
+        for portion in portions(entries, CHUNK_ROWS):
+            self._write(writer, portion)
         self._written_at = self._clock.now()
 
     def _complete_file(self, writer: Writer) -> None:
@@ -203,7 +203,7 @@ class Dashboard:
             writer.arrange()
             writer.recording.close()
 
-    def _write(self, writer: Writer, entries: list[Entry]) -> None:
+    def _write(self, writer: Writer, entries: Sequence[Entry | Part]) -> None:
         try:
             writer.write(entries)
         # After any failure in the view, the run goes on, and so does the rest of the view.

@@ -143,6 +143,29 @@ class CoupledIdentification(Generic[M]):
     smoothing: Mapping[str, float]
 
 
+@dataclass(frozen=True, eq=False)
+class FirstStage:
+    """An identified first stage of a `TwoStage`.
+
+    Parameters
+    ----------
+    model : Operator
+        Force over the voltage at resting length.
+    fit : Fit
+        Its coefficients, with the evidence for them.
+    smoothing : float
+        Weight of the roughness penalty.
+    forces, modelled : ndarray, shape (N,)
+        Measured forces and those of the stage, force units.
+    """
+
+    model: Stage
+    fit: Fit
+    smoothing: float
+    forces: Floats
+    modelled: Floats
+
+
 def identify_two_stage(
     voltages: ArrayLike,
     forces: ArrayLike,
@@ -196,21 +219,96 @@ def identify_two_stage(
     ValueError
         If a sequence is wrong, the lowest voltage is missing or there is no series.
     """
-    measured = _all(series)
-    template = _plane(*voltage_range, order, units[0], units[1]) if first is None else first
+    stage = identify_first_stage(
+        voltages,
+        forces,
+        weights=weights,
+        operator=first,
+        order=order,
+        voltage_range=voltage_range,
+        smoothing=smoothing,
+        units=units,
+    )
+    return identify_second_stage(
+        stage,
+        series,
+        operator=second,
+        order=order,
+        force_limit=force_limit,
+        pretension=pretension,
+        smoothing=smoothing,
+        units=units,
+    )
+
+
+def identify_first_stage(
+    voltages: ArrayLike,
+    forces: ArrayLike,
+    *,
+    weights: ArrayLike | None = None,
+    operator: Stage | None = None,
+    order: int = 20,
+    voltage_range: tuple[float, float] = (0.0, 3.0),
+    smoothing: Smoothing = 0.0,
+    units: tuple[str, str, str] = ("V", "N", "mm"),
+) -> FirstStage:
+    """Return the first stage of `identify_two_stage`, which needs no lengths.
+
+    Parameters
+    ----------
+    voltages, forces, weights, order, voltage_range, smoothing, units
+        As in `identify_two_stage`.
+    operator : Operator or None
+        H1 before the fit.
+
+    Raises
+    ------
+    ValueError
+        If a sequence is wrong or the lowest voltage is missing.
+    """
+    template = _plane(*voltage_range, order, units[0], units[1]) if operator is None else operator
     v, f = _resting(voltages, forces, template.input_range[0])
     start = template.initial_state()
     held = np.ones(v.size) if weights is None else _checks.samples("weights", weights)
     regressor = template.regressor(v, start)
-    one, first_smoothing = _fit(CellLayout.of(regressor.base.size), regressor, f, held, smoothing)
-    found = template.with_coefficients(one.coefficients, one.bias)
+    found, chosen = _fit(CellLayout.of(regressor.base.size), regressor, f, held, smoothing)
+    model = template.with_coefficients(found.coefficients, found.bias)
+    return FirstStage(model, found, chosen, f, model.evaluate(v, start))
 
-    limit = max(_checks.number("force_limit", force_limit), found.output_range()[1]) + _MARGIN
-    inner = _plane(-limit, limit, order, units[1], units[2]) if second is None else second
-    two, inner, second_smoothing = _fit_second(TwoStage(found, inner, pretension), measured, smoothing)
-    model = TwoStage(found, inner, pretension)
-    fits = {"first": (one, first_smoothing), "second": (two, second_smoothing)}
-    return _identification(model, measured, fits, f, found.evaluate(v, start))
+
+def identify_second_stage(
+    first: FirstStage,
+    series: Iterable[Series],
+    *,
+    operator: Stage | None = None,
+    order: int = 20,
+    force_limit: float = 11.2,
+    pretension: float = 0.3,
+    smoothing: Smoothing = 0.0,
+    units: tuple[str, str, str] = ("V", "N", "mm"),
+) -> CoupledIdentification[TwoStage]:
+    """Return the two-stage model of a first stage, as `identify_two_stage`.
+
+    Parameters
+    ----------
+    first : FirstStage
+        What `identify_first_stage` found.
+    series, order, force_limit, pretension, smoothing, units
+        As in `identify_two_stage`.
+    operator : Operator or None
+        H2 before the fit.
+
+    Raises
+    ------
+    ValueError
+        If there is no series.
+    """
+    measured = _all(series)
+    limit = max(_checks.number("force_limit", force_limit), first.model.output_range()[1]) + _MARGIN
+    inner = _plane(-limit, limit, order, units[1], units[2]) if operator is None else operator
+    found, inner, chosen = _fit_second(TwoStage(first.model, inner, pretension), measured, smoothing)
+    fits = {"first": (first.fit, first.smoothing), "second": (found, chosen)}
+    return _identification(TwoStage(first.model, inner, pretension), measured, fits, first.forces, first.modelled)
 
 
 def identify_linear(

@@ -246,7 +246,10 @@ class Workers:
 
     @contextmanager
     def together(self) -> Iterator[None]:
-        """Have no task begun within the block; then the one that was hurried is the first, whatever came before."""
+        """Have no task begun within the block; then the one that was hurried is the first, whatever came before.
+
+        Nothing in the block may wait for a task.
+        """
         with self._changed:
             self._is_held = True
         try:

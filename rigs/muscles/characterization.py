@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.hysteresis import TwoStage
-from bench.identification.two_stage import CoupledIdentification, Series, measure_series
+from bench.identification.two_stage import CoupledIdentification, FirstStage, Series, measure_series
 from bench.model_file import ModelFile
 from bench.results.figures import Curve, plot_panels
 from bench.studies import Campaign, ResultTable, keep_models
@@ -26,6 +26,7 @@ from rigs.muscles.identification import (
     errors_json,
     identify_muscle,
     identify_muscle_dynamics,
+    identify_resting,
     muscle_file,
     read_resting,
     read_series,
@@ -70,11 +71,12 @@ PAPER: Mapping[tuple[str, ModelName], str] = {
 
 @dataclass(frozen=True)
 class Measurements:
-    """The run with the ends held and those of the length, and what they measured."""
+    """The run with the ends held and those of the length, what they measured, and the stage of the former."""
 
     force: Path
     lengths: Sequence[Path]
     resting: Resting
+    first: FirstStage
     series: Sequence[Series]
 
 
@@ -125,10 +127,12 @@ def measure(runs: Mapping[str, Pending[RunResult]]) -> Measurements:
 
     Raises BenchError if one of them did not complete.
     """
-    force, *lengths = (
-        runs[protocol].result().folder for protocol in ("force-voltage", "length-voltage", "length-force")
-    )
-    return Measurements(force, lengths, read_resting(force), [one for run in lengths for one in read_series(run)])
+    force = runs["force-voltage"].result().folder
+    resting = read_resting(force)
+    # Identified beside the other runs.
+    first = identify_resting(resting)
+    lengths = [runs[protocol].result().folder for protocol in ("length-voltage", "length-force")]
+    return Measurements(force, lengths, resting, first, [one for run in lengths for one in read_series(run)])
 
 
 def identify_models(measured: Measurements, folder: Path) -> Iterator[tuple[ModelName, CoupledIdentification[Any]]]:
@@ -138,7 +142,7 @@ def identify_models(measured: Measurements, folder: Path) -> Iterator[tuple[Mode
     """
     dynamics = None
     for name in MODELS:
-        found = identify_muscle(name, measured.resting, measured.series)
+        found = identify_muscle(name, measured.resting, measured.series, measured.first)
         is_two_stage = found.model.kind == TwoStage.kind
         if is_two_stage and dynamics is None:
             # The models of two stages have the same first one, which is all that counts here.

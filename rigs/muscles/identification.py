@@ -23,10 +23,12 @@ from bench.identification import Errors
 from bench.identification.regularization import SMOOTHING
 from bench.identification.two_stage import (
     CoupledIdentification,
+    FirstStage,
     Series,
+    identify_first_stage,
     identify_linear,
+    identify_second_stage,
     identify_summed,
-    identify_two_stage,
 )
 from bench.journal import Record
 from bench.model_file import ModelFile
@@ -91,7 +93,30 @@ def read_series(run: Path) -> list[Series]:
     return series
 
 
-def identify_muscle(name: ModelName, resting: Resting, series: Sequence[Series]) -> CoupledIdentification[Any]:
+def identify_resting(resting: Resting) -> FirstStage:
+    """Identify the first stage of both models of two stages, which needs no lengths.
+
+    Raises DataError if the data do not determine it.
+    """
+    try:
+        return _first_stage(resting)
+    except ValueError as error:
+        raise DataError(f"the force over the voltage cannot be identified: {error}") from error
+
+
+def _first_stage(resting: Resting) -> FirstStage:
+    voltages, forces, _ = resting
+    weights = np.ones(voltages.size)
+    weights[0] = _COLD_WEIGHT
+    limits = 0.0, float(voltages.max())
+    return identify_first_stage(
+        voltages, forces, weights=weights, voltage_range=limits, smoothing=_SMOOTHING, units=UNITS
+    )
+
+
+def identify_muscle(
+    name: ModelName, resting: Resting, series: Sequence[Series], first: FirstStage | None = None
+) -> CoupledIdentification[Any]:
     """Identify a model among voltage, force and length.
 
     Parameters
@@ -104,6 +129,8 @@ def identify_muscle(name: ModelName, resting: Resting, series: Sequence[Series])
         Force at resting length.
     series : sequence of Series
         Lengths.
+    first : FirstStage, optional
+        What `identify_resting` gives, if it is known already.
 
     Raises
     ------
@@ -113,21 +140,19 @@ def identify_muscle(name: ModelName, resting: Resting, series: Sequence[Series])
     voltages, forces, pretension = resting
     force_limit = max(float(each.max()) for each in (forces, *(s.forces for s in series)))
     common: Any = {
-        "voltage_range": (0.0, float(voltages.max())),
         "force_limit": force_limit,
         "pretension": pretension,
         "units": UNITS,
         "smoothing": _SMOOTHING,
     }
-    weights = np.ones(voltages.size)
-    weights[0] = _COLD_WEIGHT
+    limits = 0.0, float(voltages.max())
     try:
         if name == "summed":
-            return identify_summed(series, **common)
+            return identify_summed(series, voltage_range=limits, **common)
         if name == "linear":
-            return identify_linear(voltages, forces, series, **common)
+            return identify_linear(voltages, forces, series, voltage_range=limits, **common)
         second = _plays(force_limit) if name == "two-stage-prandtl-ishlinskii" else None
-        return identify_two_stage(voltages, forces, series, weights=weights, second=second, **common)
+        return identify_second_stage(first or _first_stage(resting), series, operator=second, **common)
     except ValueError as error:
         raise DataError(f"model {name} cannot be identified: {error}") from error
 

@@ -21,6 +21,7 @@ from rigs.muscles.identification import (
     Resting,
     errors_json,
     identify_muscle,
+    identify_resting,
     muscle_file,
     read_resting,
     read_series,
@@ -189,6 +190,13 @@ class TestIdentifying:
         assert plays.first.to_json() == two_stage.first.to_json()
         assert isinstance(plays.second, PrandtlIshlinskii)
 
+    def test_a_first_stage_identified_before_gives_the_same_models(self, resting, series):
+        first = identify_resting(resting)
+        for name in ("two-stage", "two-stage-prandtl-ishlinskii"):
+            alone, known = (identify_muscle(name, resting, series, stage) for stage in (None, first))
+            assert known.model.to_json() == alone.model.to_json()
+            assert known.errors == alone.errors
+
     def test_the_force_of_the_cold_muscle_is_held(self, resting, series):
         model = identify_muscle("two-stage", resting, series).model
         cold = model.first.evaluate(np.zeros(1))[0]
@@ -214,3 +222,5 @@ class TestIdentifying:
         hot = Resting(resting.voltages[1:3], resting.forces[1:3], resting.pretension)
         with pytest.raises(DataError, match=f"model {name} cannot be identified: voltages: .*lowest voltage"):
             identify_muscle(name, hot, series)
+        with pytest.raises(DataError, match=r"force over the voltage cannot be identified: .*lowest voltage"):
+            identify_resting(hot)
