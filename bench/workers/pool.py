@@ -132,7 +132,8 @@ class Workers:
         Modules that the tasks take. A worker process loads them before its first task, the first ones beside what
         this process loads.
     aside : tuple of str
-        Modules that the tasks aside take. A worker process loads them when it has nothing else to do.
+        Modules that the tasks aside take. The worker that has these in front loads them when it has nothing else to
+        do.
     """
 
     def __init__(
@@ -147,7 +148,7 @@ class Workers:
         self.in_process = self.number == 1
         self._console = Console(quiet=True) if console is None else console
         self._display = TasksDisplay(self._console, title)
-        self._welcome = Welcome(sys.argv, self._console.width, modules, aside)
+        self._modules, self._modules_aside = modules, aside
         self._ready: list[_Worker] = []
         self._changed = threading.Condition()
         self._tasks: list[Pending[Any]] = []
@@ -168,7 +169,7 @@ class Workers:
                     former = signal.signal(getattr(signal, name), self._interrupt)
                     self._stack.callback(signal.signal, getattr(signal, name), former)
         if not self.in_process:
-            self._ready += [self._start_worker() for _ in range(min(_AT_ONCE, self.number))]
+            self._ready += [self._start_worker(number) for number in range(min(_AT_ONCE, self.number))]
         self._stack.enter_context(_one_thread())
         self._stack.enter_context(collecting_seldom())
         if self.in_process:
@@ -303,11 +304,11 @@ class Workers:
     def _serve(self, number: int) -> None:
         """Have one worker process carry out task after task; another if it dies."""
         with self._changed:
-            worker = self._ready.pop() if self._ready else None
+            worker = self._ready.pop(0) if self._ready else None
         while (task := self._take(number)) is not None:
             self._display.begin(task._number, task.name)
             try:
-                worker = worker or self._start_worker()
+                worker = worker or self._start_worker(number)
                 result = worker.carry_out(task, self._display)
             except (EOFError, OSError) as death:
                 finished = self._mourn(task, death if worker is None else worker.cause_of_death())
@@ -319,12 +320,14 @@ class Workers:
         if worker is not None:
             worker.close()
 
-    def _start_worker(self) -> _Worker:
+    def _start_worker(self, number: int) -> _Worker:
         with self._changed:
             # After the end has begun nobody would end it.
             if self._is_closing:
                 raise EOFError("the end of all workers")
-            return _Worker(self._welcome, self._processes)
+            # Elsewhere what they load would be in the way of the caches.
+            aside = self._modules_aside if number == 0 else ()
+            return _Worker(Welcome(sys.argv, self._console.width, self._modules, aside), self._processes)
 
     def _take(self, number: int) -> Pending[Any] | None:
         """Return the next task of a worker, when there is one; None at the end."""

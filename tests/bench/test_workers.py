@@ -81,9 +81,9 @@ def test_of_tasks_submitted_together_the_one_in_a_hurry_is_the_first_although_wo
         waiting.result()
 
 
-def test_workers_load_what_tasks_aside_take_while_there_is_none():
+def test_one_worker_loads_what_tasks_aside_take_while_there_is_none():
     with Workers(2, aside=("no_such_module", "wave")) as workers:
-        wait_until(lambda: workers.submit(worker_tasks.is_loaded, "wave").result())
+        wait_until(lambda: workers.submit_aside("aside", worker_tasks.is_loaded, "wave").result())
 
 
 def test_the_first_worker_has_loaded_modules_before_its_tasks():
