@@ -38,7 +38,7 @@ _WORTH_LOADING = 8
 """Tasks aside from which on a worker loads what they take, although another one has."""
 
 _AT_ONCE = 2
-"""Worker processes that are started before there is a task: what several cores are taken for has at least two."""
+"""Worker processes that are started before there is a task: work for several cores has two tasks at least."""
 
 _ENDING = ("SIGINT", "SIGTERM", "SIGHUP", "SIGBREAK")
 
@@ -325,7 +325,7 @@ class Workers:
             # After the end has begun nobody would end it.
             if self._is_closing:
                 raise EOFError("the end of all workers")
-            # Elsewhere what they load would be in the way of the caches.
+            # Beside what they load, the loops of a run are some percent slower.
             aside = self._modules_aside if number == 0 else ()
             return _Worker(Welcome(sys.argv, self._console.width, self._modules, aside), self._processes)
 
