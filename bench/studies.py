@@ -128,16 +128,19 @@ class Campaign:
         """Carry out one protocol and wait for its end; see `start`."""
         return self.start(protocol, settings, overrides).result()
 
-    def conclude(self, run: Pending[RunResult]) -> RunResult:
-        """Wait for the end of a run to which nothing will be added, and have its recording made.
+    def conclude(self, run: Pending[RunResult], identified: Iterable[ModelFile] = ()) -> RunResult:
+        """Wait for the end of a run, put models that were identified from it beside it, and have its recording made.
 
-        Raises what its `result()` raises, see `start`.
+        Nothing may be added later; the recording shows the last model. Raises what its `result()` raises, see
+        `start`, and DataError if a model cannot be written.
         """
         # Here, as it takes a while to load and `bench list` reads the studies' names.
         from bench.results.export import export_run
 
         result = run.result()
         folder = result.folder
+        for model in identified:
+            add_model(folder, model.name, result.outcome.laboratory_seconds, model.to_json())
         if self.records and folder not in self._recordings:
             self._recordings[folder] = self.workers.submit_aside(
                 f"recording of {folder.name}", export_run, folder, "rrd", None
@@ -385,17 +388,6 @@ def reproduce(
         table.print(values, console)
     _print_end(values, console)
     return values
-
-
-def keep_models(run: RunResult, files: Iterable[ModelFile]) -> None:
-    """Put models into the record of a run that they were identified from; the last one is what its recording shows.
-
-    Raises DataError if a file cannot be written.
-    """
-    with Record(run.folder) as record:
-        finished = float(record.meta["finished"])
-    for file in files:
-        add_model(run.folder, file.name, finished, file.to_json())
 
 
 def reached_targets(run: RunResult, signal: str) -> TargetResults:

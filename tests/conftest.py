@@ -267,6 +267,8 @@ def bench(capsys):
 @pytest.fixture
 def reproduce(bench, tmp_path):
     """Run a study with a seed in `tmp_path`, without complaint; return its standard output and its result."""
+    from bench.journal import Record
+    from bench.model_file import models_among
 
     def run(study, seed):
         result = tmp_path / "result.json"
@@ -281,6 +283,12 @@ def reproduce(bench, tmp_path):
         assert all(Path(path).stat().st_size > 1000 for path in campaign["figures"] + campaign["recordings"])
         if seed == RECORDED_SEED:
             assert not beyond_the_bands(study, campaign)
+        for path in Path(campaign["folder"]).rglob("journal.sqlite"):
+            with Record(path) as record:
+                # A model that was given to a run is among its files; beside it are those identified from it.
+                if (given := record.meta["parameters"].get("model")) is not None:
+                    assert models_among(record.files(), str(path))["model"].name == Path(given).stem
+                    assert not record.models()
         return out, campaign
 
     return run

@@ -319,6 +319,8 @@ def main() -> None:
         folder = Path(name)
         known_file = given.known or folder / "known.json"
         if not known_file.exists():
+            if importlib.util.find_spec("coverage") is None:
+                sys.exit("coverage is not installed; `make mutants` installs it, or give --known")
             print("which test executes which line ...", flush=True)
             forked(lambda: measure(files, list(given.tests), known_file) or 0, 3600.0)
             if not known_file.exists():

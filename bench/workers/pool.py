@@ -149,7 +149,7 @@ class Workers:
         self._console = Console(quiet=True) if console is None else console
         self._display = TasksDisplay(self._console, title)
         self._modules, self._modules_aside = modules, aside
-        self._ready: list[_Worker] = []
+        self._ready: dict[int, _Worker] = {}
         self._changed = threading.Condition()
         self._tasks: list[Pending[Any]] = []
         self._queue: deque[Pending[Any]] = deque()
@@ -169,7 +169,7 @@ class Workers:
                     former = signal.signal(getattr(signal, name), self._interrupt)
                     self._stack.callback(signal.signal, getattr(signal, name), former)
         if not self.in_process:
-            self._ready += [self._start_worker(number) for number in range(min(_AT_ONCE, self.number))]
+            self._ready = {number: self._start_worker(number) for number in range(min(_AT_ONCE, self.number))}
         self._stack.enter_context(_one_thread())
         self._stack.enter_context(collecting_seldom())
         if self.in_process:
@@ -303,8 +303,7 @@ class Workers:
 
     def _serve(self, number: int) -> None:
         """Have one worker process carry out task after task; another if it dies."""
-        with self._changed:
-            worker = self._ready.pop(0) if self._ready else None
+        worker = self._ready.pop(number, None)
         while (task := self._take(number)) is not None:
             self._display.begin(task._number, task.name)
             try:
@@ -390,7 +389,7 @@ class Workers:
                 process.kill()
         for thread in self._threads:
             thread.join()
-        for worker in self._ready:
+        for worker in self._ready.values():
             worker.close()
 
 

@@ -18,7 +18,7 @@ from bench.hysteresis import TwoStage
 from bench.identification.two_stage import CoupledIdentification, FirstStage, Series, measure_series
 from bench.model_file import ModelFile
 from bench.results.figures import Curve, plot_panels
-from bench.studies import Campaign, ResultTable, keep_models
+from bench.studies import Campaign, ResultTable
 from rigs.muscles.identification import (
     MODELS,
     ModelName,
@@ -162,10 +162,9 @@ def conclude(
 
     Raises BenchError if a run did not complete.
     """
-    for run in runs.values():
-        keep_models(run.result(), [ModelFile("two-stage", models["two-stage"].model)])
-        campaign.conclude(run)
-    verification = read_series(runs["length-verification"].result().folder)
+    identified = ModelFile("two-stage", models["two-stage"].model)
+    folders = {protocol: campaign.conclude(run, [identified]).folder for protocol, run in runs.items()}
+    verification = read_series(folders["length-verification"])
     return Characterization(measured.resting, measured.series, verification, models)
 
 

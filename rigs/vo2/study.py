@@ -24,7 +24,7 @@ from bench.results.prediction_figures import errors_text
 from bench.results.published import Published
 from bench.results.tracking import FollowingResult, TargetResults, following_result
 from bench.rig_file import load_rig
-from bench.studies import Campaign, ResultTable, Study, StudyResult, keep_models, reached_targets, true_errors
+from bench.studies import Campaign, ResultTable, Study, StudyResult, reached_targets, true_errors
 from rigs.vo2.curvature import CantileverCurvature, curvature_to_deflection, deflection_to_curvature
 
 if TYPE_CHECKING:
@@ -251,13 +251,10 @@ def carry_out(campaign: Campaign) -> StudyResult:
         inputs, outputs = steps[INPUT], steps[OUTPUT]
     predictions = {key: predict(model.file, inputs) for key, model in models.items()}
     figures = _draw_models(campaign, models, inputs, outputs, predictions)
+    # The proposed model last: the recording shows its density.
+    kept = [found.file for key, found in reversed(models.items()) if MODELS[key].validation is not None]
     for run in (characterization, validation):
-        # The proposed model last: the recording shows the density of the newest.
-        keep_models(
-            run.result(),
-            [found.file for key, found in reversed(models.items()) if MODELS[key].validation is not None],
-        )
-        campaign.conclude(run)
+        campaign.conclude(run, kept)
     slowest = reached_targets(tracking_runs["latched"].result(), OUTPUT).summary()["seconds_per_target"]
     tracking_runs[EQUAL_TIME] = tracking(
         EQUAL_TIME, {"protocols.tracking.tuning.integral.duration": str(math.ceil(2.0 * slowest) / 2.0)}
