@@ -21,7 +21,14 @@ from bench.cli.console import (
 from bench.cli.data_options import layout_options, print_assumptions
 from bench.cli.model_options import ModelOptions, offer_model_options
 from bench.cli.patience import show_patience
-from bench.cli.selection import Comparing, choose_model, is_comparison, offer_comparing, print_test
+from bench.cli.selection import (
+    Comparing,
+    check_test,
+    choose_model,
+    is_comparison,
+    offer_comparing,
+    print_test,
+)
 from bench.cli.written import print_figures, write_fit, write_rows
 from bench.errors import ConfigurationError
 from bench.printing import print_plain
@@ -97,7 +104,7 @@ def identify_(
     ] = None,
     skip: Annotated[
         int,
-        typer.Option(metavar="ROWS", help="First rows, which drive the memory but are left out of the fit."),
+        typer.Option(min=0, metavar="ROWS", help="First rows, which drive the memory but are left out of the fit."),
     ] = 0,
     initial: Annotated[
         str | None,
@@ -157,9 +164,13 @@ def identify_(
     """
     from bench.results.models import certificate_lines, identify_file
 
-    check_outputs(out=out, card=card, figures=figures, json_file=json_file, read=files)
+    check_outputs(out=out, card=card, figures=figures, json_file=json_file, read=[*files, *comparing.test_files])
     names = ", ".join(file.name for file in files)
     columns = (input_column, output_column)
+    if input_column == output_column:
+        raise ConfigurationError(f"--input and --output are the same column, {input_column}; a model needs two")
+    if comparing.test_files:
+        check_test(comparing.test_files[0], columns, time_column, reading)
     settings: dict[str, Any] = {
         "smoothing": smoothing,
         "ridge": ridge,
@@ -208,10 +219,10 @@ def identify_(
     print_rows(f"{model} from {names}", certificate_lines(found))
     if found.band is not None:
         print_band(found.band)
-    tested = print_test(found, comparing, columns, reading)
     if out is not None:
         found.file.save(out)
         print_plain(console, f"model: {out}")
+    tested = print_test(found, comparing, columns, reading)
     write_fit(found, files[0], context=context, out=out, card=card, figures=figures)
     more = {"test": tested.to_json()} if tested else {}
     more |= {"selection": selected.to_json()} if selected else {}

@@ -43,6 +43,13 @@ class Comparing:
     test: str | None = None
     table_out: Path | None = None
 
+    @property
+    def test_files(self) -> tuple[Path, ...]:
+        """The file on which the model is tested; none if there is none, or rows are given."""
+        from bench.results.joined_files import is_rows
+
+        return () if self.test is None or is_rows(self.test) else (Path(self.test),)
+
 
 def _comparing(
     train: Annotated[
@@ -153,8 +160,8 @@ def _print_table(found: SelectedModel) -> None:
     selection = found.selection
     unit = found.unit or "units"
     heads = [
-        ("", "", "", "training", "held out", "", "% of", "other", "CPU"),
-        ("", "model", "free", unit, unit, "±", "range", f"cycles, {unit}", "s"),
+        ("", "", "deg. of", "training", "held out", "", "% of", "other", "CPU"),
+        ("", "model", "freedom", unit, unit, "±", "range", f"cycles, {unit}", "s"),
     ]
     shown = list(selection.evaluations[:_SHOWN])
     shown += [each for each in (selection.chosen,) if each not in shown]
@@ -187,9 +194,11 @@ def _print_table(found: SelectedModel) -> None:
         + (f"; {more} more were worse or given up" if more > 0 else "")
     )
     _print_line(
-        f"held out: blocks of {selection.rows} rows with gaps of {selection.gap}; "
+        f"held out: contiguous blocks of the {selection.rows} rows compared, with gaps of {selection.gap}; "
         "other cycles: whole kinds of cycles left out"
     )
+    if selection.has_times and not any(each.candidate.static for each in selection.evaluations):
+        _print_line("with time: no lag, resonance, delay, creep or drift behind the best operators is worth it")
 
 
 def _print_line(text: str) -> None:
@@ -205,6 +214,18 @@ def _describe(one: Candidate) -> str:
     parts.append(f"start {one.initial}" if one.initial else "")
     parts.append(f"smooth {one.smoothing:g}" if one.smoothing else "")
     return ", ".join(part for part in parts if part and part != "none")
+
+
+def check_test(path: Path, columns: tuple[str, str], time_column: str | None, reading: ReadingOptions) -> None:
+    """Check that a file for tests can be read, before anything is fitted.
+
+    Raises DataError if it cannot.
+    """
+    from bench.results.data import FEWEST_ROWS
+    from bench.results.joined_files import read_files
+
+    names = (*columns, *([time_column] if time_column else ()))
+    read_files([path], names, at_least=FEWEST_ROWS, options=reading)
 
 
 def print_test(

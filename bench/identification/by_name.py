@@ -17,6 +17,7 @@ from bench.identification.measures import Errors, measure_errors
 from bench.identification.options import check_options
 from bench.identification.orientation import (
     NAMES,
+    ORIENTATIONS,
     Orientation,
     Sign,
     better_sign,
@@ -29,6 +30,7 @@ from bench.identification.trust import check_interpolation, check_record, check_
 
 M = TypeVar("M", bound=Operator[Any] | TimedModel[Any])
 Initial: TypeAlias = Literal["negative", "positive", "skip", "estimate"]
+INITIALS: tuple[Initial, ...] = ("negative", "positive", "skip", "estimate")
 
 
 @dataclass(frozen=True, eq=False)
@@ -245,8 +247,7 @@ def set_up_problem(
     if measured.size != sequence.size:
         raise ValueError(f"outputs: expected {sequence.size} values, one for each input, got {measured.size}")
     w = np.ones(sequence.size) if weights is None else _checks.samples("weights", weights)
-    if initial not in (None, "negative", "positive", "skip", "estimate"):
-        raise ValueError(f"initial: expected 'negative', 'positive', 'skip', 'estimate' or None, got {initial!r}")
+    check_words(initial, orientation)
     if initial == "estimate" and spec.estimate_state is None:
         raise ValueError(f"initial: 'estimate' needs a nonnegative Preisach density, not {model_name}")
     check_options(model_name, options)
@@ -266,6 +267,21 @@ def set_up_problem(
     rising, falling = (problems[sign].cost(fits[sign]) for sign in signs)
     best = better_sign(rising, falling, measured, counted)
     return replace(problems[best], known=(smoothing, fits[best]))
+
+
+def check_words(initial: str | None, orientation: str | None) -> None:
+    """Check the words for the memory before the first sample and for the orientation; None is neither.
+
+    Raises ValueError if one is unknown: names those that are allowed.
+    """
+    if initial not in (None, *INITIALS):
+        raise ValueError(f"initial: expected {_listed(INITIALS)}, got {initial!r}")
+    if orientation not in (None, *ORIENTATIONS):
+        raise ValueError(f"orientation: expected {_listed(ORIENTATIONS)}, got {orientation!r}")
+
+
+def _listed(words: Sequence[str]) -> str:
+    return f"{', '.join(map(repr, words[:-1]))} or {words[-1]!r}"
 
 
 def _orient(

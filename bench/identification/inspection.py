@@ -13,6 +13,9 @@ from bench.hysteresis._checks import Floats
 # Part of the samples that may repeat the one before, and part of the range that one step may take.
 _PLATEAU = 0.1
 _JUMP = 0.1
+# Part of the samples for which a sensor must stand still, while the input goes through this part of its range; and
+# part of the others that may repeat the one before: coarse readings often do.
+_STILL, _MOVED, _REPEATED = 0.02, 0.2, 0.1
 
 
 def check_data(
@@ -21,7 +24,8 @@ def check_data(
     """Return what is odd about a measured sequence, in sentences; none if nothing is.
 
     Looked for are plateaus (inputs repeated, which add weight but no information), branches in one direction that
-    are missing or made in one jump, a plane whose ends the inputs never reach, and outputs that do not change.
+    are missing or made in one jump, a plane whose ends the inputs never reach, outputs that do not change, and
+    those that stand still for a while, as of a frozen sensor.
 
     Parameters
     ----------
@@ -56,7 +60,32 @@ def check_data(
                 )
     if y is not None and np.ptp(y) == 0.0:
         found.append(f"the output is {y[0]:g} throughout")
+    elif y is not None:
+        found += _frozen(u, y, span)
     return found
+
+
+def _frozen(u: Floats, y: Floats, span: float) -> list[str]:
+    """Return whether outputs that otherwise change from sample to sample stand still while the input moves."""
+    same = np.diff(y) == 0.0
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(np.int8)))
+    first, last = edges[::2], edges[1::2]
+    if not first.size:
+        return []
+    longest = int(np.argmax(last - first))
+    start, stop = int(first[longest]), int(last[longest])
+    elsewhere = int(same.sum()) - (stop - start)
+    if (
+        stop - start < max(_STILL * y.size, 10)
+        or np.ptp(u[start : stop + 1]) < _MOVED * span
+        or elsewhere > _REPEATED * (y.size - (stop - start))
+    ):
+        return []
+    return [
+        f"the output stands still at {y[start]:g} from row {start} to row {stop}, while the input moves by "
+        f"{np.ptp(u[start : stop + 1]):g}, and changes from row to row elsewhere: look at the sensor, and fit the "
+        "other rows with --train"
+    ]
 
 
 def _plateaus(u: Floats, y: Floats | None) -> list[str]:

@@ -59,10 +59,8 @@ def possible_signs(
     Raises
     ------
     ValueError
-        If `wanted` is none of the three, the model has no orientation to choose, or it cannot fall.
+        If the model has no orientation to choose, or it cannot fall.
     """
-    if wanted not in ORIENTATIONS:
-        raise ValueError(f"orientation: expected 'auto', 'rising' or 'falling', got {wanted!r}")
     if not has_orientation(spec, template):
         if wanted != "auto":
             raise ValueError(f"orientation: {name} has coefficients of either sign; leave {wanted!r} out")

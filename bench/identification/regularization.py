@@ -26,6 +26,8 @@ SMOOTHING = tuple((10.0 ** np.arange(-6.0, 2.1)).tolist())
 RIDGE = (0.0, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
 """Weights of the penalty on the size of the density that are tried; see `fit`."""
 
+# Samples of a block, as far as there are so many: within fewer its neighbours tell all.
+_SHORTEST = 8
 # The weights belong to the density, not to the plane: they are chosen on one of at most this order.
 _FINEST = 24
 # Added to the squared norm of each scaled column, so that columns without a penalty may be collinear.
@@ -89,7 +91,8 @@ def choose_regularization(
     smoothing, ridge : float or None
         Weights that are given; not both 0.
     folds, blocks : int
-        Number of folds, >= 2, and of blocks; with fewer samples than blocks each sample is one.
+        Number of folds, >= 2, and of blocks; of few samples there are fewer, of at least 8 each as long as each fold
+        has one.
 
     Raises
     ------
@@ -98,6 +101,7 @@ def choose_regularization(
     """
     check_penalties(smoothing or 0.0, ridge or 0.0)
     used = outputs.size - skip
+    blocks = min(blocks, max(folds, used // _SHORTEST))
     fold = (np.maximum(np.arange(-skip, used), 0) * min(blocks, used) // used) % folds
     layout = CellLayout.of(regressor.base.size)
     coarse, layout, factor, size = _coarse(regressor, layout)
@@ -159,4 +163,6 @@ def _errors(training: Floats, held_out: Floats, penalty: Floats) -> tuple[float,
         return np.inf, np.inf
     x *= scale
     combined = np.append(-x, 1.0)
-    return float(combined @ held_out @ combined), float(combined @ training @ combined)
+    # Of an exact fit rounding may leave less than nothing.
+    left, fitted = (max(float(combined @ gram @ combined), 0.0) for gram in (held_out, training))
+    return left, fitted

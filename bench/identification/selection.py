@@ -12,11 +12,11 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
-from typing import Any, NamedTuple, Protocol, TypeAlias
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -44,16 +44,15 @@ from bench.identification.near_best import (
     simplest_near_best,
 )
 from bench.identification.orientation import Orientation, has_orientation
-
-Task: TypeAlias = Callable[[], list[Evaluation]]
-Carry: TypeAlias = Callable[[Sequence[tuple[str, Task]]], Iterable[list[Evaluation]]]
-"""Carries named tasks out and returns their results in order."""
+from bench.identification.time_stage import Carry, InTime, Task, TimeStage, is_smooth_plane, lags
 
 SMOOTHING = (0.0, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 """Weights of the roughness penalty that are tried."""
 
 # A candidate that errs so many times more than the best on the first folds is given up.
 _HOPELESS = 3.0
+# Part of the range of the outputs below which an error is one of rounding.
+_ROUNDING = 1e-9
 # A kind of no more coefficients than these at its finest costs little: its coarsest says nothing against it.
 _FEW_COEFFICIENTS = 60
 # Fewer rows say more by the fit to all than by what is left out.
@@ -74,11 +73,6 @@ _UNDETERMINED = 2.0
 _DRIFTS, _FEWEST_OF_TREND = 0.15, 100
 # Turns of the input that say nothing of its minor loops, and moves that are none.
 _FEW_REVERSALS, _LEAST_MOVE = 4, 0.02
-# The operator whose plays may depend on the rate.
-PLAYS = "prandtl-ishlinskii"
-# Operators to which a linear part and a drift are added, and what of it is a lag.
-_IN_TIME = 2
-_LAGS = {"lag", "resonance", "delay"}
 # Ratio of the two held-out errors from which the record is said to tell little of other inputs.
 _WARNED = 3.0
 
@@ -134,13 +128,15 @@ class Selection:
     rows : int
         Rows that were fitted and tested.
     span : float
-        Range of the outputs, output units.
+        Range of their outputs, output units.
     has_one_kind : bool
         Whether the input has one kind of cycle only.
     reversals : int or None
         How often the input turns back, by 2 % of its range or more.
     trend : Trend or None
         That of the errors of the chosen model, if it is one without time.
+    has_times : bool
+        Whether times are known, so that models with time took part.
     has_one_rate : bool
         Whether times are known and the input moves at one speed only.
     """
@@ -154,6 +150,7 @@ class Selection:
     has_one_kind: bool = False
     reversals: int | None = None
     trend: Trend | None = None
+    has_times: bool = False
     has_one_rate: bool = False
 
     def warnings(self) -> list[str]:
@@ -162,15 +159,20 @@ class Selection:
         chosen = self.chosen
         if self.reversals is not None and self.reversals < _FEW_REVERSALS:
             found.append(
-                f"the input reverses only {_times(self.reversals)}, which tells little of hysteresis: "
+                f"the input {_reverses(self.reversals)}, which tells little of hysteresis: "
                 "record more cycles, of several amplitudes, as `bench design` proposes"
             )
         if self.trend is not None and self.trend.share > _DRIFTS:
             part = 100.0 * abs(self.trend.change) / self.span
+            remedy = (
+                "no model with drift or creep does better on rows left out; --model hammerstein --dynamics drift "
+                "has the drift in any case"
+                if self.has_times
+                else "give --time COLUMN, so that models with drift and creep take part"
+            )
             found.append(
-                f"the errors drift by {part:.1f} % of the range from the first to the last row "
-                f"({self.trend.share:.0%} of their variance): give --time COLUMN, so that models with drift and "
-                "creep take part"
+                f"the errors drift by {part:.2g} % of the range from the first to the last row "
+                f"({self.trend.share:.0%} of their variance): {remedy}"
             )
         if self.has_one_rate:
             found.append(
@@ -194,22 +196,6 @@ class Selection:
                 "left out: expect it on inputs unlike the record, and record more kinds of cycles"
             )
         return found
-
-
-class InTime(Protocol):
-    """Evaluates operators with what may follow them in time; see `bench.timed.held_out`."""
-
-    def is_small(self, coefficients: int) -> bool:
-        """Return whether an operator of so many coefficients can be evaluated in seconds."""
-
-    def has_one_rate(self) -> bool:
-        """Return whether the input moves at one speed only."""
-
-    def evaluate(self, static: Candidate, gap: int) -> list[Evaluation]:
-        """Return the errors of a model with time with a candidate's operator; none if time tells nothing."""
-
-    def evaluate_plays(self, static: Candidate, gap: int) -> list[Evaluation]:
-        """Return the errors of a candidate's plays with thresholds that grow with their rate; none likewise."""
 
 
 def select(
@@ -264,14 +250,6 @@ class _Kind:
         return max((len(values) for _, values in self.sizes), default=1)
 
 
-class _InTimeWork(NamedTuple):
-    """Makes a model with time of an evaluated operator."""
-
-    name: str
-    evaluate: Callable[[Candidate, int], list[Evaluation]]
-    operator: Evaluation
-
-
 class _Search:
     def __init__(
         self, measured: Measurements, models: Sequence[str], given: Given, carry: Carry, in_time: InTime | None
@@ -289,7 +267,7 @@ class _Search:
 
     def run(self) -> Selection:
         screened = self.screen()
-        least = min(each.rms for each in screened.values())
+        least = self._least(screened.values())
         self.measured = replace(self.measured, gap=self._gap(min(screened.values(), key=lambda each: each.rms)))
         left = {}
         for kind, each in screened.items():
@@ -351,6 +329,11 @@ class _Search:
                 if step >= kind.steps or not gains or self._is_too_fine(kind, step):
                     del going[kind]
 
+    def _least(self, tried: Iterable[Evaluation]) -> float:
+        """Return the least error; of exact fits one that is none, so that rounding does not tell them apart."""
+        least = min((each.rms for each in tried), default=0.0)
+        return max(least, _ROUNDING * float(np.ptp(self.measured.outputs)))
+
     def _may_gain_in_time(self, kind: _Kind) -> bool:
         """Return whether a drift or a lag may hide what a finer order gains; all orders are tried behind it."""
         return self.in_time is not None and kind.model in self._with_shape
@@ -369,7 +352,7 @@ class _Search:
     def smooth(self) -> None:
         """Try smaller and greater smoothing weights on the structures near the best, until the error rises."""
         best = {kind: each for kind in self.kinds if (each := self._best(kind)) and self._is_smoothed(kind)}
-        least = min((each.rms for each in best.values()), default=0.0)
+        least = self._least(best.values())
         near = sorted((each.rms, self.kinds.index(kind)) for kind, each in best.items() if each.rms <= _NEAR * least)
         going = [self.kinds[index] for _, index in near[:_SMOOTHED]]
         while going:
@@ -412,7 +395,7 @@ class _Search:
             assert one is not None
             others = [memory for memory in self._memories[kind] if memory != one.candidate.initial]
             tries = [replace(one.candidate, initial=memory) for memory in others]
-            tasks.append((kind.model, partial(evaluate, self.measured, tries, hopeless=EQUAL * one.rms)))
+            tasks.append((kind.model, partial(evaluate, self.measured, tries, hopeless=EQUAL * self._least([one]))))
         for kind, found in zip(chosen, self.carry(tasks), strict=True):
             self.done[kind] += found
 
@@ -421,7 +404,7 @@ class _Search:
 
         Where there is one kind of cycle, it is found instead what the fit to all rows says of them.
         """
-        least = min(each.rms for each in finalists)
+        least = self._least(finalists)
         if self._has_one_kind:
             near = [each for each in finalists if each.rms <= _UNDETERMINED * least]
             checks = [(each.candidate.model, partial(judge_determined, self.measured, each)) for each in near]
@@ -440,59 +423,16 @@ class _Search:
         return found + [each for each in finalists if each not in near]
 
     def with_time(self, judged: list[Evaluation]) -> list[Evaluation]:
-        """Return models with time with the best operators, each of another model; none if times are not known."""
+        """Return models with time with the best operators; none if times are not known."""
         if self.in_time is None:
             return []
-        best: dict[str, Evaluation] = {}
-        # The one that would be chosen without time, then the best of each model.
-        for each in (self._decide(judged)[1], *sorted(judged, key=lambda one: one.rms)):
-            if self._in_time_too(each.candidate):
-                best.setdefault(each.candidate.model, each)
-        tried = list(best.values())[:_IN_TIME]
-        if not any(has_signs(each) for each in tried):
-            tried += [each for each in best.values() if has_signs(each)][:1]
-        if self.in_time.has_one_rate():
-            # A reversible part jumps where the input turns, which a lag undoes: one stands for the other.
-            planes = [each for each in judged if each.candidate.options.get("reversible") == "none"]
-            planes = [each for each in planes if has_signs(each) and self._in_time_too(each.candidate)]
-            tried += [each for each in sorted(planes, key=lambda one: one.rms)[:1] if each not in tried]
-        # Without time, a drift or a lag hides what a finer order gains.
-        shaped = self._with_shape & {each.candidate.model for each in tried}
-        tried += [each for each in judged if each.candidate.model in shaped and each not in tried]
-        works = [_InTimeWork("hammerstein", self.in_time.evaluate, each) for each in tried]
-        if PLAYS in best and not self.in_time.has_one_rate():
-            works.append(_InTimeWork(PLAYS, self.in_time.evaluate_plays, best[PLAYS]))
-        found = self._carry_in_time(works)
-        if found and self._may_skip:
-            # Without time, a lag hides what memory the record begins with.
-            work, least = min(found, key=lambda one: one[1].rms)
-            if least.candidate.initial != "skip":
-                operator = replace(work.operator, candidate=replace(work.operator.candidate, initial="skip"))
-                found += self._carry_in_time([work._replace(operator=operator)])
-        return [one for _, one in found]
-
-    def _carry_in_time(self, works: Sequence[_InTimeWork]) -> list[tuple[_InTimeWork, Evaluation]]:
-        """Return what is evaluated with time, each beside the work that did so."""
-        tasks = [(work.name, partial(work.evaluate, work.operator.candidate, self.measured.gap)) for work in works]
-        found = [(work, one) for work, ones in zip(works, self.carry(tasks), strict=True) for one in ones]
-        self.given_up += [one for _, one in found if one.failure]
-        # What is left out of the others decides.
-        units = bool(self.measured.units())
-
-        def judged_alike(work: _InTimeWork, one: Evaluation) -> Evaluation:
-            determined, follows = work.operator.determined, work.operator.follows
-            return replace(one, determined=determined, follows=follows, units=one.units if units else ())
-
-        return [(work, judged_alike(work, one)) for work, one in found if not one.failure]
-
-    def _in_time_too(self, candidate: Candidate) -> bool:
-        """Return whether a candidate can be the operator of a model with time: a free plane would need penalties."""
-        assert self.in_time is not None
-        template = find_model(candidate.model).template
-        assert template is not None
-        operator: Operator[Any] = template(self.measured.inputs, **candidate.options)
-        bounded = find_model(candidate.model).constrained or not operator.densities()
-        return bounded and self.in_time.is_small(operator.coefficients.size)
+        stage = TimeStage(
+            self.in_time, self.measured, self.carry, frozenset(self._with_shape), self._may_skip, self._has_one_kind
+        )
+        # The one that would be chosen without time comes first.
+        found, failed = stage.run([self._decide(judged)[1], *sorted(judged, key=lambda one: one.rms)])
+        self.given_up += failed
+        return found
 
     def choose(self, finalists: list[Evaluation]) -> Selection:
         """Return the table with what is chosen."""
@@ -506,10 +446,11 @@ class _Search:
             chosen,
             measured.gap,
             int(measured.tested.sum()),
-            float(np.ptp(measured.outputs)),
+            float(np.ptp(measured.outputs[measured.tested])),
             self._has_one_kind,
             self._reversals,
             self._trend(chosen) if chosen.candidate.static is None else None,
+            self.in_time is not None,
             self.in_time is not None and self.in_time.has_one_rate(),
         )
 
@@ -520,14 +461,19 @@ class _Search:
         left out are like those that are fitted. Of few rows a block is much of what there is: the criterion of Akaike
         says what takes part. At one rate the time constant of a lag is as wrong as the operator is, and no row left
         out shows it: of models with a lag it is the one of the least misfit, whose operator biases the time constant
-        least.
+        least. Of one kind of cycle at one rate neither shows: there the smooth plane with time is chosen where it is
+        about as good, as signs and smoothness bound what the record leaves open.
         """
         finalists = self._with_lag(finalists)
+        planes = [each for each in finalists if self._has_one_kind and is_smooth_plane(each)]
+        near = [each for each in planes if each.rms <= _UNBOUNDED * min(other.rms for other in finalists)]
         bounded, others = self._of_one_kind(finalists)
         judged = bounded + others or [each for each in finalists if each.units] or self._bounded(finalists)
         best, chosen = best_of_one_kind(bounded, others) if bounded else simplest_near_best(judged)
-        if self.in_time is not None and self.in_time.has_one_rate() and _lags(chosen):
-            alike = [each for each in judged if _lags(each) and has_signs(each) == has_signs(chosen)]
+        if near:
+            chosen = min(near, key=lambda each: each.rms)
+        elif self.in_time is not None and self.in_time.has_one_rate() and lags(chosen):
+            alike = [each for each in judged if lags(each) and has_signs(each) == has_signs(chosen)]
             chosen = min(alike, key=lambda each: each.misfit)
         elif chosen.units and int(self.measured.tested.sum()) < _FEW_ROWS:
             chosen = best_of_few_rows(judged)
@@ -541,7 +487,7 @@ class _Search:
         """
         if self.in_time is None or not self.in_time.has_one_rate():
             return finalists
-        lagging = [score(each).mean() for each in finalists if _lags(each) and has_signs(each)]
+        lagging = [score(each).mean() for each in finalists if lags(each) and has_signs(each)]
         least = min(lagging, default=float("inf"))
         return [
             each
@@ -667,13 +613,10 @@ class _Search:
         return correlated_rows(residuals_of(self.measured, each.candidate)[self.measured.known :], max(1, block // 4))
 
 
-def _lags(each: Evaluation) -> bool:
-    """Return whether an operator is followed by a lag."""
-    return bool(_LAGS & set(str(each.candidate.options.get("dynamics")).split(",")))
-
-
-def _times(number: int) -> str:
-    return "once" if number == 1 else f"{number} times"
+def _reverses(number: int) -> str:
+    if number == 0:
+        return "never reverses"
+    return "reverses only " + ("once" if number == 1 else f"{number} times")
 
 
 def _kinds(model: str, spec: ModelSpec, given: Given) -> list[_Kind]:

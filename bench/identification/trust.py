@@ -24,8 +24,9 @@ _SAMPLES_EACH = 3
 _CONDITION = 1e6
 # Times by which the greatest error of the first samples must exceed that of the others.
 _FIRST = 2.0
-# Least part of the plane that the inputs must reach, and of their range that the plane must hold.
-_PLANE_REACHED, _INPUTS_HELD = 0.5, 0.2
+# Least part of the plane that the inputs must reach, and of their range that the plane must hold: at all, and of a
+# fit that is not good.
+_PLANE_REACHED, _INPUTS_HELD, _HELD_OF_POOR = 0.5, 0.2, 0.95
 # Of a butterfly the loops on the two halves of the range turn in opposite directions: least ratio of their areas,
 # least area in standard deviations, and the explained part of the variance from which on a fit is good as it is.
 _AREAS, _DEVIATIONS, _GOOD = 0.2, 5.0, 0.995
@@ -55,12 +56,13 @@ def check_skipped(samples: int, skip: int, coefficients: int, estimable: bool) -
 
 
 def check_interpolation(problem: FitProblem, found: Fit) -> None:
-    """Check that a fit to what an unknown memory left has more samples than free coefficients.
+    """Check that a fit to what an unknown memory left has more samples than coefficients that the data determine.
 
     Raises ValueError if it has not.
     """
     left = problem.inputs.size - problem.skip
-    if left <= found.certificate.passive + 1:
+    effective = found.certificate.effective
+    if left <= (effective if np.isfinite(effective) else found.certificate.passive) + 1.0:
         estimable = problem.spec.estimate_state is not None
         raise ValueError(f"{_too_few(problem.inputs.size, left, estimable)}; or fewer coefficients")
 
@@ -95,9 +97,9 @@ def judge_fit(problem: FitProblem, found: Fit, errors: Floats, *, initial: str |
     explained = 1.0 - float(weights @ left**2) / float(weights @ (measured - mean) ** 2)
     signed = not problem.spec.constrained or not problem.template.nonnegative().any()
     return [
-        *_plane(problem),
+        *_plane(problem, explained),
         *_unit(problem.template),
-        *_free(found, signed),
+        *([] if explained >= _GOOD else _free(found, signed)),
         *_explained(explained, problem.template, signed),
         *([] if signed or explained >= _GOOD else _butterfly(problem, left)),
         *_samples(int(np.count_nonzero(weights)), found, smoothing),
@@ -166,13 +168,15 @@ def _first(problem: FitProblem, errors: Floats, initial: str | None) -> list[str
     ]
 
 
-def _plane(problem: FitProblem) -> list[str]:
+def _plane(problem: FitProblem, explained: float) -> list[str]:
+    """Return whether inputs and plane do not match; a plane within the inputs is none if its fit is good."""
     plane = problem.template.plane
     if plane is None:
         return []
     least, greatest = float(problem.inputs.min()), float(problem.inputs.max())
     shared = max(min(plane[1], greatest) - max(plane[0], least), 0.0)
-    if shared >= _PLANE_REACHED * (plane[1] - plane[0]) and shared >= _INPUTS_HELD * (greatest - least):
+    held = _INPUTS_HELD if explained >= _GOOD else _HELD_OF_POOR
+    if shared >= _PLANE_REACHED * (plane[1] - plane[0]) and shared >= held * (greatest - least):
         return []
     unit = f" {problem.template.input_unit}".rstrip()
     return [

@@ -81,6 +81,16 @@ def parse_rows(option: str, text: str) -> slice:
     return slice(start, stop)
 
 
+def check_rows(option: str, rows: slice | None, count: int) -> None:
+    """Check that rows that are asked for are there.
+
+    Raises ConfigurationError if there are fewer.
+    """
+    if rows is not None and max(rows.stop or 0, rows.start or 0) > count:
+        text = f"{'' if rows.start is None else rows.start}:{'' if rows.stop is None else rows.stop}"
+        raise ConfigurationError(f"{option} {text} goes beyond the last row: there are {count}")
+
+
 def fitted_rows(files: JoinedFiles, inputs: Floats, rows: slice | None) -> tuple[Flags, list[str]]:
     """Return which rows are fitted, shape (N,), and what is odd about them.
 
@@ -99,8 +109,9 @@ def fitted_rows(files: JoinedFiles, inputs: Floats, rows: slice | None) -> tuple
     Raises
     ------
     ConfigurationError
-        If no row is left.
+        If no row is left, or there are not so many rows.
     """
+    check_rows("--train", rows, inputs.size)
     chosen = np.zeros(inputs.size, dtype=bool)
     chosen[slice(None) if rows is None else rows] = True
     warnings = []

@@ -57,6 +57,9 @@ _OF_ALL = ("initial", "orientation")
 SMOOTHING = (0.0, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 """Weights of the roughness penalty that cross-validation tries."""
 
+# Coefficients up to which cross-validation that nobody asked for takes seconds.
+_MOST_CROSS_VALIDATED = 6000
+
 
 @dataclass(frozen=True, repr=False)
 class IdentifiedFile:
@@ -84,6 +87,9 @@ class IdentifiedFile:
         What was assumed about the layout of the file; empty for a run.
     times : ndarray, shape (N,), or None
         When each row was taken, s; None for a model without time.
+    fitted : int or None
+        Number of rows that were fitted, to which the errors of the identification belong; None if it is all that
+        were not skipped.
     """
 
     file: ModelFile
@@ -98,10 +104,18 @@ class IdentifiedFile:
     trials: CrossValidation | None = None
     assumptions: str = ""
     times: Floats | None = None
+    fitted: int | None = None
 
     def __repr__(self) -> str:
         """Return what a person should know of the fit."""
         return "\n".join([self.file.name, *(f"  {name:20} {text}" for name, text in certificate_lines(self))])
+
+    @property
+    def all_errors(self) -> Errors:
+        """Error measures over all rows that were not skipped, fitted or not: those of `bench predict`."""
+        found = self.identification
+        measured = self.outputs[found.skip :]
+        return measure_errors(measured, measured - found.residuals[found.skip :])
 
     @cached_property
     def band(self) -> BandedPrediction | None:
@@ -130,6 +144,7 @@ class IdentifiedFile:
         return {
             "model": found.model_name,
             "samples": int(self.inputs.size - found.skip),
+            **({} if self.fitted is None else {"fitted": self.fitted, "all_rows": errors_json(self.all_errors)}),
             "levels": densities[0].levels.size - 1 if (densities := operator.densities()) else None,
             **errors_json(found.errors),
             "kkt": certificate.kkt_residual,
@@ -216,7 +231,8 @@ def identify_file(
     model : str
         Name of an entry of `bench.models`.
     smoothing, ridge : float, optional
-        Weights of the penalties on the roughness and the size of the density; `identify` says what None is.
+        Weights of the penalties on the roughness and the size of the density; `identify` says what None is. If both
+        are None and a density with signs has more coefficients than there are rows, cross-validation chooses.
     skip : int
         Number of first rows that drive the memory but do not count in the fit.
     cross_validated : bool
@@ -286,6 +302,13 @@ def identify_file(
             found = identify_in_time(model, times, inputs, outputs, weights=weights, skip=skip, **options)
             memory, coverage = found.model.run(times, inputs, found.initial_state)[1], None
         else:
+            open_smoothing = smoothing is None and ridge is None and not (cross_validated or levels_to_try)
+            if open_smoothing and _is_undetermined(model, inputs, options, int(fitted[skip:].sum())):
+                cross_validated = True
+                warnings += (
+                    "there are more cells of the density than samples: smoothness decides between them, by "
+                    "cross-validation; --smoothing gives its weight",
+                )
             if cross_validated or levels_to_try:
                 others, orders = dict(options), levels_to_try or None
                 if isinstance(options.get("levels"), int):
@@ -320,8 +343,8 @@ def identify_file(
             calibrated = calibrate(found, inputs, outputs, weights, skip, penalties, options, times)
     except ValueError as error:
         raise ConfigurationError(f"model {model}: {error}") from None
+    counted = fitted & (np.arange(inputs.size) >= found.skip)
     if not fitted.all():
-        counted = fitted & (np.arange(inputs.size) >= found.skip)
         found = replace(found, errors=measure_errors(outputs[counted], (outputs - found.residuals)[counted]))
     warnings += found.warnings
     tests = check_return_points(inputs, outputs), check_congruency(inputs, outputs)
@@ -366,6 +389,7 @@ def identify_file(
         trials,
         columns.assumptions,
         times,
+        None if fitted.all() else int(counted.sum()),
     )
 
 
@@ -377,6 +401,16 @@ def transients_of(paths: Sequence[Path], drive: str, response: str) -> Transient
     runs = [path for path in paths if path.is_dir() or path.suffix == ".sqlite"]
     found = [recording for path in runs if (recording := read_transients(path, drive, response)) is not None]
     return identify_transients(found) if found else None
+
+
+def _is_undetermined(model: str, inputs: Floats, options: Mapping[str, Any], samples: int) -> bool:
+    """Return whether samples are fewer than the coefficients of a density with signs, which nothing else bounds."""
+    spec = find_model(model)
+    assert spec.template is not None
+    own = {name: value for name, value in options.items() if name not in _OF_ALL}
+    template: Operator[Any] = spec.template(inputs, **own)
+    count = template.coefficients.size
+    return spec.constrained and bool(template.densities()) and samples < count <= _MOST_CROSS_VALIDATED
 
 
 def _shape(operator: Operator[Any] | TimedModel[Any]) -> dict[str, float]:
@@ -448,6 +482,8 @@ def certificate_lines(identified: IdentifiedFile) -> Sequence[tuple[str, str]]:
     found, operator = identified.identification, identified.file.response
     unit = f" {operator.output_unit}" if operator.output_unit else ""
     errors, certificate, largest = found.errors, found.certificate, _largest(found.uncertainties)
+    rows = identified.inputs.size - found.skip
+    partly = f"{identified.fitted} fitted of {rows}"
     if isinstance(operator, TimedModel):
         own = [(name, f"{value:.4g} {its}".rstrip()) for name, (value, its) in operator.parameters().items()]
     else:
@@ -455,9 +491,9 @@ def certificate_lines(identified: IdentifiedFile) -> Sequence[tuple[str, str]]:
         own = [("shape", shape)] if shape else []
     return (
         *own,
-        ("samples", f"{identified.inputs.size - found.skip} (skipped: {found.skip})"),
-        ("largest error", f"{errors.maximum:.4g}{unit} ({errors.maximum_percent:.2f} % of the range)"),
-        ("RMS error", f"{errors.rms:.4g}{unit} ({errors.rms_percent:.2f} % of the range)"),
+        ("samples", f"{rows if identified.fitted is None else partly} (skipped: {found.skip})"),
+        *_error_lines(errors, unit),
+        *([] if identified.fitted is None else _error_lines(identified.all_errors, unit, " of all rows")),
         *_uniqueness(found, identified.resolution),
         *([("penalties", found.regularization.summary(unit))] if found.regularization else []),
         *([("orientation", f"{found.orientation} with the input")] if found.orientation else []),
@@ -468,6 +504,13 @@ def certificate_lines(identified: IdentifiedFile) -> Sequence[tuple[str, str]]:
         ("return points", identified.return_points.text),
         ("loops", identified.congruency.text),
     )
+
+
+def _error_lines(errors: Errors, unit: str, which: str = "") -> list[tuple[str, str]]:
+    return [
+        (f"largest error{which}", f"{errors.maximum:.4g}{unit} ({errors.maximum_percent:.2f} % of the range)"),
+        (f"RMS error{which}", f"{errors.rms:.4g}{unit} ({errors.rms_percent:.2f} % of the range)"),
+    ]
 
 
 def _uniqueness(found: Identification[Any], resolution: Resolution | None) -> list[tuple[str, str]]:

@@ -14,12 +14,15 @@ from rich.console import Console
 from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import Operator, find_model, identifiable_models, timed_models
 from bench.identification import Comparison, compare
+from bench.identification.by_name import check_words
 from bench.identification.evaluation import Evaluation, Measurements
-from bench.identification.selection import Given, Selection, Task, select
+from bench.identification.selection import Given, Selection, select
+from bench.identification.time_stage import Task
 from bench.results.data import FEWEST_ROWS, check_excitation
-from bench.results.joined_files import fitted_rows, is_rows, overwritten_from, parse_rows, read_files
+from bench.results.joined_files import check_rows, fitted_rows, is_rows, overwritten_from, parse_rows, read_files
 from bench.results.models import IdentifiedFile, errors_json
 from bench.results.reading.options import ReadingOptions
+from bench.results.starting_state import left_out
 from bench.results.times import bind_times, read_times
 from bench.timed.held_out import HeldOutInTime
 from bench.workers import Workers
@@ -144,6 +147,11 @@ def named_models(text: str) -> tuple[str, ...]:
     known = identifiable_models()
     names = tuple(known) if text == ALL else tuple(text.split(","))
     for name in names:
+        if name in timed_models():
+            raise ConfigurationError(
+                f"{name} is a model with time, which takes part with --time COLUMN where operators are compared: "
+                f"leave it out of the names, or fit it alone with --model {name}"
+            )
         if name not in known:
             raise ConfigurationError(f"there is no model {name!r}; there are: {', '.join(known)}, or {ALL}")
     return names
@@ -192,6 +200,12 @@ def select_model(
     ConfigurationError
         If no model can be fitted.
     """
+    try:
+        check_words(given.initial, given.orientation)
+    except ValueError as error:
+        raise ConfigurationError(f"--{error}") from None
+    if skip < 0:
+        raise ConfigurationError(f"--skip {skip}: expected a number of rows ≥ 0")
     if time_column is not None and len(paths) > 1:
         raise ConfigurationError(f"--time: expected one file, as times are those of one record; got {len(paths)}")
     names = (input_column, output_column, *([time_column] if time_column else ()))
@@ -296,6 +310,7 @@ def evaluate_on_test(
     """
     if is_rows(test):
         rows = parse_rows("--test", test)
+        check_rows("--test", rows, found.inputs.size)
         predicted = (found.outputs - found.identification.residuals)[rows]
         if not predicted.size:
             raise ConfigurationError(f"--test {test}: there are {found.inputs.size} rows")
@@ -306,9 +321,7 @@ def evaluate_on_test(
     read = read_files([path], names, at_least=FEWEST_ROWS, options=reading).columns
     inputs, outputs = (read.values[name] for name in columns)
     model = bind_times(found.file, read_times(read, time_column) if time_column else None)
-    skip = 0 if isinstance(model, Operator) and model.memoryless else overwritten_from(inputs)
-    if skip > inputs.size // 2:
-        skip = 0
+    skip = 0 if isinstance(model, Operator) and model.memoryless else left_out(overwritten_from(inputs), inputs.size)
     state = {"model": found.identification.initial_state}
     return TestedModel(path.name, compare({"model": model}, inputs, outputs, states=state, skip=skip)["model"], skip)
 

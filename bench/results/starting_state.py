@@ -43,7 +43,8 @@ def starting_state(
         The inputs that follow, in the unit of the model; None if they are not known yet.
     initial : {"file", "negative", "positive", "skip"} or None
         "file": the state at the start of the model's own data. On these data the rows that its identification left
-        out are left out again, on others as many as their inputs leave unknown if it was identified with "skip".
+        out are left out again, on others as many as their inputs leave unknown if it was identified with "skip",
+        unless these are more than half.
         "negative", "positive": saturation at the low or the high end of the operating range. "skip": unknown, so
         that the rows are left out until the inputs have overwritten the memory. Default "file". A model with time has
         words of its own: `TimedModel.starts`.
@@ -79,8 +80,15 @@ def starting_state(
         return StartingState(state, skip or 0)
     if initial != "skip" and model.provenance.get("input_sha256") == digest(inputs):
         return StartingState(state, int(model.provenance.get("skipped", 0)))
-    unknown = "skip" in (initial, model.provenance.get("initial"))
-    return StartingState(state, max(skip or 0, operator.unknown_until(inputs) if unknown else 0))
+    unknown = operator.unknown_until(inputs)
+    if initial != "skip":
+        unknown = left_out(unknown, inputs.size) if model.provenance.get("initial") == "skip" else 0
+    return StartingState(state, max(skip or 0, unknown))
+
+
+def left_out(unknown: int, rows: int) -> int:
+    """Return how many first rows nobody asked to leave out are: those of unknown memory, unless half of all are."""
+    return 0 if unknown > rows // 2 else unknown
 
 
 def digest(inputs: Floats) -> str:

@@ -59,6 +59,8 @@ class Search:
         Signs of the operator's coefficients that are tried.
     smoothing : float
         Weight of the roughness penalty on the density of the operator, see `fit`.
+    longest_period : float
+        Of a resonance, s.
     elapsed : ndarray, shape (N,)
         Since the first row, s.
     principal : ndarray, shape (N, r)
@@ -73,6 +75,7 @@ class Search:
     roots: Floats
     signs: tuple[Literal[1, -1], ...]
     smoothing: float = 0.0
+    longest_period: float = math.inf
     elapsed: Floats = field(init=False)
     principal: Floats = field(init=False)
     step: float = field(init=False)
@@ -104,9 +107,10 @@ class Search:
                 starts = tuple(np.linspace(shortest - 1.0, longest - 1.0, 12))
                 found.append(_Parameter("lag", starts, shortest - math.log(100.0), longest + 1.0))
             elif element == "resonance":
-                low, high = math.log(2.0 * math.pi) - longest, math.log(20.0 * math.pi) - shortest
+                low = math.log(2.0 * math.pi) - min(longest, math.log(self.longest_period))
+                high = math.log(20.0 * math.pi) - shortest
                 top = math.log(math.pi) - shortest
-                starts = (*np.linspace(max(low, top - 6.0), top, 13), high - 0.5)
+                starts = (*np.linspace(max(low, top - 6.0), max(low, top), 13), high - 0.5)
                 found.append(_Parameter("frequency", starts, low, high))
                 found.append(_Parameter("damping", tuple(map(math.log, (0.03, 0.3, 1.0))), math.log(1e-3), 3.4))
             elif element == "delay":

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bench.hysteresis._checks import Floats
 from bench.identification.branches import turning_points
@@ -24,6 +25,8 @@ _MOST = 2_000_000
 _MOST_OF_PLAYS = 250_000
 # Moves from this part of the range on have a speed.
 _LEAST_MOVE = 0.02
+# Longest period of a resonance by the time of a move, at one rate.
+_RINGING = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,11 +53,18 @@ class HeldOutInTime:
 
     def has_one_rate(self) -> bool:
         """Return whether most moves from one turning point to the next are alike in speed, to a factor of two."""
-        inputs = self.measured.inputs
-        turns = turning_points(inputs, _LEAST_MOVE * float(np.ptp(inputs)))
-        speeds = np.abs(np.diff(inputs[turns])) / np.diff(self.times[turns])
+        turns = self._turns()
+        speeds = np.abs(np.diff(self.measured.inputs[turns])) / np.diff(self.times[turns])
         slow, fast = np.quantile(speeds, (0.1, 0.9))
         return bool(fast <= 2.0 * slow)
+
+    def _turns(self) -> NDArray[np.int64]:
+        inputs = self.measured.inputs
+        return turning_points(inputs, _LEAST_MOVE * float(np.ptp(inputs)))
+
+    def _median_move(self) -> float:
+        """Return the median time from one turning point to the next, s."""
+        return float(np.median(np.diff(self.times[self._turns()])))
 
     def evaluate(self, static: Candidate, gap: int) -> list[Evaluation]:
         """Return the errors of a Hammerstein model with a candidate's operator; none if nothing need follow it.
@@ -109,9 +119,13 @@ class HeldOutInTime:
             smoothing=static.smoothing or 0.0,
         )
         _check_skipped(measured, problem)
-        # At one rate, creep is hysteresis to the record: it would be found in place of a lag.
-        slow = {"creep"} if self.has_one_rate() else set()
-        search, found = choose_elements(search, [element for element in CHOICE if element not in slow])
+        among = list(CHOICE)
+        if self.has_one_rate():
+            # To such a record creep is hysteresis, and would be found in place of a lag. So is a resonance that does
+            # not ring out within a move.
+            among.remove("creep")
+            search = replace(search, longest_period=_RINGING * self._median_move())
+        search, found = choose_elements(search, among)
         if not found.elements:
             return None
         columns, drifts = search.responses(found.elements, found.values)

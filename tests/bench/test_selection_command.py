@@ -66,6 +66,86 @@ def test_the_chosen_model_is_found_and_has_its_errors_again(bench, record, tmp_p
     assert json.loads(predicted.read_text())["rms"] == pytest.approx(content["rms"], rel=1e-6)
 
 
+@pytest.mark.parametrize("model", ["polynomial", "preisach", "prandtl-ishlinskii"])
+def test_errors_of_all_rows_beside_those_fitted_are_those_of_predict(bench, record, tmp_path, model):
+    out, result, predicted = tmp_path / "model.json", tmp_path / "result.json", tmp_path / "predicted.json"
+    code, text, err = bench(
+        "identify", record, *COLUMNS, "--model", model, "--train", "0:150", "--out", out, "--json", result
+    )
+    assert code == 0, err
+    content = json.loads(result.read_text())
+    assert content["fitted"] == 150
+    assert f"150 fitted of {content['samples']} (skipped: 0)" in text
+    code, text_of_predict, err = bench(
+        "predict", out, record, *COLUMNS, "--out", tmp_path / "p.csv", "--json", predicted
+    )
+    assert code == 0, err
+    assert json.loads(predicted.read_text())["rms"] == pytest.approx(content["all_rows"]["rms"], rel=1e-9)
+    assert content["rms"] != pytest.approx(content["all_rows"]["rms"], rel=1e-3)
+
+    def stated(text, name):
+        return next(line for line in text.splitlines() if line.strip().startswith(name)).strip()[len(name) :].strip()
+
+    assert stated(text, "RMS error of all rows") == stated(text_of_predict, "RMS error")
+
+
+def test_the_model_is_kept_where_the_rows_of_the_test_are_not_there(bench, record, tmp_path):
+    out = tmp_path / "model.json"
+    code, _, err = bench("identify", record, *COLUMNS, "--model", "polynomial", "--test", "9000:", "--out", out)
+    assert code == 2
+    assert "--test 9000: goes beyond the last row" in err
+    assert load_model(out).name == "polynomial"
+
+
+def test_a_file_for_the_test_is_read_before_anything_is_fitted(bench, record):
+    code, text, err = bench("identify", record, *COLUMNS, *SOME, "--test", "missing.csv")
+    assert code == 3
+    assert "missing.csv does not exist" in err
+    assert "held out" not in text
+
+
+def test_an_exact_line_is_chosen_as_such(bench, tmp_path):
+    inputs = ramps([0.0, 10.0, *np.random.default_rng(3).uniform(0.0, 10.0, 16)], 0.4)
+    np.savetxt(
+        tmp_path / "line.csv", np.column_stack([inputs, 2.0 * inputs + 1.0]),
+        header="voltage [V],travel [mm]", delimiter=",", comments="",
+    )  # fmt: skip
+    result = tmp_path / "result.json"
+    code, _, err = bench("identify", tmp_path / "line.csv", *COLUMNS, "--json", result)
+    assert code == 0, err
+    assert json.loads(result.read_text())["rms_percent"] < 1e-9
+    assert "hardly answers" not in err
+
+
+def test_a_coarse_output_gives_a_model(bench, tmp_path):
+    measure(tmp_path / "record.csv")
+    rows = np.loadtxt(tmp_path / "record.csv", delimiter=",", skiprows=1)
+    rows[:, 1] = np.round(rows[:, 1] / 4.0) * 4.0
+    np.savetxt(tmp_path / "coarse.csv", rows, header="voltage [V],travel [mm]", delimiter=",", comments="")
+    code, _, err = bench(
+        "identify", tmp_path / "coarse.csv", *COLUMNS, "--model", "preisach-signed,polynomial", "--levels", "30",
+        "--initial", "skip",
+    )  # fmt: skip
+    assert code == 0, err
+
+
+def test_fewer_samples_than_cells_are_smoothed_by_cross_validation(bench, tmp_path):
+    measure(tmp_path / "long.csv", seed=4)
+    lines = (tmp_path / "long.csv").read_text().splitlines()
+    (tmp_path / "few.csv").write_text("\n".join(lines[:62]) + "\n")
+    errors = {}
+    for smoothing in ((), ("--smoothing", "0")):
+        result = tmp_path / "result.json"
+        code, _, err = bench(
+            "identify", tmp_path / "few.csv", *COLUMNS, "--model", "preisach", "--reversible", "linear",
+            "--test", tmp_path / "long.csv", *smoothing, "--json", result,
+        )  # fmt: skip
+        assert code == 0, err
+        assert ("by cross-validation; --smoothing" in " ".join(err.split())) is not bool(smoothing)
+        errors[smoothing] = json.loads(result.read_text())["test"]["raw"]["rms"]
+    assert errors[()] < errors["--smoothing", "0"]
+
+
 def test_rows_are_kept_for_the_test(bench, record, tmp_path):
     result = tmp_path / "result.json"
     code, text, err = bench(
@@ -129,9 +209,15 @@ def test_one_model_of_several_files(bench, record, tmp_path):
     ("options", "word"),
     [
         (("--model", "polynomial", "--train", "5"), "START:STOP"),
-        (("--model", "polynomial", "--train", "9000:"), "--train leaves none"),
+        (("--model", "polynomial", "--train", "9000:"), "--train 9000: goes beyond the last row"),
+        (("--model", "polynomial", "--train", "0:9000"), "--train 0:9000 goes beyond the last row"),
         (("--model", "polynomial", "--test", "9000:"), "--test 9000:"),
         (("--model", "polynomial,plain"), "there is no model 'plain'"),
+        (("--model", "polynomial,hammerstein"), "takes part with --time COLUMN"),
+        ((*SOME, "--initial", "Negative"), "--initial: expected 'negative', 'positive', 'skip' or 'estimate'"),
+        ((*SOME, "--orientation", "down"), "--orientation: expected 'auto', 'rising' or 'falling', got 'down'"),
+        ((*SOME, "--skip", "-3"), "--skip"),
+        (("--output", "voltage"), "--input and --output are the same column, voltage"),
         (("--model", "polynomial", "--table-out", "t.csv"), "--table-out"),
         ((*SOME, "--cross-validate"), "--cross-validate"),
         ((*SOME, "--levels", "5"), "levels: none of the models has this option"),
@@ -201,8 +287,8 @@ def test_each_row_of_the_table_is_one_line_under_a_head_with_its_unit(bench, rec
     assert code == 0, err
     lines = text.splitlines()
     head = next(place for place, line in enumerate(lines) if "held out" in line)
-    assert lines[head].split() == ["training", "held", "out", "%", "of", "other", "CPU"]
-    assert lines[head + 1].split() == ["model", "free", "mm", "mm", "±", "range", "cycles,", "mm", "s"]
+    assert lines[head].split() == ["deg.", "of", "training", "held", "out", "%", "of", "other", "CPU"]
+    assert lines[head + 1].split() == ["model", "freedom", "mm", "mm", "±", "range", "cycles,", "mm", "s"]
     rows = lines[head + 2 : next(k for k, line in enumerate(lines) if line.startswith("* chosen"))]
     assert sum(row.startswith("*") for row in rows) == 1
     for row in rows:

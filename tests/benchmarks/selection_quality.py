@@ -41,7 +41,7 @@ CASES = [*product(PLANTS, KINDS), *product(("butterfly",), ("mixed", "drift"))]
 ROWS = 1500
 WITHIN = 1.2
 """Ratio of the error of the default to that of the best by hand that is to be reached."""
-MEASURED = ("another session", "re-zeroed", "negated", "first 60 rows")
+MEASURED = ("another session", "re-zeroed", "negated", "first 60 rows", "re-zeroed, with time")
 """Kinds of cases of measured sessions."""
 
 
@@ -148,6 +148,8 @@ def measured_case(folder: Path, kind: str) -> Case:
     usual = Case(first[:, 1], first[:, 2], second[:, 1], second[:, 2], rezeroed="re-zeroed" in kind)
     if "negated" in kind:
         return replace(usual, outputs=-usual.outputs, truth=-usual.truth)
+    if "with time" in kind:
+        return replace(usual, times=first[:, 0], other_times=second[:, 0])
     if "first 60 rows" in kind:
         return replace(usual, inputs=usual.inputs[:60], outputs=usual.outputs[:60])
     return usual
@@ -177,8 +179,8 @@ def grid_in_time() -> Iterator[Candidate]:
         *({"static": "duhem", "degree": degree} for degree in (3, 5, 7)),
     )
     # A resonance after many columns takes long, and no record has one.
-    settings = [*product(planes, ("drift", "lag", "delay", "creep"))]
-    settings += product(shapes, ("drift", "lag", "resonance", "delay", "creep"))
+    settings = [*product(planes, ("drift", "lag", "delay", "creep", "lag,drift", "lag,creep"))]
+    settings += product(shapes, ("drift", "lag", "resonance", "delay", "creep", "lag,drift", "lag,creep"))
     for (static, elements), memory in product(settings, (None, "skip")):
         for weight in (0.0, 0.1) if "levels" in static else (0.0,):
             yield Candidate("hammerstein", {**static, "dynamics": elements}, "auto", memory, weight)

@@ -213,3 +213,18 @@ def test_dead_zones_catch_saturation_and_asymmetry():
 def test_wrong_plays_are_named(options, message):
     with pytest.raises(ValueError, match=message):
         identify("prandtl-ishlinskii", [0.0, 1.0, 0.5], [0.0, 1.0, 0.7], **options)
+
+
+def test_a_sensor_that_stands_still_is_named():
+    inputs = ramps([0.0, 10.0, 0.0, 10.0, 0.0], 0.1)
+    rng = np.random.default_rng(0)
+    outputs = inputs + 0.01 * rng.standard_normal(inputs.size)
+    assert not [text for text in check_data(inputs, outputs) if "stands still" in text]
+    frozen = outputs.copy()
+    frozen[150:200] = frozen[150]
+    (text,) = [text for text in check_data(inputs, frozen) if "stands still" in text]
+    assert "from row 150 to row 199" in text
+    assert "--train" in text
+    # Coarse readings repeat everywhere, a saturated specimen where the input hardly moves.
+    assert not [text for text in check_data(inputs, np.round(frozen)) if "stands still" in text]
+    assert not [text for text in check_data(np.where(frozen == frozen[150], 5.0, inputs), frozen) if "still" in text]

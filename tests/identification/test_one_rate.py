@@ -1,13 +1,16 @@
 """At one rate, the time constant of a lag is that of the operator that fits best."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
-from hysteretic_plants import duhem, jiles_atherton, random_reversals, settled
+from hysteretic_plants import bouc_wen, duhem, jiles_atherton, random_reversals, settled, through
 
 from bench.hysteresis import identifiable_models
-from bench.identification.evaluation import Measurements
+from bench.identification.evaluation import Candidate, Measurements
 from bench.identification.near_best import simplest_near_best
 from bench.identification.selection import select
+from bench.identification.time_stage import is_smooth_plane
 from bench.timed import LinearPart, identify_in_time
 from bench.timed.held_out import HeldOutInTime
 
@@ -98,3 +101,91 @@ def test_the_least_misfit_errs_less_at_another_rate_than_the_least_error_left_ou
     with capsys.disabled():
         print(f"\ngeometric means of {len(by_fit)}, % of the range: {first:.2f} by the fit, {second:.2f} by blocks")
     assert first < second
+
+
+CYCLE = 0.028
+"""Time of a cycle, s: 28 time constants of the lag."""
+STEP_OF_CYCLES = CYCLE / 100.0
+DRIFT = 0.02
+"""Over the record, by the range."""
+
+
+def major_loops(plant, seed, rows=3000, part=LAG, drift=DRIFT):
+    """Return times, inputs and noisy outputs of cycles of the whole range, all at one rate, 100 rows each."""
+    inputs = through([0.0, *[1.0, -1.0] * (rows // 100), 0.0], rows)
+    times = STEP_OF_CYCLES * np.arange(rows)
+    outputs = part.respond(times, settled(plant, inputs)[:, None])[0][:, 0]
+    noise = 0.003 * np.random.default_rng(seed).standard_normal(rows)
+    return times, inputs, outputs + np.ptp(outputs) * (noise + drift * times / times[-1])
+
+
+def error_on_smaller_cycles(plant, times, inputs, outputs, one):
+    """Return the standard deviation, % of the range, of the errors of a model with time on cycles that fade."""
+    known = Measurements.of(inputs, outputs).known if one.initial == "skip" else 0
+    model = identify_in_time(
+        "hammerstein", times, inputs, outputs, initial=one.initial, skip=known, orientation=one.orientation,
+        smoothing=one.smoothing or 0.0, **one.options,
+    ).model  # fmt: skip
+    ends = np.repeat(np.linspace(1.0, 0.1, 10), 2) * np.tile([1.0, -1.0], 10)
+    smaller = np.concatenate([np.linspace(a, b, 50, endpoint=False) for a, b in pairwise([0.0, *ends])])
+    moments = STEP_OF_CYCLES * np.arange(smaller.size)
+    truth = LAG.respond(moments, settled(plant, smaller)[:, None])[0][:, 0]
+    wrong = (truth - model.evaluate(moments, smaller))[100:]
+    return 100.0 * np.std(wrong) / np.ptp(truth)
+
+
+def choose_of_major_loops(plant, seed, models=None, **record_of):
+    times, inputs, outputs = major_loops(plant, seed, **record_of)
+    measured = Measurements.of(inputs, outputs)
+    in_time = HeldOutInTime(measured, times, inputs.size)
+    found = select(measured, models or tuple(identifiable_models()), in_time=in_time)
+    assert found.has_one_kind
+    assert found.has_one_rate
+    return found, (times, inputs, outputs)
+
+
+def test_of_one_kind_of_cycle_at_one_rate_a_smooth_plane_is_chosen():
+    found, sequence = choose_of_major_loops(relays, 0, ("preisach", "duhem"), rows=1000)
+    assert is_smooth_plane(found.chosen)
+    assert "lag" in found.chosen.candidate.options["dynamics"]
+    assert error_on_smaller_cycles(relays, *sequence, found.chosen.candidate) < 2.0
+
+
+@pytest.mark.seeds
+@pytest.mark.timeout(1200)
+def test_a_smooth_plane_errs_less_on_smaller_cycles_than_the_least_error_left_out(capsys):
+    by_plane, by_blocks = [], []
+    for plant in (bouc_wen, duhem, jiles_atherton, relays):
+        for seed in (0, 1):
+            found, sequence = choose_of_major_loops(plant, seed)
+            if not is_smooth_plane(found.chosen):
+                continue
+            for each, errors in ((found.chosen, by_plane), (simplest_near_best(with_time(found))[1], by_blocks)):
+                errors.append(error_on_smaller_cycles(plant, *sequence, each.candidate))
+    first, second = (np.exp(np.mean(np.log(each))) for each in (by_plane, by_blocks))
+    with capsys.disabled():
+        print(
+            f"\n{len(by_plane)} records, % of the range, geometric mean and worst: "
+            f"{first:.2f}, {max(by_plane):.2f} by the smooth plane, {second:.2f}, {max(by_blocks):.2f} by blocks"
+        )
+    assert first < second
+
+
+# A tenth of a move long.
+_RATE = 2.0 * np.pi * 20.0 / CYCLE
+RINGING = LinearPart(0.0, (2.0 * 0.05 / _RATE, _RATE**-2), np.empty(0), np.empty(0))
+
+
+@pytest.mark.parametrize(
+    ("plant", "operator", "part", "has_resonance"),
+    [
+        (duhem, Candidate("duhem", {"degree": 3}, "auto", "skip"), LAG, False),
+        (bouc_wen, Candidate("bouc-wen", {}, "rising", "skip"), RINGING, True),
+    ],
+    ids=["lag", "ringing"],
+)
+def test_at_one_rate_a_resonance_rings_out_within_a_move(plant, operator, part, has_resonance):
+    times, inputs, outputs = major_loops(plant, 0, part=part, drift=0.0)
+    measured = Measurements.of(inputs, outputs)
+    (found,) = HeldOutInTime(measured, times, inputs.size).evaluate(operator, 5)
+    assert ("resonance" in found.candidate.options["dynamics"].split(",")) is has_resonance

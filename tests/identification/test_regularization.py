@@ -87,6 +87,21 @@ def test_that_holds_on_any_plane(plant, options):
     assert ratio_to_cross_validated(OTHER_PLANTS[plant], 0, options) <= 3.0
 
 
+@pytest.mark.parametrize("plant", OTHER_PLANTS)
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("plane", [None, (-3.0, 3.0)])
+def test_that_holds_with_60_samples(plant, seed, plane):
+    rng = np.random.default_rng(seed)
+    inputs = np.interp(np.linspace(0.0, 8.0, 60), np.arange(9.0), [-1.0, 1.0, -1.0, *rng.uniform(-1.0, 1.0, 6)])
+    others = ramps([-1.0, 1.0, *rng.uniform(-1.0, 1.0, 30)], 0.05)
+    raw = OTHER_PLANTS[plant]
+    outputs, expected = settled(raw, inputs), settled(raw, others)
+    noisy = outputs + 0.01 * np.ptp(outputs) * rng.standard_normal(60)
+    options = {"levels": 20, "reversible": "linear"} | ({} if plane is None else {"plane": plane})
+    found = identify("preisach-signed", inputs, noisy, **options)
+    assert held_out(found, others, expected, 81) <= 3.0 * found.regularization.rms
+
+
 @pytest.mark.seeds
 @pytest.mark.parametrize("plant", OTHER_PLANTS)
 @pytest.mark.parametrize("seed", range(4))

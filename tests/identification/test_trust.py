@@ -81,6 +81,7 @@ def noise():
             r"^the plane from 30 to 70 .*--plane 0 10,",
         ),
         ((INPUTS, measured(INPUTS)), "preisach", {"plane": (4.0, 5.0)}, r"^the plane from 4 to 5 .*--plane 0 10,"),
+        ((INPUTS, measured(INPUTS)), "preisach", {"plane": (3.0, 7.0)}, r"^the plane from 3 to 7 .*--plane 0 10,"),
         (
             (INPUTS, measured(INPUTS)),
             "preisach-nonmonotonic",
