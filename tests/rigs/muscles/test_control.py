@@ -266,9 +266,9 @@ def rounds(inverse):
 @pytest.mark.parametrize("load", [4.9, 8.82])
 def test_length_under_a_load(rounds, load):
     errors = rounds[load, "closed-loop-inverse"] / MILLIMETRE
-    after_ten, _ = rms(errors)
-    # The fit takes one of several equal minimisers, which differs from processor to processor: the median of sessions.
-    assert np.median([rms(session)[1] for session in np.split(errors, len(SEEDS))]) <= 0.02
+    after_ten, final = rms(errors)
+    # The fit takes one of several equal minimisers, which differs from processor to processor by some percent.
+    assert final <= 0.022
     assert after_ten <= 0.07
     assert np.abs(errors[:, 1]).max() <= 0.1
     assert np.median(np.abs(errors[:, 1])) <= 0.015
