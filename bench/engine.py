@@ -73,6 +73,8 @@ class Outcome:
         Number of finished steps.
     laboratory_seconds : float
         Laboratory time from the start to the safe state.
+    own_seconds : float
+        The part of it that passed in this process: of a run that is resumed, from there on.
     safe_state : mapping of str to str
         By device: `safe`, or what went wrong.
     error : Exception or None
@@ -87,6 +89,7 @@ class Outcome:
     reason: str
     steps: int
     laboratory_seconds: float
+    own_seconds: float
     safe_state: Mapping[str, str]
     error: Exception | None
     pace: Pace | None = None
@@ -126,6 +129,8 @@ class Engine:
         self._interrupts = interrupts
         self._run = RunAtHand(station, journal, observers, interrupts, ask, zero, messages)
         self._changes = deque(changes)
+        self._began = self._run.zero
+        """Time of the clock at which this process has begun with the run, s."""
         self._patience = station.description.file.safety.patience
         self._work: dict[type[Message], Callable[[Any], Reading]] = {
             Step: self._step,
@@ -154,6 +159,7 @@ class Engine:
             self._clock.restart_pace()
         self._clock.suspension()  # what was before the run does not concern it
         error: Exception | None = None
+        self._began = self._run.zero if past is None else self._clock.now()
         try:
             self._carry_out(definition, parameters, past)
         # Every exit path leads through the safe state and the end of the record, after any exception.
@@ -387,7 +393,8 @@ class Engine:
         else:
             status = "failed"
             reason = str(error) if isinstance(error, BenchError) else f"{type(error).__name__}: {error}"
-        finished = self._clock.now() - self._run.zero
+        now = self._clock.now()
+        finished, own = now - self._run.zero, now - self._began
         late = {label: each.to_json() for label, each in self._run.lateness.items()}
         pace = self._clock.pace() if isinstance(self._clock, PacedClock) else None
         try:
@@ -409,7 +416,7 @@ class Engine:
         except Exception as failure:
             why = f"the journal could not be finished: {failure}"
             status, reason, error = "failed", f"{reason}; {why}" if reason else why, error or failure
-        return Outcome(status, reason, self._run.steps, finished, safe_state, error, pace, late)
+        return Outcome(status, reason, self._run.steps, finished, own, safe_state, error, pace, late)
 
 
 def check_before_moving(description: RigDescription, definition: ProtocolDefinition, expected: Plan) -> None:

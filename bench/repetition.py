@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -88,6 +89,11 @@ def repeat(
     with Record(run) as record:
         meta, files = record.meta, record.files()
         changes = ParameterChange.among((event.kind, event.text) for event in record.events())
+        # What the repetition is compared with: a damaged row is found before anything moves.
+        deque(record.step_records(), maxlen=0)
+        record.telemetry()
+    if "protocol_source" not in meta and "recovered" in meta:
+        raise DataError(f"{run} cannot be repeated: it is a recovered copy of a record whose metadata were lost")
     if "protocol_source" not in meta:
         raise DataError(
             f"{run} cannot be repeated: its journal (schema {meta.get('schema')}) does not hold the files that the "

@@ -75,10 +75,12 @@ def resume(asked: Resume, console: Console, interrupts: Interrupts | None = None
     DataError
         If it is no run, or its record is damaged or of an older schema.
     ConfigurationError
-        If it was completed, goes on, has no finished step, or something has changed since; nothing has moved.
+        If it was completed, goes on, has no finished step, or something has changed since; if it is a journal that
+        does not stand in a folder of its own; nothing has moved.
     DeviceError
         If a device cannot be connected, or is in an error that the death of the run did not cause.
     """
+    _check_is_in_its_folder(asked.folder)
     with ExitStack() as stack:
         folder = asked.folder if asked.folder.is_dir() else asked.folder.parent
         # A reader may touch the companions of the file.
@@ -118,10 +120,27 @@ def resume(asked: Resume, console: Console, interrupts: Interrupts | None = None
     return result
 
 
+def _check_is_in_its_folder(given: Path) -> None:
+    """Raise ConfigurationError for a journal of another name, such as a recovered copy: a run is one folder."""
+    if given.name == FILE_NAME or not given.is_file() or given.suffix != ".sqlite":
+        return
+    place = given.absolute().parent
+    other = place.with_name(f"{place.name}-recovered")
+    raise ConfigurationError(
+        f"{given} is not the {FILE_NAME} of a folder of its own, in which a run is resumed. Copy it into one: "
+        f"`mkdir {other} && cp {given} {other / FILE_NAME}`, and then `bench resume {other}`"
+    )
+
+
 def _check_can_be_resumed(record: Record, given: Path) -> None:
     meta = record.meta
     if record.status == "completed":
         raise ConfigurationError(f"{given} was completed; there is nothing to resume")
+    if "recovered" in meta and "rig_given" not in meta:
+        raise ConfigurationError(
+            f"{given} is a recovered copy of a record whose metadata were lost; it takes them to resume a run, so "
+            "start it anew"
+        )
     if meta["schema"] != SCHEMA or "rig_given" not in meta:
         raise ConfigurationError(
             f"{given} was recorded by an older version, which did not record all that it takes to resume a run; "

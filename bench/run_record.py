@@ -11,21 +11,23 @@ import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+import unicodedata
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 from bench import registry
 from bench.binding import Slots
 from bench.clock import wall_time
 from bench.description import RigDescription
 from bench.errors import ConfigurationError
+from bench.journal import FILE_NAME, files_of
 from bench.protocol import Plan, ProtocolDefinition, ProtocolParameters, digest_of, is_installed
-from bench.recorded_files import file_name
+from bench.recorded_files import RIG_FILE_NAME, file_name
 
 _PACKAGES = (
     "actuator-bench",
@@ -40,6 +42,7 @@ _PACKAGES = (
 )
 _LONGEST_NAME = 96
 _LONGEST_PART = 32
+_MORE = "-more"
 _COMPARED = (
     "protocol",
     "protocol_source.sha256",
@@ -147,16 +150,18 @@ def run_name(protocol: ProtocolDefinition, meta: Mapping[str, Any]) -> str:
     At most 96 letters, digits and `.+_-`, which every file system takes; what is left out counts as `more`. `meta` is
     what `metadata` returns, with the `overrides`.
     """
-    name, files = f"{meta['rig']}-{protocol.name}", protocol.file_parameters
+    files = protocol.file_parameters
+    name = "-".join(_in_a_name(each) or "x" for each in (meta["rig"], protocol.name))
+    name = name[: _LONGEST_NAME - len(_MORE)].rstrip("-.")
     parts = [f"{key}-{_short(value)}" for key, value in meta["changed"].items() if key not in files]
     # Last what the runs of a series often share: files by the end of their path, and values of the rig file.
     for key in filter(meta["changed"].__contains__, files):
         parts.append(f"{key}-{Path(file_name(meta['changed'][key])).stem}")
     parts += [f"{key.rpartition('.')[2]}-{value}" for key, value in meta["overrides"].items()]
     for part in parts:
-        part = re.sub(r"[^A-Za-z0-9.+_-]+", "-", part)[:_LONGEST_PART].rstrip("-.")
-        if len(name) + len(part) + len("--more") > _LONGEST_NAME:
-            return f"{name}-more"
+        part = _in_a_name(part)[:_LONGEST_PART].rstrip("-.")
+        if len(name) + 1 + len(part) + len(_MORE) > _LONGEST_NAME:
+            return f"{name}{_MORE}"
         name += f"-{part}"
     return name
 
@@ -174,19 +179,70 @@ def differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[Dif
 def make_folder(parent: Path, name: str) -> Path:
     """Make the folder of a run: its name, then the time of day; a counter where two runs start in one second.
 
-    Raises ConfigurationError if it cannot be made.
+    Raises ConfigurationError if it cannot be made; nothing is left of it then.
     """
-    stamp = wall_time().strftime("%Y%m%d-%H%M%S")
-    for suffix in ("", *(f"-{i}" for i in range(2, 1000))):
-        folder = parent / f"{name}-{stamp}{suffix}"
-        try:
-            folder.mkdir(parents=True)
-        except FileExistsError:
-            continue
-        except OSError as error:
-            raise ConfigurationError(f"the folder of the run cannot be made: {error}") from None
-        return folder
-    raise ConfigurationError(f"{parent} holds a thousand runs of this second already")
+    with NewFolder() as new:
+        folder = new.make(parent, name)
+        new.keep()
+    return folder
+
+
+class NewFolder:
+    """The folder of a run that is about to start; a context manager that removes it again unless the run does start.
+
+    It stays if it holds anything but what a start puts there.
+
+    Parameters
+    ----------
+    files : sequence of str
+        Names of what a start puts there beside journal and rig file.
+    empty_files : sequence of str
+        Names of files that it puts there empty; with a content they are something else.
+    """
+
+    def __init__(self, files: Sequence[str] = (), empty_files: Sequence[str] = ()) -> None:
+        self._files = RIG_FILE_NAME, *files
+        self._empty_files = empty_files
+        self._made: list[Path] = []
+        """The folder, and those above it that were made for it, the innermost first."""
+
+    def make(self, parent: Path, name: str) -> Path:
+        """Make the folder; as `make_folder`."""
+        stamp = wall_time().strftime("%Y%m%d-%H%M%S")
+        self._made = [each for each in (parent, *parent.parents) if not each.exists()]
+        for suffix in ("", *(f"-{i}" for i in range(2, 1000))):
+            folder = parent / f"{name}-{stamp}{suffix}"
+            try:
+                folder.mkdir(parents=True)
+            except FileExistsError:
+                continue
+            except OSError as error:
+                raise ConfigurationError(f"the folder of the run cannot be made: {error}") from None
+            self._made.insert(0, folder)
+            return folder
+        raise ConfigurationError(f"{parent} holds a thousand runs of this second already")
+
+    def keep(self) -> None:
+        """Keep the folder: the run starts."""
+        self._made = []
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        # Another run may have its folder beside this one by now.
+        with suppress(OSError):
+            if self._made and self._made[0].is_dir():
+                self._remove_files(self._made[0])
+            for folder in self._made:
+                folder.rmdir()
+
+    def _remove_files(self, folder: Path) -> None:
+        ours = {folder / name for name in self._files} | {*files_of(folder / FILE_NAME)}
+        ours |= {path for name in self._empty_files if (path := folder / name).is_file() and not path.stat().st_size}
+        if (found := {*folder.iterdir()}) <= ours:
+            for path in found:
+                path.unlink()
 
 
 def current_user() -> str:
@@ -195,6 +251,13 @@ def current_user() -> str:
         return getpass.getuser()
     except (OSError, KeyError):
         return "unknown"
+
+
+def _in_a_name(text: str) -> str:
+    """Return a text as every file system takes it as a name: letters, digits and `.+_-`."""
+    # Letters without their marks.
+    plain = "".join(each for each in unicodedata.normalize("NFKD", text) if not unicodedata.combining(each))
+    return re.sub(r"[^A-Za-z0-9.+_-]+", "-", plain).strip("-.")
 
 
 def _short(value: Any) -> str:  # noqa: ANN401 - anything that JSON can hold

@@ -285,8 +285,9 @@ class RunAtHand:
             values=self._row(values),
             seen=tuple(seen),
         )
-        self._journal.step(record)
+        # What is handed over counts: a record that ends the run, as it was removed, has the step all the same.
         self.steps += 1
+        self._journal.step(record)
         if self._one_step:
             self._one_step, self._pause_reason, self._is_demanded = False, "one step", True
         self._tell(lambda observer: observer.step(record))

@@ -5,8 +5,8 @@ from __future__ import annotations
 import os
 import sys
 import threading
-from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -26,7 +26,8 @@ from bench.engine import Engine, Outcome, check_before_moving
 from bench.errors import AbortError, ConfigurationError
 from bench.extras import MissingExtraError, needed_for
 from bench.faults import read_schedule, schedule_faults
-from bench.guardian.remote import GuardedRig, RemoteStation
+from bench.guardian.black_box import FILE_NAME as BLACK_BOX_NAME
+from bench.guardian.remote import STACKS_NAME, GuardedRig, RemoteStation
 from bench.interrupts import Interrupts, say_at_once
 from bench.journal import FILE_NAME, Journal, abandon
 from bench.locks import Holder, Locks
@@ -43,7 +44,7 @@ from bench.rehearsal import Rehearsal, rehearse
 from bench.remaining_time import Expectation
 from bench.rig import Rig, clock_for
 from bench.rig_file import RigFile, load_rig
-from bench.run_record import differences, make_folder, metadata, run_name
+from bench.run_record import NewFolder, differences, metadata, run_name
 from bench.start_checks import check_start, overdue_calibrations
 from bench.station.interface import Station
 from bench.station.local import LocalStation
@@ -140,8 +141,8 @@ class RunResult:
 
     @property
     def time_ratio(self) -> float:
-        """Laboratory time over wall-clock time."""
-        return self.outcome.laboratory_seconds / self.wall_seconds
+        """Laboratory time over wall-clock time, both of this process: of a run that is resumed, from there on."""
+        return self.outcome.own_seconds / self.wall_seconds
 
 
 def carry_out(
@@ -186,6 +187,8 @@ def carry_out(
             rehearsal = _rehearsed(run, rig_file, parameters, console, interrupts)
         if rehearsal is not None:
             rehearsal.raise_if_wrong()
+        # Removed again after all that may write there is closed.
+        new = stack.enter_context(NewFolder((RECORDING_NAME, BLACK_BOX_NAME), (STACKS_NAME,)))
         station, laboratory = _connected(run, rig_file, clock, attachment, again)
         guardian = station if isinstance(station, RemoteStation) else None
         # The lines only: the engine brings the devices into their safe state, and says how that went.
@@ -212,12 +215,15 @@ def carry_out(
             meta["repeats"] = original.meta["run"]
             for difference in differences(original.meta, meta):
                 print_plain(console, f"not as in the original: {difference}")
-        folder = again.folder if again is not None else make_folder(run.folder, run_name(run.protocol, meta))
+        folder = again.folder if again is not None else new.make(run.folder, run_name(run.protocol, meta))
         if again is None:
             locks = stack.enter_context(Locks(Holder.of_this_process(rig_file.name, f"run {folder}")))
             locks.take_folder(folder)
-        if guardian is not None:
-            guardian.keep_record(folder)
+        with _written_into(folder):
+            if guardian is not None:
+                guardian.keep_record(folder)
+            if again is None:
+                (folder / RIG_FILE_NAME).write_text(rig_file.text, encoding="utf-8")
         meta["run"] = folder.name
         meta["rehearsal"] = None if rehearsal is None else rehearsal.to_json()
         signals = description.signals + trace_signals(run.protocol, description, slots)
@@ -226,7 +232,6 @@ def carry_out(
             changes = [str(each) for each in differences(again.latest, meta)]
             journal = again.reopen(folder / FILE_NAME, resumption, meta, changes, clock.now(), patience)
         else:
-            (folder / RIG_FILE_NAME).write_text(rig_file.text, encoding="utf-8")
             given = files | {RIG_FILE_NAME: rig_file.text.encode()}
             # A run on the virtual clock moves nothing, and is done again in the time that its flushes would take.
             flushed = clock.sleep_waits
@@ -259,11 +264,22 @@ def carry_out(
         engine = Engine(station, journal, observers, interrupts, ask, zero, notifier, run.changes)
         if again is None:
             engine.warn(warnings)
+        new.keep()
         outcome = engine.run(run.protocol, parameters, resumption)
         if dashboard is not None:
             dashboard.finish(outcome.status, outcome.reason, outcome.lateness)
     interrupts.finish()
     return RunResult(folder, outcome, stopwatch.seconds())
+
+
+@contextmanager
+def _written_into(folder: Path) -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise ConfigurationError(
+            f"the folder of the run, {folder}, cannot be written: {error.strerror or error}; nothing has moved"
+        ) from None
 
 
 def _open_view(dashboard: Dashboard, console: Console) -> None:

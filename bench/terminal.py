@@ -4,21 +4,24 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from datetime import timedelta
 from types import TracebackType
 from typing import Self
 
-from rich.console import Console
+from rich.console import Console, ConsoleOptions, RenderableType, RenderResult
 from rich.control import Control
 from rich.errors import LiveError
-from rich.progress import BarColumn, Progress, SpinnerColumn, TaskID, TextColumn
+from rich.progress import Progress, SpinnerColumn, Task, TaskID, TextColumn
+from rich.progress_bar import ProgressBar
 from rich.segment import ControlType
-from rich.table import Column
+from rich.table import Table
+from rich.text import Text
 
 from bench.clock import Stopwatch, wall_time
 from bench.devices import Signal
+from bench.interrupts import say_at_once
 from bench.journal import Event, StepRecord
 from bench.printing import print_plain
 from bench.remaining_time import Expectation, RemainingTime
@@ -30,6 +33,95 @@ _REFRESH = 0.1
 
 _UNSEEN = 2.0
 """Longest rehearsal that needs no display, s of wall-clock time."""
+
+
+_GAP = "  "
+"""Between two parts of the progress of a run."""
+
+_LEAST_BAR = 10
+"""Columns below which a bar says nothing."""
+
+_STATE = 7
+"""Columns of the word that says that the run stands still, so that the bar does not move for it."""
+
+
+_rehearsing = threading.Event()
+"""Set while nothing moves, as a run is rehearsed."""
+
+
+class _RunProgress(Progress):
+    """A bar of a run with what there is to read beside it, folded where the terminal is narrow.
+
+    Nothing is cut. Name, phase, steps and times come first; the bar takes what they leave of a line, and readings
+    that do not fit beside them take lines of their own.
+    """
+
+    def get_renderables(self) -> Iterator[RenderableType]:
+        """Yield what is drawn."""
+        for task in self.tasks:
+            yield _Line(task)
+
+
+class _Line:
+    """One task of `_RunProgress`, as wide as the terminal is when it is drawn."""
+
+    def __init__(self, task: Task) -> None:
+        self._task = task
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        task, width = self._task, options.max_width
+        names = [(task.description, "bold"), (f"{task.fields['phase']:{_STATE}}", "")]
+        facts = [(task.fields["steps"], "green"), *((text, "") for text in task.fields["times"])]
+        readings = [(text, "cyan") for text in task.fields["readings"]]
+        names, facts, readings = ([part for part in parts if part[0]] for parts in (names, facts, readings))
+        whole = _joined([*names, *facts, *readings])
+        if whole.cell_len + len(_GAP) + _LEAST_BAR <= width:
+            yield self._with_bar(names, [*facts, *readings], width)
+            return
+        if _joined([*names, *facts]).cell_len + len(_GAP) + _LEAST_BAR <= width:
+            yield self._with_bar(names, facts, width)
+        else:
+            yield from _folded([*names, *facts], width)
+        yield from _folded(readings, width)
+
+    def _with_bar(self, before: _Parts, after: _Parts, width: int) -> Table:
+        left, right = _joined(before), _joined(after)
+        room = width - left.cell_len - right.cell_len - len(_GAP) * (bool(before) + bool(after))
+        bar = ProgressBar(
+            total=self._task.total,
+            completed=self._task.completed,
+            width=room,
+            pulse=self._task.total is None,
+            animation_time=self._task.get_time(),
+        )
+        line = Table.grid(padding=(0, len(_GAP), 0, 0), pad_edge=False)
+        line.add_row(left, bar, right)
+        return line
+
+
+_Parts = Sequence[tuple[str, str]]
+"""Texts that are not broken, each with its style."""
+
+
+def _joined(parts: _Parts) -> Text:
+    line = Text()
+    for text, style in parts:
+        if line:
+            line.append(" " if line.plain.endswith(",") else _GAP)
+        line.append(text, style)
+    return line
+
+
+def _folded(parts: _Parts, width: int) -> Iterator[Text]:
+    """Yield lines of parts, as many in each as fit."""
+    line: list[tuple[str, str]] = []
+    for part in parts:
+        if line and _joined([*line, part]).cell_len > width:
+            yield _joined(line)
+            line = []
+        line.append(part)
+    if line:
+        yield _joined(line)
 
 
 class ProgressDisplay:
@@ -83,21 +175,9 @@ class ProgressDisplay:
         self._since_redraw = Stopwatch()
 
     def _make_bar(self) -> tuple[Progress, TaskID]:
-        progress = Progress(
-            # Names and phases are the protocol's: no markup.
-            TextColumn("{task.description}", style="bold", markup=False),
-            # Wide enough for the word that says that the run stands still.
-            TextColumn("{task.fields[phase]}", markup=False, table_column=Column(min_width=7, no_wrap=True)),
-            BarColumn(bar_width=None),
-            TextColumn("{task.fields[steps]}", style="green", markup=False),
-            TextColumn("{task.fields[times]}", markup=False),
-            TextColumn("{task.fields[readings]}", style="cyan", markup=False),
-            console=self._console,
-            transient=False,
-            disable=not self._console.is_terminal,
-        )
+        progress = _RunProgress(console=self._console, transient=False, disable=not self._console.is_terminal)
         total = 1.0 if self._remaining is not None else None
-        task = progress.add_task(self._title, total=total, phase=self._phase, steps="", times="", readings="")
+        task = progress.add_task(self._title, total=total, phase=self._phase, steps="", times=(), readings=())
         return progress, task
 
     def stand_still(self, state: str) -> None:
@@ -117,6 +197,7 @@ class ProgressDisplay:
                 self._progress.start()
 
     def __enter__(self) -> Self:
+        _rehearsing.clear()
         self._since_start = Stopwatch()
         self._progress.start()
         return self
@@ -178,13 +259,14 @@ class ProgressDisplay:
 
     def _show(self, t: float, steps: int, values: Sequence[float]) -> None:
         self._since_redraw = Stopwatch()
-        times, completed = f"t {format_duration(t)}", 0.0
+        times, completed = [f"t {format_duration(t)}"], 0.0
         if self._remaining is not None:
             left = self._remaining.at(t, self._since_start.seconds())
             completed = left.share
-            times += f"  left {format_duration(left.laboratory)}, ends {_time_of_day(left.wall)}"
+            times += [f"left {format_duration(left.laboratory)},", f"ends {_time_of_day(left.wall)}"]
             if math.isfinite(left.at_most):
-                times += f", at most {_time_of_day(left.at_most)}"
+                times[-1] += ","
+                times.append(f"at most {_time_of_day(left.at_most)}")
         readings = [f"{signal.name} {values[i]:.{signal.precision}f} {signal.unit}" for i, signal in self._shown]
         self.latest = "  ".join(readings)
         with self.lock:
@@ -194,9 +276,14 @@ class ProgressDisplay:
                     completed=completed,
                     steps=f"{steps}/{self._steps or '?'}",
                     times=times,
-                    readings=self.latest,
+                    readings=readings,
                 )
-        report(steps, self._steps or None, "  ".join([times, *readings]))
+        report(steps, self._steps or None, _joined([(text, "") for text in (*times, *readings)]).plain)
+
+
+def say_what_ctrl_c_does(text: str) -> None:
+    """Say to the operator what was understood of Ctrl-C or a signal: nothing moves in a rehearsal, which it ends."""
+    say_at_once("ending the rehearsal; nothing has moved" if _rehearsing.is_set() else text)
 
 
 class RehearsalDisplay:
@@ -227,11 +314,15 @@ class RehearsalDisplay:
         self._shown = False
 
     def __enter__(self) -> Self:
+        _rehearsing.set()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        # What ends a rehearsal ends all: it is said in another thread, which may come later.
+        if kind is None:
+            _rehearsing.clear()
         with suppress(OSError):
             self._progress.stop()
 

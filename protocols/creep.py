@@ -3,9 +3,24 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from functools import partial
 
 from bench.devices import Actuator, Signal
-from bench.protocol import Dwell, Messages, Note, Phase, Slots, Step, Views, from_slot, parameter, protocol, unit_of
+from bench.protocol import (
+    Dwell,
+    Messages,
+    Phase,
+    Slot,
+    Slots,
+    Step,
+    Summary,
+    Views,
+    from_slot,
+    parameter,
+    protocol,
+    unit_of,
+)
 from protocols.preparation import LOAD, LoadedParameters, hang_load
 
 _DRIVE = unit_of("drive")
@@ -55,7 +70,12 @@ def creep(parameters: Parameters, slots: Slots) -> Messages:
             reading = yield Step({}, Dwell(parameters.interval))
             if i * parameters.interval >= parameters.settling:
                 responses.append(reading[response.signal])
-        yield Note(
-            f"{name}, {setpoint:g} {drive.setpoint_unit}: {response.signal} from {response.show(responses[0])} to "
-            f"{response.show(responses[-1])}, spread {response.show(max(responses) - min(responses))} after settling"
-        )
+        yield Summary(partial(_summary, f"{name}, {setpoint:g} {drive.setpoint_unit}", response, responses))
+
+
+def _summary(hold: str, response: Slot, responses: Sequence[float]) -> str:
+    spread = max(responses) - min(responses)
+    return (
+        f"{hold}: {response.signal} from {response.show(responses[0])} to {response.show(responses[-1])}, "
+        f"spread {response.show(spread)} after settling"
+    )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
@@ -92,16 +92,40 @@ class Before:
         By name of the task.
     places : dict of str to str
         By name of a task the one that it had then: what differs among the runs was something else.
+    lost : dict of str to tuple of str
+        By name of a task that has to be done again the files that have gone from its folder.
     """
 
     done: dict[str, Done]
     places: dict[str, str]
+    lost: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
-    def put_in_place(self, campaign: Path) -> None:
-        """Rename the folders of tasks that have another name now."""
+    def put_in_place(self, campaign: Path) -> list[str]:
+        """Rename the folders of tasks that have another name now, and of those that are not whole.
+
+        Returns
+        -------
+        list of str
+            A line for each task that is done again as its folder is not whole.
+        """
+        lines = []
+        for name, files in self.lost.items():
+            aside = _aside(campaign / name)
+            (campaign / name).replace(aside)
+            what = "was not whole" if name in self.done else "is done again"
+            lines.append(
+                f"{name} {what}, as {' and '.join(files)} is gone; what was left is in {aside.name} beside it"
+            )
         for name, former in self.places.items():
             (campaign / name).parent.mkdir(parents=True, exist_ok=True)
             (campaign / former).replace(campaign / name)
+        return lines
+
+
+def _aside(folder: Path) -> Path:
+    """Return a name beside a folder that nothing has yet, and that is not the name of a task."""
+    names = (f"{folder.name}.incomplete{suffix}" for suffix in ("", *(f"-{i}" for i in range(2, 1000))))
+    return next(each for name in names if not (each := folder.with_name(name)).exists())
 
 
 def done_before(tasks: Mapping[str, Task], campaign: Path) -> Before:
@@ -117,7 +141,8 @@ def done_before(tasks: Mapping[str, Task], campaign: Path) -> Before:
             continue
         if (left := task.done_in(file.parent)) is not None:
             done[task.name], places[task.name] = left, former
-    return Before({name: done[name] for name in tasks if name in done}, places)
+    lost = {name: files for name, task in tasks.items() if (files := task.lost_in(campaign / name))}
+    return Before({name: done[name] for name in tasks if name in done}, places, lost)
 
 
 def carry_out_tasks(tasks: Mapping[str, Task], before: Mapping[str, Done], executor: Executor) -> dict[str, Done]:

@@ -14,8 +14,10 @@ from rich.console import Console
 
 from bench import registry
 from bench.campaigns.sources import PROGRAMS, PROGRAMS_AND_RIGS, digest
+from bench.campaigns.study_tables import FILE_NAME as STUDY_NAME
 from bench.campaigns.study_tables import write_study
 from bench.errors import AbortError, BenchError, DataError
+from bench.journal import FILE_NAME as JOURNAL_NAME
 from bench.journal import Record
 from bench.protocol import find_protocol
 from bench.results.models import compare_models, identify_file
@@ -98,6 +100,11 @@ class Task(ABC):
         """The files that it reads, with the suffixes of those beside each that it may read as well."""
         return {}
 
+    @property
+    def leaves(self) -> tuple[str, ...]:
+        """The files in its folder that its results are in, for people and for other tasks."""
+        return ()
+
     def moved(self, places: Mapping[str, str]) -> Task:  # noqa: ARG002 - of a task without files
         """Return the same task with its files in other places, by their old path."""
         return self
@@ -117,7 +124,7 @@ class Task(ABC):
             # The operator ends the campaign; the next start does this task again.
             raise
         except BenchError as error:
-            return Done(self.identity, "refused", str(error))
+            return Done(self.identity, "refused", f"{error}{self._way_on(campaign, str(error))}")
         content = {"task": self.describe(), **asdict(done)}
         (made / DONE_NAME).write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
         target = campaign / self.name
@@ -129,7 +136,23 @@ class Task(ABC):
         return done
 
     def done_in(self, folder: Path) -> Done | None:
-        """Return what this task has left in a folder, or None if it is not the folder of this task."""
+        """Return what this task has left in a folder, or None if it is not the folder of this task, or not whole."""
+        found = self._said_in(folder)
+        return found if found is not None and not self._missing(folder) else None
+
+    def lost_in(self, folder: Path) -> tuple[str, ...]:
+        """Return the files that this task has left in a folder and that are not there any more."""
+        return self._missing(folder) if self._said_in(folder) is not None else ()
+
+    def _missing(self, folder: Path) -> tuple[str, ...]:
+        return tuple(name for name in self.leaves if not (folder / name).is_file())
+
+    def _way_on(self, campaign: Path, reason: str) -> str:
+        """Return how to go on if the reason why it was refused is what another task has left."""
+        wrong = next((name for name in self.needs if str(campaign / name) in reason), None)
+        return f"; remove {wrong} from the campaign, and the next start makes it anew" if wrong else ""
+
+    def _said_in(self, folder: Path) -> Done | None:
         try:
             content = json.loads((folder / DONE_NAME).read_text(encoding="utf-8"))
             results = {name: (value, unit) for name, (value, unit) in content["results"].items()}
@@ -192,6 +215,11 @@ class RunTask(Task):
     def needs(self) -> tuple[str, ...]:
         """The identifications of its models."""
         return tuple(self.models.values())
+
+    @property
+    def leaves(self) -> tuple[str, ...]:
+        """The journal."""
+        return (JOURNAL_NAME,)
 
     @property
     def files(self) -> Mapping[Path, Sequence[str]]:
@@ -288,6 +316,11 @@ class ModelTask(Task):
     def needs(self) -> tuple[str, ...]:
         """The runs."""
         return self.sources
+
+    @property
+    def leaves(self) -> tuple[str, ...]:
+        """The model."""
+        return (MODEL_NAME,)
 
     def describe(self) -> dict[str, Any]:
         """Return what it is, for programs."""
@@ -397,6 +430,11 @@ class StudyTask(Task):
     study: str
     rig: str
     seed: int
+
+    @property
+    def leaves(self) -> tuple[str, ...]:
+        """Values and tables."""
+        return (STUDY_NAME,)
 
     def describe(self) -> dict[str, Any]:
         """Return what it is, for programs."""

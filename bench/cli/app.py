@@ -40,7 +40,7 @@ from bench.cli import (
     upkeep,
     watch,
 )
-from bench.cli.console import error_console, fail
+from bench.cli.console import error_console, exit_code, fail
 from bench.cli.registered import RegisteredCommands, Studies
 from bench.errors import BenchError
 
@@ -127,8 +127,11 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
         if _is_by_keyboard(ended):
             words = sys.argv[1:] if arguments is None else arguments
             error_console.print(f"[yellow]ended by Ctrl-C:[/] {_state_of_outputs(words)}", highlight=False)
+        code = 0 if ended.code is None else ended.code
+        if isinstance(code, int) and (code := exit_code(code)) != ended.code:
+            sys.exit(code)
         raise
-    sys.exit(0)
+    sys.exit(exit_code(0))
 
 
 def _is_by_keyboard(error: BaseException | None) -> bool:

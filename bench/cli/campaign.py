@@ -7,19 +7,27 @@ import sys
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from threading import Event, Thread
+from types import TracebackType
+from typing import TYPE_CHECKING, Annotated, Self
 
 import typer
 
-from bench.cli.console import JsonOption, console, error_console, show_compilation, write_json
+from bench.cli.console import JsonOption, check_outputs, console, error_console, show_compilation, write_json
 from bench.errors import AbortError
 from bench.printing import print_plain
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
+    from bench.campaigns.execution import Executor
     from bench.campaigns.expansion import Expansion
-    from bench.campaigns.tasks import Done
+    from bench.campaigns.tasks import Done, Task
 
 app = typer.Typer()
+
+SAID_EVERY = 10.0
+"""Wall-clock seconds between two lines about a campaign whose output is no terminal."""
 
 
 @app.command()
@@ -69,6 +77,7 @@ def campaign(
     from bench.workers import Workers, available_cores
 
     stopwatch = Stopwatch()
+    check_outputs(json_file=json_file, folder=out, read=[file])
     expansion = expand(read_campaign(file))
     folder = Path("recordings") / file.stem if out is None else out
     if scheduler is not None:
@@ -86,16 +95,19 @@ def campaign(
         opened_folder(folder, file.read_text(encoding="utf-8-sig"), stack.enter_context(Locks(holder(folder))))
         # Another process may have been at work here until it was locked.
         before = done_before(expansion.tasks, folder)
-        before.put_in_place(folder)
+        for line in before.put_in_place(folder):
+            print_plain(console, line)
+        executor: Executor
         if scheduler is not None:
             from bench.campaigns.cluster import ClusterExecutor
 
-            done = carry_out_tasks(
-                expansion.tasks, before.done, stack.enter_context(ClusterExecutor(scheduler, folder, console))
-            )
+            executor = stack.enter_context(ClusterExecutor(scheduler, folder, console))
         else:
-            pool = stack.enter_context(Workers(workers, console, file.stem))
-            done = carry_out_tasks(expansion.tasks, before.done, WorkersExecutor(pool, folder))
+            executor = WorkersExecutor(stack.enter_context(Workers(workers, console, file.stem)), folder)
+        if not console.is_terminal:
+            left = len(expansion.tasks) - len(before.done)
+            executor = stack.enter_context(SayingExecutor(executor, left, console))
+        done = carry_out_tasks(expansion.tasks, before.done, executor)
         shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
     files = _show(expansion, done, folder)
     failed = {name: each for name, each in done.items() if not each.carried_out}
@@ -121,6 +133,57 @@ def campaign(
     )
     if not all_carried_out([*done.values()]):
         sys.exit(1)
+
+
+class SayingExecutor:
+    """An executor that prints a line now and then: how many tasks are done, where no terminal draws it.
+
+    Parameters
+    ----------
+    executor : Executor
+        What carries the tasks out.
+    tasks : int
+        Number of all of them.
+    console : Console
+        Where the lines go.
+    every : float
+        Wall-clock time between two lines, s.
+    """
+
+    def __init__(self, executor: Executor, tasks: int, console: Console, every: float = SAID_EVERY) -> None:
+        self._executor, self._tasks, self._console, self._every = executor, tasks, console, every
+        self._done = 0
+        self._over = Event()
+        self._thread = Thread(target=self._say, name="progress", daemon=True)
+
+    def __enter__(self) -> Self:
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._over.set()
+        self._thread.join()
+
+    def submit(self, task: Task) -> None:
+        """Have a task carried out."""
+        self._executor.submit(task)
+
+    def next_done(self) -> tuple[Task, Done]:
+        """Wait for the next task that is done; return it with what it has left."""
+        found = self._executor.next_done()
+        self._done += 1
+        return found
+
+    def _say(self) -> None:
+        from bench.clock import Stopwatch
+        from bench.units import format_duration
+
+        since = Stopwatch()
+        while not self._over.wait(self._every):
+            text = f"{format_duration(since.seconds()):>10}  {self._done} of {self._tasks} done"
+            print_plain(self._console, text)
 
 
 @contextmanager

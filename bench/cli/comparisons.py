@@ -14,6 +14,7 @@ from bench.cli.console import JsonOption, check_outputs, console, show_compilati
 from bench.cli.data_options import layout_options, print_assumptions
 from bench.cli.models import InitialOption
 from bench.cli.patience import show_patience
+from bench.cli.tables import show_table
 from bench.cli.written import print_figures, write_rows
 from bench.errors import ConfigurationError
 from bench.printing import print_plain
@@ -126,7 +127,7 @@ def compare_(
             name, f"{raw.maximum:.4g}", f"{raw.rms:.4g}", f"{raw.rms_percent:.2f}", f"{entry.offset:+.4g}",
             f"{mended.maximum:.4g}", f"{mended.rms:.4g}",
         )  # fmt: skip
-    console.print(table)
+    show_table(console, table)
     for name, examined in result.examined.items():
         print_examined(examined, name, bands=bands)
     if out is not None:
@@ -167,14 +168,14 @@ def _print_runs(found: RunComparison) -> None:
             known = ("" if value is None else value for value in values)
             texts = (f"{value:.1f} s" if name == "seconds" and value != "" else str(value) for value in known)
             table.add_row("duration" if name == "seconds" else name, *map(Text, texts))
-    console.print(table)
+    show_table(console, table)
     if found.differences:
         table = Table("key", "first", "second", title="what differs", title_justify="left")
         for each in found.differences:
             table.add_row(
                 *(Text("none" if text is None else str(text)) for text in (each.key, each.first, each.second))
             )
-        console.print(table)
+        show_table(console, table)
     else:
         console.print("nothing differs in what they were given", highlight=False)
     table = Table(
@@ -183,6 +184,6 @@ def _print_runs(found: RunComparison) -> None:
     )  # fmt: skip
     for signal, apart in found.signals.items():
         table.add_row(signal, f"{apart.rms:.3g}", f"{apart.maximum:.3g}", apart.unit, str(apart.step))
-    console.print(table)
+    show_table(console, table)
     same = [name for name, equal in found.equal.items() if equal]
     console.print(f"equal to the last bit: {', '.join(same) or 'nothing'}", highlight=False)

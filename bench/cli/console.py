@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from bench.cli.tables import show_table
 from bench.errors import BenchError, ConfigurationError, DataError
 
 console = Console()
@@ -34,8 +35,29 @@ FigureFormatOption = Annotated[
     FigureFormat, typer.Option("--figures", help="Format of the figures; pdf and svg for papers.")
 ]
 
+STANDARD_OUTPUT = Path("-")
+"""What `--json` takes for the standard output."""
+
+
+def _take_json(context: typer.Context, path: Path | None) -> Path | None:
+    """Check the file of `--json` before its command does anything; with `-` texts go to the standard error."""
+    if path == STANDARD_OUTPUT:
+        console.stderr = True
+        context.call_on_close(lambda: setattr(console, "stderr", False))
+    elif path is not None:
+        check_outputs(json_file=path)
+    return path
+
+
 JsonOption = Annotated[
-    Path | None, typer.Option("--json", metavar="FILE", help="Write the result as JSON, for programs.")
+    Path | None,
+    typer.Option(
+        "--json",
+        metavar="FILE",
+        help="Write the result as JSON, for programs; - writes it to the standard output, and texts to the standard "
+        "error.",
+        callback=_take_json,
+    ),
 ]
 LiveOption = Annotated[
     bool, typer.Option("--live/--no-live", help="Open the live view, or print its address where there is no display.")
@@ -89,7 +111,7 @@ def print_table(title: str, rows: dict[str, str]) -> None:
     table.add_column()
     for name, text in rows.items():
         table.add_row(name, text)
-    console.print(table)
+    show_table(console, table)
     console.print()
 
 
@@ -98,7 +120,7 @@ def print_rows(title: str, rows: Sequence[tuple[str, str]]) -> None:
     table = Table(title=title, title_justify="left", show_header=False, box=None, padding=(0, 2))
     for name, text in rows:
         table.add_row(name, text)
-    console.print(table)
+    show_table(console, table)
 
 
 def parse_assignments(option: str, texts: Sequence[str]) -> dict[str, str]:
@@ -135,20 +157,21 @@ def check_outputs(
     figures: Path | None = None,
     html: Path | None = None,
     json_file: Path | None = None,
+    folder: Path | None = None,
     read: Sequence[Path] = (),
 ) -> None:
     """Check, before any computing, that the files and figures that are asked for can be written.
 
-    A file needs its folder to be there; the folder of the figures is made. No output may be one of the files that
-    are `read`, or another output. Raises ConfigurationError for `--json`, DataError for the others: names the option
-    and the folder.
+    A file needs its folder to be there; the `folder` of `--out` and that of the figures are made. No output may be
+    one of the files that are `read`, or another output. Raises ConfigurationError for `--json` and the folder of
+    `--out`, DataError for the others: names the option and the folder.
     """
     taken = {path.resolve(): "it is read" for path in read}
     for path, option, kind in (
         (out, "--out", DataError), (card, "--card", DataError), (html, "--html", DataError),
         (json_file, "--json", ConfigurationError),
     ):  # fmt: skip
-        if path is None:
+        if path is None or (path == STANDARD_OUTPUT and option == "--json"):
             continue
         if path.is_dir():
             raise kind(f"{option} {path} cannot be written: it is a folder")
@@ -159,23 +182,54 @@ def check_outputs(
         if (why := taken.get(path.resolve())) is not None:
             raise kind(f"{option} {path} cannot be written: {why}; choose another name")
         taken[path.resolve()] = f"it is that of {option}"
+    if folder is not None:
+        _check_folder("--out", folder, ConfigurationError)
     if figures is not None:
         from bench.results.figures import check_matplotlib
 
         check_matplotlib()
-        existing = next(folder for folder in (figures, *figures.absolute().parents) if folder.exists())
-        if not existing.is_dir() or not os.access(existing, os.W_OK):
-            raise DataError(f"--figures {figures}: the folder cannot be made in {existing}")
+        _check_folder("--figures", figures, DataError)
+
+
+def _check_folder(option: str, path: Path, kind: type[BenchError]) -> None:
+    existing = next(folder for folder in (path, *path.absolute().parents) if folder.exists())
+    if not existing.is_dir() or not os.access(existing, os.W_OK):
+        raise kind(f"{option} {path}: the folder cannot be made in {existing}")
 
 
 def write_json(path: Path | None, content: Any) -> None:  # noqa: ANN401 - anything that JSON can hold
     """Write a result for programs, if a file was asked for.
 
-    Raises ConfigurationError if the file cannot be written.
+    The work is done by then. If the file cannot be written all the same, as the disk is full, that is an error with
+    a message; the command goes on to its end, and `exit_code` says what it exits with.
     """
     if path is None:
         return
+    text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
     try:
-        path.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        if path == STANDARD_OUTPUT:
+            sys.stdout.write(text)
+            sys.stdout.flush()
+        else:
+            path.write_text(text, encoding="utf-8")
     except OSError as error:
-        raise ConfigurationError(f"--json {path} cannot be written: {error.strerror}") from None
+        _unwritten.append(path)
+        print_error(BenchError(f"--json {path} cannot be written: {error.strerror}; the work is done"))
+        if path == STANDARD_OUTPUT:
+            # Python would try once more at its end, and complain.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+_unwritten: list[Path] = []
+"""Files of `--json` that could not be written after the work."""
+
+
+def exit_code(of_the_work: int) -> int:
+    """Return what a command exits with, after all that it has printed.
+
+    That is the code of its work. If this is 0 and a file of `--json` could not be written, it is 1: a program must
+    not go on as if the file were there, and code 2 would say that nothing has moved.
+    """
+    unwritten = bool(_unwritten)
+    _unwritten.clear()
+    return 1 if unwritten and not of_the_work else of_the_work

@@ -11,6 +11,7 @@ from rich.table import Table
 from bench.cli.console import JsonOption, check_outputs, console, print_rows, show_compilation, write_json
 from bench.cli.data_options import layout_options
 from bench.cli.patience import show_patience
+from bench.cli.tables import show_table
 from bench.errors import ConfigurationError
 from bench.results.reading.options import ReadingOptions
 
@@ -129,7 +130,7 @@ def design(
             f"{entry.prediction_variance:.2g}",
             f"{entry.time / 3600:.2f} h",
         )
-    console.print(table)
+    show_table(console, table)
     if sequence is not None and out is not None:
         write_sequence(out, found[sequence].setpoints, unit=unit, dwell=dwell)
         _print_sequence(out, found[sequence].setpoints.size)

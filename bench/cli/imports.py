@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from bench.cli.console import JsonOption, console, write_json
+from bench.cli.console import JsonOption, check_outputs, console, write_json
 from bench.cli.data_options import layout_options, print_assumptions
 from bench.printing import print_plain
 from bench.results.reading.options import ReadingOptions
@@ -45,6 +45,7 @@ def import_(
     """
     from bench.results.imported import import_file
 
+    check_outputs(json_file=json_file, folder=out, read=[file])
     found = import_file(
         file,
         input_column=input_column,

@@ -10,7 +10,8 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from bench.cli.console import JsonOption, console, write_json
+from bench.cli.console import JsonOption, check_outputs, console, write_json
+from bench.cli.tables import show_table
 from bench.errors import RecordError
 from bench.printing import print_plain
 
@@ -41,12 +42,13 @@ def recover_journal(
     """
     from bench.journal.recovery import recover
 
+    check_outputs(json_file=json_file, read=[journal, *(second or [])])
     found = recover(journal, second or [], out)
     table = Table("table", "good", "from a second file", "lost", "first bad row", box=None, padding=(0, 2))
     for name, state in found.tables.items():
         numbers = (state.good, state.added, state.missing)
         table.add_row(name, *(str(number) if number else "-" for number in numbers), state.first_bad or "-")
-    console.print(table)
+    show_table(console, table)
     said = [f"status: {found.status}"]
     if found.problem:
         said.append(f"SQLite finds: {found.problem}")

@@ -17,6 +17,7 @@ from bench.cli.console import (
     FigureFormatOption,
     JsonOption,
     LiveOption,
+    check_outputs,
     console,
     show_compilation,
     write_json,
@@ -100,6 +101,7 @@ class Studies(RegisteredCommands):
         ) -> None:
             from bench.studies import reproduce
 
+            check_outputs(folder=out)
             result = reproduce(
                 name,
                 part,

@@ -19,6 +19,7 @@ from bench.cli.console import (
     show_compilation,
     write_json,
 )
+from bench.cli.tables import show_table
 
 if TYPE_CHECKING:
     from bench.rehearsal import Extremes, Rehearsal
@@ -68,10 +69,12 @@ def rehearse(
 
 def show_rehearsal(run: Run, json_file: Path | None) -> None:
     """Print what a run would do and touch; raises ConfigurationError if it would not complete."""
+    from bench.interrupts import Interrupts
     from bench.runs import foresee
+    from bench.terminal import say_what_ctrl_c_does
 
-    with show_compilation():
-        rehearsal = foresee(run, console)
+    with Interrupts(say_what_ctrl_c_does) as interrupts, show_compilation():
+        rehearsal = foresee(run, console, interrupts)
     _print(rehearsal)
     write_json(json_file, rehearsal.to_json())
     rehearsal.raise_if_wrong()
@@ -99,7 +102,7 @@ def _print(rehearsal: Rehearsal) -> None:
     )
     for name, each in rehearsal.extremes.items():
         table.add_row(escape(name), *_cells(each))
-    console.print(table)
+    show_table(console, table)
     for finding in rehearsal.findings:
         console.print(
             f"{format_duration(finding.t):>10}  step {finding.step}, {finding.kind}: {finding.text}",

@@ -7,7 +7,15 @@ from typing import Annotated
 
 import typer
 
-from bench.cli.console import JsonOption, LiveOption, console, parse_assignments, show_compilation, warn
+from bench.cli.console import (
+    JsonOption,
+    LiveOption,
+    check_outputs,
+    console,
+    parse_assignments,
+    show_compilation,
+    warn,
+)
 from bench.cli.runs import print_result
 from bench.printing import print_plain
 
@@ -42,10 +50,12 @@ def repeat(
 
     A record is code: its protocol and the modules of its rig file are run as they were kept.
     """
-    from bench.interrupts import Interrupts, say_at_once
+    from bench.interrupts import Interrupts
     from bench.repetition import repeat as carry_out_again
+    from bench.terminal import say_what_ctrl_c_does
 
-    with Interrupts(say_at_once) as interrupts:
+    check_outputs(json_file=json_file, folder=out, read=[run])
+    with Interrupts(say_what_ctrl_c_does) as interrupts:
         with show_compilation():
             found = carry_out_again(
                 run,

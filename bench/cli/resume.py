@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from bench.cli.console import JsonOption, LiveOption, NotifyOption, console, show_compilation
+from bench.cli.console import JsonOption, LiveOption, NotifyOption, check_outputs, console, show_compilation
 from bench.cli.runs import print_result
 
 app = typer.Typer()
@@ -62,6 +62,7 @@ def resume(
     from bench.resume import Resume
     from bench.resume import resume as resume_run
 
+    check_outputs(json_file=json_file, read=[run])
     asked = Resume(
         folder=run,
         rig=rig,

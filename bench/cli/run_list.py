@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -9,11 +11,24 @@ import typer
 from rich.text import Text
 
 from bench.cli.console import JsonOption, console, parse_assignments, write_json
+from bench.errors import ConfigurationError
 
 if TYPE_CHECKING:
     from bench.results.run_list import ListedRun
 
 app = typer.Typer()
+
+
+class Status(StrEnum):
+    """How a run ended, or has not."""
+
+    COMPLETED = "completed"
+    ABORTED = "aborted"
+    FAILED = "failed"
+    RUNNING = "running"
+    UNFINISHED = "unfinished"
+    DAMAGED = "damaged"
+
 
 _STYLES = {"completed": "", "running": "green", "unfinished": "yellow"}
 
@@ -30,7 +45,7 @@ def runs_(
         ),
     ] = None,
     status: Annotated[
-        str | None,
+        Status | None,
         typer.Option(metavar="STATUS", help="Only completed, aborted, failed, running, unfinished or damaged ones."),
     ] = None,
     protocol: Annotated[str | None, typer.Option(metavar="PROTOCOL", help="Only runs of this protocol.")] = None,
@@ -40,21 +55,31 @@ def runs_(
     """List the runs below a folder in the order of their start: how they ended, what was set, what came out.
 
     `running` is a run of a process of this computer, `unfinished` one whose process died or is of another computer,
-    `damaged` one whose journal cannot be read. Shown are the parameters that differ from their defaults; any can be
-    searched for: `bench runs --where controller=integral`.
+    `damaged` one whose journal is damaged or gone; `bench recover-journal` says what is left of it. Shown are the
+    parameters that differ from their defaults; any can be searched for: `bench runs --where controller=integral`.
     """
     from bench.results.run_list import list_runs, select_runs
 
+    runs = list_runs(folder)
+    _check_named("--protocol", protocol, [run.protocol for run in runs])
+    _check_named("--rig", rig, [run.rig for run in runs])
     found = select_runs(
-        list_runs(folder),
+        runs,
         parse_assignments("--where", where or []),
-        status=status,
+        status=None if status is None else status.value,
         protocol=protocol,
         rig=rig,
     )
     _print_runs(folder, found)
-    console.print(f"{len(found)} runs", highlight=False)
+    console.print(f"{len(found)} {'run' if len(found) == 1 else 'runs'}", highlight=False)
     write_json(json_file, [run.to_json() for run in found])
+
+
+def _check_named(option: str, name: str | None, there_are: Sequence[str]) -> None:
+    """Raise ConfigurationError if runs are found, but none of them is of that name."""
+    names = sorted({each for each in there_are if each})
+    if name is not None and names and name not in names:
+        raise ConfigurationError(f"{option} {name}: no run is of it; there are runs of: {', '.join(names)}")
 
 
 def _print_runs(folder: Path, runs: list[ListedRun]) -> None:
@@ -71,5 +96,10 @@ def _print_runs(folder: Path, runs: list[ListedRun]) -> None:
         console.print(Text(line, style), soft_wrap=True)
         if listed is not None:
             parameters = ", ".join(f"{name}={value}" for name, value in listed.changed.items())
-            for text in filter(None, (parameters, listed.result, str(listed.folder.relative_to(folder)))):
+            for text in filter(None, (parameters, listed.result, _named(listed.folder, folder))):
                 console.print(Text(f"    {text}"), soft_wrap=True, highlight=False)
+
+
+def _named(run: Path, folder: Path) -> str:
+    """Return where a run is below a folder; if it is that folder, its name."""
+    return folder.resolve().name if run == folder else str(run.relative_to(folder))

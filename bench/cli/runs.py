@@ -16,6 +16,7 @@ from bench.cli.console import (
     LiveOption,
     NotifyOption,
     SettingsOption,
+    check_outputs,
     console,
     error_console,
     parse_assignments,
@@ -27,6 +28,7 @@ from bench.cli.console import (
 )
 from bench.cli.model_options import inverse_of, options_json, print_model, print_models
 from bench.cli.rehearse import show_rehearsal
+from bench.cli.tables import show_table
 from bench.errors import BenchError, ConfigurationError
 from bench.printing import print_plain
 
@@ -207,11 +209,15 @@ def run(
         raise ConfigurationError("--rig is missing; `bench list` shows the installed rigs")
     if attach is not None and (clock != "wall" or seed):
         raise ConfigurationError("--attach: clock and seed are the server's; leave --clock and --seed out")
+    check_outputs(
+        json_file=json_file, folder=None if dry_run else out, read=[Path(rig)] if rig.endswith(".toml") else []
+    )
     definition = find_protocol(protocol)
     given = parse_assignments("--set", settings or [])
 
-    from bench.interrupts import Interrupts, say_at_once
+    from bench.interrupts import Interrupts
     from bench.runs import Run, carry_out
+    from bench.terminal import say_what_ctrl_c_does
 
     asked = Run(
         protocol=definition,
@@ -234,7 +240,7 @@ def run(
         show_rehearsal(asked, json_file)
         return
     # Until the result is printed: a terminal that hangs must not keep the process from being ended.
-    with Interrupts(say_at_once) as interrupts:
+    with Interrupts(say_what_ctrl_c_does) as interrupts:
         with show_compilation():
             result = carry_out(asked, console, interrupts)
         print_result(result, json_file)
@@ -245,10 +251,11 @@ def print_result(result: RunResult, json_file: Path | None, more: Mapping[str, A
     from bench.safety import SAFE
 
     outcome, ratio = result.outcome, result.time_ratio
+    # Of a run that was resumed, this process has seen the end only.
+    end = "" if outcome.own_seconds >= outcome.laboratory_seconds else f", the last {outcome.own_seconds:.0f} s of it"
     console.print(
-        f"{outcome.status}: {outcome.steps} steps, {outcome.laboratory_seconds:.0f} s of laboratory time in "
-        f"{result.wall_seconds:.1f} s"
-        + (f" ({ratio:.0f} times as fast)" if (ratio := result.time_ratio) >= 2 else ""),
+        f"{outcome.status}: {outcome.steps} steps, {outcome.laboratory_seconds:.0f} s of laboratory time{end} in "
+        f"{result.wall_seconds:.1f} s" + (f" ({ratio:.0f} times as fast)" if ratio >= 2 else ""),
         highlight=False,
     )
     if outcome.pace is not None and not outcome.pace.is_reached:
@@ -299,4 +306,4 @@ def print_protocol(definition: Any, rig: str | None = None) -> None:  # noqa: AN
     table = Table("--set", "default", "unit", "allowed", "what it does", title="parameters", title_justify="left")
     for entry in definition.help(file.roles, file.protocols.get(definition.name)) if file else definition.help():
         table.add_row(entry.name, entry.default, entry.unit, entry.allowed, entry.text)
-    console.print(table)
+    show_table(console, table)

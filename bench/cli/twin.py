@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from bench.cli.console import JsonOption, console, print_rows, show_compilation, write_json
+from bench.cli.console import JsonOption, check_outputs, console, print_rows, show_compilation, write_json
 from bench.printing import print_plain
 
 app = typer.Typer()
@@ -34,6 +34,7 @@ def twin_(
     """
     from bench.twin.write import write_twin
 
+    check_outputs(out=out, json_file=json_file, read=[*runs, *([] if model is None else [model])])
     twin = write_twin(runs, rig, out, model)
     print_rows(f"twin of {rig}", twin.rows())
     print_plain(console, f"rig file: {out}")

@@ -13,6 +13,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from bench.cli.console import JsonOption, console, parse_assignments, show_compilation, warn, write_json
+from bench.cli.tables import show_table
 from bench.errors import AbortError, ConfigurationError, DeviceError
 
 app = typer.Typer()
@@ -61,7 +62,7 @@ def safe(
         style = "green" if each.is_safe else "bold red"
         state = each.state if each.is_safe else f"NOT CONFIRMED: {each.state}"
         table.add_row(escape(each.device), f"[{style}]{escape(state)}[/]", escape(each.advice))
-    console.print(table)
+    show_table(console, table)
     write_json(json_file, {each.device: {"state": each.state, "is_safe": each.is_safe} for each in found})
     if not all(each.is_safe for each in found):
         sys.exit(UNSAFE_EXIT_CODE)
@@ -120,7 +121,7 @@ def _print_conditions(conditions: Sequence[object]) -> None:
         assert isinstance(each, Condition)
         style = "green" if each.state == "ready" else "bold red"
         table.add_row(escape(each.device), f"[{style}]{each.state}[/]", escape(each.meaning))
-    console.print(table)
+    show_table(console, table)
 
 
 @app.command()
@@ -168,7 +169,7 @@ def doctor(
             style = "yellow" if finding.advice else "default"
             device, text, advice = map(escape, (check.device or f"rig {name}", finding.text, finding.advice))
             table.add_row(f"[bold]{device}[/]", escape(finding.subject), f"[{style}]{text}[/]", advice)
-    console.print(table)
+    show_table(console, table)
     code = 0
     if any(finding.advice for check in checks for finding in check.findings):
         code = 1

@@ -48,6 +48,8 @@ What is recorded, on the timelines `t` (laboratory time) and `step`
     The log, and the run card.
 """
 
+# The first that loads Rerun.
+from bench.dashboard import _rerun_log as _rerun_log  # isort: skip
 from bench.dashboard.from_journal import rebuild
 from bench.dashboard.live import Dashboard
 from bench.dashboard.screenshot import picture

@@ -11,10 +11,13 @@ from typing import Any, Self
 
 from bench.clock import WallClock
 from bench.dashboard.entries import End, Entry, Part, Tick, densities_of, portions
+from bench.dashboard.recording import is_whole
 from bench.dashboard.writer import Writer
 from bench.devices import Signal
 from bench.journal import Event, StepRecord
 from bench.model_file import ModelFile
+from bench.printing import print_plain
+from bench.workers import task_console
 
 QUEUED_TICKS = 20_000
 """Entries waiting for Rerun beyond which telemetry is dropped (about 10 MB)."""
@@ -74,6 +77,7 @@ class Dashboard:
     ) -> None:
         if path is None and not live:
             raise ValueError("a dashboard needs a file or a live view")
+        self._path = path
         self._file: Writer | None = None
         self._view: Writer | None = None
         if path is not None:
@@ -94,7 +98,7 @@ class Dashboard:
         for density in densities_of(models):
             self._queue.put(density)
         self._wake = threading.Event()
-        self._closing = self._recording_stops = False
+        self._closing = self._recording_stops = self._is_complete = self._is_said = False
         self._thread = threading.Thread(target=self._work, name="dashboard", daemon=False)
         self._thread.start()
 
@@ -127,6 +131,17 @@ class Dashboard:
         self._closing = True
         self._wake.set()
         self._thread.join(_CLOSE_SECONDS)
+        if self._path is not None and not self._is_said and self._is_incomplete(self._path):
+            self._is_said = True
+            print_plain(
+                task_console(),
+                f"warning: the recording {self._path} is incomplete; bench export {self._path.parent} --format rrd "
+                "--out DIR rebuilds it from the journal",
+            )
+
+    def _is_incomplete(self, path: Path) -> bool:
+        """Return whether the file lacks something, as far as Rerun has written it by now."""
+        return self._recording_stops or (self._is_complete and not is_whole(path))
 
     def __enter__(self) -> Self:
         return self
@@ -202,6 +217,7 @@ class Dashboard:
                 self._reported += missing
             writer.arrange()
             writer.recording.close()
+            self._is_complete = True
 
     def _write(self, writer: Writer, entries: Sequence[Entry | Part]) -> None:
         try:

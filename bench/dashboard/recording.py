@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import atexit
 import hashlib
+import os
 import re
 import socket
+import threading
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
@@ -14,12 +17,23 @@ import numpy.typing as npt
 import rerun as rr
 import rerun.blueprint as rrb
 
+from bench.clock import WallClock
 from bench.errors import ConfigurationError
 
 Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
 LOOPBACK = "127.0.0.1"
+
+_END = b"RRF2FOOT"
+"""In the last bytes of a file that was written to its end."""
+
+_END_BYTES = 32
+
+_STALLED_SECONDS = 3.0
+"""Wall-clock time without growth after which a file that is completed is given up, s."""
+
+_LOOK_SECONDS = 0.05
 
 _FLUSH_SECONDS = 0.5
 """Time after which a viewer has stalled; a twentieth of it is enough to see that it still has."""
@@ -37,6 +51,7 @@ class Recording:
     def __init__(self, run_id: str, title: str, path: Path | None, port: int | None) -> None:
         self.uri: str | None = None
         """Address for a viewer, None for a file."""
+        self._path = path
         self._stream = rr.RecordingStream(_application(run_id), recording_id=run_id)
         try:
             self._stream.set_sinks(_file(path) if path is not None else self._server(port or 0))
@@ -103,9 +118,34 @@ class Recording:
             self._stream.send_property(name, rr.AnyValues(**values))
 
     def close(self) -> None:
-        """Complete the file, or let go of the viewers."""
+        """Complete the file, or let go of the viewers; a file that does not grow any more is given up."""
         self._is_written = False
-        self._stream.disconnect()
+        if self._path is None:
+            self._stream.disconnect()
+            return
+        # Rerun waits for ever for its writer of the file, if a full disk has ended that.
+        work = threading.Thread(target=self._stream.disconnect, name="recording", daemon=True)
+        work.start()
+        clock, size, grown = WallClock(), -1, 0.0
+        while work.is_alive() and clock.now() < grown + _STALLED_SECONDS:
+            work.join(_LOOK_SECONDS)
+            now = self._path.stat().st_size if self._path.exists() else -1
+            if now != size:
+                size, grown = now, clock.now()
+        if work.is_alive():
+            # It would wait for the same at the end of the process.
+            atexit.unregister(rr.rerun_shutdown)
+
+
+def is_whole(path: Path) -> bool:
+    """Return whether a file was written to its end; Rerun reports a full disk in its log only."""
+    try:
+        with path.open("rb") as file:
+            file.seek(0, os.SEEK_END)
+            file.seek(max(0, file.tell() - _END_BYTES))
+            return _END in file.read()
+    except OSError:
+        return False
 
 
 def _application(run_id: str) -> str:

@@ -18,8 +18,16 @@ from bench.errors import ConfigurationError, DataError
 _PATIENCE = 120.0
 """Wall-clock time within which the viewer of a busy machine answers and has drawn a picture, s."""
 
+_NO_DRIVER = (
+    "Rerun's viewer does not start; without a screen it needs a Vulkan driver, such as the one of the packages "
+    "mesa-vulkan-drivers and libvulkan1"
+)
+
 _LOOK = 1.5
 """Wall-clock time between two looks at what it has drawn, s."""
+
+_LAST_MOMENT = 1.0
+"""Wall-clock time that a viewer has to end once it does not answer, s."""
 
 T = TypeVar("T")
 
@@ -44,14 +52,9 @@ class Camera:
         options = ["--headless", "--hide-welcome-screen", "--bind", LOOPBACK, "--port", str(port)]
         self._viewer = start_viewer([*options, "--window-size", f"{size[0]}x{size[1]}"])
         self._clock = WallClock()
-        self._is_used = False
+        self._is_used = self._has_drawn = False
         try:
-            wait_until_it_listens(
-                self._viewer,
-                port,
-                "Rerun's viewer does not start; without a screen it needs a Vulkan driver, such as the one of the "
-                "packages mesa-vulkan-drivers and libvulkan1",
-            )
+            wait_until_it_listens(self._viewer, port, _NO_DRIVER)
             self._client = self._patiently(lambda: ViewerClient.connect(f"rerun+http://{LOOPBACK}:{port}/proxy"))
         except BaseException:
             self.close()
@@ -99,6 +102,7 @@ class Camera:
                 self._clock.sleep(_LOOK)
                 self._patiently(lambda: client.save_screenshot(str(look)))
                 content = look.read_bytes()
+                self._has_drawn = True
                 if content == before and self._patiently(client.get_state).views:
                     break
                 before = content
@@ -109,6 +113,13 @@ class Camera:
             for report in view.reports
         ]
 
+    def _has_died(self) -> bool:
+        """Return whether the viewer has ended: it stops to answer a moment before."""
+        end = self._clock.now() + _LAST_MOMENT
+        while self._viewer.poll() is None and self._clock.now() < end:
+            self._clock.sleep(0.05)
+        return self._viewer.poll() is not None
+
     def _patiently(self, ask: Callable[[], T]) -> T:
         """Ask the viewer, again if it takes too long, as on a busy machine; raises ConfigurationError in the end."""
         end = self._clock.now() + _PATIENCE
@@ -117,7 +128,11 @@ class Camera:
                 return ask()
             # The client waits a few seconds only, and says so in several ways.
             except (TimeoutError, ConnectionError, RuntimeError) as error:
-                if self._viewer.poll() is not None or self._clock.now() > end:
+                # Without a driver it listens for a moment, and dies before it has drawn anything.
+                if self._has_died():
+                    problem = "Rerun's viewer has died while it drew" if self._has_drawn else _NO_DRIVER
+                    raise ConfigurationError(problem) from error
+                if self._clock.now() > end:
                     raise ConfigurationError(f"Rerun's viewer does not answer: {error}") from error
                 self._clock.sleep(0.2)
 

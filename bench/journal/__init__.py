@@ -22,9 +22,10 @@ Schema, version 3
     `controls` (the signal under control), `plan` (as far as no reading decides), `rehearsal` (null if there was
     none), `dashboard`, `over_time` (signals whose plots over time are always visible), `rig_given` (name or path of
     the rig), `laboratory_epoch` (of a served laboratory), `resumes` (what each process was that took the run up after
-    its death), and at the end `status` (`completed`, `aborted`, `failed`), `reason`, `finished` (laboratory s),
-    `safe_state` (outcome by device), `counts` (rows by table). A file without `status` is of a run that is going on
-    or whose process died.
+    its death), `recovered` (of a copy that `bench recover-journal` wrote: from which journal, rows that are lost by
+    table, and keys whose values stand for lost ones), and at the end `status` (`completed`, `aborted`, `failed`),
+    `reason`, `finished` (laboratory s), `safe_state` (outcome by device), `counts` (rows by table). A file without
+    `status` is of a run that is going on or whose process died.
 `signals(position, name, unit, description, precision, checksum)`
     One row a signal column of the two tables below.
 `steps(step, started, finished, phase, label, settled, setpoints, "<signal>", …, seen, checksum)`
@@ -49,6 +50,7 @@ models stand in files beside the journal, see `add_model`. Version 1 has 1 for e
 """
 
 from bench.journal.card import expected_steps, run_card
+from bench.journal.finding import files_of, find_journals
 from bench.journal.models import add_model
 from bench.journal.record import Record
 from bench.journal.rows import FILE_NAME, SCHEMA, Event, StepRecord, check_names
@@ -67,6 +69,8 @@ __all__ = [
     "add_model",
     "check_names",
     "expected_steps",
+    "files_of",
+    "find_journals",
     "run_card",
     "take_in",
 ]

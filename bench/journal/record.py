@@ -14,6 +14,7 @@ import numpy as np
 
 from bench.devices import Signal
 from bench.errors import DataError
+from bench.journal.finding import missing, way_back
 from bench.journal.mirror import read_mirror, second_files
 from bench.journal.models import models_beside
 from bench.journal.opening import OpenedJournal
@@ -21,6 +22,9 @@ from bench.journal.rows import FILE_NAME, FIRST, READABLE, SCHEMA, Event, StepRe
 from bench.journal.table import Table
 from bench.locks import is_in_use
 from bench.settling import Settled
+
+_QUICKLY_CHECKED = 20_000
+"""Ticks whose checksums are compared within some 50 ms."""
 
 _FAILED = {each.value for each in Settled if each.failed}
 
@@ -44,7 +48,7 @@ class Record:
     def __init__(self, path: Path) -> None:
         self.path = path / FILE_NAME if path.is_dir() else path
         if not self.path.is_file():
-            raise DataError(f"{path} is not a run: there is no {FILE_NAME}")
+            raise DataError(missing(path))
         self._opened = OpenedJournal(self.path)
         self._db = self._opened.db
         try:
@@ -69,7 +73,7 @@ class Record:
         waiting = [
             f"{len(lacking)} of {table}"
             for table, numbers in beside.items()
-            if (lacking := numbers.difference(int(row[0]) for row in self._rows(table)))
+            if (lacking := numbers - self.numbers(table))
         ]
         if not waiting:
             return ""
@@ -85,7 +89,7 @@ class Record:
             signals = self._db.execute("SELECT * FROM signals ORDER BY position").fetchall()
             self.signals = tuple(Signal(*row[1:5]) for row in signals)
         except (sqlite3.DatabaseError, ValueError, TypeError) as error:
-            raise DataError(f"{self.path} is not a readable journal: {error}") from error
+            raise DataError(f"{self.path} is not a readable journal: {error}{way_back(self.path)}") from error
         found = self.meta.get("schema")
         if found not in READABLE:
             raise DataError(f"{self.path} has schema version {found}; this bench reads versions 1 to {SCHEMA}")
@@ -137,7 +141,7 @@ class Record:
                     tuple(map(float, json.loads(row[end]))) if self._is_checked else (),
                 )
             except (ValueError, TypeError) as error:
-                raise DataError(f"{self.path} is damaged: step {step}: {error}") from error
+                raise self._damaged(f"step {step}: {error}") from error
             yield record
 
     def newest_ticks(self, count: int) -> list[tuple[float, ...]]:
@@ -155,11 +159,16 @@ class Record:
             numbers = np.column_stack([whole[name] for name in names])
             wrong = np.flatnonzero(np.array(checksums(numbers), dtype=np.float64) != whole["checksum"])
             if len(wrong):
-                raise self._damaged("telemetry", rows[wrong[0]][0])
+                raise self._wrong_row("telemetry", rows[wrong[0]][0])
         return Table(
             {name: whole[name] for name in names if name != "tick"},
             {name: whole.units[name] for name in names if name != "tick"},
         )
+
+    def numbers(self, table: str) -> set[int]:
+        """Return the numbers of the rows of `steps`, `telemetry` or `events`, unchecked."""
+        key = {"steps": "step", "telemetry": "tick", "events": "event"}[table]
+        return {int(number) for (number,) in self._query(f"SELECT {key} FROM {table}")}  # noqa: S608 - own names
 
     def events(self, after: int = 0) -> list[Event]:
         """Return what happened, in its order, with numbers beyond `after`."""
@@ -174,7 +183,7 @@ class Record:
         result = {}
         for name, digest, content in self._query("SELECT name, sha256, content FROM files ORDER BY rowid"):
             if not isinstance(content, bytes) or hashlib.sha256(content).hexdigest() != digest:
-                raise self._damaged("files", name)
+                raise self._wrong_row("files", name)
             result[name] = content
         return result
 
@@ -186,7 +195,35 @@ class Record:
         try:
             return {name: json.loads(model) for name, model in rows} | models_beside(self.path.parent)
         except (ValueError, TypeError) as error:
-            raise DataError(f"{self.path} is damaged: {error}") from error
+            raise self._damaged(str(error)) from error
+
+    def damage(self) -> str:
+        """Return what is wrong with the rows, as far as that is quick to find; empty if that is nothing.
+
+        Found are pages that SQLite cannot read, damaged rows of all tables but a long telemetry, and rows that a
+        completed run lacks.
+        """
+        if not self._is_checked:
+            return ""
+        try:
+            (found,) = self._query("PRAGMA quick_check(1)")[0]
+            if found != "ok":
+                return str(self._damaged(str(found).replace("\n", " ")))
+            counts = {
+                "steps": len(self.steps()),
+                "telemetry": self._query("SELECT count(*) FROM telemetry")[0][0],
+                "events": len(self.events()),
+            }
+            self.files()
+            if counts["telemetry"] <= _QUICKLY_CHECKED:
+                self.telemetry()
+        except DataError as error:
+            return str(error)
+        if self.status == "completed":
+            for table, count in self.meta.get("counts", {}).items():
+                if counts.get(table, count) != count:
+                    return str(self._damaged(f"table {table} has {counts[table]} rows of {count}"))
+        return ""
 
     def close(self) -> None:
         """Close the file."""
@@ -217,19 +254,21 @@ class Record:
             except (ValueError, TypeError):
                 fits = False
             if not fits:
-                raise self._damaged(table, row[0])
+                raise self._wrong_row(table, row[0])
 
-    def _damaged(self, table: str, row: object) -> DataError:
-        return DataError(
-            f"{self.path} is damaged: table {table}, row {row}: its checksum does not fit; "
-            f"`bench recover-journal {self.path}` says what is good"
-        )
+    def _wrong_row(self, table: str, row: object) -> DataError:
+        return self._damaged(f"table {table}, row {row}: its checksum does not fit")
+
+    def _damaged(self, what: str) -> DataError:
+        # Without checksums nothing can be recovered.
+        how = f"; `bench recover-journal {self.path}` says what is good" if self._is_checked else ""
+        return DataError(f"{self.path} is damaged: {what}{how}")
 
     def _table(self, table: str, names: tuple[str, ...], rows: Sequence[tuple[Any, ...]]) -> Table:
         try:
             data = np.array(rows, dtype=np.float64).reshape(len(rows), len(names))
         except (ValueError, TypeError) as error:
-            raise DataError(f"{self.path} is damaged: table {table}: {error}") from error
+            raise self._damaged(f"table {table}: {error}") from error
         values = {name: data[:, i].copy() for i, name in enumerate(names)}
         return Table(values, {name: self.unit(name) for name in names})
 
@@ -238,4 +277,4 @@ class Record:
         try:
             return self._db.execute(statement).fetchall()
         except sqlite3.DatabaseError as error:
-            raise DataError(f"{self.path} is damaged: {error}") from error
+            raise self._damaged(str(error)) from error

@@ -6,7 +6,7 @@ import hashlib
 import json
 import sqlite3
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing, suppress
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Self
@@ -15,6 +15,7 @@ from bench.clock import Stopwatch
 from bench.devices import Signal
 from bench.errors import ConfigurationError, DataError, RecordError
 from bench.journal.background import LONGEST_UNWRITTEN, Background
+from bench.journal.finding import files_of
 from bench.journal.keeping import RESERVE_NAME, Keeper
 from bench.journal.mirror import NAME as MIRROR_NAME
 from bench.journal.mirror import read_mirror, second_files
@@ -54,7 +55,8 @@ class Journal:
     ------
     ConfigurationError
         If the file exists already: a record is never overwritten. If two signals have one name, or a signal
-        has that of a column which the journal itself needs; case does not count. If the file cannot be made.
+        has that of a column which the journal itself needs; case does not count. If the file cannot be made; nothing
+        is left of it then.
     """
 
     def __init__(
@@ -81,16 +83,21 @@ class Journal:
         ]
         for former in second_files(path):
             former.unlink(missing_ok=True)
-        try:
-            store = Store(path, _READERS, flushed=flushed)
-            store.create(names, entries)
-            if flushed:
-                store.extend_log()
-            store.wait_for_others(0.0)
-            keeper = Keeper(store)
-            keeper.begin(entries)
-        except (sqlite3.Error, OSError) as error:
-            raise ConfigurationError(f"{path} cannot be made: {error}") from None
+        with ExitStack() as made:
+            made.callback(_remove, path)
+            try:
+                store = Store(path, _READERS, flushed=flushed)
+                made.callback(store.close)
+                store.create(names, entries)
+                if flushed:
+                    store.extend_log()
+                store.wait_for_others(0.0)
+                keeper = Keeper(store)
+                made.callback(keeper.close, is_whole=True)
+                keeper.begin(entries)
+            except (sqlite3.Error, OSError) as error:
+                raise ConfigurationError(f"{path} cannot be made: {error}") from None
+            made.pop_all()
         self._begin(keeper, signals, dict.fromkeys(FIRST, 0), patience)
 
     @classmethod
@@ -117,7 +124,7 @@ class Journal:
         ConfigurationError
             If the run was completed.
         """
-        file, signals, counts = take_in(path)
+        file, signals, counts, lost = take_in(path)
         journal = cls.__new__(cls)
         was_mirrored = (file.parent / MIRROR_NAME).exists()
         keeper: Keeper | None = None
@@ -134,19 +141,25 @@ class Journal:
                 keeper.close(is_whole=False)
             raise DataError(f"{file} cannot be written on: {error}") from None
         keeper.keep([entry("meta", meta_row(key, value)) for key, value in meta.items()])
-        journal._begin(keeper, signals, counts, patience)
+        journal._begin(keeper, signals, counts, patience, lost)
         return journal
 
     def _begin(
-        self, keeper: Keeper, signals: Sequence[Signal], counts: dict[str, int], patience: float | None
+        self,
+        keeper: Keeper,
+        signals: Sequence[Signal],
+        counts: dict[str, int],
+        patience: float | None,
+        lost: Mapping[str, int] = MappingProxyType({}),
     ) -> None:
-        """Start with rows that are there already, counted by table."""
+        """Start with rows that are there already: by table those up to the last one, and of these the lost ones."""
         self.signals = tuple(signals)
         self.when_short: Callable[[], object] = lambda: None
         """Called once when the disk is nearly full: recordings stop then, as the journal needs the space."""
         self._is_told = False
         self._keeper = keeper
         self._counts = counts
+        self._lost = lost
         self._waiting: list[tuple[float, ...]] = []
         self._since_write = Stopwatch()
         self._background = None if patience is None else Background(keeper, patience)
@@ -233,10 +246,14 @@ class Journal:
         self._stop_background()
         if self._waiting:
             self._write(())
-        problem = self._keeper.end(self._counts) or (str(self._failure) if self._failure else "")
-        if problem:
+        there = {table: count - self._lost.get(table, 0) for table, count in self._counts.items()}
+        problem = self._keeper.end(there) or (str(self._failure) if self._failure else "")
+        lost = ", ".join(f"{count} of {table}" for table, count in self._lost.items())
+        if lost:
+            lost = f"rows that were lost before the run was resumed: {lost}"
+        if problem or lost:
             status = "failed" if status == "completed" else status
-            reason = "; ".join(filter(None, (reason, f"the record is not whole: {problem}")))
+            reason = "; ".join(filter(None, (reason, f"the record is not whole: {problem or f'it lacks {lost}'}")))
         end = {
             "status": status,
             "reason": reason,
@@ -253,6 +270,8 @@ class Journal:
                 f"{self.path} is not whole: {problem}; every row is in {self._keeper.second_file}; "
                 f"`bench recover-journal {self.path}` puts them together"
             )
+        if lost:
+            raise RecordError(f"{self.path} lacks {lost}")
 
     def close(self) -> None:
         """Close the files; what was recorded stays."""
@@ -296,7 +315,7 @@ class Journal:
             self._background = None
 
 
-def take_in(path: Path) -> tuple[Path, tuple[Signal, ...], dict[str, int]]:
+def take_in(path: Path) -> tuple[Path, tuple[Signal, ...], dict[str, int], dict[str, int]]:
     """Bring into the journal of a run that was not completed what waits for it in a second file.
 
     Returns
@@ -306,12 +325,14 @@ def take_in(path: Path) -> tuple[Path, tuple[Signal, ...], dict[str, int]]:
     tuple of Signal
         Its signals.
     dict of str to int
-        Number of its rows, by table.
+        Number of its rows, by table, those that are lost between others included.
+    dict of str to int
+        Of a recovered copy, the number of rows that are lost, by table; without tables that lack none.
 
     Raises
     ------
     DataError, ConfigurationError
-        As `Journal.reopen`.
+        As `Journal.reopen`. DataError also if steps or events are lost, as a run is resumed by all of them.
     """
     with Record(path) as record:
         file, signals = record.path, record.signals
@@ -319,18 +340,16 @@ def take_in(path: Path) -> tuple[Path, tuple[Signal, ...], dict[str, int]]:
             raise DataError(f"{file} has schema version {record.meta['schema']}; only one of {SCHEMA} is written on")
         if record.status == "completed":
             raise ConfigurationError(f"{file} is the record of a run that was completed")
-        counts = {
-            "steps": len(record.steps()),
-            "telemetry": len(record.telemetry()),
-            "events": len(record.events()),
-        }
+        # Each row is checked, also where only its number is needed.
+        record.steps(), record.telemetry(), record.events()
+        numbers = {table: record.numbers(table) for table in FIRST}
+        lost: dict[str, int] = dict(record.meta.get("recovered", {}).get("lost", {}))
         has_ended = "status" in record.meta
     beside = {
         (each.table, each.row[0]): each
         for second in second_files(file)
         for each in read_mirror(second)
-        # Numbered without a gap, so what the journal lacks is behind its last row.
-        if each.table not in FIRST or each.row[0] >= FIRST[each.table] + counts[each.table]
+        if each.table not in FIRST or each.row[0] not in numbers[each.table]
     }
     if not has_ended and ("meta", "status") in beside:
         raise ConfigurationError(
@@ -338,15 +357,31 @@ def take_in(path: Path) -> tuple[Path, tuple[Signal, ...], dict[str, int]]:
             f"`bench recover-journal {file}` puts them together"
         )
     missing = [each for (table, _), each in beside.items() if table in FIRST]
+    for each in missing:
+        numbers[each.table].add(int(each.row[0]))
+    # A number is never given twice, also where rows before it are lost.
+    counts = {table: max(found, default=FIRST[table] - 1) + 1 - FIRST[table] for table, found in numbers.items()}
+    lost = {**lost, **{table: counts[table] - len(found) for table, found in numbers.items()}}
+    for table in ("steps", "events"):
+        if lost[table]:
+            raise DataError(
+                f"{file} lacks {lost[table]} of its {table}, which are lost, and a run is resumed by all of them; "
+                "start the run anew"
+            )
     if missing:
         try:
             with closing(Store(file, _READERS)) as store:
                 store.write(missing)
         except (sqlite3.Error, OSError) as error:
             raise DataError(f"{file} cannot be written on: {error}") from None
-    for each in missing:
-        counts[each.table] += 1
-    return file, signals, counts
+    return file, signals, counts, {table: count for table, count in lost.items() if count}
+
+
+def _remove(journal: Path) -> None:
+    """Remove the files of a journal that could not be made."""
+    with suppress(OSError):
+        for path in (*files_of(journal), *second_files(journal)):
+            path.unlink(missing_ok=True)
 
 
 def abandon(path: Path, reason: str, safe_state: Mapping[str, str]) -> None:

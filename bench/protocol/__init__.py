@@ -27,6 +27,7 @@ from bench.protocol.vocabulary import (
     Prompt,
     Reading,
     Step,
+    Summary,
 )
 from bench.settling import Arrived, Dwell, Settle, Settled, UntilSteady
 
@@ -55,6 +56,7 @@ __all__ = [
     "Slot",
     "Slots",
     "Step",
+    "Summary",
     "UntilSteady",
     "Views",
     "digest_of",

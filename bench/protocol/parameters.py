@@ -20,6 +20,9 @@ from bench.protocol.vocabulary import Messages
 Needs = Mapping[str, type[Device] | type[Signal]] | Sequence[str]
 """Slots by name with the kind of each, or names of devices and signals of one rig."""
 
+_UNIT_OF = "unit of "
+"""Begins the unit of a parameter that is that of a slot, where no rig says which that is."""
+
 
 @dataclass(frozen=True)
 class FromSlot:
@@ -182,7 +185,13 @@ class ProtocolDefinition:
         """The names of the parameters that may be changed at a pause."""
         return tuple(name for name in self.parameters.model_fields if self._extra(name).get("changeable"))
 
-    def change(self, parameters: ProtocolParameters, name: str, value: Any) -> Any:  # noqa: ANN401
+    def change(
+        self,
+        parameters: ProtocolParameters,
+        name: str,
+        value: Any,  # noqa: ANN401
+        roles: Mapping[str, RoleTable] | None = None,
+    ) -> Any:  # noqa: ANN401
         """Change a parameter of a protocol that goes on, which sees it when it reads it next.
 
         Parameters
@@ -193,6 +202,8 @@ class ProtocolDefinition:
             The parameter.
         value
             Its new value, also as a text.
+        roles : mapping of str to RoleTable, optional
+            The roles that the rig file binds, for units in messages.
 
         Returns
         -------
@@ -209,7 +220,7 @@ class ProtocolDefinition:
             raise ConfigurationError(
                 f"protocol {self.name}: {name!r} cannot be changed at a pause; parameters that can: {known}"
             )
-        changed = self.parse({**parameters.model_dump(), name: value})
+        changed = self.parse({**parameters.model_dump(), name: value}, roles)
         # Of the object that the protocol has; no other way is open to it, as values are frozen.
         parameters.__dict__[name] = getattr(changed, name)
         return changed.model_dump(mode="json")[name]
@@ -286,7 +297,7 @@ class ProtocolDefinition:
             from_file = {
                 name: f"{path}: protocols.{self.name}.{name}: " for name in defaults or {} if name not in settings
             }
-            raise ConfigurationError("\n".join(self._explain(error, from_file))) from None
+            raise ConfigurationError("\n".join(self._explain(error, from_file, roles or {}))) from None
         for name in self.parameters.model_fields:
             choices = self._extra(name).get("choices")
             if choices is not None and getattr(parameters, name) not in choices():
@@ -324,7 +335,7 @@ class ProtocolDefinition:
         unit = str(extra.get("unit", ""))
         if unit.startswith("@"):
             slot, slash, _ = unit[1:].partition("/")
-            unit = (roles[slot].unit if slot in roles else None) or f"unit of {slot}"
+            unit = (roles[slot].unit if slot in roles else None) or f"{_UNIT_OF}{slot}"
             unit = rate_unit(unit) if slash else unit
         low = next((m.ge for m in info.metadata if getattr(m, "ge", None) is not None), None)
         high = next((m.le for m in info.metadata if getattr(m, "le", None) is not None), None)
@@ -355,15 +366,25 @@ class ProtocolDefinition:
             default = "must be given" if info.default is PydanticUndefined else str(info.default)
         return ParameterHelp(name, default, unit, allowed, info.description or "")
 
-    def _explain(self, error: ValidationError, from_file: Mapping[str, str]) -> Iterator[str]:
+    def _allowed(self, name: str, roles: Mapping[str, RoleTable]) -> str:
+        """Return what a parameter may be, with its unit, for a message."""
+        entry = self._parameter_help(name, roles, {})
+        if entry.unit in ("", "1"):
+            return entry.allowed
+        if not entry.unit.startswith(_UNIT_OF):
+            return f"{entry.allowed} {entry.unit}"
+        slot, slash, _ = entry.unit.removeprefix(_UNIT_OF).partition("/")
+        return f"{entry.allowed}, in the unit of the {slot}{' per second' if slash else ''}"
+
+    def _explain(
+        self, error: ValidationError, from_file: Mapping[str, str], roles: Mapping[str, RoleTable]
+    ) -> Iterator[str]:
         for problem in error.errors():
             name = ".".join(str(part) for part in problem["loc"]) or "parameters"
             if problem["type"] == "extra_forbidden":
                 known = ", ".join(self.parameters.model_fields) or "none"
                 yield f"protocol {self.name}: there is no parameter {name!r}; there are: {known}"
             elif name in self.parameters.model_fields:
-                entry = self._parameter_help(name, {}, {})
-                unit = f" {entry.unit}" if entry.unit not in ("", "1") else ""
                 given = "is missing" if problem["type"] == "missing" else f"= {problem['input']!r} is not allowed"
                 if problem["type"] == "missing" and isinstance(source := self._extra(name).get("default"), FromSlot):
                     given += f" (the rig file does not say {source.text})"
@@ -371,7 +392,7 @@ class ProtocolDefinition:
                     given += f" (nor does the rig file say it: [protocols.{self.name}] {name} = ...)"
                 yield (
                     f"{from_file.get(name, '')}protocol {self.name}: parameter {name} {given}; "
-                    f"allowed: {entry.allowed}{unit} ({problem['msg']})"
+                    f"allowed: {self._allowed(name, roles)} ({problem['msg']})"
                 )
             else:
                 yield f"protocol {self.name}: {problem['msg'].removeprefix('Value error, ')}"
@@ -408,7 +429,7 @@ class OpenParameters:
     def change(self, step: int, name: str, value: str) -> ParameterChange:
         """Change one from the reading of a step on; raises ConfigurationError if that is not allowed."""
         former = self.parameters.model_dump(mode="json").get(name)
-        return ParameterChange(step, name, self.definition.change(self.parameters, name, value), former)
+        return ParameterChange(step, name, self.definition.change(self.parameters, name, value, self.roles), former)
 
 
 def protocol(

@@ -69,7 +69,8 @@ def plan(definition: ProtocolDefinition, parameters: ProtocolParameters, slots: 
 
     Known are the number of a step, how it settles if all goes well, and as `NAME_setpoint` the set-point that a step
     has sent. Any other signal, and the time, is measured: a protocol may keep it, calculate with it and write it into
-    a note; the plan ends where it compares it, turns it into a number, or sends it.
+    a note; the plan ends where it compares it, turns it into a number, or sends it. What only the sentence of a
+    `Summary` depends on may be compared there.
 
     Raises ConfigurationError if the protocol does not end within a million messages, its parameters do not fit
     together, or it fails.

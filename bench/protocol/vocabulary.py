@@ -24,7 +24,7 @@ from __future__ import annotations
 import math
 import numbers
 from abc import ABC, abstractmethod
-from collections.abc import Generator, Mapping
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -333,6 +333,28 @@ class Note(Message):
 @dataclass(frozen=True)
 class Caution(Note):
     """A warning for the log."""
+
+
+class Summary(Note):
+    """A sentence for the log about readings, such as the greatest of them.
+
+    A plan has no readings, and does not ask for the sentence. So it goes on where a note that compares them would end
+    it.
+
+    Parameters
+    ----------
+    tell : callable
+        Returns the sentence.
+    """
+
+    def __init__(self, tell: Callable[[], str]) -> None:
+        object.__setattr__(self, "_tell", tell)
+
+    @property
+    def text(self) -> str:
+        """The sentence."""
+        told: str = vars(self)["_tell"]()
+        return told
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.errors import ConfigurationError, DataError
-from bench.journal import FILE_NAME, Record
+from bench.journal import Record, find_journals
 from bench.locks import is_in_use
 from bench.recorded_files import file_name
 
@@ -28,7 +28,7 @@ class ListedRun:
         Its folder.
     status : str
         `completed`, `aborted`, `failed`, `running` (in a process of this computer), `unfinished` (its process
-        died, or is of another computer) or `damaged`.
+        died, or is of another computer) or `damaged` (rows are damaged, or the journal is gone).
     protocol, rig : str
         What ran, and on what.
     started : str
@@ -65,11 +65,14 @@ class ListedRun:
 def list_runs(folder: Path) -> list[ListedRun]:
     """Return the runs below a folder, in the order of their start; those that cannot be read come first.
 
+    Damaged are those in which `Record.damage` finds a wrong row, and those whose journal is gone but for a second
+    file or a recovered copy.
+
     Raises ConfigurationError if there is no such folder.
     """
     if not folder.is_dir():
         raise ConfigurationError(f"{folder} is not a folder")
-    return sorted((_listed(path) for path in folder.rglob(FILE_NAME)), key=lambda run: (run.started, run.folder))
+    return sorted((_listed(path) for path in find_journals(folder)), key=lambda run: (run.started, run.folder))
 
 
 def select_runs(
@@ -120,15 +123,18 @@ def _listed(path: Path) -> ListedRun:
     try:
         with Record(path) as record:
             meta = record.meta
+            status = RUNNING if record.status == "unfinished" and is_in_use(folder) else record.status
+            damage = "" if status == RUNNING else record.damage()
+            counted = "counts" in meta or damage
             return ListedRun(
                 folder,
-                RUNNING if record.status == "unfinished" and is_in_use(folder) else record.status,
+                DAMAGED if damage else status,
                 str(meta["protocol"]),
                 str(meta["rig"]),
                 str(meta["host"]["started"]),
                 meta.get("finished"),
-                meta["counts"]["steps"] if "counts" in meta else len(record.steps()),
-                main_result(record) if record.status == "completed" else str(meta.get("reason", "")),
+                int(meta.get("counts", {}).get("steps", 0)) if counted else len(record.steps()),
+                damage or (main_result(record) if status == "completed" else str(meta.get("reason", ""))),
                 meta.get("changed", {}) | meta["overrides"],
                 {
                     **meta["parameters"],

@@ -8,6 +8,7 @@ so along the diagonal, from turning point to turning point, than across it, from
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -38,7 +39,7 @@ _EDGES = (0.0, 0.5, 1.0, 1.5, 2.0, 2.5, 3.0)
 """How many levels of either end of the plane may hold no hysterons, as cross-validation tries."""
 _FOLDS = 5
 _BLOCK = 40
-"""Folds of the cross-validation, and rows that stay together in it."""
+"""Folds of the cross-validation, and rows that stay together in it if there are more than these."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -151,18 +152,31 @@ def _saturated(levels: Floats, cells: Floats, target: Floats, weight: Floats) ->
 
 
 def _held_out(columns: Floats, penalty: Floats, targets: Floats, weights: Floats) -> Floats:
-    """Return the errors of cross-validation, by weight of the penalty, row and target."""
-    from scipy.linalg import solve
+    """Return the errors of cross-validation, by weight of the penalty, row and target.
+
+    They are infinite where the penalty is too small for the rows to say anything.
+    """
+    from scipy.linalg import LinAlgError, LinAlgWarning, solve
 
     gram, right = columns.T @ columns, columns.T @ targets
-    folds = (np.arange(targets.shape[0]) // _BLOCK) % _FOLDS
+    count = targets.shape[0]
+    # The rows of a single block would all be held out at once.
+    block = _BLOCK if count > _BLOCK else -(-count // _FOLDS)
+    folds = (np.arange(count) // block) % _FOLDS
     unknown = np.zeros((weights.size, *targets.shape))
     for fold in range(_FOLDS):
         out = folds == fold
         held = columns[out]
         kept, sums = gram - held.T @ held, right - held.T @ targets[out]
         for number, weight in enumerate(weights):
-            unknown[number, out] = targets[out] - held @ solve(kept + weight * penalty, sums, assume_a="pos")
+            try:
+                with warnings.catch_warnings():
+                    warnings.simplefilter("error", LinAlgWarning)
+                    found = solve(kept + weight * penalty, sums, assume_a="pos")
+            except (LinAlgError, LinAlgWarning):
+                unknown[number] = np.inf
+            else:
+                unknown[number, out] = targets[out] - held @ found
     return unknown
 
 

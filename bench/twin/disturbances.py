@@ -176,7 +176,7 @@ class _Hold:
 def _holds(recording: Recording, signal: str, dynamics: Dynamics) -> list[_Hold]:
     """Return the settled part of each hold that has readings enough."""
     values = recording.columns[signal]
-    rows = np.flatnonzero(_settled(recording, dynamics) & np.isfinite(values))
+    rows = np.flatnonzero(settled_rows(recording, dynamics) & np.isfinite(values))
     parts = np.split(rows, np.flatnonzero(np.diff(recording.last_change[rows])) + 1)
     return [_Hold(values[part], recording.is_reading[part]) for part in parts if part.size >= _LEAST_OF_HOLD]
 
@@ -415,7 +415,7 @@ class Part:
     def pair(self, edges: Floats) -> _Pairs:
         """Return the pairs of settled rows of a hold, by kind, the time between them, and slope."""
         r = self._recording
-        settled = _settled(r, self._dynamics)
+        settled = settled_rows(r, self._dynamics)
         quick, readings = (np.flatnonzero((r.is_reading == kind) & settled) for kind in (False, True))
         found = [(rows[:-gap], rows[gap:], kind) for kind, rows in enumerate((quick, readings)) for gap in _GAPS]
         # Of a hold with a single reading, how it went on until that.
@@ -506,7 +506,7 @@ def _noise(found: Sequence[float | None], resolution: float) -> Noise:
     return Noise(known if reading is None else reading, known if quick is None else quick, resolution)
 
 
-def _settled(recording: Recording, dynamics: Dynamics) -> NDArray[np.bool_]:
+def settled_rows(recording: Recording, dynamics: Dynamics) -> NDArray[np.bool_]:
     """Return at which rows the rest counts as still: so long after a change of the set-point, by its size."""
     actuator, response = dynamics.actuator, dynamics.response
     constant = 0.0 if actuator.order == 0 else max(1.0, 2.0 * actuator.damping) / actuator.frequency

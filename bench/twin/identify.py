@@ -25,6 +25,13 @@ from bench.twin.recording import read_recording, slots_of_twin
 from bench.twin.response import IdentifiedResponse, correct_response, identify_response
 from bench.twin.setpoints import identify_setpoints
 from bench.twin.specimen import Dynamics, Unevenness, Wander
+from bench.twin.suitability import (
+    doubts_of_disturbances,
+    doubts_of_model,
+    doubts_of_sweep,
+    raise_if_wrong,
+    run_of_model,
+)
 from bench.twin.tables import InexactTable
 from bench.twin.unevenness import identify_unevenness
 
@@ -63,6 +70,8 @@ class IdentifiedTwin:
         The model's output and the signal of the device, where the response is derived from that.
     source : str
         That signal; the response itself if it is not derived.
+    warnings : tuple of str
+        What the runs could not say, each with what to record instead, in a sentence.
     """
 
     recordings: tuple[Recording, ...]
@@ -80,6 +89,7 @@ class IdentifiedTwin:
     signals: Mapping[str, dict[str, Any]]
     conversion: tuple[tuple[float, float], ...]
     source: str
+    warnings: tuple[str, ...] = ()
 
     @property
     def setpoint_limits(self) -> dict[str, tuple[float, float]]:
@@ -97,6 +107,10 @@ class IdentifiedTwin:
         return found
 
     def rows(self) -> list[tuple[str, str]]:
+        """Return what was identified, and the warnings, as (name, text) pairs."""
+        return [*self.identified(), *(("warning", text) for text in self.warnings)]
+
+    def identified(self) -> list[tuple[str, str]]:
         """Return what was identified, with units and uncertainty, as (name, text) pairs."""
         first = self.recordings[0]
         units = {signal.name: signal.unit for signal in first.signals}
@@ -198,6 +212,7 @@ class IdentifiedTwin:
             "unevenness": vars(self.unevenness),
             "session_offset": self.offset,
             "reading_time": None if self.reading_time is None else vars(self.reading_time),
+            "warnings": list(self.warnings),
         }  # fmt: skip
 
 
@@ -211,20 +226,23 @@ def identify_twin(paths: Sequence[Path], file: RigFile, model: Path | None) -> I
     file : RigFile
         The rig.
     model : Path or None
-        File of the model; if None, it is identified from the run of the most steps.
+        File of the model; if None, it is identified from the run that determines most of one.
 
     Raises
     ------
     DataError
-        If a run or the model cannot be used.
+        If a run or the model cannot be used, or the model does not describe the runs.
     """
     slots_of_twin(file)
     recordings = tuple(read_recording(path, file) for path in paths)
     first = recordings[0]
     units = {signal.name: signal.unit for signal in first.signals}
     source, conversion = _source(recordings, file)
+    warnings: list[str] = []
     if model is None:
-        name, operator = _identify_model(max(recordings, key=lambda each: len(each.steps)), file, units)
+        swept, determined = run_of_model(recordings)
+        name, operator = _identify_model(swept, file, units)
+        warnings += doubts_of_sweep(swept, determined)
     else:
         name, operator = model.name, load_model(model).operator
         for what, unit, expected in (
@@ -242,6 +260,9 @@ def identify_twin(paths: Sequence[Path], file: RigFile, model: Path | None) -> I
     )
     setpoints, carried_out = identify_setpoints(recordings, actuator.dynamics, drive_noise, operator)
     response = identify_response(carried_out, actuator.dynamics, operator)
+    output = _difference(units[first.response])
+    raise_if_wrong(carried_out, response, name, output)
+    warnings += doubts_of_model(carried_out, response, output)
     operators = [operator] if response.correction is None else [operator, response.correction]
     dynamics = Dynamics(grid_step(actuator.dynamics), actuator.dynamics, response.dynamics)
     noise, wander, drift = identify_disturbances(
@@ -255,6 +276,7 @@ def identify_twin(paths: Sequence[Path], file: RigFile, model: Path | None) -> I
     unevenness = identify_unevenness(
         carried_out, response.of_model, response.left, operators, disturbed, effects, noise
     )
+    warnings += doubts_of_disturbances(carried_out, dynamics, drive_noise, noise, wander, drift)
     return IdentifiedTwin(
         recordings=recordings,
         model_name=name,
@@ -271,6 +293,7 @@ def identify_twin(paths: Sequence[Path], file: RigFile, model: Path | None) -> I
         signals=_signals(recordings, file, dynamics, drive_noise, noise, source, conversion),
         conversion=conversion,
         source=source,
+        warnings=tuple(warnings),
     )
 
 

@@ -176,7 +176,7 @@ def _delay(twin: IdentifiedTwin, file: RigFile) -> float:
 
 def _comments(twin: IdentifiedTwin) -> Iterator[str]:
     yield "# What was identified:"
-    yield from (f"#   {name.strip()}: {text}" for name, text in twin.rows())
+    yield from (f"#   {name.strip()}: {text}" for name, text in twin.identified())
 
 
 def _grid(twin: IdentifiedTwin) -> float:

@@ -90,3 +90,21 @@ def test_ctrl_c_in_the_first_moments_says_what_is(start, tmp_path):
     child.sendintr()
     child.expect("ended by Ctrl-C: no device was opened, nothing has moved; the outputs are as they were")
     assert ended(child) == 130
+
+
+def test_the_times_are_whole_on_a_terminal_of_eighty_columns(start):
+    child = start("run", "creep", "--rig", "sma", "--set", "duration=20", "--clock", "x60", columns=80)
+    child.expect(r"creep.*?\d+/\d+  t \d:\d\d:\d\d  left \d:\d\d:\d\d, ends \d\d:\d\d:\d\d")
+    child.expect(r"supply_voltage [\d.]+ V  load_cell_force [\d.-]+ N")
+    child.sendintr()
+    child.sendintr()
+    ended(child)
+
+
+def test_ctrl_c_in_the_rehearsal_says_that_nothing_has_moved(start):
+    child = start("run", "covering", "--rig", "sma", "--clock", "x60")
+    child.expect("rehearsing covering on sma")
+    child.sendintr()
+    child.expect("ending the rehearsal; nothing has moved")
+    child.expect("the rehearsal was ended by .*nothing has moved")
+    assert ended(child) == 130

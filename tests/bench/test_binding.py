@@ -173,6 +173,19 @@ class TestRefused:
         path = rig_file(append=f"{ROLES}\n[protocols.go]\n{table}\n")
         assert refused(path).startswith(f"{path}: {expected}")
 
+    def test_a_wrong_value_names_the_unit_of_the_slot(self, rig_file):
+        file = load_rig(rig_file(append=ROLES))
+        with pytest.raises(ConfigurationError, match=r"low = 'warm' is not allowed; allowed: any number °C \("):
+            PLAIN.parse({"low": "warm"}, file.roles, path=file.path)
+
+    def test_without_a_rig_the_unit_is_that_of_the_slot(self):
+        with pytest.raises(ConfigurationError) as caught:
+            PLAIN.parse({"low": "warm", "speed": "fast"})
+        assert "low = 'warm' is not allowed; allowed: any number, in the unit of the drive (" in str(caught.value)
+        assert "speed = 'fast' is not allowed; allowed: any number, in the unit of the drive per second (" in str(
+            caught.value
+        )
+
     def test_what_is_set_is_not_blamed_on_the_file(self, rig_file):
         file = load_rig(rig_file(append=f"{ROLES}\n[protocols.go]\ncount = 5\n"))
         with pytest.raises(ConfigurationError, match=r"^protocol go: parameter count = '30' is not allowed"):

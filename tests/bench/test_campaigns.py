@@ -1,6 +1,7 @@
 """Campaigns: the file, its tasks, what is done again, and the tables."""
 
 import csv
+import io
 import json
 import os
 import shutil
@@ -20,6 +21,7 @@ from bench.campaigns.file import read_campaign
 from bench.campaigns.study_tables import OverSeeds, over_seeds
 from bench.campaigns.tasks import DONE_NAME, UNFINISHED
 from bench.cli import main
+from bench.cli.campaign import SayingExecutor
 from bench.errors import ConfigurationError
 from bench.journal import Record
 from bench.locks import Holder, Locks
@@ -291,6 +293,40 @@ class TestTasks:
         assert again[0].pop("wall_time") != before[0].pop("wall_time")
         assert again == before
 
+    def test_what_is_gone_is_made_again_and_what_was_left_stays(self, campaign, tmp_path, capsys):
+        path, out = campaign(CHAIN, ("[0.1, 0.2]", "0.1"), ("0..1", "0..0")), tmp_path / "out"
+        assert start(path, "--out", out, "--workers", 1) == 0
+        tasks = expand(read_campaign(path)).tasks
+        run, model, _ = tasks
+        before = content(out / run)
+        (out / run / "journal.sqlite").unlink()
+        (out / run / "notes.txt").write_text("mine")
+        (out / model / "model.json").unlink()
+        found = done_before(tasks, out)
+        assert found.lost == {run: ("journal.sqlite",), model: ("model.json",)}
+        assert found.done.keys() == tasks.keys() - {run, model}
+        capsys.readouterr()
+        assert start(path, "--out", out, "--workers", 1) == 0
+        assert "3 of 3 carried out, 1 of them before" in capsys.readouterr().out
+        assert content(out / run) == before
+        assert (out / model / "model.json").is_file()
+        assert (out / f"{run}.incomplete" / "notes.txt").read_text() == "mine"
+        assert start(path, "--out", out, "--workers", 1) == 0
+        assert "nothing to do, 3 done before" in capsys.readouterr().out
+        (out / run / "journal.sqlite").unlink()
+        (line,) = done_before(tasks, out).put_in_place(out)
+        assert line.startswith(f"{run} is done again, as journal.sqlite is gone; what was left is in ")
+        assert line.endswith(".incomplete-2 beside it")
+
+    def test_a_result_that_cannot_be_used_is_named_with_what_to_remove(self, campaign, tmp_path, capsys):
+        path, out = campaign(CHAIN, ("[0.1, 0.2]", "0.1"), ("0..1", "0..0")), tmp_path / "out"
+        assert start(path, "--out", out, "--workers", 1) == 0
+        _, model, _ = expand(read_campaign(path)).tasks
+        (out / model / "model.json").write_text("broken")
+        path = campaign(CHAIN, ("[0.1, 0.2]", "0.2"), ("0..1", "0..0"))
+        assert start(path, "--out", out, "--workers", 1) == 1
+        assert f"; remove {model} from the campaign, and the next start makes it anew" in capsys.readouterr().err
+
     def test_models_are_compared_on_runs(self, campaign, tmp_path, capsys):
         compared = CHAIN[: CHAIN.index('[[runs]]\nname = "track"')].replace("levels = 6", "levels = [4, 6]")
         for name, recalibrate in (("own", ""), ("offset", 'recalibrate = "offset"\nrecalibrate_rows = 20\n')):
@@ -475,3 +511,29 @@ def test_a_number_over_seeds_is_its_median_and_its_range():
     assert set(values) == {"a", "same", "word"}
     assert "{a[0]:.1f}, {a[1]:+g}, {same}, {word}".format_map(values) == "2.5 (1.0–4.0), +0 (-0.2 to +0.2), 7, x"
     assert f"{OverSeeds((float('nan'), 3.0, 5.0)):.0f}" == "4 (3–5)"
+
+
+def test_a_campaign_says_now_and_then_how_far_it_is_where_there_is_no_terminal():
+    printed, go_on = threading.Event(), threading.Event()
+
+    class Slow:
+        def submit(self, task):
+            del task
+
+        def next_done(self):
+            assert go_on.wait(60)
+            return "task", "done"
+
+    class Paper(io.StringIO):
+        def write(self, text):
+            if "0 of 3 done" in text:
+                printed.set()
+            return super().write(text)
+
+    paper = Paper()
+    with SayingExecutor(Slow(), 3, Console(file=paper), every=0.01) as executor:
+        executor.submit("task")
+        assert printed.wait(60)
+        go_on.set()
+        assert executor.next_done() == ("task", "done")
+    assert paper.getvalue().splitlines()[0].endswith("  0 of 3 done")

@@ -492,9 +492,10 @@ class TestWritingOn:
         file.append([entry("steps", (n, 50.0, 50.5, "", "", "dwell", "{}", 1.0, "[]")) for n in (1, 2)])
         file.append([note(1)])
         file.close()
-        path, signals, counts = take_in(tmp_path)
+        path, signals, counts, lost = take_in(tmp_path)
         assert (path, signals[0].name) == (tmp_path / FILE_NAME, "force")
         assert counts == {"steps": 3, "telemetry": 0, "events": 1}
+        assert lost == {}
         with Record(tmp_path) as record:
             assert len(record.steps()) == 3
 

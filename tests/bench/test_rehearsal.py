@@ -22,7 +22,7 @@ from bench.errors import AbortError, ConfigurationError
 from bench.hysteresis import Preisach, ThermalExpansion, uniform_levels
 from bench.journal import FILE_NAME, Record, run_card
 from bench.model_file import ModelFile
-from bench.protocol import Dwell, Step, find_protocol, plan, protocol
+from bench.protocol import Dwell, Step, Summary, find_protocol, plan, protocol
 from bench.rehearsal import Rehearsal, rehearse
 from bench.rig import Rig
 from bench.rig_file import load_rig
@@ -237,6 +237,40 @@ class TestTwin:
         assert (found.twin, found.status, found.complete, found.steps) == ("", "planned", False, 1)
         assert found.extremes["tec_setpoint"].margin == 15.0
 
+    @pytest.mark.parametrize(("rig", "steps"), [("vo2", 243), ("sma", 244), ("hybrid", 243)])
+    def test_creep_is_planned_to_its_end(self, make, console, rig, steps):
+        """Its notes compare readings, and its steps do not depend on them."""
+        creep = find_protocol("creep")
+        with Rig(load_rig(rig), VirtualClock(), 0) as laboratory:
+            description = laboratory.description
+            settings = creep.parse({}, description.file.roles)
+            found = Rehearsal.of_plan(description, creep, plan(creep, settings, description.slots(creep)))
+        assert (found.complete, found.steps) == (True, steps)
+        assert found.seconds <= found.at_most < math.inf
+        drive = found.extremes[f"{description.file.roles['drive'].device}_setpoint"]
+        assert drive.low <= settings.cool < settings.hot <= drive.high
+        rehearsal = foresee(make(definition=creep, rig=rig, settings={"duration": 20.0}), console)
+        assert rehearsal.seconds <= rehearsal.at_most < math.inf
+
+    def test_a_summary_is_not_asked_for_in_a_plan_and_stands_in_the_log(self, make, console):
+        def sum_up(parameters):
+            first = yield Step({"tec": 20.0}, Dwell(1.0))
+            second = yield Step({"tec": 30.0}, Dwell(1.0))
+            readings = [first["probe_temperature"], second["probe_temperature"]]
+            yield Summary(
+                lambda: f"of {len(readings)} readings the greatest is the last: {max(readings) == readings[-1]}"
+            )
+            yield Step({"tec": 40.0}, Dwell(1.0))
+
+        sum_up.__annotations__ = {"parameters": stairs.parameters}
+        sum_up.__doc__ = "Sum up."
+        definition = protocol(needs=("tec",))(sum_up)
+        found = plan(definition, definition.parse({}, {}))
+        assert (found.complete, found.steps, found.extremes["tec"]) == (True, 3, (20.0, 40.0))
+        with Record(carry_out(make(definition=definition, clock="virtual"), console).folder) as record:
+            notes = [event.text for event in record.events() if event.kind == "note"]
+        assert notes == ["of 2 readings the greatest is the last: True"]
+
     @pytest.mark.parametrize(
         ("change", "message"),
         [
@@ -333,10 +367,12 @@ class TestCommand:
 
     def test_what_would_not_complete_exits_like_a_wrong_parameter(self, bench, tmp_path):
         result = tmp_path / "result.json"
-        code, out, err = bench("rehearse", "creep", "--rig", "vo2", "--set", "cool=10", "--json", result)
+        settings = ("--set", "goal=1e6", "--set", "low=30", "--set", "high=80")
+        protocol_name = self.PROTOCOL.replace(":bisect", ":climb")
+        code, out, err = bench("rehearse", protocol_name, "--rig", "vo2", *settings, "--json", result)
         assert code == 2
-        assert "error: tec: set-point 10 °C is outside of 15 to 95 °C" in re.sub(r"\s+", " ", out)
-        assert "in the rehearsal on vo2, protocol creep ends after 122 steps" in re.sub(r"\s+", " ", err)
+        assert re.search(r"error: tec: set-point [\d.]+ °C is outside of 15 to 95 °C", re.sub(r"\s+", " ", out))
+        assert re.search(r"in the rehearsal on vo2, protocol climb ends after \d+ steps", re.sub(r"\s+", " ", err))
         assert json.loads(result.read_text())["status"] == "failed"
 
     @pytest.mark.parametrize(
@@ -345,6 +381,7 @@ class TestCommand:
             (["rehearse", "creep", "--rig", "vo3"], "there is no rig 'vo3'"),
             (["rehearse", "crep", "--rig", "vo2"], "there is no protocol 'crep'"),
             (["rehearse", "creep", "--rig", "vo2", "--set", "warm=1"], "there is no parameter 'warm'"),
+            (["rehearse", "creep", "--rig", "vo2", "--set", "cool=10"], "would set tec to between 10 and 80 °C"),
             (["run", "creep", "--rig", "vo2", "--dry-run", "--no-rehearse"], "leave --no-rehearse out"),
         ],
     )

@@ -170,6 +170,19 @@ def test_a_record_that_cannot_be_repeated_gets_one_message(bench, tracked, tmp_p
     assert not (tmp_path / "again").exists()
 
 
+@pytest.mark.parametrize("change", ["UPDATE telemetry SET t = t + 1 WHERE tick = 3", "UPDATE steps SET label = 'no'"])
+def test_a_damaged_record_is_refused_before_anything_moves(bench, tracked, tmp_path, change):
+    run = tmp_path / "run"
+    run.mkdir()
+    shutil.copy(tracked[0] / FILE_NAME, run)
+    with closing(sqlite3.connect(run / FILE_NAME)) as db, db:
+        db.execute(change)
+    code, _, err = bench("repeat", run, "--out", tmp_path / "again")
+    assert code == 3
+    assert "its checksum does not fit; `bench recover-journal" in err
+    assert not (tmp_path / "again").exists()
+
+
 def test_a_rig_whose_module_is_gone_and_a_rig_that_is_in_the_record(bench, climbed, tmp_path):
     code, _, err = bench("repeat", climbed, "--rig", "vo2", "--out", tmp_path / "again")
     assert code == 2

@@ -18,6 +18,7 @@ from bench.cli import main
 from bench.errors import AgreementError, ConfigurationError, DataError
 from bench.hysteresis import MemoryCurve
 from bench.journal import FILE_NAME, Journal, Record
+from bench.journal.recovery import RECOVERED_NAME
 from bench.locks import Holder, Locks
 from bench.past.corners import corners, turning_points
 from bench.resume import Resume, resume
@@ -156,6 +157,28 @@ class TestResume:
         assert [step.step for step in steps_of(folder)] == list(range(8))
         with Record(folder) as record:
             assert [entry["after_step"] for entry in record.meta["resumes"]] == [1, 4]
+
+    def test_its_speed_is_that_of_this_process(self, climb):
+        folder = climb(steps=6, died_after=3)
+        with Record(folder) as record:
+            last = max(*record.telemetry()["t"].tolist(), *record.steps()["finished"].tolist())
+        result = resume(Resume(folder=folder), silent())
+        outcome = result.outcome
+        assert outcome.own_seconds == pytest.approx(outcome.laboratory_seconds - last)
+        assert outcome.own_seconds < outcome.laboratory_seconds
+        assert result.time_ratio == outcome.own_seconds / result.wall_seconds
+
+    def test_of_a_recovered_copy_says_where_it_has_to_be(self, climb):
+        folder = climb()
+        (folder / FILE_NAME).rename(folder / RECOVERED_NAME)
+        other = folder.with_name(f"{folder.name}-recovered")
+        with pytest.raises(ConfigurationError) as refused:
+            resume(Resume(folder=folder / RECOVERED_NAME), silent())
+        command = f"mkdir {other} && cp {folder / RECOVERED_NAME} {other / FILE_NAME}"
+        assert f"`{command}`, and then `bench resume {other}`" in str(refused.value)
+        other.mkdir()
+        shutil.copy(folder / RECOVERED_NAME, other / FILE_NAME)
+        assert resume(Resume(folder=other), silent()).outcome.status == "completed"
 
     def test_ends_what_died_behind_its_last_step(self, climb):
         folder = climb(steps=4, died_after=4)

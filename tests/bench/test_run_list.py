@@ -2,6 +2,7 @@
 
 import io
 import json
+import shutil
 import sqlite3
 from contextlib import closing
 
@@ -10,6 +11,7 @@ from heater_laboratory import RIG
 from heater_protocols import stairs
 from rich.console import Console
 
+from bench.cli.run_list import Status
 from bench.journal import FILE_NAME, Record
 from bench.locks import Holder, Locks
 from bench.protocol import Messages, Note, ProtocolParameters, parameter, protocol
@@ -65,6 +67,21 @@ def test_every_run_below_a_folder_is_listed(bench, runs, tmp_path):
     assert "5 runs" in out
 
 
+def test_damaged_rows_and_lost_journals_are_marked(bench, runs, tmp_path):
+    damaged, lost = tmp_path / "all" / "damaged", tmp_path / "all" / "lost"
+    for folder in (damaged, lost):
+        shutil.copytree(runs["plain"], folder)
+    with closing(sqlite3.connect(damaged / FILE_NAME)) as db, db:
+        db.execute("UPDATE telemetry SET t = t + 1 WHERE tick = 3")
+    (lost / FILE_NAME).rename(lost / "journal.mirror")
+    _, found = listed(bench, tmp_path, tmp_path / "all")
+    by_name = {run["folder"]: run for run in found}
+    assert [run["status"] for run in found] == ["damaged", "damaged"]
+    assert by_name[str(damaged)]["protocol"] == "stairs"
+    assert "table telemetry, row 3" in by_name[str(damaged)]["result"]
+    assert f"`bench recover-journal {lost}`" in by_name[str(lost)]["result"]
+
+
 def test_a_run_that_goes_on_is_told_from_one_that_died(bench, runs, tmp_path):
     folder = runs["unfinished"]
     with Locks(Holder.of_this_process("heater", str(folder))) as locks:
@@ -83,7 +100,7 @@ def test_a_run_that_goes_on_is_told_from_one_that_died(bench, runs, tmp_path):
         (["--where", "count=4", "--status", "completed"], {"plain", "again"}),
         (["--status", "damaged"], {"damaged"}),
         (["--protocol", "stairs", "--rig", "heater", "--where", "increment=7.5"], {"hotter"}),
-        (["--rig", "vo2"], set()),
+        (["--rig", "heater", "--status", "failed"], set()),
     ],
 )
 def test_runs_are_found_by_what_was_set(bench, runs, tmp_path, options, expected):
@@ -152,14 +169,42 @@ def test_the_name_of_a_folder_is_short_and_fits_every_file_system():
         """Try."""
         yield Note("x")
 
-    def name(overrides, **settings):
+    def name(overrides, rig="heater", **settings):
         changed = try_out.changed(try_out.parse(settings), {}, {})
-        return run_name(try_out, {"rig": "heater", "changed": changed, "overrides": overrides})
+        return run_name(try_out, {"rig": rig, "changed": changed, "overrides": overrides})
 
     assert name({}) == name({}, more="0") == "heater-try-out"
     assert name({}, model="C:\\models\\m 1.json", more="-2.50") == "heater-try-out-more--2.5-model-m-1"
     assert name({"emulation.offset": "0.3"}, levels="1,2.5") == "heater-try-out-levels-1+2.5-offset-0.3"
     assert name({}, text='a/b:c*"<|>?\n. ') == "heater-try-out-text-a-b-c"
+    assert name({}, "twin ö-climb") == "twin-o-climb-try-out"
+    assert name({}, ".§ℵ?") == "x-try-out"
+    assert len(name({}, "r" * 200)) <= 96
     long = name({f"table.key{i}": "0123456789" for i in range(20)}, text="x" * 500)
     assert len(long) <= 96
     assert long.endswith("-more")
+
+
+class TestWhatIsAskedFor:
+    @pytest.mark.parametrize(
+        ("option", "value", "said"),
+        [
+            ("--status", "nonsense", "'completed', 'aborted', 'failed', 'running', 'unfinished', 'damaged'"),
+            ("--rig", "nosuch", "--rig nosuch: no run is of it; there are runs of: heater"),
+            ("--protocol", "nosuch", "--protocol nosuch: no run is of it; there are runs of: stairs"),
+        ],
+    )
+    def test_a_name_that_no_run_has_is_refused_with_those_that_there_are(self, bench, runs, option, value, said):
+        code, out, err = bench("runs", runs["plain"].parent, option, value)
+        assert (code, out) == (2, "")
+        assert said in " ".join(err.replace("│", " ").split())
+
+    def test_a_status_that_there_is_finds_none(self, bench, runs):
+        code, out, _ = bench("runs", runs["plain"].parent, "--status", Status.ABORTED)
+        assert code == 0
+        assert out.endswith("0 runs\n")
+
+    def test_one_run_that_is_named_itself(self, bench, runs):
+        _, out, _ = bench("runs", runs["plain"])
+        assert out.endswith("\n1 run\n")
+        assert f"    {runs['plain'].name}\n" in out

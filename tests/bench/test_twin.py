@@ -16,6 +16,7 @@ from bench.control.dynamics import ActuatorDynamics
 from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import PrandtlIshlinskii, Preisach, uniform_levels
 from bench.journal import Record
+from bench.model_file import load_model
 from bench.rig_file import load_rig
 from bench.transients import _kernels
 from bench.transients.actuator import identify_actuator
@@ -24,6 +25,7 @@ from bench.twin.correction import identify_correction
 from bench.twin.disturbances import Noise, Part, evidence, identify_disturbances, mean_effects, noise_of
 from bench.twin.setpoints import identify_setpoints
 from bench.twin.specimen import Dynamics, Specimen, Unevenness, Wander
+from bench.twin.suitability import run_of_model
 from bench.twin.unevenness import identify_unevenness
 from bench.twin.write import write_twin
 from sim_devices.twin_laboratory import SpecimenPlant
@@ -61,6 +63,59 @@ def twin(measured, model, tmp_path_factory):
         main(["twin", *map(str, measured), *options])
     assert not stopped.value.code
     return out, json.loads(found.read_text())
+
+
+def test_the_model_is_from_the_run_that_sweeps_the_drive(tmp_path):
+    """The hold has more steps than the sweep, and says nothing of any other set-point."""
+    creep = bench.run("creep", "hybrid", out=tmp_path, seed=1, interval=0.2, duration=24.0)
+    loops = bench.run("damped-oscillation", "hybrid", out=tmp_path, seed=1, half_cycles=8)
+    assert len(creep.readings) > len(loops.readings)
+    twin = write_twin([creep.folder, loops.folder], "hybrid", tmp_path / "twin.toml")
+    assert twin.response.rms_model < 0.03 * np.ptp(loops.readings[twin.recordings[0].response])
+    assert twin.warnings == ()
+
+
+@pytest.mark.parametrize(("increment", "half_cycles"), [(8.0, 4), (6.0, 3)])
+def test_a_short_run_makes_a_twin_and_warnings(tmp_path, increment, half_cycles):
+    settings = {"increment": increment, "half_cycles": half_cycles, "dwell": 2.0}
+    run = bench.run("damped-oscillation", "vo2", out=tmp_path, seed=1, **settings)
+    twin = write_twin([run.folder], "vo2", tmp_path / "twin.toml")
+    few, still = twin.warnings
+    count = len(run.readings)
+    assert f"{run.folder.name}, whose readings determine only {count} of the 211 numbers" in few
+    assert "add a run that sweeps the drive up and down in small increments, such as damped-oscillation" in few
+    assert "noise of the response, wander, drift: not known, and taken as 0" in still
+    assert "add a run of creep" in still
+    load_rig(str(tmp_path / "twin.toml"))
+
+
+def test_a_run_under_control_makes_a_twin_and_warnings(model, tmp_path):
+    run = bench.run("tracking", "vo2", out=tmp_path, seed=1, model=str(model), count=4).folder
+    found = tmp_path / "twin.json"
+    with pytest.raises(SystemExit) as stopped:
+        main(["twin", str(run), "--rig", "vo2", "--out", str(tmp_path / "twin.toml"), "--json", str(found)])
+    assert not stopped.value.code
+    few, *_, still = json.loads(found.read_text())["warnings"]
+    assert "the model is from" in few
+    assert "noise of the response, wander, drift: not known" in still
+
+
+def test_what_the_runs_say_has_no_warning(twin):
+    assert twin[1]["warnings"] == []
+
+
+def test_a_model_that_describes_the_response_worse_than_a_constant_is_refused(measured, model, tmp_path):
+    right = load_model(model)
+    operator = right.operator.with_coefficients(-right.operator.coefficients, right.operator.bias)
+    wrong = replace(right, model=operator)
+    wrong.save(tmp_path / "wrong.json")
+    message = (
+        r"model wrong\.json is off by .* 1/m RMS, where the response has a range of .* or give a model by --model"
+    )
+    with pytest.raises(DataError, match=message) as error:
+        write_twin(measured, "vo2", tmp_path / "twin.toml", tmp_path / "wrong.json")
+    assert len(str(error.value).splitlines()) == 1
+    assert not (tmp_path / "twin.toml").exists()
 
 
 def test_the_dynamics_of_the_plate_are_found(twin):
@@ -302,6 +357,26 @@ def test_a_sensor_that_reads_otherwise_from_run_to_run_is_no_dynamics():
     found = identify_actuator(runs)
     assert (found.dynamics.order, found.dynamics.delay) == (0, 0.0)
     assert found.rms == pytest.approx(2e-3, rel=0.1)
+
+
+def test_the_run_of_the_model_is_not_that_of_the_most_readings():
+    """What counts is how many histories of the drive were read, on the range of all runs."""
+
+    def held(levels, readings):
+        changes = 10.0 * np.arange(len(levels))
+        times = np.sort(np.concatenate([changes + each for each in np.linspace(1.0, 9.0, readings)]))
+        levels = np.array(levels, dtype=float)
+        return recording_from(times, levels[np.searchsorted(changes, times) - 1], changes, levels)
+
+    hold = held([0.0, 40.0, 20.0], 100)
+    # A controller that makes small moves about its targets.
+    control = held([target + 0.1 * move for target in (10.0, 20.0, 30.0) for move in range(40)], 1)
+    sweep = held([*range(0, 41, 4), *range(36, -1, -4), *range(4, 33, 4)], 1)
+    assert run_of_model([hold])[1] == 3
+    # The second rise repeats the first.
+    assert run_of_model([hold, control, sweep]) == (sweep, 20)
+    assert run_of_model([hold, control])[0] is control
+    assert run_of_model([hold, control])[1] < 12
 
 
 def test_outliers_of_the_drive_are_seen_however_slow_the_response_is(tmp_path):

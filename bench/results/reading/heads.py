@@ -19,6 +19,10 @@ _UNIT = rf"(?:1|{_FACTOR})(?:\s?[/*·⋅.]\s?\(?{_FACTOR}\)?|\s{_FACTOR})*|1|-"
 _SPELLINGS = {"degC": "°C", "deg_C": "°C", "ºC": "°C", "celsius": "°C", "º": "°", "sec": "s"}
 
 
+class NoColumnError(DataError):
+    """A column that a table does not have."""
+
+
 @dataclass(frozen=True)
 class Head:
     """Head of a column.
@@ -120,8 +124,10 @@ def find_place(path: Path, heads: Sequence[Head], columns: int, name: str) -> in
 
     Raises
     ------
+    NoColumnError
+        If there is no such column.
     DataError
-        If there is no such column or several.
+        If there are several.
     """
     wanted = _folded(name.strip())
     exact = [i for i, head in enumerate(heads) if _folded(head.text) == wanted]
@@ -137,11 +143,11 @@ def find_place(path: Path, heads: Sequence[Head], columns: int, name: str) -> in
     if name.isdecimal() and 1 <= int(name) <= columns:
         return int(name) - 1
     if not heads:
-        raise DataError(
+        raise NoColumnError(
             f"{path}: has no column {name!r}, as it has no header line; name columns by number, 1 to {columns}"
         )
     known = ", ".join(head.text for head in heads if head.text)
-    raise DataError(f"{path}: has no column {name!r}; it has: {known} (or a number, 1 to {columns})")
+    raise NoColumnError(f"{path}: has no column {name!r}; it has: {known} (or a number, 1 to {columns})")
 
 
 def _spelled(unit: str) -> str:

@@ -6,7 +6,7 @@ import csv
 import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from typing import TypeAlias
@@ -25,10 +25,25 @@ NOT_NUMBERS = ("#DIV/0!", "#N/A", "#NAME?", "#NULL!", "#NUM!", "#REF!", "#VALUE!
 """Errors of spreadsheets, which are no comments."""
 
 NUMBER = {
-    ".": re.compile(r"[+-]?(?:(?:\d+(?:\.\d*)?|\.\d+)(?:[eE][+-]?\d+)?|nan|inf(?:inity)?)", re.IGNORECASE | re.ASCII),
-    ",": re.compile(r"[+-]?(?:(?:\d+(?:,\d+)?|,\d+)(?:[eE][+-]?\d+)?|nan|inf(?:inity)?)", re.IGNORECASE | re.ASCII),
+    ".": re.compile(
+        r"[+-]?(?:(?:\d+(?:\.\d*)?|\.\d+)(?:e[+-]?\d+)?|(?:\d+\.\d*|\.\d+)d[+-]?\d+|nan|inf(?:inity)?)",
+        re.IGNORECASE | re.ASCII,
+    ),
+    ",": re.compile(
+        r"[+-]?(?:(?:\d+(?:,\d+)?|,\d+)(?:e[+-]?\d+)?|\d*,\d+d[+-]?\d+|nan|inf(?:inity)?)",
+        re.IGNORECASE | re.ASCII,
+    ),
 }
-"""A number, by its decimal sign."""
+"""A number, by its decimal sign; an exponent may begin with D, as Fortran writes it, if the sign is there."""
+
+D_EXPONENTS = "exponents with D"
+"""Note of such numbers."""
+
+_TIME = re.compile(r"\d+[-./:]\d")
+"""Begins a date or a time of day."""
+
+_MUCH_LONGER = 5
+"""Factor of rows by which a table is told from names and values above it."""
 
 _DELIMITERS = {
     "\t": "tab-separated",
@@ -62,6 +77,8 @@ class Layout:
         Number of columns of the data.
     notes : tuple of str
         What was assumed.
+    numbers, figures : tuple of int
+        Indices of the columns that hold numbers as a rule; of those that hold numbers, dates or times of day.
     comments : int
         Number of lines of comment above the data.
     """
@@ -72,6 +89,8 @@ class Layout:
     heads: tuple[Head, ...]
     columns: int
     notes: tuple[str, ...]
+    numbers: tuple[int, ...] = ()
+    figures: tuple[int, ...] = ()
     comments: int = 0
 
     @property
@@ -90,13 +109,18 @@ class Row:
 
 @dataclass(frozen=True)
 class Header:
-    """What stands above the data: the heads, and how well they fit (2; 1 where there are none; 0 if they do not)."""
+    """What stands above the data: the heads, and how well they fit (2; 1 where there are none; 0 if they do not).
+
+    Of the columns also what they hold, as in `Layout`.
+    """
 
     start: int
     heads: tuple[Head, ...]
     columns: int
     fit: int
     notes: tuple[str, ...]
+    numbers: tuple[int, ...] = ()
+    figures: tuple[int, ...] = ()
 
 
 def comment_marks(delimiter: str) -> tuple[str, ...]:
@@ -144,7 +168,8 @@ def find_layout(path: Path, lines: Sequence[str], options: ReadingOptions, first
     lines : sequence of str
         First lines of the table.
     options : ReadingOptions
-        What is known.
+        What is known. With a table the first one is found, otherwise names and values above a much longer table
+        are no table.
     first : int
         Number of lines above these.
 
@@ -160,18 +185,23 @@ def find_layout(path: Path, lines: Sequence[str], options: ReadingOptions, first
         signs: list[tuple[tuple[int, int, float], Layout]] = []
         for decimal in [options.decimal] if options.decimal else [".", ","]:
             assert decimal is not None
-            header = find_header(rows, decimal, delimiter)
+            header = find_header(rows, decimal, delimiter, in_order=options.table is not None)
             if header is None or (delimiter == decimal and not _quoted(rows, lines, options)):
                 continue
             if not header.heads and header.fit == 1:
                 header = _header_in_comment(lines, first, header, delimiter)
             data = [row.cells for row in rows if row.line > header.start]
             filled = [cell for cells in data for cell in cells if cell.strip()]
-            numbers = sum(is_number(cell, decimal) for cell in filled)
+            numbers = [cell for cell in filled if is_number(cell, decimal)]
             comments = sum(is_comment(line, comment_marks(delimiter)) for line in lines[: header.start - first])
             notes = _notes(lines[: header.start - first], comments, header, delimiter, decimal)
-            layout = Layout(delimiter, decimal, header.start, header.heads, header.columns, notes, comments)
-            signs.append(((header.fit, numbers, numbers / len(filled)), layout))
+            if any("d" in cell.lower() for cell in numbers):
+                notes = (*notes, D_EXPONENTS)
+            layout = Layout(
+                delimiter, decimal, header.start, header.heads, header.columns, notes,
+                header.numbers, header.figures, comments,
+            )  # fmt: skip
+            signs.append(((header.fit, len(numbers), len(numbers) / len(filled)), layout))
         # The decimal sign is the one with which more are numbers, whether or not a header fits.
         found += sorted(signs, key=lambda entry: -entry[0][1])[:1]
     if not found:
@@ -206,13 +236,28 @@ def header_only(lines: Sequence[str], options: ReadingOptions, first: int = 0) -
     return Layout(best, options.decimal or ".", row.line, make_heads(row.cells), len(row.cells), ())
 
 
-def find_header(rows: Sequence[Row], decimal: str, delimiter: str = ",") -> Header | None:
-    """Find where the data begin, and the heads and units above them; None if no row has a number."""
+def find_header(rows: Sequence[Row], decimal: str, delimiter: str = ",", *, in_order: bool = False) -> Header | None:
+    """Find where the data begin, and the heads and units above them; None if no row has a number.
+
+    In order, the data are those of the first table; otherwise names and values above a much longer one are no table.
+    """
     masks = [tuple(None if not cell.strip() else is_number(cell, decimal) for cell in row.cells) for row in rows]
-    block = _first_block(masks)
+    block = _first_block(rows, masks, in_order=in_order)
     if block is None:
         return None
     begin, pattern = block
+    typical = rows[begin + masks[begin:].index(pattern)].cells
+    return replace(
+        _find_heads(rows, masks, begin, pattern, decimal, delimiter),
+        numbers=tuple(place for place, number in enumerate(pattern) if number),
+        figures=tuple(place for place, number in enumerate(pattern) if number or _TIME.match(typical[place].strip())),
+    )
+
+
+def _find_heads(
+    rows: Sequence[Row], masks: Sequence[Mask], begin: int, pattern: Mask, decimal: str, delimiter: str
+) -> Header:
+    """Return the heads and units above the data, which begin in a row and have a pattern."""
     columns = len(pattern)
     if (
         begin == 0
@@ -248,22 +293,49 @@ def find_header(rows: Sequence[Row], decimal: str, delimiter: str = ",") -> Head
     return Header(start, make_heads(heads, units) if fit else (), columns, fit, tuple(notes))
 
 
-def _first_block(masks: Sequence[Mask]) -> tuple[int, Mask] | None:
+@dataclass(frozen=True)
+class _Block:
+    """Rows with numbers: rank, first row, number of rows, and which cells are numbers as a rule."""
+
+    rank: tuple[bool, bool]
+    begin: int
+    length: int
+    pattern: Mask
+
+
+def _first_block(rows: Sequence[Row], masks: Sequence[Mask], *, in_order: bool) -> tuple[int, Mask] | None:
     """Return where the first rows with numbers begin, and which of their cells are numbers as a rule.
 
-    Rows without a number separate blocks. Names and values of a preamble are rarely of numbers mostly.
+    Rows without a number separate blocks. Names and values of a preamble are rarely of numbers mostly. Where they
+    are, as of two channels, a much longer block below is the table, unless blocks are counted in order.
     """
-    blocks: list[tuple[tuple[bool, bool], int, Mask]] = []
+    blocks: list[_Block] = []
     for has_numbers, group in groupby(enumerate(masks), key=lambda entry: any(entry[1])):
         if has_numbers:
             block = list(group)
             pattern, times = Counter(mask for _, mask in block).most_common(1)[0]
             mostly = 2 * sum(map(bool, pattern)) > sum(cell is not None for cell in pattern)
-            blocks.append(((times > 1, mostly), block[0][0], pattern))
+            blocks.append(_Block((times > 1, mostly), block[0][0], len(block), pattern))
     if not blocks:
         return None
-    _, begin, pattern = max(blocks, key=lambda entry: entry[0])
-    return begin, pattern
+    highest = max(block.rank for block in blocks)
+    equals = [block for block in blocks if block.rank == highest]
+    longest = max(equals, key=lambda block: block.length)
+    chosen = next(
+        block
+        for block in equals
+        if in_order
+        or block is longest
+        or block.length * _MUCH_LONGER > longest.length
+        or not _names_and_values(rows, block)
+    )
+    return chosen.begin, chosen.pattern
+
+
+def _names_and_values(rows: Sequence[Row], block: _Block) -> bool:
+    """Return whether each row of a block begins with a name of its own, as `Delta_X, 0.05, 0.05` does."""
+    names = [row.cells[0].strip() for row in rows[block.begin : block.begin + block.length]]
+    return all(name[:1].isalpha() for name in names) and len(set(names)) == len(names)
 
 
 def _matched(texts: Sequence[str], columns: int, delimiter: str) -> list[str]:
@@ -297,7 +369,7 @@ def _header_in_comment(lines: Sequence[str], first: int, header: Header, delimit
     if len(heads) != header.columns or (len(heads) == 1 and delimiter != "," and " " in heads[0]):
         return header
     notes = ("header from a comment", *(("units from a row",) if units else ()))
-    return Header(header.start, make_heads(heads, units), header.columns, 2, notes)
+    return replace(header, heads=make_heads(heads, units), fit=2, notes=notes)
 
 
 def _notes(above: Sequence[str], comments: int, header: Header, delimiter: str, decimal: str) -> tuple[str, ...]:

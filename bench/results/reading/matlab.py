@@ -12,7 +12,7 @@ import numpy.typing as npt
 from bench.errors import DataError
 from bench.results.reading.heads import find_place, make_heads
 from bench.results.reading.options import ReadingOptions
-from bench.results.reading.table import ReadColumns
+from bench.results.reading.table import NO_ROW_LEFT_OUT, ReadColumns
 from bench.results.reading.text import reading_errors
 
 HDF5 = b"\x89HDF"
@@ -62,7 +62,10 @@ def read_matlab(path: Path, names: Sequence[str], options: ReadingOptions) -> Re
     for name, column in zip(names, chosen, strict=True):
         bad = np.flatnonzero(~np.isfinite(column))
         if bad.size:
-            raise DataError(f"{path}: row {bad[0] + 1}, column {name}: {column[bad[0]]} is not a finite number")
+            raise DataError(
+                f"{path}: row {bad[0] + 1}, column {name}: {column[bad[0]]} is not a finite number; "
+                f"{NO_ROW_LEFT_OUT}: save the file without it, or with a number there"
+            )
     units = [heads[find_place(path, heads, len(heads), name)].unit for name in names]
     notes = ("MATLAB", *((f"table {options.table}",) if options.table else ()))
     return ReadColumns(chosen, units, notes)

@@ -11,7 +11,7 @@ from bench.errors import DataError
 from bench.extras import needed_for
 from bench.results.reading.heads import find_place, make_heads
 from bench.results.reading.options import ReadingOptions
-from bench.results.reading.table import ReadColumns
+from bench.results.reading.table import NO_ROW_LEFT_OUT, ReadColumns
 from bench.results.reading.text import reading_errors
 
 
@@ -44,5 +44,8 @@ def read_parquet(path: Path, names: Sequence[str], options: ReadingOptions) -> R
     for name, column in zip(names, values, strict=True):
         bad = np.flatnonzero(~np.isfinite(column))
         if bad.size:
-            raise DataError(f"{path}: row {bad[0] + 1}, column {name}: is empty or not a finite number")
+            raise DataError(
+                f"{path}: row {bad[0] + 1}, column {name}: is empty or not a finite number; {NO_ROW_LEFT_OUT}: "
+                "save the file without it, or with a number there"
+            )
     return ReadColumns(values, [heads[place].unit for place in places], ("Parquet",))

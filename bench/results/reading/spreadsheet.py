@@ -11,9 +11,10 @@ import numpy as np
 from bench.errors import DataError
 from bench.extras import needed_for
 from bench.results.reading.heads import find_place
-from bench.results.reading.layout import SAMPLE_LINES, Row, count_lines, find_header
+from bench.results.reading.layout import SAMPLE_LINES, Header, Row, count_lines, find_header
 from bench.results.reading.options import ReadingOptions
-from bench.results.reading.table import ReadColumns, finite_number
+from bench.results.reading.summary_rows import TextRows, text_note
+from bench.results.reading.table import NO_ROW_LEFT_OUT, OTHER_COLUMN, ReadColumns, finite_number
 from bench.results.reading.text import reading_errors
 
 
@@ -56,21 +57,40 @@ def read_spreadsheet(path: Path, names: Sequence[str], options: ReadingOptions) 
         raise DataError(f"{path}: sheet {title}: has no numbers")
     places = [find_place(path, header.heads, header.columns, name) for name in names]
     values: list[list[float]] = [[] for _ in names]
-    for row in rows:
-        if row.line <= header.start:
-            continue
+    body, remarks = _without_summary([row for row in rows if row.line > header.start], header, places)
+    for row in body:
+        remedy = f"; {NO_ROW_LEFT_OUT}: delete row {row.line} of the sheet, or put a number there"
         for name, place, column in zip(names, places, values, strict=True):
+            said = remedy if place in header.numbers else OTHER_COLUMN
             cell = row.cells[place].strip() if place < len(row.cells) else ""
-            column.append(finite_number(f"{path}: sheet {title}, row {row.line}, column {name}", cell))
+            column.append(finite_number(f"{path}: sheet {title}, row {row.line}, column {name}", cell, remedy=said))
     above = sum(row.line <= header.start for row in rows) - bool(header.heads) - len(header.notes)
     notes = (
         f"sheet {title}",
         *([count_lines(above, "above the header")] if above > 0 else []),
         *([] if header.heads else ["no header"]),
         *header.notes,
+        *remarks,
     )
     units = [header.heads[place].unit if place < len(header.heads) else "" for place in places]
     return ReadColumns([np.array(column) for column in values], units, notes)
+
+
+def _without_summary(
+    rows: Sequence[Row], header: Header, places: Sequence[int]
+) -> tuple[Sequence[Row], Sequence[str]]:
+    """Return the rows without those of a summary at their end, and notes of rows with text."""
+    texts = TextRows(header.figures, ".", places)
+    for row in rows:
+        texts.add(row.line, row.cells)
+    summary = texts.close()
+    return (
+        [row for row in rows if not summary or row.line < summary[0]],
+        [
+            *text_note(texts.within, "row"),
+            *([f"{len(summary)} row{'s' * (len(summary) != 1)} below the table left out"] if summary else []),
+        ],
+    )
 
 
 def _choose(path: Path, titles: Sequence[str], table: str | None) -> str:

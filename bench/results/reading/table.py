@@ -11,6 +11,12 @@ import numpy.typing as npt
 from bench.errors import DataError
 from bench.results.reading.layout import is_number
 
+NO_ROW_LEFT_OUT = "no option leaves out a row"
+"""Begins the remedy for a cell that is not a finite number."""
+
+OTHER_COLUMN = "; most rows have no number in this column: choose another"
+"""Remedy for a cell of a column that is not one of numbers."""
+
 
 @dataclass(frozen=True)
 class ReadColumns:
@@ -37,11 +43,11 @@ def finite_number(where: str, cell: str, decimal: str = ".", remedy: str = "") -
     Raises DataError with the place and a remedy, if there is none or it is not finite.
     """
     if not cell:
-        raise DataError(f"{where}: is empty; expected a number")
+        raise DataError(f"{where}: is empty; expected a number{remedy}")
     if not is_number(cell, decimal):
         shown = cell if len(cell) < 40 else f"{cell[:40]}…"
         raise DataError(f"{where}: {shown!r} is not a number{remedy}")
-    value = float(cell.replace(",", ".") if decimal == "," else cell)
+    value = float((cell.replace(",", ".") if decimal == "," else cell).upper().replace("D", "E"))
     if not math.isfinite(value):
-        raise DataError(f"{where}: {cell[:40]} is not a finite number")
+        raise DataError(f"{where}: {cell[:40]} is not a finite number{remedy}")
     return value

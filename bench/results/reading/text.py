@@ -16,6 +16,12 @@ from typing import BinaryIO, cast
 from bench.errors import DataError
 from bench.shares import say_share
 
+WHAT_IS_READ = "text, .gz of text, .mat, .xlsx and .parquet are read"
+"""Kinds of files, for messages."""
+
+FALLBACK = "cp1252"
+"""Encoding of what is not UTF-8: Western Windows."""
+
 _LINES = 20000
 """Lines after which it is said how far the reading is."""
 
@@ -70,7 +76,8 @@ def reading_errors(path: Path) -> Iterator[None]:
         raise DataError(f"{path} does not exist") from None
     except UnicodeError as error:
         raise DataError(
-            f"{path} cannot be read as text ({error}); say its encoding with --encoding, such as cp1252 or utf-16"
+            f"{path} cannot be read as text ({error}); say its encoding with --encoding, such as cp1252, utf-16 "
+            "or shift_jis"
         ) from None
     except (OSError, EOFError, LookupError, zlib.error) as error:
         raise DataError(f"{path} cannot be read: {error}") from None
@@ -103,10 +110,7 @@ def _encoding(path: Path, file: BinaryIO) -> str:
         zeros = sample[::2].count(0), sample[1::2].count(0)
         if min(zeros) == 0 and 4 * max(zeros) > len(sample):
             return "utf-16-be" if zeros[0] else "utf-16-le"
-        raise DataError(
-            f"{path} is no table of text; text, .gz of text, .mat, .xlsx and .parquet are read "
-            "(of text in another encoding, say --encoding)"
-        )
+        raise DataError(f"{path} is no table of text; {WHAT_IS_READ} (of text in another encoding, say --encoding)")
     decoder = codecs.getincrementaldecoder("utf-8")()
     try:
         while start:
@@ -114,7 +118,7 @@ def _encoding(path: Path, file: BinaryIO) -> str:
             start = file.read(_CHUNK)
         decoder.decode(b"", final=True)
     except UnicodeDecodeError:
-        return "cp1252"
+        return FALLBACK
     return "utf-8"
 
 

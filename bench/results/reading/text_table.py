@@ -4,38 +4,42 @@ from __future__ import annotations
 
 import csv
 import itertools
+import re
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
 from bench.errors import ConfigurationError, DataError
-from bench.results.reading.heads import find_place
+from bench.results.reading.formats import check_format
+from bench.results.reading.heads import NoColumnError, find_place
 from bench.results.reading.layout import (
-    SAMPLE_CHARACTERS,
-    SAMPLE_LINES,
+    D_EXPONENTS,
     Layout,
     count_lines,
     find_layout,
     header_only,
     is_comment,
-    is_number,
     split_rows,
 )
 from bench.results.reading.options import ReadingOptions
+from bench.results.reading.remedies import cell_remedy, is_cut_off, missing_column
+from bench.results.reading.summary_rows import is_label, text_note
 from bench.results.reading.table import ReadColumns, finite_number
+from bench.results.reading.tables import Ending, count_tables, find_end, note_rest, read_sample, walk_tables
 from bench.results.reading.text import TextFile, open_text
 
 Floats = npt.NDArray[np.float64]
 
-_MOST_TABLES = 9
-"""Tables that a message lists."""
+_LETTER = re.compile(r"[^\x00-@E\[-`e{-\x7f]")
+"""A letter but for that of an exponent."""
+
+_D_EXPONENT = re.compile(r"(\d*\.\d*)[dD](?=[+-]?\d)")
 
 
 class _BreakError(Exception):
-    """Lines that may separate two tables."""
+    """Lines that may not be of the table."""
 
 
 def read_text(path: Path, names: Sequence[str], options: ReadingOptions) -> ReadColumns:
@@ -67,30 +71,17 @@ def read_text(path: Path, names: Sequence[str], options: ReadingOptions) -> Read
 
 
 def _read(file: TextFile, names: Sequence[str], options: ReadingOptions) -> ReadColumns:
-    start, table = options.skip_lines, int(options.table or 1)
-    layout = _layout(file, options, start)
-    for number in range(1, table):
-        end = None if layout is None else _find_break(file, layout)
-        following = None if end is None or layout is None else _next_layout(file, options, layout, end)
-        if following is None:
-            raise DataError(f"{file.path}: --table {table}: it has {count_tables(number)}")
-        layout = following
-    layout = layout or header_only(_sample(file, start), options, start)
-    if layout is None:
-        raise DataError(f"{file.path}: is empty; expected a header line with column names, or numbers")
-    places = (
-        [find_place(file.path, layout.heads, layout.columns, name) for name in names]
-        if _fits(layout)
-        else [_place_by_number(file, layout, name) for name in names]
-    )
+    lines = read_sample(file, options.skip_lines)
+    check_format(file.path, lines)
+    layout = _choose(file, options, lines)
+    places = _find_places(file, names, options, layout, lines)
     body = _Body(file, layout, names, places)
     after: tuple[str, ...] = ()
     try:
         values = body.at_once()
     except (_BreakError, ValueError):
-        body.end = _find_break(file, layout)
-        if body.end is not None:
-            after = _what_follows(file, options, layout, body.end)
+        body.ending = find_end(file, layout, places)
+        after = note_rest(file, options, layout, body.ending)
         try:
             values = body.at_once()
         except (_BreakError, ValueError):
@@ -102,18 +93,58 @@ def _read(file: TextFile, names: Sequence[str], options: ReadingOptions) -> Read
     notes = (
         *(["gzip"] if file.compressed else []),
         *([encoding.upper() if encoding.startswith("utf") else encoding] if encoding != "utf-8" else []),
-        *([f"table {table}"] if options.table else []),
+        *([f"table {int(options.table)}"] if options.table else []),
         *layout.notes,
         *([count_lines(comments, "of comment")] if comments else []),
+        *(text_note(body.ending.within) if body.ending else []),
         *after,
     )
     units = [layout.heads[place].unit if place < len(layout.heads) else "" for place in places]
     return ReadColumns(values, units, notes)
 
 
-def count_tables(number: int) -> str:
-    """Return a number of tables for people."""
-    return f"{number} table{'s' * (number != 1)}"
+def _choose(file: TextFile, options: ReadingOptions, lines: Sequence[str]) -> Layout:
+    """Return the layout of the table that is chosen.
+
+    Raises DataError if there is no such table.
+    """
+    start, table = options.skip_lines, int(options.table or 1)
+    if options.table is None:
+        layout = find_layout(file.path, lines, options, start)
+    else:
+        layouts = list(itertools.islice(walk_tables(file, options), table))
+        if len(layouts) < table > 1:
+            raise DataError(f"{file.path}: --table {table}: it has {count_tables(max(len(layouts), 1))}")
+        layout = layouts[-1] if layouts else None
+    layout = layout or header_only(lines, options, start)
+    if layout is None and is_cut_off(lines):
+        raise DataError(
+            f"{file.path}: has neither a header nor numbers in {len(lines)} lines from line {start + 1}; leave out "
+            "the lines above the table with --skip-lines"
+        )
+    if layout is None:
+        raise DataError(f"{file.path}: is empty; expected a header line with column names, or numbers")
+    return layout
+
+
+def _find_places(
+    file: TextFile, names: Sequence[str], options: ReadingOptions, layout: Layout, lines: Sequence[str]
+) -> list[int]:
+    """Return the indices of the columns that are asked for.
+
+    Raises DataError that says what may help if there is no such column.
+    """
+    places: list[int] = []
+    for name in names:
+        try:
+            places.append(
+                find_place(file.path, layout.heads, layout.columns, name)
+                if _fits(layout)
+                else _place_by_number(file, layout, name)
+            )
+        except NoColumnError as error:
+            raise missing_column(error, name, file, options, layout, lines) from None
+    return places
 
 
 class _Body:
@@ -121,15 +152,15 @@ class _Body:
 
     Attributes
     ----------
-    end : int or None
-        Number of lines up to the end of the table.
+    ending : Ending or None
+        End of the table; None as long as it was not looked for.
     comments : int
         Number of lines of comment within it.
     """
 
     def __init__(self, file: TextFile, layout: Layout, names: Sequence[str], places: Sequence[int]) -> None:
         self._file, self._layout, self._names, self._places = file, layout, names, places
-        self.end: int | None = None
+        self.ending: Ending | None = None
         self.comments = 0
 
     def at_once(self) -> list[Floats]:
@@ -162,22 +193,32 @@ class _Body:
         """
         layout, path = self._layout, self._file.path
         values: list[list[float]] = [[] for _ in self._places]
-        lines = self._file.lines(layout.start, self.end)
+        lines = self._file.lines(layout.start, self._end())
         for number, row in enumerate(split_rows(lines, layout.delimiter, layout.start), start=1):
             for name, place, column in zip(self._names, self._places, values, strict=True):
                 cell = row.cells[place].strip() if place < len(row.cells) else ""
                 where = f"{path}: line {row.line}, row {number}, column {name}"
-                column.append(finite_number(where, cell, layout.decimal, _remedy(cell, layout)))
+                column.append(self._number(where, cell, place, row.line, first=not column))
         return [np.array(column, dtype=np.float64) for column in values]
+
+    def _number(self, where: str, cell: str, place: int, line: int, *, first: bool) -> float:
+        try:
+            return finite_number(where, cell, self._layout.decimal)
+        except DataError as error:
+            raise DataError(f"{error}{cell_remedy(cell, self._layout, place, line, first=first)}") from None
+
+    def _end(self) -> int | None:
+        return None if self.ending is None else self.ending.end
 
     def _lines(self) -> Iterator[str]:
         """Yield the lines of data as numpy reads numbers.
 
-        Raises _BreakError where what follows may be another table.
+        Raises _BreakError where what follows may not be of the table.
         """
         marks, comma = self._layout.marks, self._layout.decimal == ","
+        exponents = D_EXPONENTS in self._layout.notes
         self.comments = blank = 0
-        for line in self._file.lines(self._layout.start, self.end):
+        for line in self._file.lines(self._layout.start, self._end()):
             if line.isspace():
                 blank += 1
                 continue
@@ -189,44 +230,21 @@ class _Body:
             if blank > 1:
                 raise _BreakError
             blank = 0
-            # A point within numbers of decimal comma is none; it may not become one.
-            yield line.replace(".", "?").replace(",", ".") if comma else line
+            if self.ending is None and _LETTER.search(line) and self._has_label(line):
+                raise _BreakError
+            if comma:
+                # A point within numbers of decimal comma is none; it may not become one.
+                line = line.replace(".", "?").replace(",", ".")
+            yield _D_EXPONENT.sub(r"\1E", line) if exponents else line
 
-
-def _remedy(cell: str, layout: Layout) -> str:
-    """Return what may help with a cell that is not a number; may be empty."""
-    other = "," if layout.decimal == "." else "."
-    if is_number(cell, other):
-        return f"; if its decimal sign is a {'comma' if other == ',' else 'point'}, say --decimal {other}"
-    if any(is_number(cell.replace(sign, ""), layout.decimal) for sign in ",.'’ \xa0\u202f" if sign in cell):
-        return "; separators of thousands are not read"
-    parts = [delimiter for delimiter in "\t;, " if delimiter in cell]
-    if any(is_number(part, layout.decimal) for delimiter in parts for part in cell.split(delimiter)):
-        return "; the file may have another delimiter (--delimiter) or lines above the data (--skip-lines)"
-    return "; lines above the data are left out by --skip-lines"
-
-
-def _sample(file: TextFile, start: int) -> list[str]:
-    lines: list[str] = []
-    characters = 0
-    for line in file.lines(start, start + SAMPLE_LINES):
-        if len(lines) == 0:
-            line = line.removeprefix("\ufeff")
-        lines.append(line)
-        characters += len(line)
-        if characters > SAMPLE_CHARACTERS:
-            break
-    return lines
-
-
-def _layout(file: TextFile, options: ReadingOptions, start: int) -> Layout | None:
-    return find_layout(file.path, _sample(file, start), options, start)
-
-
-def _next_layout(file: TextFile, options: ReadingOptions, layout: Layout, start: int) -> Layout | None:
-    """Return the layout of the table behind another, preferably with its delimiter and decimal sign."""
-    like = replace(options, delimiter=layout.delimiter, decimal=layout.decimal)
-    return _layout(file, like, start) or _layout(file, options, start)
+    def _has_label(self, line: str) -> bool:
+        """Return whether a line may have a label in a column of numbers, dates or times."""
+        cells = line.split(None if self._layout.delimiter == " " else self._layout.delimiter)
+        for place in self._layout.figures:
+            # Most cells begin with a digit.
+            if place < len(cells) and not cells[place][:1].isdigit() and is_label(cells[place], self._layout.decimal):
+                return True
+        return False
 
 
 def _fits(layout: Layout) -> bool:
@@ -236,63 +254,8 @@ def _fits(layout: Layout) -> bool:
 def _place_by_number(file: TextFile, layout: Layout, name: str) -> int:
     if name.isdecimal() and 1 <= int(name) <= layout.columns:
         return int(name) - 1
-    raise DataError(
+    raise NoColumnError(
         f"{file.path}: line {layout.start}: the header does not fit the {layout.columns} columns below it, so "
         f"there is no column {name!r}; name columns by number, 1 to {layout.columns}, or say --delimiter, --decimal "
         "or --skip-lines"
-    )
-
-
-def _find_break(file: TextFile, layout: Layout) -> int | None:
-    """Return the number of lines up to the end of a table, where something else follows; None if nothing does.
-
-    A table ends before a row without numbers that follows a blank line, has another number of cells or repeats the
-    header; before a comment after a blank line; and before two blank lines.
-    """
-    marks = layout.marks
-    heads = [head.text for head in layout.heads]
-    blank, begun = 0, False
-    for number, line in enumerate(file.lines(layout.start), start=layout.start):
-        if line.isspace():
-            blank += 1
-            continue
-        if is_comment(line, marks):
-            if blank and begun:
-                return number
-            continue
-        if begun and blank > 1:
-            return number
-        cells = next((row.cells for row in split_rows([line], layout.delimiter)), [])
-        if any(is_number(cell, layout.decimal) for cell in cells):
-            begun = True
-        elif begun and cells:
-            texts = [cell.strip() for cell in cells]
-            # A column of remarks may be empty in all rows that were looked at, and so not count as one.
-            if blank or len(cells) not in (layout.columns, len(heads)) or texts == heads[: len(texts)]:
-                return number
-        blank = 0
-    return None
-
-
-def _what_follows(file: TextFile, options: ReadingOptions, layout: Layout, end: int) -> tuple[str, ...]:
-    """Return a note of the lines behind a table.
-
-    Raises DataError if they are another table, and none was chosen.
-    """
-    following = _next_layout(file, options, layout, end)
-    if following is None:
-        rest = sum(not line.isspace() and not is_comment(line, layout.marks) for line in file.lines(end))
-        return (f"{count_lines(rest, 'below the table')} left out",) if rest else ()
-    if options.table is not None:
-        return ()
-    starts = [layout.start + 1]
-    next_end: int | None = end
-    while following is not None and len(starts) < _MOST_TABLES:
-        starts.append(following.start + 1)
-        next_end = _find_break(file, following)
-        following = None if next_end is None else _next_layout(file, options, following, next_end)
-    many = "at least " * (following is not None)
-    raise DataError(
-        f"{file.path}: has {many}{count_tables(len(starts))}, whose data begin in the lines "
-        f"{', '.join(map(str, starts))}; choose one with --table, 1 to {len(starts)}"
     )

@@ -1,0 +1,296 @@
+"""Tables with names, values and summaries around them; and what a message says that would help."""
+
+import json
+
+import numpy as np
+import pytest
+
+from bench.errors import DataError
+from bench.results.data import read_columns
+from bench.results.reading.options import ReadingOptions
+
+ROWS = 40
+U = np.round(2.0 + 1.75 * np.sin(0.3 * np.arange(ROWS)), 4)
+Y = np.round(-3.5 + 12.25 * np.cos(0.3 * np.arange(ROWS)), 3)
+LINES = [f"{0.05 * row:.2f},{u:.4f},{y:.3f}\n" for row, (u, y) in enumerate(zip(U, Y, strict=True))]
+BODY = "".join(LINES)
+TABLE = "time,U,y\n" + BODY
+
+
+def write(folder, content, name="data.txt"):
+    path = folder / name
+    path.write_bytes(content.encode() if isinstance(content, str) else content)
+    return path
+
+
+def read(folder, content, names=("U", "y"), **options):
+    return read_columns(write(folder, content), names, options=ReadingOptions(**options))
+
+
+def check(columns, first="U", second="y"):
+    np.testing.assert_array_equal(columns.values[first], U)
+    np.testing.assert_array_equal(columns.values[second], Y)
+
+
+def refused(folder, content, names=("U", "y"), name="data.txt", **options):
+    path = write(folder, content, name)
+    with pytest.raises(DataError) as caught:
+        read_columns(path, names, options=ReadingOptions(**options))
+    assert str(path) in str(caught.value)
+    return str(caught.value).replace(str(path), name)
+
+
+LABVIEW = (
+    "LabVIEW Measurement\t\nWriter_Version\t2\nSeparator\tTab\nX_Columns\tOne\nDate\t2024/03/05\n"
+    "Time\t12:00:00.12\n***End_of_Header***\t\n\t\t\nChannels\t2\t\nSamples\t40\t40\nDate\t2024/03/05\t2024/03/05\n"
+    "Y_Unit_Label\tVolts\tum\nX_Dimension\tTime\tTime\nX0\t0.0E+0\t0.0E+0\nDelta_X\t0.050000\t0.050000\n"
+    "***End_of_Header***\t\t\nX_Value\tU\ty\tComment\n"
+)
+
+
+class TestNamesAndValues:
+    @pytest.mark.parametrize("decimal", [".", ","])
+    @pytest.mark.parametrize("end", ["\n", "\t\n"])
+    def test_the_header_of_labview_is_no_table(self, tmp_path, decimal, end):
+        content = LABVIEW.replace("0.0", "0" + decimal + "0") + BODY.replace(",", "\t").replace("\n", end).replace(
+            ".", decimal
+        )
+        columns = read(tmp_path, content)
+        check(columns)
+        assert columns.assumptions.endswith("15 lines above the header")
+
+    def test_a_table_by_its_number_counts_names_and_values(self, tmp_path):
+        content = LABVIEW + BODY.replace(",", "\t")
+        check(read(tmp_path, content, table="2"))
+        assert read(tmp_path, content, ("2",), table="1").values["2"].tolist() == [0.0, 0.05]
+
+    def test_a_short_table_of_numbers_above_a_long_one_is_a_table(self, tmp_path):
+        content = "a,b\n1,2\n3,4\n\n" + TABLE
+        said = "2 tables, whose data begin in the lines 2, 6"
+        assert refused(tmp_path, content, ("1",)) == f"data.txt: has {said}; choose one with --table, 1 to 2"
+        message = refused(tmp_path, content)
+        assert f"has no column 'U'; it has: a, b (or a number, 1 to 2); the file has {said}: choose" in message
+        assert message.endswith("another one with --table, or leave out the lines above it with --skip-lines")
+        for options in ({"table": "2"}, {"skip_lines": 4}):
+            check(read(tmp_path, content, **options))
+
+
+SUMMARIES = {
+    "total": ("Total,600,3\n", 1),
+    "after a blank line": ("\nmean,2.5,1.3\n", 1),
+    "after two blank lines": ("\n\nmean,2.5,1.3\nmax,2.5,1.3\n", 2),
+    "several": ("\nmean,2.5,1.3\nstd,0.5,0.3\n", 2),
+    "with a remark": ("mean,2.5,1.3\nend of measurement\n", 2),
+    "without numbers": ("end,of,measurement\n", 1),
+    "in quotes": ('"Total",600,3\n', 1),
+    "behind an empty cell": (",mean,3\n", 1),
+}
+
+
+class TestSummaries:
+    @pytest.mark.parametrize("names", [("U", "y"), ("time", "U", "y"), ("2", "3")])
+    @pytest.mark.parametrize("name", SUMMARIES)
+    def test_a_summary_ends_the_table(self, tmp_path, name, names):
+        below, lines = SUMMARIES[name]
+        columns = read(tmp_path, TABLE + below, names)
+        check(columns, *names[-2:])
+        assert columns.assumptions == f"comma-separated, {lines} line{'s' * (lines != 1)} below the table left out"
+
+    def test_a_text_in_another_column(self, tmp_path):
+        columns = read(tmp_path, TABLE + "600,3,total\n", ("time", "U"))
+        assert columns.values["U"].size == ROWS
+        assert "1 line below the table left out" in columns.assumptions
+        # In a column that is asked for, it is a wrong cell.
+        assert "line 42, row 41, column y: 'total' is not a number" in refused(tmp_path, TABLE + "600,3,total\n")
+
+    def test_below_dates_and_decimal_commas(self, tmp_path):
+        rows = "".join("05.03.2024;" + line.replace(",", ";").replace(".", ",") for line in LINES)
+        columns = read(tmp_path, "day;time;U;y\n" + rows + "mean;1,0;2,0;3,0\n")
+        check(columns)
+        assert "1 line below the table left out" in columns.assumptions
+
+    def test_of_a_table_above_another(self, tmp_path):
+        content = TABLE + "Total,600,3\n\n" + TABLE + "Total,600,3\n"
+        assert "has 2 tables, whose data begin in the lines 2, 45;" in refused(tmp_path, content)
+        for table in ("1", "2"):
+            columns = read(tmp_path, content, table=table)
+            check(columns)
+            assert "1 line below the table left out" in columns.assumptions
+
+    def test_names_and_values_behind_two_blank_lines_are_those_of_the_next_table(self, tmp_path):
+        content = TABLE + "\n\nGain,5,2\nt,U,y\n" + BODY
+        check(read(tmp_path, content, table="1"))
+        columns = read(tmp_path, content, table="2")
+        check(columns)
+        assert columns.assumptions == "table 2, comma-separated, 1 line above the header"
+
+    @pytest.mark.parametrize("mark", ["n/a", "OVLD", "--", "NaN", ""])
+    def test_a_missing_value_ends_no_table(self, tmp_path, mark):
+        columns = read(tmp_path, TABLE.replace("\n1.95,", f"\n{mark},"))
+        check(columns)
+        assert columns.assumptions == "comma-separated"
+
+    def test_text_within_the_table_stays_and_is_said(self, tmp_path):
+        columns = read(tmp_path, TABLE.replace("\n1.00,", "\npaused,"))
+        check(columns)
+        assert columns.assumptions == "comma-separated, text in a column of numbers in line 22"
+
+    def test_a_channel_that_fails_ends_no_table(self, tmp_path):
+        states = ["0"] * 50 + ["off"] * 30
+        values = zip([*U, *U], [*Y, *Y], states, strict=True)
+        columns = read(tmp_path, "U,y,state\n" + "".join(f"{u},{y},{state}\n" for u, y, state in values))
+        np.testing.assert_array_equal(columns.values["y"], [*Y, *Y])
+        assert columns.assumptions == "comma-separated, text in columns of numbers in 30 lines, first in line 52"
+
+    def test_of_a_sheet(self, tmp_path):
+        import openpyxl
+
+        book = openpyxl.Workbook()
+        for row in [["time", "U", "y"], *([0.1, float(u), float(y)] for u, y in zip(U, Y, strict=True))]:
+            book.active.append(row)
+        book.active.append(["Total", 600, 3])
+        book.save(tmp_path / "data.xlsx")
+        columns = read_columns(tmp_path / "data.xlsx", ("U", "y"))
+        check(columns)
+        assert columns.assumptions == "sheet Sheet, 1 row below the table left out"
+
+
+class TestExponents:
+    @pytest.mark.parametrize(("decimal", "letter"), [(".", "D"), (".", "d"), (",", "D")])
+    def test_of_fortran_are_read(self, tmp_path, decimal, letter):
+        rows = "".join(f"{u:16.8E}{y:16.8E}\n" for u, y in zip(U, Y, strict=True))
+        content = "  U  y\n" + rows.replace("E", letter).replace(".", decimal)
+        columns = read(tmp_path, content)
+        check(columns)
+        assert columns.assumptions.endswith("exponents with D")
+
+    def test_in_quotes_and_without_a_point(self, tmp_path):
+        rows = "".join(f'"{u:.8E}","{y:.8E}"\n' for u, y in zip(U, Y, strict=True))
+        check(read(tmp_path, "U,y\n" + rows.replace("E", "D")))
+        assert "'1D5' is not a number" in refused(tmp_path, TABLE.replace("\n1.00,", "\n1D5,"), ("time",))
+
+
+class TestWhatWouldHelp:
+    @pytest.mark.parametrize(
+        ("cell", "said"),
+        [
+            ("n/a", "'n/a' is not a number"),
+            ("OVLD", "'OVLD' is not a number"),
+            ("--", "'--' is not a number"),
+            ("bad 5", "'bad 5' is not a number"),
+            ("NaN", "NaN is not a finite number"),
+            ("-Inf", "-Inf is not a finite number"),
+            ("1.5e400", "1.5e400 is not a finite number"),
+            ("", "is empty; expected a number"),
+        ],
+    )
+    def test_a_wrong_cell_among_numbers(self, tmp_path, cell, said):
+        message = refused(tmp_path, TABLE.replace(f",{Y[20]:.3f}\n", f",{cell}\n", 1))
+        row = 1 + int(list(Y).index(Y[20]))
+        assert message == (
+            f"data.txt: line {row + 1}, row {row}, column y: {said}; no option leaves out a row: delete line "
+            f"{row + 1} from the file, or put a number there"
+        )
+
+    def test_a_text_in_the_first_row(self, tmp_path):
+        message = refused(tmp_path, "time,U,y\nSequence,Volt,5\n" + BODY)
+        assert "line 2, row 1, column U: 'Volt' is not a number; if line 2 is above the data" in message
+        assert "leave it out with --skip-lines; otherwise" in message
+        assert "delete it from the file, or put a number there" in message
+
+    def test_a_column_of_texts(self, tmp_path):
+        content = "day,U,y\n" + "".join(f"2024-03-05 12:00,{u},{y}\n" for u, y in zip(U, Y, strict=True))
+        assert "most rows have no number in this column: choose another" in refused(tmp_path, content, ("day",))
+
+    def test_another_minus(self, tmp_path):
+        assert "replace '−' by '-' in the file" in refused(tmp_path, TABLE.replace("-", "−"))
+
+    @pytest.mark.parametrize(("header", "names"), [("time:U:y\n", ("U",)), ("time:U:y\n", ("2",)), ("", ("1",))])
+    def test_another_delimiter(self, tmp_path, header, names):
+        content = header + BODY.replace(",", ":")
+        assert refused(tmp_path, content, names).endswith("if ':' stands between columns, say --delimiter ':'")
+        check(read(tmp_path, content, ("2", "3"), delimiter=":"), "2", "3")
+
+    @pytest.mark.parametrize(
+        ("encoding", "heads"),
+        [("shift_jis", "時間,電圧,変位"), ("cp1251", "время,вход,выход"), ("gb18030", "时间,电压,位移")],
+    )
+    def test_another_encoding(self, tmp_path, encoding, heads):
+        content = (heads + "\n" + BODY).encode(encoding)
+        names = heads.split(",")[1:]
+        message = refused(tmp_path, content, names)
+        assert f"--encoding {encoding}" in message
+        check(read(tmp_path, content, names, encoding=encoding), *names)
+
+    def test_another_encoding_where_no_name_tells_it(self, tmp_path):
+        message = refused(tmp_path, ("時間,電圧,変位\n" + BODY).encode("shift_jis"))
+        assert "was read as cp1252: if names look wrong, say --encoding, such as shift_jis" in message
+        assert "--encoding" not in refused(tmp_path, ("t,U (V),x (µm)\n" + BODY).encode("cp1252"))
+
+    @pytest.mark.parametrize(
+        "above",
+        [
+            "".join(f"note line {line} about things\n" for line in range(1500)),
+            "a note about things\n" * 1500,
+            "# a note\n" * 1500,
+        ],
+    )
+    def test_many_lines_above_the_table(self, tmp_path, above):
+        assert "--skip-lines" in refused(tmp_path, above + TABLE)
+        check(read(tmp_path, above + TABLE, skip_lines=1500))
+
+    def test_no_header(self, tmp_path):
+        message = refused(tmp_path, BODY)
+        assert message.endswith(
+            "by number, 1 to 3; if a header stands further down, leave out the lines above it with --skip-lines"
+        )
+
+
+RECORDS = [{"U": float(u), "y": float(y)} for u, y in zip(U, Y, strict=True)]
+
+
+class TestOtherFormats:
+    @pytest.mark.parametrize("names", [("U", "y"), ("1", "2"), ("2", "3")])
+    @pytest.mark.parametrize(
+        ("content", "kind"),
+        [
+            (json.dumps({"U": U.tolist(), "y": Y.tolist()}), "JSON"),
+            (json.dumps(RECORDS, indent=1), "JSON"),
+            (json.dumps(RECORDS * 20, indent=1), "JSON"),
+            ("\n".join(map(json.dumps, RECORDS)), "JSON"),
+            ("[[1, 2], [3, 4]]", "JSON"),
+            ('<?xml version="1.0"?>\n<svg>\n' + '<path d="M 1 2\nL 3 4\nL 5 6"/>\n' * 30 + "</svg>", "SVG"),
+            ("<!DOCTYPE html>\n<html><table><tr><td>1</td></tr></table></html>", "HTML"),
+            ('<?xml version="1.0"?>\n<data>1</data>', "XML"),
+            ("%PDF-1.4\n1 2 3\n", "PDF"),
+        ],
+    )
+    def test_what_is_no_table(self, tmp_path, content, kind, names):
+        message = refused(tmp_path, content, names, "file.txt")
+        assert message.startswith(
+            f"file.txt: is {kind}, not a table; text, .gz of text, .mat, .xlsx and .parquet are read"
+        )
+
+    def test_an_array_in_a_file_of_json(self, tmp_path):
+        assert "is JSON, not a table" in refused(tmp_path, "[1.5, 2.5,\n3.5]", ("1",), "file.json")
+
+    @pytest.mark.parametrize("above", ['{"sample": 3}\n', '{"sample": {\n"a": 3}}\n', "[[Data]]\n", "[Header]\n"])
+    def test_what_stands_above_a_table(self, tmp_path, above):
+        check(read(tmp_path, above + TABLE))
+
+    def test_what_stands_above_a_table_is_left_out(self, tmp_path):
+        content = '<?xml version="1.0"?>\n' + TABLE
+        assert "with --skip-lines" in refused(tmp_path, content)
+        check(read(tmp_path, content, skip_lines=1))
+
+    def test_matlab_and_parquet(self, tmp_path):
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+        from scipy.io import savemat
+
+        broken = np.where(np.arange(ROWS) == 4, np.nan, Y)
+        savemat(tmp_path / "data.mat", {"U": U, "y": broken})
+        pq.write_table(pa.table({"U": U, "y": broken}), tmp_path / "data.parquet")
+        for name in ("data.mat", "data.parquet"):
+            with pytest.raises(DataError, match=r"row 5, column y: .*; no option leaves out a row: save the file"):
+                read_columns(tmp_path / name, ("U", "y"))

@@ -1,0 +1,108 @@
+"""What is printed on terminals of few columns: no name, number or time is cut."""
+
+import io
+import re
+
+import pytest
+from rich.console import Console
+from rich.table import Table
+
+from bench.cli.tables import show_table
+from bench.devices import Signal
+from bench.remaining_time import Expectation
+from bench.terminal import ProgressDisplay
+
+SIGNALS = (Signal("supply_voltage", "V", ""), Signal("load_cell_force", "N", ""))
+LONG = Expectation(((5, 10.0), (100, 4000.0)), 4000.0, at_most=4000.0 * 24.0)
+
+
+def drawn(columns):
+    """Return the lines of a run's progress as it stands at the end, without what only moves the cursor."""
+    console = Console(file=io.StringIO(), width=columns, force_terminal=True, color_system=None)
+    names = [signal.name for signal in SIGNALS]
+    with ProgressDisplay(console, "damped-oscillation", SIGNALS, names, LONG, 1.0) as display:
+        display._show(100.0, 3, [2.85, -0.123])
+    last = console.file.getvalue().rpartition("\x1b[2K")[2]
+    return re.sub(r"\x1b\[[?0-9;]*[A-Za-z]", "", last).splitlines()
+
+
+class TestProgress:
+    @pytest.mark.parametrize("columns", [160, 120, 100, 80, 60, 50, 40])
+    def test_nothing_is_cut(self, columns):
+        lines = drawn(columns)
+        assert all(len(line) <= columns for line in lines)
+        text = " ".join(line.strip() for line in lines)
+        for whole in (
+            r"damped-oscillation +3/100", r"t 0:01:40", r"left \d+:\d\d:\d\d, ", r"ends (\d+-\d+-\d+ )?\d\d:\d\d",
+            r"at most (\d+-\d+-\d+ )?\d\d:\d\d", r"supply_voltage 2\.850 V", r"load_cell_force -0\.123 N",
+        ):  # fmt: skip
+            assert re.search(whole, text), whole
+        assert "…" not in text
+
+    def test_readings_give_way_before_times(self):
+        lines = drawn(140)
+        assert "at most" in lines[0]
+        assert "supply_voltage" not in lines[0]
+        assert lines[1] == "supply_voltage 2.850 V  load_cell_force -0.123 N"
+
+    def test_all_in_one_line_where_it_fits(self):
+        (line,) = drawn(220)
+        assert line.endswith("load_cell_force -0.123 N")
+
+
+CELLS = [("tec_sink_temperature", "20.992", "5 to 100 (interlock)"), ("psd", "-1.6e-06", "")]
+
+
+def table(*, box=True):
+    made = Table("signal", "lowest", "what it may not leave", title="all", **({} if box else {"box": None}))
+    for row in CELLS:
+        made.add_row(*row)
+    return made
+
+
+def shown(made, columns):
+    console = Console(file=io.StringIO(), width=columns)
+    show_table(console, made)
+    return console.file.getvalue()
+
+
+class TestTables:
+    @pytest.mark.parametrize("box", [True, False])
+    @pytest.mark.parametrize("columns", [*range(20, 80, 3)])
+    def test_every_word_is_whole(self, columns, box):
+        text = shown(table(box=box), columns)
+        for row in CELLS:
+            for word in " ".join(row).split():
+                assert re.search(rf"(^|\s){re.escape(word)}(\s|$)", text.replace("│", " ")), word
+        assert "…" not in text
+
+    def test_a_wide_terminal_has_the_table_as_it_is(self):
+        console = Console(file=io.StringIO(), width=100)
+        console.print(table())
+        assert shown(table(), 100) == console.file.getvalue()
+
+    def test_a_narrow_one_has_a_line_a_cell(self):
+        assert shown(table(), 30) == (
+            "all\ntec_sink_temperature\n    lowest: 20.992\n    what it may not leave: 5 to 100 (interlock)\n"
+            "psd\n    lowest: -1.6e-06\n"
+        )
+
+
+@pytest.mark.parametrize("columns", [40, 60, 80])
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        (["design", "--rig", "vo2"], ["set-points", "condition", "variance", "damped-oscillation", "210/210"]),
+        (["rehearse", "creep", "--rig", "vo2"], ["tec_sink_temperature", "lowest", "(interlock)", "margin"]),
+    ],
+    ids=["design", "rehearse"],
+)
+def test_commands_cut_nothing(bench, monkeypatch, columns, command, words):
+    from bench.cli.console import console
+
+    monkeypatch.setattr(console, "width", columns)
+    code, out, _ = bench(*command)
+    assert code == 0
+    for word in words:
+        assert word in out
+    assert "…" not in out
