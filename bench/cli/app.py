@@ -45,10 +45,11 @@ from bench.cli.registered import RegisteredCommands, Studies
 from bench.errors import BenchError
 
 _EPILOG = (
-    "Exit codes: 0 done; 1 failed; 2 wrong command, rig file or parameter (nothing has moved); 3 unusable data or "
-    "model file; 4 device fault; 5 interlock; 6 not steady in time; 7 safe state not confirmed; 8 record damaged or "
-    "incomplete; 9 a resumed specimen is not as it was; 10 a controller does not converge; 130 ended by the "
-    "operator. Try: bench list, and bench run PROTOCOL --rig RIG --clock virtual"
+    "Exit codes: 0 done; 1 failed, or done but the file of --json could not be written; 2 wrong command, rig file or "
+    "parameter (nothing has moved); 3 unusable data or model file; 4 device fault; 5 interlock; 6 not steady in "
+    "time; 7 safe state not confirmed; 8 record damaged or incomplete; 9 a resumed specimen is not as it was; 10 a "
+    "controller does not converge; 130 ended by the operator. Try: bench list, and bench run PROTOCOL --rig RIG "
+    "--clock virtual"
 )
 
 _MID_WAY = ("safe", "recover")
