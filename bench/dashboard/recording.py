@@ -30,7 +30,7 @@ _END = b"RRF2FOOT"
 
 _END_BYTES = 32
 
-_STALLED_SECONDS = 10.0
+_STALLED_SECONDS = 3.0
 """Wall-clock time without growth after which a file that is completed is given up, s."""
 
 _LOOK_SECONDS = 0.05

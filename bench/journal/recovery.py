@@ -7,7 +7,7 @@ import json
 import sqlite3
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -154,7 +154,7 @@ def _hopeless(journal: Path, problem: str, found: Sequence[Path]) -> str:
     )
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Left:
     """What is left of the SQLite file.
 
@@ -201,7 +201,6 @@ def _state(table: str, left: _Left, whole: Mapping[Any, Entry], count: int | Non
 
 
 def _salvage(journal: Path) -> _Left:
-    left = _Left()
     if not journal.is_file():
         return _Left(cut=set(TABLES), problem="it is not there")
     try:
@@ -211,7 +210,7 @@ def _salvage(journal: Path) -> _Left:
     # A text that is damaged is one whose checksum does not fit.
     opened.db.text_factory = lambda content: content.decode("utf-8", "replace")
     try:
-        left.problem = _problem(opened.db)
+        left = _Left(problem=_problem(opened.db))
         for table in TABLES:
             rows, is_cut = _readable(opened.db, table)
             if is_cut:
@@ -222,10 +221,9 @@ def _salvage(journal: Path) -> _Left:
                     left.bad[table].append(columns[0])
                 else:
                     left.rows[table][columns[0]] = kept
-        left.signals = signal_rows(opened.db, left.rows["signals"])
+        return replace(left, signals=signal_rows(opened.db, left.rows["signals"]))
     finally:
         opened.close()
-    return left
 
 
 def _problem(db: sqlite3.Connection) -> str:
