@@ -409,6 +409,5 @@ class _Trial:
             tested=float(errors[fold.tested].mean()),
             training=float(np.sqrt(errors[trained].mean())),
             start=float(np.sqrt(errors[first].mean())) if first.any() else 0.0,
-            free=problem.template.count_beside_coefficients()
-            + (effective if np.isfinite(effective := found.certificate.effective) else found.certificate.passive),
+            free=problem.template.count_beside_coefficients() + found.certificate.determined,
         )

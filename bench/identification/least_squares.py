@@ -86,6 +86,11 @@ class Certificate:
     effective: float = float("nan")
 
     @property
+    def determined(self) -> float:
+        """Number of coefficients that the data determine; of those that are free to move where it is not known."""
+        return self.effective if np.isfinite(self.effective) else float(self.passive)
+
+    @property
     def coverage(self) -> float:
         """Part of the columns that the excitation swept, 0 to 1."""
         return float(self.swept.mean())

@@ -465,8 +465,8 @@ class _Search:
         about as good, as signs and smoothness bound what the record leaves open.
         """
         finalists = self._with_lag(finalists)
-        planes = [each for each in finalists if self._has_one_kind and is_smooth_plane(each)]
-        near = [each for each in planes if each.rms <= _UNBOUNDED * min(other.rms for other in finalists)]
+        limit = _UNBOUNDED * min(each.rms for each in finalists)
+        near = [each for each in finalists if self._has_one_kind and is_smooth_plane(each) and each.rms <= limit]
         bounded, others = self._of_one_kind(finalists)
         judged = bounded + others or [each for each in finalists if each.units] or self._bounded(finalists)
         best, chosen = best_of_one_kind(bounded, others) if bounded else simplest_near_best(judged)

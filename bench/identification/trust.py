@@ -61,8 +61,7 @@ def check_interpolation(problem: FitProblem, found: Fit) -> None:
     Raises ValueError if it has not.
     """
     left = problem.inputs.size - problem.skip
-    effective = found.certificate.effective
-    if left <= (effective if np.isfinite(effective) else found.certificate.passive) + 1.0:
+    if left <= found.certificate.determined + 1.0:
         estimable = problem.spec.estimate_state is not None
         raise ValueError(f"{_too_few(problem.inputs.size, left, estimable)}; or fewer coefficients")
 

@@ -80,9 +80,10 @@ def starting_state(
         return StartingState(state, skip or 0)
     if initial != "skip" and model.provenance.get("input_sha256") == digest(inputs):
         return StartingState(state, int(model.provenance.get("skipped", 0)))
-    unknown = operator.unknown_until(inputs)
-    if initial != "skip":
-        unknown = left_out(unknown, inputs.size) if model.provenance.get("initial") == "skip" else 0
+    unknown = 0
+    if "skip" in (initial, model.provenance.get("initial")):
+        unknown = operator.unknown_until(inputs)
+        unknown = unknown if initial == "skip" else left_out(unknown, inputs.size)
     return StartingState(state, max(skip or 0, unknown))
 
 
