@@ -41,6 +41,11 @@ class RigDescription:
         """The set-points that are allowed, of each device that takes one."""
         return {name: device.limits for name, device in self.devices.items() if device.limits is not None}
 
+    @cached_property
+    def reading_limits(self) -> dict[str, Limits]:
+        """The readings beyond which a device raises, by signal."""
+        return {name: limits for device in self.devices.values() for name, limits in device.reading_limits.items()}
+
     def limits_of(self, name: str) -> Limits:
         """Return the set-points that a device allows; raises ConfigurationError if it takes none."""
         if name not in self.limits:

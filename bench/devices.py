@@ -26,9 +26,9 @@ from __future__ import annotations
 import math
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import date
 from typing import Any, ClassVar, Self, TypedDict
 
@@ -370,6 +370,11 @@ class Device(ABC):
         }
 
     @property
+    def reading_limits(self) -> Mapping[str, Limits]:
+        """Ranges beyond which a reading is an error, by signal name; signals without one are left out."""
+        return {}
+
+    @property
     def watchdog(self) -> float | None:
         """Silence of the host, s, after which the instrument itself goes to its safe state; None if it never does."""
         return None
@@ -500,6 +505,8 @@ class DeviceDescription:
         Silence of the host after which the instrument goes to its safe state by itself, s.
     safe_within : float
         Longest time that its safe state takes, s.
+    reading_limits : mapping of str to Limits
+        Ranges beyond which a reading is an error, by signal.
     """
 
     name: str
@@ -510,6 +517,7 @@ class DeviceDescription:
     limits: Limits | None
     watchdog: float | None
     safe_within: float
+    reading_limits: Mapping[str, Limits] = field(default_factory=dict)
 
     @classmethod
     def of(cls, device: Device) -> DeviceDescription:
@@ -524,4 +532,5 @@ class DeviceDescription:
             limits=actuator.limits if actuator else None,
             watchdog=device.watchdog,
             safe_within=device.safe_within,
+            reading_limits=device.reading_limits,
         )

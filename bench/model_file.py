@@ -91,7 +91,9 @@ class ModelFile:
         Raises DataError if it is another.
         """
         if not isinstance(self.model, Operator):
-            expected = "without time" if isinstance(self.model, TimedModel) else "of one input"
+            expected = (
+                "without time: identify it with --time none" if isinstance(self.model, TimedModel) else "of one input"
+            )
             raise DataError(f"model {self.name} is of the kind {self.model.kind}; expected one {expected}")
         return self.model
 

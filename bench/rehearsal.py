@@ -21,7 +21,7 @@ from bench.interrupts import Interrupts
 from bench.journal import Event, StepRecord
 from bench.protocol import LATENESS, TRACES, Plan, ProtocolDefinition, ProtocolParameters, plan
 from bench.protocol.plan import LONGEST
-from bench.questions import ABORT, RESUME
+from bench.questions import ABORT, RESUME, Question
 from bench.rig import Rig
 from bench.rig_file import RigFile
 from bench.running import Observer
@@ -42,7 +42,7 @@ class Bound:
     Attributes
     ----------
     by : str
-        `device` for the limits of a set-point, or `interlock`.
+        `device` for the limits of a set-point or of a reading, or `interlock`.
     low, high : float
         In the unit of the signal; infinite where there is none.
     """
@@ -289,14 +289,12 @@ def rehearse(
         expected = plan(definition, parameters, description.slots(definition))
         check_before_moving(description, definition, expected)
         kept = _Kept(definition.name, twin.name, description.signals, twin.interlocks)
-        engine = Engine(
-            station, kept, observers, interrupts, lambda _: ABORT if interrupts.pause_requested else RESUME
-        )
-        outcome = engine.run(definition, parameters)
+        answers = _Answers(interrupts)
+        outcome = Engine(station, kept, observers, interrupts, answers.answer).run(definition, parameters)
     finally:
         station.close()
         interrupts.finish()
-    _raise_if_ended(outcome, interrupts)
+    _raise_if_ended(outcome, answers.ended_by)
     reason = outcome.reason
     if isinstance(outcome.error, KeyError):
         reason = f"the protocol reads {outcome.error}, which the twin does not have"
@@ -317,12 +315,34 @@ def rehearse(
     )
 
 
-def _raise_if_ended(outcome: Outcome, interrupts: Interrupts) -> None:
+def _raise_if_ended(outcome: Outcome, by: str) -> None:
     """Raise what ends more than the rehearsal: a request to end, a protocol without an end, a wrong file."""
-    if interrupts.abort_reason is not None or outcome.status == "aborted":
-        raise AbortError(f"the rehearsal was {outcome.reason}; nothing has moved")
+    if by:
+        raise AbortError(f"the rehearsal was ended by {by}; nothing has moved")
+    if outcome.status == "aborted":
+        raise AbortError(f"in the rehearsal: {outcome.reason}; nothing has moved")
     if isinstance(outcome.error, ConfigurationError | DataError):
         raise outcome.error
+
+
+class _Answers:
+    """The answers at the pauses of a rehearsal: each goes on at once, unless the operator has asked for the end."""
+
+    def __init__(self, interrupts: Interrupts) -> None:
+        self._interrupts = interrupts
+        self._pressed = False
+
+    def answer(self, _: Question) -> str:
+        # The engine clears the request.
+        self._pressed |= self._interrupts.pause_requested
+        return ABORT if self._pressed else RESUME
+
+    @property
+    def ended_by(self) -> str:
+        """What has asked for the end, also too late to cut it short; empty if nothing has."""
+        if self._interrupts.abort_reason is not None:
+            return self._interrupts.abort_reason
+        return "Ctrl-C" if self._pressed or self._interrupts.pause_requested else ""
 
 
 class _Kept:
@@ -402,14 +422,16 @@ class _Kept:
 
 
 def _bounded(name: str, range_: tuple[float, float], description: RigDescription) -> Extremes:
-    """Return the range of a signal with what it may not leave: the limits of a set-point, and interlocks."""
+    """Return the range of a signal with what it may not leave: the limits of its device, and interlocks."""
     locks = [each for each in description.file.interlocks if each.label == name]
     bounds = [
         Bound("interlock", each.low, each.high)
         for each in locks
         if math.isfinite(each.low) or math.isfinite(each.high)
     ]
-    limits = description.limits.get(name.removesuffix(SETPOINT)) if name.endswith(SETPOINT) else None
+    limits = description.reading_limits.get(name)
+    if name.endswith(SETPOINT):
+        limits = description.limits.get(name.removesuffix(SETPOINT))
     if limits is not None:
         bounds.insert(0, Bound("device", limits.low, limits.high))
     signal = description.by_name.get(name)

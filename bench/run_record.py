@@ -63,14 +63,19 @@ _COMPARED = (
 
 @dataclass(frozen=True)
 class Difference:
-    """Something that two records say differently: a dotted key of the metadata, and both values; None for none."""
+    """Something that two records say differently: a dotted key of the metadata, and both values; None for none.
+
+    An entry of a list stands in the key by its name, as an interlock by its signal, or by its number from 0.
+    """
 
     key: str
     first: Any
     second: Any
 
     def __str__(self) -> str:
-        return f"{self.key}: {self.first if self.first is not None else 'none'} → {self.second or 'none'}"
+        """Return key and values on one line."""
+        first, second = ("none" if value is None else value for value in (self.first, self.second))
+        return f"{self.key}: {first} → {second}"
 
 
 def metadata(
@@ -167,7 +172,10 @@ def run_name(protocol: ProtocolDefinition, meta: Mapping[str, Any]) -> str:
 
 
 def differences(first: Mapping[str, Any], second: Mapping[str, Any]) -> list[Difference]:
-    """Return what the metadata of two runs say differently of protocol, rig, instruments and software."""
+    """Return what the metadata of two runs say differently of protocol, rig, instruments and software.
+
+    Of a list only the entries that are not the same; the order of entries with a name does not count.
+    """
     ours, theirs = (dict(_leaves("", {key: _at(meta, key) for key in _COMPARED})) for meta in (first, second))
     return [
         Difference(key, ours.get(key), theirs.get(key))
@@ -276,11 +284,31 @@ def _at(meta: Mapping[str, Any], key: str) -> Any:  # noqa: ANN401 - anything th
 
 
 def _leaves(key: str, value: Any) -> Iterator[tuple[str, Any]]:  # noqa: ANN401 - anything that JSON can hold
-    if isinstance(value, dict):
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        value = _by_name(value)
+    if isinstance(value, Mapping):
         for name, inner in value.items():
             yield from _leaves(f"{key}.{name}" if key else name, inner)
     else:
         yield key, value
+
+
+def _by_name(entries: Sequence[Any]) -> dict[str, Any]:
+    """Return the entries of a list by their names; several of one name are numbered, those without one from 0."""
+    found: dict[str, Any] = {}
+    for number, entry in enumerate(entries):
+        name = _name_of(entry) if isinstance(entry, Mapping) else ""
+        others = sum(other == name or other.startswith(f"{name} #") for other in found) if name else 0
+        found[f"{name} #{others + 1}" if others else name or str(number)] = entry
+    return found
+
+
+def _name_of(entry: Mapping[str, Any]) -> str:
+    """Return the name of an entry of a list; of an interlock what it watches. Empty if it has none."""
+    if isinstance(entry.get("signal"), str):
+        return f"{entry['signal']} - {entry['minus']}" if entry.get("minus") else entry["signal"]
+    name = entry.get("name")
+    return name if isinstance(name, str) else ""
 
 
 def _versions() -> Mapping[str, str]:

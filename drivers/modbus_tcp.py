@@ -64,28 +64,37 @@ class Connection:
         """End the use by one device; the last one closes the connection."""
         with _registry:
             self._users -= 1
-            if self._users <= 0:
-                self.end()
+            is_last = self._users <= 0
+            if is_last:
+                self._leave_registry()
+        if is_last:
+            self._close_client()
 
     def end(self) -> None:
-        """Close the connection for all its devices; each has to share another one."""
-        with _registry:
-            self.ended = True
-            if _connections.get(self._port) is self:
-                del _connections[self._port]
-        self.client.close()
+        """Close the connection for all its devices, after the request under way; each has to share another one."""
+        self._leave_registry()
+        self._close_client()
 
-    def acquire(self, timeout: float) -> None:
-        """Begin the use by one more device, which waits for a reply so long at most, s."""
+    def acquire(self) -> None:
+        """Begin the use by one more device."""
         self._users += 1
-        if timeout > self.timeout:
-            self.wait_for_reply(timeout)
 
     def wait_for_reply(self, timeout: float) -> None:
         """Wait for a reply so long at most from now on, s."""
         with self.lock:
             self.timeout = timeout
             self.client.wait_for(timeout)
+
+    def _leave_registry(self) -> None:
+        with _registry:
+            self.ended = True
+            if _connections.get(self._port) is self:
+                del _connections[self._port]
+
+    def _close_client(self) -> None:
+        # Never within the registry: who holds this lock may be about to end the connection.
+        with self.lock:
+            self.client.close()
 
 
 _registry = threading.RLock()
@@ -111,5 +120,7 @@ def share(port: str, timeout: float) -> Connection:
         connection = _connections.get(port)
         if connection is None or not connection.is_open:
             connection = _connections[port] = Connection(port, timeout)
-        connection.acquire(timeout)
-        return connection
+        connection.acquire()
+    if timeout > connection.timeout:
+        connection.wait_for_reply(timeout)
+    return connection

@@ -52,12 +52,16 @@ class PymodbusClient(ModbusClient):
     def __init__(self, client: ModbusTcpClient | ModbusSerialClient, unit: int) -> None:
         self._client = client
         self._unit = unit
+        self._closed = False
 
     def request(self, request: bytes, expected: int) -> bytes:
         """Send a request, from its function on, and return its reply, of an `expected` number of bytes.
 
         Raises `NoReplyError` or `UnexpectedReplyError`, besides what the base class says.
         """
+        if self._closed:
+            # pymodbus would open the line again by itself.
+            raise ConnectionError("the line is closed")
         try:
             response = self._client.execute(False, _Request(request, self._unit))
         except ModbusIOException as error:
@@ -78,7 +82,8 @@ class PymodbusClient(ModbusClient):
         self._client.comm_params.timeout_connect = seconds
 
     def close(self) -> None:
-        """Release the line; may be called again."""
+        """Release the line; may be called again. A request after it raises ConnectionError."""
+        self._closed = True
         self._client.close()  # type: ignore[no-untyped-call]
 
     @property

@@ -18,7 +18,7 @@ class CommonParameters(ProtocolParameters):
 class WeightParameters(CommonParameters):
     """Parameters of the calibration by weights."""
 
-    weights: NumberList = parameter(..., unit="N", help="dead weights, one after another")
+    weights: NumberList = parameter(..., unit="N", help="dead weights ≥ 0, one after another")
     tolerance: float = parameter(
         ..., unit="N", low=1e-3, high=1e3, help="farthest reading from the weight that is believed"
     )
@@ -39,6 +39,9 @@ def calibration_load(parameters: WeightParameters, slots: Slots) -> Messages:
 
     `bench calibrate` makes a calibration of the run: its reference are the weights.
     """
+    if min(parameters.weights) < 0.0:
+        weights = ", ".join(f"{weight:g}" for weight in parameters.weights)
+        raise ValueError(f"parameter weights = {weights} N is not allowed; allowed: numbers ≥ 0")
     yield from _compare(slots["load"], parameters.weights, parameters.tolerance, parameters)
 
 

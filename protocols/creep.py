@@ -58,7 +58,10 @@ def creep(parameters: Parameters, slots: Slots) -> Messages:
     """
     drive, response = slots["drive"], slots["response"]
     if parameters.settling + 2 * parameters.interval > parameters.duration:
-        raise ValueError("settling must leave two intervals of the duration")
+        raise ValueError(
+            f"parameter settling = {parameters.settling:g} s is not allowed with interval = {parameters.interval:g} s"
+            f" and duration = {parameters.duration:g} s; allowed: settling + 2 × interval ≤ duration"
+        )
     yield from hang_load(slots, parameters.load)
     yield Phase("start")
     yield Step({drive.device: parameters.start}, drive.settle(0.0))

@@ -4,9 +4,20 @@ from __future__ import annotations
 
 from itertools import pairwise
 
+import numpy as np
+
 from bench.identification import excitation
 from bench.protocol import Dwell, Messages, Phase, Slots, Step, from_slot, parameter, protocol
-from protocols.preparation import DRIVE, DRIVE_AND_RESPONSE, LOAD, LOOP, RampParameters, reset
+from protocols.preparation import (
+    DRIVE,
+    DRIVE_AND_RESPONSE,
+    LOAD,
+    LOOP,
+    RampParameters,
+    check_increment,
+    check_order,
+    reset,
+)
 
 
 class Parameters(RampParameters):
@@ -30,10 +41,12 @@ def damped_oscillation(parameters: Parameters, slots: Slots) -> Messages:
     IV-B: 21 to 84 °C, 8 s, about 3000 set-points). `low` has to saturate the specimen: the run begins by resetting
     the memory to negative saturation there.
     """
-    drive = slots["drive"].device
-    setpoints = excitation.damped_oscillation(
-        parameters.low, parameters.high, parameters.center, parameters.half_cycles, parameters.increment
-    )
+    drive, unit = slots["drive"].device, slots["drive"].setpoint_unit
+    check_order(parameters, "low < center < high", unit)
+    ends = parameters.low, parameters.high, parameters.center, parameters.half_cycles
+    corners = excitation.damped_oscillation(*ends, step=parameters.high - parameters.low)
+    check_increment(parameters, float(np.abs(np.diff(corners)).sum()), ("low", "high"), unit)
+    setpoints = excitation.damped_oscillation(*ends, step=parameters.increment)
     yield from reset(slots, float(setpoints[0]), parameters.dwell, load=parameters.load)
     yield Phase("rise")
     direction = 1.0

@@ -7,7 +7,7 @@ import numpy as np
 from bench.hysteresis import uniform_levels
 from bench.identification import covering_sequence, design
 from bench.protocol import Dwell, Messages, Phase, Slots, Step, from_slot, parameter, protocol
-from protocols.preparation import DRIVE, DRIVE_AND_RESPONSE, LOAD, LOOP, SweepParameters, reset
+from protocols.preparation import DRIVE, DRIVE_AND_RESPONSE, LOAD, LOOP, SweepParameters, check_order, reset
 
 
 class Parameters(SweepParameters):
@@ -28,7 +28,8 @@ def covering(parameters: Parameters, slots: Slots) -> Messages:
     set-points each, average noise as the damped oscillation does for a model of 20 levels, in half its time.
     `bench design` shows what each sequence costs.
     """
-    yield from _carry_out(parameters, slots, covering_sequence(*_grid(parameters), per_cell=parameters.per_cell))
+    sequence = covering_sequence(*_grid(parameters, slots), per_cell=parameters.per_cell)
+    yield from _carry_out(parameters, slots, sequence)
 
 
 @protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD, views=LOOP)
@@ -38,11 +39,15 @@ def first_order_reversals(parameters: Parameters, slots: Slots) -> Messages:
     From positive saturation down to each level in turn, and up again level by level (Mayergoyz, *Mathematical
     Models of Hysteresis and Their Applications*, 2003, chapter 1).
     """
-    sequence = design.first_order_reversals(*_grid(parameters), per_cell=parameters.per_cell)
+    sequence = design.first_order_reversals(*_grid(parameters, slots), per_cell=parameters.per_cell)
     yield from _carry_out(parameters, slots, sequence)
 
 
-def _grid(parameters: Parameters) -> tuple[np.ndarray, tuple[float, float]]:
+def _grid(parameters: Parameters, slots: Slots) -> tuple[np.ndarray, tuple[float, float]]:
+    """Return the levels and the range of the drive; raises ValueError if the plane is not within the range."""
+    unit = slots["drive"].setpoint_unit
+    check_order(parameters, "low < high", unit)
+    check_order(parameters, "low ≤ plane_low < plane_high ≤ high", unit)
     grid = uniform_levels(parameters.plane_low, parameters.plane_high, parameters.levels)
     return grid, (parameters.low, parameters.high)
 

@@ -14,10 +14,13 @@ from bench.controllers import ControllerSetup, Fallback, controller_names, make_
 from bench.protocol import Caution, Control, Messages, Phase, Slots, from_slot, parameter, protocol, unit_of
 from bench.results.data import read_columns
 from bench.results.tracking import FOLLOW
-from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LOOP, load_checked_model
+from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LOOP, check_order, load_checked_model
 from protocols.session import SessionParameters, begin_session, keep_adapted, session_kinds
 
 _DRIVE = unit_of("drive")
+
+_MOST = 10_000_000
+"""Most set-points of the sine."""
 
 
 class Parameters(SessionParameters):
@@ -37,7 +40,9 @@ class Parameters(SessionParameters):
     fallback: Fallback = parameter(
         "none", unit="", help="what goes on in place of a controller that is given up; none ends the run"
     )
-    fastest: float = parameter(from_slot("drive", "rate"), unit=f"{_DRIVE}/s", help="what the drive can follow")
+    fastest: float = parameter(
+        from_slot("drive", "rate"), unit=f"{_DRIVE}/s", above=0.0, help="what the drive can follow"
+    )
 
 
 @protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD, controls="response", views=LOOP)
@@ -53,7 +58,7 @@ def following(parameters: Parameters, slots: Slots) -> Messages:
     drive, response = slots["drive"], slots["response"]
     model = load_checked_model(parameters, slots)
     kinds = session_kinds(parameters)
-    times, values = _reference(parameters)
+    times, values = _reference(parameters, response.unit)
     if not model.operator.memoryless:
         slope = fastest_slope(model.operator.inverse(), times, values)
         if not slope.within(parameters.fastest):
@@ -107,8 +112,14 @@ def following(parameters: Parameters, slots: Slots) -> Messages:
     yield from keep_adapted(follower, model)
 
 
-def _reference(parameters: Parameters) -> tuple[np.ndarray, np.ndarray]:
+def _reference(parameters: Parameters, unit: str) -> tuple[np.ndarray, np.ndarray]:
     if not parameters.reference:
+        check_order(parameters, "low < high", unit)
+        if parameters.duration * parameters.rate > _MOST:
+            raise ValueError(
+                f"parameter duration = {parameters.duration:g} s is not allowed at rate = {parameters.rate:g} 1/s; "
+                f"allowed: ≤ {_MOST / parameters.rate:g} s, which is {_MOST} set-points"
+            )
         times = np.arange(0.0, parameters.duration + 0.5 / parameters.rate, 1.0 / parameters.rate)
         # From its trough, where it stands still: a plate at rest cannot start at full speed.
         return times, modulated_sine(

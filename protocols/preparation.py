@@ -24,6 +24,7 @@ from bench.protocol import (
     parameter,
     unit_of,
 )
+from bench.protocol.plan import LONGEST
 from bench.tuning_file import Tuning
 
 DRIVE_AND_RESPONSE: Mapping[str, type[Actuator] | type[Signal]] = {"drive": Actuator, "response": Signal}
@@ -48,7 +49,10 @@ class LoadedParameters(ProtocolParameters):
     """What can be set where a specimen may carry a load."""
 
     load: float = parameter(
-        from_slot("load", "rest", fallback=0.0), unit=unit_of("load"), help="load that is hung on; 0 for none"
+        from_slot("load", "rest", fallback=0.0),
+        unit=unit_of("load"),
+        low=0.0,
+        help="load that is hung on; 0 for none",
     )
 
 
@@ -71,7 +75,7 @@ class RampParameters(SweepParameters):
     """What can be set where ramps join the set-points."""
 
     increment: float = parameter(
-        from_slot("drive", "increment"), unit=DRIVE, help="largest difference of neighbouring set-points"
+        from_slot("drive", "increment"), unit=DRIVE, above=0.0, help="largest difference of neighbouring set-points"
     )
 
 
@@ -88,12 +92,43 @@ class ControlledParameters(LoadedParameters):
     )
 
 
+def check_order(parameters: ProtocolParameters, order: str, unit: str) -> None:
+    """Raise ValueError unless parameters are in an order, such as `low < center ≤ high`; names the first that is not.
+
+    `unit` is that of all of them.
+    """
+    words = order.split()
+    for first, sign, second in zip(words[::2], words[1::2], words[2::2], strict=False):
+        lower, upper = getattr(parameters, first), getattr(parameters, second)
+        if lower > upper or (lower == upper and sign == "<"):
+            raise ValueError(
+                f"parameter {first} = {lower:g} {unit} is not allowed with {second} = {upper:g} {unit}; "
+                f"allowed: {order}"
+            )
+
+
+def check_increment(parameters: RampParameters, way: float, ends: tuple[str, str], unit: str) -> None:
+    """Raise ValueError if ramps would have more than a million set-points.
+
+    `way` is their length in all, `ends` names the parameters between which they are, `unit` is that of the drive.
+    """
+    low, high = (f"{name} = {getattr(parameters, name):g}" for name in ends)
+    least = way / LONGEST
+    if parameters.increment < least:
+        raise ValueError(
+            f"parameter increment = {parameters.increment:g} {unit} is not allowed from {low} to {high} {unit}, "
+            f"which would take more than {LONGEST} set-points; allowed: ≥ {least:.3g} {unit}"
+        )
+
+
 def load_checked_model(parameters: ControlledParameters, slots: Slots) -> ModelFile:
     """Return the model in the units of the slots.
 
-    Raises DataError as `load_model_for`, and ValueError if the reset does not saturate the specimen of the model.
+    Raises DataError as `load_model_for`, and ValueError if the reset is not below the highest set-point, or does not
+    saturate the specimen of the model.
     """
     drive, setpoint = slots["drive"], parameters.reset
+    check_order(parameters, "reset < hottest", drive.unit)
     model = load_model_for(parameters.model, input_unit=drive.unit, output_unit=slots["response"].unit)
     if not saturated_below(model.operator, setpoint):
         raise ValueError(

@@ -6,7 +6,16 @@ import numpy as np
 
 from bench.identification import excitation
 from bench.protocol import Dwell, Messages, Phase, Slots, Step, from_slot, parameter, protocol
-from protocols.preparation import DRIVE, DRIVE_AND_RESPONSE, LOAD, LOOP, RampParameters, reset
+from protocols.preparation import (
+    DRIVE,
+    DRIVE_AND_RESPONSE,
+    LOAD,
+    LOOP,
+    RampParameters,
+    check_increment,
+    check_order,
+    reset,
+)
 
 
 class Parameters(RampParameters):
@@ -34,6 +43,13 @@ def random_validation(parameters: Parameters, slots: Slots) -> Messages:
     (Zhang et al. 2013, Fig. 10: 600 set-points). The run begins by resetting the memory to negative
     saturation at `low`.
     """
+    unit = slots["drive"].setpoint_unit
+    check_order(parameters, "low < high", unit)
+    check_order(parameters, "inner_low < inner_high", unit)
+    ends = {name: getattr(parameters, name) for name in ("low", "inner_low", "inner_high", "high")}
+    # One ramp may go from end to end.
+    lowest, highest = min(ends, key=ends.__getitem__), max(ends, key=ends.__getitem__)
+    check_increment(parameters, ends[highest] - ends[lowest], (lowest, highest), unit)
     setpoints = excitation.random_validation(
         np.random.default_rng(parameters.sequence_seed),
         count=parameters.count,

@@ -9,7 +9,7 @@ import numpy as np
 from bench.errors import DataError
 from bench.protocol import Dwell, Messages, Phase, Slot, Slots, Step, parameter, protocol
 from bench.results.data import read_columns
-from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LOOP, SweepParameters, reset
+from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LOOP, SweepParameters, check_order, reset
 
 _LONGEST_DWELL = 86400.0
 
@@ -33,6 +33,7 @@ def sequence(parameters: Parameters, slots: Slots) -> Messages:
     anything moves.
     """
     drive = slots["drive"]
+    check_order(parameters, "low < high", drive.setpoint_unit)
     targets, dwells = _read(parameters, drive)
     yield from reset(slots, parameters.low, parameters.dwell, load=parameters.load)
     yield Phase("sequence")

@@ -27,7 +27,7 @@ from bench.protocol import (
 )
 from bench.results.data import read_columns
 from bench.results.tracking import REACH, READING
-from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LOOP, load_checked_model
+from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LOOP, check_order, load_checked_model
 from protocols.session import SessionParameters, begin_session, keep_adapted, session_kinds
 
 _TARGETS_A_NOTE = 10
@@ -77,6 +77,7 @@ def tracking(parameters: Parameters, slots: Slots) -> Messages:
     if parameters.targets:
         targets = read_columns(Path(parameters.targets), ["target"], at_least=1).values["target"]
     else:
+        check_order(parameters, "low < high", response.unit)
         rng = np.random.default_rng(parameters.sequence_seed)
         targets = tracking_targets(rng, parameters.low, parameters.high, parameters.count)
     limits = (parameters.reset, parameters.hottest)

@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from bench.cli.band_options import BandsOption, RecalibrateOption, RecalibrateRowsOption, print_examined
-from bench.cli.console import JsonOption, check_outputs, console, show_compilation, write_json
+from bench.cli.console import JsonOption, check_outputs, console, show_compilation, warn, write_json
 from bench.cli.data_options import layout_options, print_assumptions
 from bench.cli.models import InitialOption
 from bench.cli.patience import show_patience
@@ -115,6 +115,8 @@ def compare_(
             reading=reading,
         )
     print_assumptions(data.name, result.assumptions)
+    for warning in result.warnings:
+        warn(warning)
     if result.skip:
         console.print(f"rows 1 to {result.skip} are left out of the errors", highlight=False)
     table = Table(title=f"models on {data.name}, errors in {result.unit or 'output units'}", title_justify="left")

@@ -25,6 +25,7 @@ from bench.cli.selection import (
     Comparing,
     check_test,
     choose_model,
+    find_common_times,
     is_comparison,
     offer_comparing,
     print_test,
@@ -62,7 +63,12 @@ InitialOption = Annotated[
 
 
 TimeColumn = Annotated[
-    str | None, typer.Option("--time", metavar="COLUMN", help="Column of times, for a model with time.")
+    str | None,
+    typer.Option(
+        "--time",
+        metavar="COLUMN",
+        help="Column of times, for a model with time; if not given, that of its data, or one named time or t.",
+    ),
 ]
 
 
@@ -114,7 +120,15 @@ def identify_(
             "reach, or estimate it.",
         ),
     ] = None,
-    time_column: TimeColumn = None,
+    time_column: Annotated[
+        str | None,
+        typer.Option(
+            "--time",
+            metavar="COLUMN|none",
+            help="Column of times: models with time take part in the comparison. If not given, one named time or t, "
+            "by which a model is chosen only if it errs 1.2 times less; none leaves time out.",
+        ),
+    ] = None,
     static: Annotated[
         str | None,
         typer.Option(metavar="NAME", help="Operator within a model with time, such as preisach (hammerstein)."),
@@ -163,12 +177,18 @@ def identify_(
     `--table telemetry` takes those within its steps, as of a fast loop.
     """
     from bench.results.models import certificate_lines, identify_file
+    from bench.results.times import NO_TIMES
 
     check_outputs(out=out, card=card, figures=figures, json_file=json_file, read=[*files, *comparing.test_files])
     names = ", ".join(file.name for file in files)
     columns = (input_column, output_column)
     if input_column == output_column:
         raise ConfigurationError(f"--input and --output are the same column, {input_column}; a model needs two")
+    is_time_asked = time_column is not None
+    if not is_time_asked:
+        time_column = find_common_times(files, comparing.test_files, columns, model, reading)
+    elif time_column == NO_TIMES:
+        time_column = None
     if comparing.test_files:
         check_test(comparing.test_files[0], columns, time_column, reading)
     settings: dict[str, Any] = {
@@ -185,7 +205,16 @@ def identify_(
         if static is not None or dynamics is not None:
             raise ConfigurationError("--static and --dynamics go with --model hammerstein")
         selected = choose_model(
-            files, columns, model, options, settings, comparing, skip=skip, time_column=time_column, reading=reading
+            files,
+            columns,
+            model,
+            options,
+            settings,
+            comparing,
+            skip=skip,
+            time_column=time_column,
+            is_time_asked=is_time_asked,
+            reading=reading,
         )
         model, settings = selected.model, settings | selected.settings()
         time_column = time_column if selected.is_timed else None
@@ -274,11 +303,12 @@ def predict_(
     from bench.results.predictions import Predictions, Quantity
     from bench.results.recalibrations import Session
     from bench.results.starting_state import starting_state
-    from bench.results.times import read_times, time_quantity
+    from bench.results.times import choose_times, foreign_drift, read_times, time_quantity
 
     check_outputs(out=out, figures=figures, json_file=json_file, read=(model_path, file))
     session = Session.parse(recalibrate, recalibrate_rows)
     model = load_model(model_path)
+    time_column = choose_times(model, file, time_column, reading)
     with show_patience(f"reading {file.name}"):
         names = [name for name in (input_column, output_column, time_column) if name]
         columns = read_columns(file, names, options=reading)
@@ -288,6 +318,8 @@ def predict_(
     if output_column:
         check_unit(model.response.output_unit, columns.units[output_column], output_column)
     if warning := outside_of_range(model, inputs):
+        warn(warning)
+    if session is None and (warning := foreign_drift(model, inputs)):
         warn(warning)
     start = starting_state(model, inputs, initial=initial, skip=skip, continue_memory=continue_memory)
     measured = columns.values[output_column] if output_column else None
@@ -368,11 +400,12 @@ def invert(
     from bench.results.inverted import NEAR, TOO_EARLY, invert_targets
     from bench.results.models import check_unit
     from bench.results.starting_state import starting_state
-    from bench.results.times import read_times
+    from bench.results.times import choose_times, read_times
     from bench.units import header_with_unit
 
     check_outputs(out=out, json_file=json_file, read=(model_path, file))
     model = load_model(model_path)
+    time_column = choose_times(model, file, time_column, reading)
     with show_patience(f"reading {file.name}"):
         columns = read_columns(file, [name for name in (column, time_column) if name], options=reading)
     print_assumptions(file.name, columns.assumptions)

@@ -69,7 +69,7 @@ def list_(
     catalogue = Catalogue.of_installed()
     if name in catalogue.rigs:
         # Plain, so that it can be redirected into a file.
-        typer.echo(catalogue.rigs[name].text, nl=False)
+        typer.echo(catalogue.rigs[name].text, nl=False, err=console.stderr)
         write_json(json_file, {"name": name, "text": catalogue.rigs[name].text})
     elif name in catalogue.protocols:
         definition = catalogue.protocols[name]

@@ -97,6 +97,7 @@ def choose_model(
     *,
     skip: int,
     time_column: str | None,
+    is_time_asked: bool,
     reading: ReadingOptions,
 ) -> SelectedModel:
     """Compare models on measurements, and print the table.
@@ -105,6 +106,8 @@ def choose_model(
     ----------
     files, columns, skip, time_column, reading
         The measurements.
+    is_time_asked : bool
+        Whether the column of times was asked for, not found.
     model : str
         `all`, or names with commas between them.
     options : ModelOptions
@@ -121,7 +124,6 @@ def choose_model(
     """
     from bench.identification.selection import Given
     from bench.results.selection import named_models, select_model
-    from bench.results.times import find_times
 
     if settings["ridge"] is not None:
         raise ConfigurationError("--ridge goes with one --model NAME")
@@ -133,6 +135,7 @@ def choose_model(
         initial=settings["initial"],
         orientation=None if orientation == "auto" else orientation,
         smoothing=settings["smoothing"],
+        is_time_asked=is_time_asked,
     )
     found = select_model(
         files,
@@ -147,8 +150,8 @@ def choose_model(
         reading=reading,
     )
     _print_table(found)
-    if time_column is None and len(files) == 1 and (name := find_times(files[0], reading)) is not None:
-        print_plain(console, f"column {name} holds times: with --time {name} rate, creep and drift would take part")
+    if time_column is not None and not is_time_asked:
+        _print_line(_on_found_times(found, time_column))
     if comparing.table_out is not None:
         found.save(comparing.table_out)
         print_plain(console, f"table: {comparing.table_out}")
@@ -197,8 +200,58 @@ def _print_table(found: SelectedModel) -> None:
         f"held out: contiguous blocks of the {selection.rows} rows compared, with gaps of {selection.gap}; "
         "other cycles: whole kinds of cycles left out"
     )
-    if selection.has_times and not any(each.candidate.static for each in selection.evaluations):
+    if (
+        selection.has_times
+        and selection.is_time_asked
+        and not any(each.candidate.static for each in selection.evaluations)
+    ):
         _print_line("with time: no lag, resonance, delay, creep or drift behind the best operators is worth it")
+
+
+def find_common_times(
+    files: Sequence[Path], tests: Sequence[Path], columns: tuple[str, str], model: str, reading: ReadingOptions
+) -> str | None:
+    """Return the column of times that nobody named, where a model with time may use it.
+
+    None of several files, as times are those of one record, and if it is one of the model's own or missing from a
+    file for tests. What is in the way of comparing models with time is printed.
+    """
+    from bench.errors import DataError
+    from bench.hysteresis import timed_models
+    from bench.results.times import find_times, named_times
+
+    if len(files) > 1 or not (is_comparison(model) or model in timed_models()):
+        return None
+    if not is_comparison(model):
+        return named_times(files[0], reading)
+    try:
+        name = find_times(files[0], reading)
+    except DataError as error:
+        print_plain(console, f"{error}: time is left out")
+        return None
+    if name in columns:
+        return None
+    for test in tests:
+        if name is not None and named_times(test, reading, name) != name:
+            print_plain(console, f"{test.name} has no column {name}: time is left out")
+            return None
+    return name
+
+
+def _on_found_times(found: SelectedModel, name: str) -> str:
+    """Return what became of a column of times that nobody asked for."""
+    selection = found.selection
+    if not selection.has_times:
+        return f"column {name} holds times of too few rows: --time {name} compares models with time all the same"
+    if found.is_timed:
+        return (
+            f"column {name} holds times: the chosen model takes time, as it errs at least 1.2 times less than what "
+            "would be chosen without. --time none leaves time out: controllers take models without time"
+        )
+    return (
+        f"column {name} holds times: no model with time errs 1.2 times less than the chosen one. "
+        f"--time {name} compares them as equals"
+    )
 
 
 def _print_line(text: str) -> None:

@@ -100,7 +100,8 @@ def recover(
             names = ", ".join(entry.name for entry in wanted)
             if not yes and not (sys.stdin is not None and sys.stdin.isatty()):
                 raise ConfigurationError(f"clearing the errors of {names} needs --yes where no operator can answer")
-            if not yes and not typer.confirm(f"Is the cause removed? Clear the errors of {names}"):
+            question = f"Is the cause removed? Clear the errors of {names}"
+            if not yes and not typer.confirm(question, err=console.stderr):
                 raise AbortError("nothing was cleared")
             found |= {entry.name: recover_device(place, entry) for entry in wanted}
             console.print()

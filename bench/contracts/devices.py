@@ -72,6 +72,14 @@ class DeviceContract:
             expected = [(f"{device.name}_{quantity}", unit) for quantity, unit in self.quantities]
             assert [(signal.name, signal.unit) for signal in device.signals] == expected
 
+    def test_readings_are_within_their_limits(self, device: Device) -> None:
+        """`reading_limits` are of its own signals and in their units, and what it measures is within them."""
+        units = {signal.name: signal.unit for signal in device.signals}
+        values = device.measure()
+        for name, limits in device.reading_limits.items():
+            assert limits.unit == units[name]
+            assert values[name] in limits
+
     def test_measures_every_signal(self, device: Device) -> None:
         """`measure` and `glance` deliver a finite number for each signal in their order, in a new table each time."""
         for take in (device.measure, device.glance):

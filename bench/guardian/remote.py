@@ -360,5 +360,6 @@ def _description(file: RigFile, found: Message) -> RigDescription:
             limits=None if limits is None else Limits(**limits),
             watchdog=content["watchdog"],
             safe_within=content["safe_within"],
+            reading_limits={name: Limits(**limits) for name, limits in content["reading_limits"].items()},
         )
     return RigDescription(file, devices, tuple(Signal(**signal) for signal in found["signals"]))

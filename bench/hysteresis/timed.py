@@ -156,6 +156,20 @@ class TimedSequence:
         """Return the outputs to inputs, shape (N,); as `TimedModel.evaluate`."""
         return self.model.evaluate(self.times, inputs, state)
 
+    def first(self, rows: int) -> TimedSequence:
+        """Return the model at the first of its times."""
+        return TimedSequence(self.model, self.times[:rows])
+
+    @property
+    def input_range(self) -> tuple[float, float]:
+        """That of the model, input units."""
+        return self.model.input_range
+
+    @property
+    def input_unit(self) -> str:
+        """That of the model."""
+        return self.model.input_unit
+
 
 def check_times(times: ArrayLike) -> Floats:
     """Return times as an array, s, or raise ValueError if they are not finite and strictly increasing."""

@@ -15,6 +15,7 @@ import numpy as np
 
 from bench.hysteresis import Operator, _checks
 from bench.hysteresis._checks import Floats
+from bench.hysteresis.timed import TimedSequence
 
 Kind: TypeAlias = Literal["offset", "gain", "drift", "input-offset"]
 KINDS: tuple[Kind, ...] = get_args(Kind)
@@ -58,13 +59,13 @@ class Recalibration:
     rows: int
     rms: float
 
-    def predict(self, operator: Operator[Any], inputs: Floats, state: Any = None) -> Floats:  # noqa: ANN401
+    def predict(self, operator: Operator[Any] | TimedSequence, inputs: Floats, state: Any = None) -> Floats:  # noqa: ANN401
         """Return the outputs of the model in the other session, shape (N,), output units.
 
         Parameters
         ----------
-        operator : Operator
-            The model.
+        operator : Operator or TimedSequence
+            The model, one with time at the times of the rows.
         inputs : ndarray, shape (N,)
             Inputs from the first row of the session on, input units.
         state : object
@@ -115,7 +116,7 @@ class Recalibration:
 
 
 def recalibrate(
-    operator: Operator[Any],
+    operator: Operator[Any] | TimedSequence,
     inputs: Floats,
     outputs: Floats,
     kinds: Iterable[Kind],
@@ -128,8 +129,8 @@ def recalibrate(
 
     Parameters
     ----------
-    operator : Operator
-        The model.
+    operator : Operator or TimedSequence
+        The model, one with time at the times of the rows.
     inputs, outputs : array_like, shape (N,)
         The measured sequence from the first row of the session on.
     kinds : iterable of {"offset", "gain", "drift", "input-offset"}
@@ -165,6 +166,8 @@ def recalibrate(
             f"{2 * len(wanted) + 3} are needed"
         )
     u, y, numbers = u[:count], y[skip:count], np.arange(skip, count, dtype=np.float64)
+    if isinstance(operator, TimedSequence):
+        operator = operator.first(count)
 
     def predicted(moved: float) -> Floats:
         return operator.evaluate(u + moved, state)[skip:]
@@ -203,7 +206,7 @@ def recalibrate(
     )
 
 
-def _best_shift(operator: Operator[Any], solve: Any) -> float:  # noqa: ANN401
+def _best_shift(operator: Operator[Any] | TimedSequence, solve: Any) -> float:  # noqa: ANN401
     """Return the input offset of the least squared residual."""
     from scipy.optimize import minimize_scalar
 

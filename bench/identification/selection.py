@@ -67,6 +67,9 @@ _GAIN = 0.98
 _MOST_COEFFICIENTS = 5
 # What no signs bound, on other inputs without units left out or at other rates, has to be so much better.
 _UNBOUNDED = 1.2
+# What times that nobody asked for have to gain: at the rates of the record a lag and hysteresis look alike, and
+# controllers take models without time only.
+_UNASKED = 1.2
 # Of one kind of cycle, what the record leaves open of a model is tested by nothing: it has to be so much better.
 _UNDETERMINED = 2.0
 # Part of the variance of the errors that a trend over the rows must be, to be no chance of neighbouring errors.
@@ -87,12 +90,16 @@ class Given:
         Options of models; each model takes those that it has.
     initial, orientation, smoothing
         As `Candidate`; None leaves the choice.
+    is_time_asked : bool
+        Whether models with time take part as the others do. Otherwise one is chosen only if it errs 1.2 times less,
+        of 100 rows or more.
     """
 
     options: Mapping[str, Any] = field(default_factory=dict)
     initial: Initial | None = None
     orientation: Orientation | None = None
     smoothing: float | None = None
+    is_time_asked: bool = True
 
 
 class Trend(NamedTuple):
@@ -136,7 +143,9 @@ class Selection:
     trend : Trend or None
         That of the errors of the chosen model, if it is one without time.
     has_times : bool
-        Whether times are known, so that models with time took part.
+        Whether models with time took part.
+    is_time_asked : bool
+        Whether they did as the others; see `Given`.
     has_one_rate : bool
         Whether times are known and the input moves at one speed only.
     """
@@ -151,6 +160,7 @@ class Selection:
     reversals: int | None = None
     trend: Trend | None = None
     has_times: bool = False
+    is_time_asked: bool = True
     has_one_rate: bool = False
 
     def warnings(self) -> list[str]:
@@ -167,7 +177,7 @@ class Selection:
             remedy = (
                 "no model with drift or creep does better on rows left out; --model hammerstein --dynamics drift "
                 "has the drift in any case"
-                if self.has_times
+                if self.has_times and self.is_time_asked
                 else "give --time COLUMN, so that models with drift and creep take part"
             )
             found.append(
@@ -254,7 +264,10 @@ class _Search:
     def __init__(
         self, measured: Measurements, models: Sequence[str], given: Given, carry: Carry, in_time: InTime | None
     ) -> None:
-        self.measured, self.given, self.carry, self.in_time = measured, given, carry, in_time
+        self.measured, self.given, self.carry = measured, given, carry
+        # Of few rows a lag hardly shows, and hides much.
+        is_heard = given.is_time_asked or int(measured.tested.sum()) >= _FEW_ROWS
+        self.in_time = in_time if is_heard else None
         self.kinds = [kind for model in models for kind in _kinds(model, find_model(model), given)]
         self.done: dict[_Kind, list[Evaluation]] = {kind: [] for kind in self.kinds}
         self.given_up: list[Evaluation] = []
@@ -276,11 +289,15 @@ class _Search:
             else:
                 left[kind] = each.candidate
         self.refine(left, _HOPELESS * least)
+        if not any(self._whole(kind) for kind in self.kinds):
+            # The first two folds may be much easier than the others.
+            self.done = {kind: [] for kind in self.kinds}
+            self.refine(left, float("inf"))
         self.smooth()
         self.remember()
         finalists = [each for kind in self.kinds for each in self._of_each_size(kind)]
         judged = self.with_units(finalists)
-        return self.choose(judged + self.with_time(judged))
+        return self.choose(judged, self.with_time(judged))
 
     def screen(self) -> dict[_Kind, Evaluation]:
         """Return each kind at its coarsest, with its best orientation and memory."""
@@ -434,9 +451,14 @@ class _Search:
         self.given_up += failed
         return found
 
-    def choose(self, finalists: list[Evaluation]) -> Selection:
-        """Return the table with what is chosen."""
+    def choose(self, judged: list[Evaluation], timed: list[Evaluation]) -> Selection:
+        """Return the table with what is chosen of models without time and with."""
+        finalists = judged + timed
         best, chosen = self._decide(finalists)
+        if chosen in timed and not self.given.is_time_asked:
+            without = self._decide(judged)
+            if _UNASKED * chosen.rms > without[1].rms:
+                best, chosen = without
         others = [each for kind in self.kinds for each in self.done[kind] if len(each.blocks) < self._folds]
         table = sorted(finalists, key=lambda each: each.rms) + others + self.given_up
         measured = self.measured
@@ -451,6 +473,7 @@ class _Search:
             self._reversals,
             self._trend(chosen) if chosen.candidate.static is None else None,
             self.in_time is not None,
+            self.given.is_time_asked,
             self.in_time is not None and self.in_time.has_one_rate(),
         )
 

@@ -21,6 +21,9 @@ PLAYS = "prandtl-ishlinskii"
 # Operators to which a linear part and a drift are added, and what of it is a lag.
 _IN_TIME = 2
 _LAGS = {"lag", "resonance", "delay"}
+# Others as well, of so few coefficients and errors up to so many times the least: a drift that they cannot follow
+# counts against them, which finer ones take for hysteresis.
+_FEW_COEFFICIENTS, _NEAR = 60, 2.0
 # Weight of the roughness penalty of a plane that one kind of cycle does not determine, and its reversible part.
 _SMOOTHING, _REVERSIBLE = 1e-2, "linear"
 
@@ -116,6 +119,8 @@ class TimeStage:
         for each in possible:
             best.setdefault(each.candidate.model, each)
         tried = list(best.values())[:_IN_TIME]
+        least = min((each.rms for each in possible), default=0.0)
+        tried += [each for each in best.values() if each.rms <= _NEAR * least and self._is_cheap(each.candidate)]
         if not any(has_signs(each) for each in tried):
             tried += [each for each in best.values() if has_signs(each)][:1]
         if self.in_time.has_one_rate():
@@ -153,11 +158,19 @@ class TimeStage:
 
     def _is_possible(self, candidate: Candidate) -> bool:
         """Return whether a candidate can be the operator of a model with time: a free plane would need penalties."""
+        operator = self._operator(candidate)
+        bounded = find_model(candidate.model).constrained or not operator.densities()
+        return bounded and self.in_time.is_small(operator.coefficients.size)
+
+    def _is_cheap(self, candidate: Candidate) -> bool:
+        """Return whether a candidate's operator has few coefficients."""
+        return self._operator(candidate).coefficients.size <= _FEW_COEFFICIENTS
+
+    def _operator(self, candidate: Candidate) -> Operator[Any]:
         template = find_model(candidate.model).template
         assert template is not None
         operator: Operator[Any] = template(self.measured.inputs, **candidate.options)
-        bounded = find_model(candidate.model).constrained or not operator.densities()
-        return bounded and self.in_time.is_small(operator.coefficients.size)
+        return operator
 
 
 def _changed(each: Evaluation, **settings: Any) -> Evaluation:  # noqa: ANN401 - those of a candidate

@@ -77,6 +77,7 @@ def parameter(
     help: str,  # noqa: A002 - the word that the user sees
     low: float | None = None,
     high: float | None = None,
+    above: float | None = None,
     choices: Callable[[], Sequence[str]] | None = None,
     file: bool = False,
     changeable: bool = False,
@@ -93,6 +94,8 @@ def parameter(
         What it does, in one sentence without a full stop.
     low, high : float, optional
         The allowed range, both ends included.
+    above : float, optional
+        In place of `low`: what it has to be greater than.
     choices : callable, optional
         Returns the texts that are allowed, where these are registered by name.
     file : bool
@@ -109,6 +112,7 @@ def parameter(
         default,
         description=help,
         ge=low,
+        gt=above,
         le=high,
         json_schema_extra=extra,
         # A default that is a text may stand for another type, such as a list of numbers.
@@ -338,11 +342,14 @@ class ProtocolDefinition:
             unit = (roles[slot].unit if slot in roles else None) or f"{_UNIT_OF}{slot}"
             unit = rate_unit(unit) if slash else unit
         low = next((m.ge for m in info.metadata if getattr(m, "ge", None) is not None), None)
+        above = next((m.gt for m in info.metadata if getattr(m, "gt", None) is not None), None)
         high = next((m.le for m in info.metadata if getattr(m, "le", None) is not None), None)
         if extra.get("choices") is not None:
             allowed = ", ".join(extra["choices"]())
         elif low is not None and high is not None:
             allowed = f"{low:g} to {high:g}"
+        elif above is not None:
+            allowed = f"> {above:g}" + ("" if high is None else f", ≤ {high:g}")
         elif low is not None:
             allowed = f"≥ {low:g}"
         elif high is not None:

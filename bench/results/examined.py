@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.errors import ConfigurationError
-from bench.hysteresis import TimedModel
+from bench.hysteresis.timed import TimedSequence
 from bench.identification import Errors, measure_errors
 from bench.identification.recalibration import Recalibration
 from bench.model_file import ModelFile
@@ -101,25 +101,20 @@ def examine(
     ConfigurationError
         If the session cannot be estimated, or a model with time has no times.
     """
-    if isinstance(model.model, TimedModel):
-        if session is not None:
-            raise ConfigurationError(f"--recalibrate: {model.name} is a model with time; it takes none")
-        outputs = bind_times(model, times).evaluate(inputs, state)
-        band = predict_band(model, inputs, state, times)
-        return Examined(outputs, measured, None, band, (model.model.input_unit, model.model.output_unit), skip)
-    operator = model.operator
-    units = operator.input_unit, operator.output_unit
+    bound = bind_times(model, times)
+    times = times if isinstance(bound, TimedSequence) else None
+    units = model.response.input_unit, model.response.output_unit
     if session is None:
-        predicted = np.asarray(operator.evaluate(inputs, state))
-        return Examined(predicted, measured, None, predict_band(model, inputs, state), units, skip)
+        predicted = np.asarray(bound.evaluate(inputs, state))
+        return Examined(predicted, measured, None, predict_band(model, inputs, state, times), units, skip)
     if measured is None:
         raise ConfigurationError("--recalibrate needs measured outputs: name their column with --output")
-    found = session.estimate(operator, inputs, measured, skip=skip, state=state)
+    found = session.estimate(bound, inputs, measured, skip=skip, state=state)
     return Examined(
-        found.predict(operator, inputs, state),
+        found.predict(bound, inputs, state),
         measured,
         found,
-        predict_band(model, inputs + found.values.get("input-offset", 0.0), state),
+        predict_band(model, inputs + found.values.get("input-offset", 0.0), state, times),
         units,
         session.first_unused(inputs.size, skip),
     )

@@ -91,7 +91,7 @@ def import_file(
     wanted = [input_column, output_column, *others]
     if len(set(wanted)) < len(wanted):
         raise ConfigurationError(f"columns {', '.join(wanted)}: one of them is asked for twice")
-    time_column = time_column or find_times(path, reading)
+    time_column = time_column or _times(path, reading)
     columns = read_columns(path, [*wanted, *([time_column] if time_column else [])], options=reading)
     rows = len(columns.values[input_column])
     times = np.arange(1.0, rows + 1.0) if time_column is None else read_times(columns, time_column)
@@ -112,6 +112,14 @@ def import_file(
     journal.finish(status="completed", reason="", finished=float(elapsed[-1]), safe_state={})
     journal.close()
     return ImportedRun(folder, rows, ", ".join(filter(None, assumptions)))
+
+
+def _times(path: Path, reading: ReadingOptions | None) -> str | None:
+    """Return the column of times, None if there is none of one record."""
+    try:
+        return find_times(path, reading)
+    except DataError:
+        return None
 
 
 def _signal(column: str, unit: str) -> Signal:

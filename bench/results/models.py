@@ -44,7 +44,16 @@ from bench.results.predictions import Predictions, Quantity
 from bench.results.reading.options import ReadingOptions
 from bench.results.recalibrations import Session
 from bench.results.starting_state import StartingState, digest, starting_state
-from bench.results.times import bind_times, check_model_name, check_penalties, is_smoothed, read_times, time_quantity
+from bench.results.times import (
+    bind_times,
+    check_model_name,
+    check_penalties,
+    choose_times,
+    foreign_drift,
+    is_smoothed,
+    read_times,
+    time_quantity,
+)
 from bench.timed import identify_in_time
 from bench.transients.identification import Transients, identify_dynamics, identify_transients, read_transients
 
@@ -550,12 +559,15 @@ class ComparedModels:
         What was assumed about the layout of the file; empty for a run.
     examined : mapping of str to Examined
         The session recalibrated and the band of each model, by the same names.
+    warnings : tuple of str
+        What of a model belongs to its own record only.
     """
 
     comparisons: Mapping[str, Comparison]
     predictions: Predictions
     assumptions: str = ""
     examined: Mapping[str, Examined] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
 
     @property
     def unit(self) -> str:
@@ -633,7 +645,7 @@ def compare_models(
     ]
     timed = [file for file in files if isinstance(file.model, TimedModel)]
     if time_column is None and timed:
-        time_column = str(timed[0].provenance.get("time", ""))
+        time_column = choose_times(timed[0], data, None, reading)
     columns = read_columns(data, [*names, *([time_column] if time_column else [])], options=reading)
     inputs, outputs = (columns.values[name] for name in names)
     times = read_times(columns, time_column) if time_column else None
@@ -662,4 +674,5 @@ def compare_models(
         skip=first,
         bands={name: entry.band for name, entry in examined.items() if entry.band is not None},
     )
-    return ComparedModels(comparisons, predictions, columns.assumptions, examined)
+    drifts = () if session is not None else tuple(filter(None, (foreign_drift(file, inputs) for file in files)))
+    return ComparedModels(comparisons, predictions, columns.assumptions, examined, drifts)

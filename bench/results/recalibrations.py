@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from bench.errors import ConfigurationError
 from bench.hysteresis import Operator
+from bench.hysteresis.timed import TimedSequence
 from bench.identification.recalibration import Kind, Recalibration, parse_kinds, recalibrate
 
 Floats = npt.NDArray[np.float64]
@@ -48,7 +49,7 @@ class Session:
 
     def estimate(
         self,
-        operator: Operator[Any],
+        operator: Operator[Any] | TimedSequence,
         inputs: Floats,
         outputs: Floats,
         *,

@@ -149,7 +149,7 @@ def named_models(text: str) -> tuple[str, ...]:
     for name in names:
         if name in timed_models():
             raise ConfigurationError(
-                f"{name} is a model with time, which takes part with --time COLUMN where operators are compared: "
+                f"{name} is a model with time, which takes part in a comparison of operators with --time COLUMN: "
                 f"leave it out of the names, or fit it alone with --model {name}"
             )
         if name not in known:
@@ -181,7 +181,7 @@ def select_model(
     models : sequence of str
         Names of the models.
     given : Given
-        Settings that are not to be chosen.
+        Settings that are not to be chosen, and whether times were asked for.
     console : Console
         Where the progress is drawn.
     skip : int

@@ -16,8 +16,13 @@ from bench.model_file import ModelFile
 from bench.results.data import Columns, Floats, read_columns
 from bench.results.predictions import Quantity
 from bench.results.reading.options import ReadingOptions
+from bench.results.starting_state import digest
+from bench.timed.hammerstein import Hammerstein
 
 _SECONDS = {"": 1.0, "s": 1.0, "ms": 1e-3, "µs": 1e-6, "μs": 1e-6, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
+NO_TIMES = "none"
+"""Stands for a column of times where a file's own is to be left out."""
+
 # Heads that name a column of times.
 _NAMES = ("time", "t", "Time", "time_s", "t_s", "Time_s")
 
@@ -90,20 +95,57 @@ def time_quantity(times: Floats | None) -> Quantity | None:
     return None if times is None else Quantity("time", "s", times)
 
 
-def find_times(path: Path, reading: ReadingOptions | None) -> str | None:
-    """Return the column of a file that by its name holds times, and increases; None if there is none.
+def named_times(path: Path, reading: ReadingOptions | None, own: str | None = None) -> str | None:
+    """Return the column of a file that by its name and unit holds times; None if there is none.
 
-    A run has its own.
+    Tried first is the column of a model's own data, if given. Of a run no other is: its steps are quasi-static.
     """
-    if path.is_dir() or path.suffix == ".sqlite":
-        return None
-    for name in _NAMES:
+    names = [] if own is None else [own]
+    if not (path.is_dir() or path.suffix == ".sqlite"):
+        names += _NAMES
+    for name in names:
         try:
-            read_times(read_columns(path, [name], options=reading), name)
+            unit = read_columns(path, [name], options=reading).units[name]
         except (DataError, ConfigurationError):
             continue
-        return name
+        if unit in _SECONDS:
+            return name
     return None
+
+
+def find_times(path: Path, reading: ReadingOptions | None) -> str | None:
+    """Return the column of a file that by its name and unit holds times; None if there is none.
+
+    Raises DataError if they do not increase.
+    """
+    name = named_times(path, reading)
+    if name is not None:
+        read_times(read_columns(path, [name], options=reading), name)
+    return name
+
+
+def choose_times(file: ModelFile, path: Path, given: str | None, reading: ReadingOptions | None) -> str | None:
+    """Return the column of times by which a model predicts a file: the given one, or for a model with time one found.
+
+    None for a model without time; also if no column is found.
+    """
+    if given is not None or not isinstance(file.model, TimedModel):
+        return given
+    own = file.provenance.get("time")
+    return named_times(path, reading, str(own) if own else None)
+
+
+def foreign_drift(file: ModelFile, inputs: Floats) -> str:
+    """Return a warning if a model's drift is applied to inputs, shape (N,), of another record; else an empty text."""
+    model = file.model
+    own = file.provenance.get("input_sha256")
+    if not isinstance(model, Hammerstein) or not model.drift or own in (None, digest(inputs)):
+        return ""
+    value, unit = model.parameters()["drift"]
+    return (
+        f"{file.name} has a drift of {value:.3g} {unit}, which is that of its own record, from its first row on; "
+        "--recalibrate offset,drift estimates what it is in this one"
+    )
 
 
 def bind_times(file: ModelFile, times: Floats | None) -> Operator[Any] | TimedSequence:

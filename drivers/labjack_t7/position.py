@@ -7,12 +7,13 @@ Assumption: a linear magnet sensor such as the SPS-L035-LATS gives 10 to 90 % of
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
 from bench.clock import Clock
+from bench.devices import Limits
 from bench.errors import DeviceError
 from bench.roles import PositionSensor
 from drivers.device import Slope
@@ -113,6 +114,11 @@ class T7PositionSensor(T7InputDevice[T7PositionSettings], PositionSensor):
         self._signal = f"{name}_position"
         self._readout, self._position_limits = settings.readout, settings.position_limits
         self._zero_volts, self._volts_per_metre = settings.zero_volts, settings.volts_per_metre
+
+    @property
+    def reading_limits(self) -> Mapping[str, Limits]:
+        """The calibrated range of the position, m."""
+        return {self._signal: Limits(*self._position_limits, "m")}
 
     def safe(self) -> None:
         """Do nothing: a sensor is safe in any state."""

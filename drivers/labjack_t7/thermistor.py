@@ -6,12 +6,13 @@ Source: Steinhart and Hart 1968, Deep-Sea Research 15.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import ClassVar, Self
 
 from pydantic import Field, model_validator
 
 from bench.clock import Clock
+from bench.devices import Limits
 from bench.errors import DeviceError
 from bench.roles import TemperatureSensor
 from drivers.labjack_t7.inputs import RAIL, Channel, T7InputDevice, T7InputSettings
@@ -91,6 +92,11 @@ class T7Thermistor(T7InputDevice[T7ThermistorSettings], TemperatureSensor):
         self._excitation = lowest, highest
         self._reference_ohms, self._steinhart_hart = settings.reference_ohms, settings.steinhart_hart
         self._temperature_limits = settings.temperature_limits
+
+    @property
+    def reading_limits(self) -> Mapping[str, Limits]:
+        """The temperatures that are no error, °C."""
+        return {self._signal: Limits(*self._temperature_limits, "°C")}
 
     def safe(self) -> None:
         """Do nothing: a sensor is safe in any state."""

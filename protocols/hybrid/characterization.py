@@ -73,7 +73,10 @@ def current_sine(parameters: CurrentSineParameters, slots: Slots) -> Messages:
     amplitude = parameters.amplitude
     for frequency in parameters.frequencies:
         if not 0 < frequency <= parameters.rate / 10:
-            raise ValueError(f"frequencies: expected more than 0 and at most {parameters.rate / 10:g} Hz")
+            raise ValueError(
+                f"parameter frequencies: {frequency:g} Hz is not allowed; allowed: more than 0 and at most "
+                f"{parameters.rate / 10:g} Hz, a tenth of rate"
+            )
         yield Phase(f"sine of {frequency:g} Hz")
         yield _play(
             slots,

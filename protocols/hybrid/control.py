@@ -24,6 +24,7 @@ from bench.protocol import (
 from bench.protocol.number_list import NumberList
 from bench.tuning_file import Tuning
 from protocols.hybrid import BOTH_LOOPS, FINE, FINE_OVER_TIME, SENSORS, THERMAL, WITNESS
+from protocols.preparation import check_order
 
 ControllerName = Literal["hybrid", "hybrid-low-pass", "open-loop", "thermal-feedback"]
 ReferenceName = Literal["moves", "staircase", "ramp", "sine-on-ramp", "hold"]
@@ -44,7 +45,7 @@ class Parameters(ProtocolParameters):
     )
     controller: ControllerName = parameter("hybrid", unit="", help="which controller")
     reference: ReferenceName = parameter("moves", unit="", help="what is followed")
-    reach: float = parameter(..., unit="m", help="farthest position of either sign that the response sees")
+    reach: float = parameter(..., unit="m", above=0.0, help="farthest position of either sign that the response sees")
     positions: NumberList = parameter(..., unit="m", help="of moves: positions, one after another")
     low: float = parameter(..., unit="m", help="lowest position of the others")
     high: float = parameter(..., unit="m", help="highest position of the others")
@@ -91,7 +92,10 @@ def hybrid_control(parameters: Parameters, slots: Slots) -> Messages:
     controller = make_controller("hybrid", p.controller, setup)
     for name, height in (("amplitude", p.amplitude), ("probe", p.probe)):
         if height > (stroke := numbers["stroke"]):
-            raise ValueError(f"{name} = {height:g}: expected at most the stroke of the piezo part, {stroke:g} m")
+            raise ValueError(
+                f"parameter {name} = {height:g} m is not allowed; allowed: at most the stroke of the piezo part, "
+                f"{stroke:g} m"
+            )
     accuracy = slots["response"].accuracy
     if accuracy is None:
         yield Note("the response is not calibrated: how far its readings are from the true deflection is not known")
@@ -121,7 +125,7 @@ class StepParameters(ProtocolParameters):
     )
     step: float = parameter(..., unit="m", help="height of the step")
     stroke: float = parameter(
-        ..., unit="m", help="largest deflection of either sign that the piezo part is asked for"
+        ..., unit="m", above=0.0, help="largest deflection of either sign that the piezo part is asked for"
     )
     rest: float = parameter(0.05, unit="s", low=0, high=10, help="time at the deflection of the start before it")
     duration: float = parameter(0.2, unit="s", low=1e-3, high=100, help="time after it")
@@ -145,8 +149,8 @@ def fine_step(parameters: StepParameters, slots: Slots) -> Messages:
     low, high = controller.reach
     if not low <= parameters.step <= high:
         raise ValueError(
-            f"step: the piezo part of {Path(parameters.model).name} reaches {low:.3g} to {high:.3g} m within a fast "
-            f"loop, got {parameters.step:g} m"
+            f"parameter step = {parameters.step:g} m is not allowed; allowed: {low:.3g} to {high:.3g} m, which the "
+            f"piezo part of {Path(parameters.model).name} reaches within a fast loop"
         )
     yield Phase("fine step")
     yield FixedRate(
@@ -182,10 +186,15 @@ def moves_of(parameters: Parameters) -> SmoothMoves:
     """Return the moves that a reference consists of, without its sine."""
     p = parameters
     for name, places in (("positions", p.positions), ("low", (p.low,)), ("high", (p.high,))):
-        if max(map(abs, places)) > p.reach:
-            raise ValueError(f"{name}: expected numbers from {-p.reach:g} to {p.reach:g} m, as far as reach says")
+        if abs(place := max(places, key=abs)) > p.reach:
+            raise ValueError(
+                f"parameter {name}: {place:g} m is not allowed; allowed: {-p.reach:g} to {p.reach:g} m, as far as "
+                "reach says"
+            )
     if p.reference == "moves":
         return SmoothMoves([0.0, *p.positions], p.speed, hold=p.hold)
+    if p.reference != "hold":
+        check_order(p, "low < high", "m")
     if p.reference == "staircase":
         return staircase(p.low, p.high, p.steps, p.speed, hold=p.hold)
     if p.reference == "hold":

@@ -16,6 +16,7 @@ from protocols.muscles.parts import (
     reset_on_stage,
     stretch,
 )
+from protocols.preparation import check_order
 
 _STRETCHED = 1.0 / 6.0
 """Error of a force that the stage sets, as a part of the pretension."""
@@ -42,8 +43,7 @@ def length_force(parameters: Parameters, slots: Slots) -> Messages:
     up to the largest force and back, with one reading after each dwell (Zhang and Yip 2017, sections II-A and
     V-A: 138 readings).
     """
-    if not parameters.smallest_force < parameters.largest_force:
-        raise ValueError("smallest_force must be below largest_force")
+    check_order(parameters, "smallest_force < largest_force", "N")
     up = np.linspace(parameters.smallest_force, parameters.largest_force, parameters.points)
     forces = [*up, *up[-2::-1]]
     yield from fasten(parameters, slots)

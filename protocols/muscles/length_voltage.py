@@ -64,7 +64,7 @@ def length_verification(parameters: RandomParameters, slots: Slots) -> Messages:
 def _under_loads(parameters: Loaded, slots: Slots, voltages: Sequence[float]) -> Messages:
     if min(parameters.loads) <= 0:
         loads = ", ".join(f"{load:g}" for load in parameters.loads)
-        raise ValueError(f"loads = {loads}: expected positive loads")
+        raise ValueError(f"parameter loads = {loads} N is not allowed; allowed: positive numbers")
     for load in parameters.loads:
         yield from reset_under_weights(parameters, slots)
         yield from hang(parameters, slots, load)

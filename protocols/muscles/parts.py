@@ -68,7 +68,10 @@ class ResetParameters(ProtocolParameters):
     """Parameters of each of these protocols."""
 
     highest: float = parameter(
-        from_slot("drive", "high"), unit=unit_of("drive"), help="highest set-point, where the memory is reset"
+        from_slot("drive", "high"),
+        unit=unit_of("drive"),
+        above=0.0,
+        help="highest set-point, where the memory is reset",
     )
     dwell: float = parameter(
         from_slot("drive", "dwell"),
@@ -162,9 +165,13 @@ def stretch(
 
     The tolerance is a part of the pretension. Raises ValueError if the stiffnesses are not two positive numbers.
     """
-    if len(parameters.stiffnesses) != 2:
-        raise ValueError(f"stiffnesses: expected two numbers, got {len(parameters.stiffnesses)}")
-    least, greatest = parameters.stiffnesses
+    stiffnesses = parameters.stiffnesses
+    if len(stiffnesses) != 2 or not 0.0 < stiffnesses[0] <= stiffnesses[1]:
+        given = ", ".join(f"{stiffness:g}" for stiffness in stiffnesses)
+        raise ValueError(
+            f"parameter stiffnesses = {given} N/m is not allowed; allowed: two positive numbers, the lower one first"
+        )
+    least, greatest = stiffnesses
     stage = slots["stage"]
     reading = yield Control(
         task=Approach(

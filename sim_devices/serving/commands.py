@@ -7,6 +7,7 @@ import json
 import os
 import secrets
 import socket
+import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
@@ -16,7 +17,7 @@ import typer
 from rich.table import Table
 
 from bench.cli import JsonOption, console
-from bench.cli.console import parse_assignments, parse_numbers, warn
+from bench.cli.console import STANDARD_OUTPUT, parse_assignments, parse_numbers, warn
 from bench.errors import ConfigurationError
 
 if TYPE_CHECKING:
@@ -69,7 +70,8 @@ def emulate(
     """Serve the emulated instruments of rigs to other processes, on pseudo-terminals and TCP ports.
 
     Each instrument speaks the bytes of the real one, so that any client of its protocol can talk to it. The addresses
-    are printed, and written to the file of `--json` once everything is ready. The control socket reads the true state
+    are printed, and written to the file of `--json` once everything is ready; with `--json -` they are one line of
+    the standard output. The control socket reads the true state
     of the laboratory, injects faults such as {"do": "fault", "fault": "tec.delay", "duration": 5}, and lists them by
     {"do": "help"}; the file of `--state` says when each began and ended. Ctrl-C and SIGTERM end it.
     """
@@ -111,7 +113,9 @@ def emulate(
         if not _is_loopback(host):
             warn(f"everybody who reaches {host} can command these instruments, and nothing asks for a password")
         content = _endpoints(served, clock, control_socket.address, identity)
-        if json_file is not None:
+        if json_file == STANDARD_OUTPUT:
+            _print_line(content)
+        elif json_file is not None:
             _write_at_once(json_file, content)
             stack.callback(_remove, json_file, identity)
         _print(served, control_socket.address)
@@ -187,6 +191,15 @@ def _endpoints(served: Sequence[ServedLaboratory], clock: str, control: str, ide
     rigs = [{"rig": each.name, "instruments": each.endpoints()} for each in served]
     common = {"clock": clock, "factor": served[0].clock.factor, "control": control, "server": identity}
     return {**common, **rigs[0]} if len(rigs) == 1 else {**common, "rigs": rigs}
+
+
+def _print_line(content: dict[str, Any]) -> None:
+    """Write to the standard output, on one line: who reads it need not wait for the end of the server."""
+    try:
+        sys.stdout.write(json.dumps(content, ensure_ascii=False) + "\n")
+        sys.stdout.flush()
+    except OSError as error:
+        raise ConfigurationError(f"--json - cannot be written: {error.strerror}") from None
 
 
 def _write_at_once(path: Path, content: dict[str, Any]) -> None:

@@ -93,6 +93,20 @@ def test_a_dash_is_the_standard_output_and_texts_go_to_the_standard_error(bench)
     assert err == ""
 
 
+@pytest.mark.parametrize(
+    "command",
+    [["list"], ["list", "vo2"], ["list", "creep"], ["list", "models"], ["runs", "."], ["safe", "vo2"],
+     ["recover", "vo2"], ["doctor", "vo2"]],
+    ids=" ".join,
+)  # fmt: skip
+def test_nothing_else_goes_to_the_standard_output(bench, tmp_path, monkeypatch, command):
+    monkeypatch.chdir(tmp_path)
+    _, out, err = bench(*command, "--json", "-")
+    json.loads(out)
+    assert err
+    assert [*tmp_path.iterdir()] == []
+
+
 @needs_full
 @pytest.mark.usefixtures("warm_popen")
 def test_a_standard_output_that_is_full():

@@ -73,6 +73,13 @@ def model(tmp_path_factory):
     return str(path)
 
 
+def as_protocol(generator):
+    """Make a protocol of the heater's TEC, with the parameters of `stairs`."""
+    generator.__annotations__ = {"parameters": stairs.parameters}
+    generator.__doc__ = "Do it."
+    return protocol(needs=("tec",))(generator)
+
+
 class TestRehearsal:
     @pytest.mark.parametrize("rig", ["vo2", "sma"])
     @pytest.mark.parametrize("definition", [climb, secant, bisect], ids=lambda each: each.name)
@@ -121,6 +128,20 @@ class TestRehearsal:
         assert again == Rehearsal.from_json(rehearsal.to_json())
         assert (again.steps, again.extremes) == (rehearsal.steps, rehearsal.extremes)
 
+    def test_a_reading_beyond_which_its_device_raises_is_a_bound(self, make, console):
+        limits = {"devices.psd.position_limits": "[-40e-6, 95e-6]"}
+        interlock = {"interlocks": '[{ signal = "psd_position", high = 98e-6 }]'}
+        definition = find_protocol("creep")
+        common = {"definition": definition, "settings": {"duration": 20.0}, "rig": "vo2"}
+        psd = foresee(make(overrides=limits | interlock, **common), console).extremes["psd_position"]
+        bounds = [("device", -40e-6, 95e-6), ("interlock", -math.inf, 98e-6)]
+        assert [(bound.by, bound.low, bound.high) for bound in psd.bounds] == bounds
+        assert psd.margin == min(95e-6 - psd.high, psd.low + 40e-6)
+        # And it is not only said: nearer to the limit the device ends the run.
+        beyond = {"devices.psd.position_limits": f"[-40e-6, {psd.high - 5e-6}]"}
+        refused = foresee(make(overrides=beyond, **common), console)
+        assert "is outside of its calibrated range" in refused.reason
+
     def test_what_warns_is_found_and_refuses_nothing(self, make, console):
         warning = '\n[[interlocks]]\nsignal = "probe_temperature"\nminus = "tec_temperature"\nhigh = -9.0\n' \
             'level = "warn"\n'  # fmt: skip
@@ -143,20 +164,31 @@ class TestRehearsal:
         with pytest.raises(ConfigurationError, match=r"wait-for-ever does not end in its rehearsal on vo2, within"):
             foresee(run, console)
 
-    def test_ctrl_c_ends_it(self, make, console):
+    @pytest.mark.parametrize("last", [False, True], ids=["in its middle", "behind its last step"])
+    def test_ctrl_c_ends_it(self, make, console, last):
         def press(parameters):
             yield Step({"tec": 30.0}, Dwell(1.0))
             signal.raise_signal(signal.SIGINT)
-            yield Step({"tec": 31.0}, Dwell(1.0))
+            if not last:
+                yield Step({"tec": 31.0}, Dwell(1.0))
 
-        press.__annotations__ = {"parameters": stairs.parameters}
-        press.__doc__ = "Press."
+        run = make(definition=as_protocol(press))
         former = signal.signal(signal.SIGINT, lambda *_: None)
         try:
-            with pytest.raises(AbortError, match="the rehearsal was ended by the operator"):
-                carry_out(make(definition=protocol(needs=("tec",))(press)), console)
+            # Nobody has paused.
+            with pytest.raises(AbortError, match=r"^the rehearsal was ended by Ctrl-C; nothing has moved$"):
+                carry_out(run, console)
         finally:
             signal.signal(signal.SIGINT, former)
+        assert not run.folder.exists()
+
+    def test_what_a_protocol_raises_to_end_it_is_not_said_to_be_the_operator(self, make, console):
+        def give_up(parameters):
+            if (yield Step({"tec": 30.0}, Dwell(1.0))).time > 0.0:
+                raise SystemExit
+
+        with pytest.raises(AbortError, match=r"^in the rehearsal: ended by SystemExit, which the protocol raised; "):
+            foresee(make(definition=as_protocol(give_up)), console)
 
 
 class TestBeforeARun:
@@ -262,9 +294,7 @@ class TestTwin:
             )
             yield Step({"tec": 40.0}, Dwell(1.0))
 
-        sum_up.__annotations__ = {"parameters": stairs.parameters}
-        sum_up.__doc__ = "Sum up."
-        definition = protocol(needs=("tec",))(sum_up)
+        definition = as_protocol(sum_up)
         found = plan(definition, definition.parse({}, {}))
         assert (found.complete, found.steps, found.extremes["tec"]) == (True, 3, (20.0, 40.0))
         with Record(carry_out(make(definition=definition, clock="virtual"), console).folder) as record:

@@ -17,7 +17,7 @@ from bench.locks import Holder, Locks
 from bench.protocol import Messages, Note, ProtocolParameters, parameter, protocol
 from bench.protocol.number_list import NumberList
 from bench.results.run_comparison import compare_runs
-from bench.run_record import run_name
+from bench.run_record import Difference, run_name
 from bench.runs import Run, carry_out
 
 
@@ -140,6 +140,31 @@ def test_two_runs_are_compared(bench, runs, tmp_path):
         same = compare_runs(first, second)
     assert same.differences == ()
     assert all(same.equal.values())
+
+
+def test_of_a_list_only_what_differs_is_named(bench, tmp_path, rig_file):
+    warning = '\n[[interlocks]]\nsignal = "probe_temperature"\nhigh = 80.0\nlevel = "warn"\n'
+    current = '\n[[interlocks]]\nsignal = "tec_current"\nhigh = 5.0\n'
+    difference = '\n[[interlocks]]\nsignal = "probe_temperature"\nminus = "tec_temperature"\nhigh = {}\n'
+    folders = []
+    for append in (current + warning + difference.format(9.0), warning.replace("80", "85") + difference.format(0.0)):
+        asked = Run(stairs, {}, rig_file(append=append), tmp_path / "runs", clock="virtual", recording=False)
+        folders.append(carry_out(asked, Console(file=io.StringIO())).folder)
+    result = tmp_path / "result.json"
+    code, out, _ = bench("compare", *folders, "--json", result)
+    assert code == 0
+    found = json.loads(result.read_text(encoding="utf-8"))["differences"]
+    different = {each["key"]: (each["first"], each["second"]) for each in found if each["key"] != "files.rig.toml"}
+    interlocks = "rig_content.interlocks"
+    assert different == {
+        f"{interlocks}.tec_current.signal": ("tec_current", None),
+        f"{interlocks}.tec_current.high": (5.0, None),
+        f"{interlocks}.probe_temperature #2.high": (80.0, 85.0),
+        f"{interlocks}.probe_temperature - tec_temperature.high": (9.0, 0.0),
+    }
+    assert "[{" not in out
+    key = f"{interlocks}.probe_temperature - tec_temperature.high"
+    assert str(Difference(key, *different[key])) == f"{key}: 9.0 → 0.0"
 
 
 @pytest.mark.parametrize(

@@ -213,7 +213,7 @@ def test_one_model_of_several_files(bench, record, tmp_path):
         (("--model", "polynomial", "--train", "0:9000"), "--train 0:9000 goes beyond the last row"),
         (("--model", "polynomial", "--test", "9000:"), "--test 9000:"),
         (("--model", "polynomial,plain"), "there is no model 'plain'"),
-        (("--model", "polynomial,hammerstein"), "takes part with --time COLUMN"),
+        (("--model", "polynomial,hammerstein"), "takes part in a comparison of operators with --time COLUMN"),
         ((*SOME, "--initial", "Negative"), "--initial: expected 'negative', 'positive', 'skip' or 'estimate'"),
         ((*SOME, "--orientation", "down"), "--orientation: expected 'auto', 'rising' or 'falling', got 'down'"),
         ((*SOME, "--skip", "-3"), "--skip"),
@@ -256,30 +256,63 @@ def drifting(path: Path) -> None:
     np.savetxt(path, content, header="time [s],voltage [V],travel [mm]", delimiter=",", comments="")
 
 
-def test_a_drift_is_warned_of_and_with_times_a_model_with_time_is_chosen(bench, tmp_path):
+def test_a_drift_is_warned_of_and_times_are_taken_where_they_gain(bench, tmp_path):
     file, out, result = tmp_path / "drifting.csv", tmp_path / "model.json", tmp_path / "result.json"
     drifting(file)
-    code, text, err = bench("identify", file, *COLUMNS, *SOME)
+    code, text, err = bench("identify", file, *COLUMNS, *SOME, "--time", "none")
     assert code == 0, err
     assert "the errors drift by" in (text + err).replace("\n", " ")
-    assert "with --time time rate, creep and drift would take part" in text
-    code, text, err = bench(
-        "identify", file, *COLUMNS, *SOME, "--time", "time", "--test", "150:", "--out", out, "--json", result
-    )
-    assert code == 0, err
-    assert "would take part" not in text
-    content = json.loads(result.read_text())
-    assert content["model"] == load_model(out).name == "hammerstein"
-    assert content["test"]["raw"]["rms_percent"] < 1.0
+    assert "holds times" not in text
     predicted = tmp_path / "predicted.json"
-    code, _, err = bench(
-        "predict", out, file, *COLUMNS, "--time", "time", "--out", tmp_path / "p.csv", "--json", predicted
-    )
-    assert code == 0, err
-    assert json.loads(predicted.read_text())["rms"] == pytest.approx(content["rms"], rel=1e-6)
-    code, text, err = bench("identify", file, *COLUMNS, *SOME, "--time", "time", "--test", file)
+    for time in ((), ("--time", "time")):
+        code, text, err = bench(
+            "identify", file, *COLUMNS, *SOME, *time, "--test", "150:", "--out", out, "--json", result
+        )
+        assert code == 0, err
+        assert ("column time holds times: the chosen model takes time" in text) is (not time)
+        content = json.loads(result.read_text())
+        assert content["model"] == load_model(out).name == "hammerstein"
+        assert content["test"]["raw"]["rms_percent"] < 1.0
+        code, _, err = bench("predict", out, file, *COLUMNS, "--out", tmp_path / "p.csv", "--json", predicted)
+        assert code == 0, err
+        assert json.loads(predicted.read_text())["rms"] == pytest.approx(content["rms"], rel=1e-6)
+    code, text, err = bench("identify", file, *COLUMNS, *SOME, "--test", file)
     assert code == 0, err
     assert "on drifting.csv" in text
+
+
+def timed(path: Path, times: np.ndarray, head: str = "time [s]") -> Path:
+    """Write the record of `measure` with a column of times."""
+    measure(path)
+    rows = np.column_stack([times, np.loadtxt(path, delimiter=",", skiprows=1)])
+    np.savetxt(path, rows, header=f"{head},voltage [V],travel [mm]", delimiter=",", comments="")
+    return path
+
+
+def test_times_that_gain_little_are_not_taken(bench, record, tmp_path):
+    """Plays behind no lag: the file's times change nothing, and what is in their way is said."""
+    assert bench("identify", record, *COLUMNS, *SOME, "--json", tmp_path / "untimed.json")[0] == 0
+    count = len(record.read_text().splitlines()) - 1
+    file = timed(tmp_path / "timed.csv", 0.1 * np.arange(count))
+    code, text, err = bench("identify", file, *COLUMNS, *SOME, "--json", tmp_path / "timed.json")
+    assert code == 0, err
+    assert "no model with time errs 1.2 times less than the chosen one" in text
+    found, plain = (json.loads((tmp_path / f"{name}.json").read_text()) for name in ("timed", "untimed"))
+    assert (found["model"], found["rms"]) == (plain["model"], plain["rms"])
+    again = timed(tmp_path / "again.csv", np.minimum(np.arange(count), 5))
+    code, text, err = bench("identify", again, *COLUMNS, *SOME)
+    assert code == 0, err
+    assert "column time does not increase in row 7" in text
+    assert "time is left out" in text
+    # A file for tests without times, and a column so named that holds something else.
+    code, text, err = bench("identify", file, *COLUMNS, *SOME, "--test", record)
+    assert code == 0, err
+    assert "record.csv has no column time: time is left out" in text
+    warm = timed(tmp_path / "warm.csv", 20.0 + np.zeros(count), head="t [degC]")
+    code, text, err = bench("identify", warm, *COLUMNS, *SOME)
+    assert code == 0, err
+    assert "time is left out" not in text
+    assert "holds times" not in text
 
 
 def test_each_row_of_the_table_is_one_line_under_a_head_with_its_unit(bench, record):

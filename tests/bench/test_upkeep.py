@@ -1,5 +1,6 @@
 """`bench safe`, `bench recover` and `bench doctor` on served rigs; what is safe is read from the instruments."""
 
+import io
 import json
 import signal
 import subprocess
@@ -237,6 +238,19 @@ class TestRecover:
         text = " ".join(out.split())
         assert "error 138" in text
         assert "bench recover RIG tec" in text
+        assert bench("recover", *attached(rig), "--yes")[0] == 0
+
+    def test_its_question_is_no_part_of_the_json(self, bench, served, monkeypatch):
+        class Terminal(io.StringIO):
+            def isatty(self):
+                return True
+
+        rig = served("vo2")
+        rig.control.fault("tec-over-temperature")
+        monkeypatch.setattr("sys.stdin", Terminal("n\n"))
+        code, out, err = bench("recover", *attached(rig), "--json", "-")
+        assert (code, out.strip()) == (130, "")
+        assert "Clear the errors of tec" in err
         assert bench("recover", *attached(rig), "--yes")[0] == 0
 
     @pytest.mark.slow

@@ -2138,6 +2138,47 @@ def test_a_register_is_set_over_another_connection_if_the_former_has_ended(bench
     assert bench.t7.tdac_volts(0) == pytest.approx(1.0, abs=2e-3)
 
 
+def test_a_connection_is_closed_after_the_request_under_way(bench):
+    asked, goes_on = threading.Event(), threading.Event()
+
+    def hold(address, words):
+        if address == TEST.address:
+            asked.set()
+            goes_on.wait(60.0)
+        return words
+
+    answers: list[list[int]] = []
+    with ModbusTcpServer(Altered(bench.t7, hold)) as server:
+        t7 = LabJackT7("base", server.address, 60.0)
+        reader = threading.Thread(target=lambda: answers.append(t7.read_words(TEST.address, 2)))
+        reader.start()
+        asked.wait(60.0)
+        ender = threading.Thread(target=t7._connection.end)
+        ender.start()
+        # Long enough for one that does not wait.
+        ender.join(0.5)
+        goes_on.set()
+        reader.join()
+        ender.join()
+        assert answers == [[0x0011, 0x2233]]
+        assert t7.repeats == 0
+        t7.close()
+
+
+def test_a_connection_that_has_ended_is_not_opened_again_by_a_request_that_waited_for_it(bench):
+    first = LabJackT7("base", bench.server.address, 60.0)
+    second = LabJackT7("tip", bench.server.address, 60.0)
+    former = second._connection
+    former.end()
+    # As a thread does that has found it open, and waited for the request of another.
+    with pytest.raises(ConnectionError, match="closed"):
+        former.client.read(TEST.address, 2)
+    assert not former.is_open
+    for each in (first, second):
+        assert each.read_words(TEST.address, 2) == [0x0011, 0x2233]
+        each.close()
+
+
 def test_an_input_that_another_program_left_differential_is_read_against_ground(bench, in_process):
     bench.t7.write_value("AIN4_NEGATIVE_CH", 5)
     bench.volts |= {4: 0.5, 5: 0.25}

@@ -227,6 +227,61 @@ def test_at_one_rate_a_lag_is_not_taken_for_hysteresis():
     assert found.chosen.candidate.options["dynamics"] == "lag"
 
 
+def test_times_that_were_not_asked_for_must_gain():
+    """At one rate a static equation stands for plays behind a lag; asked for, the lag is taken all the same."""
+    inputs = random_reversals(np.random.default_rng(1), 1500, 40)
+    times = np.arange(inputs.size) / inputs.size
+    lag = LinearPart(0.0, (1e-3, 0.0), np.empty(0), np.empty(0))
+    outputs = lag.respond(times, settled(duhem, inputs)[:, None])[0][:, 0]
+    measured = Measurements.of(inputs, noisy(outputs, 0.01))
+    in_time = HeldOutInTime(measured, times, inputs.size)
+    models = ("duhem", "generalized-prandtl-ishlinskii")
+    asked, unasked = (select(measured, models, Given(is_time_asked=yes), in_time=in_time) for yes in (True, False))
+    assert asked.chosen.candidate.static is not None
+    assert unasked.chosen.candidate.static is None
+    assert unasked.chosen.rms < 1.2 * asked.chosen.rms
+    # They took part all the same.
+    assert asked.chosen.candidate in [each.candidate for each in unasked.evaluations]
+    assert any("one speed" in text for text in unasked.warnings())
+    fast = replace(in_time, times=np.append(times[:750], times[750] + 0.2 * (times[750:] - times[750])))
+    outputs = lag.respond(fast.times, settled(duhem, inputs)[:, None])[0][:, 0]
+    measured = Measurements.of(inputs, noisy(outputs, 0.01))
+    fast = replace(fast, measured=measured)
+    both = select(measured, models, Given(is_time_asked=False), in_time=fast)
+    assert both.chosen.candidate.static is not None
+
+
+def test_of_few_rows_times_are_not_tried_unless_asked_for():
+    inputs = random_reversals(np.random.default_rng(1), 60, 8)
+    measured = Measurements.of(inputs, noisy(settled(duhem, inputs), 0.01))
+    in_time = HeldOutInTime(measured, np.arange(60.0), 60)
+    assert select(measured, ("duhem",), in_time=in_time).has_times
+    assert not select(measured, ("duhem",), Given(is_time_asked=False), in_time=in_time).has_times
+
+
+def test_a_drift_does_not_hide_an_equation_behind_a_finer_plane():
+    """40 levels take the drift for hysteresis; with times the equation is tried as well."""
+    rng = np.random.default_rng(2)
+    inputs = [random_reversals(rng, 1500, turns) for turns in (60, 40)][1]
+    outputs = settled(bouc_wen, inputs)
+    outputs += np.ptp(outputs) * (0.01 * rng.standard_normal(1500) + 0.05 * np.linspace(0.0, 1.0, 1500))
+    measured = Measurements.of(inputs, outputs)
+    in_time = HeldOutInTime(measured, 0.01 * np.arange(inputs.size), inputs.size)
+    models = ("bouc-wen", "preisach", "preisach-nonmonotonic")
+    plain, found = select(measured, models), select(measured, models, in_time=in_time)
+    assert plain.chosen.candidate.model == "preisach"
+    assert found.chosen.candidate.options == {"static": "bouc-wen", "dynamics": "drift"}
+    assert found.chosen.rms < 0.7 * plain.chosen.rms
+
+
+def test_folds_that_are_all_harder_than_the_first_two_leave_a_model():
+    inputs = through([-1.0, 1.0, 0.6, 0.9], 300)
+    outputs = settled(butterfly, inputs)
+    outputs = outputs + 0.002 * np.ptp(outputs) * np.random.default_rng(10).standard_normal(300)
+    found = select(Measurements.of(inputs, outputs), ("bouc-wen", "preisach-signed", "duhem"))
+    assert len(found.chosen.blocks) == 5
+
+
 def with_a_lag(inputs, static):
     """Return outputs behind a lag at two rates, and what evaluates models with time."""
     times = np.cumsum(np.where(np.arange(inputs.size) < inputs.size // 2, 1.0, 0.1))

@@ -8,7 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from bench.hysteresis import Preisach, uniform_levels
 from bench.journal import Record
+from bench.model_file import ModelFile
 from bench.results.tracking import target_results
 from bench.rig_file import load_rig
 
@@ -132,3 +134,94 @@ def test_from_characterization_to_tracking_in_few_steps(run, bench, tmp_path, ri
         rms = 100 * target_results(record, case.response).summary()["rms"] / (high - low)
     # As rough as the models are: measured 25 % (sma), 3.7 % (hybrid).
     assert rms < 40.0
+
+
+REFUSED = [
+    ("damped-oscillation", {"increment": "-1"}, "increment = '-1' is not allowed; allowed: > 0 °C"),
+    ("random-validation", {"increment": "0"}, "increment = '0' is not allowed; allowed: > 0 °C"),
+    ("damped-oscillation", {"increment": "nan"}, "increment = 'nan' is not allowed; allowed: > 0 °C"),
+    (
+        "damped-oscillation",
+        {"center": "90"},
+        "center = 90 °C is not allowed with high = 84 °C; allowed: low < center < high",
+    ),
+    (
+        "damped-oscillation",
+        {"low": "84", "high": "21"},
+        "low = 84 °C is not allowed with center = 54 °C; allowed: low < ",
+    ),
+    # Refused before an array of so many numbers is made.
+    ("damped-oscillation", {"low": "-1e12"}, "increment = 0.35 °C is not allowed from low = -1e+12 to high = 84 °C"),
+    (
+        "damped-oscillation",
+        {"increment": "1e-9"},
+        "increment = 1e-09 °C is not allowed from low = 21 to high = 84 °C",
+    ),
+    (
+        "random-validation",
+        {"inner_low": "-1e12"},
+        "increment = 1.2 °C is not allowed from inner_low = -1e+12 to high = 84 °C",
+    ),
+    (
+        "random-validation",
+        {"low": "84", "high": "21"},
+        "low = 84 °C is not allowed with high = 21 °C; allowed: low < high",
+    ),
+    (
+        "random-validation",
+        {"inner_low": "72", "inner_high": "40"},
+        "inner_low = 72 °C is not allowed with inner_high = 40 °C; allowed: inner_low < inner_high",
+    ),
+    ("sequence", {"low": "84", "high": "21"}, "low = 84 °C is not allowed with high = 21 °C; allowed: low < high"),
+    *(
+        (protocol, settings, words)
+        for protocol in ("covering", "first-order-reversals")
+        for settings, words in (
+            ({"high": "0"}, "low = 21 °C is not allowed with high = 0 °C; allowed: low < high"),
+            (
+                {"plane_low": "0"},
+                "low = 21 °C is not allowed with plane_low = 0 °C; allowed: low ≤ plane_low < plane_high ",
+            ),
+            (
+                {"plane_high": "30"},
+                "plane_low = 30 °C is not allowed with plane_high = 30 °C; allowed: low ≤ plane_low ",
+            ),
+        )
+    ),
+    ("creep", {"load": "-1"}, "load = '-1' is not allowed; allowed: ≥ 0"),
+    ("tracking", {"reset": "90"}, "reset = 90 °C is not allowed with hottest = 84 °C; allowed: reset < hottest"),
+    (
+        "tracking",
+        {"low": "900", "high": "100"},
+        "low = 900 1/m is not allowed with high = 100 1/m; allowed: low < high",
+    ),
+    (
+        "following",
+        {"low": "900", "high": "100"},
+        "low = 900 1/m is not allowed with high = 100 1/m; allowed: low < high",
+    ),
+    ("following", {"fastest": "0"}, "fastest = '0' is not allowed; allowed: > 0 K/s"),
+    (
+        "following",
+        {"duration": "1e7", "rate": "50"},
+        "duration = 1e+07 s is not allowed at rate = 50 1/s; allowed: ≤ 2",
+    ),
+]
+
+
+@pytest.mark.parametrize(("protocol", "settings", "words"), REFUSED)
+def test_a_parameter_is_refused_by_its_name_with_its_value_and_what_is_allowed(
+    bench, tmp_path, protocol, settings, words
+):
+    model, setpoints = tmp_path / "model.json", tmp_path / "setpoints.csv"
+    operator = Preisach(uniform_levels(30.0, 70.0, 4), np.ones(10), input_unit="°C", output_unit="1/m")
+    ModelFile("preisach", operator, None).save(model)
+    setpoints.write_text("input,dwell\n30,1\n")
+    given = {"sequence": {"setpoints": setpoints}, "tracking": {"model": model}, "following": {"model": model}}
+    for command in (["rehearse"], ["run", "--clock", "virtual", "--out", tmp_path / "runs"]):
+        options = [f"--set={key}={value}" for key, value in (given.get(protocol, {}) | settings).items()]
+        code, out, err = bench(command[0], protocol, "--rig", "vo2", *command[1:], *options)
+        assert (code, out) == (2, "")
+        (line,) = err.splitlines()
+        assert line.startswith(f"error: protocol {protocol}: parameter {words}")
+    assert not (tmp_path / "runs").exists()

@@ -208,7 +208,7 @@ def test_the_setpoints_of_the_command_predict_the_targets(bench, files):
     setpoints, predicted, summary = files / "setpoints.csv", files / "predicted.csv", files / "inverted.json"
     model, wanted = files / "model.json", files / "targets.csv"
     options = ("--column", "displacement", "--out", setpoints, "--json", summary)
-    code, _, text = bench("invert", model, wanted, "--time", "t", *options)
+    code, _, text = bench("invert", model, wanted, *options)
     assert code == 0, text
     assert setpoints.read_text(encoding="utf-8").startswith(
         "time [s],target [µm],passing [V],setpoint [V],predicted [µm],flag"
@@ -224,7 +224,7 @@ def test_the_setpoints_of_the_command_predict_the_targets(bench, files):
 @pytest.mark.parametrize(
     ("model", "options", "message"),
     [
-        ("model", (), "model film needs the time of each row: give --time COLUMN"),
+        ("model", ("--time", "displacement"), "column displacement is in µm; expected a time"),
         ("static", ("--time", "t"), "--time: static is a model without time"),
         ("oscillator", ("--time", "t"), "model beam cannot be inverted: a model of the kind bouc-wen-oscillator"),
     ],

@@ -1,6 +1,7 @@
 """Models with time from the command line: `identify`, then `predict` and `compare` with the same errors."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -142,7 +143,11 @@ def test_times_are_read_in_their_unit(bench, tmp_path):
 def test_what_does_not_fit_together_is_refused_with_the_option(bench, tmp_path):
     data, model = hammerstein(tmp_path), tmp_path / "model.json"
     without = COLUMNS[2:]
-    code, _, text = bench("identify", data, *without, "--model", "hammerstein")
+    nameless = tmp_path / "nameless.csv"
+    nameless.write_text(Path(data).read_text(encoding="utf-8").replace("time", "clock"), encoding="utf-8")
+    code, _, text = bench("identify", nameless, *without, "--model", "hammerstein")
+    assert (code, "needs the time of each row: give --time COLUMN" in text) == (2, True)
+    code, _, text = bench("identify", data, *without, "--time", "none", "--model", "hammerstein")
     assert (code, "needs the time of each row: give --time COLUMN" in text) == (2, True)
     code, _, text = bench("identify", data, *COLUMNS, "--model", "preisach")
     assert (code, "--time: preisach is a model without time" in text.replace("\n", " ")) == (2, True)
@@ -152,15 +157,71 @@ def test_what_does_not_fit_together_is_refused_with_the_option(bench, tmp_path):
     assert code != 0
     assert "column drive is in V" in text
     assert bench("identify", data, *COLUMNS, "--model", "hammerstein", "--dynamics", "lag", "--out", model)[0] == 0
-    code, _, text = bench("predict", model, data, *without, "--out", tmp_path / "p.csv")
+    code, _, text = bench("predict", model, nameless, *without, "--out", tmp_path / "p.csv")
     assert (code, "give --time COLUMN" in text) == (2, True)
     code, _, text = bench("predict", model, data, *COLUMNS, "--out", tmp_path / "p.csv", "--initial", "rest")
     assert (code, "negative, positive, skip" in text.replace("\n", " ")) == (2, True)
     swapped = tmp_path / "swapped.csv"
     write(swapped, [0, 1, 3, 2, *range(4, 14)], np.arange(14.0), np.arange(14.0))
-    code, _, text = bench("identify", swapped, *COLUMNS, "--model", "hammerstein")
-    assert code != 0
-    assert "does not increase in row 4" in text.replace("\n", " ")
+    for columns in (COLUMNS, without):
+        code, _, text = bench("identify", swapped, *columns, "--model", "hammerstein")
+        assert code != 0
+        assert "does not increase in row 4" in text.replace("\n", " ")
+
+
+def test_a_column_named_time_and_that_of_the_model_need_not_be_given(bench, tmp_path):
+    data, model, errors = hammerstein(tmp_path), tmp_path / "model.json", tmp_path / "errors.json"
+    clocked = tmp_path / "clocked.csv"
+    clocked.write_text(Path(data).read_text(encoding="utf-8").replace("time", "clock"), encoding="utf-8")
+    without = COLUMNS[2:]
+    for file, time in ((data, ()), (clocked, ("--time", "clock"))):
+        code, _, text = bench(
+            "identify", file, *without, *time, "--model", "hammerstein", "--dynamics", "lag", "--out", model,
+            "--json", errors,
+        )  # fmt: skip
+        assert code == 0, text
+        found = json.loads(errors.read_text())["rms"]
+        # Its own column comes first, then one so named.
+        for other in (data, clocked) if time else (data,):
+            code, _, text = bench("predict", model, other, *without, "--out", tmp_path / "p.csv", "--json", errors)
+            assert code == 0, text
+            assert json.loads(errors.read_text())["rms"] == pytest.approx(found, rel=1e-9)
+
+
+def test_a_drift_is_of_its_own_record_and_a_session_is_recalibrated(bench, tmp_path):
+    """Another session has no drift, another zero and a gain of 1.1."""
+    rng = np.random.default_rng(0)
+    t = np.cumsum(rng.uniform(5e-4, 2e-3, 400))
+    first, second = (5.0 + 5.0 * np.sin(2.0 * np.pi * f * t) * (1.0 - t) for f in (12.0, 9.0))
+    model = Hammerstein(Preisach(uniform_levels(0.0, 10.0, 5), rng.random(15)), LinearPart(0.0, (0.004, 0.0)))
+    drifting = write(tmp_path / "first.csv", 1e3 * t, first, model.evaluate(t, first) + 4.0 * t)
+    later = write(tmp_path / "second.csv", 1e3 * t, second, 2.0 + 1.1 * model.evaluate(t, second))
+    out, errors, without = tmp_path / "model.json", tmp_path / "errors.json", COLUMNS[2:]
+    code, _, text = bench(
+        "identify", drifting, *without, "--model", "hammerstein", "--levels", 5, "--dynamics", "lag,drift",
+        "--out", out,
+    )  # fmt: skip
+    assert code == 0, text
+    found = {}
+    for file, options in (
+        (drifting, ()),
+        (later, ()),
+        (later, ("--recalibrate", "offset,gain,drift", "--recalibrate-rows", 300)),
+    ):
+        code, _, text = bench("predict", out, file, *without, *options, "--out", tmp_path / "p.csv", "--json", errors)
+        assert code == 0, text
+        warned = "which is that of its own record" in " ".join(text.split())
+        assert warned is (file == later and not options)
+        found[file, options] = json.loads(errors.read_text())
+    mended = found[later, options]
+    assert mended["rms"] < 0.1 * found[later, ()]["rms"]
+    assert mended["recalibration"]["gain"]["value"] == pytest.approx(1.1, rel=0.01)
+    code, shown, text = bench("compare", out, "--data", later)
+    assert code == 0
+    assert "that of its own record" in " ".join((shown + text).split())
+    code, _, text = bench("compare", out, "--data", later, *options, "--json", errors)
+    assert code == 0, text
+    assert json.loads(errors.read_text())["model"]["recalibrated"]["rms"] == pytest.approx(mended["rms"], rel=1e-6)
 
 
 def test_rate_dependent_plays_are_identified_inverted_and_go_on_from_their_memory(bench, tmp_path):

@@ -332,8 +332,12 @@ class TestRefused:
                 {"frequencies": "0.001, x"},
                 "frequencies = '0.001, x' is not allowed",
             ),
-            ("current-sine", {"frequencies": "0.06"}, "frequencies: expected more than 0 and at most 0.05 Hz"),
-            ("current-sine", {"frequencies": "0.001, -0.001"}, "frequencies: expected more than 0"),
+            (
+                "current-sine",
+                {"frequencies": "0.06"},
+                "parameter frequencies: 0.06 Hz is not allowed; allowed: more than 0 and at most 0.05 Hz",
+            ),
+            ("current-sine", {"frequencies": "0.001, -0.001"}, "parameter frequencies: -0.001 Hz is not allowed"),
             ("current-sine", {"periods": "1"}, "periods = '1' is not allowed; allowed: 2 to 100"),
             ("current-sine", {"amplitude": "2"}, "amplitude = '2' is not allowed; allowed: 0.001 to 1 A"),
             ("current-steps", {"levels": "inf"}, "levels = 'inf' is not allowed; allowed: numbers"),
@@ -351,14 +355,35 @@ class TestRefused:
                 {"positions": "1e-6 2e-6"},
                 "positions = '1e-6 2e-6' is not allowed",
             ),
-            ("hybrid-control", {"positions": "5e-6, -2e-4"}, "expected numbers from -0.000199 to 0.000199 m"),
-            ("hybrid-control", {"low": "-2e-4"}, "low: expected numbers from -0.000199 to 0.000199 m"),
-            ("hybrid-control", {"reference": "staircase", "low": "1e-6", "high": "1e-6"}, "low, high: expected"),
-            ("hybrid-control", {"amplitude": "1e-5"}, "amplitude = 1e-05: expected at most the stroke of the piezo"),
+            (
+                "hybrid-control",
+                {"positions": "5e-6, -2e-4"},
+                "positions: -0.0002 m is not allowed; allowed: -0.000199 to 0.000199 m",
+            ),
+            (
+                "hybrid-control",
+                {"low": "-2e-4"},
+                "parameter low: -0.0002 m is not allowed; allowed: -0.000199 to 0.000199",
+            ),
+            *(
+                (
+                    "hybrid-control",
+                    {"reference": reference, "low": "1e-6", "high": "1e-6"},
+                    "parameter low = 1e-06 m is not allowed with high = 1e-06 m; allowed: low < high",
+                )
+                for reference in ("staircase", "ramp", "sine-on-ramp")
+            ),
+            ("hybrid-control", {"reach": "0"}, "reach = '0' is not allowed; allowed: > 0 m"),
+            (
+                "hybrid-control",
+                {"amplitude": "1e-5"},
+                "amplitude = 1e-05 m is not allowed; allowed: at most the stroke",
+            ),
             ("hybrid-control", {"rate": "20"}, "rate = '20' is not allowed; allowed: 50 to 1000 Hz"),
-            ("fine-step", {"step": "1e-5"}, "reaches -8.55e-06 to 8.55e-06 m within a fast loop, got 1e-05 m"),
-            ("fine-step", {"step": "8.9e-6"}, "reaches -8.55e-06 to 8.55e-06 m within a fast loop, got 8.9e-06 m"),
-            ("fine-step", {"step": "-8.9e-6"}, "reaches -8.55e-06 to 8.55e-06 m within a fast loop, got -8.9e-06 m"),
+            ("fine-step", {"step": "1e-5"}, "step = 1e-05 m is not allowed; allowed: -8.55e-06 to 8.55e-06 m"),
+            ("fine-step", {"step": "8.9e-6"}, "step = 8.9e-06 m is not allowed; allowed: -8.55e-06 to 8.55e-06"),
+            ("fine-step", {"step": "-8.9e-6"}, "step = -8.9e-06 m is not allowed; allowed: -8.55e-06 to 8.55e-06"),
+            ("fine-step", {"stroke": "-1e-6"}, "stroke = '-1e-6' is not allowed; allowed: > 0 m"),
             ("fine-step", {"rate": "1000"}, "rate = '1000' is not allowed; allowed: 2000 to 1e+06 Hz"),
         ],
     )

@@ -236,7 +236,7 @@ class TestRefused:
             ("length-force", ["voltages=0, 3.4"], ["supply", "3.4 V", "0 to 3.2 V"]),
             ("length-force", ["voltages=-1"], ["supply", "-1", "0 to 3.2 V"]),
             ("length-force", ["voltages=high"], ["voltages = 'high'", "commas"]),
-            ("length-force", ["smallest_force=5", "largest_force=5"], ["smallest_force", "below largest_force"]),
+            ("length-force", ["smallest_force=5", "largest_force=5"], ["smallest_force", "< largest_force"]),
             ("length-force", ["points=1"], ["points", "2 to 1000"]),
             ("length-control", [], ["model", "is missing"]),
             ("force-control", [], ["model", "is missing"]),
@@ -300,9 +300,38 @@ class TestRefused:
         assert f"vo2.toml: protocol {protocol} needs {missing}; the file binds: drive, response" in text
         assert not list(tmp_path.iterdir())
 
-    def test_forces_out_of_order(self):
-        with pytest.raises(ConfigurationError, match="smallest_force must be below largest_force"):
-            planned("length-force", smallest_force=6, largest_force=5)
+    @pytest.mark.parametrize(
+        ("protocol", "settings", "words"),
+        [
+            (
+                "length-force",
+                {"smallest_force": 6, "largest_force": 5},
+                "smallest_force = 6 N is not allowed with largest_force = 5 N; allowed: smallest_force < larg",
+            ),
+            (
+                "length-force",
+                {"stiffnesses": "900, 30"},
+                "stiffnesses = 900, 30 N/m is not allowed; allowed: two positive",
+            ),
+            (
+                "force-voltage",
+                {"stiffnesses": "0, 0"},
+                "stiffnesses = 0, 0 N/m is not allowed; allowed: two positive",
+            ),
+            ("force-voltage", {"highest": "0"}, "highest = '0' is not allowed; allowed: > 0 V"),
+            ("length-verification", {"highest": "-1"}, "highest = '-1' is not allowed; allowed: > 0 V"),
+            ("length-voltage", {"loads": "0, 1"}, "loads = 0, 1 N is not allowed; allowed: positive numbers"),
+            (
+                "calibration-load",
+                {"weights": "1, -1", "tolerance": "0.2"},
+                "weights = 1, -1 N is not allowed; allowed: numbers ≥ 0",
+            ),
+        ],
+    )
+    def test_a_parameter_is_named_with_its_value_and_what_is_allowed(self, protocol, settings, words):
+        with pytest.raises(ConfigurationError) as caught:
+            planned(protocol, **settings)
+        assert str(caught.value).startswith(f"protocol {protocol}: parameter {words}")
 
 
 @pytest.fixture(scope="module")

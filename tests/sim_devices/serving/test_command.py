@@ -4,6 +4,8 @@ import json
 import signal
 import socket
 import struct
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -31,6 +33,24 @@ def test_a_signal_ends_it_and_nothing_is_left(emulate, tmp_path, how):
         probe.connect(("127.0.0.1", port))
     # The laboratory time is in the last line.
     assert "times as fast as the wall clock (of 1)" in (tmp_path / "output.txt").read_text()
+
+
+def test_a_dash_prints_the_endpoints_on_a_line_and_texts_elsewhere(tmp_path):
+    command = [sys.executable, "-P", "-m", "bench", "emulate", "vo2", "--json", "-"]
+    with subprocess.Popen(
+        command, cwd=tmp_path, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    ) as process:
+        try:
+            endpoints = json.loads(process.stdout.readline())
+            with ControlClient(endpoints["control"]) as control:
+                assert control.request("time")["server"] == endpoints["server"]
+        finally:
+            process.terminate()
+        out, err = process.communicate(timeout=60)
+    assert process.returncode == 0
+    assert out == ""
+    assert endpoints["instruments"]["tec"]["port"] in err
+    assert [*tmp_path.iterdir()] == []
 
 
 def test_several_rigs_have_a_name_each(emulate):
