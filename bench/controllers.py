@@ -416,11 +416,11 @@ INTEGRAL_FOLLOWER = ControllerSpec(
 
 
 def load_model_for(path: str, *, input_unit: str, output_unit: str) -> ModelFile:
-    """Read a model file for a rig, whose signals have the given units.
+    """Read a model file for a rig, whose signals have the given units; of a model with time, its operator at rest.
 
-    Raises DataError if it cannot be read, or its units are others.
+    Raises DataError if it cannot be read, its units are others, or it does not come to rest.
     """
-    model = load_model(Path(path))
+    model = load_model(Path(path)).at_rest()
     for what, unit, expected in (
         ("input", model.operator.input_unit, input_unit),
         ("output", model.operator.output_unit, output_unit),

@@ -35,7 +35,7 @@ import importlib.metadata
 import json
 from collections.abc import Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -104,6 +104,27 @@ class ModelFile:
         Raises DataError if it is another.
         """
         return self.model if isinstance(self.model, TimedModel) else self.operator
+
+    def at_rest(self) -> ModelFile:
+        """Return the model of an input that stands still, as controllers take it: a model without time is one.
+
+        Of a model with time it is the operator that its output settles to; `left_out` in its provenance says in words
+        what else it has. Raises DataError if it settles to none.
+        """
+        model = self.model
+        if not isinstance(model, TimedModel):
+            return self
+        now, before = (
+            model.at_rest(model.initial_state() if state is None else state) for state in (self.memory, self.initial)
+        )
+        if now is None or before is None:
+            raise DataError(
+                f"model {self.name} is of the kind {model.kind}, whose output goes on while the input stands still; "
+                "expected one that settles: identify it with --time none"
+            )
+        left_out = ", ".join(f"{name} {value:.3g} {unit}" for name, (value, unit) in model.parameters().items())
+        provenance = {**self.provenance, "left_out": left_out}
+        return replace(self, model=now[0], memory=now[1], initial=before[1], band=None, provenance=provenance)
 
     def to_json(self) -> dict[str, Any]:
         """Return the file's content."""

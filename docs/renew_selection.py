@@ -1,9 +1,9 @@
 """Measure what the default of `bench identify` reaches, and put the tables into docs/reference/model-selection.md.
 
-`python docs/renew_selection.py FOLDER 0` measures all cases of seed 0, and keeps each in a file of the folder: a run
-that is stopped goes on there. A case that an earlier state of the code left is measured anew. `--measured` names a
-folder with two measured sessions, identification.csv and validation.csv. `--kind KIND` measures that kind of record
-over all seeds instead.
+`python docs/renew_selection.py FOLDER 0 1 2` measures all cases of three seeds, and keeps each in a file of the
+folder: a run that is stopped goes on there. A case that an earlier state of the code left is measured anew.
+`--measured` names a folder with two measured sessions, identification.csv and validation.csv. `--kind KIND` measures
+that kind of record alone, beside a cubic with plays. `--jobs N` measures N cases at once.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import hashlib
 import json
 import sys
 from collections.abc import Callable, Mapping
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -40,7 +41,7 @@ STATE = state()
 
 
 def outcome(folder: Path, plant: str, kind: str, one: Callable[[], Case]) -> Outcome:
-    """Return and print what a folder holds of a case in this state of the code; measure it if that is nothing."""
+    """Return what a folder holds of a case in this state of the code; measure it if that is nothing."""
     file = folder / f"{plant} {kind}.json".replace(" ", "-")
     kept = json.loads(file.read_text(encoding="utf-8")) if file.exists() else {}
     if kept.pop("state", "") == STATE:
@@ -49,7 +50,6 @@ def outcome(folder: Path, plant: str, kind: str, one: Callable[[], Case]) -> Out
         found = choose(one())
         folder.mkdir(parents=True, exist_ok=True)
         file.write_text(json.dumps({"state": STATE, **asdict(found)}, indent=1), encoding="utf-8")
-    show(f"{plant} {kind}", found)
     return found
 
 
@@ -63,15 +63,22 @@ def show(what: str, found: Outcome) -> None:
     )
 
 
-def table(found: Mapping[tuple[str, str], Outcome]) -> str:
+def table(found: Mapping[tuple[str, str], list[Outcome]]) -> str:
     """Return a row for each kind of record and a column for each plant: default / best by hand, ratio."""
     plants = list(dict.fromkeys(plant for plant, _ in found))
     kinds = [kind for kind in (*KINDS, *MEASURED) if any(name == kind for _, name in found)]
     lines = [["record", *plants], ["---"] * (len(plants) + 1)]
-    lines += [[kind, *(cell(found.get((plant, kind))) for plant in plants)] for kind in kinds]
-    within = sum(each.ratio <= WITHIN for each in found.values())
+    lines += [[kind, *(cell(found.get((plant, kind), [])) for plant in plants)] for kind in kinds]
     rows = "\n".join(f"| {' | '.join(line)} |" for line in lines)
-    return f"{rows}\n\nWithin {WITHIN:g} times the best: {within} of {len(found)}."
+    within = sum(ratio_of(each) <= WITHIN for each in found.values())
+    singly = [one.ratio <= WITHIN for each in found.values() for one in each]
+    alone = f", and {sum(singly)} of {len(singly)} single records" if len(singly) > len(found) else ""
+    return f"{rows}\n\nWithin {WITHIN:g} times the best: {within} of {len(found)}{alone}."
+
+
+def ratio_of(found: list[Outcome]) -> float:
+    """Return the median ratio over seeds."""
+    return median(one.ratio for one in found)
 
 
 def over_seeds(found: Mapping[str, list[Outcome]]) -> str:
@@ -92,13 +99,21 @@ def over_seeds(found: Mapping[str, list[Outcome]]) -> str:
     return "\n".join(lines)
 
 
-def cell(found: Outcome | None) -> str:
-    """Return the errors of default and best by hand and their ratio; beyond the bound with how much is within it."""
-    if found is None:
+def cell(found: list[Outcome]) -> str:
+    """Return the median errors of default and best by hand, their median ratio, and the greatest over seeds.
+
+    Of a single record beyond the bound, how many different errors are within it.
+    """
+    if not found:
         return ""
-    beyond = f"**{found.ratio:.2f}** ({found.near} of {found.tried})"
-    ratio = f"{found.ratio:.2f}" if found.ratio <= WITHIN else beyond
-    return f"{found.error:.2f} / {found.least:.2f}, {ratio}"
+    ratio = ratio_of(found)
+    text = f"{ratio:.2f}" if ratio <= WITHIN else f"**{ratio:.2f}**"
+    if len(found) > 1:
+        text += f" ({max(one.ratio for one in found):.2f})"
+    elif ratio > WITHIN:
+        text += f" ({found[0].near} of {found[0].tried})"
+    error, least = (median(getattr(one, name) for one in found) for name in ("error", "least"))
+    return f"{error:.2f} / {least:.2f}, {text}"
 
 
 def main() -> None:
@@ -108,26 +123,28 @@ def main() -> None:
     parser.add_argument("seeds", type=int, nargs="*")
     parser.add_argument("--measured", type=Path)
     parser.add_argument("--kind", choices=KINDS)
+    parser.add_argument("--jobs", type=int, default=1)
     given = parser.parse_args()
 
-    def of_seed(plant: str, kind: str, seed: int) -> Outcome:
-        return outcome(given.folder / str(seed), plant, kind, partial(case, kind, plant, seed))
-
-    tables = {}
-    if given.kind is not None:
-        plants = [plant for plant, kind in CASES if kind == given.kind]
-        tables[given.kind] = over_seeds(
-            {plant: [of_seed(plant, given.kind, seed) for seed in given.seeds] for plant in plants}
-        )
-    else:
-        for seed in given.seeds:
-            tables[f"seed {seed}"] = table({(plant, kind): of_seed(plant, kind, seed) for plant, kind in CASES})
+    wanted = [each for each in CASES if given.kind in (None, each[1])]
+    synthetic = [(given.folder / str(seed), plant, kind, seed) for plant, kind in wanted for seed in given.seeds]
+    tasks = [(folder, plant, kind, partial(case, kind, plant, seed)) for folder, plant, kind, seed in synthetic]
     if given.measured is not None:
         name = given.measured.name.replace("_", " ")
-        tables["measured"] = table({
-            (name, kind): outcome(given.folder, name, kind, partial(measured_case, given.measured, kind))
-            for kind in MEASURED
-        })  # fmt: skip
+        tasks += [(given.folder, name, kind, partial(measured_case, given.measured, kind)) for kind in MEASURED]
+    found: dict[tuple[str, str], list[Outcome]] = {}
+    with ProcessPoolExecutor(given.jobs) as pool:
+        for (_, plant, kind, _), one in zip(tasks, pool.map(outcome, *zip(*tasks, strict=True)), strict=True):
+            show(f"{plant} {kind}", one)
+            found.setdefault((plant, kind), []).append(one)
+    measured = {each: found.pop(each) for each in list(found) if each not in CASES}
+    tables = {}
+    if given.kind is not None:
+        tables[given.kind] = over_seeds({plant: each for (plant, _), each in found.items()})
+    elif found:
+        tables["synthetic"] = table(found)
+    if measured:
+        tables["measured"] = table(measured)
     put(PAGE, tables)
 
 

@@ -13,7 +13,7 @@ from bench.controllers import time_to_rest
 from bench.identification.excitation import ramps
 from bench.identification.recalibration import Kind, parse_kinds, recalibrate
 from bench.model_file import ModelFile
-from bench.protocol import Dwell, KeptModel, Note, Phase, Reading, Slots, Step, from_slot, parameter
+from bench.protocol import Caution, Dwell, KeptModel, Note, Phase, Reading, Slots, Step, from_slot, parameter
 from protocols.preparation import ControlledParameters, Part, reset, reset_unknown_memory
 
 SESSION = "session"
@@ -71,6 +71,8 @@ def begin_session(
     estimated from all readings there, and noted. Raises ValueError if the readings do not tell it, or the input of
     such a model cannot be shifted; ConfigurationError if nothing says how long the specimen takes to come to rest.
     """
+    if left_out := model.provenance.get("left_out"):
+        yield Caution(f"the controller takes the model of an input that stands still, without {left_out}")
     if "input-offset" in kinds:
         # A model that cannot be corrected is refused before anything moves.
         model.operator.shifted(0.0)

@@ -246,7 +246,7 @@ def _on_found_times(found: SelectedModel, name: str) -> str:
     if found.is_timed:
         return (
             f"column {name} holds times: the chosen model takes time, as it errs at least 1.2 times less than what "
-            "would be chosen without. --time none leaves time out: controllers take models without time"
+            "would be chosen without. --time none leaves time out"
         )
     return (
         f"column {name} holds times: no model with time errs 1.2 times less than the chosen one. "

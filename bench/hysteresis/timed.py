@@ -13,6 +13,7 @@ from bench.hysteresis import _checks
 from bench.hysteresis._checks import Floats
 from bench.hysteresis.documents import Model
 from bench.hysteresis.inverse import Policy
+from bench.hysteresis.operator import Operator
 
 S = TypeVar("S")
 
@@ -104,6 +105,13 @@ class TimedModel(Model, ABC, Generic[S]):
     @abstractmethod
     def start(self, word: str) -> S:
         """Return the state before a first sample that one of `starts` names."""
+
+    def at_rest(self, state: S) -> tuple[Operator[Any], Any] | None:  # noqa: ARG002
+        """Return the operator that the output settles to while the input stands still, with its state.
+
+        None, which is the default, if there is none. A drift goes on, and is left out.
+        """
+        return None
 
     def unknown_until(self, inputs: ArrayLike) -> int:  # noqa: ARG002
         """Return the first sample from which inputs, shape (N,), have overwritten all memory they ever do."""

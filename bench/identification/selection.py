@@ -67,8 +67,7 @@ _GAIN = 0.98
 _MOST_COEFFICIENTS = 5
 # What no signs bound, on other inputs without units left out or at other rates, has to be so much better.
 _UNBOUNDED = 1.2
-# What times that nobody asked for have to gain: at the rates of the record a lag and hysteresis look alike, and
-# controllers take models without time only.
+# What times that nobody asked for have to gain: at the rates of the record a lag and hysteresis look alike.
 _UNASKED = 1.2
 # Of one kind of cycle, what the record leaves open of a model is tested by nothing: it has to be so much better.
 _UNDETERMINED = 2.0
@@ -489,13 +488,15 @@ class _Search:
         """
         finalists = self._with_lag(finalists)
         limit = _UNBOUNDED * min(each.rms for each in finalists)
-        near = [each for each in finalists if self._has_one_kind and is_smooth_plane(each) and each.rms <= limit]
+        one_rate = self.in_time is not None and self.in_time.has_one_rate()
+        alone = one_rate and self._has_one_kind
+        near = [each for each in finalists if alone and is_smooth_plane(each) and each.rms <= limit]
         bounded, others = self._of_one_kind(finalists)
         judged = bounded + others or [each for each in finalists if each.units] or self._bounded(finalists)
         best, chosen = best_of_one_kind(bounded, others) if bounded else simplest_near_best(judged)
         if near:
             chosen = min(near, key=lambda each: each.rms)
-        elif self.in_time is not None and self.in_time.has_one_rate() and lags(chosen):
+        elif one_rate and lags(chosen):
             alike = [each for each in judged if lags(each) and has_signs(each) == has_signs(chosen)]
             chosen = min(alike, key=lambda each: each.misfit)
         elif chosen.units and int(self.measured.tested.sum()) < _FEW_ROWS:

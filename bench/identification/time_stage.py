@@ -21,9 +21,9 @@ PLAYS = "prandtl-ishlinskii"
 # Operators to which a linear part and a drift are added, and what of it is a lag.
 _IN_TIME = 2
 _LAGS = {"lag", "resonance", "delay"}
-# Others as well, of so few coefficients and errors up to so many times the least: a drift that they cannot follow
-# counts against them, which finer ones take for hysteresis.
-_FEW_COEFFICIENTS, _NEAR = 60, 2.0
+# Others as well, if they take a small part of the time and err up to so many times the least: a drift that they
+# cannot follow counts against them, which finer ones take for hysteresis.
+_CHEAP, _NEAR = 20, 2.0
 # Weight of the roughness penalty of a plane that one kind of cycle does not determine, and its reversible part.
 _SMOOTHING, _REVERSIBLE = 1e-2, "linear"
 
@@ -163,8 +163,8 @@ class TimeStage:
         return bounded and self.in_time.is_small(operator.coefficients.size)
 
     def _is_cheap(self, candidate: Candidate) -> bool:
-        """Return whether a candidate's operator has few coefficients."""
-        return self._operator(candidate).coefficients.size <= _FEW_COEFFICIENTS
+        """Return whether a candidate can be evaluated in a small part of the time that others may take."""
+        return self.in_time.is_small(_CHEAP * self._operator(candidate).coefficients.size)
 
     def _operator(self, candidate: Candidate) -> Operator[Any]:
         template = find_model(candidate.model).template

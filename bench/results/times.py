@@ -24,7 +24,7 @@ NO_TIMES = "none"
 """Stands for a column of times where a file's own is to be left out."""
 
 # Heads that name a column of times.
-_NAMES = ("time", "t", "Time", "time_s", "t_s", "Time_s")
+_NAMES = ("time", "t", "Time", "time_s", "t_s", "Time_s", "timestamp", "Timestamp", "datetime")
 
 
 def check_model_name(model: str, time_column: str | None) -> None:

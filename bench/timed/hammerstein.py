@@ -226,6 +226,10 @@ class Hammerstein(TimedModel[HammersteinState]):
             found["drift time"] = self.drift_time, "s"
         return found
 
+    def at_rest(self, state: HammersteinState) -> tuple[Operator[Any], Any] | None:
+        """Return the operator and its state; None behind creep, which goes on."""
+        return None if self.linear.creep_times.size else (self.static, state.memory)
+
     def structure(self) -> Mapping[str, Any]:
         """Return what follows the operator, as `dynamics`."""
         part = self.linear

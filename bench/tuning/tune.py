@@ -101,7 +101,7 @@ def tune(
     from bench.workers import Workers
 
     shown = console or Console(quiet=True)
-    file = load_model(model)
+    file = load_model(model).at_rest()
     task = task_of(file, controller, protocol)
     on = twin or load_rig(rig).rig.twin or rig
     if not load_rig(on).in_process:

@@ -2,6 +2,7 @@
 
 import gzip
 import io
+from datetime import datetime, timedelta
 
 import numpy as np
 import pytest
@@ -232,6 +233,68 @@ class TestOtherFormats:
         with pytest.raises(DataError, match=words) as caught:
             read_columns(write(tmp_path, content, name), ("U", "y"))
         assert name in str(caught.value)
+
+
+MOMENTS = {
+    "date and time": lambda s: f"2026-11-25 23:59:{s:06.3f}",
+    "with a zone": lambda s: f"2026-11-26T00:59:{s:06.3f}+01:00",
+    "in universal time": lambda s: f"2026-11-25T23:59:{s:06.3f}Z",
+    "time of day": lambda s: f"23:59:{s:06.3f}",
+    "hours without a zero": lambda s: f"7:05:{s:06.3f}",
+    "elapsed": lambda s: f"112:05:{s:06.3f}",
+}
+
+
+class TestDatesAndTimes:
+    """Of a column of dates or times the seconds since its first row are read."""
+
+    @pytest.mark.parametrize("name", MOMENTS)
+    @pytest.mark.parametrize("layout", ["{},{},{}", '"{}";"{}";"{}"'])
+    def test_text(self, tmp_path, name, layout):
+        rows = [layout.format(MOMENTS[name](t), u, y) for t, u, y in zip(TIME, U, Y, strict=True)]
+        head = layout.format("time", "U", "y")
+        columns = read_columns(write(tmp_path, "\n".join([head, *rows]) + "\n"), ("U", "y", "time"))
+        check(columns, ("U", "y"))
+        assert columns.units["time"] == "s"
+        assert columns.assumptions.endswith("time: dates and times, in s since the first row")
+        np.testing.assert_allclose(columns.values["time"], TIME, atol=1e-6)
+
+    def test_seconds_with_a_decimal_comma(self, tmp_path):
+        rows = [f"23:59:{t:06.3f}\t{u}\t{y}".replace(".", ",") for t, u, y in zip(TIME, U, Y, strict=True)]
+        columns = read_columns(write(tmp_path, "\n".join(["time\tU\ty", *rows])), ("U", "y", "time"))
+        check(columns, ("U", "y"))
+        np.testing.assert_allclose(columns.values["time"], TIME, atol=1e-6)
+
+    def test_spreadsheet_and_parquet(self, tmp_path):
+        import openpyxl
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+
+        start = datetime.fromisoformat("2026-11-25 23:59")
+        moments = [start + timedelta(seconds=float(t)) for t in TIME]
+        book = openpyxl.Workbook()
+        for row in [("time", "U", "y"), *zip(moments, U.tolist(), Y.tolist(), strict=True)]:
+            book.active.append(row)
+        book.save(tmp_path / "data.xlsx")
+        pq.write_table(pa.table({"time": moments, "U": U, "y": Y}), tmp_path / "data.parquet")
+        for name in ("data.xlsx", "data.parquet"):
+            columns = read_columns(tmp_path / name, ("U", "y", "time"))
+            check(columns, ("U", "y"))
+            assert columns.units["time"] == "s"
+            np.testing.assert_allclose(columns.values["time"], TIME, atol=1e-5)
+
+    @pytest.mark.parametrize("cell", ["23:59", "late", "", "2026-11-25 23:61:00"])
+    def test_another_cell_among_them_is_named(self, tmp_path, cell):
+        rows = [f"23:59:{t:06.3f},{u},{y}" for t, u, y in zip(TIME, U, Y, strict=True)]
+        rows[5] = f"{cell},1,2"
+        path = write(tmp_path, "\n".join(["time,U,y", *rows]) + "\n")
+        with pytest.raises(DataError, match=r"row 6, column time: .* is no date and time"):
+            read_columns(path, ("U", "time"))
+
+    def test_they_are_no_numbers_elsewhere(self, tmp_path):
+        path = write(tmp_path, "time,U\n0,1\n1,2\n23:59:01,3\n")
+        with pytest.raises(DataError, match="row 3, column time: '23:59:01' is not a number"):
+            read_columns(path, ("U", "time"))
 
 
 class TestRefused:

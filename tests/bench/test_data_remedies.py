@@ -199,7 +199,7 @@ class TestWhatWouldHelp:
         assert "delete it from the file, or put a number there" in message
 
     def test_a_column_of_texts(self, tmp_path):
-        content = "day,U,y\n" + "".join(f"2024-03-05 12:00,{u},{y}\n" for u, y in zip(U, Y, strict=True))
+        content = "day,U,y\n" + "".join(f"Tuesday,{u},{y}\n" for u, y in zip(U, Y, strict=True))
         assert "most rows have no number in this column: choose another" in refused(tmp_path, content, ("day",))
 
     def test_another_minus(self, tmp_path):

@@ -14,6 +14,7 @@ from bench.identification.excitation import damped_oscillation
 from bench.journal import Record
 from bench.model_file import ModelFile, load_model
 from bench.results.tracking import following_result, target_results
+from bench.timed import Hammerstein, LinearPart
 
 VO2 = ["--rig", "vo2", "--clock", "virtual"]
 
@@ -43,6 +44,10 @@ def models(operator, tmp_path_factory):
     paths = {"preisach": folder / "preisach.json", "polynomial": folder / "polynomial.json"}
     ModelFile("preisach-nonmonotonic", operator, operator.initial_state().advance(inputs)).save(paths["preisach"])
     ModelFile("polynomial", fitted, None).save(paths["polynomial"])
+    for name, creep in (("hammerstein", ()), ("creeping", (20.0,))):
+        timed = Hammerstein(operator, LinearPart(0.0, (1.5, 0.0), creep, [0.05 for _ in creep]), drift=0.002)
+        paths[name] = folder / f"{name}.json"
+        ModelFile(name, timed, timed.run(8.0 * np.arange(inputs.size), inputs)[1]).save(paths[name])
     other = json.loads(paths["preisach"].read_text())
     other["model"]["output_unit"] = "µm"
     paths["micrometres"] = folder / "micrometres.json"
@@ -68,6 +73,28 @@ def assert_refused(bench, out, code, words, protocol, *options):
     for word in words:
         assert word in re.sub(r"\s+", " ", err)
     assert not out.exists()
+
+
+class TestModelsWithTime:
+    def test_the_operator_of_a_hammerstein_model_is_taken_and_what_is_left_out_is_said(self, bench, models, tmp_path):
+        found = []
+        for name in ("preisach", "hammerstein"):
+            code, out, err = bench(
+                "run", "tracking", *VO2, "--set", f"model={models[name]}", "--set", "controller=open-loop-inverse",
+                "--set", "count=6", "--out", tmp_path,
+            )  # fmt: skip
+            assert code == 0, err
+            said = " ".join((out + err).split())
+            words = "the model of an input that stands still, without time constant 1.5 s, drift 0.002 1/m/s"
+            assert (words in said) is (name == "hammerstein")
+            (folder,) = tmp_path.glob(f"*{name}*")
+            with Record(folder) as record:
+                found.append(target_results(record, "curvature").summary()["rms"])
+        assert found[0] == found[1]
+
+    def test_one_that_creeps_is_refused(self, bench, models, tmp_path):
+        words = ("goes on while the input stands still", "identify it with --time none")
+        assert_refused(bench, tmp_path / "runs", 3, words, "tracking", "--set", f"model={models['creeping']}")
 
 
 class TestAdaptation:

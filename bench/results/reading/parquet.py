@@ -10,6 +10,7 @@ import numpy as np
 from bench.errors import DataError
 from bench.extras import needed_for
 from bench.results.reading.heads import find_place, make_heads
+from bench.results.reading.moments import since_first
 from bench.results.reading.options import ReadingOptions
 from bench.results.reading.table import NO_ROW_LEFT_OUT, ReadColumns
 from bench.results.reading.text import reading_errors
@@ -38,6 +39,11 @@ def read_parquet(path: Path, names: Sequence[str], options: ReadingOptions) -> R
             places = [find_place(path, heads, len(heads), name) for name in names]
             table = pq.ParquetFile(path).read(columns=[texts[place] for place in places])
             found = [table.column(texts[place]) for place in places]
+            are_moments = [pa.types.is_timestamp(column.type) for column in found]
+            found = [
+                column.cast(pa.timestamp("us")).cast(pa.int64()) if is_moment else column
+                for column, is_moment in zip(found, are_moments, strict=True)
+            ]
             values = [np.asarray(column.cast(pa.float64()).to_numpy(), dtype=np.float64) for column in found]
         except (pa.ArrowException, KeyError) as error:
             raise DataError(f"{path} cannot be read as Parquet: {error}") from None
@@ -48,4 +54,6 @@ def read_parquet(path: Path, names: Sequence[str], options: ReadingOptions) -> R
                 f"{path}: row {bad[0] + 1}, column {name}: is empty or not a finite number; {NO_ROW_LEFT_OUT}: "
                 "save the file without it, or with a number there"
             )
-    return ReadColumns(values, [heads[place].unit for place in places], ("Parquet",))
+    values = [1e-6 * column if moment else column for column, moment in zip(values, are_moments, strict=True)]
+    values, units, times = since_first(values, [heads[place].unit for place in places], names, are_moments)
+    return ReadColumns(values, units, ("Parquet", *times))

@@ -12,6 +12,7 @@ from bench.errors import DataError
 from bench.extras import needed_for
 from bench.results.reading.heads import find_place
 from bench.results.reading.layout import SAMPLE_LINES, Header, Row, count_lines, find_header
+from bench.results.reading.moments import moment_in, since_first, with_moments
 from bench.results.reading.options import ReadingOptions
 from bench.results.reading.summary_rows import TextRows, text_note
 from bench.results.reading.table import NO_ROW_LEFT_OUT, OTHER_COLUMN, ReadColumns, finite_number
@@ -58,12 +59,14 @@ def read_spreadsheet(path: Path, names: Sequence[str], options: ReadingOptions) 
     places = [find_place(path, header.heads, header.columns, name) for name in names]
     values: list[list[float]] = [[] for _ in names]
     body, remarks = _without_summary([row for row in rows if row.line > header.start], header, places)
+    moments = with_moments(body[0].cells, places) if body else frozenset()
     for row in body:
         remedy = f"; {NO_ROW_LEFT_OUT}: delete row {row.line} of the sheet, or put a number there"
         for name, place, column in zip(names, places, values, strict=True):
             said = remedy if place in header.numbers else OTHER_COLUMN
             cell = row.cells[place].strip() if place < len(row.cells) else ""
-            column.append(finite_number(f"{path}: sheet {title}, row {row.line}, column {name}", cell, remedy=said))
+            where = f"{path}: sheet {title}, row {row.line}, column {name}"
+            column.append(moment_in(where, cell) if place in moments else finite_number(where, cell, remedy=said))
     above = sum(row.line <= header.start for row in rows) - bool(header.heads) - len(header.notes)
     notes = (
         f"sheet {title}",
@@ -73,7 +76,10 @@ def read_spreadsheet(path: Path, names: Sequence[str], options: ReadingOptions) 
         *remarks,
     )
     units = [header.heads[place].unit if place < len(header.heads) else "" for place in places]
-    return ReadColumns([np.array(column) for column in values], units, notes)
+    arrays, units, times = since_first(
+        [np.array(column) for column in values], units, names, [place in moments for place in places]
+    )
+    return ReadColumns(arrays, units, (*notes, *times))
 
 
 def _without_summary(

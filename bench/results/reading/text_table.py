@@ -6,6 +6,7 @@ import csv
 import itertools
 import re
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,7 @@ from bench.results.reading.layout import (
     is_comment,
     split_rows,
 )
+from bench.results.reading.moments import moment_in, since_first, with_moments
 from bench.results.reading.options import ReadingOptions
 from bench.results.reading.remedies import cell_remedy, is_cut_off, missing_column
 from bench.results.reading.summary_rows import is_label, text_note
@@ -79,12 +81,12 @@ def _read(file: TextFile, names: Sequence[str], options: ReadingOptions) -> Read
     after: tuple[str, ...] = ()
     try:
         values = body.at_once()
-    except (_BreakError, ValueError):
+    except (_BreakError, DataError, ValueError):
         body.ending = find_end(file, layout, places)
         after = note_rest(file, options, layout, body.ending)
         try:
             values = body.at_once()
-        except (_BreakError, ValueError):
+        except (_BreakError, DataError, ValueError):
             values = body.cell_by_cell()
     if not all(np.isfinite(column).all() for column in values):
         values = body.cell_by_cell()
@@ -100,7 +102,8 @@ def _read(file: TextFile, names: Sequence[str], options: ReadingOptions) -> Read
         *after,
     )
     units = [layout.heads[place].unit if place < len(layout.heads) else "" for place in places]
-    return ReadColumns(values, units, notes)
+    values, units, remarks = since_first(values, units, names, [place in body.moments for place in places])
+    return ReadColumns(values, units, (*notes, *remarks))
 
 
 def _choose(file: TextFile, options: ReadingOptions, lines: Sequence[str]) -> Layout:
@@ -156,17 +159,20 @@ class _Body:
         End of the table; None as long as it was not looked for.
     comments : int
         Number of lines of comment within it.
+    moments : frozenset of int
+        Indices of the columns that have dates and times, by their first row.
     """
 
     def __init__(self, file: TextFile, layout: Layout, names: Sequence[str], places: Sequence[int]) -> None:
         self._file, self._layout, self._names, self._places = file, layout, names, places
         self.ending: Ending | None = None
         self.comments = 0
+        self.moments: frozenset[int] = frozenset()
 
     def at_once(self) -> list[Floats]:
         """Return the columns by numpy's reader, shape (rows,) each.
 
-        Raises ValueError or _BreakError if cells are not all numbers.
+        Raises ValueError, DataError or _BreakError if cells are not all numbers, or moments.
         """
         layout = self._layout
         if layout.decimal == layout.delimiter:
@@ -176,6 +182,7 @@ class _Body:
         if first is None:
             return [np.empty(0) for _ in self._places]
         wanted = sorted(set(self._places))
+        self.moments = with_moments(next(split_rows([first], layout.delimiter)).cells, wanted)
         array = np.loadtxt(
             itertools.chain([first], lines),
             delimiter=None if layout.delimiter == " " else layout.delimiter,
@@ -183,6 +190,7 @@ class _Body:
             comments=None,
             quotechar='"',
             ndmin=2,
+            converters={place: partial(moment_in, "") for place in self.moments} or None,
         )
         return [np.ascontiguousarray(array[:, wanted.index(place)]) for place in self._places]
 
@@ -195,6 +203,8 @@ class _Body:
         values: list[list[float]] = [[] for _ in self._places]
         lines = self._file.lines(layout.start, self._end())
         for number, row in enumerate(split_rows(lines, layout.delimiter, layout.start), start=1):
+            if number == 1:
+                self.moments = with_moments(row.cells, self._places)
             for name, place, column in zip(self._names, self._places, values, strict=True):
                 cell = row.cells[place].strip() if place < len(row.cells) else ""
                 where = f"{path}: line {row.line}, row {number}, column {name}"
@@ -202,6 +212,8 @@ class _Body:
         return [np.array(column, dtype=np.float64) for column in values]
 
     def _number(self, where: str, cell: str, place: int, line: int, *, first: bool) -> float:
+        if place in self.moments:
+            return moment_in(where, cell)
         try:
             return finite_number(where, cell, self._layout.decimal)
         except DataError as error:
