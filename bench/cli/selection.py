@@ -242,7 +242,10 @@ def _on_found_times(found: SelectedModel, name: str) -> str:
     """Return what became of a column of times that nobody asked for."""
     selection = found.selection
     if not selection.has_times:
-        return f"column {name} holds times of too few rows: --time {name} compares models with time all the same"
+        return (
+            f"column {name} holds times, of too few or too many rows to be tried unasked: --time {name} compares "
+            "models with time all the same"
+        )
     if found.is_timed:
         return (
             f"column {name} holds times: the chosen model takes time, as it errs at least 1.2 times less than what "

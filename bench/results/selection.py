@@ -30,6 +30,9 @@ from bench.workers import Workers
 MOST_ROWS = 4000
 """Rows by which models are compared: of more, evenly chosen ones; the chosen model is fitted to all."""
 
+# With more, models with time take longer than all others, and are compared only if they were asked for.
+_MOST_UNASKED = 50_000
+
 # Fewer are compared in less time than worker processes take to start.
 _FEW_ROWS = 1000
 
@@ -223,7 +226,7 @@ def select_model(
     measured = whole.thinned(MOST_ROWS)
     few = measured.inputs.size <= _FEW_ROWS
     in_time = None
-    if time_column is not None:
+    if time_column is not None and (given.is_time_asked or inputs.size <= _MOST_UNASKED):
         # A linear part needs the rows between.
         in_time = HeldOutInTime(whole, read_times(files.columns, time_column), measured.inputs.size)
     try:

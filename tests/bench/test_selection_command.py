@@ -289,6 +289,15 @@ def timed(path: Path, times: np.ndarray, head: str = "time [s]") -> Path:
     return path
 
 
+def test_times_of_few_rows_are_tried_only_if_asked_for(bench, tmp_path):
+    file = tmp_path / "few.csv"
+    drifting(file)
+    file.write_text("\n".join(file.read_text().splitlines()[:81]) + "\n")
+    code, text, err = bench("identify", file, *COLUMNS, *SOME)
+    assert code == 0, err
+    assert "of too few or too many rows to be tried unasked: --time time compares" in " ".join(text.split())
+
+
 def test_times_that_gain_little_are_not_taken(bench, record, tmp_path):
     """Plays behind no lag: the file's times change nothing, and what is in their way is said."""
     assert bench("identify", record, *COLUMNS, *SOME, "--json", tmp_path / "untimed.json")[0] == 0
