@@ -127,7 +127,7 @@ def main() -> None:
     given = parser.parse_args()
 
     wanted = [each for each in CASES if given.kind in (None, each[1])]
-    synthetic = [(given.folder / str(seed), plant, kind, seed) for plant, kind in wanted for seed in given.seeds]
+    synthetic = [(given.folder / str(seed), plant, kind, seed) for seed in given.seeds for plant, kind in wanted]
     tasks = [(folder, plant, kind, partial(case, kind, plant, seed)) for folder, plant, kind, seed in synthetic]
     if given.measured is not None:
         name = given.measured.name.replace("_", " ")

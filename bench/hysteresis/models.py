@@ -39,6 +39,9 @@ class ModelSpec:
     sizes : mapping of str to tuple
         Values of options of `template` from the coarsest to the finest, which it goes through together as long as
         the error falls.
+    saturates : bool
+        Whether all memory is lost at the ends of the operating range, so that `negative` and `positive` can say what
+        a record begins with. If not, the choice of a model rather leaves out its first rows.
     fit_in_time : callable or None
         For a model with time (`TimedModel`), in place of `template`: takes times, inputs, outputs and the keyword
         options `weights`, `skip`, `initial`, units and its own; returns an `Identification`.
@@ -52,6 +55,7 @@ class ModelSpec:
     estimate_state: Callable[..., Any] | None = None
     variants: Mapping[str, tuple[Any, ...]] = field(default_factory=dict)
     sizes: Mapping[str, tuple[Any, ...]] = field(default_factory=dict)
+    saturates: bool = True
     fit_in_time: Callable[..., Any] | None = None
 
 

@@ -142,7 +142,9 @@ def _maxwell_slip(
 
 
 BOUC_WEN = ModelSpec("Bouc-Wen operator, rate-independent, with a spring", BoucWen, _bouc_wen)
-DUHEM = ModelSpec("Duhem operator of Coleman and Hodgdon", Duhem, _duhem, sizes={"degree": (3, 5, 7)})
+DUHEM = ModelSpec(
+    "Duhem operator of Coleman and Hodgdon", Duhem, _duhem, sizes={"degree": (3, 5, 7)}, saturates=False
+)
 GENERALIZED_PRANDTL_ISHLINSKII = ModelSpec(
     "Prandtl-Ishlinskii operator between two tanh envelopes, for loops that saturate or are asymmetric",
     GeneralizedPrandtlIshlinskii,

@@ -25,6 +25,8 @@ _LEAST_MOVE = 0.005
 _LEAST_CYCLE = 0.02
 # Part of a range from which rows cover it.
 _COVERED = 0.95
+# Rows that are enough to test models by, even if they are less than half of all.
+_MANY_ROWS = 300
 # Rank of the regressor by coefficients, from which the data determine a model.
 _DETERMINED = 0.9
 # Part of the travel of an output on smaller cycles that may be against the input's beyond what the record's is.
@@ -92,12 +94,14 @@ class Measurements:
     def of(cls, inputs: Floats, outputs: Floats, fitted: Flags | None = None) -> Measurements:
         """Return measurements of which rows are tested from where the inputs have overwritten all memory they do.
 
-        If that takes more than half of the rows, all are tested.
+        If that takes more than half of the rows, or of many rows more than three quarters, all are tested.
         """
         span = float(inputs.min()), float(inputs.max())
         until = PolynomialPlays(np.zeros(1), np.ones(1), np.zeros(1), span).unknown_until(inputs)
         rows = np.ones(inputs.size, dtype=bool) if fitted is None else fitted
-        return cls(inputs, outputs, rows, until if until <= inputs.size // 2 else 0)
+        left = inputs.size - until
+        is_enough = left >= inputs.size // 2 or (left >= inputs.size // 4 and left >= _MANY_ROWS)
+        return cls(inputs, outputs, rows, until if is_enough else 0)
 
     def thinned(self, most: int) -> Measurements:
         """Return about `most` rows, evenly chosen; turning points stay as rows that are not fitted.
@@ -118,10 +122,10 @@ class Measurements:
         """Rows that may be tested, shape (N,)."""
         return np.asarray(self.fitted & (np.arange(self.inputs.size) >= self.known), dtype=bool)
 
-    def covers_its_range(self) -> bool:
+    def covers_its_range(self, part: float = _COVERED) -> bool:
         """Return whether the rows that are tested reach the inputs that all fitted ones do, to 5 % of the range."""
         tested = self.inputs[self.tested]
-        return bool(tested.size and np.ptp(tested) >= _COVERED * np.ptp(self.inputs[self.fitted]))
+        return bool(tested.size and np.ptp(tested) >= part * np.ptp(self.inputs[self.fitted]))
 
     def blocks(self) -> tuple[Fold, ...]:
         """Return the folds of contiguous blocks of a cycle or more; rows before `known` are in every fit."""

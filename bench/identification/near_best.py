@@ -110,16 +110,29 @@ def best_smoothing(tries: Sequence[Evaluation]) -> Evaluation:
     )
 
 
-def of_best_memory(tries: Sequence[Evaluation]) -> list[Evaluation]:
-    """Return the tries from the initial memory of the best of them."""
+def of_best_memory(
+    tries: Sequence[Evaluation], *, prefers_skip: bool = False, skip_gains: float = 1.0
+) -> list[Evaluation]:
+    """Return the tries from the initial memory of the best of them; see `best_memory`."""
     memories: dict[Initial | None, list[Evaluation]] = {}
     for each in tries:
         memories.setdefault(each.candidate.initial, []).append(each)
-    chosen = best_memory([min(each, key=lambda one: one.rms) for each in memories.values()])
+    least = [min(each, key=lambda one: one.rms) for each in memories.values()]
+    chosen = best_memory(least, prefers_skip=prefers_skip, skip_gains=skip_gains)
     return memories[chosen.candidate.initial]
 
 
-def best_memory(tries: Sequence[Evaluation]) -> Evaluation:
-    """Return the try of the least error; of several within 2 % of it that of the least error in the first rows."""
+def best_memory(tries: Sequence[Evaluation], *, prefers_skip: bool = False, skip_gains: float = 1.0) -> Evaluation:
+    """Return the try of the least error; of several within 2 % of it that of the least error in the first rows.
+
+    With `prefers_skip` it is the one that leaves out the first rows, if that is among them. A memory that is wrong by
+    less than the noise shows in no error, but bends an equation; a few rows less cost their part of what it knows.
+    One that leaves them out is taken only if it errs `skip_gains` times less than every other.
+    """
+    others = [each for each in tries if each.candidate.initial != "skip"]
+    limit = min((each.rms for each in others), default=float("inf"))
+    tries = [each for each in tries if each in others or skip_gains * each.rms <= limit]
     least = min(each.rms for each in tries)
-    return min((each for each in tries if each.rms <= EQUAL * least), key=lambda each: each.start)
+    near = [each for each in tries if each.rms <= EQUAL * least]
+    skipped = [each for each in near if prefers_skip and each.candidate.initial == "skip"]
+    return min(skipped or near, key=lambda each: each.start)

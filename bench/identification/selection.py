@@ -16,7 +16,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict
 
 import numpy as np
 
@@ -73,6 +73,8 @@ _UNASKED = 1.2
 _UNDETERMINED = 2.0
 # Part of the variance of the errors that a trend over the rows must be, to be no chance of neighbouring errors.
 _DRIFTS, _FEWEST_OF_TREND = 0.15, 100
+# Part of the range that first rows may leave to the others of a model with a shape, if it then errs so much less.
+_NEARLY_COVERED, _SKIP_GAINS = 0.9, 1.1
 # Turns of the input that say nothing of its minor loops, and moves that are none.
 _FEW_REVERSALS, _LEAST_MOVE = 4, 0.02
 # Ratio of the two held-out errors from which the record is said to tell little of other inputs.
@@ -259,6 +261,11 @@ class _Kind:
         return max((len(values) for _, values in self.sizes), default=1)
 
 
+class _MemoryRules(TypedDict):
+    prefers_skip: bool
+    skip_gains: float
+
+
 class _Search:
     def __init__(
         self, measured: Measurements, models: Sequence[str], given: Given, carry: Carry, in_time: InTime | None
@@ -313,7 +320,7 @@ class _Search:
         for kind, found in zip(kinds, self.carry(tasks), strict=True):
             usable = [each for each in found if each.blocks]
             if usable:
-                result[kind] = best_memory(usable)
+                result[kind] = best_memory(usable, **self._memory_rules(kind))
             else:
                 failures.append(found[0])
         self.given_up += failures
@@ -411,7 +418,9 @@ class _Search:
             assert one is not None
             others = [memory for memory in self._memories[kind] if memory != one.candidate.initial]
             tries = [replace(one.candidate, initial=memory) for memory in others]
-            tasks.append((kind.model, partial(evaluate, self.measured, tries, hopeless=EQUAL * self._least([one]))))
+            # Two folds may hide a memory that is to be preferred.
+            hopeless = (EQUAL if find_model(kind.model).saturates else _NEAR) * self._least([one])
+            tasks.append((kind.model, partial(evaluate, self.measured, tries, hopeless=hopeless)))
         for kind, found in zip(chosen, self.carry(tasks), strict=True):
             self.done[kind] += found
 
@@ -583,7 +592,20 @@ class _Search:
         sizes: dict[str, list[Evaluation]] = {}
         for each in self._whole(kind):
             sizes.setdefault(repr(sorted(each.candidate.options.items())), []).append(each)
-        return [best_smoothing(of_best_memory(each)) for each in sizes.values()]
+        rules = self._memory_rules(kind)
+        return [best_smoothing(of_best_memory(each, **rules)) for each in sizes.values()]
+
+    def _memory_rules(self, kind: _Kind) -> _MemoryRules:
+        """Return how the initial memories of a kind are compared; see `best_memory`.
+
+        Of a model that does not saturate no word says what the memory is. Of others, rows that alone reach an end of
+        the range are left out of a shape's fit only if that gains.
+        """
+        saturates = find_model(kind.model).saturates
+        return {
+            "prefers_skip": not saturates and self.measured.known > 0,
+            "skip_gains": _SKIP_GAINS if saturates and not self._may_skip else 1.0,
+        }
 
     def _best(self, kind: _Kind) -> Evaluation | None:
         """Return the best candidate of a kind."""
@@ -609,7 +631,11 @@ class _Search:
             given = self.given.orientation
             orientations = ("rising", "falling") if given in (None, "auto") else (given,)
         memories: tuple[Initial | None, ...] = (None,)
-        skipping: tuple[Initial, ...] = ("skip",) if self._may_skip else ()
+        with_shape = bool(template.shape_parameters().names)
+        covers = self._may_skip or (
+            with_shape and self.given.initial is None and self.measured.covers_its_range(_NEARLY_COVERED)
+        )
+        skipping: tuple[Initial, ...] = ("skip",) if covers else ()
         if not template.memoryless:
             estimated: tuple[Initial, ...] = ("estimate",) if spec.estimate_state is not None else ()
             # Plays, springs and differential equations begin relaxed.
@@ -618,7 +644,7 @@ class _Search:
             memories = (None, *negative, "positive", *estimated, *skipping)
             memories = memories if self.given.initial is None else (self.given.initial,)
         self._memories[kind] = memories
-        if template.shape_parameters().names:
+        if with_shape:
             self._with_shape.add(kind.model)
             if self.given.initial is None:
                 # Each set-up is a search for the shape; the others are tried on those near the best only.

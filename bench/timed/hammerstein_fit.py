@@ -28,7 +28,7 @@ from bench.identification.orientation import NAMES, Orientation, has_orientation
 from bench.identification.regularization import Regularization
 from bench.identification.trust import judge_fit
 from bench.timed.hammerstein import Hammerstein, HammersteinState
-from bench.timed.hammerstein_search import EVALUATIONS, FREE, Found, Search, find_best, search_ends
+from bench.timed.hammerstein_search import FREE, Found, Search, find_best, search_ends
 from bench.timed.parsimony import WORTH, chance_of, check_size, deviations_of, is_worth
 
 ELEMENTS = ("lag", "resonance", "delay", "creep", "kelvin-voigt", "drift", "fading-drift")
@@ -44,8 +44,9 @@ _EXCLUSIVE = ({"lag", "resonance"}, {"creep", "kelvin-voigt"}, {"drift", "fading
 _RESHAPED, _STEP_OF_SHAPE = 500_000, 1e-6
 # Part by which a drift, which belongs to one record only, must lower the RMS error.
 _WORTH_OF_DRIFT = 0.2
-# Evaluations of a search that only chooses among elements.
-_FEW = 8
+# Evaluations of a search that only chooses among elements, and of one for a shape: it and a lag stand for each other
+# along a valley, and 40 may leave three times the error on other inputs.
+_FEW, _EVALUATIONS = 8, 200
 
 
 def identify_hammerstein(
@@ -301,7 +302,7 @@ def _reshaped(search: Search, found: Found) -> tuple[Search, Found]:
         xtol=1e-10,
         gtol=1e-10,
         diff_step=np.full(low.size, _STEP_OF_SHAPE),
-        max_nfev=EVALUATIONS,
+        max_nfev=_EVALUATIONS,
     )
     static, fitted, rest = at(end.x)
     cost = float(rest @ rest)

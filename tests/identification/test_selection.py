@@ -10,6 +10,7 @@ from bench.hysteresis import ModelSpec, Polynomial, PrandtlIshlinskii, Preisach,
 from bench.identification.by_name import set_up_problem
 from bench.identification.evaluation import Candidate, Evaluation, Measurements, evaluate
 from bench.identification.near_best import (
+    best_memory,
     best_of_few_rows,
     best_of_one_kind,
     best_smoothing,
@@ -17,7 +18,7 @@ from bench.identification.near_best import (
     simplest_near_best,
 )
 from bench.identification.selection import Given, select
-from bench.timed import LinearPart
+from bench.timed import LinearPart, identify_in_time
 from bench.timed.held_out import HeldOutInTime
 
 INPUTS = random_reversals(np.random.default_rng(1), 400, 30)
@@ -227,6 +228,72 @@ def test_at_one_rate_a_lag_is_not_taken_for_hysteresis():
     assert found.chosen.candidate.options["dynamics"] == "lag"
 
 
+def mixed(plant, seed, rows=1500):
+    """Return a record of random reversals with 1 % noise, and another sequence with the true outputs."""
+    rng = np.random.default_rng(seed)
+    others, inputs = random_reversals(rng, rows, 60), random_reversals(rng, rows, 40)
+    outputs = plant(inputs)
+    return inputs, outputs + 0.01 * np.ptp(outputs) * rng.standard_normal(rows), others, settled(plant, others)
+
+
+def error(inputs, outputs, others, truth, one):
+    """Return the RMS error of a candidate on another sequence, % of the range, from where its memory is known."""
+    known = Measurements.of(inputs, outputs).known if one.initial == "skip" else 0
+    problem = set_up_problem(one.model, inputs, outputs, None, known, 0.0, one.initial, dict(one.options))
+    found = problem.fit(0.0)
+    predicted = problem.template.with_coefficients(found.coefficients, found.bias).evaluate(others)
+    wrong = (truth - predicted)[Measurements.of(others, truth).known :]
+    return 100.0 * float(np.sqrt(np.mean(wrong**2)) / np.ptp(truth))
+
+
+class TestInitialMemory:
+    def test_of_equations_that_do_not_saturate_the_first_rows_are_rather_left_out(self):
+        """No word is their memory: wrong by less than the noise, it bends them."""
+        record = mixed(lambda inputs: settled(duhem, inputs), 3)
+        measured = Measurements.of(*record[:2])
+        found = select(measured, ("duhem",))
+        assert found.chosen.candidate.initial == "skip"
+        kept = replace(found.chosen.candidate, initial=None)
+        (with_first,) = evaluate(measured, [kept])
+        assert with_first.rms < 1.02 * found.chosen.rms
+        assert error(*record, found.chosen.candidate) < 0.5 * error(*record, kept)
+
+    def test_first_rows_that_alone_reach_an_end_are_left_out_of_a_shape_where_that_gains(self):
+        """A virgin specimen begins with a memory that no word is."""
+        record = mixed(bouc_wen, 3)
+        measured = Measurements.of(*record[:2])
+        assert not measured.covers_its_range()
+        found = select(measured, ("bouc-wen",))
+        assert found.chosen.candidate.initial == "skip"
+        assert error(*record, found.chosen.candidate) < 0.3 * error(
+            *record, replace(found.chosen.candidate, initial=None)
+        )
+        # Nothing is to be gained where the memory is known.
+        known = mixed(lambda inputs: settled(bouc_wen, inputs), 3)
+        assert select(Measurements.of(*known[:2]), ("bouc-wen",)).chosen.candidate.initial != "skip"
+
+    def test_what_leaves_out_first_rows_may_have_to_gain(self):
+        memories = (None, 1.0), ("positive", 1.2), ("skip", 0.95)
+        tries = [
+            replace(evaluation([rms**2] * 5), candidate=Candidate("bouc-wen", initial=memory))
+            for memory, rms in memories
+        ]
+        assert best_memory(tries).candidate.initial == "skip"
+        assert best_memory(tries, skip_gains=1.1).candidate.initial is None
+        assert best_memory(tries[1:], skip_gains=1.1).candidate.initial == "skip"
+        assert best_memory([tries[2]], skip_gains=1.1).candidate.initial == "skip"
+        alike = [replace(tries[0], start=0.1), replace(tries[2], blocks=tries[0].blocks, start=3.0)]
+        assert best_memory(alike).candidate.initial is None
+        assert best_memory(alike, prefers_skip=True).candidate.initial == "skip"
+
+    def test_of_many_rows_a_quarter_is_enough_to_test_by(self):
+        """Minor loops overwrite what came before late."""
+        first, then = np.linspace(-0.4, 0.4, 500), through([0.4, -1.0, 1.0, -0.5, 0.6, -0.3, 0.5, -0.4], 800)
+        late = np.append(first, then)
+        assert 800 <= Measurements.of(late, late).known <= 820
+        assert Measurements.of(late[::10], late[::10]).known == 0
+
+
 def test_times_that_were_not_asked_for_must_gain():
     """At one rate a static equation stands for plays behind a lag; asked for, the lag is taken all the same."""
     inputs = random_reversals(np.random.default_rng(1), 1500, 40)
@@ -300,6 +367,21 @@ def test_behind_a_lag_it_is_found_too_that_the_memory_of_the_record_is_unknown()
     assert found.chosen.candidate.options == {"static": "bouc-wen", "dynamics": "lag"}
     kept = select(measured, ("bouc-wen",), Given(initial="positive"), in_time=in_time)
     assert {each.candidate.initial for each in kept.evaluations} == {"positive"}
+
+
+def test_a_shape_and_what_follows_it_are_searched_to_the_end():
+    """They stand for each other: an end too early left a larger model with a greater error."""
+    inputs, outputs, _, _ = mixed(lambda path: settled(bouc_wen, path), 2)
+    noise = outputs - settled(bouc_wen, inputs)
+    half = inputs.size // 2
+    times = np.cumsum(np.where(np.arange(inputs.size) < half, 1.0, 0.2)) / inputs.size
+    lag = LinearPart(0.0, (1e-3, 0.0), np.empty(0), np.empty(0))
+    outputs = lag.respond(times, settled(bouc_wen, inputs)[:, None])[0][:, 0] + noise
+    errors = [
+        identify_in_time("hammerstein", times, inputs, outputs, static="bouc-wen", dynamics=dynamics).errors.rms
+        for dynamics in ("lag", "lag,delay")
+    ]
+    assert errors[1] <= 1.001 * errors[0]
 
 
 def test_criteria_of_models_with_time_are_those_of_the_same_rows():
