@@ -599,9 +599,10 @@ class _Search:
         """Return how the initial memories of a kind are compared; see `best_memory`.
 
         Of a model that does not saturate no word says what the memory is. Of others, rows that alone reach an end of
-        the range are left out of a shape's fit only if that gains.
+        the range are left out of a shape's fit only if that gains. Of one kind of cycle all words are about as good:
+        the loop is closed after a few.
         """
-        saturates = find_model(kind.model).saturates
+        saturates = find_model(kind.model).saturates or self._has_one_kind
         return {
             "prefers_skip": not saturates and self.measured.known > 0,
             "skip_gains": _SKIP_GAINS if saturates and not self._may_skip else 1.0,

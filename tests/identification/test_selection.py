@@ -258,6 +258,17 @@ class TestInitialMemory:
         assert with_first.rms < 1.02 * found.chosen.rms
         assert error(*record, found.chosen.candidate) < 0.5 * error(*record, kept)
 
+    def test_of_one_kind_of_cycle_they_are_left_out_only_if_that_gains(self):
+        inputs = through([0.0, *[1.0, -1.0] * 10], 1500)
+        outputs = settled(duhem, inputs)
+        outputs += 0.01 * np.ptp(outputs) * np.random.default_rng(1).standard_normal(1500)
+        measured = Measurements.of(inputs, outputs)
+        found = select(measured, ("duhem",))
+        assert found.has_one_kind
+        assert found.chosen.candidate.initial is None
+        (left_out,) = evaluate(measured, [replace(found.chosen.candidate, initial="skip")])
+        assert left_out.rms < 1.02 * found.chosen.rms
+
     def test_first_rows_that_alone_reach_an_end_are_left_out_of_a_shape_where_that_gains(self):
         """A virgin specimen begins with a memory that no word is."""
         record = mixed(bouc_wen, 3)
