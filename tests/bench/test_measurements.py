@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from bench.devices import Signal
@@ -163,6 +163,7 @@ class TestTrouble:
 
     @settings(deadline=None, max_examples=200)
     @given(st.binary(max_size=60), st.booleans())
+    @example(b'"', True)
     def test_any_bytes_are_read_or_are_a_data_error(self, tmp_path_factory, content, header):
         path = tmp_path_factory.getbasetemp() / "any.csv"
         path.write_bytes(b"a,b\n" * header + content)

@@ -107,9 +107,8 @@ def test_the_table_of_the_choice_shows_each_ratio_and_counts_those_within_the_bo
     def found(error):
         return outcome("duhem, degree 5", error, "duhem, degree 7", 1.0, 3.0, 2, 263, 9.0)
 
-    shown = table(
-        {("duhem", "mixed"): found(1.1), ("duhem", "drift"): found(1.3), ("butterfly", "mixed"): found(1.0)}
-    )
+    records = {("duhem", "mixed"): 1.1, ("duhem", "drift"): 1.3, ("butterfly", "mixed"): 1.0}
+    shown = table({record: [found(error)] for record, error in records.items()})
     assert shown.splitlines() == [
         "| record | duhem | butterfly |",
         "| --- | --- | --- |",
@@ -117,6 +116,12 @@ def test_the_table_of_the_choice_shows_each_ratio_and_counts_those_within_the_bo
         "| drift | 1.30 / 1.00, **1.30** (2 of 263) |  |",
         "",
         "Within 1.2 times the best: 2 of 3.",
+    ]
+    over_seeds = table({("duhem", "mixed"): [found(error) for error in (1.1, 2.5, 1.0)]})
+    assert over_seeds.splitlines()[2:] == [
+        "| mixed | 1.10 / 1.00, 1.10 (2.50) |",
+        "",
+        "Within 1.2 times the best: 1 of 1, and 2 of 3 single records.",
     ]
 
 

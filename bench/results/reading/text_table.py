@@ -182,7 +182,8 @@ class _Body:
         if first is None:
             return [np.empty(0) for _ in self._places]
         wanted = sorted(set(self._places))
-        self.moments = with_moments(next(split_rows([first], layout.delimiter)).cells, wanted)
+        row = next(split_rows([first], layout.delimiter), None)
+        self.moments = with_moments(row.cells, wanted) if row is not None else frozenset()
         array = np.loadtxt(
             itertools.chain([first], lines),
             delimiter=None if layout.delimiter == " " else layout.delimiter,
