@@ -649,7 +649,7 @@ class _Search:
             self._with_shape.add(kind.model)
             if self.given.initial is None:
                 # Each set-up is a search for the shape; the others are tried on those near the best only.
-                memories = (None, *(skipping or ("positive",)))
+                memories = (None, *skipping, *(() if self._may_skip else ("positive",)))
         weight: float | None = 0.0
         if self._has_plane[kind]:
             weight = 0.0 if self.given.smoothing is None and spec.constrained else self.given.smoothing
