@@ -125,13 +125,12 @@ def of_best_memory(
 def best_memory(tries: Sequence[Evaluation], *, prefers_skip: bool = False, skip_gains: float = 1.0) -> Evaluation:
     """Return the try of the least error; of several within 2 % of it that of the least error in the first rows.
 
-    With `prefers_skip` it is the one that leaves out the first rows, if that is among them. A memory that is wrong by
-    less than the noise shows in no error, but bends an equation; a few rows less cost their part of what it knows.
-    One that leaves them out is taken only if it errs `skip_gains` times less than every other.
+    One that leaves out the first rows takes part only if it errs `skip_gains` times less than every other, or at 1 no
+    more. With `prefers_skip` it then is taken, whatever the errors in the first rows: a memory that is wrong by less
+    than the noise shows in no error, but bends an equation; a few rows less cost their part of what it knows.
     """
-    others = [each for each in tries if each.candidate.initial != "skip"]
-    limit = min((each.rms for each in others), default=float("inf"))
-    tries = [each for each in tries if each in others or skip_gains * each.rms <= limit]
+    limit = min((each.rms for each in tries if each.candidate.initial != "skip"), default=float("inf"))
+    tries = [each for each in tries if each.candidate.initial != "skip" or skip_gains * each.rms <= limit]
     least = min(each.rms for each in tries)
     near = [each for each in tries if each.rms <= EQUAL * least]
     skipped = [each for each in near if prefers_skip and each.candidate.initial == "skip"]

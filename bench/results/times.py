@@ -100,16 +100,22 @@ def named_times(path: Path, reading: ReadingOptions | None, own: str | None = No
 
     Tried first is the column of a model's own data, if given. Of a run no other is: its steps are quasi-static.
     """
+    found = _read_named(path, reading, own)
+    return None if found is None else found[0]
+
+
+def _read_named(path: Path, reading: ReadingOptions | None, own: str | None = None) -> tuple[str, Columns] | None:
+    """Return the column of `named_times` and its values."""
     names = [] if own is None else [own]
     if not (path.is_dir() or path.suffix == ".sqlite"):
         names += _NAMES
     for name in names:
         try:
-            unit = read_columns(path, [name], options=reading).units[name]
+            columns = read_columns(path, [name], options=reading)
         except (DataError, ConfigurationError):
             continue
-        if unit in _SECONDS:
-            return name
+        if columns.units[name] in _SECONDS:
+            return name, columns
     return None
 
 
@@ -118,9 +124,11 @@ def find_times(path: Path, reading: ReadingOptions | None) -> str | None:
 
     Raises DataError if they do not increase.
     """
-    name = named_times(path, reading)
-    if name is not None:
-        read_times(read_columns(path, [name], options=reading), name)
+    found = _read_named(path, reading)
+    if found is None:
+        return None
+    name, columns = found
+    read_times(columns, name)
     return name
 
 
