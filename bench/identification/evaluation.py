@@ -14,7 +14,15 @@ from bench.hysteresis import PolynomialPlays
 from bench.hysteresis._checks import Floats
 from bench.identification.branches import turning_points
 from bench.identification.by_name import FitProblem, Initial, set_up_problem
-from bench.identification.folds import Flags, Fold, block_folds, correlated_rows, unit_folds
+from bench.identification.folds import (
+    REACHED,
+    Flags,
+    Fold,
+    block_folds,
+    correlated_rows,
+    unit_folds,
+    with_reach,
+)
 from bench.identification.least_squares import Fit
 from bench.identification.orientation import Orientation
 from bench.identification.resolution import resolve
@@ -23,8 +31,6 @@ from bench.identification.resolution import resolve
 _LEAST_MOVE = 0.005
 # Moves from this part of the range on make cycles.
 _LEAST_CYCLE = 0.02
-# Part of a range from which rows cover it.
-_COVERED = 0.95
 # Rows that are enough to test models by, even if they are less than half of all.
 _MANY_ROWS = 300
 # Rank of the regressor by coefficients, from which the data determine a model.
@@ -122,14 +128,18 @@ class Measurements:
         """Rows that may be tested, shape (N,)."""
         return np.asarray(self.fitted & (np.arange(self.inputs.size) >= self.known), dtype=bool)
 
-    def covers_its_range(self, part: float = _COVERED) -> bool:
+    def covers_its_range(self, part: float = REACHED) -> bool:
         """Return whether the rows that are tested reach the inputs that all fitted ones do, to 5 % of the range."""
         tested = self.inputs[self.tested]
         return bool(tested.size and np.ptp(tested) >= part * np.ptp(self.inputs[self.fitted]))
 
     def blocks(self) -> tuple[Fold, ...]:
-        """Return the folds of contiguous blocks of a cycle or more; rows before `known` are in every fit."""
-        return self._with_first_rows(block_folds(self.tested, blocks=self.count_of_blocks, gap=self.gap))
+        """Return the folds of contiguous blocks of a cycle or more; rows before `known` are in every fit.
+
+        So are inputs that one fold alone reaches; see `with_reach`.
+        """
+        folds = block_folds(self.tested, blocks=self.count_of_blocks, gap=self.gap)
+        return self._with_first_rows(tuple(with_reach(fold, self.inputs, self.gap) for fold in folds))
 
     @property
     def count_of_blocks(self) -> int:

@@ -22,6 +22,9 @@ _SAME = 0.05
 # Branches that span this part of the range form the major loop: what they sweep is swept nowhere else.
 _MAJOR = 0.9
 
+REACHED = 0.95
+"""Part of a range from which rows reach it."""
+
 
 @dataclass(frozen=True, eq=False)
 class Fold:
@@ -70,6 +73,23 @@ def block_folds(usable: Flags, *, folds: int = 5, blocks: int = 20, gap: int = 0
     number = np.full(usable.size, -1)
     number[usable] = fold_numbers(int(usable.sum()), folds, blocks)
     return tuple(_fold(number == k, usable, gap) for k in range(folds))
+
+
+def with_reach(fold: Fold, inputs: Floats, gap: int = 0) -> Fold:
+    """Return a fold whose fit has the rows beyond the inputs that it reaches otherwise; as it is if these lack < 5 %.
+
+    Beyond them an equation is extrapolated, and its memory carries the error on; the fit to all rows knows them. They
+    are not tested then, nor are `gap` rows next to them. If that leaves fewer than half, the record hardly says what
+    it does there, and the fold is as it was: it tests that.
+    """
+    if not fold.trained.any():
+        return fold
+    reached = inputs[fold.trained]
+    if np.ptp(reached) >= REACHED * np.ptp(inputs[fold.trained | fold.tested]):
+        return fold
+    beyond = fold.tested & ((inputs < reached.min()) | (inputs > reached.max()))
+    tested = fold.tested & ~near(beyond, gap)
+    return Fold(tested, fold.trained | beyond) if 2 * tested.sum() >= fold.tested.sum() else fold
 
 
 def unit_folds(inputs: Floats, usable: Flags, *, folds: int = 5, gap: int = 0) -> tuple[Fold, ...]:

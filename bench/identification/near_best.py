@@ -126,11 +126,13 @@ def best_memory(tries: Sequence[Evaluation], *, prefers_skip: bool = False, skip
     """Return the try of the least error; of several within 2 % of it that of the least error in the first rows.
 
     One that leaves out the first rows takes part only if it errs `skip_gains` times less than every other, or at 1 no
-    more. With `prefers_skip` it then is taken, whatever the errors in the first rows: a memory that is wrong by less
-    than the noise shows in no error, but bends an equation; a few rows less cost their part of what it knows.
+    more. With `prefers_skip` it is taken within 2 % of the least, whatever the errors in the first rows: a memory
+    that is wrong by less than the noise shows in no error, but bends an equation; a few rows less cost their part of
+    what it knows.
     """
     limit = min((each.rms for each in tries if each.candidate.initial != "skip"), default=float("inf"))
-    tries = [each for each in tries if each.candidate.initial != "skip" or skip_gains * each.rms <= limit]
+    if not prefers_skip:
+        tries = [each for each in tries if each.candidate.initial != "skip" or skip_gains * each.rms <= limit]
     least = min(each.rms for each in tries)
     near = [each for each in tries if each.rms <= EQUAL * least]
     skipped = [each for each in near if prefers_skip and each.candidate.initial == "skip"]

@@ -16,7 +16,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
-from typing import Any, NamedTuple, TypedDict
+from typing import Any, TypedDict
 
 import numpy as np
 
@@ -44,6 +44,7 @@ from bench.identification.near_best import (
     simplest_near_best,
 )
 from bench.identification.orientation import Orientation, has_orientation
+from bench.identification.selected import FEW_REVERSALS, Selection, Trend
 from bench.identification.time_stage import Carry, InTime, Task, TimeStage, is_smooth_plane, lags
 
 SMOOTHING = (0.0, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
@@ -67,18 +68,18 @@ _GAIN = 0.98
 _MOST_COEFFICIENTS = 5
 # What no signs bound, on other inputs without units left out or at other rates, has to be so much better.
 _UNBOUNDED = 1.2
+# Reversible part beside which signs bound the answer of a plane, and sizes that are tried of such planes.
+_NO_REVERSIBLE, _COARSE = "none", 2
 # What times that nobody asked for have to gain: at the rates of the record a lag and hysteresis look alike.
 _UNASKED = 1.2
 # Of one kind of cycle, what the record leaves open of a model is tested by nothing: it has to be so much better.
 _UNDETERMINED = 2.0
-# Part of the variance of the errors that a trend over the rows must be, to be no chance of neighbouring errors.
-_DRIFTS, _FEWEST_OF_TREND = 0.15, 100
+# Rows of which a trend of the errors can be told from chance.
+_FEWEST_OF_TREND = 100
 # Part of the range that first rows may leave to the others of a model with a shape, if it then errs so much less.
 _NEARLY_COVERED, _SKIP_GAINS = 0.9, 1.1
-# Turns of the input that say nothing of its minor loops, and moves that are none.
-_FEW_REVERSALS, _LEAST_MOVE = 4, 0.02
-# Ratio of the two held-out errors from which the record is said to tell little of other inputs.
-_WARNED = 3.0
+# Moves by this part of the range are none, and by this part of it or more in both directions show hysteresis.
+_LEAST_MOVE, _BOTH_WAYS = 0.02, 0.5
 
 
 @dataclass(frozen=True)
@@ -101,112 +102,6 @@ class Given:
     orientation: Orientation | None = None
     smoothing: float | None = None
     is_time_asked: bool = True
-
-
-class Trend(NamedTuple):
-    """A straight line through errors over rows.
-
-    Attributes
-    ----------
-    change : float
-        From the first to the last row, output units.
-    share : float
-        Part of the variance of the errors, 0 to 1.
-    """
-
-    change: float
-    share: float
-
-
-@dataclass(frozen=True)
-class Selection:
-    """What was tried, and what was chosen.
-
-    Attributes
-    ----------
-    evaluations : tuple of Evaluation
-        The best of each structure first, by their error; those given up and those that failed last.
-    best : Evaluation
-        That of the least held-out error.
-    chosen : Evaluation
-        The simplest within one standard error of it, or by the fit to all rows: where its residuals are uncorrelated,
-        of few rows, of one kind of cycle, and of lags at one rate.
-    gap : int
-        Rows left out next to each block.
-    rows : int
-        Rows that were fitted and tested.
-    span : float
-        Range of their outputs, output units.
-    has_one_kind : bool
-        Whether the input has one kind of cycle only.
-    reversals : int or None
-        How often the input turns back, by 2 % of its range or more.
-    trend : Trend or None
-        That of the errors of the chosen model, if it is one without time.
-    has_times : bool
-        Whether models with time took part.
-    is_time_asked : bool
-        Whether they did as the others; see `Given`.
-    has_one_rate : bool
-        Whether times are known and the input moves at one speed only.
-    """
-
-    evaluations: tuple[Evaluation, ...]
-    best: Evaluation
-    chosen: Evaluation
-    gap: int
-    rows: int
-    span: float
-    has_one_kind: bool = False
-    reversals: int | None = None
-    trend: Trend | None = None
-    has_times: bool = False
-    is_time_asked: bool = True
-    has_one_rate: bool = False
-
-    def warnings(self) -> list[str]:
-        """Return what the held-out errors say against the chosen model, in sentences."""
-        found = []
-        chosen = self.chosen
-        if self.reversals is not None and self.reversals < _FEW_REVERSALS:
-            found.append(
-                f"the input {_reverses(self.reversals)}, which tells little of hysteresis: "
-                "record more cycles, of several amplitudes, as `bench design` proposes"
-            )
-        if self.trend is not None and self.trend.share > _DRIFTS:
-            part = 100.0 * abs(self.trend.change) / self.span
-            remedy = (
-                "no model with drift or creep does better on rows left out; --model hammerstein --dynamics drift "
-                "has the drift in any case"
-                if self.has_times and self.is_time_asked
-                else "give --time COLUMN, so that models with drift and creep take part"
-            )
-            found.append(
-                f"the errors drift by {part:.2g} % of the range from the first to the last row "
-                f"({self.trend.share:.0%} of their variance): {remedy}"
-            )
-        if self.has_one_rate:
-            found.append(
-                "the input always moves at about one speed, at which a lag can hardly be told from hysteresis: "
-                "errors at other rates are unknown; record slower and faster cycles"
-            )
-        if not chosen.units and self.has_one_kind:
-            found.append(
-                "the input does not vary its amplitude, so that the error on inputs of other amplitudes is unknown; "
-                "models that the record determines were preferred: record smaller cycles too, as `bench design` "
-                "proposes"
-            )
-        elif not chosen.units:
-            found.append(
-                "the record is too short to leave whole cycles out, so that the error on other inputs is unknown: "
-                "record more cycles, as `bench design` proposes"
-            )
-        elif chosen.units_rms > _WARNED * chosen.rms:
-            found.append(
-                f"the error with whole cycles left out is {chosen.units_rms / chosen.rms:.1f} times that with blocks "
-                "left out: expect it on inputs unlike the record, and record more kinds of cycles"
-            )
-        return found
 
 
 def select(
@@ -272,8 +167,8 @@ class _Search:
     ) -> None:
         self.measured, self.given, self.carry = measured, given, carry
         # Of few rows a lag hardly shows, and hides much.
-        is_heard = given.is_time_asked or int(measured.tested.sum()) >= _FEW_ROWS
-        self.in_time = in_time if is_heard else None
+        self._has_few_rows = int(measured.tested.sum()) < _FEW_ROWS
+        self.in_time = None if self._has_few_rows and not given.is_time_asked else in_time
         self.kinds = [kind for model in models for kind in _kinds(model, find_model(model), given)]
         self.done: dict[_Kind, list[Evaluation]] = {kind: [] for kind in self.kinds}
         self.given_up: list[Evaluation] = []
@@ -282,6 +177,9 @@ class _Search:
         self._has_one_kind = has_one_kind(measured.inputs, measured.tested)
         turns = turning_points(measured.inputs, _LEAST_MOVE * float(np.ptp(measured.inputs)))
         self._reversals = max(turns.size - 2, 0)
+        moves = np.diff(measured.inputs[turns])
+        both = min(float(moves.max(initial=0.0)), float(-moves.min(initial=0.0)))
+        self._is_swept_once = self._reversals < FEW_REVERSALS and both < _BOTH_WAYS * float(np.ptp(measured.inputs))
         self._memories: dict[_Kind, tuple[Initial | None, ...]] = {}
 
     def run(self) -> Selection:
@@ -302,6 +200,8 @@ class _Search:
         self.smooth()
         self.remember()
         finalists = [each for kind in self.kinds for each in self._of_each_size(kind)]
+        if self._is_swept_once:
+            finalists += self.smooth_planes([each.candidate for each in finalists], screened)
         judged = self.with_units(finalists)
         return self.choose(judged, self.with_time(judged))
 
@@ -342,13 +242,14 @@ class _Search:
                 if self._is_smoothed(kind) and step:
                     weights.append(1e-2)
                 tries = [replace(sized, smoothing=weight) for weight in weights]
-                tasks.append((kind.model, partial(evaluate, self.measured, tries, hopeless=hopeless)))
+                limit = float("inf") if self._is_told_by_fit(kind) else hopeless
+                tasks.append((kind.model, partial(evaluate, self.measured, tries, hopeless=limit)))
             step += 1
             for (kind, _), found in zip(names, self.carry(tasks), strict=True):
                 before = min((each.rms for each in self.done[kind]), default=float("inf"))
                 self.done[kind] += found
                 now = min(each.rms for each in found)
-                gains = now < _GAIN * before or self._may_gain_in_time(kind)
+                gains = now < _GAIN * before or self._may_gain_in_time(kind) or self._is_told_by_fit(kind)
                 if step >= kind.steps or not gains or self._is_too_fine(kind, step):
                     del going[kind]
 
@@ -360,6 +261,13 @@ class _Search:
     def _may_gain_in_time(self, kind: _Kind) -> bool:
         """Return whether a drift or a lag may hide what a finer order gains; all orders are tried behind it."""
         return self.in_time is not None and kind.model in self._with_shape
+
+    def _is_told_by_fit(self, kind: _Kind) -> bool:
+        """Return whether an equation is judged by its fit to few rows, whatever its error on blocks left out.
+
+        One block may be all there is of a part of the range: what is left out there extrapolates.
+        """
+        return self._has_few_rows and kind.model in self._with_shape
 
     def _is_too_fine(self, kind: _Kind, step: int) -> bool:
         """Return whether a kind has many more coefficients than there are rows."""
@@ -403,6 +311,20 @@ class _Search:
             if weight not in tried
         ]
 
+    def smooth_planes(self, others: Sequence[Candidate], screened: Mapping[_Kind, Evaluation]) -> list[Evaluation]:
+        """Return planes with signs, the greatest smoothing and no reversible part, beside other candidates.
+
+        Of a record that hardly goes both ways signs and smoothness say how the answer goes on.
+        """
+        tries = [
+            replace(screened[kind].candidate, options=kind.options(step), smoothing=SMOOTHING[-1])
+            for kind in screened
+            if self._is_smoothed(kind) and dict(kind.fixed).get("reversible") == _NO_REVERSIBLE
+            for step in range(min(kind.steps, _COARSE))
+        ]
+        tasks = [(each.model, partial(evaluate, self.measured, [each])) for each in tries if each not in others]
+        return [each for found in self.carry(tasks) for each in found if len(each.blocks) == self._folds]
+
     def remember(self) -> None:
         """Try the other initial memories on the best, which were compared at the coarsest order only.
 
@@ -410,8 +332,10 @@ class _Search:
         """
         best = sorted((each.rms, self.kinds.index(kind)) for kind in self.kinds if (each := self._best(kind)))
         chosen = [self.kinds[index] for _, index in best[:_REMEMBERED]]
-        near = [self.kinds[index] for rms, index in best[_REMEMBERED:] if rms <= _NEAR * best[0][0]]
-        chosen += [kind for kind in near if kind.model in self._with_shape]
+        for rms, index in best[_REMEMBERED:]:
+            kind = self.kinds[index]
+            if kind.model in self._with_shape and (rms <= _NEAR * best[0][0] or self._is_told_by_fit(kind)):
+                chosen.append(kind)
         tasks = []
         for kind in chosen:
             one = self._best(kind)
@@ -427,7 +351,8 @@ class _Search:
     def with_units(self, finalists: list[Evaluation]) -> list[Evaluation]:
         """Return the finalists, those near the best with whole units of the excitation left out too.
 
-        Where there is one kind of cycle, it is found instead what the fit to all rows says of them.
+        So are equations whose fit to few rows leaves only noise, and that follow smaller cycles. Where there is one
+        kind of cycle, it is found instead what the fit to all rows says of them.
         """
         least = self._least(finalists)
         if self._has_one_kind:
@@ -437,15 +362,21 @@ class _Search:
         if not self.measured.units():
             return finalists
         near = [each for each in finalists if each.rms <= _NEAR * least]
+        others = [each for each in finalists if each not in near]
+        told = [each for each in others if self._has_few_rows and each.candidate.model in self._with_shape]
         tasks = [
             (each.candidate.model, partial(evaluate, self.measured, [each.candidate], with_units=True))
-            for each in near
+            for each in near + told
         ]  # fmt: skip
         found = [
             replace(one, seconds=one.seconds + each.seconds)
-            for each, (one,) in zip(near, self.carry(tasks), strict=True)
+            for each, (one,) in zip(near + told, self.carry(tasks), strict=True)
         ]
-        return found + [each for each in finalists if each not in near]
+        adequate = [
+            one for one in found[len(near) :] if one.uncorrelated and judge_determined(self.measured, one)[0].follows
+        ]
+        judged = [one.candidate for one in adequate]
+        return found[: len(near)] + adequate + [each for each in others if each.candidate not in judged]
 
     def with_time(self, judged: list[Evaluation]) -> list[Evaluation]:
         """Return models with time with the best operators; none if times are not known."""
@@ -465,7 +396,7 @@ class _Search:
         best, chosen = self._decide(finalists)
         if chosen in timed and not self.given.is_time_asked:
             without = self._decide(judged)
-            if _UNASKED * chosen.rms > without[1].rms:
+            if _UNASKED * chosen.rms > without[1].rms and not self._is_drift(chosen, without[1]):
                 best, chosen = without
         others = [each for kind in self.kinds for each in self.done[kind] if len(each.blocks) < self._folds]
         table = sorted(finalists, key=lambda each: each.rms) + others + self.given_up
@@ -493,13 +424,17 @@ class _Search:
         says what takes part. At one rate the time constant of a lag is as wrong as the operator is, and no row left
         out shows it: of models with a lag it is the one of the least misfit, whose operator biases the time constant
         least. Of one kind of cycle at one rate neither shows: there the smooth plane with time is chosen where it is
-        about as good, as signs and smoothness bound what the record leaves open.
+        about as good, as signs and smoothness bound what the record leaves open. So they do where it hardly goes both
+        ways.
         """
         finalists = self._with_lag(finalists)
         limit = _UNBOUNDED * min(each.rms for each in finalists)
         one_rate = self.in_time is not None and self.in_time.has_one_rate()
         alone = one_rate and self._has_one_kind
         near = [each for each in finalists if alone and is_smooth_plane(each) and each.rms <= limit]
+        if self._is_swept_once:
+            limit = _UNDETERMINED * min(each.rms for each in finalists)
+            near = [each for each in finalists if self._is_bounding_plane(each) and each.rms <= limit]
         bounded, others = self._of_one_kind(finalists)
         judged = bounded + others or [each for each in finalists if each.units] or self._bounded(finalists)
         best, chosen = best_of_one_kind(bounded, others) if bounded else simplest_near_best(judged)
@@ -508,9 +443,15 @@ class _Search:
         elif one_rate and lags(chosen):
             alike = [each for each in judged if lags(each) and has_signs(each) == has_signs(chosen)]
             chosen = min(alike, key=lambda each: each.misfit)
-        elif chosen.units and int(self.measured.tested.sum()) < _FEW_ROWS:
+        elif chosen.units and self._has_few_rows:
             chosen = best_of_few_rows(judged)
         return best, chosen
+
+    def _is_bounding_plane(self, each: Evaluation) -> bool:
+        """Return whether signs and the greatest smoothing bound an answer, with nothing beside the plane."""
+        one = each.candidate
+        smoothest = one.smoothing == SMOOTHING[-1]
+        return has_signs(each) and smoothest and one.options.get("reversible") == _NO_REVERSIBLE
 
     def _with_lag(self, finalists: list[Evaluation]) -> list[Evaluation]:
         """Return the finalists; at one rate without those that leave time out, where signs ask for a lag.
@@ -527,6 +468,11 @@ class _Search:
             for each in finalists
             if each.candidate.static or not lagging or _UNBOUNDED**2 * score(each).mean() < least
         ]
+
+    def _is_drift(self, timed: Evaluation, without: Evaluation) -> bool:
+        """Return whether a model with time has a drift, and errors without time have a trend: no lag has one."""
+        trend = self._trend(without)
+        return "drift" in str(timed.candidate.options.get("dynamics")) and trend is not None and trend.drifts
 
     def _trend(self, chosen: Evaluation) -> Trend | None:
         """Return the trend of errors over the rows tested; None of fewer rows than tell one from chance."""
@@ -559,7 +505,7 @@ class _Search:
             return True
         operator = find_model(each.candidate.operator).model
         # Beyond a single rise a polynomial is bounded by nothing, but for a straight line.
-        return bool(operator.memoryless and (self._reversals >= _FEW_REVERSALS or each.free <= 1.0))
+        return bool(operator.memoryless and (self._reversals >= FEW_REVERSALS or each.free <= 1.0))
 
     def _bounded(self, finalists: list[Evaluation]) -> list[Evaluation]:
         """Return the finalists without those of a plane and free signs, unless these are clearly better.
@@ -662,12 +608,6 @@ class _Search:
         """Return over how many rows the errors of a first candidate are alike, at most a quarter of a block."""
         block = int(self.measured.tested.sum()) // self.measured.count_of_blocks
         return correlated_rows(residuals_of(self.measured, each.candidate)[self.measured.known :], max(1, block // 4))
-
-
-def _reverses(number: int) -> str:
-    if number == 0:
-        return "never reverses"
-    return "reverses only " + ("once" if number == 1 else f"{number} times")
 
 
 def _kinds(model: str, spec: ModelSpec, given: Given) -> list[_Kind]:

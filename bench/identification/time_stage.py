@@ -134,7 +134,13 @@ class TimeStage:
         # Without time, a drift or a lag hides what a finer order gains.
         shaped = self.with_shape & {each.candidate.model for each in tried}
         tried += [each for each in operators if each.candidate.model in shaped]
+        tried = [self._without_first_rows(each) for each in tried]
         return [each for n, each in enumerate(tried) if each.candidate not in [one.candidate for one in tried[:n]]]
+
+    def _without_first_rows(self, each: Evaluation) -> Evaluation:
+        """Return an operator that no word says the memory of without its first rows, which a lag hides too."""
+        no_word = self.may_skip and not self.has_one_kind and not find_model(each.candidate.model).saturates
+        return _changed(each, initial="skip") if no_word else each
 
     def _smoothed(self, plane: Evaluation) -> Evaluation:
         """Return a plane with some smoothing, without first rows: a memory found without time is that of no lag."""

@@ -16,7 +16,8 @@ from bench.hysteresis import Operator, find_model, identifiable_models, timed_mo
 from bench.identification import Comparison, compare
 from bench.identification.by_name import check_words
 from bench.identification.evaluation import Evaluation, Measurements
-from bench.identification.selection import Given, Selection, select
+from bench.identification.selected import Selection
+from bench.identification.selection import Given, select
 from bench.identification.time_stage import Task
 from bench.results.data import FEWEST_ROWS, check_excitation
 from bench.results.joined_files import check_rows, fitted_rows, is_rows, overwritten_from, parse_rows, read_files

@@ -37,13 +37,16 @@ ELEMENTS = ("lag", "resonance", "delay", "creep", "kelvin-voigt", "drift", "fadi
 CHOICE = ("lag", "resonance", "delay", "creep", "drift")
 """What is chosen among if nobody says what follows."""
 
+WORTH_OF_DRIFT = 0.2
+"""Part by which a drift must lower the RMS error: it belongs to one record, and rates that grow look like one."""
+
 # What cannot stand beside each other.
 _EXCLUSIVE = ({"lag", "resonance"}, {"creep", "kelvin-voigt"}, {"drift", "fading-drift"})
 # Numbers of a regressor up to which the shape of the operator is found anew with what follows it, and the relative
 # step of its differences.
 _RESHAPED, _STEP_OF_SHAPE = 500_000, 1e-6
-# Part by which a drift, which belongs to one record only, must lower the RMS error.
-_WORTH_OF_DRIFT = 0.2
+# Ratio of two sums of squares from which the sign of the operator is clear, whatever follows it.
+_CLEAR = 100.0
 # Evaluations of a search that only chooses among elements, and of one for a shape: it and a lag stand for each other
 # along a valley, and 40 may leave three times the error on other inputs.
 _FEW, _EVALUATIONS = 8, 200
@@ -219,12 +222,15 @@ def _cross_validated(search: Search, found: Found, tried: Sequence[float]) -> Tr
     return compare_smoothing(fitted, regressor, search.static.outputs, search.roots**2, tried).best
 
 
-def choose_elements(search: Search, among: Sequence[str] = CHOICE) -> tuple[Search, Found]:
+def choose_elements(
+    search: Search, among: Sequence[str] = CHOICE, worth_of_drift: float = WORTH_OF_DRIFT
+) -> tuple[Search, Found]:
     """Return the elements that are worth it, one after the other, with the rest.
 
-    The search that is returned has the operator's shape as it is with them.
+    The search that is returned has the operator's shape as it is with them. A drift must lower the RMS error by
+    `worth_of_drift`.
     """
-    found = find_best(search, ())
+    search, found = _of_clear_sign(search)
     used = max(int(np.count_nonzero(search.roots)), 1)
     chance = chance_of(used)
     shortest, longest = search.creep_span
@@ -244,7 +250,7 @@ def choose_elements(search: Search, among: Sequence[str] = CHOICE) -> tuple[Sear
             reshaped, best = _reshaped(search, find_best(search, least.elements, found, rounds=1))
         added = set(best.elements) - set(found.elements)
         more = max(_count(best) - _count(found), 1)
-        if not is_worth(found.cost, best.cost, more, used, _WORTH_OF_DRIFT if "drift" in added else WORTH):
+        if not is_worth(found.cost, best.cost, more, used, worth_of_drift if "drift" in added else WORTH):
             break
         search, found = reshaped, best
         # Beside what was added, an earlier element may be worth no more than chance.
@@ -254,6 +260,16 @@ def choose_elements(search: Search, among: Sequence[str] = CHOICE) -> tuple[Sear
             if not _log_cost(best) - _log_cost(found) > max(_count(found) - _count(best), 1) * chance:
                 search, found, among = reshaped, best, [name for name in among if name != element]
     return search, min(find_best(search, found.elements), found, key=lambda each: each.cost)
+
+
+def _of_clear_sign(search: Search) -> tuple[Search, Found]:
+    """Return a search and its fit without elements; of one sign, if the other leaves a hundred times the squares.
+
+    A fit with signs takes most of the time.
+    """
+    ends = [(one, find_best(one, ())) for one in (replace(search, signs=(sign,)) for sign in search.signs)]
+    clear, best = min(ends, key=lambda end: end[1].cost)
+    return clear if max(found.cost for _, found in ends) > _CLEAR * best.cost else search, best
 
 
 def _log_cost(found: Found) -> float:

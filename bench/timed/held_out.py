@@ -16,7 +16,7 @@ from bench.identification.evaluation import Candidate, Evaluation, Measurements,
 from bench.identification.folds import Fold
 from bench.identification.least_squares import Fit, one_thread
 from bench.identification.orientation import NAMES
-from bench.timed.hammerstein_fit import CHOICE, choose_elements, set_up_search
+from bench.timed.hammerstein_fit import CHOICE, WORTH_OF_DRIFT, choose_elements, set_up_search
 from bench.timed.rate_dependent_plays_fit import PlaysSearch
 
 # Rows times coefficients of the operator up to which the choice of what follows it takes seconds.
@@ -25,6 +25,8 @@ _MOST = 2_000_000
 _MOST_OF_PLAYS = 250_000
 # Moves from this part of the range on have a speed.
 _LEAST_MOVE = 0.02
+# Part by which a drift must lower the RMS error of such a record, about 15 % of the variance: no rates look like one.
+_WORTH_AT_ONE_RATE = 0.08
 # Longest period of a resonance by the time of a move, at one rate.
 _RINGING = 0.2
 
@@ -119,13 +121,14 @@ class HeldOutInTime:
             smoothing=static.smoothing or 0.0,
         )
         _check_skipped(measured, problem)
-        among = list(CHOICE)
+        among, worth = list(CHOICE), WORTH_OF_DRIFT
         if self.has_one_rate():
             # To such a record creep is hysteresis, and would be found in place of a lag. So is a resonance that does
             # not ring out within a move.
             among.remove("creep")
+            worth = _WORTH_AT_ONE_RATE
             search = replace(search, longest_period=_RINGING * self._median_move())
-        search, found = choose_elements(search, among)
+        search, found = choose_elements(search, among, worth)
         if not found.elements:
             return None
         columns, drifts = search.responses(found.elements, found.values)

@@ -4,10 +4,19 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from hysteretic_plants import through
 
 from bench.identification import ramps
 from bench.identification.branches import turning_points
-from bench.identification.folds import block_folds, correlated_rows, excitation_units, near, unit_folds
+from bench.identification.folds import (
+    REACHED,
+    block_folds,
+    correlated_rows,
+    excitation_units,
+    near,
+    unit_folds,
+    with_reach,
+)
 
 
 @settings(max_examples=60, deadline=None)
@@ -47,6 +56,41 @@ def test_blocks_are_contiguous():
     fold = block_folds(np.ones(100, dtype=bool), folds=5, blocks=10, gap=2)[0]
     assert np.flatnonzero(fold.tested).tolist() == [*range(10), *range(50, 60)]
     assert np.flatnonzero(~fold.trained).tolist() == [*range(12), *range(48, 62)]
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    inputs=st.lists(st.floats(-1.0, 1.0), min_size=12, max_size=60), gap=st.integers(0, 3), number=st.integers(0, 4)
+)
+def test_no_fold_tests_what_its_fit_does_not_reach_unless_that_is_most_of_it(inputs, gap, number):
+    values = np.array(inputs)
+    fold = block_folds(np.ones(values.size, dtype=bool), blocks=10, gap=gap)[number]
+    made = with_reach(fold, values, gap)
+    if not fold.trained.any():
+        assert made is fold
+        return
+    low, high = values[fold.trained].min(), values[fold.trained].max()
+    beyond = fold.tested & ((values < low) | (values > high))
+    if made is not fold:
+        assert (made.trained == (fold.trained | beyond)).all()
+        # What is tested is as far from the rows that were added as from any other.
+        assert not (near(beyond, gap) & made.tested).any()
+        assert not (made.tested & ~fold.tested).any()
+        assert ((values[made.tested] >= low) & (values[made.tested] <= high)).all()
+    elif high - low < REACHED * np.ptp(values[fold.trained | fold.tested]):
+        assert 2 * (fold.tested & ~near(beyond, gap)).sum() < fold.tested.sum()
+
+
+def test_an_extreme_that_one_block_alone_reaches_is_in_every_fit():
+    inputs = through([0.5, -0.5, 0.5, -1.0, 0.5, -0.5, 0.5, -0.5], 150)
+    folds = block_folds(np.ones(150, dtype=bool), blocks=5, gap=1)
+    (alone,) = (fold for fold in folds if fold.tested[inputs < -0.9].any())
+    made = with_reach(alone, inputs, 1)
+    assert inputs[made.trained].min() == inputs.min()
+    assert made.tested.any()
+    # Of a record that goes there in most of a block, the block tests what it does beyond.
+    rise = np.linspace(0.0, 1.0, 150)
+    assert with_reach(folds[4], rise, 1) is folds[4]
 
 
 def _amplitudes():

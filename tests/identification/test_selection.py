@@ -295,7 +295,9 @@ class TestInitialMemory:
         assert best_memory([tries[2]], skip_gains=1.1).candidate.initial == "skip"
         alike = [replace(tries[0], start=0.1), replace(tries[2], blocks=tries[0].blocks, start=3.0)]
         assert best_memory(alike).candidate.initial is None
-        assert best_memory(alike, prefers_skip=True).candidate.initial == "skip"
+        for rms, expected in ((1.0, "skip"), (1.01, "skip"), (1.03, None)):
+            little_more = replace(alike[1], blocks=(rms**2,) * 5)
+            assert best_memory([alike[0], little_more], prefers_skip=True).candidate.initial == expected
 
     def test_of_many_rows_a_quarter_is_enough_to_test_by(self):
         """Minor loops overwrite what came before late."""
@@ -327,6 +329,38 @@ def test_times_that_were_not_asked_for_must_gain():
     fast = replace(fast, measured=measured)
     both = select(measured, models, Given(is_time_asked=False), in_time=fast)
     assert both.chosen.candidate.static is not None
+
+
+def test_a_drift_is_taken_unasked_where_the_errors_show_it():
+    """Unlike a lag it is no hysteresis; of less than a fifth of the error, too."""
+    rng = np.random.default_rng(1)
+    inputs = [random_reversals(rng, 1500, turns) for turns in (60, 40)][1]
+    outputs = settled(jiles_atherton, inputs)
+    outputs += np.ptp(outputs) * (0.01 * rng.standard_normal(1500) + 0.05 * np.linspace(0.0, 1.0, 1500))
+    measured = Measurements.of(inputs, outputs)
+    in_time = HeldOutInTime(measured, 0.01 * np.arange(inputs.size), inputs.size)
+    models = ("generalized-prandtl-ishlinskii",)
+    plain = select(measured, models)
+    found = select(measured, models, Given(is_time_asked=False), in_time=in_time)
+    assert plain.trend is not None
+    assert plain.trend.share > 0.15
+    assert found.chosen.candidate.options == {"static": "generalized-prandtl-ishlinskii", "dynamics": "drift"}
+    assert plain.chosen.rms / 1.2 < found.chosen.rms < 0.9 * plain.chosen.rms
+
+
+def test_behind_a_lag_all_orders_of_an_equation_are_tried_without_first_rows():
+    """A lag hides what memory the record begins with, and a higher order from there errs more than a lower one."""
+    rng = np.random.default_rng(1)
+    inputs = [random_reversals(rng, 1500, turns) for turns in (60, 40)][1]
+    times = np.cumsum(np.where(np.arange(inputs.size) < 750, 1.0, 0.2)) / inputs.size
+    lag = LinearPart(0.0, (1e-3, 0.0), np.empty(0), np.empty(0))
+    outputs = lag.respond(times, settled(duhem, inputs)[:, None])[0][:, 0]
+    measured = Measurements.of(inputs, outputs + 0.01 * np.ptp(outputs) * rng.standard_normal(1500))
+    found = select(measured, ("duhem",), in_time=HeldOutInTime(measured, times, inputs.size))
+    timed = [each for each in found.evaluations if each.candidate.static]
+    assert sorted(each.candidate.options["degree"] for each in timed) == [3, 5, 7]
+    assert {each.candidate.initial for each in timed} == {"skip"}
+    assert found.chosen.candidate.options["degree"] == 7
 
 
 def test_of_few_rows_times_are_not_tried_unless_asked_for():

@@ -110,6 +110,78 @@ def test_first_rows_that_alone_reach_an_end_of_the_range_are_not_left_out():
     assert error(found.chosen.candidate, inputs, outputs, others, truth) < 0.05 * np.ptp(truth)
 
 
+def test_an_equation_whose_fit_leaves_only_noise_is_chosen_although_a_block_left_out_extrapolates():
+    """The lower half is swept once, by one block."""
+    inputs = through([-1.0, 1.0, 0.75, 0.82, 0.15, 0.27, 0.06], 60)
+    _, _, others, truth = records("duhem", 10)
+    outputs = settled(duhem, inputs)
+    outputs += 0.01 * np.ptp(outputs) * np.random.default_rng(4).standard_normal(60)
+    found = select(Measurements.of(inputs, outputs), ("duhem", "generalized-prandtl-ishlinskii", "polynomial-plays"))
+    simplest = simplest_near_best([each for each in found.evaluations if each.units])[1]
+    assert found.chosen.candidate.model == "duhem"
+    assert found.chosen.uncorrelated
+    assert found.chosen.rms > 2.0 * found.best.rms
+    chosen, other = (error(each.candidate, inputs, outputs, others, truth) for each in (found.chosen, simplest))
+    assert chosen < 0.7 * other
+
+
+def one_way(plant, seed):
+    """Return a record that rises and falls by a small part of it, and others without noise in its range."""
+    rng = np.random.default_rng(seed)
+    low, high = rng.uniform(-1.0, 0.0), rng.uniform(0.3, 1.0)
+    inputs = through([low, high, high - (high - low) * rng.uniform(0.02, 0.3)], 60)
+    others = 0.5 * (high + low) + 0.5 * (high - low) * random_reversals(rng, 600, 30)
+    outputs = settled(ALL[plant], np.append([1.0, -1.0, low], inputs))[3:]
+    noise = 0.01 * np.ptp(outputs) * rng.standard_normal(60)
+    return inputs, outputs + noise, others, settled(ALL[plant], others)
+
+
+def wrong(candidate, inputs, outputs, others, truth):
+    """Return the standard deviation of the errors on other inputs, % of their range."""
+    found = identify(
+        candidate.model, inputs, outputs, initial=candidate.initial, orientation=candidate.orientation,
+        smoothing=candidate.smoothing, ridge=None if candidate.smoothing is None else 0.0, **candidate.options,
+    )  # fmt: skip
+    return 100.0 * float(np.std(truth - found.model.evaluate(others)) / np.ptp(truth))
+
+
+def test_of_a_record_that_goes_one_way_signs_and_smoothness_say_how_it_goes_on():
+    record = one_way("jiles-atherton", 5)
+    found = select(Measurements.of(*record[:2]), ("preisach", "generalized-prandtl-ishlinskii", "polynomial"))
+    chosen = found.chosen.candidate
+    assert (chosen.model, chosen.options["reversible"], chosen.smoothing) == ("preisach", "none", 1.0)
+    plays = next(each.candidate for each in found.evaluations if each.candidate.model.startswith("generalized"))
+    assert wrong(chosen, *record) < 0.7 * wrong(plays, *record)
+    assert any("reverses only once" in text for text in found.warnings())
+    # One that comes back all the way says so itself.
+    inputs = through([-1.0, 1.0, -1.0], 60)
+    outputs = settled(ALL["jiles-atherton"], inputs)
+    back = select(Measurements.of(inputs, outputs), ("preisach", "generalized-prandtl-ishlinskii", "polynomial"))
+    assert back.chosen.candidate.smoothing != 1.0
+
+
+@pytest.mark.seeds
+def test_records_that_go_one_way_are_answered_better_than_by_plays_or_a_line(capsys):
+    tried = {
+        "chosen": None,
+        "plays with an envelope": Candidate("generalized-prandtl-ishlinskii"),
+        "a line": Candidate("polynomial", {"degree": 1}, "auto"),
+    }
+    errors = {name: [] for name in tried}
+    for plant in PLANTS:
+        for seed in range(20, 26):
+            record = one_way(plant, seed)
+            chosen = select(Measurements.of(*record[:2]), tuple(identifiable_models())).chosen.candidate
+            for name, candidate in tried.items():
+                errors[name].append(wrong(candidate or chosen, *record))
+    means = {name: float(np.exp(np.mean(np.log(each)))) for name, each in errors.items()}
+    with capsys.disabled():
+        print(f"\ngeometric means of {len(errors['chosen'])} records, % of the range, and greatest")
+        for name, mean in means.items():
+            print(f"{name}: {mean:.1f}, {max(errors[name]):.1f}")
+    assert means["chosen"] < min(mean for name, mean in means.items() if name != "chosen")
+
+
 @pytest.mark.seeds
 @pytest.mark.parametrize("plant", ALL)
 @pytest.mark.parametrize("seed", [10, 11])
