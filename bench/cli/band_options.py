@@ -57,6 +57,8 @@ def print_examined(found: Examined, name: str = "", *, bands: bool = True) -> No
     """Print what was estimated of a session, and the band unless it is unwanted; `name` is that of the model."""
     from bench.results.recalibrations import session_rows
 
+    for text in found.warnings():
+        warn(f"{name}: {text}" if name else text)
     if found.recalibration is not None:
         rows = session_rows(found.recalibration, found.predicted.size, found.units)
         errors = found.errors()

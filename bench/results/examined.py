@@ -19,6 +19,9 @@ from bench.results.times import bind_times
 
 Floats = npt.NDArray[np.float64]
 
+# Fewer rows hardly have first ones; these are a tenth of all, and err so many times more than the others.
+_FEWEST, _FIRST_PART, _MUCH = 100, 10, 3.0
+
 
 @dataclass(frozen=True)
 class Examined:
@@ -56,6 +59,20 @@ class Examined:
         """Return the errors over the rows that count. There must be measurements."""
         assert self.measured is not None
         return measure_errors(self.measured[self.first :], self.predicted[self.first :])
+
+    def warnings(self) -> list[str]:
+        """Return a sentence if the largest errors stand in the first rows, which follow what nobody recorded."""
+        errors = np.abs(np.empty(0) if self.residuals is None else self.residuals)
+        first = errors.size // _FIRST_PART
+        if errors.size < _FEWEST or not errors[:first].max() > _MUCH * (largest := float(errors[first:].max())):
+            return []
+        last = self.first + int(np.flatnonzero(errors[:first] > largest)[-1]) + 1
+        unit = self.units[1]
+        return [
+            f"the largest errors stand in the first {last} rows ({errors.max():.4g} {unit}".rstrip()
+            + f"; {largest:.4g} {unit}".rstrip()
+            + f" in the others), where what came before the file still matters: --skip {last} leaves them out"
+        ]
 
     def to_json(self) -> dict[str, Any]:
         """Return `recalibration` and `band` for programs, those that there are."""

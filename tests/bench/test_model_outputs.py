@@ -313,3 +313,23 @@ class TestCard:
         assert sha256_of(loop) == card["Data"]["SHA-256"][0]
         with pytest.raises(DataError, match=r"model card .* cannot be written"):
             write_card(tmp_path / "none" / "card.md", found, loop, command="bench", model=None, figures=[])
+
+
+@pytest.mark.parametrize("command", ["predict", "compare"])
+def test_errors_that_stand_in_the_first_rows_are_told_with_the_option_that_leaves_them_out(
+    bench, loop, models, tmp_path, command
+):
+    rows = loop.read_text(encoding="utf-8").splitlines()
+    for row in range(1, 5):
+        time, voltage, displacement = rows[row].split(",")
+        rows[row] = f"{time},{voltage},{float(displacement) + 10.0 - row}"
+    moved = tmp_path / "moved.csv"
+    moved.write_text("\n".join(rows), encoding="utf-8")
+    for file, skip, is_told in ((moved, 0, True), (moved, 4, False), (loop, 0, False)):
+        given = {"predict": (models["preisach"], file), "compare": (models["preisach"], "--data", file)}[command]
+        out = ("--out", tmp_path / "rows.csv", "--skip", skip)
+        code, _, err = bench(command, *given, *COLUMNS, *out)
+        assert code == 0, err
+        text = " ".join(err.split())
+        assert ("largest errors stand in the first 4 rows" in text) is is_told
+        assert ("--skip 4 leaves them out" in text) is is_told

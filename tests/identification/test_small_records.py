@@ -160,6 +160,14 @@ def test_of_a_record_that_goes_one_way_signs_and_smoothness_say_how_it_goes_on()
     assert back.chosen.candidate.smoothing != 1.0
 
 
+def test_a_curve_without_memory_that_is_gone_one_way_remains_one():
+    rng = np.random.default_rng(0)
+    inputs = through([-0.4, 0.8, 0.6], 60)
+    outputs = inputs + 0.5 * inputs**3
+    found = select(Measurements.of(inputs, outputs + 0.01 * rng.standard_normal(60)), ("preisach", "polynomial"))
+    assert found.chosen.candidate.model == "polynomial"
+
+
 @pytest.mark.seeds
 def test_records_that_go_one_way_are_answered_better_than_by_plays_or_a_line(capsys):
     tried = {
