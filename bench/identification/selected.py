@@ -96,7 +96,7 @@ class Selection:
             remedy = (
                 "no model with drift or creep does better on rows left out; --model hammerstein --dynamics drift "
                 "has the drift in any case"
-                if self.has_times and self.is_time_asked
+                if self.has_times
                 else "give --time COLUMN, so that models with drift and creep take part"
             )
             found.append(
