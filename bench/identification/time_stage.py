@@ -104,13 +104,19 @@ class TimeStage:
         if plays and not self.in_time.has_one_rate():
             works.append(_Work(PLAYS, self.in_time.evaluate_plays, plays[0]))
         found, failed = self._carry_out(works)
-        if found and self.may_skip:
+        if self.may_skip:
             # Without time, a lag hides what memory the record begins with.
-            work, least = min(found, key=lambda one: one[1].rms)
-            if least.candidate.initial != "skip":
-                more, failed_too = self._carry_out([work._replace(operator=_changed(work.operator, initial="skip"))])
-                found, failed = found + more, failed + failed_too
+            more, failed_too = self._carry_out([_from_later(work) for work in self._tried_again(works, found)])
+            found, failed = found + more, failed + failed_too
         return [one for _, one in found], failed
+
+    def _tried_again(self, works: Sequence[_Work], found: Sequence[tuple[_Work, Evaluation]]) -> list[_Work]:
+        """Return what is tried without first rows too: the best, and at one rate what has signs and needed no lag."""
+        again = [min(found, key=lambda one: one[1].rms)[0]] if found else []
+        if self.in_time.has_one_rate():
+            followed = [work for work, _ in found]
+            again += [work for work in works if work not in followed and has_signs(work.operator)]
+        return [work for work in again if work.operator.candidate.initial != "skip"]
 
     def _tried(self, operators: Sequence[Evaluation]) -> list[Evaluation]:
         """Return the operators to which time is added: the first, the best of another model, and those beside."""
@@ -177,6 +183,11 @@ class TimeStage:
         assert template is not None
         operator: Operator[Any] = template(self.measured.inputs, **candidate.options)
         return operator
+
+
+def _from_later(work: _Work) -> _Work:
+    """Return a work with an operator that leaves first rows out."""
+    return work._replace(operator=_changed(work.operator, initial="skip"))
 
 
 def _changed(each: Evaluation, **settings: Any) -> Evaluation:  # noqa: ANN401 - those of a candidate
