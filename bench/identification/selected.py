@@ -67,6 +67,8 @@ class Selection:
         Whether they did as the others; see `Given`.
     has_one_rate : bool
         Whether times are known and the input moves at one speed only.
+    is_swept_once : bool
+        Whether the input hardly goes both ways.
     """
 
     evaluations: tuple[Evaluation, ...]
@@ -81,6 +83,7 @@ class Selection:
     has_times: bool = False
     is_time_asked: bool = True
     has_one_rate: bool = False
+    is_swept_once: bool = False
 
     def warnings(self) -> list[str]:
         """Return what the held-out errors say against the chosen model, in sentences."""
@@ -109,10 +112,12 @@ class Selection:
                 "errors at other rates are unknown; record slower and faster cycles"
             )
         if not chosen.units and self.has_one_kind:
+            preferred = (
+                "planes with the greatest smoothing" if self.is_swept_once else "models that the record determines"
+            )
             found.append(
                 "the input does not vary its amplitude, so that the error on inputs of other amplitudes is unknown; "
-                "models that the record determines were preferred: record smaller cycles too, as `bench design` "
-                "proposes"
+                f"{preferred} were preferred: record smaller cycles too, as `bench design` proposes"
             )
         elif not chosen.units:
             found.append(

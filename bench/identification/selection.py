@@ -414,6 +414,7 @@ class _Search:
             self.in_time is not None,
             self.given.is_time_asked,
             self.in_time is not None and self.in_time.has_one_rate(),
+            self._is_swept_once,
         )
 
     def _decide(self, finalists: list[Evaluation]) -> tuple[Evaluation, Evaluation]:

@@ -153,6 +153,7 @@ def test_of_a_record_that_goes_one_way_signs_and_smoothness_say_how_it_goes_on()
     plays = next(each.candidate for each in found.evaluations if each.candidate.model.startswith("generalized"))
     assert wrong(chosen, *record) < 0.7 * wrong(plays, *record)
     assert any("reverses only once" in text for text in found.warnings())
+    assert any("planes with the greatest smoothing were preferred" in text for text in found.warnings())
     # One that comes back all the way says so itself.
     inputs = through([-1.0, 1.0, -1.0], 60)
     outputs = settled(ALL["jiles-atherton"], inputs)
