@@ -50,6 +50,9 @@ from bench.identification.time_stage import Carry, InTime, Task, TimeStage, is_s
 SMOOTHING = (0.0, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 """Weights of the roughness penalty that are tried."""
 
+# That of a fine plane which is compared for the first time.
+_SOME = 1e-2
+
 # A candidate that errs so many times more than the best on the first folds is given up.
 _HOPELESS = 3.0
 # Part of the range of the outputs below which an error is one of rounding.
@@ -240,7 +243,7 @@ class _Search:
                 weights: list[float | None] = [sized.smoothing]
                 # A fine plane without any smoothing may fail where the same plane with some does not.
                 if self._is_smoothed(kind) and step:
-                    weights.append(1e-2)
+                    weights.append(_SOME)
                 tries = [replace(sized, smoothing=weight) for weight in weights]
                 limit = float("inf") if self._is_told_by_fit(kind) else hopeless
                 tasks.append((kind.model, partial(evaluate, self.measured, tries, hopeless=limit)))
@@ -599,7 +602,10 @@ class _Search:
                 memories = (None, *skipping, *(() if self._may_skip else ("positive",)))
         weight: float | None = 0.0
         if self._has_plane[kind]:
-            weight = 0.0 if self.given.smoothing is None and spec.constrained else self.given.smoothing
+            weight = self.given.smoothing
+            if weight is None and spec.constrained:
+                is_too_fine = kind.steps == 1 and self._count(kind, 0) > int(self.measured.tested.sum())
+                weight = _SOME if is_too_fine else 0.0
         return [
             Candidate(kind.model, kind.options(0), orientation, initial, weight)
             for orientation, initial in product(orientations, memories)

@@ -93,6 +93,14 @@ def test_a_plane_that_is_asked_for_does_not_make_it_worse(plant):
     assert ratio(plant, 10, PLANES, {"levels": 20, "reversible": "linear"}) <= MOST
 
 
+def test_a_fine_plane_that_is_asked_for_is_tried_with_some_smoothing_from_the_start():
+    """Without any, that of the right orientation errs by four times the range and was given up."""
+    inputs, outputs, others, truth = records("bouc-wen", 15)
+    found = select(Measurements.of(inputs, outputs), ("preisach",), Given({"levels": 40}))
+    assert found.chosen.candidate.orientation == "falling"
+    assert error(found.chosen.candidate, inputs, outputs, others, truth) < 0.03 * np.ptp(truth)
+
+
 def test_first_rows_that_alone_reach_an_end_of_the_range_are_not_left_out():
     # The lower half is swept once, before the memory is known.
     inputs = through([-1.0, 1.0, 0.1, 0.9, 0.2, 1.0, 0.1, 0.8, 0.3, 0.9], 60)
