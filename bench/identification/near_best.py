@@ -130,8 +130,8 @@ def best_memory(tries: Sequence[Evaluation], *, prefers_skip: bool = False, skip
     that is wrong by less than the noise shows in no error, but bends an equation; a few rows less cost their part of
     what it knows.
     """
-    limit = min((each.rms for each in tries if each.candidate.initial != "skip"), default=float("inf"))
     if not prefers_skip:
+        limit = min((each.rms for each in tries if each.candidate.initial != "skip"), default=float("inf"))
         tries = [each for each in tries if each.candidate.initial != "skip" or skip_gains * each.rms <= limit]
     least = min(each.rms for each in tries)
     near = [each for each in tries if each.rms <= EQUAL * least]

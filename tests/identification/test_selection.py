@@ -331,14 +331,17 @@ def test_times_that_were_not_asked_for_must_gain():
     assert both.chosen.candidate.static is not None
 
 
+def with_a_drift(plant, seed):
+    """Return a record whose outputs drift by 5 % of their range, and what evaluates models with time."""
+    inputs, outputs, _, _ = mixed(lambda path: settled(plant, path), seed)
+    drift = 0.05 * np.ptp(settled(plant, inputs)) * np.linspace(0.0, 1.0, inputs.size)
+    measured = Measurements.of(inputs, outputs + drift)
+    return measured, HeldOutInTime(measured, 0.01 * np.arange(inputs.size), inputs.size)
+
+
 def test_a_drift_is_taken_unasked_where_the_errors_show_it():
     """Unlike a lag it is no hysteresis; of less than a fifth of the error, too."""
-    rng = np.random.default_rng(1)
-    inputs = [random_reversals(rng, 1500, turns) for turns in (60, 40)][1]
-    outputs = settled(jiles_atherton, inputs)
-    outputs += np.ptp(outputs) * (0.01 * rng.standard_normal(1500) + 0.05 * np.linspace(0.0, 1.0, 1500))
-    measured = Measurements.of(inputs, outputs)
-    in_time = HeldOutInTime(measured, 0.01 * np.arange(inputs.size), inputs.size)
+    measured, in_time = with_a_drift(jiles_atherton, 1)
     models = ("generalized-prandtl-ishlinskii",)
     plain = select(measured, models)
     found = select(measured, models, Given(is_time_asked=False), in_time=in_time)
@@ -373,12 +376,7 @@ def test_of_few_rows_times_are_not_tried_unless_asked_for():
 
 def test_a_drift_does_not_hide_an_equation_behind_a_finer_plane():
     """40 levels take the drift for hysteresis; with times the equation is tried as well."""
-    rng = np.random.default_rng(2)
-    inputs = [random_reversals(rng, 1500, turns) for turns in (60, 40)][1]
-    outputs = settled(bouc_wen, inputs)
-    outputs += np.ptp(outputs) * (0.01 * rng.standard_normal(1500) + 0.05 * np.linspace(0.0, 1.0, 1500))
-    measured = Measurements.of(inputs, outputs)
-    in_time = HeldOutInTime(measured, 0.01 * np.arange(inputs.size), inputs.size)
+    measured, in_time = with_a_drift(bouc_wen, 2)
     models = ("bouc-wen", "preisach", "preisach-nonmonotonic")
     plain, found = select(measured, models), select(measured, models, in_time=in_time)
     assert plain.chosen.candidate.model == "preisach"

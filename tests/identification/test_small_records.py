@@ -25,15 +25,19 @@ def records(plant, seed):
     return few, outputs + 0.01 * np.ptp(outputs) * rng.standard_normal(60), others, truth
 
 
-def error(candidate: Candidate, inputs, outputs, others, truth):
-    """Return the RMS error on other inputs, from where their memory no longer depends on what came before."""
+def fitted(candidate: Candidate, inputs, outputs):
+    """Return the model of a candidate."""
     known = Measurements.of(inputs, outputs).known if candidate.initial == "skip" else 0
-    found = identify(
+    return identify(
         candidate.model, inputs, outputs, skip=known, initial=candidate.initial, orientation=candidate.orientation,
         smoothing=candidate.smoothing, ridge=None if candidate.smoothing is None else 0.0, **candidate.options,
-    )  # fmt: skip
+    ).model  # fmt: skip
+
+
+def error(candidate: Candidate, inputs, outputs, others, truth):
+    """Return the RMS error on other inputs, from where their memory no longer depends on what came before."""
     after = Measurements.of(others, truth).known
-    return float(np.sqrt(np.mean((truth - found.model.evaluate(others))[after:] ** 2)))
+    return float(np.sqrt(np.mean((truth - fitted(candidate, inputs, outputs).evaluate(others))[after:] ** 2)))
 
 
 def ratio(plant, seed, models, options):
@@ -109,8 +113,7 @@ def test_first_rows_that_alone_reach_an_end_of_the_range_are_not_left_out():
     measured = Measurements.of(inputs, outputs)
     assert not measured.covers_its_range()
     # What no row may be fitted to reaches beyond in any case.
-    fitted = inputs >= 0.09
-    assert replace(measured, fitted=fitted).covers_its_range()
+    assert replace(measured, fitted=inputs >= 0.09).covers_its_range()
     found = select(measured, ("duhem", "polynomial-plays"))
     assert "skip" not in {each.candidate.initial for each in found.evaluations}
     left_out = replace(found.chosen.candidate, initial="skip")
@@ -146,11 +149,7 @@ def one_way(plant, seed):
 
 def wrong(candidate, inputs, outputs, others, truth):
     """Return the standard deviation of the errors on other inputs, % of their range."""
-    found = identify(
-        candidate.model, inputs, outputs, initial=candidate.initial, orientation=candidate.orientation,
-        smoothing=candidate.smoothing, ridge=None if candidate.smoothing is None else 0.0, **candidate.options,
-    )  # fmt: skip
-    return 100.0 * float(np.std(truth - found.model.evaluate(others)) / np.ptp(truth))
+    return 100.0 * float(np.std(truth - fitted(candidate, inputs, outputs).evaluate(others)) / np.ptp(truth))
 
 
 def test_of_a_record_that_goes_one_way_signs_and_smoothness_say_how_it_goes_on():
