@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 from bisect import bisect_left
+from collections import Counter
 from contextlib import closing, contextmanager
 from itertools import accumulate, chain, groupby
 from pathlib import Path
@@ -26,6 +27,7 @@ import rigs  # noqa: F401
 import sim_devices  # noqa: F401
 
 sys.path.append(str(Path(__file__).parent))
+from programs import PROGRAMS, how_to_install, missing
 from regression_bands import RECORDED_SEED, beyond_the_bands
 from warm_popen import WarmPopen
 
@@ -97,6 +99,82 @@ def pytest_collection_modifyitems(config, items):
     for worker in reversed(range(workers)):
         modules.insert(places[worker] + (worker > 0), studies[worker::workers])
     items[:] = chain.from_iterable(modules)
+
+
+def pytest_addoption(parser):
+    parser.addoption("--no-skips", action="store_true", help="fail if a test is skipped")
+
+
+class Skips:
+    """What the tests that were skipped lack: the last line of a run, and its exit code with `--no-skips`."""
+
+    def __init__(self):
+        self.reasons = Counter()
+
+    def pytest_runtest_logreport(self, report):
+        if report.skipped and not hasattr(report, "wasxfail"):
+            self.reasons[report.longrepr[2].removeprefix("Skipped: ")] += 1
+
+    @pytest.hookimpl(tryfirst=True)
+    def pytest_sessionfinish(self, session):
+        if self.reasons and session.config.getoption("no_skips") and not session.exitstatus:
+            session.exitstatus = pytest.ExitCode.TESTS_FAILED
+
+    @pytest.hookimpl(trylast=True)
+    def pytest_unconfigure(self):
+        if self.reasons:
+            lacking = {name: program for name, program in missing().items() if _reason(name) in self.reasons}
+            skipped = ", ".join(f"{count} ({reason})" for reason, count in sorted(self.reasons.items()))
+            print(f"skipped: {skipped}." + (f" To run them: {how_to_install(lacking)}" if lacking else ""))
+
+
+def pytest_configure(config):
+    # The process that reports, which with several workers runs no test itself.
+    if "PYTEST_XDIST_WORKER" not in os.environ:
+        config.pluginmanager.register(Skips())
+
+
+def _reason(name):
+    return f"needs the Debian package {PROGRAMS[name].packages.replace(' ', ' and ')}"
+
+
+def _installed(name):
+    """Return the path of a program; skip the test if it is not installed."""
+    if (path := PROGRAMS[name].find()) is None:
+        pytest.skip(_reason(name))
+    return path
+
+
+@pytest.fixture(scope="session")
+def mbpoll():
+    """Call mbpoll, an independent Modbus client; return the completed process."""
+    program = _installed("mbpoll")
+
+    def call(*arguments):
+        command = [program, *map(str, arguments)]
+        return subprocess.run(command, capture_output=True, text=True, timeout=240, check=False)
+
+    return call
+
+
+@pytest.fixture(scope="session")
+def vulkan():
+    """A Vulkan driver, with which Rerun's viewer draws without a screen."""
+    return _installed("vulkan")
+
+
+# While playwright is open, the thread has an event loop, and other modules start their own.
+@pytest.fixture(scope="module")
+def browser():
+    """Chromium, which draws by the processor."""
+    program = _installed("chromium")
+    from playwright.sync_api import sync_playwright
+
+    options = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+    with sync_playwright() as tools:
+        opened = tools.chromium.launch(executable_path=program, args=options)
+        yield opened
+        opened.close()
 
 
 @contextmanager

@@ -101,7 +101,6 @@ META = {
 }
 CONTROL_COLOURS = {"output": (236, 100, 46), "error": (150, 156, 166), "disturbance": (30, 170, 170)}
 _STYLE = ("radii", "colors", "draw_order", "names", "widths", "values", "markers", "marker_sizes")
-VULKAN = Path("/usr/share/vulkan/icd.d")
 # Stopping a thread of Rerun takes long only when a viewer hangs.
 PATIENCE = 60.0
 
@@ -1046,12 +1045,7 @@ def test_a_picture_needs_a_recording(tmp_path: Path) -> None:
         picture(tmp_path / "none.rrd", tmp_path / "none.png")
 
 
-NEEDS_VULKAN = pytest.mark.skipif(
-    not [*VULKAN.glob("lvp_icd*.json")], reason="needs the packages mesa-vulkan-drivers and libvulkan1"
-)
-
-
-@NEEDS_VULKAN
+@pytest.mark.usefixtures("vulkan")
 def test_the_viewer_draws_it_without_complaint(
     tmp_path: Path, rebuilt: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -1076,7 +1070,7 @@ def test_the_viewer_draws_it_without_complaint(
     assert ((abs(middle[300:] - (22, 168, 150))).sum(axis=2) < 60).sum() > 200
 
 
-@NEEDS_VULKAN
+@pytest.mark.usefixtures("vulkan")
 @pytest.mark.seeds
 def test_the_viewer_draws_a_control_run_without_complaint(tmp_path: Path, control_folder: Path) -> None:
     png = tmp_path / "dashboard.png"
@@ -1090,7 +1084,7 @@ def test_the_viewer_draws_a_control_run_without_complaint(tmp_path: Path, contro
     assert heights["output"].mean() < heights["error"].mean() < heights["disturbance"].mean()
 
 
-@NEEDS_VULKAN
+@pytest.mark.usefixtures("vulkan")
 @pytest.mark.seeds
 def test_the_viewer_shows_three_loops_and_two_planes_at_once(tmp_path: Path, muscle: Path) -> None:
     png = tmp_path / "dashboard.png"

@@ -1,7 +1,6 @@
 """The page of a run, opened in a browser: it holds all that the record says, and asks for nothing from anywhere."""
 
 import io
-import shutil
 from pathlib import Path
 
 import pytest
@@ -12,18 +11,6 @@ from bench.face import identify
 from bench.journal import add_model
 from bench.results.published import Published
 from bench.results.report import PAGE_NAME, report_run
-
-sync_api = pytest.importorskip("playwright.sync_api")
-CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-
-
-@pytest.fixture(scope="module")
-def browser():
-    assert CHROMIUM, "no Chromium is installed: apt-get install chromium"
-    with sync_api.sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox"])
-        yield browser
-        browser.close()
 
 
 @pytest.fixture(scope="module")

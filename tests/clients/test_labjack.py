@@ -8,7 +8,6 @@ import struct
 import pytest
 from pymodbus.client import AsyncModbusTcpClient, ModbusTcpClient
 from served import PATIENCE, address
-from test_load_cell import mbpoll, needs_mbpoll
 
 AIN0, DAC0, FIO0, TEST, SERIAL = 0, 1000, 2000, 55100, 60028
 TEST_REQUEST = bytes.fromhex("0000 0000 0006 01 03 d73c 0002")
@@ -90,21 +89,17 @@ def test_asyncio_reads_at_the_same_time(place):
     assert asyncio.run(read()) == {(0x0011, 0x2233)}
 
 
-@needs_mbpoll
-def test_mbpoll_reads(place):
-    code, output = mbpoll(
-        "-m", "tcp", "-p", place[1], "-0", "-r", TEST, "-t", "4:hex", "-c", 2, "-1", "-o", 10, place[0]
-    )
-    assert code == 0, output
-    assert re.findall(r"0x([0-9A-F]{4})", output) == ["0011", "2233"]
+def test_mbpoll_reads(place, mbpoll):
+    polled = mbpoll("-m", "tcp", "-p", place[1], "-0", "-r", TEST, "-t", "4:hex", "-c", 2, "-1", "-o", 10, place[0])
+    assert polled.returncode == 0, polled.stderr
+    assert re.findall(r"0x([0-9A-F]{4})", polled.stdout) == ["0011", "2233"]
 
 
-@needs_mbpoll
-def test_mbpoll_writes(place, client):
-    code, output = mbpoll(
+def test_mbpoll_writes(place, client, mbpoll):
+    polled = mbpoll(
         "-m", "tcp", "-p", place[1], "-0", "-r", DAC0, "-t", "4:float", "-B", "-1", "-o", 10, place[0], 1.25
     )
-    assert code == 0, output
+    assert polled.returncode == 0, polled.stderr
     assert real(client, DAC0) == 1.25
 
 

@@ -2,8 +2,6 @@
 
 import asyncio
 import re
-import shutil
-import subprocess
 
 import pytest
 from pymodbus.client import AsyncModbusSerialClient, ModbusSerialClient
@@ -31,21 +29,6 @@ def hang(sma):
 
 
 SERIAL = ("-m", "rtu", "-a", 1, "-b", 38_400, "-P", "none", "-0", "-B", "-1", "-o", 10)
-
-
-def mbpoll(*arguments):
-    """Call mbpoll; return exit code and output."""
-    finished = subprocess.run(
-        [shutil.which("mbpoll"), *map(str, arguments)],
-        capture_output=True,
-        text=True,
-        timeout=2 * PATIENCE,
-        check=False,
-    )
-    return finished.returncode, finished.stdout + finished.stderr
-
-
-needs_mbpoll = pytest.mark.skipif(not shutil.which("mbpoll"), reason="needs the program mbpoll")
 
 
 @pytest.fixture
@@ -86,19 +69,17 @@ def test_minimalmodbus_opens_the_line_again_after_half_a_frame(minimal):
     assert minimal().read_long(IDENTITY) == 1410
 
 
-@needs_mbpoll
-def test_mbpoll_weighs(port, hang):
+def test_mbpoll_weighs(port, hang, mbpoll):
     hang(4.0)
-    code, output = mbpoll(*SERIAL, "-r", GROSS, "-t", "4:float", port)
-    assert code == 0, output
-    shown = re.search(rf"\[{GROSS}\]:\s+(\S+)", output)
+    polled = mbpoll(*SERIAL, "-r", GROSS, "-t", "4:float", port)
+    assert polled.returncode == 0, polled.stderr
+    shown = re.search(rf"\[{GROSS}\]:\s+(\S+)", polled.stdout)
     assert float(shown[1]) == pytest.approx(4.0, abs=0.2)
 
 
-@needs_mbpoll
-def test_mbpoll_writes(port, minimal):
-    code, output = mbpoll(*SERIAL, "-r", MOTION_TIME, "-t", "4:int", port, 900)
-    assert code == 0, output
+def test_mbpoll_writes(port, minimal, mbpoll):
+    polled = mbpoll(*SERIAL, "-r", MOTION_TIME, "-t", "4:int", port, 900)
+    assert polled.returncode == 0, polled.stderr
     cell = minimal()
     assert cell.read_long(MOTION_TIME) == 900
     cell.write_long(MOTION_TIME, 1000)

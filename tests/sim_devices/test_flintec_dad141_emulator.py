@@ -1,7 +1,6 @@
 """The emulated DAD 141.1: its registers, its filter and motion detection, its wire, and independent clients."""
 
 import math
-import shutil
 import struct
 import subprocess
 import sys
@@ -621,7 +620,6 @@ def test_a_defect_of_the_instrument_is_a_device_failure(caplog):
 
 
 needs_pty = pytest.mark.skipif(sys.platform == "win32", reason="needs pseudo-terminals")
-needs_mbpoll = pytest.mark.skipif(shutil.which("mbpoll") is None, reason="needs the Debian package mbpoll")
 
 
 @needs_pty
@@ -650,35 +648,33 @@ def test_minimalmodbus(pseudo_terminal):
             client.serial.close()
 
 
-def mbpoll(path: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-    command = ["mbpoll", "-m", "rtu", "-b", "115200", "-P", "none", "-a", "7", "-0", "-1", "-q", "-o", "5"]
-    return subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=60, check=False)
-
-
 def values(result: subprocess.CompletedProcess[str]) -> list[str]:
     assert result.returncode == 0, result.stderr
     return [line.split()[-1] for line in result.stdout.splitlines() if line.startswith("[")]
 
 
 @needs_pty
-@needs_mbpoll
-def test_mbpoll(pseudo_terminal):
+def test_mbpoll(pseudo_terminal, mbpoll):
     cell = vector_cell()
+
+    def poll(*arguments: str) -> subprocess.CompletedProcess[str]:
+        return mbpoll("-m", "rtu", "-b", "115200", "-P", "none", "-a", "7", "-0", "-1", "-q", "-o", "5", *arguments)
+
     with pseudo_terminal(ModbusRtuServer(cell, 7)) as path:
-        both = mbpoll(path, "-t", "4:float", "-B", "-r", str(0x2000), "-c", "2", path)
+        both = poll("-t", "4:float", "-B", "-r", str(0x2000), "-c", "2", path)
         assert [float(each) for each in values(both)] == [12.0, 11.5]
-        assert values(mbpoll(path, "-t", "3:hex", "-r", str(0x3500), "-c", "5", path)) == [
+        assert values(poll("-t", "3:hex", "-r", str(0x3500), "-c", "5", path)) == [
             "0x4140",
             "0x0000",
             "0x4138",
             "0x0000",
             "0x0030",
         ]
-        assert values(mbpoll(path, "-t", "4:int", "-B", "-r", str(0x2020), path)) == ["12000"]
-        assert mbpoll(path, "-t", "4", "-r", str(0x2061), path, "8").returncode == 0
+        assert values(poll("-t", "4:int", "-B", "-r", str(0x2020), path)) == ["12000"]
+        assert poll("-t", "4", "-r", str(0x2061), path, "8").returncode == 0
         assert cell.floats(0x2002) == [0.0]
-        assert mbpoll(path, "-t", "4:int", "-B", "-r", str(0x2106), path, "6").returncode == 0
+        assert poll("-t", "4:int", "-B", "-r", str(0x2106), path, "6").returncode == 0
         assert cell.integer(0x2106) == 6
-        refusal = mbpoll(path, "-t", "4", "-r", str(0x2004), path)
+        refusal = poll("-t", "4", "-r", str(0x2004), path)
         assert refusal.returncode != 0
         assert "illegal data address" in refusal.stderr.lower()

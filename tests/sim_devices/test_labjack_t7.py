@@ -1,10 +1,8 @@
 """The emulated T7: its register map, its converter, its watchdog, its wire, and independent clients."""
 
 import math
-import shutil
 import socket
 import struct
-import subprocess
 import threading
 from collections.abc import Callable, Iterator
 from itertools import pairwise
@@ -993,40 +991,34 @@ def test_pymodbus_as_it_is(served):
         client.close()
 
 
-def mbpoll(port: int, *arguments: str) -> subprocess.CompletedProcess[str]:
-    command = ["mbpoll", "-m", "tcp", "-p", str(port), "-a", "1", "-0", "-1", "-q", "-o", "5"]
-    return subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=60, check=False)
+@pytest.fixture
+def poll(served, mbpoll):
+    """Call mbpoll on the served T7; return the completed process."""
+    options = ["-m", "tcp", "-p", served[1].port, "-a", "1", "-0", "-1", "-q", "-o", "5"]
+    return lambda *arguments: mbpoll(*options, *arguments)
 
 
-needs_mbpoll = pytest.mark.skipif(shutil.which("mbpoll") is None, reason="needs the Debian package mbpoll")
-
-
-@needs_mbpoll
-def test_mbpoll_reads(served):
-    _, server = served
-    result = mbpoll(server.port, "-t", "4:float", "-B", "-r", "0", "-c", "2", "127.0.0.1")
+def test_mbpoll_reads(poll):
+    result = poll("-t", "4:float", "-B", "-r", "0", "-c", "2", "127.0.0.1")
     assert result.returncode == 0, result.stderr
     values = [float(line.split()[-1]) for line in result.stdout.splitlines() if line.startswith("[")]
     assert values == pytest.approx([2.5, -0.75], abs=LSB)
-    result = mbpoll(server.port, "-t", "4:hex", "-r", "55100", "-c", "2", "127.0.0.1")
+    result = poll("-t", "4:hex", "-r", "55100", "-c", "2", "127.0.0.1")
     assert [line.split()[-1] for line in result.stdout.splitlines() if line.startswith("[")] == [
         "0x0011",
         "0x2233",
     ]
 
 
-@needs_mbpoll
-def test_mbpoll_writes(served):
-    t7, server = served
-    result = mbpoll(server.port, "-t", "4:float", "-B", "-r", "1002", "127.0.0.1", "1.5")
+def test_mbpoll_writes(served, poll):
+    t7, _ = served
+    result = poll("-t", "4:float", "-B", "-r", "1002", "127.0.0.1", "1.5")
     assert result.returncode == 0, result.stderr
     assert t7.dac_volts(1) == pytest.approx(1.5, abs=DAC_STEP / 2)
 
 
-@needs_mbpoll
-def test_mbpoll_is_refused(served):
-    _, server = served
-    result = mbpoll(server.port, "-t", "4:float", "-B", "-r", "40000", "127.0.0.1", "5.0")
+def test_mbpoll_is_refused(poll):
+    result = poll("-t", "4:float", "-B", "-r", "40000", "127.0.0.1", "5.0")
     assert result.returncode != 0
     assert "failure" in result.stderr.lower()
 
