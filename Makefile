@@ -3,26 +3,39 @@
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
+# Written when something is done: base, extras of the demo and packages of the tests are installed, the kernels of the
+# demo are compiled, and the tests are collected.
+BASE := $(VENV)/.base
+DEMO := $(VENV)/.demo
 SETUP := $(VENV)/.set-up
+KERNELS := $(VENV)/.kernels
 COLLECTED := $(VENV)/.collected
 # Many tests wait for another process: one worker more than cores.
 WORKERS ?= $(shell expr $$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2) + 1)
 PYTEST := $(BIN)/python -m pytest --ignore tests/benchmarks --numprocesses $(WORKERS) --dist worksteal
-# Beside the compilation of the kernels runs mypy, and then the first collection of the tests.
+# Two at once: the kernels are compiled, and then mypy runs, beside what waits for the network and the disk.
 MAKEFLAGS += --jobs=2
 # Without files of byte code each worker and each process of the tests compiles every module again.
 unexport PYTHONDONTWRITEBYTECODE
+# Most of the modules that are installed are never imported: pip need not compile them all.
+ifneq ($(shell command -v uv 2>/dev/null),)
+INSTALL := uv pip install --quiet --python $(BIN)/python
+else
+INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
+endif
+INSTALL += --constraint constraints.txt
 
-.PHONY: demo demo-sma demo-muscles demo-hybrid test-quick test test-all check lint types
-.PHONY: kernels tests all-tests benchmark busy busy-study kill-safe interlock-times fault-matrix journal-faults journal-kills
+.PHONY: demo demo-sma demo-muscles demo-hybrid test-quick test test-all preflight check lint types
+.PHONY: kernels tests all-tests benchmark busy busy-study kill-safe interlock-times fault-matrix journal-faults
+.PHONY: journal-kills
 .PHONY: docs mutants studies resume-trials twin-trials clean
 
-# The emulated VO2 laboratory: characterization, identification and validation, on the virtual clock.
-demo: $(SETUP)
+# The emulated VO2 laboratory: characterization, identification, validation and tracking, on the virtual clock.
+demo: $(DEMO) $(KERNELS)
 	$(BIN)/bench reproduce vo2 --out recordings
 
 # The other laboratories likewise.
-demo-sma demo-muscles demo-hybrid: demo-%: $(SETUP)
+demo-sma demo-muscles demo-hybrid: demo-%: $(DEMO)
 	$(BIN)/bench reproduce $* --out recordings
 
 # Under a minute: numbers, contracts and drivers.
@@ -31,10 +44,14 @@ test-quick: lint
 		tests/hysteresis tests/identification tests/control tests/contracts tests/drivers
 
 # Everything, the first seed of each study.
-test: check tests
+test: preflight check tests
 
 # Everything, all seeds.
-test-all: check all-tests
+test-all: preflight check all-tests
+
+# What the tests cannot install themselves, said before anything else.
+preflight:
+	@$(PYTHON) tests/programs.py
 
 check: lint types
 
@@ -47,8 +64,8 @@ types: lint
 	$(BIN)/mypy
 
 # Compiled once, before the workers of the tests would each do it.
-kernels: lint
-	$(BIN)/python -P tests/compile_kernels.py
+kernels: $(BASE)
+	$(BIN)/python -P tests/kernels.py
 
 # So are the modules of the tests, with what pytest makes of their assertions; what is wrong with one of them is said
 # when the tests run.
@@ -127,9 +144,22 @@ pictures: $(SETUP)
 clean:
 	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache
 
-$(SETUP): pyproject.toml constraints.txt
+$(BASE): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt setuptools
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt \
-		--no-build-isolation --editable '.[dev]'
-	touch $(SETUP)
+	$(INSTALL) setuptools
+	$(INSTALL) --no-build-isolation --editable .
+	touch $@
+
+# The project itself is installed by now: these add what its extras need.
+$(DEMO): $(BASE)
+	$(INSTALL) 'actuator-bench[dashboard,report]'
+	touch $@
+
+$(SETUP): $(DEMO)
+	$(INSTALL) 'actuator-bench[dev]'
+	touch $@
+
+# Once, beside the second half of the installation; afterwards `bench reproduce` compiles what has changed.
+$(KERNELS): $(BASE)
+	@$(BIN)/python -P -c "from rich.console import Console; from bench.studies import prepare; prepare('vo2', Console())"
+	touch $@

@@ -1,13 +1,93 @@
-"""Printing of texts as they are."""
+"""Printing of texts as they are, and of tables that fit the terminal without cutting a word or a number."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from rich.table import Column, Table
+from rich.text import Text
+
 if TYPE_CHECKING:
-    from rich.console import Console
+    from rich.console import Console, RenderableType
+
+_INDENT = "    "
 
 
 def print_plain(console: Console, text: str) -> None:
     """Print a text on one line of any length, such as a path or a name of the user's own: no markup, no colours."""
     console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+
+def show_table(console: Console, table: Table) -> None:
+    """Print a table.
+
+    Texts are wrapped between words. Where the terminal is too narrow even for that, each row becomes a block: its
+    first cell, and below it a line for each other cell that is not empty, with the head of its column. Such lines are
+    as long as they are, so that what is copied from them is whole.
+
+    Parameters
+    ----------
+    console : Console
+        Where to print.
+    table : Table
+        Its cells are texts, plain or with markup.
+    """
+    columns = [[_text(console, cell) for cell in column.cells] for column in table.columns]
+    heads = [_text(console, column.header) for column in table.columns] if table.show_header else []
+    measured = [[head, *cells] for head, cells in zip(heads, columns, strict=True)] if heads else columns
+    whole = [max((_longest_line(text) for text in texts), default=0) for texts in measured]
+    least = [
+        length if column.no_wrap else max((_longest_word(text) for text in texts), default=0)
+        for column, texts, length in zip(table.columns, measured, whole, strict=True)
+    ]
+    room = console.width - _beside_texts(table)
+    if sum(whole) > room >= sum(least):
+        for column, width in zip(table.columns, _widths(least, whole, room), strict=True):
+            column.width = width
+    if sum(least) <= room:
+        console.print(table)
+        return
+    if table.title:
+        console.print(table.title, highlight=False, soft_wrap=True, style="table.title")
+    for row in zip(*columns, strict=True):
+        _print_block(console, [head.plain for head in heads], row, table.columns)
+
+
+def _print_block(console: Console, heads: Sequence[str], row: Sequence[Text], columns: Sequence[Column]) -> None:
+    name, *others = row
+    if name.plain.strip():
+        console.print(name, style="bold", highlight=False, soft_wrap=True)
+    for i, (text, column) in enumerate(zip(others, columns[1:], strict=True), 1):
+        if text.plain.strip():
+            head = f"{heads[i]}: " if heads and heads[i] else ""
+            line = Text.assemble(_INDENT, head, text)
+            console.print(line, style=column.style, highlight=False, soft_wrap=True)
+
+
+def _text(console: Console, cell: RenderableType) -> Text:
+    return cell if isinstance(cell, Text) else console.render_str(str(cell), highlight=False)
+
+
+def _longest_line(text: Text) -> int:
+    return max((line.cell_len for line in text.split()), default=0)
+
+
+def _longest_word(text: Text) -> int:
+    return max((Text(word).cell_len for word in text.plain.split()), default=0)
+
+
+def _beside_texts(table: Table) -> int:
+    """Return the columns of the terminal that padding and lines of a table take."""
+    _, right, _, left = table.padding
+    count = len(table.columns)
+    return count * (left + right) + (0 if table.box is None else count + 1)
+
+
+def _widths(least: Sequence[int], whole: Sequence[int], room: int) -> list[int]:
+    """Return widths that fill the room, the narrow columns first, none below its least."""
+    widths = list(least)
+    for _ in range(room - sum(least)):
+        i = min((i for i, width in enumerate(widths) if width < whole[i]), key=widths.__getitem__)
+        widths[i] += 1
+    return widths

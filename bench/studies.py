@@ -23,7 +23,7 @@ from bench.clock import Stopwatch
 from bench.errors import BenchError, ConfigurationError, DataError
 from bench.extras import MissingExtraError, check_extra
 from bench.journal import Record, add_model
-from bench.printing import print_plain
+from bench.printing import print_plain, show_table
 from bench.protocol import find_protocol
 from bench.results.published import Published
 from bench.results.tracking import TargetResults, target_results
@@ -37,6 +37,12 @@ P = ParamSpec("P")
 
 _TELLING = 20
 """Longest setting that is part of a run's name, characters."""
+_KERNELS = (
+    "bench.hysteresis._kernels",
+    "bench.identification._kernels",
+    "bench.identification._factor_kernels",
+)
+"""Kernels of the identification of a Preisach operator, which every study takes."""
 _OF_RUNS = "bench.compilation_display", "bench.runs"
 """Modules that every run takes."""
 _OF_RESULTS = "matplotlib.figure", "bench.dashboard"
@@ -222,13 +228,13 @@ class ResultTable:
     note: str = ""
 
     def print(self, values: Mapping[str, Any], console: Console) -> None:
-        """Print it, with the first column aligned left and all others right."""
-        table = Table(title=self.title.format_map(values), title_justify="left")
+        """Print it, with the first column aligned left and all others right; heads are folded before cells."""
+        table = Table(title=self.title.format_map(values), title_justify="left", box=None)
         for i, column in enumerate(self.columns):
-            table.add_column(column, justify="left" if i == 0 else "right", overflow="fold")
+            table.add_column(column, justify="left" if i == 0 else "right", no_wrap=i == 0)
         for row in self.rows:
             table.add_row(*(cell.format_map(values) for cell in row))
-        console.print(table)
+        show_table(console, table)
         if self.note:
             console.print(self.note.format_map(values), highlight=False)
 
@@ -253,11 +259,14 @@ class StudyResult:
         Results for people, in the order in which they are printed.
     figures : tuple of Path
         Files that were drawn.
+    verdict : tuple of str
+        A line for each part of the study, its main number beside the paper's; format strings as in the tables.
     """
 
     values: Mapping[str, Any]
     tables: tuple[ResultTable, ...]
     figures: tuple[Path, ...]
+    verdict: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -276,6 +285,9 @@ class Study:
         Runs the protocols of a campaign and evaluates them. Raises `BenchError` if a run did not complete.
     published : tuple of Published
         What papers state of the rig, for the pages of its runs.
+    kernels : tuple of str
+        Further packages whose kernels its runs take, those of its laboratories among them; see
+        `bench.compiled.kernels_of`.
     """
 
     rig: str | None
@@ -283,6 +295,24 @@ class Study:
     description: str
     carry_out: Callable[[Campaign], StudyResult]
     published: tuple[Published, ...] = ()
+    kernels: tuple[str, ...] = ()
+
+    @property
+    def all_kernels(self) -> tuple[str, ...]:
+        """Packages of all kernels that its runs and identifications take."""
+        return (*_KERNELS, *self.kernels)
+
+
+def prepare(name: str, console: Console) -> None:
+    """Compile the kernels of a study, as `reproduce` does before its first run.
+
+    Raises ConfigurationError if there is no such study.
+    """
+    # Here, as numba is slow to load.
+    from bench.compilation_display import compile_kernels
+
+    study: Study = registry.load("studies", name)
+    compile_kernels(study.all_kernels, console)
 
 
 def published_of(run: Path) -> tuple[Published, ...]:
@@ -367,7 +397,7 @@ def reproduce(
 
     stopwatch = Stopwatch()
     folder = out / f"reproduce-{name}-seed-{seed}"
-    with Workers(1 if live else workers, console, name, _OF_RUNS, _OF_RESULTS) as pool:
+    with Workers(1 if live else workers, console, name, _OF_RUNS, _OF_RESULTS, study.all_kernels) as pool:
         # Not before: a worker process loads its modules meanwhile.
         from bench.compilation_display import CompilationDisplay
 
@@ -386,7 +416,8 @@ def reproduce(
     }
     for table in found.tables:
         table.print(values, console)
-    _print_end(values, console)
+        console.print()
+    _print_end(found.verdict, values, console)
     return values
 
 
@@ -407,16 +438,9 @@ def true_errors(errors: npt.NDArray[np.float64]) -> dict[str, float]:
     return {"true_max": float(np.abs(errors).max()), "true_rms": float(np.sqrt(np.mean(errors**2)))}
 
 
-def _print_end(values: Mapping[str, Any], console: Console) -> None:
+def _print_end(verdict: Sequence[str], values: Mapping[str, Any], console: Console) -> None:
     laboratory, wall = values["laboratory_seconds"], values["wall_seconds"]
-    console.print(
-        f"{laboratory / 3600:.1f} h of laboratory time in {wall:.1f} s: {laboratory / wall:.0f} times as fast",
-        highlight=False,
-    )
-    print_plain(console, f"runs, models and recordings: {values['folder']}")
-    for folder in dict.fromkeys(str(Path(path).parent) for path in values["figures"]):
-        print_plain(console, f"figures: {folder}")
-    if values["recordings"]:
-        console.print("open a recording with `rerun FILE`:", highlight=False)
-    for path in values["recordings"]:
-        print_plain(console, f"  {path}")
+    time = f"time: {laboratory / 3600:.1f} h of laboratory time in {wall:.1f} s (paper: not stated)"
+    for line in (*(line.format_map(values) for line in verdict), time):
+        print_plain(console, line)
+    print_plain(console, f"next: `bench runs {values['folder']}` lists the runs; figures and recordings are there")

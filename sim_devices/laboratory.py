@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from types import MappingProxyType
-from typing import TypeVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -23,8 +22,6 @@ from sim_devices.faults.line import AnswerFault, FaultyLine, FaultySerial, Fault
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC
 from sim_devices.wire import TcpServer, WireServer
 from sim_devices.world import World
-
-T = TypeVar("T")
 
 _HOUR = 3600.0
 _STREAM = 0xFA17
@@ -79,6 +76,9 @@ class EmulatedLaboratory:
 
     Attributes
     ----------
+    kernels : tuple of str
+        Packages of the compiled loops of its plant and instruments, see `bench.compiled.kernels_of`. They are ready
+        when it is made: a driver must not wait for an answer while its instrument compiles.
     faults : mapping of str to Fault
         What can go wrong, by name: `FAULT`, or `INSTRUMENT.FAULT`.
     lines : mapping of str to FaultyLine
@@ -86,6 +86,8 @@ class EmulatedLaboratory:
     events : list of FaultEvent
         The faults that have happened.
     """
+
+    kernels: ClassVar[tuple[str, ...]] = ()
 
     def __init__(
         self,
@@ -98,6 +100,12 @@ class EmulatedLaboratory:
         faults: Mapping[str, Fault] = MappingProxyType({}),
         seed: int = 0,
     ) -> None:
+        if self.kernels:
+            # Here, as numba is slow to load.
+            from bench.compiled import kernels_of
+
+            for kernel in kernels_of(self.kernels):
+                kernel.prepare()
         self.world = world
         self.instruments = instruments
         self.events: list[FaultEvent] = []
@@ -277,14 +285,6 @@ class EmulatedLaboratory:
     def close(self) -> None:
         """Switch the instruments off; those of another laboratory stay as they are."""
         self._opened.close()
-
-
-def compile_loops(plant: T, use: Callable[[T], object]) -> None:
-    """Use a copy of a plant once, so that its compiled loops are ready before a driver waits for an answer.
-
-    `use` does all that the instruments do with it, and advances it by a step of its grid at least.
-    """
-    use(copy.deepcopy(plant))
 
 
 def _nothing() -> None:

@@ -345,17 +345,27 @@ def bench(capsys):
 @pytest.fixture
 def reproduce(bench, tmp_path):
     """Run a study with a seed in `tmp_path`, without complaint; return its standard output and its result."""
+    from kernels import OWN
+
+    from bench.compiled import kernels_of
     from bench.journal import Record
     from bench.model_file import models_among
+    from bench.registry import load
+
+    def loaded():
+        return {kernel.py_func for kernel in kernels_of(OWN) if kernel.overloads}
 
     def run(study, seed):
-        result = tmp_path / "result.json"
+        result, before = tmp_path / "result.json", loaded()
         # One worker: the tests themselves go on beside each other.
         code, out, err = bench(
             "reproduce", study, "--seed", seed, "--workers", 1, "--out", tmp_path, "--json", result
         )
         assert code == 0
         assert err == ""
+        # They are compiled before worker processes start, which would compile any other one once more each.
+        named = {kernel.py_func for kernel in kernels_of(load("studies", study).all_kernels)}
+        assert {kernel.__module__ for kernel in loaded() - before - named} == set()
         campaign = json.loads(result.read_text())
         assert campaign["seed"] == seed
         assert all(Path(path).stat().st_size > 1000 for path in campaign["figures"] + campaign["recordings"])

@@ -21,6 +21,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from bench import registry
+from bench.compiled import kernels_of
 from bench.protocol.discovery import packaged_protocols
 
 # Nothing that reads the width of the terminal or the entry points when it is imported.
@@ -130,10 +131,10 @@ def main():
     """Fork for each request."""
     for name in LIBRARIES:
         importlib.import_module(name)
-    # The first use of a kernel sets numba up, and each process would load those of its laboratory.
-    uses = runpy.run_path(str(Path(__file__).with_name("compile_kernels.py")))
-    uses["operators"]()
-    uses["laboratories"]()
+    # Otherwise each process would load those that it takes.
+    packages = runpy.run_path(str(Path(__file__).with_name("kernels.py")))["OWN"]
+    for kernel in kernels_of(packages):
+        kernel.prepare()
     packaged_protocols()
     # The pages of what is never collected stay shared.
     gc.freeze()

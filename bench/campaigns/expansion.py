@@ -82,12 +82,15 @@ class Expansion:
         By the name of a task its planned laboratory time and that on the wall clock, s; those that are known.
     units : mapping of (str, str) to str
         Unit of a parameter, by the table of runs and its name.
+    kernels : tuple of str
+        Packages whose kernels the tasks take, but for those of laboratories, which are compiled by now.
     """
 
     tasks: Mapping[str, Task]
     varying: Mapping[str, tuple[str, ...]]
     plans: Mapping[str, tuple[float, float]]
     units: Mapping[tuple[str, str], str]
+    kernels: tuple[str, ...]
 
     def estimate(self, names: Sequence[str]) -> Estimate:
         """Return what these tasks will take."""
@@ -122,6 +125,7 @@ class _Expander:
         self._found_plans: dict[str, tuple[float, float]] = {}
         self._varying: dict[str, tuple[str, ...]] = {}
         self._units: dict[tuple[str, str], str] = {}
+        self._kernels = ["bench.hysteresis", "bench.identification", "bench.transients"]
 
     def expansion(self) -> Expansion:
         """Return all tasks, those of runs in an order in which their models come before them."""
@@ -145,7 +149,7 @@ class _Expander:
                 f"{file.path}: {len(self._tasks)} runs, models and studies; expected at most twice most_runs = "
                 f"{file.most_runs}"
             )
-        return Expansion(self._tasks, self._varying, self._found_plans, self._units)
+        return Expansion(self._tasks, self._varying, self._found_plans, self._units, tuple(self._kernels))
 
     def _check_number(self) -> None:
         """Check the number of runs before any list of them is made."""
@@ -463,6 +467,7 @@ class _Expander:
             used = rig or study.rig
             known = self._rig(where, used, {}).digest if used else ""
             identity = digest({"code": code_digest(), "study": table.name, "rig": known, "seed": seed})
+            self._kernels += study.all_kernels
             values = {"rig": Path(rig).stem, "seed": seed}
             varying = ["rig"] * (len(table.rigs) > 1) + ["seed"]
             self._add(StudyTask(_name(table.name, values, varying, identity), identity, table.name, given, seed))

@@ -103,7 +103,8 @@ def campaign(
 
             executor = stack.enter_context(ClusterExecutor(scheduler, folder, console))
         else:
-            executor = WorkersExecutor(stack.enter_context(Workers(workers, console, file.stem)), folder)
+            pool = Workers(workers, console, file.stem, kernels=expansion.kernels)
+            executor = WorkersExecutor(stack.enter_context(pool), folder)
         if not console.is_terminal:
             left = len(expansion.tasks) - len(before.done)
             executor = stack.enter_context(SayingExecutor(executor, left, console))

@@ -14,10 +14,9 @@ from bench.cli.console import JsonOption, check_outputs, console, show_compilati
 from bench.cli.data_options import layout_options, print_assumptions
 from bench.cli.models import InitialOption
 from bench.cli.patience import show_patience
-from bench.cli.tables import show_table
 from bench.cli.written import print_figures, write_rows
 from bench.errors import ConfigurationError
-from bench.printing import print_plain
+from bench.printing import print_plain, show_table
 from bench.results.reading.options import ReadingOptions
 
 if TYPE_CHECKING:

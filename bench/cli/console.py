@@ -16,8 +16,8 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from bench.cli.tables import show_table
 from bench.errors import BenchError, ConfigurationError, DataError
+from bench.printing import show_table
 
 console = Console()
 error_console = Console(stderr=True)

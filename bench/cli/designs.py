@@ -11,8 +11,8 @@ from rich.table import Table
 from bench.cli.console import JsonOption, check_outputs, console, print_rows, show_compilation, write_json
 from bench.cli.data_options import layout_options
 from bench.cli.patience import show_patience
-from bench.cli.tables import show_table
 from bench.errors import ConfigurationError
+from bench.printing import show_table
 from bench.results.reading.options import ReadingOptions
 
 if TYPE_CHECKING:

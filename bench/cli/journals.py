@@ -11,9 +11,8 @@ import typer
 from rich.table import Table
 
 from bench.cli.console import JsonOption, check_outputs, console, write_json
-from bench.cli.tables import show_table
 from bench.errors import RecordError
-from bench.printing import print_plain
+from bench.printing import print_plain, show_table
 
 app = typer.Typer()
 

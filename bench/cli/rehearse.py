@@ -19,7 +19,7 @@ from bench.cli.console import (
     show_compilation,
     write_json,
 )
-from bench.cli.tables import show_table
+from bench.printing import show_table
 
 if TYPE_CHECKING:
     from bench.rehearsal import Extremes, Rehearsal

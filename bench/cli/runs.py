@@ -28,9 +28,8 @@ from bench.cli.console import (
 )
 from bench.cli.model_options import inverse_of, options_json, print_model, print_models
 from bench.cli.rehearse import show_rehearsal
-from bench.cli.tables import show_table
 from bench.errors import BenchError, ConfigurationError
-from bench.printing import print_plain
+from bench.printing import print_plain, show_table
 
 if TYPE_CHECKING:
     from bench.runs import RunResult

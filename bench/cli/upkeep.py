@@ -13,8 +13,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from bench.cli.console import JsonOption, console, parse_assignments, show_compilation, warn, write_json
-from bench.cli.tables import show_table
 from bench.errors import AbortError, ConfigurationError, DeviceError
+from bench.printing import show_table
 
 app = typer.Typer()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.compiled import inner, kernel
+from bench.compiled import Fixed, inner, kernel
 from bench.hysteresis import _kernels as memory
 
 Floats = NDArray[np.float64]
@@ -46,7 +46,7 @@ def _tabulate(levels: Floats, density: Floats, table: Floats, below: Floats) -> 
 @kernel
 def adapt(
     axis: memory.Axis,
-    old_density: Floats,
+    old_density: Fixed,
     bias: float,
     terms: memory.Terms,
     start: memory.Start,

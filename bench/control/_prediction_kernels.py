@@ -7,22 +7,22 @@ import math
 from numpy import int64
 from numpy.typing import NDArray
 
-from bench.compiled import kernel
+from bench.compiled import Table, kernel
 from bench.hysteresis._checks import Floats
 
 
 @kernel
 def drive(
     start: Floats,
-    setpoints: Floats,
+    setpoints: Table,
     source: NDArray[int64],
-    steps: Floats,
+    steps: Table,
     order: int,
     most: float,
     remains: float,
     power: float,
-    positions: Floats,
-    seen: Floats,
+    positions: Table,
+    seen: Table,
 ) -> tuple[float, float, float]:
     """Write what the drive does, and what the specimen sees of it, after each step; return the last state.
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.compiled import inlined, inner, kernel
+from bench.compiled import IntegerTable, Table, inlined, inner, kernel
 from bench.hysteresis import _kernels as memory
 
 Floats = NDArray[np.float64]
@@ -346,10 +346,10 @@ def follow(
     start: memory.Start,
     raw: float,
     targets: Floats,
-    rooms: tuple[Floats, memory.Integers, Floats],
+    rooms: tuple[Table, IntegerTable, Floats],
     count: int,
     rising: bool,
-    found: Floats,
+    found: Table,
     met: Flags,
     steps: memory.Integers,
 ) -> int:

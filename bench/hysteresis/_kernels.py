@@ -17,15 +17,15 @@ import numpy as np
 from numba.extending import intrinsic
 from numpy.typing import NDArray
 
-from bench.compiled import inlined, inner, kernel
+from bench.compiled import Cube, Fixed, Table, inlined, inner, kernel
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 
 # What the loops share, as plain tuples: numba passes them at the cost of their members.
 Axis = tuple[Floats, float]  # levels and inverse step of a lattice
-Plane = tuple[Floats, float, Floats]  # levels, inverse step, table
-Terms = tuple[Floats, Floats]  # breaks and quadratics of the reversible part
+Plane = tuple[Floats, float, Cube]  # levels, inverse step, table
+Terms = tuple[Floats, Table]  # breaks and quadratics of the reversible part
 Start = tuple[Floats, Floats, float]  # left edges and heights of the pieces, and the input within the plane
 Pieces = tuple[Floats, Floats, Floats, Integers, Integers]  # left, height, mass_left, column, row
 Entries = tuple[NDArray[np.int32], Floats]  # cells and changes
@@ -490,7 +490,7 @@ def difference_product(starts: Integers, cells: NDArray[np.int32], changes: Floa
 
 
 @kernel
-def dense_rows(starts: Integers, cells: NDArray[np.int32], changes: Floats, base: Floats, result: Floats) -> None:
+def dense_rows(starts: Integers, cells: NDArray[np.int32], changes: Floats, base: Floats, result: Table) -> None:
     """Fill result[:, : base.size] with the rows themselves."""
     row = base.copy()
     for t in range(starts.size - 1):
@@ -533,7 +533,7 @@ def by_column(
 
 
 @kernel
-def best_staircases(columns: Floats, widths: Floats) -> Floats:
+def best_staircases(columns: Table, widths: Floats) -> Floats:
     """Return F[j, i]: the greatest mass below a non-increasing staircase over columns < j, heights >= i.
 
     columns[i, j] is the mass per unit width of column j below level i; -inf marks i <= j.
@@ -550,7 +550,7 @@ def best_staircases(columns: Floats, widths: Floats) -> Floats:
 
 
 @kernel
-def plays(drive: Floats, thresholds: Floats, state: Floats) -> Floats:
+def plays(drive: Floats, thresholds: Fixed, state: Floats) -> Floats:
     """Step the plays through `drive`; return their states sample by sample. `state` is changed."""
     result = np.empty((drive.size, state.size))
     for t in range(drive.size):
@@ -562,7 +562,7 @@ def plays(drive: Floats, thresholds: Floats, state: Floats) -> Floats:
 
 
 @kernel
-def weighted_plays(drive: Floats, thresholds: Floats, weights: Floats, state: Floats) -> Floats:
+def weighted_plays(drive: Floats, thresholds: Fixed, weights: Fixed, state: Floats) -> Floats:
     """Step the plays through `drive`; return their weighted sum. `state` is changed."""
     result = np.empty(drive.size)
     for t in range(drive.size):

@@ -55,12 +55,6 @@ def _pointer_type(typing_context: Any, address: Any) -> Any:  # noqa: ANN401, AR
 pointer: Any = intrinsic(_pointer_type)
 
 
-def entry(function: Any) -> Step:  # noqa: ANN401 - numba ships no types
-    """Return a compiled step as a plain function of address and number, without numba's look at the arguments."""
-    compiled: Step = function.compile((types.int64, types.float64))
-    return compiled
-
-
 @inlined
 def _words(address: int) -> Words:
     return carray(pointer(address), WORD_COUNT, np.int64)

@@ -198,9 +198,9 @@ class ElementStream(AddressedStream[ElementState]):
 @cache
 def _compiled(name: str) -> Step:
     from bench.hysteresis import _element_stream_kernels as kernels
-    from bench.hysteresis._stream_kernels import entry
 
-    return entry(getattr(kernels, name))
+    step: Step = getattr(kernels, name).prepare()
+    return step
 
 
 def checked_coefficients(values: ArrayLike, count: int) -> Floats:

@@ -224,7 +224,8 @@ def compiled_step(name: str) -> Step:
     """Return a compiled step of `_stream_kernels` as a plain function of address and number."""
     from bench.hysteresis import _stream_kernels as kernels
 
-    return kernels.entry(getattr(kernels, name))
+    step: Step = getattr(kernels, name).prepare()
+    return step
 
 
 def address_of(array: np.ndarray[Any, Any]) -> int:

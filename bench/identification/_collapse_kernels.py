@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.compiled import inner, kernel
+from bench.compiled import Cube, Table, inner, kernel
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -129,7 +129,7 @@ def quadrature(
 
 @kernel
 def collapse_runs(
-    values: Floats, w: Floats, firsts: Integers, travel: Floats, allowed: Floats
+    values: Table, w: Floats, firsts: Integers, travel: Floats, allowed: Floats
 ) -> tuple[Integers, Floats, Floats, Floats, Floats]:
     """Return for each run the number of its nodes, these, their weights and values, and what is left of all values.
 
@@ -158,11 +158,11 @@ def collapsed_rows(
     starts: Integers,
     cells: Rows,
     changes: Floats,
-    values: Floats,
+    values: Table,
     w: Floats,
     firsts: Integers,
     travel: Floats,
-    found: tuple[Integers, Floats, Floats, Floats],
+    found: tuple[Integers, Table, Table, Cube],
 ) -> tuple[Integers, Rows, Floats, Floats, Floats]:
     """Return starts, cells, changes, values and weights of the rows: nodes, and one without weight at a run's end."""
     nodes, points, weights, at_nodes = found

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.compiled import inlined, inner, kernel, reordered
+from bench.compiled import Table, inlined, inner, kernel, reordered
 from bench.hysteresis._kernels import borrowed
 
 Floats = NDArray[np.float64]
@@ -43,7 +43,7 @@ def _four_rows(factor: Floats, c: int) -> tuple[Floats, Floats, Floats, Floats]:
 
 
 @reordered
-def solve_lower(factor: Floats, size: int, right: Floats) -> None:
+def solve_lower(factor: Floats, size: int, right: Table) -> None:
     """Replace each of a few right sides, the first `size` of a row, by the x with L x = right.
 
     Rows that are contiguous as a whole take a third of the time of those of a slice.
@@ -184,7 +184,7 @@ def products_of_columns(factor: Floats, size: int, first: Integers, second: Inte
 
 
 @kernel
-def factor_independent(lower: Floats, least: Floats, good: Flags) -> None:
+def factor_independent(lower: Table, least: Floats, good: Flags) -> None:
     """Replace the lower half of a symmetric matrix by its Cholesky factor, without columns of too small a pivot.
 
     `good` becomes False for columns whose pivot is below `least`; rows and columns of these mean nothing.

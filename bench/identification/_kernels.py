@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.compiled import kernel, reordered
+from bench.compiled import IntegerTable, Table, kernel, reordered
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
@@ -49,9 +49,7 @@ def moments(sparse: Columns, base: Floats, remaining: Floats) -> tuple[Floats, F
 
 
 @kernel
-def products(
-    sparse: Columns, norms: Floats, extra: Floats, weights: Floats, total: float, residual: Floats
-) -> Floats:
+def products(sparse: Columns, norms: Floats, extra: Table, weights: Floats, total: float, residual: Floats) -> Floats:
     """Return the product of each scaled, centred column with the weighted residual.
 
     `total` is the sum of the weights. The residual is taken about its mean, so that the columns' starting values drop
@@ -117,8 +115,8 @@ def gram_rows(
     weights: Floats,
     new: Integers,
     known: Integers,
-    tail: Floats,
-    result: Floats,
+    tail: Table,
+    result: Table,
 ) -> None:
     """Fill result[k, m] with the product of the scaled, centred columns new[k] and known[m].
 
@@ -179,7 +177,7 @@ def gram_rows(
 
 
 @kernel
-def crests(g: Floats, threshold: float, neighbours: Integers) -> Flags:
+def crests(g: Floats, threshold: float, neighbours: IntegerTable) -> Flags:
     """Return which values are at least a threshold and not below any of their neighbours.
 
     Row c of `neighbours`, shape (columns, 4), lists those of column c; -1 stands for none.

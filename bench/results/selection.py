@@ -231,7 +231,8 @@ def select_model(
         # A linear part needs the rows between.
         in_time = HeldOutInTime(whole, read_times(files.columns, time_column), measured.inputs.size)
     try:
-        with Workers(1 if few else None, console, "models") as workers:
+        kernels = ("bench.hysteresis", "bench.identification", "bench.timed")
+        with Workers(1 if few else None, console, "models", kernels=kernels) as workers:
             selection = select(measured, models, given, lambda tasks: _carry_out(workers, tasks), in_time)
     except ValueError as error:
         raise ConfigurationError(f"no model can be fitted: {error}") from None

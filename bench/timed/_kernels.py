@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.compiled import kernel
+from bench.compiled import Table, kernel
 from bench.hysteresis import _kernels as memory
 
 Floats = NDArray[np.float64]
@@ -14,13 +14,13 @@ Integers = NDArray[np.int64]
 
 @kernel
 def filtered(
-    columns: Floats,
+    columns: Table,
     steps: Floats,
     lag: float,
-    free: Floats,
+    free: Table,
     rows: Integers,
     offsets: Floats,
-    late: Floats,
+    late: Table,
     value: Floats,
     rate: Floats,
 ) -> Floats:
@@ -75,7 +75,7 @@ def filtered(
 
 
 @kernel
-def oscillate(inputs: Floats, steps: Floats, parameters: Floats, state: Floats, outputs: Floats) -> bool:
+def oscillate(inputs: Table, steps: Floats, parameters: Floats, state: Floats, outputs: Floats) -> bool:
     """Integrate m y'' + c y' + k y + z = u, z' = a y' - b |y'| z - d y' |z| by Runge and Kutta's method of order 4.
 
     Parameters
@@ -131,7 +131,7 @@ def oscillate(inputs: Floats, steps: Floats, parameters: Floats, state: Floats, 
 
 @kernel
 def oscillate_on_plane(
-    inputs: Floats,
+    inputs: Table,
     steps: Floats,
     parameters: Floats,
     plane: memory.Plane,
@@ -140,7 +140,7 @@ def oscillate_on_plane(
     pieces: memory.Pieces,
     count: int,
     state: Floats,
-    outputs: Floats,
+    outputs: Table,
 ) -> tuple[int, bool]:
     """Integrate m y'' + c y' + F[y] = u, F a Preisach operator, by the leapfrog method (Störmer and Verlet).
 

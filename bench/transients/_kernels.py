@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.compiled import inner, kernel
+from bench.compiled import Table, inner, kernel
 from bench.hysteresis._checks import Floats
 
 STATE_SIZE = 5
@@ -70,7 +70,9 @@ def hold_back(lagged: float, positions: Floats, seen: Floats, step: float, lag: 
     `lagged` is the state of the lag before the first.
     """
     if lag <= 0.0:
-        seen[:] = positions
+        # As a loop: numba takes 2 s to compile the assignment of a slice.
+        for k in range(positions.size):
+            seen[k] = positions[k]
         return lagged
     remains = math.exp(-step / lag)
     for k in range(positions.size):
@@ -84,8 +86,8 @@ def hold_back(lagged: float, positions: Floats, seen: Floats, step: float, lag: 
 def follow(
     state: Floats,
     setpoints: Floats,
-    normals: Floats,
-    out: Floats,
+    normals: Table,
+    out: Table,
     step: float,
     frequency: float,
     damping: float,
@@ -122,7 +124,7 @@ def follow(
 
 
 @kernel
-def creep(slow: Floats, outputs: Floats, step: float, shares: Floats, times: Floats) -> None:
+def creep(slow: Floats, outputs: Table, step: float, shares: Floats, times: Floats) -> None:
     """Replace outputs by what they are with their slow parts, each a lag of first order; `slow` is their state."""
     for j in range(times.size):
         remains = math.exp(-step / times[j])
@@ -134,7 +136,7 @@ def creep(slow: Floats, outputs: Floats, step: float, shares: Floats, times: Flo
 
 
 @kernel
-def lag_behind(outputs: Floats, step: float, times: Floats, late: Floats) -> None:
+def lag_behind(outputs: Floats, step: float, times: Floats, late: Table) -> None:
     """Write outputs behind lags of first order, which begin at rest, to the rows of `late`, one for each time, s."""
     for j in range(times.size):
         remains = math.exp(-step / times[j])

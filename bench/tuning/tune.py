@@ -104,7 +104,8 @@ def tune(
     file = load_model(model).at_rest()
     task = task_of(file, controller, protocol)
     on = twin or load_rig(rig).rig.twin or rig
-    if not load_rig(on).in_process:
+    tuned_on = load_rig(on)
+    if not tuned_on.in_process:
         raise ConfigurationError(
             f"rig {on} is not emulated: give --twin, such as a rig file that bench twin has made"
         )
@@ -139,7 +140,8 @@ def tune(
             shown.print(begun, highlight=False, markup=False)
 
     # What each of many runs says of itself would hide what the search says.
-    with Workers(workers, title=f"tune {controller}") as pool:
+    kernels = ("bench.hysteresis", "bench.control", "bench.transients", *getattr(tuned_on.laboratory, "kernels", ()))
+    with Workers(workers, title=f"tune {controller}", kernels=kernels) as pool:
         runs = TuningRuns(task, on, file, folder, pool, given, seeds, time_weight=time_weight)
         best = search(begin, spec.tunable, runs, tell, rounds)
         if best.failed:

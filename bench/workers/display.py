@@ -42,6 +42,7 @@ class TasksDisplay:
         self._lines: dict[int, TaskID] = {}
         self._shares: dict[int, float] = {}
         self._tasks = self._finished = 0
+        self._said: set[str] = set()
 
     def start(self) -> None:
         """Begin to draw."""
@@ -83,7 +84,11 @@ class TasksDisplay:
             self._draw_whole()
 
     def say(self, text: str) -> None:
-        """Print above the lines."""
+        """Print above the lines what no task has said before."""
+        with self._lock:
+            if text in self._said:
+                return
+            self._said.add(text)
         print_plain(self._console, text)
 
     def _draw_whole(self) -> None:

@@ -134,6 +134,9 @@ class Workers:
     aside : tuple of str
         Modules that the tasks aside take. The worker that has these in front loads them when it has nothing else to
         do.
+    kernels : tuple of str
+        Packages whose kernels the tasks take, see `bench.compiled.kernels_of`. They are compiled in this process
+        before a worker process is started, which would compile them once more.
     """
 
     def __init__(
@@ -143,12 +146,14 @@ class Workers:
         title: str = "all",
         modules: tuple[str, ...] = (),
         aside: tuple[str, ...] = (),
+        kernels: tuple[str, ...] = (),
     ) -> None:
         self.number = available_cores() if number is None else number
         self.in_process = self.number == 1
         self._console = Console(quiet=True) if console is None else console
         self._display = TasksDisplay(self._console, title)
         self._modules, self._modules_aside = modules, aside
+        self._kernels = kernels
         self._ready: dict[int, _Worker] = {}
         self._changed = threading.Condition()
         self._tasks: list[Pending[Any]] = []
@@ -169,6 +174,7 @@ class Workers:
                     former = signal.signal(getattr(signal, name), self._interrupt)
                     self._stack.callback(signal.signal, getattr(signal, name), former)
         if not self.in_process:
+            self._compile()
             self._ready = {number: self._start_worker(number) for number in range(min(_AT_ONCE, self.number))}
         self._stack.enter_context(_one_thread())
         self._stack.enter_context(collecting_seldom())
@@ -191,6 +197,13 @@ class Workers:
                             task.result()
             finally:
                 self._close()
+
+    def _compile(self) -> None:
+        if self._kernels:
+            # Here, as numba is slow to load.
+            from bench.compilation_display import compile_kernels
+
+            compile_kernels(self._kernels, self._console)
 
     def submit(self, function: Callable[P, T], *arguments: P.args, **keywords: P.kwargs) -> Pending[T]:
         """Have a function called; its name is that of the task, see `submit_as`."""

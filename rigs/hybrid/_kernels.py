@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.compiled import inner, kernel
+from bench.compiled import Table, inner, kernel
 from bench.hysteresis._checks import Floats
 
 NETWORK = 13
@@ -130,7 +130,7 @@ def slope(rise: float, bending: Floats, slopes: Floats) -> float:
 
 
 @kernel
-def rise_for(wanted: float, table: Floats) -> float:
+def rise_for(wanted: float, table: Table) -> float:
     """Return the rise of the tip (K) for a deflection (m), at most that at the end of the table.
 
     `table`, shape (2, N), has increasing deflections (m) and their rises (K).
@@ -157,7 +157,7 @@ def next_current(
     network: Floats,
     bending: Floats,
     slopes: Floats,
-    table: Floats,
+    table: Table,
 ) -> tuple[float, float]:
     """Return the current of the coming period (A), and the heat that is fed back over time (W).
 

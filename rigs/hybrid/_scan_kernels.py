@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from bench.compiled import inner, kernel
+from bench.compiled import Table, inner, kernel
 from bench.hysteresis._checks import Floats
 from sim_devices.instruments._labjack_t7_kernels import converted
 from sim_devices.plants._hybrid_kernels import FACE, INCREMENT, NODES, deflection
@@ -43,7 +43,7 @@ def scan(
     elapsed: float,
     plant: Floats,
     n: Floats,
-    scales: Floats,
+    scales: Table,
     base_excitation: float,
     tip_excitation: float,
     displacement_normal: float,

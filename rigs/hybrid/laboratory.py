@@ -23,7 +23,7 @@ from sim_devices.faults.supply import ClippedPeltier
 from sim_devices.instruments.labjack_t7 import EmulatedT7
 from sim_devices.instruments.meerstetter_table import DeviceStatus
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC
-from sim_devices.laboratory import EmulatedLaboratory, TrueValue, compile_loops, tec_faults
+from sim_devices.laboratory import EmulatedLaboratory, TrueValue, tec_faults
 from sim_devices.plants.grid import changed
 from sim_devices.plants.hybrid import HybridCantilever
 from sim_devices.plants.hybrid_parameters import HybridParameters
@@ -110,15 +110,6 @@ class HybridLaboratorySettings(SensorSettings):
     fault_time: float = Field(default=0.0, ge=0, description="time of the fault, s of laboratory time")
 
 
-def _use(plant: HybridCantilever) -> float:
-    plant.advance(plant.parameters.step)
-    plant.apply(1.0)
-    plant.lead(1.0, 2.0, 1, 1e-6)
-    plant.advance(plant.parameters.step)
-    plant.terminals()
-    return plant.deflection
-
-
 class HybridLaboratory(EmulatedLaboratory):
     """A `bench.rig.Laboratory` with the instruments `tec` (serial, MeCom) and `t7` (Modbus TCP), and the `witness`.
 
@@ -133,6 +124,12 @@ class HybridLaboratory(EmulatedLaboratory):
     """
 
     Settings = HybridLaboratorySettings
+    kernels = (
+        "sim_devices.plants._hybrid_kernels",
+        "sim_devices.plants._voltage_course_kernels",
+        "sim_devices.transducers._imperfect_kernels",
+        "sim_devices.transducers._voltage_kernels",
+    )
 
     def __init__(self, settings: HybridLaboratorySettings, clock: Clock, seed: int) -> None:
         # One stream a source of noise: reading one instrument must not change the noise of another.
@@ -149,7 +146,6 @@ class HybridLaboratory(EmulatedLaboratory):
             ),
             plant,
         )
-        compile_loops(self.plant, _use)
         self.world = World(self.plant, clock)
         peltier = ClippedPeltier(self.plant.peltier)
         self.tec = EmulatedTEC("tec", self.world, peltier, rng=tec)

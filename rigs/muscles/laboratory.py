@@ -26,7 +26,7 @@ from sim_devices.instruments.flintec_dad141 import EmulatedDAD141
 from sim_devices.instruments.labjack_t7 import EmulatedT7
 from sim_devices.instruments.roboteq import EmulatedRoboteq
 from sim_devices.instruments.roboteq_objects import Fault as SupplyFault
-from sim_devices.laboratory import EmulatedLaboratory, TrueValue, compile_loops
+from sim_devices.laboratory import EmulatedLaboratory, TrueValue
 from sim_devices.plants.coiled_polymer import CoiledPolymerMuscle, CoiledPolymerParameters
 from sim_devices.plants.grid import GRID_TOLERANCE, Floats, changed
 from sim_devices.plants.mckibben import McKibbenMuscle, McKibbenParameters
@@ -66,6 +66,9 @@ FaultName = Literal[
     "heavy-load",
     "unplugged-sensor",
 ]
+
+
+_SENSOR_KERNELS = ("sim_devices.instruments._flintec_kernels", "sim_devices.transducers._imperfect_kernels")
 
 
 class MusclePlant(Protocol):
@@ -272,11 +275,6 @@ class ForceCourse:
         return self._muscle.since_point()
 
 
-def _use(muscle: MusclePlant) -> tuple[float, float]:
-    muscle.advance(muscle.parameters.step)
-    return muscle.position, muscle.force
-
-
 class MuscleLaboratory(EmulatedLaboratory):
     """A laboratory with the instruments `supply`, `load_cell`, `stage` (serial lines) and `t7` (TCP).
 
@@ -300,7 +298,6 @@ class MuscleLaboratory(EmulatedLaboratory):
         plant, supply, cell, sensor, t7 = np.random.default_rng(seed).spawn(5)
         self._settings = settings
         self.muscle = settings.make_muscle(plant)
-        compile_loops(self.muscle, _use)
         self.frame = Frame(self.muscle)
         self.world = World(self.frame, clock)
         self._load_is_forgotten = False
@@ -492,6 +489,7 @@ class SMALaboratory(MuscleLaboratory):
     """The laboratory with a shape-memory-alloy wire."""
 
     Settings = SMALaboratorySettings
+    kernels = ("sim_devices.plants._sma_kernels", *_SENSOR_KERNELS)
 
 
 class McKibbenLaboratorySettings(MuscleLaboratorySettings):
@@ -513,6 +511,7 @@ class McKibbenLaboratory(MuscleLaboratory):
     """
 
     Settings = McKibbenLaboratorySettings
+    kernels = ("sim_devices.plants._friction_kernels", *_SENSOR_KERNELS)
 
 
 class CoiledPolymerLaboratorySettings(_ThermalSettings):
@@ -529,3 +528,4 @@ class CoiledPolymerLaboratory(MuscleLaboratory):
     """The laboratory with a super-coiled polymer muscle."""
 
     Settings = CoiledPolymerLaboratorySettings
+    kernels = ("sim_devices.plants._friction_kernels", *_SENSOR_KERNELS)

@@ -23,6 +23,13 @@ TABLES = tuple(
 )
 
 
+VERDICT = tuple(
+    f"{part}, {title}: RMS {{{key}[{kind}][two_stage][rms]:.1f}} % of the range (paper: not stated)"
+    for key, (title, _) in MUSCLES.items()
+    for part, kind in (("identification", "lv"), ("validation", "verification"))
+)
+
+
 def carry_out(campaign: Campaign) -> StudyResult:
     """Characterize both muscles and identify the models.
 
@@ -36,7 +43,7 @@ def carry_out(campaign: Campaign) -> StudyResult:
         measured = characterize(part, runs[key])
         values[key] = measured.errors_json()
         figures += _draw(part, measured)
-    return StudyResult(values, TABLES, tuple(figures))
+    return StudyResult(values, TABLES, tuple(figures), VERDICT)
 
 
 STUDY = Study(
@@ -45,6 +52,12 @@ STUDY = Study(
     "Runs force-voltage, length-voltage, length-force and length-verification on the rigs mckibben and "
     "coiled-polymer, and identifies the models. The outlook of Zhang and Yip, 2017.",
     carry_out,
+    kernels=(
+        "bench.transients",
+        "sim_devices.plants._friction_kernels",
+        "sim_devices.instruments._flintec_kernels",
+        "sim_devices.transducers._imperfect_kernels",
+    ),
 )
 
 

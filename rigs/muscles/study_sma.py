@@ -83,10 +83,12 @@ CONTROL = {
     "length_4.9N": ControlSession("length under 4.90 N", _LENGTH, {"load": "4.9"}),
     "length_8.82N": ControlSession("length under 8.82 N", _LENGTH, {"load": "8.82"}),
     "length_changing_load": ControlSession(
-        f"length, load changes by {LOAD_CHANGE} N", _LENGTH, {"load": "4.9", "change": str(LOAD_CHANGE)}
+        "length, changing load", _LENGTH, {"load": "4.9", "change": str(LOAD_CHANGE)}
     ),
     "force": ControlSession("force, ends held", _FORCE, {}),
 }
+
+_LENGTH_RMS, _VERIFIED_RMS = (PAPER[kind, "two-stage"].partition(" / ")[2] for kind in ("lv", "verification"))
 
 TABLES = (
     errors_table("errors, average / RMS in % of the range", beside_paper=True),
@@ -121,6 +123,13 @@ TABLES = (
         "The errors above are those of the readings: repeatability. These are those of length and force behind the "
         "readings, of sensors with the systematic errors of their data sheets (docs/reference/sensors.md).",
     ),
+)
+
+
+VERDICT = (
+    f"identification: RMS {{lv[two_stage][rms]:.1f}} % of the range, two-stage (paper: {_LENGTH_RMS})",
+    f"validation: RMS {{verification[two_stage][rms]:.1f}} % of the range, two-stage (paper: {_VERIFIED_RMS})",
+    "tracking: RMS {control[length_4.9N][closed_loop_inverse][rms]:.3f} mm, length, closed loop (paper: not stated)",
 )
 
 
@@ -175,6 +184,7 @@ def carry_out(campaign: Campaign) -> StudyResult:
         },
         TABLES,
         tuple(figures),
+        VERDICT,
     )
 
 
@@ -198,6 +208,14 @@ STUDY = Study(
     "modeling of robotic artificial muscles with application to shape memory alloy actuators, 2017.",
     carry_out,
     PUBLISHED,
+    (
+        "bench.hysteresis._inverse_kernels",
+        "bench.hysteresis._stream_kernels",
+        "bench.transients",
+        "sim_devices.plants._sma_kernels",
+        "sim_devices.instruments._flintec_kernels",
+        "sim_devices.transducers._imperfect_kernels",
+    ),
 )
 
 

@@ -15,7 +15,7 @@ from sim_devices.faults.supply import ClippedPeltier
 from sim_devices.instruments.labjack_t7 import EmulatedT7
 from sim_devices.instruments.meerstetter_table import DeviceStatus
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC
-from sim_devices.laboratory import EmulatedLaboratory, TrueValue, compile_loops, tec_faults
+from sim_devices.laboratory import EmulatedLaboratory, TrueValue, tec_faults
 from sim_devices.plants.grid import changed
 from sim_devices.plants.vo2 import VO2Cantilever, VO2Parameters
 from sim_devices.transducers.data_sheets import PSD
@@ -67,6 +67,7 @@ class VO2Laboratory(EmulatedLaboratory):
     """
 
     Settings = VO2LaboratorySettings
+    kernels = ("sim_devices.plants._vo2_kernels", "sim_devices.transducers._imperfect_kernels")
 
     def __init__(self, settings: VO2LaboratorySettings, clock: Clock, seed: int) -> None:
         # One stream a source of noise: how often one instrument is read must not change the readings of another.
@@ -80,7 +81,6 @@ class VO2Laboratory(EmulatedLaboratory):
             specimen = replace(specimen, wander_sd=0.0, drift_sd=0.0)
         specimen = changed(specimen, settings.plant)
         self.plant = VO2Cantilever(specimen, plant_stream)
-        compile_loops(self.plant, lambda plant: plant.advance(plant.parameters.step))
         self.world = World(self.plant, clock)
         peltier = ClippedPeltier(self.plant)
         self.tec = EmulatedTEC("tec", self.world, peltier, rng=tec_stream)

@@ -74,7 +74,7 @@ MODELS = {
     ),
     # The paper compares cells of 2.0 K with cells of 3.15 K; these are of 2.0 K.
     "signed_same_cells": PaperModel(
-        "signed Preisach, cells as the proposed model's",
+        "signed Preisach, same cells",
         "preisach-signed",
         {"levels": 32, "plane": (20.0, 84.0), "smoothing": 0.0, "ridge": 0.0},
     ),
@@ -84,8 +84,8 @@ MODELS = {
 CONTROLLERS = {
     "open_loop_inverse": ("open-loop inverse", "78", "26.7"),
     "polynomial": ("polynomial look-up", "734.2", "320.6"),
-    "integral": ("integral, no inverse", "–", "–"),
-    "integral_equal_time": ("integral, as long as latched", "–", "–"),
+    "integral": ("integral", "–", "–"),
+    "integral_equal_time": ("integral, time of latched", "–", "–"),
     "closed_loop_inverse": ("closed-loop inverse", "–", "–"),
     "latched": ("latched", "–", "–"),
 }
@@ -183,6 +183,13 @@ TABLES = (
         "The errors above are those of the readings: repeatability. These are those of the curvature behind the "
         "readings, of a PSD with the systematic errors of its data sheet (docs/reference/sensors.md).",
     ),
+)
+
+
+VERDICT = (
+    "identification: largest error {identification[nonmonotonic][max]:.1f} 1/m, proposed model (paper: 46.8)",
+    "validation: largest error {validation[nonmonotonic][max]:.1f} 1/m, another session (paper: 108.1)",
+    "tracking: RMS {tracking[open_loop_inverse][rms]:.1f} 1/m, open loop (paper: 26.7)",
 )
 
 
@@ -287,6 +294,7 @@ def carry_out(campaign: Campaign) -> StudyResult:
         },
         TABLES,
         tuple(figures),
+        VERDICT,
     )
 
 
@@ -337,6 +345,13 @@ STUDY = Study(
     "nonmonotonic hysteresis in VO2-coated microactuators, 2013.",
     carry_out,
     PUBLISHED,
+    (
+        "bench.hysteresis._inverse_kernels",
+        "bench.hysteresis._stream_kernels",
+        "bench.transients",
+        "sim_devices.plants._vo2_kernels",
+        "sim_devices.transducers._imperfect_kernels",
+    ),
 )
 
 

@@ -10,31 +10,26 @@ thousands of times a run. Here lengths are in mm, forces in N, pressures in bar 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Annotated, Any, NamedTuple
 
-import numpy as np
-
-from bench.compiled import inner, kernel
-from sim_devices.plants.grid import Floats, Record
+from bench.compiled import Table, inner, kernel
+from sim_devices.plants.grid import Floats, record_type
 from sim_devices.plants.muscle import CLAMPED, FAN, LOAD, PLACE, VOLTAGE
 
-
-def _record(names: str) -> np.dtype[np.void]:
-    return np.dtype([(name, np.float64) for name in names.split()])
-
-
-STATE = _record("drive freed setting offset force length position relaxing")
+STATE = record_type("drive freed setting offset force length position relaxing")
 """State: pressure (bar) or temperature (°C), its free displacement (mm), pressure that the regulator aims at (bar),
 deviation of supply (bar) or room (K), tension, length, position of the moving end (mm), force of the Maxwell arm."""
 
-LAW = _record("level slope square cube stretch press press_from yielding yield_stretch yield_press yield_load free")
+LAW = record_type(
+    "level slope square cube stretch press press_from yielding yield_stretch yield_press yield_load free"
+)
 """The law at one value of the drive.
 
 Backbone: polynomial in the length, then two one-sided squares, one that resists stretching beyond a length and one
 that resists contraction beyond a length. Yield force of all contacts: a constant, and shares of the two one-sided
 forces and of the polynomial. Free displacement."""
 
-COEFFICIENTS = _record(
+COEFFICIENTS = record_type(
     "pneumatic step rest_length rest series_compliance force_limit force_step length_step drive_step "
     "base gain band decay fan_decay fan_share offset_decay offset_kick offset_gain arm arm_time "
     "friction friction_stretch friction_press friction_drive slip pressure_area thread_length "
@@ -43,6 +38,10 @@ COEFFICIENTS = _record(
 )
 """Coefficients, prepared once from the parameters; `pneumatic` is 1 if pressure drives the muscle, 0 if temperature
 does. Those of the laws mean what the muscle's parameters say."""
+
+State = Annotated[Any, STATE]
+Law = Annotated[Any, LAW]
+Coefficients = Annotated[Any, COEFFICIENTS]
 
 # Rows of the contact table: stiffness (N/mm), share of the yield force, share of the free displacement.
 STIFFNESS, WEIGHT, SHARE = range(3)
@@ -59,18 +58,18 @@ _RELAXED = 1e-12
 class Parts(NamedTuple):
     """All numbers of a muscle, as the compiled loops take them; state, law and forces are changed in place."""
 
-    state: Record
-    law: Record
-    c: Record
+    state: State
+    law: Law
+    c: Coefficients
     """State, law at the present drive, and coefficients."""
-    contacts: Floats
+    contacts: Table
     """Contact table, three rows."""
     forces: Floats
     """Forces of the contacts, N."""
 
 
 @inner
-def expansion(temperature: float, c: Record) -> float:
+def expansion(temperature: float, c: Coefficients) -> float:
     """Contraction of the unloaded coiled muscle, mm, from 0 °C on; steeper above the softening temperature."""
     above = (temperature - c.softening) / c.softening_width
     # log(1 + exp(above)) without overflow.
@@ -80,7 +79,7 @@ def expansion(temperature: float, c: Record) -> float:
 
 
 @kernel
-def law_at(drive: float, c: Record, law: Record) -> None:
+def law_at(drive: float, c: Coefficients, law: Law) -> None:
     """Write the muscle's law at one value of its drive, pressure or temperature."""
     law.square = law.cube = law.stretch = law.press = law.press_from = 0.0
     law.yield_stretch = law.yield_press = law.yield_load = 0.0
@@ -110,7 +109,7 @@ def law_at(drive: float, c: Record, law: Record) -> None:
 
 
 @inner
-def backbone(length: float, law: Record) -> tuple[float, float, float, float]:
+def backbone(length: float, law: Law) -> tuple[float, float, float, float]:
     """Tension of the elastic backbone and its slope, yield force of all contacts together and its slope."""
     smooth = law.level + length * (law.slope + length * (law.square + length * law.cube))
     smooth_slope = law.slope + length * (2.0 * law.square + 3.0 * length * law.cube)
@@ -272,7 +271,7 @@ def drive_to(drive: float, seconds: float, clamped: bool, parts: Parts) -> None:
 
 
 @inner
-def next_drive(state: Record, command: Floats, c: Record) -> float:
+def next_drive(state: State, command: Floats, c: Coefficients) -> float:
     """Pressure or temperature after one grid step: exact for a constant command; moves the regulator's aim."""
     decay = c.decay
     if c.pneumatic:

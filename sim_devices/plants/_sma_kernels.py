@@ -7,13 +7,13 @@ microsecond; coefficients go by name. Here stresses are in MPa, forces in N, len
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.compiled import inner, kernel
-from sim_devices.plants.grid import Floats, Record
+from bench.compiled import Table, inner, kernel
+from sim_devices.plants.grid import Floats, record_type
 from sim_devices.plants.muscle import CLAMPED, FAN, LOAD, PLACE, VOLTAGE
 
 # Continuous state: wire temperature, ambient deviation (K), stress, position of the moving end (mm),
@@ -40,19 +40,28 @@ FIRST_HALVINGS = 5
 
 Flags = NDArray[np.bool_]
 
+COEFFICIENTS = record_type(
+    "ambient heating still_decay fan_decay fan_share ambient_decay ambient_kick ambient_gain area "
+    "rest_length series_compliance martensite_modulus austenite_modulus expansion expansion_reference "
+    "transformation_strain unoriented_share rest_strain stress_limit temperature_step stress_step "
+    "length_step"
+)
+"""Coefficients, prepared once from the parameters."""
+Coefficients = Annotated[Any, COEFFICIENTS, 1]
+
 
 class Parts(NamedTuple):
     """All numbers of a wire, as the compiled loops take them."""
 
     state: Floats
-    c: Record
+    c: Coefficients
     """State, and coefficients."""
-    grains: Floats
+    grains: Table
     """Grain table, `GRAIN_ROWS` rows."""
     martensite: Flags
     oriented: Flags
     """Committed grain states."""
-    scratch: Floats
+    scratch: Table
     """Two rows of stresses, MPa."""
     quiet: Floats
     """Quiet surroundings of the committed grain states; none while KELVIN and MEGAPASCAL are 0."""
@@ -60,7 +69,7 @@ class Parts(NamedTuple):
 
 @kernel
 def update_grains(
-    temperature: float, stress: float, unoriented_share: float, grains: Floats, martensite: Flags, oriented: Flags
+    temperature: float, stress: float, unoriented_share: float, grains: Table, martensite: Flags, oriented: Flags
 ) -> tuple[int, int]:
     """Bring every grain to a temperature and a stress; return the number of martensite and of oriented grains."""
     martensites = 0
@@ -131,7 +140,7 @@ def quiet_stress(temperature: float, quiet: Floats) -> float:
 
 @kernel
 def wire_length(
-    temperature: float, stress: float, martensites: float, orienteds: float, count: int, c: Record
+    temperature: float, stress: float, martensites: float, orienteds: float, count: int, c: Coefficients
 ) -> float:
     """Elongation of the wire from its resting length, mm."""
     share = martensites / count
@@ -145,7 +154,7 @@ def wire_length(
 
 @inner
 def end_position(
-    temperature: float, stress: float, martensites: float, orienteds: float, count: int, c: Record
+    temperature: float, stress: float, martensites: float, orienteds: float, count: int, c: Coefficients
 ) -> float:
     """Position of the moving end of a taut wire: its elongation and that of frame and load cell, mm."""
     length = wire_length(temperature, stress, martensites, orienteds, count, c)

@@ -7,14 +7,14 @@ microsecond; coefficients go by name. All temperatures are in degrees Celsius ex
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.compiled import inner, kernel
+from bench.compiled import Table, inner, kernel
 from sim_devices.plants.cooler import CLOSED, COMMAND, LIMIT, TARGET
-from sim_devices.plants.grid import Floats, Record
+from sim_devices.plants.grid import Floats, record_type
 
 ZERO_CELSIUS = 273.15
 
@@ -29,12 +29,20 @@ COUNTER_SIZE = 3
 Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
+COEFFICIENTS = record_type(
+    "step loop_ee loop_ev loop_ve loop_vv slew slew_decay current_decay seebeck resistance conductance "
+    "plate_loss plate_capacity sink_capacity sink_loss ambient wander_decay wander_kick drift_decay "
+    "drift_kick offset coupling relay_step"
+)
+"""Coefficients, prepared once from the parameters."""
+Coefficients = Annotated[Any, COEFFICIENTS, 1]
+
 
 class Parts(NamedTuple):
     """All numbers of the film and its plate, as the compiled loops take them."""
 
     state: Floats
-    c: Record
+    c: Coefficients
     """State and coefficients."""
     counters: Integers
     """Relay counters."""
@@ -102,7 +110,7 @@ def settle_film(film: float, parts: Parts) -> None:
 
 
 @kernel
-def plate_rate(plate: float, current: float, sink: float, c: Record) -> float:
+def plate_rate(plate: float, current: float, sink: float, c: Coefficients) -> float:
     """Evaluate the heat balance: rate of the plate temperature (K/s) under a current (A, positive heats)."""
     heat = c[0].seebeck * (plate + ZERO_CELSIUS) * current + 0.5 * c[0].resistance * current * current
     heat -= c[0].conductance * (plate - sink) + c[0].plate_loss * (plate - c[0].ambient)
@@ -111,7 +119,7 @@ def plate_rate(plate: float, current: float, sink: float, c: Record) -> float:
 
 
 @inner
-def current_for(plate: float, rate: float, sink: float, c: Record) -> float:
+def current_for(plate: float, rate: float, sink: float, c: Coefficients) -> float:
     """Find the current (A) that gives the plate a rate: inverse of `plate_rate`, the root of smaller magnitude."""
     heat = c[0].plate_capacity * rate
     heat += c[0].conductance * (plate - sink) + c[0].plate_loss * (plate - c[0].ambient)
@@ -123,7 +131,7 @@ def current_for(plate: float, rate: float, sink: float, c: Record) -> float:
 
 
 @inner
-def limited_rate(rate: float, slew: float, limit: float, plate: float, sink: float, c: Record) -> float:
+def limited_rate(rate: float, slew: float, limit: float, plate: float, sink: float, c: Coefficients) -> float:
     """Limit a rate (K/s) to the slew limit and the heat flow that the current limit (A, may be infinite) allows."""
     # Beyond this current the Joule heat outgrows the pumping and more current cools less.
     best_cooling = c[0].seebeck * (plate + ZERO_CELSIUS) / c[0].resistance
@@ -133,7 +141,7 @@ def limited_rate(rate: float, slew: float, limit: float, plate: float, sink: flo
 
 
 @inner
-def step_plate(state: Floats, command: Floats, c: Record) -> None:
+def step_plate(state: Floats, command: Floats, c: Coefficients) -> None:
     """Advance plate, current and sink by one grid step."""
     step = c[0].step
     plate = state[PLATE]
@@ -170,7 +178,7 @@ def step_plate(state: Floats, command: Floats, c: Record) -> None:
 
 
 @kernel
-def advance_steps(normals: Floats, command: Floats, parts: Parts) -> None:
+def advance_steps(normals: Table, command: Floats, parts: Parts) -> None:
     """Advance the whole plant by one grid step for each row of `normals`: wander, drift."""
     state, c = parts.state, parts.c
     for row in range(normals.shape[0]):

@@ -271,6 +271,7 @@ def _coefficients(parameters: SMAParameters) -> Record:
     p = parameters
     ambient_decay, ambient_kick = fluctuation(p.ambient_sd, p.ambient_time, p.step)
     return record(
+        kernels.COEFFICIENTS,
         ambient=p.ambient_temperature,
         heating=p.rise / p.rated_voltage**2,
         still_decay=math.exp(-p.step / p.time_constant),

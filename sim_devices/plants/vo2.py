@@ -342,6 +342,7 @@ def _coefficients(parameters: VO2Parameters) -> Record:
     wander_decay, wander_kick = fluctuation(p.wander_sd, p.wander_time, step)
     drift_decay, drift_kick = fluctuation(p.drift_sd, p.drift_time, step)
     return record(
+        kernels.COEFFICIENTS,
         step=step,
         loop_ee=cosine + decay * sine,
         loop_ev=-sine,

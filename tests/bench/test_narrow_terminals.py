@@ -7,8 +7,8 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
-from bench.cli.tables import show_table
 from bench.devices import Signal
+from bench.printing import show_table
 from bench.remaining_time import Expectation
 from bench.terminal import ProgressDisplay
 
