@@ -614,3 +614,50 @@ class TestCommands:
         )
         np.testing.assert_array_equal(found.inputs, U)
         assert found.file.operator.output_unit == "µm"
+
+
+class TestNoRowVanishes:
+    """A row of the file is read, or the file is refused with its line, or a note counts the row."""
+
+    ROWS = 400
+
+    def write(self, path, changes):
+        lines = ["t,u,y,remark", *(f"{i / 10:.1f},{i % 50},{i % 7},fine" for i in range(self.ROWS))]
+        for line, remark in changes.items():
+            lines[line - 1] = lines[line - 1].replace("fine", remark)
+        path.write_bytes("\n".join([*lines, ""]).encode())
+        return path
+
+    @pytest.mark.parametrize("command", ["identify", "import"])
+    @pytest.mark.parametrize("end", [{}, {301: 'again"'}, {301: 'again" and off'}], ids=["open", "closed", "stray"])
+    def test_a_quote_that_is_not_closed_in_its_line_is_refused(self, bench, tmp_path, command, end):
+        path = self.write(tmp_path / "a.csv", {201: '"5 N hung on', **end})
+        columns = ["--input", "u", "--output", "y"]
+        options = (
+            ["--model", "polynomial", "--degree", "1"]
+            if command == "identify"
+            else ["--time", "t", "--out", tmp_path / "runs"]
+        )
+        code, _, err = bench(command, path, *columns, *options)
+        assert code == 3
+        assert "a.csv: line 201: a quotation mark opens a cell" in err
+
+    @pytest.mark.parametrize(
+        "remark", ['"5 N, hung on"', '5" disc', '"a ""b"" c"', "a\x0bb\x0cc\x1cd", "a\u2028b\x85c", ""]
+    )
+    def test_what_stays_in_its_cell_costs_no_row(self, tmp_path, remark):
+        path = self.write(tmp_path / "a.csv", {201: remark})
+        read = read_columns(path, ["t", "u", "y"])
+        assert [len(column) for column in read.values.values()] == [self.ROWS] * 3
+
+    @pytest.mark.parametrize("remark", ["a\0b", "a\rb", "fine\nt,u,y,remark", "fine\n1.0", "fine\n\n\n1,2,3,fine"])
+    def test_what_breaks_a_table_is_refused(self, tmp_path, remark):
+        path = self.write(tmp_path / "a.csv", {201: remark})
+        with pytest.raises(DataError, match=r"a\.csv"):
+            read_columns(path, ["t", "u", "y"])
+
+    def test_a_comment_among_the_rows_is_counted_whatever_it_quotes(self, tmp_path):
+        path = self.write(tmp_path / "a.csv", {201: 'fine\n# "5 N hung on'})
+        read = read_columns(path, ["t", "u", "y"])
+        assert [len(column) for column in read.values.values()] == [self.ROWS] * 3
+        assert "1 line of comment" in read.assumptions

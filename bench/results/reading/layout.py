@@ -135,22 +135,38 @@ def is_comment(line: str, marks: tuple[str, ...]) -> bool:
 
 
 def split_rows(lines: Iterable[str], delimiter: str, first: int = 0) -> Iterator[Row]:
-    """Yield the rows of lines that are neither blank nor comments; `first` lines stand above them."""
+    """Yield the rows of lines that are neither blank nor comments; `first` lines stand above them.
+
+    Each line is a row: no cell of a table of numbers contains a line break, so a quote that is not closed must not
+    take in the lines below.
+    """
     marks = comment_marks(delimiter)
-    number = first
-
-    def contents() -> Iterator[str]:
-        nonlocal number
-        for number, line in enumerate(lines, start=first + 1):  # noqa: B007 - the reader's own count lacks comments
-            if not line.isspace() and not is_comment(line, marks):
-                # Trailing delimiters close empty cells, of which spreadsheets write thousands.
-                yield line.replace("\t", " ").strip() if delimiter == " " else line
-
-    for cells in csv.reader(contents(), delimiter=delimiter, skipinitialspace=delimiter == " "):
+    for number, line in enumerate(lines, start=first + 1):
+        if line.isspace() or is_comment(line, marks):
+            continue
+        cells = _cells(line, delimiter)
+        # Trailing delimiters close empty cells, of which spreadsheets write thousands.
         while cells and not cells[-1].strip():
             cells.pop()
         if any(cell.strip() for cell in cells):
             yield Row(number, cells)
+
+
+def _cells(line: str, delimiter: str, *, strict: bool = False) -> list[str]:
+    """Return the cells of a line; raise csv.Error for quotes that do not enclose a cell, if `strict`."""
+    line = line.replace("\t", " ").strip() if delimiter == " " else line.rstrip("\r\n")
+    return next(csv.reader([line], delimiter=delimiter, skipinitialspace=delimiter == " ", strict=strict), [])
+
+
+def closes_its_quotes(line: str, delimiter: str) -> bool:
+    """Return whether each cell of a line that begins with a quote ends with one."""
+    if '"' not in line:
+        return True
+    try:
+        _cells(line, delimiter, strict=True)
+    except csv.Error:
+        return False
+    return True
 
 
 def is_number(cell: str, decimal: str) -> bool:

@@ -18,6 +18,7 @@ from bench.results.reading.heads import NoColumnError, find_place
 from bench.results.reading.layout import (
     D_EXPONENTS,
     Layout,
+    closes_its_quotes,
     count_lines,
     find_layout,
     header_only,
@@ -202,7 +203,7 @@ class _Body:
         """
         layout, path = self._layout, self._file.path
         values: list[list[float]] = [[] for _ in self._places]
-        lines = self._file.lines(layout.start, self._end())
+        lines = self._closed(self._file.lines(layout.start, self._end()))
         for number, row in enumerate(split_rows(lines, layout.delimiter, layout.start), start=1):
             if number == 1:
                 self.moments = with_moments(row.cells, self._places)
@@ -231,7 +232,7 @@ class _Body:
         marks, comma = self._layout.marks, self._layout.decimal == ","
         exponents = D_EXPONENTS in self._layout.notes
         self.comments = blank = 0
-        for line in self._file.lines(self._layout.start, self._end()):
+        for line in self._closed(self._file.lines(self._layout.start, self._end())):
             if line.isspace():
                 blank += 1
                 continue
@@ -249,6 +250,17 @@ class _Body:
                 # A point within numbers of decimal comma is none; it may not become one.
                 line = line.replace(".", "?").replace(",", ".")
             yield _D_EXPONENT.sub(r"\1E", line) if exponents else line
+
+    def _closed(self, lines: Iterator[str]) -> Iterator[str]:
+        """Yield lines of data; raise DataError for a quote that opens a cell and does not close it in its line."""
+        layout = self._layout
+        for number, line in enumerate(lines, start=layout.start + 1):
+            if not closes_its_quotes(line, layout.delimiter) and not is_comment(line, layout.marks):
+                raise DataError(
+                    f"{self._file.path}: line {number}: a quotation mark opens a cell and does not close it before "
+                    "the next delimiter or the end of the line; remove it, or close it"
+                )
+            yield line
 
     def _has_label(self, line: str) -> bool:
         """Return whether a line may have a label in a column of numbers, dates or times."""
