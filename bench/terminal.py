@@ -253,6 +253,8 @@ class ProgressDisplay:
                 style=style,
                 highlight=False,
                 markup=False,
+                # A line of a log is not folded.
+                soft_wrap=not self._console.is_terminal,
             )
             if self.ask_again is not None:
                 self.ask_again()

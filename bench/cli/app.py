@@ -42,6 +42,7 @@ from bench.cli import (
 )
 from bench.cli.console import error_console, exit_code, fail
 from bench.cli.registered import RegisteredCommands, Studies
+from bench.cli.streams import standard_streams
 from bench.errors import BenchError
 
 _EPILOG = (
@@ -115,6 +116,11 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     gc.set_threshold(10_000, 20, 20)
     # The collector would search all that the libraries have left behind: up to a second, after the work is done.
     atexit.register(gc.freeze)
+    with standard_streams():
+        _carry_out(arguments)
+
+
+def _carry_out(arguments: Sequence[str] | None) -> NoReturn:
     try:
         registry.check_own_packages()
         app(args=None if arguments is None else list(arguments))

@@ -16,6 +16,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from bench.cli.streams import write_out
 from bench.errors import BenchError, ConfigurationError, DataError
 from bench.printing import show_table
 
@@ -206,18 +207,17 @@ def write_json(path: Path | None, content: Any) -> None:  # noqa: ANN401 - anyth
     if path is None:
         return
     text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
-    try:
-        if path == STANDARD_OUTPUT:
-            sys.stdout.write(text)
-            sys.stdout.flush()
-        else:
+    if path == STANDARD_OUTPUT:
+        failure = write_out(text)
+    else:
+        try:
             path.write_text(text, encoding="utf-8")
-    except OSError as error:
+            failure = ""
+        except OSError as error:
+            failure = error.strerror or str(error)
+    if failure:
         _unwritten.append(path)
-        print_error(BenchError(f"--json {path} cannot be written: {error.strerror}; the work is done"))
-        if path == STANDARD_OUTPUT:
-            # Python would try once more at its end, and complain.
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        print_error(BenchError(f"--json {path} cannot be written: {failure}; the work is done"))
 
 
 _unwritten: list[Path] = []

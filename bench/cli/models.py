@@ -239,6 +239,9 @@ def identify_(
         )
     if selected is not None:
         found = selected.record_in(found)
+    # Before anything is printed: a terminal that fails must not cost the fit.
+    if out is not None:
+        found.file.save(out)
     print_assumptions(names, found.assumptions)
     if found.trials is not None:
         console.print(f"cross-validation, errors in {found.file.response.output_unit or 'output units'}:")
@@ -249,7 +252,6 @@ def identify_(
     if found.band is not None:
         print_band(found.band)
     if out is not None:
-        found.file.save(out)
         print_plain(console, f"model: {out}")
     tested = print_test(found, comparing, columns, reading)
     write_fit(found, files[0], context=context, out=out, card=card, figures=figures)
