@@ -2,13 +2,15 @@
 
 A lock is a file in a folder that all users of the computer share, held by `flock` (on Windows by a locked byte). The
 kernel frees it when its holder dies in any way, so a lock is never stale. Its text names the holder, for whoever is
-refused. Different names of a line are one lock: a link and the device node behind it, a host name and its address.
+refused. What other users put there is locked, but neither followed, nor written, nor believed. Different names of a
+line are one lock: a link and the device node behind it, a host name and its address.
 
 A computer does not see the locks of another one.
 """
 
 from __future__ import annotations
 
+import errno
 import getpass
 import hashlib
 import ipaddress
@@ -17,8 +19,8 @@ import os
 import platform
 import re
 import socket
+import stat
 import sys
-import tempfile
 from collections.abc import Iterable
 from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass
@@ -33,8 +35,15 @@ from bench.errors import ConfigurationError
 EMULATED = "emulated://"
 """Scheme of the lines to instruments of an emulated laboratory; in this process they need no lock."""
 
-_FOLDER = "actuator-bench-locks"
-_EVERYBODY = 0o1777  # like the folder for temporary files itself: everybody adds files, nobody removes another's
+FOLDER_VARIABLE = "ACTUATOR_BENCH_LOCKS"
+"""Variable of the environment that names another folder of the locks, for a container that has none of them."""
+
+_SHARED = Path("/run/lock"), Path("/tmp")  # noqa: S108 - that of all users is what is wanted
+"""Folders for the locks: the first that everybody may use is taken. Filesystem Hierarchy Standard 3.0, 5.9."""
+_EVERYBODY = 0o1777
+_SAFELY = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+_ATTEMPTS = 20
+"""How often a lock is opened that others remove or replace meanwhile."""
 _TCP_PORT = 502
 _WRITING = 0.1
 """Wall-clock time (s) that a holder is given to write its name after it has taken the lock."""
@@ -144,7 +153,6 @@ class Locks:
         self._take({f"folder {folder.resolve()}": "it"}, f"folder {folder}")
 
     def _take(self, wanted: dict[str, str], what: str = "") -> None:
-        _make_folder()
         with ExitStack() as taken:
             # Two benches that ask in the same order cannot refuse each other.
             for name in sorted(wanted.keys() - self._taken):
@@ -167,7 +175,7 @@ class Locks:
 def is_in_use(folder: Path) -> bool:
     """Return whether a process of this computer works in a folder, as `Locks.take_folder` says."""
     path = _path(f"folder {folder.resolve()}")
-    if not path.exists():
+    if not os.path.lexists(path):
         return False
     file = _take_file(path)
     if file is None:
@@ -242,29 +250,35 @@ def _canonical(address: str) -> str:
 
 
 def _folder() -> Path:
-    """Return the folder of the locks, the same one for all users and sessions of this computer."""
-    return Path(tempfile.gettempdir()) / _FOLDER
+    """Return the folder of the locks, the same one for all users and sessions of this computer.
+
+    That of the temporary files would be another one for each user of some systems. A folder of its own would belong
+    to whoever came first, who could remove the locks of all others.
+    """
+    if chosen := os.environ.get(FOLDER_VARIABLE):
+        return Path(chosen)
+    if sys.platform == "win32":
+        return Path(os.environ.get("PROGRAMDATA", r"C:\ProgramData"))
+    return next((folder for folder in _SHARED if _is_shared(folder)), _SHARED[-1])
 
 
-def _make_folder() -> None:
-    folder = _folder()
+def _is_shared(folder: Path) -> bool:
+    """Return whether everybody adds files to a folder, and nobody but root removes another's."""
     try:
-        folder.mkdir(exist_ok=True)
-        # The mode of mkdir is cut by the process's mask. Only the owner can, and has to.
-        with suppress(PermissionError):
-            folder.chmod(_EVERYBODY)
-    except OSError as error:
-        raise ConfigurationError(f"the folder of the locks, {folder}, cannot be made: {error.strerror}") from None
+        found = folder.stat()
+    except OSError:
+        return False
+    return found.st_uid == 0 and stat.S_IMODE(found.st_mode) & _EVERYBODY == _EVERYBODY
 
 
 def _path(name: str) -> Path:
     readable = re.sub(r"[^a-z0-9.]+", "-", name.lower())[-60:].strip("-.")
-    return _folder() / f"{readable}-{hashlib.sha256(name.encode()).hexdigest()[:12]}.lock"
+    return _folder() / f"actuator-bench-{readable}-{hashlib.sha256(name.encode()).hexdigest()[:12]}.lock"
 
 
 def _take_file(path: Path) -> int | None:
     """Return the open file of a lock that was taken, or None if it is held."""
-    while True:
+    for _ in range(_ATTEMPTS):
         file = _open(path)
         taken = False
         try:
@@ -273,28 +287,58 @@ def _take_file(path: Path) -> int | None:
                 return None
             # Its last holder removed it, perhaps after it was opened here.
             with suppress(FileNotFoundError):
-                if os.path.samestat(os.fstat(file), path.stat()):
+                if os.path.samestat(os.fstat(file), path.lstat()):
                     return file
             taken = False
         finally:
             if not taken:
                 os.close(file)
+    raise ConfigurationError(f"the lock {path} cannot be taken: it is replaced again and again")
 
 
 def _open(path: Path) -> int:
-    """Open the file of a lock, which any user may take; it is closed in programs that this process starts."""
-    while True:
+    """Open the file of a lock; it is closed in programs that this process starts.
+
+    The folder is everybody's: a link or a pipe of another user is not followed, and a file of another user is locked
+    but not written, see `_write`.
+    """
+    for _ in range(_ATTEMPTS):
         try:
             # Without O_CREAT where it is there: Linux may refuse that for a file of another user in such a folder.
             with suppress(FileNotFoundError):
-                return os.open(path, os.O_RDWR)
+                return _checked(os.open(path, (os.O_RDWR if _is_own(path.lstat()) else os.O_RDONLY) | _SAFELY))
             with suppress(FileExistsError):
-                file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o666)
-                if sys.platform != "win32":
-                    os.fchmod(file, 0o666)
-                return file
+                return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)
         except OSError as error:
-            raise ConfigurationError(f"the lock {path} cannot be opened: {error.strerror}") from None
+            why = "it is a link; remove it" if error.errno == errno.ELOOP else error.strerror
+            raise ConfigurationError(f"the lock {path} cannot be opened: {why}") from None
+    raise ConfigurationError(f"the lock {path} cannot be opened: it comes and goes")
+
+
+def _checked(file: int) -> int:
+    """Return the open file of a lock; raise OSError if it is none, FileNotFoundError if it was removed meanwhile."""
+    found = os.fstat(file)
+    if stat.S_ISREG(found.st_mode) and found.st_nlink == 1:
+        return file
+    os.close(file)
+    if found.st_nlink == 0:
+        raise FileNotFoundError
+    raise OSError(errno.EINVAL, f"it is no file of its own, but a link or a pipe of {_user(found.st_uid)}; remove it")
+
+
+def _is_own(found: os.stat_result) -> bool:
+    """Return whether what a file says can be believed: it is of this user or of root."""
+    return sys.platform == "win32" or found.st_uid in (os.geteuid(), 0)
+
+
+def _user(number: int) -> str:
+    """Return the name of a user, who may have none."""
+    if sys.platform != "win32":
+        import pwd
+
+        with suppress(KeyError):
+            return pwd.getpwuid(number).pw_name
+    return f"user {number}"
 
 
 if sys.platform == "win32":
@@ -320,15 +364,21 @@ else:
 
 
 def _write(file: int, holder: Holder) -> None:
+    if not _is_own(os.fstat(file)):
+        return
     os.lseek(file, 0, os.SEEK_SET)
     os.truncate(file, 0)
     os.write(file, json.dumps(asdict(holder)).encode())
 
 
 def _holder(name: str) -> str:
-    """Return who holds a lock, as it says itself."""
+    """Return who holds a lock, as it says itself if it is of this user or of root."""
+    path = _path(name)
     try:
-        return str(Holder(**json.loads(_path(name).read_text(encoding="utf-8"))))
+        found = path.lstat()
+        if not _is_own(found):
+            return f"a process that cannot say who it is, as {_user(found.st_uid)} made the lock {path}"
+        return str(Holder(**json.loads(path.read_text(encoding="utf-8"))))
     except (OSError, ValueError, TypeError):
         return "a process that has not said who it is"
 

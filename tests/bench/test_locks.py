@@ -27,9 +27,10 @@ child.wait()
 @pytest.fixture(autouse=True)
 def folder(tmp_path, monkeypatch):
     """A folder for locks of this test's own."""
-    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    monkeypatch.setenv("TMPDIR", str(tmp_path))
-    return tmp_path / "actuator-bench-locks"
+    folder = tmp_path / "shared"
+    folder.mkdir()
+    monkeypatch.setenv("ACTUATOR_BENCH_LOCKS", str(folder))
+    return folder
 
 
 @pytest.fixture
@@ -222,8 +223,85 @@ class TestProcesses:
             process.stderr.close()
 
 
-def test_the_folder_is_for_all_users(locks, tmp_path, folder):
-    locks("one").take_lines([port(tmp_path / "a")])
-    assert folder.stat().st_mode & 0o7777 == 0o1777
-    (file,) = folder.iterdir()
-    assert file.stat().st_mode & 0o777 == 0o666
+@pytest.mark.skipif(sys.platform == "win32", reason="needs links, pipes and users of POSIX")
+class TestOtherUsers:
+    """Everybody adds files to the folder of the locks: nothing of another user is followed, written or believed."""
+
+    @pytest.fixture
+    def lock(self, locks, tmp_path, folder):
+        """Return the path of the lock of a line, and the line."""
+        node = port(tmp_path / "ttyUSB0")
+        one = locks("one")
+        one.take_lines([node])
+        (path,) = folder.iterdir()
+        one.close()
+        return path, node
+
+    @pytest.fixture
+    def strange(self, monkeypatch):
+        """Make a file one of another user."""
+
+        def give_away(path):
+            if os.geteuid() == 0:
+                os.chown(path, 65534, -1)
+            else:
+                monkeypatch.setattr(os, "geteuid", lambda: 65533)
+
+        return give_away
+
+    def test_the_folder_does_not_depend_on_the_environment_of_a_user(self, monkeypatch, tmp_path):
+        monkeypatch.delenv("ACTUATOR_BENCH_LOCKS")
+        monkeypatch.setenv("TMPDIR", str(tmp_path))
+        monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+        node = port(tmp_path / "ttyUSB0")
+        with Locks(Holder.of_this_process("one", "bench test")) as held:
+            held.take_lines([node])
+            monkeypatch.setenv("TMPDIR", str(tmp_path / "other"))
+            with pytest.raises(ConfigurationError, match="in use"):
+                Locks(Holder.of_this_process("other", "bench test")).take_lines([node])
+
+    @pytest.mark.parametrize("exists", [True, False])
+    def test_a_link_is_not_followed(self, lock, locks, tmp_path, exists):
+        path, node = lock
+        target = tmp_path / "target"
+        if exists:
+            target.write_text("precious")
+        path.symlink_to(target)
+        with pytest.raises(ConfigurationError, match="it is a link; remove it"):
+            locks("mine").take_lines([node])
+        assert target.exists() == exists
+        assert not exists or target.read_text() == "precious"
+
+    def test_a_second_name_of_a_file_is_not_written(self, lock, locks, tmp_path):
+        path, node = lock
+        target = tmp_path / "target"
+        target.write_text("precious")
+        path.hardlink_to(target)
+        with pytest.raises(ConfigurationError, match="remove it"):
+            locks("mine").take_lines([node])
+        assert target.read_text() == "precious"
+
+    def test_a_pipe_keeps_nobody_waiting(self, lock, locks):
+        path, node = lock
+        os.mkfifo(path)
+        with pytest.raises(ConfigurationError, match="remove it"):
+            locks("mine").take_lines([node])
+
+    def test_a_file_of_another_user_is_locked_but_not_written(self, lock, locks, strange):
+        path, node = lock
+        path.write_text("theirs")
+        strange(path)
+        locks("mine").take_lines([node])
+        assert path.read_text() == "theirs"
+        with pytest.raises(ConfigurationError, match="in use"):
+            locks("other").take_lines([node])
+
+    def test_a_holder_of_another_user_is_not_believed(self, lock, locks, strange):
+        path, node = lock
+        held = locks("one")
+        held.take_lines([node])
+        strange(path)
+        with pytest.raises(ConfigurationError) as caught:
+            locks("mine").take_lines([node])
+        assert "cannot say who it is" in str(caught.value)
+        assert "bench test" not in str(caught.value)
