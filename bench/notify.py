@@ -19,6 +19,7 @@ import smtplib
 import ssl
 import subprocess
 import threading
+import urllib.parse
 import urllib.request
 from collections.abc import Callable, Mapping, Sequence
 from email.message import EmailMessage
@@ -53,8 +54,34 @@ _SMTP = {
 }
 """Variables of the environment that say how mail is sent."""
 
+_OPTION = "--notify"
+
 Facts = Mapping[str, Any]
 Send = Callable[[Facts], None]
+
+
+def redacted(target: str) -> str:
+    """Return a target without what may be secret: the path of a webhook, and the arguments of a command."""
+    if target.lower().startswith(("http://", "https://")):
+        parts = urllib.parse.urlsplit(target)
+        return f"{parts.scheme}://{parts.hostname or ''}/…"
+    if target.lower().startswith("mailto:"):
+        return target
+    program, separator, _ = target.strip().partition(" ")
+    return f"{program} …" if separator else program
+
+
+def redacted_command(words: Sequence[str]) -> list[str]:
+    """Return a command of the bench as it is recorded: its targets of messages are `redacted`."""
+    kept: list[str] = []
+    for word in words:
+        option, equals, target = word.partition("=")
+        if kept and kept[-1] == _OPTION:
+            word = redacted(word)
+        elif option == _OPTION and equals:
+            word = f"{option}={redacted(target)}"
+        kept.append(word)
+    return kept
 
 
 def sender(target: str) -> Send:
@@ -67,17 +94,17 @@ def sender(target: str) -> Send:
     if target.lower().startswith("mailto:"):
         address = target[len("mailto:") :]
         if "@" not in address:
-            raise ConfigurationError(f"--notify {target}: expected mailto:NAME@DOMAIN")
+            raise ConfigurationError(f"{_OPTION} {target}: expected mailto:NAME@DOMAIN")
         if not os.environ.get("BENCH_SMTP_HOST"):
             known = "; ".join(f"{name}: {text}" for name, text in _SMTP.items())
-            raise ConfigurationError(f"--notify {target}: BENCH_SMTP_HOST is not set ({known})")
+            raise ConfigurationError(f"{_OPTION} {target}: BENCH_SMTP_HOST is not set ({known})")
         return partial(_mail, address)
     # On Windows a backslash is part of a path.
     words = [word.strip('"') for word in shlex.split(target, posix=False)] if os.name == "nt" else shlex.split(target)
     program = shutil.which(words[0]) if words else None
     if program is None:
         raise ConfigurationError(
-            f"--notify {target!r}: there is no such program; expected a command, mailto:ADDRESS or https://ADDRESS"
+            f"{_OPTION} {redacted(target)!r}: there is no such program; expected a command, mailto:ADDRESS or https://ADDRESS"
         )
     return partial(_call, [program, *words[1:]])
 
@@ -229,9 +256,16 @@ class Notifier:
             for target, send in self._senders.items():
                 try:
                     send(facts)
+                except subprocess.TimeoutExpired:
+                    # What this error says names all arguments.
+                    self._fail(target, facts, f"it took longer than {_WITHIN:g} s")
                 # Whatever a library raises: the run goes on.
                 except Exception as error:
-                    self._notices.append(f"{target} was not told of the {facts['event']}: {error}")
+                    self._fail(target, facts, str(error))
+
+    def _fail(self, target: str, facts: Facts, why: str) -> None:
+        shown = redacted(target)
+        self._notices.append(f"{shown} was not told of the {facts['event']}: {why.replace(target, shown)}")
 
 
 def facts_of(meta: Mapping[str, Any], folder: Path) -> dict[str, Any]:

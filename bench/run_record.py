@@ -26,6 +26,7 @@ from bench.clock import wall_time
 from bench.description import RigDescription
 from bench.errors import ConfigurationError
 from bench.journal import FILE_NAME, files_of
+from bench.notify import redacted_command
 from bench.protocol import Plan, ProtocolDefinition, ProtocolParameters, digest_of, is_installed
 from bench.recorded_files import RIG_FILE_NAME, file_name
 
@@ -137,7 +138,7 @@ def metadata(
         "dashboard": layout.model_dump(mode="json") if layout else None,
         "over_time": protocol.views.signals_over_time(slots) if protocol.views else [],
         "operator": current_user(),
-        "command": sys.argv,
+        "command": redacted_command(sys.argv),
         "packages": _versions(),
         "git": _git_state(),
         "host": {

@@ -17,6 +17,7 @@ from bench.clock import wall_time
 from bench.devices import Signal
 from bench.errors import ConfigurationError, DataError
 from bench.journal import FILE_NAME, Event, Journal, StepRecord
+from bench.notify import redacted_command
 from bench.results.data import read_columns
 from bench.results.reading.heads import split_unit
 from bench.results.reading.options import ReadingOptions
@@ -170,7 +171,7 @@ def _metadata(
         "dashboard": None,
         "rehearsal": None,
         "operator": current_user(),
-        "command": sys.argv,
+        "command": redacted_command(sys.argv),
         "packages": {"actuator-bench": version_of("actuator-bench")},
         "git": "",
         "host": {"started": now},

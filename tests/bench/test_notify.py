@@ -118,6 +118,33 @@ class TestTargets:
         assert "too hot" in lines
 
 
+class TestSecrets:
+    TOKEN = "T0K3N"
+
+    @pytest.mark.parametrize("equals", [False, True])
+    @pytest.mark.parametrize("fails", [False, True])
+    def test_neither_a_record_nor_what_is_made_of_it_holds_them(self, bench, tmp_path, monkeypatch, equals, fails):
+        program = f'"{sys.executable}" -c "import sys; sys.stdin.read(); sys.exit({int(fails)})" --token {self.TOKEN}'
+        targets = [program, f"http://me:{self.TOKEN}@127.0.0.1:1/hooks/{self.TOKEN}?key={self.TOKEN}"]
+        options = [f"--notify={target}" for target in targets]
+        if not equals:
+            options = [word for target in targets for word in ("--notify", target)]
+        command = ["run", "creep", "--rig", "vo2", "--clock", "virtual", "--set", "duration=4", "--set", "settling=2",
+                   "--out", tmp_path / "runs", *options]  # fmt: skip
+        monkeypatch.setattr(sys, "argv", ["bench", *map(str, command)])
+        code, out, err = bench(*command)
+        assert code == 0
+        assert "was not told of the end" in out + err
+        (run,) = (tmp_path / "runs").iterdir()
+        for kind in ("csv", "bluesky"):
+            assert bench("export", run, "--format", kind, "--out", tmp_path / kind)[0] == 0
+        assert bench("report", run)[0] == 0
+        with Record(run) as record:
+            assert record.meta["command"][-1].endswith("://127.0.0.1/…")
+        texts = [out, err, *(path.read_bytes().decode(errors="replace") for path in tmp_path.rglob("*.*"))]
+        assert not [text for text in texts if self.TOKEN in text]
+
+
 class TestNotifier:
     def test_what_is_told_and_what_is_not(self, listener):
         command, told = listener
@@ -143,7 +170,7 @@ class TestNotifier:
             notifier.event(Event(0.0, "WARN", "pause", "paused"))
         assert len(told()) == 1
         (notice,) = notifier.take_notices()
-        assert notice == f"{failing} was not told of the pause: exit code 1"
+        assert notice == f'"{sys.executable}" … was not told of the pause: exit code 1'
 
     def test_nothing_waits_for_one_that_hangs(self, monkeypatch):
         free = threading.Event()
@@ -170,7 +197,7 @@ class TestNotifier:
         assert facts["run"] == str(result.folder.resolve())
         assert facts["values"]["tec_temperature"] > 30.0
         with Record(result.folder) as record:
-            assert [each.text[-50:] for each in record.events() if each.kind == "notify"] == [
-                f"{failing} was not told of the end: exit code 1"[-50:]
+            assert [each.text for each in record.events() if each.kind == "notify"] == [
+                f'"{sys.executable}" … was not told of the end: exit code 1'
             ]
             assert record.status == "completed"
