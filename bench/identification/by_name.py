@@ -238,8 +238,12 @@ def set_up_problem(
     options: dict[str, Any],
     *,
     orientation: Orientation = "auto",
+    shape: Sequence[float] = (),
 ) -> FitProblem:
-    """Return the problem that `identify` solves; its arguments are those of `identify`."""
+    """Return the problem that `identify` solves; its arguments are those of `identify`.
+
+    Shape parameters are found from the data, unless they are given because an earlier set-up found them.
+    """
     spec = find_model(model_name)
     assert spec.template is not None
     sequence = _checks.samples("inputs", inputs)
@@ -259,7 +263,7 @@ def set_up_problem(
     check_record(sequence, measured, skip)
     signs = possible_signs(orientation, model_name, spec, template, sequence, measured, counted)
     problems = {
-        sign: _orient(sign, spec, template, sequence, measured, w, skip, smoothing, initial) for sign in signs
+        sign: _orient(sign, spec, template, sequence, measured, w, skip, smoothing, initial, shape) for sign in signs
     }
     if len(problems) == 1:
         return problems[signs[0]]
@@ -294,6 +298,7 @@ def _orient(
     skip: int,
     smoothing: float,
     initial: Initial | None,
+    shape: Sequence[float],
 ) -> FitProblem:
     """Return the problem with the output of one sign, its initial memory and its shape found from the data."""
     measured = outputs if sign > 0 else -outputs
@@ -309,7 +314,10 @@ def _orient(
 
     if spec.refine is not None:
         template = spec.refine(template, inputs, measured, weights, skip, start(template))
-    template = fit_shape(template, spec.constrained, start, inputs, measured, weights, skip, smoothing)
+    if shape:
+        template = template.with_shape(shape)
+    else:
+        template = fit_shape(template, spec.constrained, start, inputs, measured, weights, skip, smoothing)
     before = start(template)
     regressor = template.regressor(inputs, before)
     return FitProblem(spec, inputs, outputs, weights, skip, template, before, regressor, start, sign)

@@ -73,6 +73,11 @@ class Candidate:
         """Name of the operator, also of a model with time."""
         return self.static or self.model
 
+    @property
+    def name(self) -> str:
+        """The same text of all candidates that are equal."""
+        return repr(replace(self, options=dict(sorted(self.options.items()))))
+
 
 @dataclass(frozen=True, eq=False)
 class Measurements:
@@ -189,6 +194,8 @@ class Evaluation:
         The corrected criterion of Akaike of that fit; see `akaike`.
     uncorrelated : bool
         Whether the residuals of that fit are uncorrelated from row to row; False where it is not known.
+    shape : tuple of float
+        Shape parameters of the operator that the fit to all rows found; empty if it has none, or if it has times.
     """
 
     candidate: Candidate
@@ -204,6 +211,7 @@ class Evaluation:
     misfit: float = float("nan")
     akaike: float = float("nan")
     uncorrelated: bool = False
+    shape: tuple[float, ...] = ()
 
     @property
     def rms(self) -> float:
@@ -229,7 +237,7 @@ def evaluate(
     *,
     most_folds: int | None = None,
     hopeless: float = float("inf"),
-    with_units: bool = False,
+    shapes: Mapping[str, tuple[float, ...]] | None = None,
 ) -> list[Evaluation]:
     """Return how candidates do; a task that can be sent to a worker process.
 
@@ -243,40 +251,52 @@ def evaluate(
         Number of block folds; all if None.
     hopeless : float
         RMS error, output units, above which a candidate is given up after two folds.
-    with_units : bool
-        Whether excitation units are left out as well.
+    shapes : mapping of str to tuple of float, optional
+        Shape parameters of candidates that were fitted to the same rows before, by their `name`.
     """
     blocks = measured.blocks()[:most_folds]
-    units = measured.units() if with_units else ()
-    return [_evaluate(measured, candidate, blocks, units, hopeless) for candidate in candidates]
+    known = shapes or {}
+    return [_evaluate(measured, each, blocks, hopeless, known.get(each.name, ())) for each in candidates]
 
 
 def _evaluate(
-    measured: Measurements, candidate: Candidate, blocks: Sequence[Fold], units: Sequence[Fold], hopeless: float
+    measured: Measurements, candidate: Candidate, blocks: Sequence[Fold], hopeless: float, shape: tuple[float, ...]
 ) -> Evaluation:
     begin = time.process_time()
     try:
-        trial = _Trial(measured, candidate)
+        trial = _Trial(measured, candidate, shape)
         done = [trial.leave_out(fold) for fold in blocks[:2]]
         if np.sqrt(np.mean([each.tested for each in done])) <= hopeless:
             done += [trial.leave_out(fold) for fold in blocks[2:]]
-        by_unit = [trial.leave_out(fold) for fold in units] if len(done) == len(blocks) else []
-        free = float(np.mean([each.free for each in done]))
-        residuals = trial.residuals()[measured.tested] if by_unit else None
     # A model of another package must not end the comparison of the others.
     except Exception as error:
-        text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
-        return Evaluation(candidate, failure=text, seconds=time.process_time() - begin)
-    evaluated = Evaluation(
+        return _failed(candidate, error, begin)
+    return Evaluation(
         candidate,
         blocks=tuple(each.tested for each in done),
-        units=tuple(each.tested for each in by_unit),
         training=float(np.mean([each.training for each in done])),
         start=float(np.mean([each.start for each in done])),
-        free=free,
+        free=float(np.mean([each.free for each in done])),
+        seconds=time.process_time() - begin,
+        shape=trial.shape,
     )
-    judged = evaluated if residuals is None else with_fit(evaluated, residuals)
-    return replace(judged, seconds=time.process_time() - begin)
+
+
+def leave_units_out(measured: Measurements, evaluated: Evaluation) -> list[Evaluation]:
+    """Return an evaluation with excitation units left out, and with the criteria of a fit to all rows."""
+    begin = time.process_time()
+    try:
+        trial = _Trial(measured, evaluated.candidate, evaluated.shape)
+        by_unit = tuple(trial.leave_out(fold).tested for fold in measured.units())
+        judged = with_fit(replace(evaluated, units=by_unit), trial.residuals()[measured.tested])
+    except Exception as error:
+        return [_failed(evaluated.candidate, error, begin)]
+    return [replace(judged, seconds=evaluated.seconds + time.process_time() - begin)]
+
+
+def _failed(candidate: Candidate, error: Exception, begin: float) -> Evaluation:
+    text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+    return Evaluation(candidate, failure=text, seconds=time.process_time() - begin)
 
 
 def judge_determined(measured: Measurements, evaluated: Evaluation) -> list[Evaluation]:
@@ -287,7 +307,7 @@ def judge_determined(measured: Measurements, evaluated: Evaluation) -> list[Eval
     are left out of account. A model without signs must follow the input on smaller cycles as it does on the record:
     the output moves the other way by no more of its travel, and does not run far beyond its range.
     """
-    trial = _Trial(measured, evaluated.candidate)
+    trial = _Trial(measured, evaluated.candidate, evaluated.shape)
     problem = trial.problem
     found = resolve(problem.regressor, measured.tested.astype(np.float64), problem.skip)
     count = problem.regressor.shape[1]
@@ -336,9 +356,9 @@ def _retreat(inputs: Floats, outputs: Floats) -> float:
     return min(against, along) / max(against + along, 1e-300)
 
 
-def residuals_of(measured: Measurements, candidate: Candidate) -> Floats:
-    """Return measured less fitted outputs of a candidate that is fitted to all rows, shape (N,)."""
-    return _Trial(measured, candidate).residuals()
+def residuals_of(measured: Measurements, evaluated: Evaluation) -> Floats:
+    """Return measured less fitted outputs of an evaluated candidate that is fitted to all rows, shape (N,)."""
+    return _Trial(measured, evaluated.candidate, evaluated.shape).residuals()
 
 
 def corrected(residuals: Floats, free: float) -> float:
@@ -375,9 +395,10 @@ class _LeftOut:
 class _Trial:
     """A candidate's problem, which is set up once unless the outputs decide on more than the coefficients."""
 
-    def __init__(self, measured: Measurements, candidate: Candidate) -> None:
+    def __init__(self, measured: Measurements, candidate: Candidate, shape: tuple[float, ...]) -> None:
         self.measured, self.candidate = measured, candidate
-        self.problem = self._set_up(measured.fitted)
+        self.problem = self._set_up(measured.fitted, shape)
+        self.shape = tuple(self.problem.template.shape_parameters().values)
         spec = self.problem.spec
         # Two penalties of all rows: to choose them anew in each fold would take longer than all the rest.
         ridge = None if candidate.smoothing is None else 0.0
@@ -387,7 +408,7 @@ class _Trial:
         if self.problem.skip > measured.known:
             raise ValueError(f"its memory is unknown until row {self.problem.skip}: too few rows are left")
 
-    def _set_up(self, trained: Flags) -> FitProblem:
+    def _set_up(self, trained: Flags, shape: tuple[float, ...] = ()) -> FitProblem:
         each = self.candidate
         return set_up_problem(
             each.model,
@@ -400,6 +421,7 @@ class _Trial:
             each.initial,
             dict(each.options),
             orientation=each.orientation,
+            shape=shape,
         )
 
     def fit(self, problem: FitProblem, weights: Floats | None = None) -> Fit:

@@ -30,6 +30,7 @@ from bench.identification.evaluation import (
     Measurements,
     evaluate,
     judge_determined,
+    leave_units_out,
     residuals_of,
 )
 from bench.identification.folds import correlated_rows, has_one_kind
@@ -184,6 +185,7 @@ class _Search:
         both = min(float(moves.max(initial=0.0)), float(-moves.min(initial=0.0)))
         self._is_swept_once = self._reversals < FEW_REVERSALS and both < _BOTH_WAYS * float(np.ptp(measured.inputs))
         self._memories: dict[_Kind, tuple[Initial | None, ...]] = {}
+        self._shapes: dict[str, tuple[float, ...]] = {}
 
     def run(self) -> Selection:
         screened = self.screen()
@@ -208,9 +210,25 @@ class _Search:
         judged = self.with_units(finalists)
         return self.choose(judged, self.with_time(judged))
 
+    def _evaluated(
+        self, tries: Sequence[Sequence[Candidate]], *, most_folds: int | None = None, hopeless: Sequence[float] = ()
+    ) -> list[list[Evaluation]]:
+        """Return how candidates do, a task for each sequence of them.
+
+        What takes longest, the search for the shape of an operator, is carried out once for each candidate.
+        """
+        limits = hopeless or [float("inf")] * len(tries)
+        tasks = []
+        for each, limit in zip(tries, limits, strict=True):
+            settings: dict[str, Any] = {"most_folds": most_folds, "hopeless": limit, "shapes": self._shapes}
+            tasks.append((each[0].model, partial(evaluate, self.measured, each, **settings)))
+        result = list(self.carry(tasks))
+        self._shapes |= {each.candidate.name: each.shape for ones in result for each in ones if each.shape}
+        return result
+
     def screen(self) -> dict[_Kind, Evaluation]:
         """Return each kind at its coarsest, with its best orientation and memory."""
-        tasks, kinds, failures = [], [], []
+        tried, kinds, failures = [], [], []
         for kind in self.kinds:
             try:
                 tries = self._first_tries(kind)
@@ -218,9 +236,9 @@ class _Search:
                 failures.append(Evaluation(Candidate(kind.model, kind.options(0)), failure=str(error)))
             else:
                 kinds.append(kind)
-                tasks.append((kind.model, partial(evaluate, self.measured, tries, most_folds=2)))
+                tried.append(tries)
         result = {}
-        for kind, found in zip(kinds, self.carry(tasks), strict=True):
+        for kind, found in zip(kinds, self._evaluated(tried, most_folds=2), strict=True):
             usable = [each for each in found if each.blocks]
             if usable:
                 result[kind] = best_memory(usable, **self._memory_rules(kind))
@@ -237,18 +255,17 @@ class _Search:
         step = 0
         while going:
             names = list(going.items())
-            tasks = []
+            tried, limits = [], []
             for kind, candidate in names:
                 sized = replace(candidate, options=kind.options(step))
                 weights: list[float | None] = [sized.smoothing]
                 # A fine plane without any smoothing may fail where the same plane with some does not.
                 if self._is_smoothed(kind) and step:
                     weights.append(_SOME)
-                tries = [replace(sized, smoothing=weight) for weight in weights]
-                limit = float("inf") if self._is_told_by_fit(kind) else hopeless
-                tasks.append((kind.model, partial(evaluate, self.measured, tries, hopeless=limit)))
+                tried.append([replace(sized, smoothing=weight) for weight in weights])
+                limits.append(float("inf") if self._is_told_by_fit(kind) else hopeless)
             step += 1
-            for (kind, _), found in zip(names, self.carry(tasks), strict=True):
+            for (kind, _), found in zip(names, self._evaluated(tried, hopeless=limits), strict=True):
                 before = min((each.rms for each in self.done[kind]), default=float("inf"))
                 self.done[kind] += found
                 now = min(each.rms for each in found)
@@ -291,10 +308,10 @@ class _Search:
         going = [self.kinds[index] for _, index in near[:_SMOOTHED]]
         while going:
             tries = [(kind, each) for kind in going for each in self._neighbours(kind)]
-            tasks = [
-                (kind.model, partial(evaluate, self.measured, [each], hopeless=_NEAR * least)) for kind, each in tries
-            ]
-            for (kind, _), found in zip(tries, self.carry(tasks), strict=True):
+            limits = [_NEAR * least] * len(tries)
+            for (kind, _), found in zip(
+                tries, self._evaluated([[each] for _, each in tries], hopeless=limits), strict=True
+            ):
                 self.done[kind] += found
             going = [kind for kind in going if self._neighbours(kind)]
 
@@ -325,8 +342,8 @@ class _Search:
             if self._is_smoothed(kind) and dict(kind.fixed).get("reversible") == _NO_REVERSIBLE
             for step in range(min(kind.steps, _COARSE))
         ]
-        tasks = [(each.model, partial(evaluate, self.measured, [each])) for each in tries if each not in others]
-        return [each for found in self.carry(tasks) for each in found if len(each.blocks) == self._folds]
+        found = self._evaluated([[each] for each in tries if each not in others])
+        return [each for ones in found for each in ones if len(each.blocks) == self._folds]
 
     def remember(self) -> None:
         """Try the other initial memories on the best, which were compared at the coarsest order only.
@@ -339,16 +356,17 @@ class _Search:
             kind = self.kinds[index]
             if kind.model in self._with_shape and (rms <= _NEAR * best[0][0] or self._is_told_by_fit(kind)):
                 chosen.append(kind)
-        tasks = []
+        kinds, tried, limits = [], [], []
         for kind in chosen:
             one = self._best(kind)
             assert one is not None
             others = [memory for memory in self._memories[kind] if memory != one.candidate.initial]
-            tries = [replace(one.candidate, initial=memory) for memory in others]
-            # Two folds may hide a memory that is to be preferred.
-            hopeless = (EQUAL if find_model(kind.model).saturates else _NEAR) * self._least([one])
-            tasks.append((kind.model, partial(evaluate, self.measured, tries, hopeless=hopeless)))
-        for kind, found in zip(chosen, self.carry(tasks), strict=True):
+            if others:
+                kinds.append(kind)
+                tried.append([replace(one.candidate, initial=memory) for memory in others])
+                # Two folds may hide a memory that is to be preferred.
+                limits.append((EQUAL if find_model(kind.model).saturates else _NEAR) * self._least([one]))
+        for kind, found in zip(kinds, self._evaluated(tried, hopeless=limits), strict=True):
             self.done[kind] += found
 
     def with_units(self, finalists: list[Evaluation]) -> list[Evaluation]:
@@ -367,14 +385,8 @@ class _Search:
         near = [each for each in finalists if each.rms <= _NEAR * least]
         others = [each for each in finalists if each not in near]
         told = [each for each in others if self._has_few_rows and each.candidate.model in self._with_shape]
-        tasks = [
-            (each.candidate.model, partial(evaluate, self.measured, [each.candidate], with_units=True))
-            for each in near + told
-        ]  # fmt: skip
-        found = [
-            replace(one, seconds=one.seconds + each.seconds)
-            for each, (one,) in zip(near + told, self.carry(tasks), strict=True)
-        ]
+        tasks = [(each.candidate.model, partial(leave_units_out, self.measured, each)) for each in near + told]
+        found = [one for (one,) in self.carry(tasks)]
         adequate = [
             one for one in found[len(near) :] if one.uncorrelated and judge_determined(self.measured, one)[0].follows
         ]
@@ -481,7 +493,7 @@ class _Search:
     def _trend(self, chosen: Evaluation) -> Trend | None:
         """Return the trend of errors over the rows tested; None of fewer rows than tell one from chance."""
         rows = np.flatnonzero(self.measured.tested)
-        errors = residuals_of(self.measured, chosen.candidate)[rows]
+        errors = residuals_of(self.measured, chosen)[rows]
         if rows.size < _FEWEST_OF_TREND or not np.ptp(errors) > 0.0:
             return None
         place = (rows - rows.mean()) / max(int(np.ptp(rows)), 1)
@@ -614,7 +626,7 @@ class _Search:
     def _gap(self, each: Evaluation) -> int:
         """Return over how many rows the errors of a first candidate are alike, at most a quarter of a block."""
         block = int(self.measured.tested.sum()) // self.measured.count_of_blocks
-        return correlated_rows(residuals_of(self.measured, each.candidate)[self.measured.known :], max(1, block // 4))
+        return correlated_rows(residuals_of(self.measured, each)[self.measured.known :], max(1, block // 4))
 
 
 def _kinds(model: str, spec: ModelSpec, given: Given) -> list[_Kind]:
