@@ -92,7 +92,7 @@ def test_of_few_rows_the_least_error_of_those_that_the_fit_to_all_supports_decid
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("plant", ALL)
+@pytest.mark.parametrize("plant", ["bouc-wen", "butterfly"])
 def test_a_plane_that_is_asked_for_does_not_make_it_worse(plant):
     assert ratio(plant, 10, PLANES, {"levels": 20, "reversible": "linear"}) <= MOST
 
@@ -100,7 +100,7 @@ def test_a_plane_that_is_asked_for_does_not_make_it_worse(plant):
 def test_a_fine_plane_that_is_asked_for_is_tried_with_some_smoothing_from_the_start():
     """Without any, that of the right orientation errs by four times the range and was given up."""
     inputs, outputs, others, truth = records("bouc-wen", 15)
-    found = select(Measurements.of(inputs, outputs), ("preisach",), Given({"levels": 40}))
+    found = select(Measurements.of(inputs, outputs), ("preisach",), Given({"levels": 40, "reversible": "linear"}))
     assert found.chosen.candidate.orientation == "falling"
     assert error(found.chosen.candidate, inputs, outputs, others, truth) < 0.03 * np.ptp(truth)
 
@@ -127,7 +127,7 @@ def test_an_equation_whose_fit_leaves_only_noise_is_chosen_although_a_block_left
     _, _, others, truth = records("duhem", 10)
     outputs = settled(duhem, inputs)
     outputs += 0.01 * np.ptp(outputs) * np.random.default_rng(4).standard_normal(60)
-    found = select(Measurements.of(inputs, outputs), ("duhem", "generalized-prandtl-ishlinskii", "polynomial-plays"))
+    found = select(Measurements.of(inputs, outputs), ("duhem", "polynomial-plays"))
     simplest = simplest_near_best([each for each in found.evaluations if each.units])[1]
     assert found.chosen.candidate.model == "duhem"
     assert found.chosen.uncorrelated
@@ -154,17 +154,19 @@ def wrong(candidate, inputs, outputs, others, truth):
 
 def test_of_a_record_that_goes_one_way_signs_and_smoothness_say_how_it_goes_on():
     record = one_way("jiles-atherton", 5)
-    found = select(Measurements.of(*record[:2]), ("preisach", "generalized-prandtl-ishlinskii", "polynomial"))
+    given = Given({"levels": 10})
+    found = select(Measurements.of(*record[:2]), ("preisach", "generalized-prandtl-ishlinskii"), given)
     chosen = found.chosen.candidate
     assert (chosen.model, chosen.options["reversible"], chosen.smoothing) == ("preisach", "none", 1.0)
-    plays = next(each.candidate for each in found.evaluations if each.candidate.model.startswith("generalized"))
-    assert wrong(chosen, *record) < 0.7 * wrong(plays, *record)
+    plays = next(each for each in found.evaluations if each.candidate.model.startswith("generalized"))
+    assert plays.rms < found.chosen.rms
+    assert wrong(chosen, *record) < 0.7 * wrong(plays.candidate, *record)
     assert any("reverses only once" in text for text in found.warnings())
     assert any("planes with the greatest smoothing were preferred" in text for text in found.warnings())
     # One that comes back all the way says so itself.
     inputs = through([-1.0, 1.0, -1.0], 60)
     outputs = settled(ALL["jiles-atherton"], inputs)
-    back = select(Measurements.of(inputs, outputs), ("preisach", "generalized-prandtl-ishlinskii", "polynomial"))
+    back = select(Measurements.of(inputs, outputs), ("preisach",), given)
     assert back.chosen.candidate.smoothing != 1.0
 
 
