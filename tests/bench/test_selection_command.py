@@ -15,6 +15,7 @@ from bench.results.joined_files import read_files
 COLUMNS = ("--input", "voltage", "--output", "travel")
 # Few models keep this short; `all` is tested once.
 SOME = ("--model", "polynomial,polynomial-plays,prandtl-ishlinskii")
+TWO = ("--model", "polynomial,prandtl-ishlinskii", "--plays", "5")
 
 
 def measure(path: Path, seed: int = 0, offset: float = 0.0, unit: str = "V") -> None:
@@ -111,7 +112,9 @@ def test_an_exact_line_is_chosen_as_such(bench, tmp_path):
         header="voltage [V],travel [mm]", delimiter=",", comments="",
     )  # fmt: skip
     result = tmp_path / "result.json"
-    code, _, err = bench("identify", tmp_path / "line.csv", *COLUMNS, "--json", result)
+    # An equation, and models with and without cells.
+    models = ("--model", "polynomial,duhem,prandtl-ishlinskii,preisach", "--levels", 5)
+    code, _, err = bench("identify", tmp_path / "line.csv", *COLUMNS, *models, "--json", result)
     assert code == 0, err
     assert json.loads(result.read_text())["rms_percent"] < 1e-9
     assert "hardly answers" not in err
@@ -259,14 +262,14 @@ def drifting(path: Path) -> None:
 def test_a_drift_is_warned_of_and_times_are_taken_where_they_gain(bench, tmp_path):
     file, out, result = tmp_path / "drifting.csv", tmp_path / "model.json", tmp_path / "result.json"
     drifting(file)
-    code, text, err = bench("identify", file, *COLUMNS, *SOME, "--time", "none")
+    code, text, err = bench("identify", file, *COLUMNS, *TWO, "--time", "none")
     assert code == 0, err
     assert "the errors drift by" in (text + err).replace("\n", " ")
     assert "holds times" not in text
     predicted = tmp_path / "predicted.json"
     for time in ((), ("--time", "time")):
         code, text, err = bench(
-            "identify", file, *COLUMNS, *SOME, *time, "--test", "150:", "--out", out, "--json", result
+            "identify", file, *COLUMNS, *TWO, *time, "--test", "150:", "--out", out, "--json", result
         )
         assert code == 0, err
         assert ("column time holds times: the chosen model takes time" in text) is (not time)
@@ -276,7 +279,7 @@ def test_a_drift_is_warned_of_and_times_are_taken_where_they_gain(bench, tmp_pat
         code, _, err = bench("predict", out, file, *COLUMNS, "--out", tmp_path / "p.csv", "--json", predicted)
         assert code == 0, err
         assert json.loads(predicted.read_text())["rms"] == pytest.approx(content["rms"], rel=1e-6)
-    code, text, err = bench("identify", file, *COLUMNS, *SOME, "--test", file)
+    code, text, err = bench("identify", file, *COLUMNS, *TWO, "--test", file)
     assert code == 0, err
     assert "on drifting.csv" in text
 
@@ -300,25 +303,25 @@ def test_times_of_few_rows_are_tried_only_if_asked_for(bench, tmp_path):
 
 def test_times_that_gain_little_are_not_taken(bench, record, tmp_path):
     """Plays behind no lag: the file's times change nothing, and what is in their way is said."""
-    assert bench("identify", record, *COLUMNS, *SOME, "--json", tmp_path / "untimed.json")[0] == 0
+    assert bench("identify", record, *COLUMNS, *TWO, "--json", tmp_path / "untimed.json")[0] == 0
     count = len(record.read_text().splitlines()) - 1
     file = timed(tmp_path / "timed.csv", 0.1 * np.arange(count))
-    code, text, err = bench("identify", file, *COLUMNS, *SOME, "--json", tmp_path / "timed.json")
+    code, text, err = bench("identify", file, *COLUMNS, *TWO, "--json", tmp_path / "timed.json")
     assert code == 0, err
     assert "no model with time errs 1.2 times less than the chosen one" in text
     found, plain = (json.loads((tmp_path / f"{name}.json").read_text()) for name in ("timed", "untimed"))
     assert (found["model"], found["rms"]) == (plain["model"], plain["rms"])
     again = timed(tmp_path / "again.csv", np.minimum(np.arange(count), 5))
-    code, text, err = bench("identify", again, *COLUMNS, *SOME)
+    code, text, err = bench("identify", again, *COLUMNS, *TWO)
     assert code == 0, err
     assert "column time does not increase in row 7" in text
     assert "time is left out" in text
     # A file for tests without times, and a column so named that holds something else.
-    code, text, err = bench("identify", file, *COLUMNS, *SOME, "--test", record)
+    code, text, err = bench("identify", file, *COLUMNS, *TWO, "--test", record)
     assert code == 0, err
     assert "record.csv has no column time: time is left out" in text
     warm = timed(tmp_path / "warm.csv", 20.0 + np.zeros(count), head="t [degC]")
-    code, text, err = bench("identify", warm, *COLUMNS, *SOME)
+    code, text, err = bench("identify", warm, *COLUMNS, *TWO)
     assert code == 0, err
     assert "time is left out" not in text
     assert "holds times" not in text

@@ -43,7 +43,7 @@ def calibrated(name, times, inputs, outputs, **options):
 @pytest.mark.parametrize(
     ("name", "options", "sequences"),
     [
-        ("hammerstein", {**LAG, "skip": 50}, 4),
+        ("hammerstein", {**LAG, "plays": 8, "skip": 50}, 3),
         pytest.param("hammerstein", {"dynamics": "lag", "levels": 10, "skip": 50}, 8, marks=pytest.mark.seeds),
         pytest.param("rate-dependent-plays", {"time_constants": 1, "skip": 50}, 8, marks=pytest.mark.seeds),
     ],

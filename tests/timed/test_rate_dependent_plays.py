@@ -257,7 +257,7 @@ def test_the_comparison_with_time_finds_loops_that_widen(bench, tmp_path):
     rows = np.column_stack([t, u, y])
     np.savetxt(data, rows, delimiter=",", header="t [s],drive [V],response [um]", comments="", fmt="%.17g")
     columns = ("--time", "t", "--input", "drive", "--output", "response")
-    models = ("--model", "prandtl-ishlinskii,polynomial-plays")
+    models = ("--model", "prandtl-ishlinskii,polynomial", "--initial", "skip", "--orientation", "rising")
     fit, predicted = tmp_path / "fit.json", tmp_path / "predicted.json"
     code, out, err = bench("identify", data, *columns, *models, "--out", model, "--json", fit)
     assert code == 0, err
