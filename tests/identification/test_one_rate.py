@@ -190,7 +190,7 @@ RINGING = LinearPart(0.0, (2.0 * 0.05 / _RATE, _RATE**-2), np.empty(0), np.empty
     ids=["lag", "ringing"],
 )
 def test_at_one_rate_a_resonance_rings_out_within_a_move(plant, operator, part, has_resonance):
-    times, inputs, outputs = major_loops(plant, 0, part=part, drift=0.0)
+    times, inputs, outputs = major_loops(plant, 0, 1000, part, drift=0.0)
     measured = Measurements.of(inputs, outputs)
     (found,) = HeldOutInTime(measured, times, inputs.size).evaluate(operator, 5)
     assert ("resonance" in found.candidate.options["dynamics"].split(",")) is has_resonance

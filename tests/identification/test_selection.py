@@ -403,7 +403,7 @@ def with_a_lag(inputs, static):
 
 
 def test_behind_a_lag_it_is_found_too_that_the_memory_of_the_record_is_unknown():
-    inputs = random_reversals(np.random.default_rng(5), 300, 16)
+    inputs = random_reversals(np.random.default_rng(5), 200, 12)
     measured, in_time = with_a_lag(inputs, bouc_wen(inputs))
     found = select(measured, ("bouc-wen",), in_time=in_time)
     static = [each for each in found.evaluations if each.candidate.static is None]
@@ -432,8 +432,9 @@ def test_a_shape_and_what_follows_it_are_searched_to_the_end():
 
 def test_criteria_of_models_with_time_are_those_of_the_same_rows():
     inputs = random_reversals(np.random.default_rng(5), 300, 16)
-    _, in_time = with_a_lag(inputs, settled(bouc_wen, inputs))
-    one = Candidate("bouc-wen", orientation="auto")
+    plays = PrandtlIshlinskii(np.arange(5) / 5.0, [0.5, 0.3, 0.6, 0.2, 0.4])
+    _, in_time = with_a_lag(inputs, plays.evaluate(inputs))
+    one = Candidate("prandtl-ishlinskii", {"plays": 5, "dead_zones": 0})
     (whole,), (without,) = (in_time.evaluate(replace(one, initial=memory), 2) for memory in (None, "skip"))
     assert whole.akaike == pytest.approx(without.akaike, abs=4.0)
 

@@ -18,7 +18,7 @@ from bench.model_file import ModelFile, load_model
 
 PACKAGE = Path(__file__).parent / "boucwen_package"
 TRUE = {"rho": 1.2, "sigma": 1.6, "n": 1.8}
-INPUTS = damped_oscillation(-5.0, 5.0, 0.0, 20, 0.1)
+INPUTS = damped_oscillation(-5.0, 5.0, 0.0, 20, 0.2)
 
 
 @pytest.fixture(scope="module")
