@@ -46,8 +46,9 @@ class TestEveryClock:
 
     def test_sleep_until_the_past_returns_at_once(self, clock):
         before = clock.now()
-        clock.sleep_until(before - 1000.0)
-        assert before <= clock.now() < before + 500.0
+        clock.sleep_until(before - 1e6)
+        # A busy machine may take its time: a minute, at x1000.
+        assert before <= clock.now() < before + 60e3
 
     @pytest.mark.parametrize("seconds", [math.nan, math.inf, -math.inf])
     def test_refuses_what_is_not_finite(self, clock, seconds):
@@ -58,9 +59,11 @@ class TestEveryClock:
 
     def test_timestamp_and_date_agree(self, clock):
         clock.sleep(1e-3)
-        stamp, date = clock.timestamp(), clock.date()
-        assert stamp == pytest.approx(clock.epoch.timestamp() + clock.now(), abs=10.0)
-        assert date.timestamp() == pytest.approx(stamp, abs=10.0)
+        before, stamp, date, after = clock.now(), clock.timestamp(), clock.date(), clock.now()
+        # A time of day is in whole microseconds.
+        assert before <= stamp - clock.epoch.timestamp() + 2e-6
+        assert stamp <= date.timestamp() + 2e-6
+        assert date.timestamp() - clock.epoch.timestamp() <= after + 2e-6
         assert date.tzinfo is not None
 
 

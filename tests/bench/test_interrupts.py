@@ -271,9 +271,9 @@ class TestProcesses:
         return process
 
     def test_at_a_terminal_pause_and_resume(self, start):
-        process = self.paused(start, "stairs", "dwell=0.3")
-        os.write(process.terminal, b"what\nr\n")
-        process.until("OUTCOME completed 4 True")
+        process = self.paused(start, "stairs", "dwell=0.3", "count=100", "increment=0.1")
+        os.write(process.terminal, b"what\nset dwell=0\nr\n")
+        process.until("OUTCOME completed 100 True")
         assert process.end() == 0, process.output
         assert "please answer r" in process.output
 

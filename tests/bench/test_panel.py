@@ -222,7 +222,7 @@ class TestHands:
 class TestRunInProgress:
     def test_it_is_paused_answered_and_shown_to_its_end(self, tmp_path, rig_file):
         run = Run(
-            protocol=stairs, settings={"dwell": 0.5, "count": 40, "increment": 1}, rig=rig_file(),
+            protocol=stairs, settings={"dwell": 2.5, "count": 40, "increment": 1}, rig=rig_file(),
             folder=tmp_path / "runs", clock="x2", recording=False, rehearse=False,
         )  # fmt: skip
         results = []
@@ -250,9 +250,9 @@ class TestRunInProgress:
                 await enter(pilot, "what")
                 await pilot.press("f4")
                 await until("PAUSED: paused by the operator")
-                assert "set dwell=… now 0.5 s" in source.view().help
+                assert "set dwell=… now 2.5 s" in source.view().help
                 await enter(pilot, "set dwell=0.05")
-                await until("dwell = 0.05 (was 0.5)")
+                await until("dwell = 0.05 (was 2.5)")
                 await until("now 0.05 s")
                 await enter(pilot, "r")
                 await until("completed")

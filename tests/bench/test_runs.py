@@ -140,12 +140,9 @@ class TestCarryOut:
         assert not result.outcome.is_safe
         assert result.outcome.safe_state == {"tec": "OSError: [Errno 5] Input/output error", "probe": "safe"}
 
-    @pytest.mark.parametrize("clock", ["x20", "x100"])
-    def test_the_packaged_rig_on_a_fast_clock(self, tmp_path, console, clock):
-        # Without the watchdog: on a busy machine its 5 s, 50 ms at x100, may pass between two requests.
-        creep = find_protocol("creep")
-        overrides = {"devices.tec.watchdog": "0", "devices.psd.timeout": "60"}
-        run = Run(creep, {"duration": "8"}, "vo2", tmp_path, overrides=overrides, clock=clock, recording=False)
+    def test_the_packaged_rig_on_a_fast_clock(self, tmp_path, console):
+        # No watchdog trips on a busy machine: its time does not pass while this process does not run.
+        run = Run(find_protocol("creep"), {"duration": "8"}, "vo2", tmp_path, clock="x100", recording=False)
         outcome = carry_out(run, console).outcome
         assert outcome.status == "completed", outcome.reason
         assert outcome.is_safe

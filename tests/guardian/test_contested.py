@@ -16,7 +16,13 @@ from bench.journal import Record
 pytestmark = pytest.mark.usefixtures("warm_popen")
 
 PROTOCOL = f"{Path(__file__).with_name('hanging_protocols.py')}:cycle"
-OVERRIDES = {"emulation.disturbances": "false"}
+# A busy machine keeps server and client waiting by the wall clock.
+OVERRIDES = {
+    "emulation.disturbances": "false",
+    "devices.tec.watchdog": "600",
+    "devices.tec.timeout": "10",
+    "devices.psd.timeout": "60",
+}
 LONGEST = 200.0
 """Longest wait for anything here, s."""
 
@@ -67,7 +73,9 @@ def endpoints(rig, path, **ports):
 def test_the_second_bench_is_refused_and_the_first_one_is_not_disturbed(emulated_rig, tmp_path):
     rig = emulated_rig("vo2", clock="x2", overrides=OVERRIDES)
     enough, contested, undisturbed, refused = (tmp_path / name for name in ("enough", "first", "alone", "second"))
-    first = bench_run("--attach", str(rig.endpoints_file), "--out", str(contested), "--set", f"until={enough}")
+    first = bench_run(
+        "--attach", str(rig.endpoints_file), "--out", str(contested), "--set", f"until={enough}", *overrides()
+    )
     try:
         await_first_step(contested, first)
         link = tmp_path / "link"

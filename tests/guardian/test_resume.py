@@ -15,6 +15,10 @@ from sim_devices.serving.process import serve
 
 pytestmark = pytest.mark.usefixtures("warm_popen")
 
+WATCHDOG = 600.0
+"""Laboratory time (s), 150 s of the wall clock: a busy machine trips none."""
+PATIENT = {"devices.tec.watchdog": WATCHDOG, "devices.tec.timeout": 10, "devices.psd.timeout": 60}
+
 
 @pytest.fixture
 def served():
@@ -31,15 +35,18 @@ def kill_both(bench):
 
 
 def test_clears_what_the_watchdogs_left_and_goes_on(served, tmp_path, capsys):
-    settings = ("increment=31.5", "half_cycles=1", "dwell=2")
+    settings = ("increment=31.5", "half_cycles=1", "dwell=1")
     command = ["run", "damped-oscillation", "--rig", "vo2", "--attach", str(served.endpoints_file)]
     command += ["--no-rehearse", "--out", str(tmp_path), *(f"--set={setting}" for setting in settings)]
-    folder = kill_after(2, tmp_path, *command, kill=kill_both)
+    command += [f"--override={key}={value}" for key, value in PATIENT.items()]
+    folder = kill_after(1, tmp_path, *command, kill=kill_both)
     with Record(folder) as record:
         total = record.meta["plan"]["steps"]
         before = len(record.steps())
     assert before < total
     # Nobody is left who could switch it off: its own watchdog does, and it stays in error.
+    assert is_on(served)
+    served.control.advance(WATCHDOG)
     seconds_until(lambda: not is_on(served))
     with pytest.raises(SystemExit) as refused:
         main(["resume", str(folder)])

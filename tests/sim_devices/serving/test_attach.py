@@ -12,10 +12,21 @@ from bench.results.run_folder import RunFolder
 
 pytestmark = pytest.mark.usefixtures("warm_popen")
 
-CREEP = ["--set", "hot=70", "--set", "cool=50", "--set", "duration=10"]
-PATIENT = ["--override", "devices.tec.watchdog=300", "--override", "devices.tec.timeout=10",
-           "--override", "devices.psd.timeout=30", "--no-rehearse"]  # fmt: skip
-"""A busy machine keeps the client waiting by the wall clock; a rehearsal is not what is tested."""
+CREEP = ["--set", "start=22", "--set", "hot=26", "--set", "cool=22", "--set", "duration=2.6", "--set", "interval=0.2",
+         "--set", "settling=1"]  # fmt: skip
+"""10 s of laboratory time: the faster it has to pass, the less a process may be kept waiting."""
+
+
+def overrides(values):
+    return [f"--override=devices.{key}={value}" for key, value in values.items()]
+
+
+VO2 = overrides({"tec.watchdog": 600, "tec.timeout": 10, "psd.timeout": 60})
+"""A busy machine keeps server and client waiting by the wall clock."""
+SMA = overrides({
+    "supply.watchdog": 60, "supply.heartbeat": 60, "supply.timeout": 10, "load_cell.timeout": 10,
+    "wire_end.timeout": 60, "stage.watchdog": 0, "stage.timeout": 10, "fan.watchdog": 600, "fan.timeout": 60,
+})  # fmt: skip
 
 
 def readings(folder):
@@ -26,34 +37,33 @@ def readings(folder):
 
 @pytest.mark.slow
 def test_creep_gives_what_it_gives_in_process(bench, emulate, tmp_path):
-    with emulate("vo2", "--clock", "x10"):
+    # Its watchdog then leaves 150 s of the wall clock.
+    with emulate("vo2", "--clock", "x4"):
         ports = tmp_path / "endpoints.json"
         served, inside = tmp_path / "served", tmp_path / "inside"
         code, out, err = bench(
-            "run", "creep", "--rig", "vo2", "--attach", ports, "--no-rehearse", *CREEP, *PATIENT, "--out", served
+            "run", "creep", "--rig", "vo2", "--attach", ports, "--no-rehearse", *CREEP, *VO2, "--out", served
         )
         assert (code, err) == (0, "")
-        assert "completed: 43 steps" in out
+        assert "completed: 29 steps" in out
     assert bench("run", "creep", "--rig", "vo2", "--clock", "virtual", *CREEP, "--out", inside)[0] == 0
     one, other = readings(served), readings(inside)
     assert len(one["curvature"]) == len(other["curvature"])
     # Noise of one reading: 0.35 1/m of the detector, and what 5 mK rms of the film make on the slope.
-    for target in (70.0, 50.0):
+    for target in (26.0, 22.0):
         served_last, inside_last = (
-            each["curvature"][abs(each["tec_temperature"] - target) < 0.1][-8:] for each in (one, other)
+            each["curvature"][abs(each["tec_temperature"] - target) < 0.1][-4:] for each in (one, other)
         )
-        assert len(served_last) == len(inside_last) == 8
+        assert len(served_last) == len(inside_last) == 4
         assert np.mean(served_last) == pytest.approx(np.mean(inside_last), abs=3.0)
 
 
 @pytest.mark.slow
 def test_a_prompt_is_carried_out_by_the_server(bench, emulate, tmp_path):
-    with emulate("sma", "--clock", "x10"):
+    with emulate("sma", "--clock", "x1", "--override", "emulation.supply_watchdog=60"):
         code, _, err = bench(
-            "run", "creep", "--rig", "sma", "--attach", tmp_path / "endpoints.json", "--no-rehearse",
-            "--out", tmp_path / "runs",
-            "--set", "load=4.9", "--set", "hot=1", "--set", "cool=0", "--set", "duration=1", "--set", "settling=0",
-            "--override", "devices.stage.watchdog=0", "--override", "devices.fan.watchdog=100",
+            "run", "calibration-load", "--rig", "sma", "--attach", tmp_path / "endpoints.json", "--no-rehearse",
+            "--out", tmp_path / "runs", "--set", "weights=4.9", "--set", "readings=2", "--set", "dwell=0.2", *SMA,
         )  # fmt: skip
         assert (code, err) == (0, "")
         run = RunFolder(next((tmp_path / "runs").iterdir()))
@@ -64,18 +74,18 @@ def test_a_prompt_is_carried_out_by_the_server(bench, emulate, tmp_path):
 def test_a_schedule_of_faults_happens_in_the_server_and_stands_in_its_log(bench, emulate, tmp_path):
     faults, log = tmp_path / "faults.jsonl", tmp_path / "state.jsonl"
     faults.write_text(
-        '{"at": 6.0, "fault": "displaced-spot", "values": {"metres": 5e-6}, "duration": 4.0}\n'
-        '{"at": 8.0, "fault": "tec-over-current"}\n'
+        '{"at": 1.0, "fault": "displaced-spot", "values": {"metres": 5e-6}, "duration": 4.0}\n'
+        '{"at": 3.0, "fault": "tec-over-current"}\n'
     )
-    with emulate("vo2", "--clock", "x5", "--state", log) as (_, endpoints):
+    with emulate("vo2", "--clock", "x1", "--state", log) as (_, endpoints):
         code, _, err = bench(
-            "run", "creep", "--rig", "vo2", "--attach", tmp_path / "endpoints.json", *CREEP, *PATIENT,
+            "run", "creep", "--rig", "vo2", "--attach", tmp_path / "endpoints.json", "--no-rehearse", *CREEP, *VO2,
             "--faults", faults, "--out", tmp_path / "runs",
         )  # fmt: skip
         assert code not in (0, 7)
         assert "tec: " in err
         with ControlClient(endpoints["control"]) as control:
-            control.wait(control.time() + 6.0)
+            control.advance(6.0)
             events = control.events()
             assert control.state()["tec_output"] == 0.0
     assert [(each["fault"], each["what"]) for each in events] == [
@@ -89,16 +99,17 @@ def test_a_schedule_of_faults_happens_in_the_server_and_stands_in_its_log(bench,
 
 @pytest.mark.slow
 def test_a_run_ends_when_its_server_is_killed(emulate, tmp_path):
-    with emulate("vo2", "--clock", "x10") as (server, endpoints):
+    with emulate("vo2", "--clock", "x1") as (server, endpoints):
         command = [sys.executable, "-P", "-m", "bench", "run", "creep", "--rig", "vo2", "--set", "duration=3000",
-                   "--attach", str(tmp_path / "endpoints.json"), "--no-rehearse",
+                   "--attach", str(tmp_path / "endpoints.json"), "--no-rehearse", *VO2,
                    "--out", str(tmp_path / "runs")]  # fmt: skip
         run = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
         with ControlClient(endpoints["control"]) as control:
             while not control.state()["tec_output"]:
-                control.wait(control.time() + 1.0)
+                assert run.poll() is None
+                control.wait(control.time() + 0.1)
         server.kill()
-        _, err = run.communicate(timeout=120)
+        _, err = run.communicate(timeout=240)
     # Nothing answers any more, so that the safe state cannot be confirmed.
     assert run.returncode == 7
     assert "tec is NOT in its safe state" in err

@@ -54,7 +54,7 @@ def test_a_dash_prints_the_endpoints_on_a_line_and_texts_elsewhere(tmp_path):
 
 
 def test_several_rigs_have_a_name_each(emulate):
-    with emulate("sma", "vo2", "mckibben", "--clock", "x2") as (_, endpoints):
+    with emulate("sma", "vo2", "mckibben", "--clock", "x1") as (_, endpoints):
         assert [each["rig"] for each in endpoints["rigs"]] == ["sma", "vo2", "mckibben"]
         addresses = [one["port"] for each in endpoints["rigs"] for one in each["instruments"].values()]
         assert len({*addresses}) == len(addresses) == 10
