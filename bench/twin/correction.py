@@ -105,8 +105,7 @@ def identify_correction(
         weights = _PENALTIES[best]
         options = [(unknown[best[0], :, 0], problem)]
         if own.any():
-            problem = _problem(levels, cells, _saturated(levels, cells, targets[:, [1]], weights[[1]]))
-            options.append((_held_out(*problem[1:], targets[:, [1]], weights[[1]])[0, :, 0], problem))
+            options.append(_saturated(levels, cells, targets[:, [1]], weights[[1]]))
     losses = [float(missed @ missed) for missed, _ in options]
     which = int(np.argmin(losses))
     if losses[which] >= float(target @ target):
@@ -126,7 +125,8 @@ def _problem(
 ) -> tuple[csr_array, Floats, Floats]:
     """Return what each node adds to the density of each cell, and to each row, and the penalty of all unknowns.
 
-    The last unknown is a constant. `saturated` is as `_saturated` returns it.
+    The last unknown is a constant. `saturated` is how many levels from the lower and the upper end of the plane hold
+    no hysterons.
     """
     nodes, roughness = _smooth_densities(levels, saturated)
     columns = np.column_stack([nodes.T.dot(cells.T).T, np.ones(cells.shape[0])])
@@ -135,20 +135,25 @@ def _problem(
     return nodes, columns, penalty
 
 
-def _saturated(levels: Floats, cells: Floats, target: Floats, weight: Floats) -> tuple[float, float]:
-    """Return how many levels from the lower and the upper end of the plane hold no hysterons, by held-out errors.
+def _saturated(
+    levels: Floats, cells: Floats, target: Floats, weight: Floats
+) -> tuple[Floats, tuple[csr_array, Floats, Floats]]:
+    """Return the held-out errors and the problem of the ends of the plane without hysterons that predict best.
 
     There the density ends at once, which no smooth one does.
     """
-    found = [0.0, 0.0]
-    for end in (0, 1):
-        losses = []
-        for edge in _EDGES:
-            found[end] = edge
-            _, columns, penalty = _problem(levels, cells, (found[0], found[1]))
-            losses.append(float(np.sum(_held_out(columns, penalty, target, weight) ** 2)))
-        found[end] = _EDGES[int(np.argmin(losses))]
-    return found[0], found[1]
+
+    def tried(below: float, above: float) -> tuple[float, Floats, tuple[csr_array, Floats, Floats]]:
+        problem = _problem(levels, cells, (below, above))
+        missed = _held_out(*problem[1:], target, weight)
+        return float(np.sum(missed**2)), missed[0, :, 0], problem
+
+    # With equal losses the first, as the smallest.
+    lower = [tried(edge, 0.0) for edge in _EDGES]
+    below = int(np.argmin([loss for loss, *_ in lower]))
+    upper = [lower[below], *(tried(_EDGES[below], edge) for edge in _EDGES[1:])]
+    _, missed, problem = upper[int(np.argmin([loss for loss, *_ in upper]))]
+    return missed, problem
 
 
 def _held_out(columns: Floats, penalty: Floats, targets: Floats, weights: Floats) -> Floats:

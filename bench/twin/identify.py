@@ -271,7 +271,8 @@ def identify_twin(paths: Sequence[Path], file: RigFile, model: Path | None) -> I
     disturbed = replace(dynamics, wander=wander, drift=drift)
     # The readings had the effect of wander, too: the twin adds its own.
     effects = mean_effects(carried_out, operators, disturbed)
-    response = correct_response(response, carried_out, operator, effects)
+    if any(effect.any() for effect in effects):
+        response = correct_response(response, carried_out, operator, effects)
     operators = [operator] if response.correction is None else [operator, response.correction]
     unevenness = identify_unevenness(
         carried_out, response.of_model, response.left, operators, disturbed, effects, noise
