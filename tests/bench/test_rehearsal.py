@@ -103,7 +103,10 @@ class TestRehearsal:
     @pytest.mark.parametrize("protocol_name", ["tracking", "following"])
     def test_a_run_under_control_takes_as_long_as_rehearsed(self, make, console, model, protocol_name):
         """Those of another session differ by what it draws at random: on this film by 4 %, one standard deviation."""
-        settings = {"model": model, **({"readings": 1} if protocol_name == "tracking" else {"duration": 60})}
+        settings = {
+            "model": model,
+            **({"readings": 1, "count": 8} if protocol_name == "tracking" else {"duration": 60}),
+        }
         # The model is one of curvature itself, not of what a detector with errors makes of it.
         common = {"definition": find_protocol(protocol_name), "settings": settings, "rig": "vo2",
                   "overrides": {"emulation.sensors": "ideal"}}  # fmt: skip

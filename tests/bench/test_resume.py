@@ -294,7 +294,7 @@ def test_a_killed_run_is_resumed_to_the_model_of_an_uninterrupted_one(rig, tmp_p
 
 
 def test_a_controller_goes_on_where_its_readings_had_brought_it(tmp_path):
-    measured = bench.run("damped-oscillation", "vo2", out=tmp_path / "model", increment=3.0, half_cycles=8)
+    measured = bench.run("damped-oscillation", "vo2", out=tmp_path / "model", increment=6.0, half_cycles=4)
     model = tmp_path / "model.json"
     bench.identify(measured, "preisach-nonmonotonic", levels=8, plane=(30.0, 70.0)).file.save(model)
     settings = {"model": str(model), "count": 4, "readings": 2}
@@ -314,7 +314,7 @@ def test_a_controller_goes_on_where_its_readings_had_brought_it(tmp_path):
 
 
 def test_what_was_done_by_hand_is_done_again_in_a_new_laboratory(tmp_path):
-    folder = bench.run("force-voltage", "sma", out=tmp_path, points=11, conditioning=1).folder
+    folder = bench.run("force-voltage", "sma", out=tmp_path, points=11, conditioning=1, dwell=20.0).folder
     total = len(steps_of(folder))
     shutil.copytree(folder, tmp_path / "early")
     # After the prompt, before anything was set.

@@ -263,7 +263,7 @@ class TestInterlocks:
         assert it.end() == SAFE
 
     def test_a_blind_interlock_is_the_safe_state_of_what_can_be_reached(self, station, vo2):
-        it = station()
+        it = station(safety__reconnect="0.5")
         vo2.control.unplug("tec")
         seconds_until(lambda: it._process.poll() is None and not is_on(vo2))
         with pytest.raises(DeviceConnectionError, match="tec: no answer"):
@@ -340,7 +340,7 @@ class TestGuardianGone:
         assert not is_on(vo2)
 
     def test_a_rescue_that_fails_is_no_safe_state(self, station, vo2):
-        it = station()
+        it = station(safety__reconnect="0.5")
         guardian_of(it).kill()
         vo2.control.unplug("tec")
         assert "safe" not in it.end()["tec"].split()

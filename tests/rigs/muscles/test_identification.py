@@ -1,6 +1,7 @@
 """From runs of a muscle to models, on short runs of the rig `sma` recorded here."""
 
 import re
+from functools import cache
 
 import numpy as np
 import pytest
@@ -60,6 +61,12 @@ def resting(runs):
 @pytest.fixture(scope="module")
 def series(runs):
     return [*read_series(runs["length-voltage"]), *read_series(runs["length-force"])]
+
+
+@pytest.fixture(scope="module")
+def fitted(resting, series):
+    """Each model by its name, identified once."""
+    return cache(lambda name: identify_muscle(name, resting, series))
 
 
 class TestReading:
@@ -157,8 +164,8 @@ KINDS = {
 
 class TestIdentifying:
     @pytest.mark.parametrize("name", MODELS)
-    def test_each_model(self, name, runs, resting, series, tmp_path):
-        found = identify_muscle(name, resting, series)
+    def test_each_model(self, name, runs, resting, series, fitted, tmp_path):
+        found = fitted(name)
         assert isinstance(found.model, KINDS[name])
         assert set(found.errors) == {"length-voltage", "length-force"} | (
             set() if name == "summed" else {"force-voltage"}
@@ -181,29 +188,29 @@ class TestIdentifying:
             np.testing.assert_array_equal(predict_series(again.model, one), predict_series(found.model, one))
         assert again.model.to_json() == found.model.to_json()
 
-    def test_stages_are_those_that_the_name_says(self, resting, series):
-        two_stage = identify_muscle("two-stage", resting, series).model
+    def test_stages_are_those_that_the_name_says(self, fitted):
+        two_stage = fitted("two-stage").model
         assert isinstance(two_stage.first, Preisach)
         assert isinstance(two_stage.second, Preisach)
         assert (two_stage.voltage_unit, two_stage.force_unit, two_stage.length_unit) == ("V", "N", "m")
-        plays = identify_muscle("two-stage-prandtl-ishlinskii", resting, series).model
+        plays = fitted("two-stage-prandtl-ishlinskii").model
         assert plays.first.to_json() == two_stage.first.to_json()
         assert isinstance(plays.second, PrandtlIshlinskii)
 
-    def test_a_first_stage_identified_before_gives_the_same_models(self, resting, series):
+    def test_a_first_stage_identified_before_gives_the_same_models(self, resting, series, fitted):
         first = identify_resting(resting)
         for name in ("two-stage", "two-stage-prandtl-ishlinskii"):
-            alone, known = (identify_muscle(name, resting, series, stage) for stage in (None, first))
+            alone, known = fitted(name), identify_muscle(name, resting, series, first)
             assert known.model.to_json() == alone.model.to_json()
             assert known.errors == alone.errors
 
-    def test_the_force_of_the_cold_muscle_is_held(self, resting, series):
-        model = identify_muscle("two-stage", resting, series).model
+    def test_the_force_of_the_cold_muscle_is_held(self, resting, fitted):
+        model = fitted("two-stage").model
         cold = model.first.evaluate(np.zeros(1))[0]
         assert cold == pytest.approx(resting.forces[0], abs=0.05)
 
-    def test_errors_say_what_predictions_miss(self, resting, series):
-        found = identify_muscle("two-stage", resting, series)
+    def test_errors_say_what_predictions_miss(self, series, fitted):
+        found = fitted("two-stage")
         chosen = [one for one in series if one.kind == "length-force"]
         errors = measure_series(found.model, chosen)
         assert errors_json(errors) == errors_json(found.errors["length-force"])

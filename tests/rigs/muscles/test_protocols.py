@@ -340,8 +340,8 @@ def identified(tmp_path_factory):
     folder = tmp_path_factory.mktemp("identified")
     runs = []
     for protocol, settings in (
-        ("force-voltage", {"points": 41, "dwell": 15}),
-        ("length-voltage", {"points": 41, "dwell": 10, "loads": "2.94, 4.9, 6.86"}),
+        ("force-voltage", {"points": 21, "dwell": 15}),
+        ("length-voltage", {"points": 21, "dwell": 10, "loads": "2.94, 4.9, 6.86"}),
     ):
         result = folder / "run.json"
         with pytest.raises(SystemExit) as stopped:

@@ -28,7 +28,7 @@ from sim_devices.world import World
 LIVELY = HybridParameters()
 PLAIN = HybridParameters(ambient_sd=0.0)
 PURE = dataclasses.replace(PLAIN, creep_share=0.0)
-LONG = 20_000.0  # s, 47 time constants of the block
+LONG = 10_000.0  # s, 23 time constants of the block
 
 
 def make(parameters=PLAIN, seed=1):
@@ -211,7 +211,7 @@ class TestHeat:
             errors.append(np.abs(plant._rise + 22.0 - exact).max())
         assert errors[0] > 3.0 * errors[1] > 9.0 * errors[2]
 
-    @pytest.mark.parametrize("current", [-0.3, -0.1, 0.02, 0.1])
+    @pytest.mark.parametrize("current", [-0.3, 0.1])
     def test_settled_heat_to_air_is_the_electrical_power(self, current):
         plant = settled(current)
         assert plant.current * plant.tec_voltage > 1e-4

@@ -450,7 +450,7 @@ class TestNoise:
         assert lagged == pytest.approx(math.exp(-1.0), abs=0.05)
 
         only_drift = make(VO2Parameters(relay_count=16, wander_sd=0.0), seed=3)
-        drift = np.empty(1500)
+        drift = np.empty(700)
         for k in range(drift.size):
             only_drift.advance(600.0)
             drift[k] = only_drift.film_temperature - only_drift.plate_temperature
