@@ -230,8 +230,9 @@ class TestProcesses:
         process.send(signal.SIGINT)
         assert self.assert_aborted(process, "Ctrl-C") == 0
 
-    @pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
-    @pytest.mark.parametrize("protocol", ["stairs", "settle"])
+    @pytest.mark.parametrize(
+        ("name", "protocol"), [("SIGTERM", "stairs"), ("SIGTERM", "settle"), ("SIGHUP", "stairs")]
+    )
     def test_the_system_ends_it_at_once(self, start, name, protocol):
         more = ("dwell=3000",) if protocol == "stairs" else ("minimum=3000", "timeout=3600")
         process = start(protocol, *more, clock="x2")

@@ -40,7 +40,7 @@ FALLING = [(name, {}) for name in identifiable_models()]
 """What `make test` looks at; `make test-all` looks at all."""
 
 
-def write(path, sign, rows=240):
+def write(path, sign, rows=160):
     """Write a file that starts on the way down from positive saturation."""
     angles = np.linspace(1.2, 41.0, rows)
     inputs = 5.0 + 5.0 * np.cos(angles) * np.interp(angles, [0.0, 6.2, 41.0], [0.9, 1.0, 0.2])
@@ -106,7 +106,7 @@ def test_predict_prints_the_errors_of_identify(bench, tmp_path, data, name, opti
     assert code == 0, err
     assert printed_errors(predicted) == printed_errors(identified) != []
     again = json.loads(result.read_text())
-    assert fit["samples"] == 240 - again["skipped"]
+    assert fit["samples"] == 160 - again["skipped"]
     for key in ("max", "rms", "average", "max_percent", "rms_percent"):
         assert fit[key] == again[key]
 
@@ -140,7 +140,7 @@ def test_the_start_is_kept_and_can_be_chosen(bench, tmp_path, data):
     for command in (
         ["predict", model, data[1], *COLUMNS, "--out", tmp_path / "o.csv", "--initial", "somewhere"],
         ["predict", model, data[1], *COLUMNS, "--out", tmp_path / "o.csv", "--initial", "file", "--continue-memory"],
-        ["predict", model, data[1], *COLUMNS, "--out", tmp_path / "o.csv", "--skip", "240"],
+        ["predict", model, data[1], *COLUMNS, "--out", tmp_path / "o.csv", "--skip", "160"],
         ["invert", model, targets, "--column", "target", "--out", tmp_path / "o.csv", "--initial", "skip"],
     ):
         code, _, err = bench(*command)

@@ -97,6 +97,7 @@ def test_ctrl_c_leaves_in_the_safe_state(panel, vo2):
     assert not is_on(vo2)
 
 
+@pytest.mark.usefixtures("warm_popen")
 def test_a_rig_in_use_is_one_message(vo2, tmp_path):
     holder = Holder.of_this_process("vo2", "a test that is at work")
     with Locks(holder) as locks:
