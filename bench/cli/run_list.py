@@ -84,7 +84,7 @@ def _check_named(option: str, name: str | None, there_are: Sequence[str]) -> Non
 
 def _print_runs(folder: Path, runs: list[ListedRun]) -> None:
     """Print a line of short columns a run, and below it what is long."""
-    rows = [("started", "status", "protocol", "rig", "duration", "steps")]
+    rows = [("started (UTC)", "status", "protocol", "rig", "duration", "steps")]
     for run in runs:
         duration = "" if run.seconds is None else f"{run.seconds:.0f} s"
         started = run.started[:16].replace("T", " ")

@@ -97,9 +97,9 @@ def metadata(journal: Path, files: Mapping[Any, Entry], events: Iterable[Entry])
 
 
 def _start(journal: Path) -> str:
-    """Return when a run began, by the name of its folder, or else by its oldest file."""
+    """Return when a run began, by the name of its folder, which is in UTC, or else by its oldest file."""
     if stamp := _STAMP.search(journal.absolute().parent.name):
         with suppress(ValueError):
-            return datetime.strptime(stamp[1], "%Y%m%d-%H%M%S").astimezone().isoformat()
+            return datetime.strptime(stamp[1], "%Y%m%d-%H%M%S").replace(tzinfo=UTC).isoformat()
     times = [file.stat().st_mtime for file in journal.absolute().parent.iterdir() if file.is_file()]
     return datetime.fromtimestamp(min(times, default=0.0), UTC).isoformat()

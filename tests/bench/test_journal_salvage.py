@@ -3,6 +3,7 @@
 import random
 import shutil
 import sqlite3
+import time
 from contextlib import closing
 from datetime import datetime
 
@@ -20,6 +21,17 @@ from bench.journal.mirror import NAME as MIRROR_NAME
 from bench.journal.mirror import Mirror
 from bench.journal.recovery import RECOVERED_NAME, recover
 from bench.journal.rows import checksum, ticks
+
+
+@pytest.fixture(params=["UTC", "America/Los_Angeles", "Asia/Kolkata"])
+def zone(request):
+    """Let the computer stand in another time zone; Windows has no such variable."""
+    set_zone = getattr(time, "tzset", int)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("TZ", request.param)
+        set_zone()
+        yield
+    set_zone()
 
 
 @pytest.fixture(scope="module")
@@ -78,6 +90,7 @@ class TestAnOverwrittenPage:
         ):
             assert bench(*command)[0] == 0
 
+    @pytest.mark.usefixtures("zone")
     def test_that_has_the_metadata_leaves_what_other_rows_tell_of_them(self, completed, folder):
         overwrite(folder, "meta")
         found = recover(folder)
@@ -88,7 +101,7 @@ class TestAnOverwrittenPage:
             assert after.meta["finished"] == before.meta["finished"]
             assert (after.meta["rig"], after.meta["protocol"]) == ("unknown", "unknown")
             assert "protocol" in after.meta["recovered"]["substituted"]
-            # The folder is named after the second, in local time.
+            # The folder is named after the second, in UTC wherever the computer stands.
             assert abs(_seconds(after.meta["epoch"]) - _seconds(before.meta["host"]["started"])) < 60.0
 
     def test_of_a_copy_without_metadata_is_neither_repeated_nor_resumed(self, bench, folder, tmp_path):
