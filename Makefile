@@ -18,12 +18,12 @@ MAKEFLAGS += --jobs=2
 # Without files of byte code each worker and each process of the tests compiles every module again.
 unexport PYTHONDONTWRITEBYTECODE
 # Most of the modules that are installed are never imported: pip need not compile them all.
-ifneq ($(shell command -v uv 2>/dev/null),)
-INSTALL := uv pip install --quiet --python $(BIN)/python
-else
-INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile
-endif
-INSTALL += --constraint constraints.txt
+PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile --constraint constraints.txt
+# uv takes an eighth of the time. Where there is none pip installs it beside, and where it fails, as behind a mirror that
+# only pip knows, pip does its work.
+UV = $(firstword $(shell command -v uv 2>/dev/null) $(BIN)/uv)
+install = { test -x $(UV) && $(UV) pip install --quiet --python $(BIN)/python --constraint constraints.txt $(1); } \
+	|| $(PIP) $(1)
 
 .PHONY: demo demo-sma demo-muscles demo-hybrid test-quick test test-all preflight check lint types
 .PHONY: kernels tests all-tests benchmark busy busy-study kill-safe interlock-times fault-matrix journal-faults
@@ -44,10 +44,10 @@ test-quick: lint
 		tests/hysteresis tests/identification tests/control tests/contracts tests/drivers
 
 # Everything, the first seed of each study.
-test: preflight check tests
+test: preflight tests check
 
 # Everything, all seeds.
-test-all: preflight check all-tests
+test-all: preflight all-tests check
 
 # What the tests cannot install themselves, said before anything else.
 preflight:
@@ -146,17 +146,19 @@ clean:
 
 $(BASE): pyproject.toml constraints.txt
 	$(PYTHON) -m venv $(VENV)
-	$(INSTALL) setuptools
-	$(INSTALL) --no-build-isolation --editable .
+	test -x $(UV) || $(PIP) uv || true
+	$(call install,setuptools)
+	$(call install,--no-build-isolation --editable .)
 	touch $@
 
-# The project itself is installed by now: these add what its extras need.
+# The project itself is installed by now: these add what its extras need. A comma would end an argument of `call`.
+OF_DEMO := dashboard,report
 $(DEMO): $(BASE)
-	$(INSTALL) 'actuator-bench[dashboard,report]'
+	$(call install,'actuator-bench[$(OF_DEMO)]')
 	touch $@
 
 $(SETUP): $(DEMO)
-	$(INSTALL) 'actuator-bench[dev]'
+	$(call install,'actuator-bench[dev]')
 	touch $@
 
 # Once, beside the second half of the installation; afterwards `bench reproduce` compiles what has changed.

@@ -363,6 +363,9 @@ def reproduce(bench, tmp_path):
         )
         assert code == 0
         assert err == ""
+        *_, time, following = out.splitlines()
+        assert (time[:6], following[:12]) == ("time: ", "next: `bench")
+        assert [line for line in out.splitlines() if len(line) > 80 and "note: " not in line] in ([], [following])
         # They are compiled before worker processes start, which would compile any other one once more each.
         named = {kernel.py_func for kernel in kernels_of(load("studies", study).all_kernels)}
         assert {kernel.__module__ for kernel in loaded() - before - named} == set()

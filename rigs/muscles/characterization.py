@@ -42,13 +42,13 @@ TITLES: Mapping[ModelName, str] = {
     "two-stage": "two-stage (proposed)",
     "summed": "Summed",
     "linear": "Linear",
-    "two-stage-prandtl-ishlinskii": "two-stage, second one of 15 plays",
+    "two-stage-prandtl-ishlinskii": "two-stage, 15 plays",
 }
 KINDS = {
     "fv": ("F–V, ends held", "Fig. 6"),
-    "lv": ("L–V, five loads", "Figs. 7 and 10"),
-    "lf": ("L–F, six voltages", "Figs. 8 and 10"),
-    "verification": ("verification, random voltages", "Fig. 11"),
+    "lv": ("L–V, five loads", "Figs. 7, 10"),
+    "lf": ("L–F, six voltages", "Figs. 8, 10"),
+    "verification": ("verification", "Fig. 11"),
 }
 """The kinds of series by their keys in the JSON: what was varied, and the paper's figures of it."""
 _RESIDUALS = {"fv": "force-voltage", "lv": "length-voltage", "lf": "length-force"}

@@ -24,8 +24,8 @@ TABLES = tuple(
 
 
 VERDICT = tuple(
-    f"{part}, {title}: RMS {{{key}[{kind}][two_stage][rms]:.1f}} % of the range (paper: not stated)"
-    for key, (title, _) in MUSCLES.items()
+    f"{part}, {rig}: RMS {{{key}[{kind}][two_stage][rms]:.1f}} % of the range (paper: not stated)"
+    for key, (_, rig) in MUSCLES.items()
     for part, kind in (("identification", "lv"), ("validation", "verification"))
 )
 

@@ -122,9 +122,10 @@ class TestSecrets:
     TOKEN = "T0K3N"
 
     @pytest.mark.parametrize("equals", [False, True])
-    @pytest.mark.parametrize("fails", [False, True])
-    def test_neither_a_record_nor_what_is_made_of_it_holds_them(self, bench, tmp_path, monkeypatch, equals, fails):
-        program = f'"{sys.executable}" -c "import sys; sys.stdin.read(); sys.exit({int(fails)})" --token {self.TOKEN}'
+    def test_neither_a_record_nor_what_is_made_of_it_holds_them(self, bench, tmp_path, monkeypatch, equals):
+        program = (
+            f'"{sys.executable}" -c "import sys; sys.stdin.read(); sys.exit({int(equals)})" --token {self.TOKEN}'
+        )
         targets = [program, f"http://me:{self.TOKEN}@127.0.0.1:1/hooks/{self.TOKEN}?key={self.TOKEN}"]
         options = [f"--notify={target}" for target in targets]
         if not equals:
