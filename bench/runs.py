@@ -23,13 +23,12 @@ from bench.devices import Signal
 from bench.dialogue import Dialogue
 from bench.emulated_twin import twin_of
 from bench.engine import Engine, Outcome, check_before_moving
-from bench.errors import AbortError, ConfigurationError
+from bench.errors import AbortError, ConfigurationError, GuardianError
 from bench.extras import MissingExtraError, needed_for
 from bench.faults import read_schedule, schedule_faults
-from bench.guardian.black_box import FILE_NAME as BLACK_BOX_NAME
 from bench.guardian.remote import STACKS_NAME, GuardedRig, RemoteStation
 from bench.interrupts import Interrupts, say_at_once
-from bench.journal import FILE_NAME, Journal, abandon
+from bench.journal import BLACK_BOX_NAME, FILE_NAME, Ending, Journal, abandon, ending_of
 from bench.locks import Holder, Locks
 from bench.mailbox import RunMailbox
 from bench.model_file import models_among
@@ -444,13 +443,17 @@ def _leave(reason: str, station: Station | None = None, journal: Path | None = N
     """End the process from another thread than the one that hangs; a guardian makes the devices safe then."""
     safe_state = station.end() if isinstance(station, LocalStation) else {}
     text = f"ended by {reason}; the protocol did not come to an end, so the process was left"
+    ending = Ending("aborted", text, safe_state)
     if journal is not None:
-        abandon(journal, text, safe_state)
+        # The guardian asks a bench that hangs to end as well.
+        ending = ending_of(journal.parent) or ending
+        abandon(journal, ending)
+    text = ending.reason
     # The terminal may hang as well.
     saying = threading.Thread(target=say_at_once, args=(text,), daemon=True)
     saying.start()
     saying.join(_LAST_WORDS)
-    os._exit(AbortError.exit_code)
+    os._exit(AbortError.exit_code if ending.status == "aborted" else GuardianError.exit_code)
 
 
 def _dashboard_class(run: Run, console: Console) -> type[Dashboard] | None:

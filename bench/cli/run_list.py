@@ -54,9 +54,10 @@ def runs_(
 ) -> None:
     """List the runs below a folder in the order of their start: how they ended, what was set, what came out.
 
-    `running` is a run of a process of this computer, `unfinished` one whose process died or is of another computer,
-    `damaged` one whose journal is damaged or gone; `bench recover-journal` says what is left of it. Shown are the
-    parameters that differ from their defaults; any can be searched for: `bench runs --where controller=integral`.
+    `running` is a run of a process of this computer, `unfinished` one whose process died, with no guardian to say
+    how, or is of another computer, `damaged` one whose journal is damaged or gone; `bench recover-journal` says what
+    is left of it. Shown are the parameters that differ from their defaults; any can be searched for:
+    `bench runs --where controller=integral`.
     """
     from bench.results.run_list import list_runs, select_runs
 

@@ -155,7 +155,6 @@ def _write(writer: Writer, parts: Sequence[Entry | Part]) -> None:
 
 def _end_of(record: Record) -> list[End]:
     """Return how the run ended; nothing if it goes on or its process died."""
-    if "status" not in record.meta:
+    if record.status == "unfinished":
         return []
-    meta = record.meta
-    return [End(str(meta["status"]), str(meta.get("reason", "")), meta.get("lateness", {}))]
+    return [End(record.status, record.reason, record.meta.get("lateness", {}))]

@@ -11,8 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from bench.clock import wall_time
+from bench.journal import BLACK_BOX_NAME
 
-FILE_NAME = "guardian.jsonl"
 _KEPT = 150
 """Looks that are kept for the record of what went before a trip: 30 s at 5 Hz."""
 
@@ -29,7 +29,7 @@ class BlackBox:
 
     def keep_in(self, folder: Path) -> None:
         """Write to the folder of a run from now on."""
-        self._path = folder / FILE_NAME
+        self._path = folder / BLACK_BOX_NAME
 
     def saw(self, values: dict[str, float]) -> None:
         """Note a look; it is written only if something happens within the next half a minute."""

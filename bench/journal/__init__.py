@@ -25,7 +25,8 @@ Schema, version 3
     its death), `recovered` (of a copy that `bench recover-journal` wrote: from which journal, rows that are lost by
     table, and keys whose values stand for lost ones), and at the end `status` (`completed`, `aborted`, `failed`),
     `reason`, `finished` (laboratory s), `safe_state` (outcome by device), `counts` (rows by table). A file without
-    `status` is of a run that is going on or whose process died.
+    `status` is of a run that is going on or whose process died; how that was may stand in the guardian's own record
+    beside it (`bench.journal.ending`).
 `signals(position, name, unit, description, precision, checksum)`
     One row a signal column of the two tables below.
 `steps(step, started, finished, phase, label, settled, setpoints, "<signal>", …, seen, checksum)`
@@ -50,6 +51,7 @@ models stand in files beside the journal, see `add_model`. Version 1 has 1 for e
 """
 
 from bench.journal.card import expected_steps, run_card
+from bench.journal.ending import BLACK_BOX_NAME, Ending, ending_of
 from bench.journal.finding import files_of, find_journals
 from bench.journal.models import add_model
 from bench.journal.record import Record
@@ -58,8 +60,10 @@ from bench.journal.table import Table
 from bench.journal.writing import Journal, abandon, take_in
 
 __all__ = [
+    "BLACK_BOX_NAME",
     "FILE_NAME",
     "SCHEMA",
+    "Ending",
     "Event",
     "Journal",
     "Record",
@@ -68,6 +72,7 @@ __all__ = [
     "abandon",
     "add_model",
     "check_names",
+    "ending_of",
     "expected_steps",
     "files_of",
     "find_journals",

@@ -6,7 +6,7 @@ import hashlib
 import json
 import math
 import sqlite3
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -14,6 +14,7 @@ import numpy as np
 
 from bench.devices import Signal
 from bench.errors import DataError
+from bench.journal.ending import ending_of
 from bench.journal.finding import missing, way_back
 from bench.journal.mirror import read_mirror, second_files
 from bench.journal.models import models_beside
@@ -56,6 +57,9 @@ class Record:
         except DataError:
             self.close()
             raise
+        # A recovered copy beside the journal says for itself how far it is good.
+        is_silent = "status" not in self.meta and self.path.name == FILE_NAME
+        self._ending = ending_of(self.path.parent) if is_silent else None
 
     def remark(self) -> str:
         """Return what is unusual: how the journal is read, and how many rows only a second file has; else nothing."""
@@ -105,8 +109,24 @@ class Record:
 
     @property
     def status(self) -> str:
-        """`completed`, `aborted`, `failed`, or `unfinished` if the run goes on or its process died."""
-        return str(self.meta.get("status", "unfinished"))
+        """`completed`, `aborted`, `failed`, or `unfinished` if the run goes on or its process died.
+
+        A run whose bench hung or died is `failed` if its guardian has said so.
+        """
+        return str(self.meta.get("status", "unfinished" if self._ending is None else self._ending.status))
+
+    @property
+    def reason(self) -> str:
+        """Why the run was not completed; empty if it was, or if nothing says it."""
+        return str(self.meta.get("reason", "" if self._ending is None else self._ending.reason))
+
+    @property
+    def safe_state(self) -> Mapping[str, str]:
+        """What became of each device at the end: `safe`, or what went wrong; empty if nothing says it."""
+        found: Mapping[str, str] = self.meta.get(
+            "safe_state", {} if self._ending is None else self._ending.safe_state
+        )
+        return found
 
     def unit(self, signal: str) -> str:
         """Return the unit of a column: a signal's own, s for times, 1 for counts."""

@@ -7,6 +7,7 @@ import json
 import sqlite3
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
+from dataclasses import asdict
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Self
@@ -15,6 +16,7 @@ from bench.clock import Stopwatch
 from bench.devices import Signal
 from bench.errors import ConfigurationError, DataError, RecordError
 from bench.journal.background import LONGEST_UNWRITTEN, Background
+from bench.journal.ending import Ending
 from bench.journal.finding import files_of
 from bench.journal.keeping import RESERVE_NAME, Keeper
 from bench.journal.mirror import NAME as MIRROR_NAME
@@ -384,11 +386,11 @@ def _remove(journal: Path) -> None:
             path.unlink(missing_ok=True)
 
 
-def abandon(path: Path, reason: str, safe_state: Mapping[str, str]) -> None:
+def abandon(path: Path, ending: Ending) -> None:
     """Record the end of a run whose own thread hangs, if its file can be written within a second."""
     with suppress(OSError):
         (path.parent / RESERVE_NAME).unlink(missing_ok=True)
     with suppress(sqlite3.Error), closing(sqlite3.connect(path, timeout=1.0)) as db, db:
-        for key, value in {"status": "aborted", "reason": reason, "safe_state": dict(safe_state)}.items():
+        for key, value in asdict(ending).items():
             rows = entry("meta", meta_row(key, value)).columns()
             db.executemany("INSERT OR IGNORE INTO meta VALUES (?, ?, ?)", rows)

@@ -112,10 +112,10 @@ def report_run(
     return {
         "run": record.meta["run"],
         "status": record.status,
-        "reason": record.meta.get("reason", ""),
+        "reason": record.reason,
         "steps": len(steps),
         "laboratory_seconds": record.meta.get("finished"),
-        "safe_state": record.meta.get("safe_state", {}),
+        "safe_state": record.safe_state,
         "extremes": extremes,
         "models": comparison,
         "lateness": record.meta.get("lateness", {}),
@@ -163,14 +163,13 @@ def draw_identification(found: IdentifiedFile, out: Path) -> list[Path]:
 
 
 def _print_status(record: Record, steps: int, console: Console) -> None:
-    reason = record.meta.get("reason")
     style = {"completed": "green", "unfinished": "yellow"}.get(record.status, "red")
     expected = expected_steps(record.meta)
     of = f" of {expected}" if expected is not None else ""
     console.print(f"[{style}]{record.status}[/] after {steps}{of} steps", highlight=False)
-    if reason:
-        console.print(f"  {reason}", highlight=False, markup=False)
-    for device, state in record.meta.get("safe_state", {}).items():
+    if record.reason:
+        console.print(f"  {record.reason}", highlight=False, markup=False)
+    for device, state in record.safe_state.items():
         console.print(f"  {device}: {state}", highlight=False, markup=False)
 
 

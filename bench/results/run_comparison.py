@@ -140,7 +140,7 @@ def _outcomes(record: Record, steps: int) -> Outcomes:
     return Outcomes(
         str(record.meta["run"]),
         record.status,
-        str(record.meta.get("reason", "")),
+        record.reason,
         steps,
         record.meta.get("finished"),
         main_result(record),

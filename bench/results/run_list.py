@@ -28,7 +28,8 @@ class ListedRun:
         Its folder.
     status : str
         `completed`, `aborted`, `failed`, `running` (in a process of this computer), `unfinished` (its process
-        died, or is of another computer) or `damaged` (rows are damaged, or the journal is gone).
+        died, with no guardian to say how, or is of another computer) or `damaged` (rows are damaged, or the journal
+        is gone).
     protocol, rig : str
         What ran, and on what.
     started : str
@@ -134,7 +135,7 @@ def _listed(path: Path) -> ListedRun:
                 str(meta["host"]["started"]),
                 meta.get("finished"),
                 int(meta.get("counts", {}).get("steps", 0)) if counted else len(record.steps()),
-                damage or (main_result(record) if status == "completed" else str(meta.get("reason", ""))),
+                damage or (main_result(record) if status == "completed" else record.reason),
                 meta.get("changed", {}) | meta["overrides"],
                 {
                     **meta["parameters"],

@@ -12,7 +12,18 @@ import pytest
 
 from bench.devices import Signal
 from bench.errors import ConfigurationError, DataError, RecordError
-from bench.journal import FILE_NAME, Event, Journal, Record, StepRecord, background, keeping, opening
+from bench.journal import (
+    BLACK_BOX_NAME,
+    FILE_NAME,
+    Ending,
+    Event,
+    Journal,
+    Record,
+    StepRecord,
+    background,
+    keeping,
+    opening,
+)
 from bench.journal.background import Background
 from bench.journal.keeping import RESERVE_NAME, Keeper
 from bench.journal.mirror import NAME as MIRROR_NAME
@@ -518,16 +529,38 @@ class TestWritingOn:
     def test_the_end_of_one_whose_thread_hangs(self, tmp_path):
         journal = Journal(tmp_path / FILE_NAME, SIGNALS, {"rig": "vo2"})
         journal.step(step(0))
-        abandon(journal.path, "it hangs", {"tec": "safe"})
+        abandon(journal.path, Ending("aborted", "it hangs", {"tec": "safe"}))
         assert not (tmp_path / RESERVE_NAME).exists()
         with Record(tmp_path) as record:
             assert (record.status, record.meta["reason"]) == ("aborted", "it hangs")
             assert record.meta["safe_state"] == {"tec": "safe"}
         # What it would have said of itself later stays.
-        abandon(journal.path, "again", {})
+        abandon(journal.path, Ending("failed", "again", {}))
         with Record(tmp_path) as record:
             assert record.meta["reason"] == "it hangs"
         journal.close()
+
+    def test_the_end_of_one_whose_process_died_is_what_its_guardian_says(self, tmp_path):
+        journal = Journal(tmp_path / FILE_NAME, SIGNALS, {"rig": "vo2"})
+
+        def found(*lines):
+            (tmp_path / BLACK_BOX_NAME).write_text("\n".join(lines), encoding="utf-8")
+            with Record(tmp_path) as record:
+                return record.status, record.reason, record.safe_state
+
+        begin = '{"what": "begin"}'
+        failed = '{"what": "failed", "reason": "it hung", "safe": {"tec": "no answer"}}'
+        nothing = ("unfinished", "", {})
+        assert found(begin) == nothing
+        assert found(begin, failed) == ("failed", "it hung", {"tec": "no answer"})
+        assert found(begin, failed, '{"what": "end", "safe": {"tec": "safe"}}')[2] == {"tec": "safe"}
+        # A guardian that was killed; one that ended as the bench asked for it; a run that was taken up again.
+        assert found(begin, failed, '{"what": "end", "sa')[2] == {"tec": "no answer"}
+        assert found(begin, '{"what": "end", "safe": {"tec": "safe"}}') == nothing
+        assert found(begin, failed, "[]", begin) == nothing
+        journal.finish(status="completed", reason="", finished=1.0, safe_state={"tec": "safe"})
+        journal.close()
+        assert found(begin, failed) == ("completed", "", {"tec": "safe"})
 
     def test_signals_with_a_null_character_are_refused(self, tmp_path):
         with pytest.raises(ConfigurationError, match="may not have a null character"):

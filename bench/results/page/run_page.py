@@ -127,8 +127,9 @@ def _lead(
             f"{steps}{of} steps{lasted}."
         )
     else:
-        reason = f": {meta['reason']}" if meta.get("reason") else ""
-        second = f"It ended as {record.status} after {steps}{of} steps{lasted}{reason}. {safe_state_text(meta)}"
+        reason = f": {record.reason}" if record.reason else ""
+        states = safe_state_text(record.safe_state)
+        second = f"It ended as {record.status} after {steps}{of} steps{lasted}{reason}. {states}"
     lead = [first, second]
     if remark := record.remark():
         lead.append(f"{remark[0].upper()}{remark[1:]}.")

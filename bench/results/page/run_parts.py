@@ -297,9 +297,8 @@ def repeat_section(record: Record) -> PageSection:
     return PageSection("How to repeat it", parts)
 
 
-def safe_state_text(meta: Mapping[str, Any]) -> str:
+def safe_state_text(states: Mapping[str, str]) -> str:
     """Return a sentence about the safe state at the end."""
-    states = meta.get("safe_state", {})
     wrong = {name: state for name, state in states.items() if state != "safe"}
     if not states:
         return "The record does not say whether the safe state was reached."
