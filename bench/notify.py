@@ -35,7 +35,7 @@ from bench.journal import Event, StepRecord
 _OCCASIONS = {"pause": "pause", "prompt": "prompt", "warning": "warning", "interlock": "trip", "end": "end"}
 """Kinds of events that are told, and what the occasion is called."""
 
-_WITHIN = 30.0
+WITHIN = 30.0
 """Wall-clock time that one message may take, s."""
 
 _AT_THE_END = 10.0
@@ -117,7 +117,7 @@ def _call(command: Sequence[str], facts: Facts) -> None:
         env={**os.environ, **said},
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
-        timeout=_WITHIN,
+        timeout=WITHIN,
         check=False,
         # Ctrl-C at the terminal is meant for the run.
         start_new_session=os.name != "nt",
@@ -133,7 +133,7 @@ def _post(url: str, facts: Facts) -> None:
     request = urllib.request.Request(  # noqa: S310 - http and https only, see `sender`
         url, body, {"Content-Type": "application/json", "User-Agent": "actuator-bench"}
     )
-    with urllib.request.urlopen(request, timeout=_WITHIN):  # noqa: S310
+    with urllib.request.urlopen(request, timeout=WITHIN):  # noqa: S310
         pass
 
 
@@ -149,9 +149,9 @@ def _mail(address: str, facts: Facts) -> None:
     encrypted = settings["BENCH_SMTP_TLS"].lower() != "no"
     context = ssl.create_default_context()
     connection = (
-        smtplib.SMTP_SSL(host, port, timeout=_WITHIN, context=context)
+        smtplib.SMTP_SSL(host, port, timeout=WITHIN, context=context)
         if encrypted and port == 465
-        else smtplib.SMTP(host, port, timeout=_WITHIN)
+        else smtplib.SMTP(host, port, timeout=WITHIN)
     )
     with connection as server:
         if encrypted and port != 465:
@@ -184,6 +184,8 @@ class Notifier:
         self.signals = tuple(signals)
         self.facts: dict[str, Any] = {}
         """What is said of the run in each message: run, rig, protocol, …"""
+        self.is_told: Callable[[], bool] = lambda: False
+        """Whether another process has told already that the run has failed; nobody is told twice."""
         self._values: Sequence[float] = ()
         self._waiting: queue.Queue[Facts | None] = queue.Queue(_MOST)
         self._notices: list[str] = []
@@ -191,8 +193,12 @@ class Notifier:
         self._is_finished = False
         self._thread = threading.Thread(target=self._work, name="notifier", daemon=True)
 
-    def __enter__(self) -> Self:
+    def start(self) -> None:
+        """Begin to send; what has happened before is sent as well."""
         self._thread.start()
+
+    def __enter__(self) -> Self:
+        self.start()
         return self
 
     def __exit__(
@@ -217,6 +223,8 @@ class Notifier:
             return
         if occasion == "trip" and event.level != "ERROR":
             occasion = "warning"  # of an interlock that does not end the run
+        if occasion == "end" and event.level != "INFO" and self.is_told():
+            return
         values = dict(zip(self.signals, self._values, strict=False))
         facts = {
             "event": occasion,
@@ -238,18 +246,18 @@ class Notifier:
         taken, self._notices = self._notices, []
         return taken
 
-    def finish(self) -> None:
-        """Wait until all messages are sent, for 10 s at most."""
+    def finish(self, longest: float = _AT_THE_END) -> None:
+        """Wait until all messages are sent, for so many seconds at most."""
         if self._is_finished:
             return
         self._is_finished = True
         try:
-            self._waiting.put(None, timeout=_AT_THE_END)
-            self._thread.join(_AT_THE_END)
+            self._waiting.put(None, timeout=longest)
+            self._thread.join(longest)
         except queue.Full:
             pass
         if self._thread.is_alive():
-            self._notices.append(f"messages were not sent within {_AT_THE_END:g} s after the end")
+            self._notices.append(f"messages were not sent within {longest:g} s after the end")
 
     def _work(self) -> None:
         while (facts := self._waiting.get()) is not None:
@@ -258,7 +266,7 @@ class Notifier:
                     send(facts)
                 except subprocess.TimeoutExpired:
                     # What this error says names all arguments.
-                    self._fail(target, facts, f"it took longer than {_WITHIN:g} s")
+                    self._fail(target, facts, f"it took longer than {WITHIN:g} s")
                 # Whatever a library raises: the run goes on.
                 except Exception as error:
                     self._fail(target, facts, str(error))

@@ -164,6 +164,15 @@ class TestNotifier:
         assert (facts["rig"], facts["t"]) == ("heater", 2.0)
         assert not notifier.take_notices()
 
+    def test_a_failure_that_another_process_has_told_is_not_told_again(self, listener):
+        command, told = listener
+        with Notifier([command]) as notifier:
+            notifier.is_told = lambda: True
+            notifier.event(Event(0.0, "WARN", "pause", "paused"))
+            notifier.event(Event(1.0, "WARN", "end", "failed"))
+            notifier.event(Event(2.0, "INFO", "end", "completed"))
+        assert [text for _, text, _ in told()] == ["paused", "completed"]
+
     def test_what_fails_is_said_and_the_next_is_told(self, listener):
         command, told = listener
         failing = f'"{sys.executable}" -c "raise SystemExit(1)"'
