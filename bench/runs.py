@@ -97,7 +97,8 @@ class Run:
         Whether the run is rehearsed on the emulated twin of the rig before anything moves. A run on the virtual clock
         is not, as it would take as long itself.
     notify : tuple of str
-        Who is sent messages at a pause, a prompt, a warning, a trip and the end; see `bench.notify`.
+        Who is sent messages at a pause, a prompt, a warning, a trip and the end, also that of a bench which hung or
+        died; see `bench.notify`.
     changes : tuple of ParameterChange
         Parameters that are changed on the way, as in the run that is repeated.
     """
@@ -220,7 +221,8 @@ def carry_out(
             locks.take_folder(folder)
         with _written_into(folder):
             if guardian is not None:
-                guardian.keep_record(folder)
+                began = (meta if again is None else again.meta)["epoch"]
+                guardian.keep_record(folder, run.notify, facts_of(meta, folder), began)
             if again is None:
                 (folder / RIG_FILE_NAME).write_text(rig_file.text, encoding="utf-8")
         meta["run"] = folder.name
@@ -252,6 +254,8 @@ def carry_out(
         if notifier is not None:
             notifier.signals = tuple(signal.name for signal in signals)
             notifier.facts = facts_of(meta, folder)
+            if guardian is not None:
+                notifier.is_told = lambda: guardian.is_told
             observers.append(stack.enter_context(notifier))
         # A run on the virtual clock is over before anybody could look at it.
         mailbox = stack.enter_context(RunMailbox(folder, interrupts)) if clock.sleep_waits else None

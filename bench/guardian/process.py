@@ -3,6 +3,9 @@
 One thread decides; the devices are asked in the threads of their lines. The bench promises with each request by when
 the next one comes. The run ends in the safe state when a promise is broken, the bench is gone, an interlock trips, or
 a device cannot be read.
+
+A bench that hung or is gone cannot say so: once the devices are safe, the guardian writes it into its own record and
+sends the messages of the run. It ends a bench that does not come back.
 """
 
 from __future__ import annotations
@@ -13,10 +16,10 @@ import queue
 import selectors
 import signal
 import socket
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,7 +33,11 @@ from bench.errors import BenchError, ConfigurationError, DeviceError, GuardianEr
 from bench.guardian.black_box import BlackBox
 from bench.guardian.channel import LONGEST_ANSWER, STILL_AT_IT, Channel, ChannelError, Message, to_message
 from bench.guardian.lines import BENCH, LOOK, SAFE, LineThreads, Result
+from bench.guardian.parent import BenchProcess
 from bench.interlocks import InterlockWatch
+from bench.journal import Event
+from bench.journal.ending import BEGIN, END, FAILED
+from bench.notify import WITHIN, Notifier
 from bench.rig import Look, Rig
 from bench.safety import SAFE as IS_SAFE
 from bench.station.core import StationCore
@@ -48,6 +55,16 @@ _TRY_FOR = 600.0
 
 _BLIND = 2.0
 """Time for which what the interlocks need may not be seen, s; a request that is carried out counts as seen."""
+
+_COMES_BACK = 3.0
+"""Time that a bench which was late has to come back and end its run itself, s: as long as the safe state may take."""
+
+_ENDS = 6.0
+"""Time that it has to end by SIGTERM, s: it leaves a protocol that goes on after 2 s, and writes its record and its
+last words within 1 s each."""
+
+_DIES = 1.0
+"""Time from the end of the channel, s, within which a process that ends has ended."""
 
 _NOTHING = Result("", None, None, was_away=False)
 """The result of a request that concerns no device."""
@@ -88,7 +105,7 @@ class Guardian:
     def __init__(self, channel: Channel, rig: Rig, bench: int) -> None:
         self._channel = channel
         self._rig = rig
-        self._bench = bench
+        self._process = BenchProcess(bench)
         self._wall: Clock = WallClock()
         safety = rig.file.safety
         self._factor = factor = float(getattr(rig.clock, "factor", 1.0))
@@ -115,7 +132,16 @@ class Guardian:
         self._requested = 0.0
         self._seen_at = {name: self._wall.now() for name, known in self._concerned.items() if known & self._watched}
         self._bench_is_there = True
+        self._loss: GuardianError | None = None
+        self._lost_at = 0.0
         self._writes_stacks = False
+        self._keeps_record = False
+        self._zero = rig.clock.now()
+        # One each: a server that does not answer keeps no other from being told.
+        self._notifiers: list[Notifier] = []
+        self._values: dict[str, float] = {}
+        self._told: float | None = None
+        self._is_asked_to_end = False
         self._ending: float | None = None
         # Every device counts as unsafe until it has said otherwise, whatever fails here.
         self._unsafe = dict.fromkeys(rig.devices, f"has not answered within {_SAFE_WITHIN:g} s")
@@ -141,9 +167,12 @@ class Guardian:
         with selectors.DefaultSelector() as selector:
             selector.register(self._channel, selectors.EVENT_READ, self._receive)
             selector.register(self._woken, selectors.EVENT_READ, self._wake_up)
-            parent = self._watch_bench()
+            lose = partial(self._lose_bench, "the bench has died")
+            parent = self._process.descriptor
             if parent is not None:
-                selector.register(parent, selectors.EVENT_READ, partial(self._lose_bench, "the bench has died"))
+                selector.register(parent, selectors.EVENT_READ, lose)
+            elif self._process.has_died():
+                lose()
             while not self._is_over():
                 if self._bench_is_there:
                     events = selectors.EVENT_READ | selectors.EVENT_WRITE * self._channel.is_sending
@@ -163,7 +192,15 @@ class Guardian:
                     for lost in (self._channel, parent):
                         with suppress(KeyError, ValueError, TypeError):
                             selector.unregister(lost)  # type: ignore[arg-type]
-        self._box.note("end", safe=self._safe)
+        self._box.note(END, safe=self._safe)
+
+    def finish(self) -> None:
+        """Wait until all have been told that the bench hung or is gone, and close the record."""
+        for notifier in self._notifiers:
+            if self._told is not None:
+                notifier.finish(WITHIN)
+            for text in notifier.take_notices():
+                self._box.note("notify", text=text)
         self._box.close()
 
     # What has to be done now
@@ -197,7 +234,7 @@ class Guardian:
         if self._ending is None or self._safe is None:
             return False
         if not (self._unsafe or self._pending):
-            return self._reported or not self._bench_is_there
+            return self._reported or (not self._bench_is_there and not self._owes_word)
         # A driver that hangs for good does not keep this process for good.
         return not self._bench_is_there and self._is_in_vain()
 
@@ -224,7 +261,9 @@ class Guardian:
         if self._bench_is_there:
             self._bench_is_there = False
             self._request = None
-            self._core.trip(GuardianError(f"the bench is gone ({why})"))
+            self._lost_at = self._wall.now()
+            self._loss = GuardianError(f"the bench is gone ({why})")
+            self._core.trip(self._loss)
 
     def _take(self, message: Message) -> None:
         do = message.get("do")
@@ -277,6 +316,7 @@ class Guardian:
                     "news": [asdict(each) for each in news],
                     "holding": self._core.holding,
                     "pause": pause,
+                    "told": self._told is not None,
                     "tripped": None if cause is None else to_message(cause),
                     **content,
                 }
@@ -294,7 +334,13 @@ class Guardian:
     def _keep_record(self, message: Message) -> None:
         self._box.keep_in(Path(message["folder"]))
         self._writes_stacks = bool(message["stacks"])
-        self._box.note("begin", rig=self._rig.file.name, process=os.getpid())
+        passed = (self._rig.clock.date() - datetime.fromisoformat(message["epoch"])).total_seconds()
+        self._zero = self._rig.clock.now() - passed
+        self._notifiers = [Notifier([target]) for target in message["targets"]]
+        for notifier in self._notifiers:
+            notifier.facts = message["facts"]
+        self._keeps_record = True
+        self._box.note(BEGIN, rig=self._rig.file.name, process=os.getpid())
         self._reply(message)
 
     def _look(self, message: Message, tries: int = TRIES) -> None:
@@ -410,6 +456,7 @@ class Guardian:
         known = self._rig.assembled({name: self._latest[name] for name in self._looked_at if name in self._latest})
         values = {name: known[name] for name in self._concerned[result.device] if name in known}
         self._box.saw(values)
+        self._values.update(values)
         self._judge(self._rig.clock.now(), values)
 
     def _judge_block(self, names: Sequence[str], rows: Sequence[Sequence[float]], period: float) -> None:
@@ -451,7 +498,8 @@ class Guardian:
             cause = self._core.cause
             self._box.note("safe", cause=None if cause is None else str(cause))
             if self._core.late and self._writes_stacks:
-                self._show_where_the_bench_stands()
+                # It writes the stacks of its threads (`faulthandler`) into the folder of the run.
+                self._process.send("SIGUSR1")
         if not self._pending and self._stages:
             self._next_stage()
         complete = not self._pending and not self._stages
@@ -465,6 +513,8 @@ class Guardian:
                 self._next_try = now + _TRY_AGAIN
                 self._make_safe([name for name in self._unsafe if name not in self._pending])
             self._report()
+            self._speak_for_bench(now)
+            self._end_bench(now)
 
     def _next_stage(self) -> None:
         self._make_safe(self._stages[0])
@@ -497,6 +547,59 @@ class Guardian:
             self._reported = True
         else:
             self._refuse(self._request, self._core.cause or GuardianError("the run has ended already"))
+
+    # A bench that cannot speak for itself
+
+    @property
+    def _owes_word(self) -> bool:
+        """Whether it is the guardian who has to say how the run has ended, if the bench does not come back."""
+        return self._keeps_record and not self._reported and self._told is None
+
+    def _speak_for_bench(self, now: float) -> None:
+        """Say that the bench hung or is gone, once."""
+        if not self._owes_word or self._request is not None:
+            return
+        if self._loss is not None:
+            if self._process.has_died():
+                fate = "the bench is gone: its process was killed, crashed or left"
+            elif now - self._lost_at < _DIES:
+                return
+            else:
+                fate = str(self._loss)
+        elif self._core.is_late(now):
+            fate = self._core.lateness
+        else:
+            return
+        assert self._safe is not None
+        cause = self._core.cause
+        reason = fate if cause in (None, self._loss) or str(cause) == fate else f"{cause}; then {fate}"
+        states = ", ".join(
+            f"{name}: {state if state == IS_SAFE else f'NOT CONFIRMED SAFE, {state}'}"
+            for name, state in self._safe.items()
+        )
+        t = self._rig.clock.now() - self._zero
+        self._told = now
+        self._box.note(FAILED, reason=reason, safe=self._safe)
+        for notifier in self._notifiers:
+            notifier.signals = tuple(self._values)
+            notifier.telemetry(t, 0, tuple(self._values.values()))
+            notifier.event(Event(t, "ERROR", "error", f"{reason}; {states}"))
+            notifier.event(Event(t, "WARN", "end", "failed"))
+            notifier.start()
+
+    def _end_bench(self, now: float) -> None:
+        """End the process of a bench that hung and has not come back: ask it first, then kill it."""
+        if self._told is None or not self._bench_is_there or not self._core.is_late(now):
+            return
+        if not self._is_asked_to_end and now - self._told >= _COMES_BACK:
+            self._is_asked_to_end = True
+            self._news.append(News("ERROR", "guardian", f"{self._core.lateness}; it was asked to end by SIGTERM"))
+            self._box.note("ends the bench", by="SIGTERM")
+            self._process.send("SIGTERM")
+        elif now - self._told >= _COMES_BACK + _ENDS:
+            self._box.note("ends the bench", by="SIGKILL")
+            self._process.send("SIGKILL")
+            self._lose_bench("it hung, and was killed")
 
     # Devices
 
@@ -558,28 +661,6 @@ class Guardian:
         # A derived signal, say, that cannot be computed.
         except Exception as error:
             job.failed(error)
-
-    def _watch_bench(self) -> int | None:
-        """Return a descriptor that becomes readable when the bench dies, where the system has one.
-
-        The channel alone does not do: a forked child of the bench keeps its end open.
-        """
-        if not hasattr(os, "pidfd_open"):
-            return None
-        with suppress(OSError):
-            descriptor = os.pidfd_open(self._bench)
-            # The parent of an orphan is another process.
-            if os.getppid() == self._bench:
-                return descriptor
-        if os.getppid() != self._bench:
-            self._lose_bench("the bench has died")
-        return None
-
-    def _show_where_the_bench_stands(self) -> None:
-        """Have the bench write the stacks of its threads (`faulthandler`) to its run folder."""
-        if hasattr(signal, "SIGUSR1") and sys.platform != "win32" and os.getppid() == self._bench:
-            with suppress(OSError):
-                os.kill(self._bench, signal.SIGUSR1)
 
     def _terminate(self, _number: int, _frame: object) -> None:
         self._terminated = True

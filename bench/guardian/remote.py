@@ -12,6 +12,7 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, TextIO
 
 import numpy as np
@@ -113,6 +114,8 @@ class RemoteStation(Station):
         self._is_holding = False
         self._pause = ""
         self._stacks: TextIO | None = None
+        self._is_told = False
+        self._keeps_record = False
         self._lost: GuardianError | None = None
         self._last_words = ""
         self._log = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `close`
@@ -151,15 +154,46 @@ class RemoteStation(Station):
         pause, self._pause = self._pause, ""
         return pause
 
-    def keep_record(self, folder: Path) -> None:
-        """Have the guardian keep its own record in the folder of the run.
+    @property
+    def is_told(self) -> bool:
+        """Whether the guardian has told that this process hung."""
+        return self._is_told
 
-        If this process breaks a promise, the guardian has it write there where each of its threads stands.
+    def keep_record(
+        self,
+        folder: Path,
+        targets: Sequence[str] = (),
+        facts: Mapping[str, str] = MappingProxyType({}),
+        epoch: str | None = None,
+    ) -> None:
+        """Have the guardian keep its own record in the folder of the run, and speak for this process if it cannot.
+
+        If this process breaks a promise, the guardian has it write there where each of its threads stands, and ends
+        it if it does not come back. If it hung or is gone, the guardian tells so.
+
+        Parameters
+        ----------
+        folder : Path
+            The folder.
+        targets : sequence of str
+            Who is told; see `bench.notify`.
+        facts : mapping of str to str
+            What is said of the run in each message.
+        epoch : str, optional
+            Time of day of the laboratory at the start of the run, ISO 8601; now if not given.
         """
         if _STACKS is not None:
             self._stacks = (folder / STACKS_NAME).open("w", encoding="utf-8")
             faulthandler.register(_STACKS, self._stacks)
-        self._ask("record", folder=str(folder.resolve()), stacks=_STACKS is not None)
+        self._ask(
+            "record",
+            folder=str(folder.resolve()),
+            stacks=_STACKS is not None,
+            targets=list(targets),
+            facts=dict(facts),
+            epoch=epoch or self.clock.date().isoformat(),
+        )
+        self._keeps_record = True
 
     def promise(self, seconds: float, why: str) -> None:
         """Promise that each request from now on is followed by the next one within so many seconds."""
@@ -273,6 +307,10 @@ class RemoteStation(Station):
             self._stacks = None
         if self._log.closed:
             return
+        if self._keeps_record and self._safe is None:
+            # A run that was refused has not died.
+            with suppress(BenchError):
+                self._ask("end", _END)
         self._channel.close()
         if not self._has_ended():
             # It goes on until what is not safe yet is safe.
@@ -339,6 +377,7 @@ class RemoteStation(Station):
         self._news += [News(**each) for each in reply.get("news", ())]
         self._is_holding = bool(reply.get("holding"))
         self._pause = reply.get("pause") or self._pause
+        self._is_told = bool(reply.get("told"))
         if reply.get("tripped") is not None:
             self._tripped = to_error(reply["tripped"])
         if "error" in reply:

@@ -67,6 +67,7 @@ class StationCore:
         self._promised = _FIRST_PROMISE
         self._why = "it has promised nothing yet"
         self._asked = False
+        self._is_bound = False
         self._seen: float | None = None
         self.state = State.IDLE
         self.over = False
@@ -92,7 +93,7 @@ class StationCore:
     def arm(self) -> None:
         """Note that an output may be on from now on."""
         if self.state is State.IDLE:
-            self.state = State.ARMED
+            self.state, self._is_bound = State.ARMED, True
 
     def request(self, now: float) -> None:
         """Begin with a request of the bench.
@@ -137,14 +138,19 @@ class StationCore:
 
     def advance(self, now: float) -> None:
         """Trip if the bench has broken its promise."""
-        if self._lease() <= now:
+        if not self.over and self.is_late(now):
             self.late = True
-            self.trip(
-                GuardianError(
-                    f"the bench has not come back within the {self._promised:g} s that it promised ({self._why}); "
-                    "every device was made safe"
-                )
-            )
+            self.trip(GuardianError(self.lateness))
+
+    def is_late(self, now: float) -> bool:
+        """Return whether the bench owes a request that it has promised, also after the station has tripped."""
+        # While a request is carried out the bench waits, and cannot be late.
+        return self._is_bound and not self._asked and self._lease_end <= now
+
+    @property
+    def lateness(self) -> str:
+        """What is said of a bench that is late."""
+        return f"the bench hung: it has not come back within the {self._promised:g} s that it promised ({self._why})"
 
     def judge(
         self,
@@ -207,9 +213,5 @@ class StationCore:
         """End the run in the safe state, as the bench asks for it."""
         if not self.over:
             self.state, self.over = State.ENDED, True
-
-    def _lease(self) -> float:
-        # While a request is carried out the bench waits, and cannot be late.
-        if self.state is not State.ARMED or self._asked:
-            return math.inf
-        return self._lease_end
+        # It need not come back.
+        self._is_bound = False

@@ -43,8 +43,8 @@ def _methods(kind: type, *left_out: str) -> dict[str, tuple[type, str]]:
 
 
 _NOT_IN_A_RUN = (
-    *("begin", "serve", "close", "keep_in", "_keep_record", "_look_readers", "_watch_bench"),
-    *("_line_was_away", "_lose_bench", "_terminate", "_show_where_the_bench_stands"),
+    *("begin", "serve", "close", "keep_in", "_keep_record", "_look_readers", "finish"),
+    *("_line_was_away", "_lose_bench", "_terminate"),
 )
 
 METHODS = {

@@ -9,7 +9,7 @@ import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from datetime import datetime
 from pathlib import Path
@@ -63,6 +63,8 @@ class GuardedRun:
         Options `--override` and `--set`.
     stalled : bool
         Whether nobody reads what the bench prints.
+    options : sequence of str
+        More options.
     """
 
     def __init__(
@@ -73,10 +75,11 @@ class GuardedRun:
         parameters: Mapping[str, str],
         *,
         stalled: bool = False,
+        options: Sequence[str] = (),
     ) -> None:
         self._rig = rig
         command = [sys.executable, "-P", "-m", "bench", "run", f"{PROTOCOLS}:{protocol}", "--rig", rig.name]
-        command += ["--attach", str(rig.endpoints_file), "--no-rehearse"]
+        command += ["--attach", str(rig.endpoints_file), "--no-rehearse", *options]
         for option, values in (("--override", overrides), ("--set", parameters)):
             for key, value in values.items():
                 command += [option, f"{key}={value}"]
@@ -146,6 +149,11 @@ class GuardedRun:
             assert self.process.poll() is None, f"it ended, exit code {self.process.returncode}: {self.said[-500:]}"
             time.sleep(0.02)
         raise AssertionError(f"{text!r} was never recorded")
+
+    @property
+    def folder(self) -> Path:
+        """The folder of the run."""
+        return next(self._runs.glob("*/journal.sqlite")).parent
 
     @property
     def cause(self) -> str:

@@ -8,7 +8,7 @@ from killing import kill_after
 
 from bench.cli import main
 from bench.errors import DeviceError
-from bench.journal import Record
+from bench.journal import BLACK_BOX_NAME, Record
 from bench.upkeep.opening import opened
 from bench.upkeep.recovery import clear_expired_watchdogs
 from sim_devices.serving.process import serve
@@ -65,6 +65,25 @@ def test_clears_what_the_watchdogs_left_and_goes_on(served, tmp_path, capsys):
         assert [step.step for step in record.step_records()] == list(range(total))
         # The time of the laboratory went on while nobody was there.
         assert record.meta["resumes"][0]["t"] > record.steps()["finished"][before - 1]
+
+
+def test_goes_on_with_a_run_that_its_guardian_calls_failed(served, tmp_path, capsys):
+    settings = ("increment=31.5", "half_cycles=1", "dwell=2")
+    command = ["run", "damped-oscillation", "--rig", "vo2", "--attach", str(served.endpoints_file)]
+    command += ["--no-rehearse", "--out", str(tmp_path), *(f"--set={setting}" for setting in settings)]
+    folder = kill_after(2, tmp_path, *command)
+    seconds_until(lambda: status_of(folder) == "failed")
+    # Its guardian has the lines a moment longer.
+    seconds_until(lambda: '"what": "end"' in (folder / BLACK_BOX_NAME).read_text())
+    with pytest.raises(SystemExit) as ended:
+        main(["resume", str(folder), "--attach", str(served.endpoints_file), "--accept-disagreement"])
+    assert not ended.value.code, capsys.readouterr().err
+    assert status_of(folder) == "completed"
+
+
+def status_of(folder):
+    with Record(folder) as record:
+        return record.status
 
 
 def test_clears_no_other_error(served):

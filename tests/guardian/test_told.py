@@ -1,0 +1,162 @@
+"""A bench that hangs or dies is told of by its guardian; its rig is free, and its record says what became of it."""
+
+import contextlib
+import json
+import re
+import signal
+import sys
+from pathlib import Path
+
+import pytest
+from benches import LONG, connected, seconds_until
+from guarded_run import SETPOINTS, GuardedRun
+
+from bench.errors import ConfigurationError
+from bench.journal import BLACK_BOX_NAME, Record, ending_of
+from bench.locks import is_in_use
+from bench.results.run_list import list_runs
+
+pytestmark = [
+    pytest.mark.usefixtures("warm_popen"),
+    pytest.mark.timeout(300),
+    pytest.mark.skipif(not sys.platform.startswith("linux"), reason="it looks for processes as on Linux"),
+]
+
+TOKEN = "T0K3N"
+
+SAFE = {"tec": "safe", "psd": "safe"}
+
+HUNG = r"the bench hung: it has not come back within the \d s that it promised \(.*\)"
+GONE = "the bench is gone: its process was killed, crashed or left"
+
+
+@pytest.fixture
+def listener(tmp_path):
+    """A program that writes down what it is told, a line each time; its command, and what it has written."""
+    out = tmp_path / "told.jsonl"
+    program = tmp_path / "listen.py"
+    program.write_text(
+        "import json, sys\n"
+        "facts = json.loads(sys.stdin.buffer.read())\n"
+        f"with open({str(out)!r}, 'a') as file:\n"
+        "    file.write(json.dumps(facts) + '\\n')\n"
+    )
+
+    def told():
+        return [json.loads(line) for line in out.read_text().splitlines()] if out.exists() else []
+
+    return f'"{sys.executable}" "{program}" {TOKEN}', told
+
+
+@pytest.fixture
+def started(vo2, listener):
+    """What starts a run that switches everything on, and tells the listener and one that cannot be reached."""
+
+    def start(protocol, *targets):
+        # Time to find its guardian before it goes wrong.
+        parameters = {"setpoints": json.dumps(SETPOINTS["vo2"]), "before": "4"}
+        targets = targets or (f"http://127.0.0.1:1/{TOKEN}", listener[0])
+        options = [f"--notify={target}" for target in targets]
+        return GuardedRun(vo2, protocol, {"safety.patience": "3"}, parameters, options=options)
+
+    yield start
+    vo2.control.power_cycle("tec")
+
+
+@pytest.mark.parametrize(
+    ("protocol", "sent", "reason"),
+    [
+        pytest.param("spin", None, HUNG, id="endless loop"),
+        pytest.param("hold", signal.SIGSTOP, HUNG, id="SIGSTOP"),
+        pytest.param("hold", signal.SIGKILL, GONE, id="SIGKILL"),
+        pytest.param("leave", None, GONE, id="os._exit(0)"),
+    ],
+)
+def test_it_is_told_once_and_recorded_and_the_rig_is_free(started, listener, protocol, sent, reason):
+    _, told = listener
+    with started(protocol) as run:
+        run.await_on(1)
+        if sent is not None:
+            run.process.send_signal(sent)
+        seconds_until(told)
+        # By its guardian, where it has not ended by itself.
+        run.process.wait(LONG)
+        assert run.has_freed_lines()
+        assert not is_in_use(run.folder)
+        (facts,) = told()
+        assert facts["event"] == "end"
+        assert re.fullmatch(rf"failed: {reason}; tec: safe, psd: safe", facts["text"])
+        assert (facts["run"], facts["rig"], facts["protocol"]) == (str(run.folder), "vo2", protocol)
+        assert facts["t"] > 0
+        assert facts["values"]["tec_temperature"] > 0
+        with Record(run.folder) as record:
+            assert record.status == "failed"
+            # What the bench has written as it was asked to end says the same.
+            assert record.meta.get("status", "failed") == "failed"
+            assert re.fullmatch(reason, record.reason)
+            assert record.safe_state == SAFE
+        (listed,) = list_runs(run.folder)
+        assert (listed.status, listed.result) == ("failed", record.reason)
+        notes = (run.folder / BLACK_BOX_NAME).read_text(encoding="utf-8")
+        assert "http://127.0.0.1/\\u2026 was not told of the end" in notes
+        texts = [run.said, *(path.read_bytes().decode(errors="replace") for path in run.folder.rglob("*.*"))]
+        assert not [text for text in texts if TOKEN in text]
+
+
+def test_a_bench_that_comes_back_does_not_tell_it_again(started, listener):
+    _, told = listener
+    with started("hold") as run:
+        run.await_on(1)
+        run.process.send_signal(signal.SIGSTOP)
+        seconds_until(told)
+        run.process.send_signal(signal.SIGCONT)
+        run.process.wait(LONG)
+        assert run.has_freed_lines()
+        assert len(told()) == 1
+        with Record(run.folder) as record:
+            # Its own record, if the guardian did not have to end it.
+            assert record.meta.get("status") in ("failed", "aborted", None)
+            assert record.safe_state == SAFE
+
+
+def test_the_rig_is_free_before_a_slow_message_is_sent(vo2, started, tmp_path):
+    begun, go = tmp_path / "begun", tmp_path / "go"
+    program = tmp_path / "slow.py"
+    program.write_text(
+        "import pathlib, time\n"
+        f"pathlib.Path({str(begun)!r}).touch()\n"
+        f"while not pathlib.Path({str(go)!r}).exists():\n"
+        "    time.sleep(0.05)\n"
+    )
+
+    def is_free():
+        with contextlib.suppress(ConfigurationError), connected(vo2):
+            return True
+        return False
+
+    with started("hold", f'"{sys.executable}" "{program}"') as run:
+        run.await_on(1)
+        run.process.kill()
+        seconds_until(begun.exists)
+        vo2.control.power_cycle("tec")
+        seconds_until(is_free)
+        assert (Path("/proc") / str(run.guardian)).exists()
+        go.touch()
+        assert run.has_freed_lines()
+        assert "was not told" not in (run.folder / BLACK_BOX_NAME).read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("leaves", [True, False])
+def test_a_run_that_was_refused_has_not_died(vo2, listener, tmp_path, leaves):
+    command, told = listener
+    with connected(vo2) as station:
+        station.keep_record(tmp_path, [command], {"rig": "vo2", "protocol": "none"})
+        if leaves:
+            station.close()
+        else:
+            station._channel.close()
+        station._process.wait(LONG)
+    assert [facts["text"] for facts in told()] == (
+        [] if leaves else ["failed: the bench is gone (the other side is gone); tec: safe, psd: safe"]
+    )
+    assert (ending_of(tmp_path) is None) is leaves
