@@ -192,7 +192,7 @@ class Guardian:
                     for lost in (self._channel, parent):
                         with suppress(KeyError, ValueError, TypeError):
                             selector.unregister(lost)  # type: ignore[arg-type]
-        self._box.note(END, safe=self._safe)
+        self._box.note(END, safe=self._states())
 
     def finish(self) -> None:
         """Wait until all have been told that the bench hung or is gone, and close the record."""
@@ -534,8 +534,11 @@ class Guardian:
         self._box.note("device", device=result.device, state=self._unsafe.get(result.device, IS_SAFE))
 
     def _report_safe(self) -> None:
-        self._safe = {name: self._unsafe.get(name, IS_SAFE) for name in self._rig.devices}
+        self._safe = self._states()
         self._news += masked(self._rig.devices.values())
+
+    def _states(self) -> dict[str, str]:
+        return {name: self._unsafe.get(name, IS_SAFE) for name in self._rig.devices}
 
     def _report(self) -> None:
         """Answer a request that is open: with the end that it asked for, or with what has tripped the station."""

@@ -160,3 +160,25 @@ def test_a_run_that_was_refused_has_not_died(vo2, listener, tmp_path, leaves):
         [] if leaves else ["failed: the bench is gone (the other side is gone); tec: safe, psd: safe"]
     )
     assert (ending_of(tmp_path) is None) is leaves
+
+
+def test_a_device_that_cannot_be_reached_is_not_called_safe(vo2, listener, tmp_path):
+    command, told = listener
+    try:
+        with connected(vo2) as station:
+            station.keep_record(tmp_path, [command], {"rig": "vo2", "protocol": "none"})
+            station.promise(LONG, "a test")
+            station.apply({"tec": 40.0})
+            vo2.control.unplug("tec")
+            station._channel.close()
+            seconds_until(told)
+            assert ending_of(tmp_path).safe_state["tec"] != "safe"
+            # It goes on until the TEC is safe, and tells no more.
+            vo2.control.plug_in("tec")
+            station._process.wait(LONG)
+            assert ending_of(tmp_path).safe_state == SAFE
+    finally:
+        vo2.control.plug_in("tec")
+        vo2.control.power_cycle("tec")
+    (facts,) = told()
+    assert re.search(r"; tec: NOT CONFIRMED SAFE, .*, psd: safe$", facts["text"])
