@@ -12,7 +12,9 @@ KERNELS := $(VENV)/.kernels
 COLLECTED := $(VENV)/.collected
 # Many tests wait for another process: one worker more than cores.
 WORKERS ?= $(shell expr $$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2) + 1)
-PYTEST := $(BIN)/python -m pytest --ignore tests/benchmarks --numprocesses $(WORKERS) --dist worksteal
+# More of them for pytest, such as --no-skips.
+OPTIONS ?=
+PYTEST := $(BIN)/python -m pytest --ignore tests/benchmarks --numprocesses $(WORKERS) --dist worksteal $(OPTIONS)
 # Two at once: the kernels are compiled, and then mypy runs, beside what waits for the network and the disk.
 MAKEFLAGS += --jobs=2
 # Without files of byte code each worker and each process of the tests compiles every module again.
