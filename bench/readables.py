@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from bench.clock import Clock
-from bench.devices import BlueskyReading, DataKey, Signal
+from bench.devices import BlueskyReading, DataKey, Signal, Status
 
 
 class ReadableSignal:
-    """One signal that no device measures by itself; conforms to `bluesky.protocols.Readable`.
+    """One signal that no device measures by itself; conforms to `bluesky.protocols.Readable` and `Triggerable`.
 
     Parameters
     ----------
@@ -48,6 +48,10 @@ class ReadableSignal:
         """Take the value, with its time stamp."""
         value = self._take()
         return {self.name: {"value": value, "timestamp": self._clock.timestamp()}}
+
+    def trigger(self) -> Status:
+        """Return a completed status: `read` takes the value by itself (bluesky asks)."""
+        return Status.completed(self.name, self._clock)
 
     def describe(self) -> dict[str, DataKey]:
         """Describe what `read` returns."""

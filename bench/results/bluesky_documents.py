@@ -30,7 +30,8 @@ _DTYPES = {"integer": "integer", "number": "number", "truth": "boolean", "text":
 def documents(record: Record) -> Iterator[Document]:
     """Yield the documents of a run in order of their kind: start, and for each stream descriptor and events, stop.
 
-    A run that has not ended has no stop. A number that is missing is nan, a text that is missing is empty.
+    A run that has not ended has no stop. A number that is missing or not finite is left out of its event, as JSON has
+    none; a text that is missing is empty.
 
     Raises DataError if the record is damaged.
     """
@@ -107,7 +108,8 @@ def _stream(
     )
     rows = zip(*(each.values for each in kept), strict=True)
     for number, (time, row) in enumerate(zip(times, rows, strict=True), start=1):
-        data = {_key(each): _value(each, value) for each, value in zip(kept, row, strict=True)}
+        values = ((_key(each), _value(each, value)) for each, value in zip(kept, row, strict=True))
+        data = {key: value for key, value in values if value is not None}
         yield (
             "event",
             {
@@ -136,9 +138,10 @@ def _data_key(column: Column, stream: str) -> dict[str, Any]:
 
 
 def _value(column: Column, value: Any) -> Any:  # noqa: ANN401 - of the kind of the column
-    if value is None:
-        return math.nan if column.kind == "number" else ""
-    return value
+    """Return a value as JSON has it, None for a number that is missing or not finite."""
+    if column.kind != "number":
+        return "" if value is None else value
+    return value if value is not None and math.isfinite(value) else None
 
 
 def write_documents(record: Record, path: Path) -> None:
@@ -149,6 +152,6 @@ def write_documents(record: Record, path: Path) -> None:
     try:
         with path.open("w", encoding="utf-8") as file:
             for name, document in documents(record):
-                file.write(json.dumps([name, document], ensure_ascii=False) + "\n")
+                file.write(json.dumps([name, document], ensure_ascii=False, allow_nan=False) + "\n")
     except OSError as error:
         raise DataError(f"{path} cannot be written: {error.strerror}") from None

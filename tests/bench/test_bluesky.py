@@ -114,6 +114,11 @@ class TestReadables:
         assert data[-1]["curvature"] == pytest.approx(measured, abs=10.0)
         assert data[0]["curvature"] != data[-1]["curvature"]
 
+    def test_an_adaptive_scan_triggers_them(self, engine, rig):
+        readables = [rig.readables["curvature"], rig.devices["psd"]]
+        scan = plans.adaptive_scan(readables, "curvature", rig.devices["tec"], 40.0, 44.0, 0.5, 2.0, 20.0, True)
+        assert len(run(engine, scan)["event"]) >= 3
+
     def test_documents_and_readings_have_one_time_base(self, engine):
         with open_rig("vo2") as rig:
             documents = run(engine, plans.count([rig.readables["curvature"]], 2))
