@@ -21,6 +21,7 @@ from bench.clock import Clock, ScaledClock
 from bench.configuration_errors import problems
 from bench.errors import ConfigurationError, DeviceConnectionError
 from bench.faults import ScheduledFault
+from bench.parsing import parse_json
 
 _NAME = "the served laboratory"
 _TIMEOUT = 30.0
@@ -72,7 +73,7 @@ def read_endpoints(path: Path) -> Endpoints:
     Raises ConfigurationError if it cannot be read, or is not one.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = parse_json(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigurationError(f"{path} cannot be read: {error.strerror}") from None
     except ValueError as error:
@@ -130,7 +131,7 @@ class ControlClient:
         try:
             self._socket.sendall(json.dumps({"do": do, **keys}).encode() + b"\n")
             line = self._answers.readline()
-            answer: dict[str, Any] = json.loads(line)
+            answer: dict[str, Any] = parse_json(line)
         except (OSError, ValueError) as error:
             raise DeviceConnectionError(_NAME, f"no longer answers at {self._address}: {error}") from None
         if "error" in answer:

@@ -33,6 +33,7 @@ from bench.configuration_errors import problems
 from bench.derived import Derived, DerivedSignal
 from bench.devices import Signal
 from bench.errors import DataError, DeviceError
+from bench.parsing import parse_json
 
 Floats = NDArray[np.float64]
 
@@ -95,7 +96,7 @@ class Calibration(BaseModel):
 def read_calibration(path: Path) -> Calibration:
     """Read a calibration file; raise DataError, which names the file, if it is none."""
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = parse_json(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
         raise DataError(f"calibration file {path} cannot be read: {error}") from None
     try:

@@ -19,8 +19,6 @@ or JSON lines (`.jsonl`), with the same keys in an object a line.
 
 from __future__ import annotations
 
-import json
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol, Self, runtime_checkable
@@ -29,6 +27,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from bench.configuration_errors import problems
 from bench.errors import ConfigurationError
+from bench.parsing import parse_json, parse_toml
 
 _LONGEST = 1e9
 _HIGHEST_RATE = 36_000.0
@@ -106,8 +105,8 @@ def schedule_faults(laboratory: object, faults: Sequence[ScheduledFault], path: 
 def _entries(path: Path, text: str) -> list[Any]:
     try:
         if path.suffix == ".jsonl":
-            return [json.loads(line) for line in text.splitlines() if line.strip()]
-        content = tomllib.loads(text)
+            return [parse_json(line) for line in text.splitlines() if line.strip()]
+        content = parse_toml(text)
     except (ValueError, RecursionError) as error:
         form = "JSON lines" if path.suffix == ".jsonl" else "TOML"
         raise ConfigurationError(f"{path} is not {form}: {error}") from None

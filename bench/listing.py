@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from bench import registry
+from bench.parsing import parse_json
 
 
 def listing() -> dict[str, Any]:
@@ -26,7 +27,7 @@ def listing() -> dict[str, Any]:
     state = _state()
     file = _file_of_this_environment()
     with suppress(OSError, ValueError):
-        remembered = json.loads(file.read_text(encoding="utf-8"))
+        remembered = parse_json(file.read_text(encoding="utf-8"))
         if isinstance(remembered, dict) and remembered.get("state") == state:
             found: dict[str, Any] = remembered["catalogue"]
             return found

@@ -31,6 +31,7 @@ from typing import Self
 from bench.clock import WallClock, wall_time
 from bench.devices import DriverSettings, Identity
 from bench.errors import ConfigurationError
+from bench.parsing import parse_json
 
 EMULATED = "emulated://"
 """Scheme of the lines to instruments of an emulated laboratory; in this process they need no lock."""
@@ -378,7 +379,7 @@ def _holder(name: str) -> str:
         found = path.lstat()
         if not _is_own(found):
             return f"a process that cannot say who it is, as {_user(found.st_uid)} made the lock {path}"
-        return str(Holder(**json.loads(path.read_text(encoding="utf-8"))))
+        return str(Holder(**parse_json(path.read_text(encoding="utf-8"))))
     except (OSError, ValueError, TypeError):
         return "a process that has not said who it is"
 

@@ -17,6 +17,7 @@ from typing import Any, Self
 
 from bench.clock import wall_time
 from bench.interrupts import Interrupts
+from bench.parsing import parse_json
 from bench.questions import Question
 
 _NAME = "operator"
@@ -163,7 +164,7 @@ def _write(path: Path, content: dict[str, Any]) -> None:
 
 def _read(path: Path) -> dict[str, Any] | None:
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = parse_json(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
     return content if isinstance(content, dict) else None

@@ -42,6 +42,7 @@ from typing import TYPE_CHECKING, Any
 from bench.control.dynamics import IdentifiedDynamics
 from bench.errors import DataError
 from bench.hysteresis import Operator, TimedModel, model_class, model_from_json
+from bench.parsing import parse_json
 
 if TYPE_CHECKING:
     from bench.identification.bands import Band
@@ -159,7 +160,7 @@ class ModelFile:
                 f"model file {path} is not written, as it could not be loaded again: {reference} is not the class "
                 f"registered for the kind {self.model.kind!r}; register it in an entry of the group bench.models"
             )
-        again = parse_model(json.loads(text), str(path)).to_json()
+        again = parse_model(parse_json(text), str(path)).to_json()
         if any(
             again.get(key) != content.get(key) for key in ("kind", "model", "memory", "initial", "band", "dynamics")
         ):
@@ -188,7 +189,7 @@ def load_model(path: Path, kind: str | None = None) -> ModelFile:
         If there is none, it is damaged, its version or kind is unknown, or it is of another kind.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = parse_json(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise DataError(f"model file {path} cannot be read: {error.strerror}") from None
     # Not only a JSONDecodeError: a number of thousands of digits, brackets without end.
@@ -216,7 +217,7 @@ def models_among(files: Mapping[str, bytes], source: str) -> dict[str, ModelFile
         if content.lstrip()[:1] != b"{":
             continue
         with suppress(ValueError, RecursionError):
-            parsed = json.loads(content)
+            parsed = parse_json(content)
             if is_model(parsed):
                 found[name] = parse_model(parsed, f"{source}: {name}")
     return found

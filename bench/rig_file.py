@@ -61,7 +61,6 @@ register a part (`bench.registry`), and those in the folder of the rig file; any
 from __future__ import annotations
 
 import importlib
-import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import date, time
@@ -82,6 +81,7 @@ from bench.errors import ConfigurationError
 from bench.interlocks import Interlock
 from bench.layout import DashboardLayout
 from bench.locks import EMULATED
+from bench.parsing import parse_toml
 
 
 class _Table(BaseModel):
@@ -364,8 +364,8 @@ def _merged(path: str, text: str, extending: tuple[str, ...], bases: list[str]) 
     `extending` are the rigs on the way to it.
     """
     try:
-        content = _without_dates(tomllib.loads(text))
-    except tomllib.TOMLDecodeError as error:
+        content = _without_dates(parse_toml(text))
+    except ValueError as error:
         raise ConfigurationError(f"{path}: not valid TOML: {error}") from None
     if isinstance(rig := content.get("rig"), dict) and str(rig.get("twin", "")).endswith(".toml"):
         rig["twin"] = str(Path(path).parent / rig["twin"])
@@ -442,8 +442,8 @@ def _override(content: dict[str, Any], key: str, value: str, path: str) -> None:
     if table is None:
         raise ConfigurationError(f"{path}: there is no table {'.'.join(parents)!r} in which {last!r} could be set")
     try:
-        table[last] = _without_dates(tomllib.loads(f"value = {value}"))["value"]
-    except tomllib.TOMLDecodeError:
+        table[last] = _without_dates(parse_toml(f"value = {value}"))["value"]
+    except ValueError:
         table[last] = value
 
 

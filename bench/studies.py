@@ -6,7 +6,6 @@ A package registers a `Study` as an entry point of the group `bench.studies`; `b
 from __future__ import annotations
 
 import itertools
-import tomllib
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -23,6 +22,7 @@ from bench.clock import Stopwatch
 from bench.errors import BenchError, ConfigurationError, DataError
 from bench.extras import MissingExtraError, check_extra
 from bench.journal import Record, add_model
+from bench.parsing import parse_toml
 from bench.printing import print_plain, show_table
 from bench.protocol import find_protocol
 from bench.results.published import Published
@@ -323,8 +323,8 @@ def published_of(run: Path) -> tuple[Published, ...]:
     with Record(run) as record:
         rigs = {record.meta["rig"]}
         # The text of a file may be of a later version.
-        with suppress(tomllib.TOMLDecodeError, KeyError):
-            rigs.add(tomllib.loads(record.meta["rig_file"])["extends"])
+        with suppress(ValueError, KeyError):
+            rigs.add(parse_toml(record.meta["rig_file"])["extends"])
     found: list[Published] = []
     for name in registry.entries("studies"):
         # A study of somebody else that cannot be imported is no matter of this run.

@@ -6,8 +6,6 @@ A file is TOML: a table `[tuning.CONTROLLER]` for each controller, as a rig file
 
 from __future__ import annotations
 
-import json
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,6 +13,7 @@ from typing import Annotated, Any
 from pydantic import BeforeValidator
 
 from bench.errors import ConfigurationError
+from bench.parsing import parse_json, parse_toml
 
 
 def load_tuning(path: Path) -> dict[str, dict[str, Any]]:
@@ -23,10 +22,10 @@ def load_tuning(path: Path) -> dict[str, dict[str, Any]]:
     Raises ConfigurationError if it cannot be read, or is no tuning file.
     """
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
+        content = parse_toml(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigurationError(f"tuning file {path} cannot be read: {error.strerror}") from None
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, UnicodeDecodeError) as error:
         raise ConfigurationError(f"tuning file {path} is damaged: not TOML: {error}") from None
     tables = content.get("tuning")
     if not isinstance(tables, dict) or not all(isinstance(table, dict) for table in tables.values()):
@@ -40,7 +39,7 @@ def _given(value: object) -> object:
         return value
     if value.lstrip().startswith("{"):
         try:
-            return json.loads(value)
+            return parse_json(value)
         except ValueError as error:
             raise ValueError(f"expected tables of numbers as JSON, or a tuning file: {error}") from None
     try:

@@ -39,7 +39,6 @@ from __future__ import annotations
 
 import json
 import re
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,6 +48,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from bench.configuration_errors import problems
 from bench.errors import ConfigurationError
+from bench.parsing import parse_toml
 from bench.results.recalibrations import Session
 
 _NAME = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,60}"
@@ -252,10 +252,10 @@ def read_campaign(path: Path) -> CampaignFile:
     Raises ConfigurationError if it cannot be read, or a table is wrong; names file, table, key and what is allowed.
     """
     try:
-        content = tomllib.loads(path.read_text(encoding="utf-8-sig"))
+        content = parse_toml(path.read_text(encoding="utf-8-sig"))
     except (OSError, UnicodeDecodeError) as error:
         raise ConfigurationError(f"campaign file {path} cannot be read: {error}") from None
-    except tomllib.TOMLDecodeError as error:
+    except ValueError as error:
         raise ConfigurationError(f"{path}: not valid TOML: {error}") from None
     try:
         tables = _Content.model_validate(content)

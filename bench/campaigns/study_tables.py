@@ -12,6 +12,7 @@ from typing import Any
 
 from rich.console import Console
 
+from bench.parsing import parse_json
 from bench.studies import ResultTable, StudyResult
 
 FILE_NAME = "study.json"
@@ -52,7 +53,7 @@ def print_over_seeds(name: str, folders: Sequence[Path], console: Console) -> st
 
     Returns them as Markdown.
     """
-    contents = [json.loads((folder / FILE_NAME).read_text(encoding="utf-8")) for folder in folders]
+    contents = [parse_json((folder / FILE_NAME).read_text(encoding="utf-8")) for folder in folders]
     values = over_seeds([content["values"] for content in contents])
     head = f"{name}, {len(folders)} seeds: median (least–greatest)"
     console.print(head, highlight=False)

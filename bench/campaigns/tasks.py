@@ -19,6 +19,7 @@ from bench.campaigns.study_tables import write_study
 from bench.errors import AbortError, BenchError, DataError
 from bench.journal import FILE_NAME as JOURNAL_NAME
 from bench.journal import Record
+from bench.parsing import parse_json
 from bench.protocol import find_protocol
 from bench.results.models import compare_models, identify_file
 from bench.results.recalibrations import Session
@@ -154,7 +155,7 @@ class Task(ABC):
 
     def _said_in(self, folder: Path) -> Done | None:
         try:
-            content = json.loads((folder / DONE_NAME).read_text(encoding="utf-8"))
+            content = parse_json((folder / DONE_NAME).read_text(encoding="utf-8"))
             results = {name: (value, unit) for name, (value, unit) in content["results"].items()}
             found = Done(content["identity"], content["status"], content["reason"], results)
         except (OSError, ValueError, KeyError, TypeError):

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+
+from bench.parsing import parse_json
 
 BLACK_BOX_NAME = "guardian.jsonl"
 """The guardian's own record, lines of JSON: `what` happened, `at` which time of day."""
@@ -66,7 +67,7 @@ def ending_of(folder: Path) -> Ending | None:
 def _note(line: str) -> Mapping[str, Any]:
     """Return a line; nothing if it is torn, as the last one of a guardian that was killed may be."""
     try:
-        note = json.loads(line)
+        note = parse_json(line)
     except ValueError:
         return {}
     return note if isinstance(note, dict) else {}

@@ -11,6 +11,7 @@ from urllib.parse import quote, unquote
 
 from bench.errors import DataError
 from bench.journal.rows import FILE_NAME
+from bench.parsing import parse_json
 
 FOLDER = "models"
 
@@ -71,7 +72,7 @@ def _kept(folder: Path) -> list[tuple[int, str, Any]]:
     result = []
     for file in sorted(folder.glob("*.json")):
         try:
-            content = json.loads(file.read_text(encoding="utf-8"))
+            content = parse_json(file.read_text(encoding="utf-8"))
             # What was put there by hand comes first.
             kept = content.pop(_KEPT, {}) if isinstance(content, dict) else {}
             result.append((int(kept.get("position", 0)), unquote(file.stem), content))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
@@ -15,6 +14,7 @@ from tempfile import TemporaryDirectory
 from bench.clock import Clock, Stopwatch
 from bench.devices import Actuator
 from bench.locks import port_of
+from bench.parsing import parse_json
 from bench.rig_file import DeviceEntry
 from bench.safety import SAFE
 from bench.upkeep.opening import Workplace
@@ -115,7 +115,7 @@ def rescue_by_another_process(
             if not result.exists():
                 reason = f"`bench safe` ended with exit code {ended.returncode}: {ended.stderr.strip()}"
                 return dict.fromkeys(devices, reason)
-            content = json.loads(result.read_text(encoding="utf-8"))
+            content = parse_json(result.read_text(encoding="utf-8"))
         except (OSError, ValueError, subprocess.SubprocessError) as error:
             return dict.fromkeys(devices, f"`bench safe` failed: {error}")
     return {name: SAFE if each["is_safe"] else each["state"] for name, each in content.items()}

@@ -19,6 +19,7 @@ from rich.table import Table
 from bench.cli import JsonOption, console
 from bench.cli.console import STANDARD_OUTPUT, parse_assignments, parse_numbers, warn
 from bench.errors import ConfigurationError
+from bench.parsing import parse_json
 
 if TYPE_CHECKING:
     # Imported by the functions, as `bench --help` imports this module for its help text.
@@ -216,7 +217,7 @@ def _write_at_once(path: Path, content: dict[str, Any]) -> None:
 def _remove(path: Path, identity: str) -> None:
     """Remove the file, unless another server has written its own there."""
     with suppress(OSError, ValueError):
-        if json.loads(path.read_text(encoding="utf-8")).get("server") == identity:
+        if parse_json(path.read_text(encoding="utf-8")).get("server") == identity:
             path.unlink()
 
 

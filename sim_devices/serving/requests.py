@@ -5,7 +5,6 @@ A request names itself under `do`; `docs/reference/emulate.md` describes each.
 
 from __future__ import annotations
 
-import json
 from typing import Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -13,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from bench.configuration_errors import problems
 from bench.errors import ConfigurationError
 from bench.faults import ScheduledFault
+from bench.parsing import parse_json
 
 _LONGEST_SKIP = 3600.0
 _RIG = Field(default=None, description="which rig is meant, where several are served")
@@ -178,7 +178,7 @@ def parse_request(line: bytes) -> Request:
     Raises ConfigurationError if it is none: names what is wrong and what is allowed.
     """
     try:
-        content: Any = json.loads(line)
+        content: Any = parse_json(line)
     except (ValueError, RecursionError) as error:
         raise ConfigurationError(f'not a line of JSON: {error}; expected such as {{"do": "help"}}') from None
     if not isinstance(content, dict) or not isinstance(content.get("do"), str):
