@@ -2,16 +2,35 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+import re
+from collections.abc import Iterable, Sequence
 
+from rich.console import Console, ConsoleOptions, RenderableType
+from rich.segment import Segment
 from rich.table import Column, Table
 from rich.text import Text
 
-if TYPE_CHECKING:
-    from rich.console import Console, RenderableType
-
 _INDENT = "    "
+
+_COMMANDING = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")
+"""Characters that command a terminal, but for tab and line feed, and those that change the direction of a text
+(Unicode Standard Annex 9, section 2)."""
+
+
+class PlainConsole(Console):
+    """A console on which a text commands nothing, whoever wrote it: an instrument, a file, or another user.
+
+    Characters that would are shown as U+FFFD.
+    """
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterable[Segment]:
+        """Yield the segments of what is printed; those of the console itself, such as of its cursor, as they are."""
+        for segment in super().render(renderable, options):
+            text, style, control = segment
+            if control is None and not text.isprintable():
+                yield Segment(_COMMANDING.sub("\ufffd", text), style)
+            else:
+                yield segment
 
 
 def print_plain(console: Console, text: str) -> None:

@@ -12,16 +12,15 @@ from pathlib import Path
 from typing import Annotated, Any, NoReturn
 
 import typer
-from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
 from bench.cli.streams import write_out
 from bench.errors import BenchError, ConfigurationError, DataError
-from bench.printing import show_table
+from bench.printing import PlainConsole, show_table
 
-console = Console()
-error_console = Console(stderr=True)
+console = PlainConsole()
+error_console = PlainConsole(stderr=True)
 
 
 class FigureFormat(StrEnum):

@@ -15,9 +15,8 @@ from collections import deque
 from contextlib import suppress
 from typing import IO
 
-from rich.console import Console
-
 from bench.errors import BenchError
+from bench.printing import PlainConsole
 from bench.workers.messages import Message, Order, Progress, Result, Welcome, Words, receive, send
 from bench.workers.task import collecting_seldom, task_surroundings
 
@@ -33,7 +32,7 @@ def main() -> None:
         return
     sys.argv = welcome.command
     threading.Thread(target=_listen, args=(orders, inbox), name="orders", daemon=True).start()
-    console = Console(file=_Speaker(outbox), width=welcome.width, force_terminal=False)
+    console = PlainConsole(file=_Speaker(outbox), width=welcome.width, force_terminal=False)
     with collecting_seldom(), task_surroundings(console, lambda *how_far: outbox.put(Progress(*how_far))):
         for module in welcome.modules:
             _load(module)

@@ -6,9 +6,10 @@ import re
 import pytest
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from bench.devices import Signal
-from bench.printing import show_table
+from bench.printing import PlainConsole, print_plain, show_table
 from bench.remaining_time import Expectation
 from bench.terminal import ProgressDisplay
 
@@ -106,3 +107,35 @@ def test_commands_cut_nothing(bench, monkeypatch, columns, command, words):
     for word in words:
         assert word in out
     assert "…" not in out
+
+
+class TestTextsOfOthers:
+    """Names, notes and answers come from files, instruments and other users: none of them commands the terminal."""
+
+    HOSTILE = "x\x1b[2K\x1b[1Gerror\x07\r\x9b31mz\u202egnp.exe\u2066\u200f"
+
+    @pytest.mark.parametrize("is_terminal", [True, False])
+    def test_characters_that_command_a_terminal_are_shown_as_such(self, is_terminal):
+        console = PlainConsole(file=io.StringIO(), width=200, force_terminal=is_terminal, color_system=None)
+        print_plain(console, self.HOSTILE)
+        console.print("first\nsecond\tthird", soft_wrap=True)
+        show_table(console, table_of(self.HOSTILE))
+        lines = console.file.getvalue().splitlines()
+        assert lines[1:3] == ["first", "second  third"]
+        text = re.sub(r"\x1b\[\d*m", "", "\n".join(lines))
+        assert not set("\x1b\x07\r\x9b\u202e\u2066\u200f") & set(text)
+        assert text.count("error") == 2
+
+    def test_a_bar_still_moves_the_cursor(self):
+        console = PlainConsole(file=io.StringIO(), width=80, force_terminal=True, color_system=None)
+        with ProgressDisplay(console, "creep\x1b[1G", SIGNALS, [], LONG, 1.0) as display:
+            display._show(100.0, 3, [2.85, -0.123])
+        text = console.file.getvalue()
+        assert "\x1b[2K" in text
+        assert "creep�[1G" in text
+
+
+def table_of(cell):
+    made = Table("name", title="all")
+    made.add_row(Text(cell))
+    return made
