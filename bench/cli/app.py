@@ -7,6 +7,7 @@ wait until a command needs them, so that `bench --help` answers at once.
 from __future__ import annotations
 
 import atexit
+import errno
 import gc
 import sqlite3
 import sys
@@ -43,7 +44,7 @@ from bench.cli import (
 from bench.cli.console import error_console, exit_code, fail
 from bench.cli.registered import RegisteredCommands, Studies
 from bench.cli.streams import standard_streams
-from bench.errors import BenchError
+from bench.errors import BenchError, ConfigurationError
 
 _EPILOG = (
     "Exit codes: 0 done; 1 failed, or done but the file of --json could not be written; 2 wrong command, rig file or "
@@ -121,24 +122,41 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
 
 
 def _carry_out(arguments: Sequence[str] | None) -> NoReturn:
+    words = sys.argv[1:] if arguments is None else list(arguments)
     try:
+        _check_words(words)
         registry.check_own_packages()
-        app(args=None if arguments is None else list(arguments))
+        app(args=words)
     except BenchError as error:
         fail(error)
+    except OSError as error:
+        if error.errno != errno.ENAMETOOLONG:
+            raise
+        fail(ConfigurationError(f"{str(error.filename)[:60]}…: the name of a file or folder is too long"))
     except sqlite3.Error as error:
         error_console.print("[bold red]error:[/] the journal cannot be written:", escape(str(error)), highlight=False)
         sys.exit(1)
     # As typer ends a command at Ctrl-C: without a word.
     except SystemExit as ended:
         if _is_by_keyboard(ended):
-            words = sys.argv[1:] if arguments is None else arguments
             error_console.print(f"[yellow]ended by Ctrl-C:[/] {_state_of_outputs(words)}", highlight=False)
         code = 0 if ended.code is None else ended.code
         if isinstance(code, int) and (code := exit_code(code)) != ended.code:
             sys.exit(code)
         raise
     sys.exit(exit_code(0))
+
+
+def _check_words(words: Sequence[str]) -> None:
+    """Raise ConfigurationError for a word whose bytes are no text: neither a record nor a log could hold it."""
+    for word in words:
+        try:
+            word.encode()
+        except UnicodeEncodeError:
+            raise ConfigurationError(
+                f"{word!a}: its bytes are no text in {sys.getfilesystemencoding()}, the encoding of this system; "
+                "expected names that are"
+            ) from None
 
 
 def _is_by_keyboard(error: BaseException | None) -> bool:

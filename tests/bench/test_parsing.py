@@ -1,4 +1,4 @@
-"""Files that somebody else wrote, nested deeper than they can be read: one message, whatever the file is for."""
+"""Files that are nested deeper than they can be read, and names that no file can have: one message each."""
 
 import pytest
 
@@ -38,3 +38,21 @@ def test_it_is_one_message(bench, tmp_path, name, text, command):
     assert code in (2, 3)
     assert (err.count("error: "), "Traceback" in err) == (1, False)
     assert name in err
+
+
+LONG, NO_TEXT = "a" * 4200, "a\udcff"
+COMMANDS = (
+    [*CREEP, "--rig", "vo2", "--out"], ["runs"], ["identify", "--input", "u", "--output", "y"], ["report"], ["watch"],
+    ["new", "rig"], ["repeat"], ["resume"], ["reproduce", "vo2", "--out"], ["emulate", "vo2", "--json"],
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("name", [LONG, NO_TEXT], ids=["long", "no text"])
+@pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
+def test_a_name_that_no_file_has_is_one_message(bench, tmp_path, monkeypatch, command, name):
+    monkeypatch.chdir(tmp_path)
+    code, _, err = bench(*command, name)
+    assert code == 2
+    assert (err.count("error: "), "Traceback" in err) == (1, False)
+    assert ("too long" if name is LONG else "no text") in err
+    assert [*tmp_path.iterdir()] == []
