@@ -1,5 +1,22 @@
-"""`python -m bench` is `bench`."""
+"""`bench`, and `python -m bench`: the command line, which Ctrl-C ends without a traceback while it loads, too."""
 
-from bench.cli import main
+from __future__ import annotations
 
-main()
+import sys
+from typing import NoReturn
+
+
+def start() -> NoReturn:
+    """Run the command of the command line."""
+    try:
+        # Loading it takes a while.
+        from bench.cli import main
+
+        main()
+    except KeyboardInterrupt:
+        sys.stderr.write("ended by Ctrl-C: no device was opened, nothing has moved\n")
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    start()

@@ -304,3 +304,18 @@ class TestProcesses:
     def test_without_any_standard_input(self, start):
         process = start("stairs", "dwell=0.1", clock="virtual", preexec_fn=lambda: os.close(0))
         assert process.end() == 0, process.output
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="sends signals of POSIX")
+def test_ctrl_c_while_the_command_loads_is_one_line():
+    # Python itself reports what has been imported: numpy and typer come while the command loads.
+    command = [sys.executable, "-v", "-P", "-m", "bench", "list"]
+    with subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True) as process:
+        for line in process.stderr:
+            if "import 'bench.cli'" in line or "import 'typer" in line:
+                process.send_signal(signal.SIGINT)
+                break
+        rest = process.stderr.read()
+    assert process.returncode == 130
+    assert "Traceback" not in rest
+    assert "ended by Ctrl-C: no device was opened, nothing has moved" in rest
