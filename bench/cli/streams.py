@@ -15,6 +15,9 @@ from typing import TextIO
 _PATIENCE = 10.0
 """Longest wait at the end for a pipe that nobody reads, s of wall-clock time without progress."""
 
+_PART = 4096
+"""Bytes that are written at once: PIPE_BUF of Linux."""
+
 _UNREAD = "nobody reads it"
 
 
@@ -37,7 +40,7 @@ class Output(io.TextIOBase):
     def __init__(self, stream: TextIO | None) -> None:
         self.failure = ""
         self._stream = stream
-        self._waiting: deque[bytes] = deque()
+        self._waiting: deque[memoryview] = deque()
         self._changed = threading.Condition()
         self._thread: threading.Thread | None = None
         with suppress(OSError, ValueError, AttributeError):
@@ -73,8 +76,10 @@ class Output(io.TextIOBase):
         if self._pipe is None:
             self._attempt(lambda stream: stream.write(text))
             return len(text)
+        content = text.replace("\n", os.linesep).encode(self.encoding, "backslashreplace")
         with self._changed:
-            self._waiting.append(text.replace("\n", os.linesep).encode(self.encoding, "backslashreplace"))
+            if content:
+                self._waiting.append(memoryview(content))
             self._changed.notify_all()
         if self._thread is None:
             self._thread = threading.Thread(target=self._pass_on, args=(self._pipe,), name="output", daemon=True)
@@ -113,7 +118,8 @@ class Output(io.TextIOBase):
                     self._changed.wait()
                 content = self._waiting[0]
             try:
-                written = os.write(pipe, content[:4096])
+                # In parts: what a slow reader has taken of them counts as progress.
+                written = os.write(pipe, content[:_PART])
             except OSError as error:
                 written, failure = 0, error.strerror or str(error)
             else:
