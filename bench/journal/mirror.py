@@ -9,8 +9,10 @@ rows' numbers and texts as in `bench.journal.rows.Entry`. What is damaged or cut
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import os
+import stat
 import struct
 import tempfile
 import zlib
@@ -46,9 +48,7 @@ class Mirror:
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._file = os.fdopen(
-            os.open(path, os.O_RDWR | os.O_CREAT | getattr(os, "O_BINARY", 0), 0o666), "r+b", buffering=0
-        )
+        self._file = os.fdopen(_open(path, os.O_RDWR | os.O_CREAT), "r+b", buffering=0)
         self._end = self._file.seek(0, os.SEEK_END)
 
     def append(self, entries: Iterable[Entry]) -> None:
@@ -86,11 +86,38 @@ def second_files(journal: Path) -> list[Path]:
 
 
 def read_mirror(path: Path) -> list[Entry]:
-    """Return the rows of a second file, without those that are damaged; of a file that there is not, none."""
+    """Return the intact rows, or an empty list if the file is missing or another user's."""
     try:
-        return list(_decoded(path.read_bytes()))
-    except FileNotFoundError:
+        with os.fdopen(_open(path, os.O_RDONLY), "rb") as file:
+            return list(_decoded(file.read()))
+    except (FileNotFoundError, _ForeignFileError):
         return []
+
+
+class _ForeignFileError(OSError):
+    """A file in the folder for temporary files that this user has not written."""
+
+
+def _open(path: Path, flags: int) -> int:
+    """Open a second file; one in the folder for temporary files has to be a file of this user or of root.
+
+    Everybody can write to that folder, and the names are no secret: no link is followed there, and nothing of another
+    user is believed.
+    """
+    flags |= getattr(os, "O_BINARY", 0)
+    if path.name == NAME or os.name == "nt":
+        return os.open(path, flags, 0o666)
+    try:
+        file = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK, 0o600)
+    except OSError as error:
+        if error.errno == errno.ELOOP:
+            raise _ForeignFileError(errno.ELOOP, "it is a link", str(path)) from None
+        raise
+    found = os.fstat(file)
+    if stat.S_ISREG(found.st_mode) and found.st_nlink == 1 and found.st_uid in (os.geteuid(), 0):
+        return file
+    os.close(file)
+    raise _ForeignFileError(errno.EPERM, "it is not a file of this user", str(path))
 
 
 def _encoded(entry: Entry) -> bytes:

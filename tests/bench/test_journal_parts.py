@@ -1,7 +1,9 @@
 """The parts of a journal by themselves: second file, keeper, thread, SQLite file, and reading damaged ones."""
 
 import json
+import os
 import sqlite3
+import sys
 import tempfile
 import threading
 from collections import namedtuple
@@ -162,6 +164,31 @@ class TestMirror:
         assert (first.parent, first.suffix, late.suffix) == (other_disk, ".mirror", ".late")
         assert len(first.stem) == len("bench-") + 24
         assert elsewhere(tmp_path / "other.sqlite")[0] != first
+
+    @pytest.mark.skipif(sys.platform == "win32", reason="needs links and users of POSIX")
+    @pytest.mark.parametrize("forged", ["link", "second name", "of another user"])
+    def test_elsewhere_nothing_of_another_user_is_followed_or_believed(self, tmp_path, monkeypatch, forged):
+        path, _ = elsewhere(tmp_path / FILE_NAME)
+        file = Mirror(path)
+        file.append([note(1)])
+        file.close()
+        assert path.stat().st_mode & 0o077 == 0
+        assert [each.row[0] for each in read_mirror(path)] == [1]
+        theirs = tmp_path / "theirs"
+        if forged == "of another user" and os.geteuid() == 0:
+            os.chown(path, 65534, -1)
+        elif forged == "of another user":
+            monkeypatch.setattr(os, "geteuid", lambda: 65533)
+        elif forged == "link":
+            path.rename(theirs)
+            path.symlink_to(theirs)
+        else:
+            theirs.hardlink_to(path)
+        assert read_mirror(path) == []
+        content = path.read_bytes()
+        with pytest.raises(OSError, match=r"link|not a file of this user"):
+            Mirror(path)
+        assert path.read_bytes() == content
 
 
 class TestKeeper:
