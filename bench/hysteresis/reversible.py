@@ -79,10 +79,9 @@ class QuadraticTerm(Document):
     origin: float = 0.0
 
     def __post_init__(self) -> None:
-        _checks.number("linear", self.linear)
-        _checks.number("origin", self.origin)
+        _keep_numbers(self, "linear", "origin")
         if self.quadratic is not None:
-            _checks.number("quadratic", self.quadratic)
+            _keep_numbers(self, "quadratic")
 
     @property
     def coefficients(self) -> Floats:
@@ -149,6 +148,7 @@ class PolynomialTerm(Document):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "series", tuple(_checks.samples("series", self.series).tolist()))
+        _keep_numbers(self, "low", "high")
         _checks.increasing("low, high", [self.low, self.high])
         if isinstance(self.knots, bool) or not isinstance(self.knots, int) or self.knots < 1:
             raise ValueError(f"knots: expected a whole number >= 1, got {self.knots!r}")
@@ -238,8 +238,7 @@ class ThermalExpansion(Document):
     reference: float
 
     def __post_init__(self) -> None:
-        for name in ("k0", "k1", "low", "high", "reference"):
-            _checks.number(name, getattr(self, name))
+        _keep_numbers(self, "k0", "k1", "low", "high", "reference")
         if self.low >= self.high:
             raise ValueError(f"low: expected a value below high = {self.high}, got {self.low}")
 
@@ -278,6 +277,12 @@ class ThermalExpansion(Document):
         q = (k1 - k0) / (self.high - self.low)
         middle = [(k0 - q * self.low) * t0, q * (t0 + self.low) - k0, -q]
         return np.array([self.low, self.high]), np.array([[k0 * t0, -k0, 0.0], middle, [k1 * t0, -k1, 0.0]])
+
+
+def _keep_numbers(term: object, *names: str) -> None:
+    """Make fields of a frozen term floats, as whole numbers of any size are no numbers of numpy."""
+    for name in names:
+        object.__setattr__(term, name, _checks.number(name, getattr(term, name)))
 
 
 def reversible_from_json(document: Mapping[str, Any]) -> Reversible:

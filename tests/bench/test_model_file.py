@@ -226,6 +226,16 @@ def test_any_mutation_is_a_usable_model_or_a_data_error(name, data):
     assert isinstance(file.operator.output_unit, str)
 
 
+@pytest.mark.parametrize(
+    ("name", "key"), [("non-monotonic", "k0"), ("non-monotonic", "high"), ("with a quadratic", "quadratic")]
+)
+def test_a_whole_number_of_any_size_is_a_number(name, key):
+    document = copy.deepcopy(content(name))
+    document["model"]["reversible"][key] = 10**30
+    model = parse_model(document, "m.json").operator
+    assert model.evaluate(np.linspace(*model.input_range, 5)).dtype == np.float64
+
+
 def stage(low, high, units):
     return Preisach(uniform_levels(low, high, 4), np.linspace(0.1, 1.0, 10), 0.5, None, None, *units)
 
