@@ -107,7 +107,7 @@ def _entries(path: Path, text: str) -> list[Any]:
         if path.suffix == ".jsonl":
             return [parse_json(line) for line in text.splitlines() if line.strip()]
         content = parse_toml(text)
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         form = "JSON lines" if path.suffix == ".jsonl" else "TOML"
         raise ConfigurationError(f"{path} is not {form}: {error}") from None
     unknown = [key for key in content if key != "fault"]

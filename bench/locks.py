@@ -307,7 +307,7 @@ def _open(path: Path) -> int:
         try:
             # Without O_CREAT where it is there: Linux may refuse that for a file of another user in such a folder.
             with suppress(FileNotFoundError):
-                return _checked(os.open(path, (os.O_RDWR if _is_own(path.lstat()) else os.O_RDONLY) | _SAFELY))
+                return _checked(os.open(path, (os.O_RDWR if is_own(path.lstat()) else os.O_RDONLY) | _SAFELY))
             with suppress(FileExistsError):
                 return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)
         except OSError as error:
@@ -327,8 +327,8 @@ def _checked(file: int) -> int:
     raise OSError(errno.EINVAL, f"it is no file of its own, but a link or a pipe of {_user(found.st_uid)}; remove it")
 
 
-def _is_own(found: os.stat_result) -> bool:
-    """Return whether what a file says can be believed: it is of this user or of root."""
+def is_own(found: os.stat_result) -> bool:
+    """Return whether a file can be believed in a folder that everybody may write to: it is this user's or root's."""
     return sys.platform == "win32" or found.st_uid in (os.geteuid(), 0)
 
 
@@ -365,7 +365,7 @@ else:
 
 
 def _write(file: int, holder: Holder) -> None:
-    if not _is_own(os.fstat(file)):
+    if not is_own(os.fstat(file)):
         return
     os.lseek(file, 0, os.SEEK_SET)
     os.truncate(file, 0)
@@ -377,7 +377,7 @@ def _holder(name: str) -> str:
     path = _path(name)
     try:
         found = path.lstat()
-        if not _is_own(found):
+        if not is_own(found):
             return f"a process that cannot say who it is, as {_user(found.st_uid)} made the lock {path}"
         return str(Holder(**parse_json(path.read_text(encoding="utf-8"))))
     except (OSError, ValueError, TypeError):

@@ -192,8 +192,8 @@ def load_model(path: Path, kind: str | None = None) -> ModelFile:
         content = parse_json(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise DataError(f"model file {path} cannot be read: {error.strerror}") from None
-    # Not only a JSONDecodeError: a number of thousands of digits, brackets without end.
-    except (ValueError, RecursionError) as error:
+    # Not only a JSONDecodeError: a number of thousands of digits, too.
+    except ValueError as error:
         raise DataError(f"model file {path} is damaged: not JSON: {error}") from None
     file = parse_model(content, str(path))
     if kind not in (None, file.model.kind):

@@ -25,7 +25,7 @@ def load_tuning(path: Path) -> dict[str, dict[str, Any]]:
         content = parse_toml(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigurationError(f"tuning file {path} cannot be read: {error.strerror}") from None
-    except (ValueError, UnicodeDecodeError) as error:
+    except ValueError as error:
         raise ConfigurationError(f"tuning file {path} is damaged: not TOML: {error}") from None
     tables = content.get("tuning")
     if not isinstance(tables, dict) or not all(isinstance(table, dict) for table in tables.values()):

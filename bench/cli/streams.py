@@ -1,4 +1,4 @@
-"""Standard output and standard error as commands use them: what cannot be printed destroys no work."""
+"""Standard output and standard error as commands use them: a failed print destroys no work."""
 
 from __future__ import annotations
 

@@ -215,7 +215,7 @@ class _Search:
     ) -> list[list[Evaluation]]:
         """Return how candidates do, a task for each sequence of them.
 
-        What takes longest, the search for the shape of an operator, is carried out once for each candidate.
+        The search for the shape of an operator takes longest, so it is carried out once for each candidate.
         """
         limits = hopeless or [float("inf")] * len(tries)
         tasks = []

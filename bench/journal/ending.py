@@ -13,7 +13,7 @@ BLACK_BOX_NAME = "guardian.jsonl"
 """The guardian's own record, lines of JSON: `what` happened, `at` which time of day."""
 
 BEGIN, FAILED, END = "begin", "failed", "end"
-"""What lines of it are about: the guardian of a run begins, the bench has hung or is gone, the guardian ends."""
+"""Kinds of its lines: the guardian of a run begins, the bench has hung or is gone, the guardian ends."""
 
 
 @dataclass(frozen=True)

@@ -20,6 +20,7 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 from bench.journal.rows import TABLES, TEXTS, Entry, unpacked
+from bench.locks import is_own
 
 NAME = "journal.mirror"
 _MARK = b"\xb5row"
@@ -114,7 +115,7 @@ def _open(path: Path, flags: int) -> int:
             raise _ForeignFileError(errno.ELOOP, "it is a link", str(path)) from None
         raise
     found = os.fstat(file)
-    if stat.S_ISREG(found.st_mode) and found.st_nlink == 1 and found.st_uid in (os.geteuid(), 0):
+    if stat.S_ISREG(found.st_mode) and found.st_nlink == 1 and is_own(found):
         return file
     os.close(file)
     raise _ForeignFileError(errno.EPERM, "it is not a file of this user", str(path))

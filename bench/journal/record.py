@@ -122,7 +122,7 @@ class Record:
 
     @property
     def safe_state(self) -> Mapping[str, str]:
-        """What became of each device at the end: `safe`, or what went wrong; empty if nothing says it."""
+        """State of each device at the end: `safe`, or the fault; empty if it is not recorded."""
         found: Mapping[str, str] = self.meta.get(
             "safe_state", {} if self._ending is None else self._ending.safe_state
         )

@@ -179,7 +179,7 @@ def parse_request(line: bytes) -> Request:
     """
     try:
         content: Any = parse_json(line)
-    except (ValueError, RecursionError) as error:
+    except ValueError as error:
         raise ConfigurationError(f'not a line of JSON: {error}; expected such as {{"do": "help"}}') from None
     if not isinstance(content, dict) or not isinstance(content.get("do"), str):
         raise ConfigurationError(f'expected an object with a request, such as {{"do": "help"}}; {_known()}')

@@ -1,4 +1,4 @@
-"""What cannot be printed destroys no work: encodings that lack characters, full disks, readers that are gone."""
+"""A failed print destroys no work: encodings that lack characters, full disks, readers that are gone."""
 
 import io
 import math
