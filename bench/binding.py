@@ -25,7 +25,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Self
+from typing import Protocol, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
@@ -196,6 +196,22 @@ def rate_unit(unit: str) -> str:
 
 Slots = Mapping[str, Slot]
 """The slots of a protocol by name."""
+
+
+class SlotsAsked(Protocol):
+    """What a protocol says of its slots: its name, and the kinds that it needs and that it may use, by slot."""
+
+    @property
+    def name(self) -> str:
+        """Name of the protocol."""
+
+    @property
+    def slots(self) -> Mapping[str, type[Device] | type[Signal]]:
+        """Kinds of the slots that it needs."""
+
+    @property
+    def may_use(self) -> Mapping[str, type[Device] | type[Signal]]:
+        """Kinds of the slots that it uses if the rig binds them."""
 
 
 def bind(

@@ -6,10 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from bench.binding import Slots, bind
+from bench.binding import Slots, SlotsAsked, bind
 from bench.devices import DeviceDescription, Limits, Signal
 from bench.errors import ConfigurationError
-from bench.protocol.parameters import ProtocolDefinition
 from bench.rig_file import RigFile
 
 
@@ -57,7 +56,7 @@ class RigDescription:
         """Return the unit of a signal."""
         return self.by_name[signal].unit
 
-    def slots(self, definition: ProtocolDefinition) -> Slots:
+    def slots(self, definition: SlotsAsked) -> Slots:
         """Return the slots of a protocol, bound as the rig file says.
 
         Raises ConfigurationError if one is not bound, or bound to something of another kind.

@@ -26,7 +26,7 @@ from __future__ import annotations
 import math
 import threading
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from datetime import date
@@ -35,7 +35,7 @@ from typing import Any, ClassVar, Self, TypedDict
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from bench.clock import Clock
-from bench.errors import DeviceConnectionError, DeviceError, LimitError
+from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, LimitError
 
 
 @dataclass(frozen=True)
@@ -76,6 +76,37 @@ class Signal:
     description: str
     precision: int = 3
     accuracy: float | None = None
+
+
+RESERVED_NAMES = (
+    "step",
+    "started",
+    "finished",
+    "phase",
+    "label",
+    "settled",
+    "setpoints",
+    "seen",
+    "tick",
+    "t",
+    "checksum",
+)
+"""Columns that a table of readings has beside the signals; see `bench.journal`."""
+
+
+def check_signal_names(names: Sequence[str]) -> None:
+    """Check that the names of signals can be columns of one table.
+
+    Raises ConfigurationError if two have one name, or one is in `RESERVED_NAMES`; case does not
+    count.
+    """
+    seen = dict.fromkeys(RESERVED_NAMES, "is the name of a column of the journal")
+    for name in names:
+        if "\0" in name:
+            raise ConfigurationError(f"signal {name!r}: a name may not have a null character")
+        if (folded := name.lower()) in seen:
+            raise ConfigurationError(f"signal {name!r}: {seen[folded]}; choose another")
+        seen[folded] = "is the name of two signals (case does not count)"
 
 
 @dataclass(frozen=True)

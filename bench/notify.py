@@ -31,6 +31,7 @@ from typing import Any, Self
 from bench.clock import wall_time
 from bench.errors import ConfigurationError
 from bench.journal import Event, StepRecord
+from bench.redaction import OPTION, redacted
 
 _OCCASIONS = {"pause": "pause", "prompt": "prompt", "warning": "warning", "interlock": "trip", "end": "end"}
 """Kinds of events that are told, and what the occasion is called."""
@@ -54,34 +55,8 @@ _SMTP = {
 }
 """Variables of the environment that say how mail is sent."""
 
-_OPTION = "--notify"
-
 Facts = Mapping[str, Any]
 Send = Callable[[Facts], None]
-
-
-def redacted(target: str) -> str:
-    """Return a target without what may be secret: the path of a webhook, and the arguments of a command."""
-    if target.lower().startswith(("http://", "https://")):
-        parts = urllib.parse.urlsplit(target)
-        return f"{parts.scheme}://{parts.hostname or ''}/…"
-    if target.lower().startswith("mailto:"):
-        return target
-    program, separator, _ = target.strip().partition(" ")
-    return f"{program} …" if separator else program
-
-
-def redacted_command(words: Sequence[str]) -> list[str]:
-    """Return a command of the bench as it is recorded: its targets of messages are `redacted`."""
-    kept: list[str] = []
-    for word in words:
-        option, equals, target = word.partition("=")
-        if kept and kept[-1] == _OPTION:
-            word = redacted(word)
-        elif option == _OPTION and equals:
-            word = f"{option}={redacted(target)}"
-        kept.append(word)
-    return kept
 
 
 def sender(target: str) -> Send:
@@ -94,17 +69,17 @@ def sender(target: str) -> Send:
     if target.lower().startswith("mailto:"):
         address = target[len("mailto:") :]
         if "@" not in address:
-            raise ConfigurationError(f"{_OPTION} {target}: expected mailto:NAME@DOMAIN")
+            raise ConfigurationError(f"{OPTION} {target}: expected mailto:NAME@DOMAIN")
         if not os.environ.get("BENCH_SMTP_HOST"):
             known = "; ".join(f"{name}: {text}" for name, text in _SMTP.items())
-            raise ConfigurationError(f"{_OPTION} {target}: BENCH_SMTP_HOST is not set ({known})")
+            raise ConfigurationError(f"{OPTION} {target}: BENCH_SMTP_HOST is not set ({known})")
         return partial(_mail, address)
     # On Windows a backslash is part of a path.
     words = [word.strip('"') for word in shlex.split(target, posix=False)] if os.name == "nt" else shlex.split(target)
     program = shutil.which(words[0]) if words else None
     if program is None:
         raise ConfigurationError(
-            f"{_OPTION} {redacted(target)!r}: there is no such program; expected a command, mailto:ADDRESS or https://ADDRESS"
+            f"{OPTION} {redacted(target)!r}: there is no such program; expected a command, mailto:ADDRESS or https://ADDRESS"
         )
     return partial(_call, [program, *words[1:]])
 

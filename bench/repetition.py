@@ -17,7 +17,6 @@ from bench.journal import Record
 from bench.protocol import ProtocolDefinition, digest_of, find_protocol
 from bench.protocol.changes import ParameterChange
 from bench.recorded_files import PROTOCOL_NAME, Original, unpack
-from bench.results.run_comparison import RunComparison, compare_runs
 from bench.rig_file import RigFile, rig_of_content
 from bench.runs import Run, RunResult, carry_out
 
@@ -32,15 +31,12 @@ class Repetition:
         The run that was repeated.
     result : RunResult
         What its repetition left behind.
-    comparison : RunComparison
-        Both side by side.
     is_exact : bool
         Whether equal values were to be expected: all emulated in this process, on the virtual clock.
     """
 
     original: Path
     result: RunResult
-    comparison: RunComparison
     is_exact: bool
 
 
@@ -130,8 +126,7 @@ def repeat(
             changes=changes,
         )
         result = carry_out(asked, console, interrupts)
-    with Record(run) as before, Record(result.folder) as now:
-        return Repetition(run, result, compare_runs(before, now), own is not None and meta["clock"] == "virtual")
+    return Repetition(run, result, own is not None and meta["clock"] == "virtual")
 
 
 def _has_own_rig(meta: Mapping[str, Any], rig: RigFile | None) -> bool:

@@ -13,9 +13,8 @@ from bench.binding import check_roles
 from bench.clock import Clock, make_clock
 from bench.derived import Derived
 from bench.description import RigDescription
-from bench.devices import Actuator, Device, DeviceDescription, Signal
+from bench.devices import Actuator, Device, DeviceDescription, Signal, check_signal_names
 from bench.errors import ConfigurationError, DeviceError
-from bench.journal import check_names
 from bench.readables import ReadableSignal
 from bench.rig_file import Laboratory, RigFile
 from bench.roles import BlockPlayer, Floats, JointReader, LoadCell
@@ -328,7 +327,7 @@ class Rig:
     def _check_references(self) -> None:
         path = self.file.path
         try:
-            check_names([signal.name for signal in self.signals])
+            check_signal_names([signal.name for signal in self.signals])
         except ConfigurationError as error:
             raise ConfigurationError(f"{path}: {error}") from None
         used = [(f"interlocks.{i}.signal", lock.signal) for i, lock in enumerate(self.file.interlocks)]

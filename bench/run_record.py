@@ -26,9 +26,9 @@ from bench.clock import wall_time
 from bench.description import RigDescription
 from bench.errors import ConfigurationError
 from bench.journal import FILE_NAME, files_of
-from bench.notify import redacted_command
 from bench.protocol import Plan, ProtocolDefinition, ProtocolParameters, digest_of, is_installed
 from bench.recorded_files import RIG_FILE_NAME, file_name
+from bench.redaction import redacted_command
 
 _PACKAGES = (
     "actuator-bench",

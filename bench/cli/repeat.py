@@ -51,7 +51,9 @@ def repeat(
     A record is code: its protocol and the modules of its rig file are run as they were kept.
     """
     from bench.interrupts import Interrupts
+    from bench.journal import Record
     from bench.repetition import repeat as carry_out_again
+    from bench.results.run_comparison import compare_runs
     from bench.terminal import say_what_ctrl_c_does
 
     check_outputs(json_file=json_file, folder=out, read=[run])
@@ -67,7 +69,9 @@ def repeat(
                 live=live,
                 interrupts=interrupts,
             )
-        equal = found.comparison.equal
+        with Record(found.original) as before, Record(found.result.folder) as now:
+            comparison = compare_runs(before, now)
+        equal = comparison.equal
         if all(equal.values()):
             console.print(f"as the original: {', '.join(equal)} are equal to the last bit", highlight=False)
         else:
@@ -77,4 +81,4 @@ def repeat(
                 warn(text)
             else:
                 print_plain(console, text)
-        print_result(found.result, json_file, {"repeats": str(found.original), **found.comparison.to_json()})
+        print_result(found.result, json_file, {"repeats": str(found.original), **comparison.to_json()})

@@ -55,7 +55,7 @@ from bench.journal.ending import BLACK_BOX_NAME, Ending, ending_of
 from bench.journal.finding import files_of, find_journals
 from bench.journal.models import add_model
 from bench.journal.record import Record
-from bench.journal.rows import FILE_NAME, SCHEMA, Event, StepRecord, check_names
+from bench.journal.rows import FILE_NAME, SCHEMA, Event, StepRecord
 from bench.journal.table import Table
 from bench.journal.writing import Journal, abandon, take_in
 
@@ -71,7 +71,6 @@ __all__ = [
     "Table",
     "abandon",
     "add_model",
-    "check_names",
     "ending_of",
     "expected_steps",
     "files_of",

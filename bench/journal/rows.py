@@ -14,7 +14,6 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from bench.errors import ConfigurationError
 from bench.settling import Settled
 
 SCHEMA = 3
@@ -23,19 +22,6 @@ FILE_NAME = "journal.sqlite"
 RECOVERED_NAME = "journal.recovered.sqlite"
 """The copy that `bench recover-journal` writes."""
 
-_OWN_COLUMNS = (
-    "step",
-    "started",
-    "finished",
-    "phase",
-    "label",
-    "settled",
-    "setpoints",
-    "seen",
-    "tick",
-    "t",
-    "checksum",
-)
 
 _TABLES = (
     "meta (key TEXT PRIMARY KEY, value TEXT NOT NULL, checksum INTEGER NOT NULL) WITHOUT ROWID",
@@ -130,21 +116,6 @@ class Event:
     level: str
     kind: str
     text: str
-
-
-def check_names(names: Sequence[str]) -> None:
-    """Check that signals can be columns of a journal.
-
-    Raises ConfigurationError if two have one name, or one has that of a column which the journal itself needs; case
-    does not count.
-    """
-    seen = dict.fromkeys(_OWN_COLUMNS, "is the name of a column of the journal")
-    for name in names:
-        if "\0" in name:
-            raise ConfigurationError(f"signal {name!r}: a name may not have a null character")
-        if (folded := name.lower()) in seen:
-            raise ConfigurationError(f"signal {name!r}: {seen[folded]}; choose another")
-        seen[folded] = "is the name of two signals (case does not count)"
 
 
 def quoted(name: str) -> str:

@@ -13,7 +13,7 @@ from types import MappingProxyType
 from typing import Any, Self
 
 from bench.clock import Stopwatch
-from bench.devices import Signal
+from bench.devices import Signal, check_signal_names
 from bench.errors import ConfigurationError, DataError, RecordError
 from bench.journal.background import LONGEST_UNWRITTEN, Background
 from bench.journal.ending import Ending
@@ -23,7 +23,7 @@ from bench.journal.mirror import NAME as MIRROR_NAME
 from bench.journal.mirror import read_mirror, second_files
 from bench.journal.models import add_model
 from bench.journal.record import Record
-from bench.journal.rows import FIRST, SCHEMA, Entry, Event, StepRecord, check_names, entry, meta_row, ticks
+from bench.journal.rows import FIRST, SCHEMA, Entry, Event, StepRecord, entry, meta_row, ticks
 from bench.journal.store import Store
 
 _READERS = 10.0
@@ -74,7 +74,7 @@ class Journal:
         if path.exists():
             raise ConfigurationError(f"{path} exists already; a record of a run is never overwritten")
         names = [signal.name for signal in signals]
-        check_names(names)
+        check_signal_names(names)
         entries = [entry("meta", meta_row(key, value)) for key, value in {"schema": SCHEMA, **meta}.items()]
         entries += [
             entry("signals", (position, signal.name, signal.unit, signal.description, signal.precision))

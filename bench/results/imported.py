@@ -17,7 +17,7 @@ from bench.clock import wall_time
 from bench.devices import Signal
 from bench.errors import ConfigurationError, DataError
 from bench.journal import FILE_NAME, Event, Journal, StepRecord
-from bench.notify import redacted_command
+from bench.redaction import redacted_command
 from bench.results.data import read_columns
 from bench.results.reading.heads import split_unit
 from bench.results.reading.options import ReadingOptions
