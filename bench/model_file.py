@@ -24,9 +24,6 @@ A file of version 2 is an object with these keys:
 `provenance`
     `source`, `input`, `output`, `rows`, `skipped` (first rows that did not count), `initial` (what was asked for),
     `input_sha256` (of the input column), `orientation`, errors and certificate of the fit, `bench` (version).
-
-Version 1 had three formats, which are still read: `bench-model`, with `operator` in place of `kind` and `model`, and
-`bench-coupled-model` and `bench-hybrid-model`, without `kind` and `memory`.
 """
 
 from __future__ import annotations
@@ -49,8 +46,6 @@ if TYPE_CHECKING:
 
 FORMAT = "bench-model"
 VERSION = 2
-_FORMER_FORMATS = {FORMAT: "operator", "bench-coupled-model": "model", "bench-hybrid-model": "model"}
-"""The formats of version 1, and the key of the model in each."""
 
 
 @dataclass(frozen=True)
@@ -203,7 +198,7 @@ def load_model(path: Path, kind: str | None = None) -> ModelFile:
 
 def is_model(content: object) -> bool:
     """Return whether something is the content of a model file of any version."""
-    return isinstance(content, dict) and content.get("format") in list(_FORMER_FORMATS)
+    return isinstance(content, dict) and content.get("format") == FORMAT
 
 
 def models_among(files: Mapping[str, bytes], source: str) -> dict[str, ModelFile]:
@@ -230,16 +225,13 @@ def parse_model(content: object, source: str) -> ModelFile:
     """
     if not isinstance(content, dict) or not is_model(content):
         raise DataError(f"{source} is not a model file: its `format` is not {FORMAT!r}")
-    version, format_ = content.get("version"), content["format"]
-    former = version == 1
-    if not former and (version != VERSION or format_ != FORMAT):
-        raise DataError(f"model file {source} has version {version!r}; this bench reads versions 1 and {VERSION}")
+    if (version := content.get("version")) != VERSION:
+        raise DataError(f"model file {source} has version {version!r}; this bench reads version {VERSION}")
     try:
-        model = model_from_json(content[_FORMER_FORMATS[format_] if former else "model"])
-        if not former and content["kind"] != model.kind:
+        model = model_from_json(content["model"])
+        if content["kind"] != model.kind:
             raise ValueError(f"kind: expected {model.kind!r}, the type of the model, got {content['kind']!r}")
-        memory = content["memory"] if format_ == FORMAT else None
-        initial = None if former else content.get("initial")
+        memory, initial = content["memory"], content.get("initial")
         if isinstance(model, Operator | TimedModel):
             for key in ("input_unit", "output_unit"):
                 if not isinstance(getattr(model, key), str):

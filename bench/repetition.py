@@ -88,13 +88,8 @@ def repeat(
         # What the repetition is compared with: a damaged row is found before anything moves.
         deque(record.step_records(), maxlen=0)
         record.telemetry()
-    if "protocol_source" not in meta and "recovered" in meta:
-        raise DataError(f"{run} cannot be repeated: it is a recovered copy of a record whose metadata were lost")
     if "protocol_source" not in meta:
-        raise DataError(
-            f"{run} cannot be repeated: its journal (schema {meta.get('schema')}) does not hold the files that the "
-            "run was given; only runs of this version of the bench and later ones can be"
-        )
+        raise DataError(f"{run} cannot be repeated: it is a recovered copy of a record whose metadata were lost")
     # On Windows, what is still open cannot be deleted.
     with tempfile.TemporaryDirectory(prefix="bench-repeat-", ignore_cleanup_errors=True) as scratch:
         folder = Path(scratch).resolve()

@@ -14,7 +14,7 @@ from rich.console import Console
 
 from bench.errors import ConfigurationError
 from bench.interrupts import Interrupts
-from bench.journal import FILE_NAME, SCHEMA, Record, take_in
+from bench.journal import FILE_NAME, Record, take_in
 from bench.locks import Holder, Locks
 from bench.past import Interrupted, Past
 from bench.printing import print_plain
@@ -73,7 +73,7 @@ def resume(asked: Resume, console: Console, interrupts: Interrupts | None = None
     Raises
     ------
     DataError
-        If it is no run, or its record is damaged or of an older schema.
+        If it is no run, or its record is damaged or of another schema.
     ConfigurationError
         If it was completed, goes on, has no finished step, or something has changed since; if it is a journal that
         does not stand in a folder of its own; nothing has moved.
@@ -136,14 +136,9 @@ def _check_can_be_resumed(record: Record, given: Path) -> None:
     meta = record.meta
     if record.status == "completed":
         raise ConfigurationError(f"{given} was completed; there is nothing to resume")
-    if "recovered" in meta and "rig_given" not in meta:
+    if "rig_given" not in meta:
         raise ConfigurationError(
             f"{given} is a recovered copy of a record whose metadata were lost; it takes them to resume a run, so "
-            "start it anew"
-        )
-    if meta["schema"] != SCHEMA or "rig_given" not in meta:
-        raise ConfigurationError(
-            f"{given} was recorded by an older version, which did not record all that it takes to resume a run; "
             "start it anew"
         )
 

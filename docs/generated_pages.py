@@ -177,7 +177,7 @@ def protocols() -> Iterator[str]:
 def journal_schema() -> Iterator[str]:
     """Yield the lines of the page about the tables of a journal."""
     yield "# Tables of a journal\n"
-    yield f"`{rows.FILE_NAME}`, schema {rows.SCHEMA}; schemas {', '.join(map(str, rows.READABLE))} can be read."
+    yield f"`{rows.FILE_NAME}`, schema {rows.SCHEMA}."
     yield "Times are laboratory time in s from the start of the run. `checksum` covers the row"
     yield "([journal](../journal.md)).\n"
     connection = sqlite3.connect(":memory:")

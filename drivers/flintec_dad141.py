@@ -388,11 +388,6 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
             self.clear_tare()
         line.longest_silence = 0.0
 
-    @property
-    def tared(self) -> bool:
-        """Whether the force is counted from a tare."""
-        return self._tared
-
     def measure(self) -> dict[str, float]:
         """Measure the force in N, as the mean of `samples` readings.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal
 
@@ -146,7 +146,3 @@ class Adapter:
         other.__dict__.update(self.__dict__)
         other.__dict__.update(state=state, output=output, error=error)
         return other
-
-    def with_state(self, state: MemoryCurve) -> Adapter:
-        """Return the adapter for a plant in another state, of unknown output."""
-        return replace(self, state=state, output=math.nan, error=math.nan)

@@ -110,12 +110,6 @@ class ThirdOrder:
         """The zeros, rad/s, shape (0,) to (2,)."""
         return np.roots([self.numerator[1], self.numerator[0], 1.0]).astype(np.complex128)
 
-    @property
-    def zpk(self) -> tuple[Complexes, Complexes, float]:
-        """Zeros, poles and the factor in front of them."""
-        leading = next(n for n in (self.numerator[1], self.numerator[0], 1.0) if n != 0.0)
-        return self.zeros, self.poles, self.gain * leading * self.real_pole * self.frequency**2
-
     def normalised(self) -> ThirdOrder:
         """Return D(s) / D(0)."""
         return replace(self, gain=1.0)

@@ -46,8 +46,7 @@ Schema, version 3
 `checksum` is the CRC-32 of the other columns of a row, see `bench.journal.rows.checksum`; a row whose checksum does
 not fit is damaged.
 
-Versions 1 and 2, which are still read, have neither checksums nor files, and a table `models(name, t, model)`; now
-models stand in files beside the journal, see `add_model`. Version 1 has 1 for each `settled`.
+Models that were identified from the run stand in files beside the journal, see `add_model`.
 """
 
 from bench.journal.card import expected_steps, run_card

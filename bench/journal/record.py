@@ -19,7 +19,7 @@ from bench.journal.finding import missing, way_back
 from bench.journal.mirror import read_mirror, second_files
 from bench.journal.models import models_beside
 from bench.journal.opening import OpenedJournal
-from bench.journal.rows import FILE_NAME, FIRST, READABLE, SCHEMA, Event, StepRecord, checksum, checksums, quoted
+from bench.journal.rows import FILE_NAME, FIRST, SCHEMA, Event, StepRecord, checksum, checksums, quoted
 from bench.journal.table import Table
 from bench.locks import is_in_use
 from bench.settling import Settled
@@ -95,9 +95,8 @@ class Record:
         except (sqlite3.DatabaseError, ValueError, TypeError) as error:
             raise DataError(f"{self.path} is not a readable journal: {error}{way_back(self.path)}") from error
         found = self.meta.get("schema")
-        if found not in READABLE:
-            raise DataError(f"{self.path} has schema version {found}; this bench reads versions 1 to {SCHEMA}")
-        self._is_checked = found == SCHEMA
+        if found != SCHEMA:
+            raise DataError(f"{self.path} has schema version {found}; this bench reads version {SCHEMA}")
         self._check("meta", meta)
         self._check("signals", signals)
 
@@ -155,10 +154,10 @@ class Record:
                     finished,
                     phase,
                     label,
-                    Settled.UNRECORDED if settled == 1 else Settled(settled),
+                    Settled(settled),
                     json.loads(setpoints),
                     tuple(math.nan if value is None else float(value) for value in values),
-                    tuple(map(float, json.loads(row[end]))) if self._is_checked else (),
+                    tuple(map(float, json.loads(row[end]))),
                 )
             except (ValueError, TypeError) as error:
                 raise self._damaged(f"step {step}: {error}") from error
@@ -174,8 +173,8 @@ class Record:
         """Return the ticks, those with numbers beyond `after`: columns `t`, `step`, and one a signal."""
         names = ("tick", "t", "step", *(signal.name for signal in self.signals))
         rows = self._rows("telemetry", after)
-        whole = self._table("telemetry", (*names, "checksum") if self._is_checked else names, rows)
-        if self._is_checked and rows:
+        whole = self._table("telemetry", (*names, "checksum"), rows)
+        if rows:
             numbers = np.column_stack([whole[name] for name in names])
             wrong = np.flatnonzero(np.array(checksums(numbers), dtype=np.float64) != whole["checksum"])
             if len(wrong):
@@ -197,9 +196,7 @@ class Record:
         return [Event(*row[1:5]) for row in rows]
 
     def files(self) -> dict[str, bytes]:
-        """Return the content of every file that the run was given, by name; schemas before version 3 have none."""
-        if not self._is_checked:
-            return {}
+        """Return the content of every file that the run was given, by name."""
         result = {}
         for name, digest, content in self._query("SELECT name, sha256, content FROM files ORDER BY rowid"):
             if not isinstance(content, bytes) or hashlib.sha256(content).hexdigest() != digest:
@@ -209,13 +206,7 @@ class Record:
 
     def models(self) -> dict[str, Any]:
         """Return the content of the model files that were identified from this run, by name, the newest last."""
-        if self._is_checked:
-            return models_beside(self.path.parent)
-        rows = self._query("SELECT name, model FROM models ORDER BY rowid")
-        try:
-            return {name: json.loads(model) for name, model in rows} | models_beside(self.path.parent)
-        except (ValueError, TypeError) as error:
-            raise self._damaged(str(error)) from error
+        return models_beside(self.path.parent)
 
     def damage(self) -> str:
         """Return what is wrong with the rows, as far as that is quick to find; empty if that is nothing.
@@ -223,8 +214,6 @@ class Record:
         Found are pages that SQLite cannot read, damaged rows of all tables but a long telemetry, and rows that a
         completed run lacks.
         """
-        if not self._is_checked:
-            return ""
         try:
             (found,) = self._query("PRAGMA quick_check(1)")[0]
             if found != "ok":
@@ -257,8 +246,8 @@ class Record:
             "events": ("event", "t", "level", "kind", "text"),
         }[table]
         signals = () if table == "events" else tuple(signal.name for signal in self.signals)
-        seen = ("seen",) if table == "steps" and self._is_checked else ()
-        names = (*leading, *signals, *seen, *(("checksum",) if self._is_checked else ()))
+        seen = ("seen",) if table == "steps" else ()
+        names = (*leading, *signals, *seen, "checksum")
         columns = ", ".join(map(quoted, names))
         # The rows are numbered by their first column, from 0 or 1.
         first = leading[0]
@@ -266,8 +255,6 @@ class Record:
 
     def _check(self, table: str, rows: Sequence[tuple[Any, ...]]) -> None:
         """Raise DataError for the first row that its checksum, the last column, does not fit."""
-        if not self._is_checked:
-            return
         for row in rows:
             try:
                 fits = checksum(row[:-1]) == row[-1]
@@ -280,9 +267,7 @@ class Record:
         return self._damaged(f"table {table}, row {row}: its checksum does not fit")
 
     def _damaged(self, what: str) -> DataError:
-        # Without checksums nothing can be recovered.
-        how = f"; `bench recover-journal {self.path}` says what is good" if self._is_checked else ""
-        return DataError(f"{self.path} is damaged: {what}{how}")
+        return DataError(f"{self.path} is damaged: {what}; `bench recover-journal {self.path}` says what is good")
 
     def _table(self, table: str, names: tuple[str, ...], rows: Sequence[tuple[Any, ...]]) -> Table:
         try:

@@ -93,7 +93,7 @@ def recover(path: Path, others: Sequence[Path] = (), out: Path | None = None) ->
     Raises
     ------
     DataError
-        If it is no journal with checksums, or nothing of it is readable.
+        If it is no journal, its schema is of another version, or nothing of it is readable.
     ConfigurationError
         If the copy exists already or cannot be written, or there is no second file that was named.
     """
@@ -116,7 +116,7 @@ def recover(path: Path, others: Sequence[Path] = (), out: Path | None = None) ->
     # A second file has every row.
     is_lost = {table: table in left.cut and not beside["meta"] for table in TABLES}
     if meta.get("schema", None if whole["meta"] and not left.bad["meta"] else SCHEMA) != SCHEMA:
-        raise DataError(f"{journal} has schema version {meta.get('schema')}, which has no checksums to recover by")
+        raise DataError(f"{journal} has schema version {meta.get('schema')}; this bench reads version {SCHEMA}")
     substitutes: dict[str, Any] = {}
     if is_lost["meta"] or set(left.bad["meta"]).difference(whole["meta"]):
         guessed = metadata(journal, whole["files"], whole["events"].values())

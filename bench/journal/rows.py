@@ -17,7 +17,6 @@ import numpy.typing as npt
 from bench.settling import Settled
 
 SCHEMA = 3
-READABLE = (1, 2, SCHEMA)
 FILE_NAME = "journal.sqlite"
 RECOVERED_NAME = "journal.recovered.sqlite"
 """The copy that `bench recover-journal` writes."""

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 import sqlite3
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing, suppress
@@ -11,11 +9,12 @@ from pathlib import Path
 
 from bench.journal.rows import TABLES, Entry, entry, table_definitions
 
-_LOG_SIZE = 4 << 20
-"""Size of the write-ahead log from the beginning, bytes: as SQLite folds it in, at 1000 pages of 4 kB."""
+_LOG_PAGES = 64
+"""Pages after which the write-ahead log is folded in and overwritten, of a journal whose commits wait for the disk.
 
-_ROOM = 16
-"""Space that is left free for each byte by which the log is extended."""
+A commit that makes the log longer waits for the file system's record of its size as well. After 64 pages, some 16
+steps, the log does not grow any more (https://sqlite.org/wal.html).
+"""
 
 
 class Store:
@@ -33,7 +32,9 @@ class Store:
 
     def __init__(self, path: Path, wait: float = 0.0, *, flushed: bool = True) -> None:
         self.path = path
-        self._synchronous = "FULL" if flushed else "NORMAL"
+        self._settings = (
+            ("synchronous=FULL", f"wal_autocheckpoint={_LOG_PAGES}") if flushed else ("synchronous=NORMAL",)
+        )
         self._connect(wait)
         made = path.stat()
         self._file = made.st_dev, made.st_ino
@@ -42,7 +43,8 @@ class Store:
         # One thread at a time, see `Keeper`.
         self._db = sqlite3.connect(self.path, timeout=wait, isolation_level=None, check_same_thread=False)
         self._db.execute("PRAGMA journal_mode=WAL")
-        self._db.execute(f"PRAGMA synchronous={self._synchronous}")
+        for setting in self._settings:
+            self._db.execute(f"PRAGMA {setting}")
 
     def create(self, signals: Sequence[str], entries: Iterable[Entry]) -> None:
         """Make the tables, with their first rows."""
@@ -77,27 +79,6 @@ class Store:
             # A row that comes a second time, from the second file, is the same.
             statement = f"INSERT OR REPLACE INTO {each.table} VALUES ({marks})"  # noqa: S608 - own names
             self._db.executemany(statement, each.columns())
-
-    def extend_log(self) -> None:
-        """Give the write-ahead log the size that it will have, where the disk has space.
-
-        A commit into a file that grows waits for the file system's own record of its size as well, which takes
-        about half as long again. SQLite writes over the log from its beginning once that is folded in, and takes
-        zeros for no frame (https://sqlite.org/fileformat2.html, section 4.2).
-        """
-        log = self.path.with_name(f"{self.path.name}-wal")
-        # Where that cannot be, commits are slower.
-        with suppress(OSError, sqlite3.Error):
-            size = log.stat().st_size
-            missing = _LOG_SIZE - size
-            if missing <= 0 or shutil.disk_usage(log.parent).free < _ROOM * missing:
-                return
-            # Nobody writes into the log meanwhile.
-            self._db.execute("BEGIN IMMEDIATE")
-            try:
-                _append_zeros(log, size, missing)
-            finally:
-                self._db.execute("ROLLBACK")
 
     def wait_for_others(self, seconds: float) -> None:
         """Wait for other programs from now on, each time for so long at most, s of wall-clock time."""
@@ -149,15 +130,3 @@ class Store:
             self._db.execute("PRAGMA busy_timeout=0")
             self._db.execute("PRAGMA journal_mode=DELETE")
         self._db.close()
-
-
-def _append_zeros(path: Path, size: int, quantity: int) -> None:
-    """Append zeros to a file of a size, all or none."""
-    with path.open("ab", buffering=0) as file:
-        try:
-            if file.write(bytes(quantity)) != quantity:
-                raise OSError(f"{path} takes no more")
-            os.fsync(file.fileno())
-        except OSError:
-            file.truncate(size)
-            raise

@@ -91,8 +91,6 @@ class Journal:
                 store = Store(path, _READERS, flushed=flushed)
                 made.callback(store.close)
                 store.create(names, entries)
-                if flushed:
-                    store.extend_log()
                 store.wait_for_others(0.0)
                 keeper = Keeper(store)
                 made.callback(keeper.close, is_whole=True)
@@ -122,7 +120,7 @@ class Journal:
         Raises
         ------
         DataError
-            If there is none, it is damaged or of an older schema, or cannot be written.
+            If there is none, it is damaged or of another schema, or cannot be written.
         ConfigurationError
             If the run was completed.
         """
@@ -134,7 +132,6 @@ class Journal:
             # A reader may have it for a moment.
             keeper = Keeper(Store(file, _READERS))
             keeper.store.forget(_END)
-            keeper.store.extend_log()
             keeper.store.wait_for_others(0.0)
             if not was_mirrored:
                 keeper.begin(keeper.store.entries())
@@ -338,8 +335,6 @@ def take_in(path: Path) -> tuple[Path, tuple[Signal, ...], dict[str, int], dict[
     """
     with Record(path) as record:
         file, signals = record.path, record.signals
-        if record.meta["schema"] != SCHEMA:
-            raise DataError(f"{file} has schema version {record.meta['schema']}; only one of {SCHEMA} is written on")
         if record.status == "completed":
             raise ConfigurationError(f"{file} is the record of a run that was completed")
         # Each row is checked, also where only its number is needed.

@@ -37,11 +37,6 @@ from sim_devices.wire.mecom import MeComServer
 from sim_devices.wire.modbus_tcp import ModbusTcpInstrument
 from sim_devices.world import World
 
-DISPLACEMENT_INPUT = 0
-BASE_INPUTS, TIP_INPUTS = (1, 2), (3, 4)
-"""Inputs of the T7: of each thermistor the divider and its excitation."""
-AMPLIFIER_INPUTS = (5, 6, 7)
-"""Voltage monitor, current monitor and status of the amplifier."""
 ENABLE_LINE = 4
 """Digital line of the amplifier's enable input, FIO4 of the T7; the LJTick-DAC is on FIO0 and FIO1."""
 GAIN = 4.0

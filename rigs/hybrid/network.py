@@ -208,17 +208,6 @@ class ThermalNetwork:
         """Return the temperatures under a constant current, °C, shape (4,); see `steady_rises`."""
         return ambient + self.steady_rises(current, ambient)
 
-    def heat_to_air(self, temperatures: ArrayLike, ambient: float) -> float:
-        """Return the heat flow from all nodes (°C, shape (4,)) to the air, W."""
-        rises = _nodes("temperatures", temperatures) - _air(ambient)
-        return float(self.air_conductances @ rises)
-
-    def electrical_power(self, temperatures: ArrayLike, current: float) -> float:
-        """Return the power that the cooler draws from its supply, R_p i² + alpha (T_0 - T_x) i, W."""
-        nodes, i = _nodes("temperatures", temperatures), _checks.number("current", current)
-        difference = nodes[_BASE] - ABSOLUTE_ZERO - self._back_face(nodes, i)
-        return float(self.electrical_resistance * i**2 + self.seebeck * difference * i)
-
     def linearise(self, current: float = 0.0, ambient: float = 22.0) -> tuple[Floats, Floats]:
         """Return A (shape (4, 4), 1/s) and B (shape (4,), K/(A s)) of small changes about a steady state.
 

@@ -437,22 +437,6 @@ class EmulatedT7(LineFaults, RegisterInstrument):
 
     # The analog inputs.
 
-    def set_inputs_up(
-        self, channels: Sequence[int], range_volts: float, resolution_index: int, samples: int, sample_rate: float
-    ) -> None:
-        """Set single-ended inputs up for `convert` and `burst`, as requests of a host would.
-
-        Raises `RegisterError` if a setting is refused.
-        """
-        self.write_value("STREAM_RESOLUTION_INDEX", resolution_index)
-        for channel in channels:
-            self.write_value(f"AIN{channel}_RANGE", range_volts)
-            self.write_value(f"AIN{channel}_NEGATIVE_CH", SINGLE_ENDED)
-            self.write_value(f"AIN{channel}_RESOLUTION_INDEX", resolution_index)
-            self.write_value(f"AIN{channel}_EF_INDEX", _EF_AVERAGE)
-            self.write_value(f"AIN{channel}_EF_CONFIG_A", samples)
-            self.write_value(f"AIN{channel}_EF_CONFIG_D", sample_rate)
-
     def convert(self, channel: int) -> float:
         """Return one reading of an input in V, as a read of AIN does."""
         with self._request():

@@ -356,41 +356,6 @@ class TestSlowDisk:
         journal.close()
 
 
-class TestLog:
-    """The write-ahead log does not grow while a run goes on, as commits would wait for the file's size as well."""
-
-    def test_has_its_size_from_the_beginning(self, tmp_path, monkeypatch):
-        for opened in (lambda: Journal(tmp_path / FILE_NAME, SIGNALS, {}), lambda: Journal.reopen(tmp_path)):
-            journal = opened()
-            size = log_of(tmp_path).stat().st_size
-            assert size >= store._LOG_SIZE
-            monkeypatch.setattr(keeping, "_BETWEEN_FOLDS", 1e9)
-            count = add(journal, 100)
-            monkeypatch.setattr(keeping, "_BETWEEN_FOLDS", 0.0)
-            monkeypatch.setattr(keeping, "_BETWEEN_LOOKS", 0.0)
-            count = add(journal, 20)
-            assert log_of(tmp_path).stat().st_size == size
-            journal.close()
-            assert not log_of(tmp_path).exists()
-        assert count == 240
-
-    def test_is_as_it_was_for_who_reads_meanwhile_and_after_a_death(self, journal, tmp_path, other_disk):
-        count = add(journal, 3)
-        with Record(tmp_path) as run:
-            assert len(run.steps()) == count
-        add(journal, 3)
-        copy = other_disk / "copy"
-        shutil.copytree(tmp_path, copy)
-        journal = Journal.reopen(copy)
-        assert journal.steps == count + 3
-        journal.close()
-
-    def test_does_not_grow_for_a_run_whose_commits_do_not_wait(self, tmp_path):
-        journal = Journal(tmp_path / FILE_NAME, SIGNALS, {}, flushed=False)
-        assert log_of(tmp_path).stat().st_size < 1 << 17
-        journal.close()
-
-
 class TestFoldingIn:
     def test_a_copy_without_its_companion_lacks_little(self, journal, tmp_path, monkeypatch):
         monkeypatch.setattr(keeping, "_BETWEEN_FOLDS", 0.0)

@@ -108,9 +108,9 @@ class TestUnusable:
         with pytest.raises(DataError, match=rf"m\.json is not a model file: its `format` is not '{FORMAT}'"):
             parse_model(document, "m.json")
 
-    @pytest.mark.parametrize("version", [0, 3, "1", None, [1]])
+    @pytest.mark.parametrize("version", [0, 1, 3, "2", None, [2]])
     def test_another_version(self, version):
-        with pytest.raises(DataError, match=f"has version .*; this bench reads versions 1 and {VERSION}"):
+        with pytest.raises(DataError, match=f"has version .*; this bench reads version {VERSION}"):
             parse_model({**content(), "version": version}, "m.json")
 
     @pytest.mark.parametrize("key", ["name", "kind", "model", "memory", "provenance"])
@@ -380,9 +380,9 @@ class TestHybrid:
             with pytest.raises(DataError, match=r"m\.json"):
                 load_model(tmp_path / "m.json")
 
-    @pytest.mark.parametrize("version", [0, 3, "1", None])
+    @pytest.mark.parametrize("version", [0, 1, 3, "2", None])
     def test_another_version(self, hybrid_file, version):
-        with pytest.raises(DataError, match=f"has version .*; this bench reads versions 1 and {VERSION}"):
+        with pytest.raises(DataError, match=f"has version .*; this bench reads version {VERSION}"):
             load_model(hybrid_file([(("version",), version)]))
 
     @pytest.mark.parametrize(
@@ -455,37 +455,6 @@ def test_any_mutation_of_a_hybrid_model_is_usable_or_a_data_error(tmp_path_facto
     with np.errstate(over="ignore", invalid="ignore"):
         assert file.model.thermal_deflection([0.0]).shape == (1,)
     json.dumps(file.to_json())
-
-
-def version_1(document, format_):
-    """The same model as a file of version 1."""
-    former = {key: value for key, value in document.items() if key not in ("kind", "model", "memory")}
-    former |= {"format": format_, "version": 1}
-    if format_ == FORMAT:
-        return {**former, "operator": document["model"], "memory": document["memory"]}
-    return {**former, "model": document["model"]}
-
-
-@pytest.mark.parametrize(
-    ("file", "format_"),
-    [
-        *(
-            (ModelFile(name, model, None if name == "polynomial" else MEMORY), FORMAT)
-            for name, model in MODELS.items()
-        ),
-        (ModelFile("plays", HYBRID.hysteresis, (1.0, 2.0, 3.0, 4.0)), FORMAT),
-        *((ModelFile(name, model), "bench-coupled-model") for name, model in COUPLED.items()),
-        (ModelFile("hybrid", HYBRID), "bench-hybrid-model"),
-    ],
-)
-def test_files_of_version_1_are_read(file, format_):
-    document = version_1(json.loads(json.dumps(file.to_json())), format_)
-    again = parse_model(document, "m.json")
-    assert again.to_json() == file.to_json()
-    assert again.memory == file.memory
-    del document["operator" if format_ == FORMAT else "model"]
-    with pytest.raises(DataError, match=r"m\.json is damaged: key '\w+' is missing"):
-        parse_model(document, "m.json")
 
 
 class TestUnregistered:

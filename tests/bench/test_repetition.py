@@ -151,7 +151,7 @@ def test_a_script_and_the_module_beside_it_are_kept(bench, climbed, tmp_path):
 @pytest.mark.parametrize(
     ("meta", "expected"),
     [
-        ({"protocol_source": None}, "does not hold the files that the run was given"),
+        ({"protocol_source": None}, "it is a recovered copy of a record whose metadata were lost"),
         ({"protocol": "juggling"}, "there is no protocol 'juggling'"),
         ({"protocol_source": {"installed": True, "module": "m", "sha256": "0"}}, "(m) was changed since it ran"),
         ({"protocol_source": {"installed": False, "module": "__main__"}}, "in the program or notebook"),

@@ -23,7 +23,7 @@ SIGNALS = tuple(Signal(f"signal_{i}", "V", "a signal") for i in range(8))
 VALUES = tuple(0.1 * i for i in range(8))
 SLOW_DISK = 6e-3
 TICK = 1e-3
-GOAL = 1.3
+GOAL = 1.5
 
 
 def step_of(number):
@@ -51,22 +51,18 @@ def durable_steps():
     return [statistics.median(times) for times in (synced, written, cpu)]
 
 
-def test_a_durable_step_costs_little_more_than_one_fdatasync(capsys, monkeypatch):
-    """The medians of five records each, with the log as it is made, and with one that grows."""
-    measured = {"log of 4 MB": [durable_steps() for _ in range(5)]}
-    monkeypatch.setattr(Store, "extend_log", lambda _: None)
-    measured["log that grows"] = [durable_steps() for _ in range(5)]
-    ratios = {name: statistics.median(step / one for one, step, _ in runs) for name, runs in measured.items()}
+def test_a_durable_step_costs_little_more_than_one_fdatasync(capsys):
+    """The medians of five records."""
+    runs = [durable_steps() for _ in range(5)]
+    ratio = statistics.median(step / one for one, step, _ in runs)
     with capsys.disabled():
-        for name, runs in measured.items():
-            one, step, cpu = (1e6 * statistics.median(column) for column in zip(*runs, strict=True))
-            print(
-                f"\n{name}: fdatasync {one:.0f} us, a durable step {step:.0f} us, {cpu:.0f} us of it CPU: "
-                f"{ratios[name]:.2f} times",
-                end="",
-            )
+        one, step, cpu = (1e6 * statistics.median(column) for column in zip(*runs, strict=True))
+        print(
+            f"\nfdatasync {one:.0f} us, a durable step {step:.0f} us, {cpu:.0f} us of it CPU: {ratio:.2f} times",
+            end="",
+        )
     # A ratio of medians, on one disk.
-    assert ratios["log of 4 MB"] <= max(GOAL, ratios["log that grows"])
+    assert ratio <= GOAL
 
 
 def test_a_disk_of_6_ms_does_not_hold_up_a_loop_of_1_khz(capsys, monkeypatch, tmp_path):

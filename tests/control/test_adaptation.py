@@ -100,9 +100,6 @@ def test_samples_without_output_move_the_memory_only():
     assert moved.model is adapter.model
     assert moved.state == adapter.state.step(0.9)
     assert math.isnan(moved.update(0.7, 0.4).error)
-    elsewhere = adapter.with_state(MemoryCurve.from_positive_saturation(0.5))
-    assert math.isnan(elsewhere.output)
-    assert elsewhere.state.saturation == 1
 
 
 def track(adapter, truth, references, drift, noise, seed, adapting=True):
