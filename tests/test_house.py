@@ -24,8 +24,6 @@ WHERE_A_RIG_IS_NAMED = {
     "bench/face.py": {"vo2", "tec_temperature"},
     # The title of the paper.
     "bench/control/tracking.py": {"VO2"},
-    # A format that files of former versions have.
-    "bench/model_file.py": {"hybrid"},
 }
 MACHINE = re.compile(
     r"/(home|root|tmp|Users|work)/\w|\b(pypi|index)\.[a-z]+\.(org|net|com)/simple|localhost:\d{4}/simple"
