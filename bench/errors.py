@@ -101,6 +101,10 @@ class RecordError(BenchError):
     exit_code = 8
 
 
+class IncompleteRecordWarning(UserWarning):
+    """A record lacks rows that were recorded. The command line prints it; a program gets it by `warnings`."""
+
+
 class AgreementError(BenchError):
     """A resumed run did not find the specimen as its record left it; it was ended in the safe state."""
 

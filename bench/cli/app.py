@@ -41,7 +41,7 @@ from bench.cli import (
     upkeep,
     watch,
 )
-from bench.cli.console import error_console, exit_code, fail
+from bench.cli.console import error_console, exit_code, fail, told_of_records
 from bench.cli.registered import RegisteredCommands, Studies
 from bench.cli.streams import standard_streams
 from bench.errors import BenchError, ConfigurationError
@@ -117,7 +117,7 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
     gc.set_threshold(10_000, 20, 20)
     # The collector would search all that the libraries have left behind: up to a second, after the work is done.
     atexit.register(gc.freeze)
-    with standard_streams():
+    with standard_streams(), told_of_records():
         _carry_out(arguments)
 
 

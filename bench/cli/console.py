@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Iterator, Sequence
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
@@ -16,7 +17,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from bench.cli.streams import write_out
-from bench.errors import BenchError, ConfigurationError, DataError
+from bench.errors import BenchError, ConfigurationError, DataError, IncompleteRecordWarning
 from bench.printing import PlainConsole, show_table
 
 console = PlainConsole()
@@ -92,6 +93,31 @@ def print_error(error: BenchError) -> None:
 def warn(text: str) -> None:
     """Print a warning."""
     error_console.print("[yellow]warning:[/]", escape(text), highlight=False, soft_wrap=True)
+
+
+@contextmanager
+def told_of_records() -> Iterator[None]:
+    """Print once what is missing in a record that is opened within; `write_json` writes it for programs too."""
+
+    def show(message: Warning | str, category: type[Warning], *others: Any) -> None:  # noqa: ANN401 - of `warnings`
+        if not issubclass(category, IncompleteRecordWarning):
+            otherwise(message, category, *others)
+        elif str(message) not in _of_records:
+            _of_records.append(str(message))
+            warn(str(message))
+
+    with warnings.catch_warnings():
+        otherwise = warnings.showwarning
+        warnings.showwarning = show
+        warnings.simplefilter("always", IncompleteRecordWarning)
+        try:
+            yield
+        finally:
+            _of_records.clear()
+
+
+_of_records: list[str] = []
+"""What is missing in the records that the command has opened."""
 
 
 @contextmanager
@@ -205,6 +231,8 @@ def write_json(path: Path | None, content: Any) -> None:  # noqa: ANN401 - anyth
     """
     if path is None:
         return
+    if _of_records and isinstance(content, Mapping):
+        content = {**content, "missing_rows": list(_of_records)}
     text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
     if path == STANDARD_OUTPUT:
         failure = write_out(text)

@@ -142,8 +142,9 @@ def _models_of(record: Record) -> list[ModelFile]:
 
 
 def _writer_of(record: Record, models: list[ModelFile]) -> Writer:
+    missing = {"missing_rows": str(record.missing)} if record.missing else {}
     try:
-        return Writer(record.signals, record.meta, models)
+        return Writer(record.signals, {**record.meta, **missing}, models)
     except (ConfigurationError, KeyError, TypeError) as error:
         raise DataError(f"{record.path}: the metadata of its dashboard is damaged: {error}") from error
 

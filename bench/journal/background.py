@@ -9,7 +9,7 @@ from bench.clock import Stopwatch
 from bench.errors import RecordError
 from bench.journal.keeping import Keeper
 from bench.journal.mirror import Mirror, elsewhere
-from bench.journal.rows import Entry
+from bench.journal.rows import Entry, joined
 
 LONGEST_UNWRITTEN = 0.1
 """Wall-clock time after which a tick is committed, s."""
@@ -117,7 +117,7 @@ class Background:
             failure: Exception | None = None
             try:
                 if batch:
-                    self._keeper.keep(batch)
+                    self._keeper.keep(joined(batch))
                 else:
                     self._keeper.fold_in()
             # Raised in the run's own thread.

@@ -9,7 +9,10 @@ from bench.units import format_duration
 
 
 def run_card(meta: Mapping[str, Any]) -> str:
-    """Return a run's metadata as a Markdown page, for the dashboard and the report."""
+    """Return a run's metadata as a Markdown page, for the dashboard and the report.
+
+    `missing_rows` in the metadata, a text, says what its record lacks.
+    """
     lines = [
         f"# {meta['rig_title']}",
         "",
@@ -18,6 +21,7 @@ def run_card(meta: Mapping[str, Any]) -> str:
     ]
     lines += ["| | |", "|---|---|"]
     rows = {
+        **({"incomplete": meta["missing_rows"]} if "missing_rows" in meta else {}),
         "run": meta["run"],
         "operator": meta["operator"],
         "started": f"{meta['epoch']} ({meta['clock']} clock)",

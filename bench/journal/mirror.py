@@ -18,13 +18,16 @@ import tempfile
 import zlib
 from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import IO
 
-from bench.journal.rows import TABLES, TEXTS, Entry, unpacked
+from bench.journal.rows import TABLES, TEXTS, Entry, split, unpacked
 from bench.locks import is_own
 
 NAME = "journal.mirror"
 _MARK = b"\xb5row"
 _HEAD = struct.Struct("<BIHII")
+_BLOCK = 1 << 20
+"""Bytes that are read together."""
 _sync = getattr(os, "fdatasync", os.fsync)
 
 
@@ -72,9 +75,9 @@ class Mirror:
     def entries(self) -> list[Entry]:
         """Return the rows, also of a file that has been removed meanwhile."""
         self._file.seek(0)
-        content = self._file.read()
+        entries = list(split(_decoded(self._file)))
         self._file.seek(self._end)
-        return list(_decoded(content))
+        return entries
 
     def close(self) -> None:
         """Close the file."""
@@ -86,13 +89,13 @@ def second_files(journal: Path) -> list[Path]:
     return [journal.parent / NAME, *elsewhere(journal)]
 
 
-def read_mirror(path: Path) -> list[Entry]:
-    """Return the intact rows, or an empty list if the file is missing or another user's."""
+def read_mirror(path: Path) -> Iterator[Entry]:
+    """Yield the intact rows as they were written: ticks of one write together; none of a missing or foreign file."""
     try:
         with os.fdopen(_open(path, os.O_RDONLY), "rb") as file:
-            return list(_decoded(file.read()))
+            yield from _decoded(file)
     except (FileNotFoundError, _ForeignFileError):
-        return []
+        return
 
 
 class _ForeignFileError(OSError):
@@ -127,21 +130,39 @@ def _encoded(entry: Entry) -> bytes:
     return b"".join((_MARK, _HEAD.pack(table, len(entry.rows), numbers, len(payload), zlib.crc32(payload)), payload))
 
 
-def _decoded(data: bytes) -> Iterator[Entry]:
-    start = 0
-    while (start := data.find(_MARK, start)) >= 0:
-        start += len(_MARK)
+def _decoded(file: IO[bytes]) -> Iterator[Entry]:
+    size = os.fstat(file.fileno()).st_size
+    data, start, passed = b"", 0, 0
+
+    def reaches(end: int) -> bool:
+        """Read on to an end in `data`; return whether the file goes so far, as a damaged length may be any."""
+        nonlocal data
+        if end > len(data) and passed + end <= size:
+            data += file.read(max(end - len(data), _BLOCK))
+        return end <= len(data)
+
+    while True:
+        if start >= _BLOCK:
+            data, start, passed = data[start:], 0, passed + start
+        mark = data.find(_MARK, start)
+        if mark < 0:
+            start = max(start, len(data) + 1 - len(_MARK))
+            if not reaches(len(data) + 1):
+                return
+            continue
+        start = mark + len(_MARK)
         begin = start + _HEAD.size
-        if begin > len(data):
+        if not reaches(begin):
             return
         table, count, numbers, length, crc = _HEAD.unpack_from(data, start)
-        payload = data[begin : begin + length]
-        if len(payload) < length or zlib.crc32(payload) != crc or table >= len(TABLES):
+        if not reaches(begin + length):
             continue
-        size = length // count if count else 0
-        parts = [payload[size * i : size * (i + 1)] for i in range(count)]
-        rows = [unpacked(TABLES[table], numbers, part) for part in parts]
-        for row, part in zip(rows, parts, strict=True):
-            if row is not None:
-                yield Entry(TABLES[table], (row,), part)
+        payload = data[begin : begin + length]
+        if zlib.crc32(payload) != crc or table >= len(TABLES):
+            continue
         start = begin + length
+        each = length // count if count else 0
+        parts = [payload[each * i : each * (i + 1)] for i in range(count)]
+        rows = [(row, part) for part in parts if (row := unpacked(TABLES[table], numbers, part)) is not None]
+        if rows:
+            yield Entry(TABLES[table], [row for row, _ in rows], b"".join(part for _, part in rows))

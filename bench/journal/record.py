@@ -6,26 +6,42 @@ import hashlib
 import json
 import math
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+import warnings
+from collections import deque
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+import numpy.typing as npt
 
-from bench.devices import Signal
-from bench.errors import DataError
+from bench.devices import RESERVED_NAMES, Signal
+from bench.errors import DataError, IncompleteRecordWarning
 from bench.journal.ending import ending_of
 from bench.journal.finding import missing, way_back
-from bench.journal.mirror import read_mirror, second_files
+from bench.journal.missing_rows import MissingRows, find_missing_rows
 from bench.journal.models import models_beside
 from bench.journal.opening import OpenedJournal
-from bench.journal.rows import FILE_NAME, FIRST, SCHEMA, Event, StepRecord, checksum, checksums, quoted
+from bench.journal.rows import (
+    FILE_NAME,
+    NUMBERS,
+    SCHEMA,
+    Event,
+    StepRecord,
+    checksum,
+    checksums,
+    quoted,
+)
 from bench.journal.table import Table
 from bench.locks import is_in_use
 from bench.settling import Settled
 
 _QUICKLY_CHECKED = 20_000
 """Ticks whose checksums are compared within some 50 ms."""
+
+_BLOCK = 8192
+"""Rows that are read together; one takes some 1 kB until it is an array."""
 
 _FAILED = {each.value for each in Settled if each.failed}
 
@@ -40,10 +56,20 @@ class Record:
     path : Path
         The journal, or the folder of the run that holds it.
 
+    Attributes
+    ----------
+    missing : MissingRows
+        Rows that were recorded and that the journal does not have; of a run that goes on it is not known.
+
     Raises
     ------
     DataError
         If there is no journal there, it is damaged, or its schema is of another version.
+
+    Warns
+    -----
+    IncompleteRecordWarning
+        If rows are missing.
     """
 
     def __init__(self, path: Path) -> None:
@@ -60,31 +86,18 @@ class Record:
         # A recovered copy beside the journal says for itself how far it is good.
         is_silent = "status" not in self.meta and self.path.name == FILE_NAME
         self._ending = ending_of(self.path.parent) if is_silent else None
+        goes_on = "status" not in self.meta and is_in_use(self.path.parent)
+        self.missing = MissingRows(self.path) if goes_on else find_missing_rows(self._db, self.path, self.meta)
+        if self.missing:
+            try:
+                warnings.warn(str(self.missing), IncompleteRecordWarning, stacklevel=2)
+            except IncompleteRecordWarning:
+                self.close()
+                raise
 
     def remark(self) -> str:
-        """Return what is unusual: how the journal is read, and how many rows only a second file has; else nothing."""
-        return "; ".join(filter(None, (self._opened.remark, self._waiting())))
-
-    def _waiting(self) -> str:
-        if "status" in self.meta or is_in_use(self.path.parent):
-            # A run that goes on has all its rows in the second file as well.
-            return ""
-        beside: dict[str, set[int]] = {table: set() for table in FIRST}
-        for second in second_files(self.path):
-            for entry in read_mirror(second):
-                if entry.table in beside:
-                    beside[entry.table].update(int(row[0]) for row in entry.rows)
-        waiting = [
-            f"{len(lacking)} of {table}"
-            for table, numbers in beside.items()
-            if (lacking := numbers - self.numbers(table))
-        ]
-        if not waiting:
-            return ""
-        return (
-            f"{self.path} lacks rows that its second file has ({', '.join(waiting)}): bench recover-journal writes a "
-            "journal with them, bench resume takes them in"
-        )
+        """Return what is unusual: how the journal is read, and which rows are missing; else nothing."""
+        return "; ".join(filter(None, (self._opened.remark, str(self.missing) if self.missing else "")))
 
     def _read_heading(self) -> None:
         try:
@@ -99,6 +112,14 @@ class Record:
             raise DataError(f"{self.path} has schema version {found}; this bench reads version {SCHEMA}")
         self._check("meta", meta)
         self._check("signals", signals)
+        self._check_signals()
+
+    def _check_signals(self) -> None:
+        """Raise DataError if a column of the steps is of a signal that is not among the signals."""
+        known = {*RESERVED_NAMES, *(signal.name for signal in self.signals)}
+        columns = [str(row[1]) for row in self._query("PRAGMA table_info(steps)")]
+        if lost := [name for name in columns if name not in known]:
+            raise self._damaged(f"table signals has no row of {lost[0]}")
 
     def __enter__(self) -> Self:
         return self
@@ -134,18 +155,20 @@ class Record:
 
     def steps(self) -> Table:
         """Return the readings: columns `step`, `started`, `finished`, `settled` (1 or 0), and one a signal."""
-        rows = self._rows("steps")
-        self._check("steps", rows)
         names = ("step", "started", "finished", "settled", *(signal.name for signal in self.signals))
         end = 7 + len(self.signals)
-        return self._table("steps", names, [(*row[:3], row[5] not in _FAILED, *row[7:end]) for row in rows])
+        return self._joined(
+            names,
+            (
+                self._table("steps", names, [(*row[:3], row[5] not in _FAILED, *row[7:end]) for row in rows])
+                for rows in self._checked("steps")
+            ),
+        )
 
     def step_records(self, after: int = -1) -> Iterator[StepRecord]:
         """Yield the finished steps one by one, those with numbers beyond `after`."""
-        rows = self._rows("steps", after)
-        self._check("steps", rows)
         end = 7 + len(self.signals)
-        for row in rows:
+        for row in chain.from_iterable(self._checked("steps", after)):
             step, started, finished, phase, label, settled, setpoints, *values = row[:end]
             try:
                 record = StepRecord(
@@ -169,31 +192,40 @@ class Record:
         rows = self._query(f"SELECT {columns} FROM telemetry ORDER BY tick DESC LIMIT {count:d}")  # noqa: S608 - own names
         return [tuple(math.nan if value is None else float(value) for value in row) for row in reversed(rows)]
 
-    def telemetry(self, after: int = 0) -> Table:
-        """Return the ticks, those with numbers beyond `after`: columns `t`, `step`, and one a signal."""
+    def telemetry(self, after: int = 0, names: Collection[str] | None = None) -> Table:
+        """Return the ticks, those with numbers beyond `after`: columns `t`, `step`, and one a signal.
+
+        With `names` only these columns are kept, so that a long run takes no more memory than they do.
+        """
+        columns = ("t", "step", *(signal.name for signal in self.signals))
+        kept = [name for name in columns if names is None or name in names]
+        return self._joined(kept, self.ticks(after))
+
+    def ticks(self, after: int = 0) -> Iterator[Table]:
+        """Yield the ticks with numbers beyond `after` in blocks, columns as `telemetry`; of none no block."""
         names = ("tick", "t", "step", *(signal.name for signal in self.signals))
-        rows = self._rows("telemetry", after)
-        whole = self._table("telemetry", (*names, "checksum"), rows)
-        if rows:
+        for rows in self._blocks("telemetry", after):
+            whole = self._table("telemetry", (*names, "checksum"), rows)
             numbers = np.column_stack([whole[name] for name in names])
             wrong = np.flatnonzero(np.array(checksums(numbers), dtype=np.float64) != whole["checksum"])
             if len(wrong):
                 raise self._wrong_row("telemetry", rows[wrong[0]][0])
-        return Table(
-            {name: whole[name] for name in names if name != "tick"},
-            {name: whole.units[name] for name in names if name != "tick"},
-        )
+            yield Table(
+                {name: whole[name] for name in names if name != "tick"},
+                {name: whole.units[name] for name in names if name != "tick"},
+            )
 
     def numbers(self, table: str) -> set[int]:
         """Return the numbers of the rows of `steps`, `telemetry` or `events`, unchecked."""
-        key = {"steps": "step", "telemetry": "tick", "events": "event"}[table]
-        return {int(number) for (number,) in self._query(f"SELECT {key} FROM {table}")}  # noqa: S608 - own names
+        return {int(number) for (number,) in self._query(f"SELECT {NUMBERS[table]} FROM {table}")}  # noqa: S608
 
     def events(self, after: int = 0) -> list[Event]:
         """Return what happened, in its order, with numbers beyond `after`."""
-        rows = self._rows("events", after)
-        self._check("events", rows)
-        return [Event(*row[1:5]) for row in rows]
+        return list(self.each_event(after))
+
+    def each_event(self, after: int = 0) -> Iterator[Event]:
+        """Yield what `events` returns, one by one."""
+        return (Event(*row[1:5]) for row in chain.from_iterable(self._checked("events", after)))
 
     def files(self) -> dict[str, bytes]:
         """Return the content of every file that the run was given, by name."""
@@ -211,34 +243,28 @@ class Record:
     def damage(self) -> str:
         """Return what is wrong with the rows, as far as that is quick to find; empty if that is nothing.
 
-        Found are pages that SQLite cannot read, damaged rows of all tables but a long telemetry, and rows that a
-        completed run lacks.
+        Found are pages that SQLite cannot read, damaged rows of all tables but a long telemetry, and rows that are
+        missing in a run that was completed or whose process died.
         """
         try:
             (found,) = self._query("PRAGMA quick_check(1)")[0]
             if found != "ok":
                 return str(self._damaged(str(found).replace("\n", " ")))
-            counts = {
-                "steps": len(self.steps()),
-                "telemetry": self._query("SELECT count(*) FROM telemetry")[0][0],
-                "events": len(self.events()),
-            }
+            for table in ("steps", "events"):
+                deque(self._checked(table), maxlen=0)
             self.files()
-            if counts["telemetry"] <= _QUICKLY_CHECKED:
-                self.telemetry()
+            if self._query("SELECT count(*) FROM telemetry")[0][0] <= _QUICKLY_CHECKED:
+                deque(self.ticks(), maxlen=0)
         except DataError as error:
             return str(error)
-        if self.status == "completed":
-            for table, count in self.meta.get("counts", {}).items():
-                if counts.get(table, count) != count:
-                    return str(self._damaged(f"table {table} has {counts[table]} rows of {count}"))
-        return ""
+        return str(self.missing) if self.missing and self.status in ("completed", "unfinished") else ""
 
     def close(self) -> None:
         """Close the file."""
         self._opened.close()
 
-    def _rows(self, table: str, after: int = -1) -> list[tuple[Any, ...]]:
+    def _blocks(self, table: str, after: int = -1) -> Iterator[list[tuple[Any, ...]]]:
+        """Yield the rows with numbers beyond `after` in blocks."""
         # Columns by name, as only then a missing one is an error.
         leading = {
             "steps": ("step", "started", "finished", "phase", "label", "settled", "setpoints"),
@@ -251,7 +277,19 @@ class Record:
         columns = ", ".join(map(quoted, names))
         # The rows are numbered by their first column, from 0 or 1.
         first = leading[0]
-        return self._query(f"SELECT {columns} FROM {table} WHERE {first} > {after:d} ORDER BY 1")  # noqa: S608
+        statement = f"SELECT {columns} FROM {table} WHERE {first} > {after:d} ORDER BY 1"  # noqa: S608 - own names
+        try:
+            cursor = self._db.execute(statement)
+            while rows := cursor.fetchmany(_BLOCK):
+                yield rows
+        except sqlite3.DatabaseError as error:
+            raise self._damaged(str(error)) from error
+
+    def _checked(self, table: str, after: int = -1) -> Iterator[list[tuple[Any, ...]]]:
+        """Yield what `_blocks` does, each row compared with its checksum."""
+        for rows in self._blocks(table, after):
+            self._check(table, rows)
+            yield rows
 
     def _check(self, table: str, rows: Sequence[tuple[Any, ...]]) -> None:
         """Raise DataError for the first row that its checksum, the last column, does not fit."""
@@ -276,6 +314,16 @@ class Record:
             raise self._damaged(f"table {table}: {error}") from error
         values = {name: data[:, i].copy() for i, name in enumerate(names)}
         return Table(values, {name: self.unit(name) for name in names})
+
+    def _joined(self, names: Sequence[str], blocks: Iterable[Table]) -> Table:
+        """Return blocks as one table; a column at a time is copied, so that no more than one is held twice."""
+        parts: dict[str, list[npt.NDArray[np.float64]]] = {name: [] for name in names}
+        for block in blocks:
+            for name, several in parts.items():
+                several.append(block[name])
+        units = {name: self.unit(name) for name in names}
+        columns = {name: np.concatenate([*parts.pop(name), np.empty(0)]) for name in names}
+        return Table(columns, units)
 
     def _query(self, statement: str) -> list[tuple[Any, ...]]:
         # All at once: damage may show at any row.

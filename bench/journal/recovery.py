@@ -5,22 +5,45 @@ from __future__ import annotations
 import hashlib
 import json
 import sqlite3
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import closing, suppress
+from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from bench.errors import ConfigurationError, DataError
 from bench.journal.finding import missing
 from bench.journal.mirror import NAME as MIRROR_NAME
 from bench.journal.mirror import read_mirror, second_files
+from bench.journal.missing_rows import Range, joined_ranges
 from bench.journal.opening import OpenedJournal
-from bench.journal.rows import FILE_NAME, FIRST, RECOVERED_NAME, SCHEMA, TABLES, Entry, entry, meta_row
+from bench.journal.rows import (
+    FILE_NAME,
+    FIRST,
+    NUMBERS,
+    RECOVERED_NAME,
+    SCHEMA,
+    TABLES,
+    Entry,
+    canonical,
+    checksums,
+    entry,
+    meta_row,
+)
 from bench.journal.store import Store
 from bench.journal.substitutes import metadata, signal_rows, unnamed_signals
+from bench.journal.write_ahead_log import log_damage
 
-_KEYS = dict(zip(TABLES, ("key", "position", "step", "tick", "event", "rowid"), strict=True))
+_SMALL = tuple(table for table in TABLES if table not in FIRST)
+"""Tables that are held as a whole; the others may have millions of rows."""
+_KEYS = {"meta": "key", "signals": "position", "files": "rowid", **NUMBERS}
+_BESIDE_SIGNALS = {"steps": 8, "telemetry": 3, "events": 5}
+"""Columns of a row, without its checksum, that are no signals."""
+_BLOCK = 4096
+"""Rows that are read together."""
 
 
 @dataclass(frozen=True)
@@ -105,29 +128,32 @@ def recover(path: Path, others: Sequence[Path] = (), out: Path | None = None) ->
     if not journal.is_file() and not found:
         raise DataError(missing(path))
     left = _salvage(journal)
-    beside: dict[str, dict[Any, Entry]] = {table: {} for table in TABLES}
-    for second in found:
-        for each in read_mirror(second):
-            beside[each.table][each.row[0]] = each
-    whole = {table: {**beside[table], **left.rows[table]} for table in TABLES}
-    if not any(whole.values()):
+    beside = _beside(found)
+    whole = {table: {**beside.rows[table], **left.rows[table]} for table in _SMALL}
+    numbers = {table: left.numbers[table].joined(beside.numbers[table]) for table in FIRST}
+    if not any(whole.values()) and not any(numbers.values()):
         raise DataError(_hopeless(journal, left.problem, found))
     meta = {key: json.loads(each.row[1]) for key, each in whole["meta"].items()}
     # A second file has every row.
-    is_lost = {table: table in left.cut and not beside["meta"] for table in TABLES}
+    is_lost = {table: table in left.cut and not beside.rows["meta"] for table in TABLES}
     if meta.get("schema", None if whole["meta"] and not left.bad["meta"] else SCHEMA) != SCHEMA:
         raise DataError(f"{journal} has schema version {meta.get('schema')}; this bench reads version {SCHEMA}")
     substitutes: dict[str, Any] = {}
     if is_lost["meta"] or set(left.bad["meta"]).difference(whole["meta"]):
-        guessed = metadata(journal, whole["files"], whole["events"].values())
+        events = chain.from_iterable(each.rows for each in _rows_of(journal, found, ("events",)))
+        guessed = metadata(journal, whole["files"], events)
         substitutes = {key: value for key, value in guessed.items() if key not in meta}
-    named = left.signals or unnamed_signals(whole["steps"].values(), whole["telemetry"].values())
+    named = left.signals or unnamed_signals(max(left.signals_of_rows, beside.signals_of_rows))
     signals = {position: each for position, each in named.items() if position not in whole["signals"]}
     # What is known to be lost although nothing of it can be read.
     left.bad["meta"] += [] if not is_lost["meta"] else [key for key in substitutes if key not in left.bad["meta"]]
     left.bad["signals"] += [position for position in signals if position not in left.bad["signals"]]
     counts = meta.get("counts", {})
-    tables = {table: _state(table, left, whole[table], counts.get(table), is_cut=is_lost[table]) for table in TABLES}
+    tables = {table: _small_state(left, table, whole[table], is_cut=is_lost[table]) for table in _SMALL}
+    tables |= {
+        table: _state(left, table, numbers[table], counts.get(table), is_cut=is_lost[table]) for table in FIRST
+    }
+    tables = {table: tables[table] for table in TABLES}
     meta = substitutes | meta
     copy = None
     if left.problem or any(state.added or state.missing or state.first_bad for state in tables.values()):
@@ -139,7 +165,7 @@ def recover(path: Path, others: Sequence[Path] = (), out: Path | None = None) ->
         more["recovered"] = {"from": str(journal), "lost": lost, "substituted": sorted(substitutes)}
         meta |= more
         whole["signals"] |= signals
-        _write(copy, whole, more)
+        _write(copy, whole, _rows_of(journal, found, tuple(FIRST)), more)
     return Recovery(journal, str(meta.get("status", "unfinished")), left.problem, tables, found, copy)
 
 
@@ -154,76 +180,164 @@ def _hopeless(journal: Path, problem: str, found: Sequence[Path]) -> str:
     )
 
 
-@dataclass(frozen=True)
+class _Numbers:
+    """Numbers of rows, as ranges: rows come in the order of their numbers, so that there are few."""
+
+    def __init__(self, ranges: Iterable[Range] = ()) -> None:
+        self.ranges = list(ranges)
+
+    def add(self, first: int, last: int) -> None:
+        if self.ranges:
+            begin, end = self.ranges[-1]
+            if begin <= first <= end + 1 or begin <= last + 1 <= end + 1:
+                self.ranges[-1] = min(begin, first), max(end, last)
+                return
+        self.ranges.append((first, last))
+
+    def joined(self, others: _Numbers) -> _Numbers:
+        """Return these and others, in order and without a number twice."""
+        return _Numbers(joined_ranges([*self.ranges, *others.ranges]))
+
+    def lacking(self, first: int, last: int) -> list[Range]:
+        """Return the ranges of the numbers from `first` to `last` that are not among these, which are in order."""
+        edges = [first - 1, *chain.from_iterable(self.ranges), last + 1]
+        pairs = zip(edges[::2], edges[1::2], strict=True)
+        return [(before + 1, after - 1) for before, after in pairs if after - before > 1]
+
+    @property
+    def last(self) -> int | None:
+        return max((end for _, end in self.ranges), default=None)
+
+    def __contains__(self, number: object) -> bool:
+        return isinstance(number, int) and any(first <= number <= last for first, last in self.ranges)
+
+    def __len__(self) -> int:
+        return sum(last - first + 1 for first, last in self.ranges)
+
+
+@dataclass
 class _Left:
-    """What is left of the SQLite file.
+    """What is left of the SQLite file or of second files; numbered rows are counted only, as there may be many.
 
     Attributes
     ----------
     rows : dict of str to dict
-        The good rows of each table by their keys.
+        The good rows of each small table by their keys.
+    numbers : dict of str to _Numbers
+        The numbers of the good rows of the other tables.
     bad : dict of str to list
         The keys of bad ones.
     cut : set of str
         The tables of which there may be more rows than are known.
     signals : dict of int to Entry
         By position, in the place of signals whose rows are lost.
+    signals_of_rows : int
+        Most values of signals that a numbered row has.
     problem : str
         What SQLite finds wrong.
     """
 
-    rows: dict[str, dict[Any, Entry]] = field(default_factory=lambda: {table: {} for table in TABLES})
+    rows: dict[str, dict[Any, Entry]] = field(default_factory=lambda: {table: {} for table in _SMALL})
+    numbers: dict[str, _Numbers] = field(default_factory=lambda: {table: _Numbers() for table in FIRST})
     bad: dict[str, list[Any]] = field(default_factory=lambda: {table: [] for table in TABLES})
     cut: set[str] = field(default_factory=set)
     signals: dict[Any, Entry] = field(default_factory=dict)
+    signals_of_rows: int = 0
     problem: str = ""
 
+    def add(self, entry: Entry) -> None:
+        """Add good rows."""
+        if entry.table in _SMALL:
+            self.rows[entry.table][entry.row[0]] = entry
+            return
+        self.signals_of_rows = max(self.signals_of_rows, len(entry.row) - _BESIDE_SIGNALS[entry.table])
+        for row in entry.rows:
+            self.numbers[entry.table].add(int(row[0]), int(row[0]))
 
-def _state(table: str, left: _Left, whole: Mapping[Any, Entry], count: int | None, *, is_cut: bool) -> TableState:
+
+def _small_state(left: _Left, table: str, whole: Mapping[Any, Entry], *, is_cut: bool) -> TableState:
     good, bad = left.rows[table], left.bad[table]
-    added = len(whole) - len(good)
+    lost = set(bad) - set(whole)
     lacking = set(bad) | (set(whole) - set(good))
-    missing = set(bad) - set(whole)
-    if table in FIRST:
-        start = FIRST[table]
-        numbers = [*whole, *(key for key in bad if isinstance(key, int)), start - 1]
-        last = int(max(numbers)) if count is None else count + start - 1
-        gone = set(range(start, last + 1)) - set(whole)
-        missing |= gone
-        lacking |= gone
-        # Their end is known all the same.
-        is_cut = is_cut and count is None
-    first = min(lacking, key=lambda key: (isinstance(key, str), key)) if lacking else ""
-    first_bad = first if isinstance(first, str) else str(int(first))
-    if is_cut and not missing:
-        return TableState(len(good), added, 1, first_bad or "?")
-    return TableState(len(good), added, len(missing), first_bad)
+    first = min(lacking, key=lambda key: (isinstance(key, str), key)) if lacking else None
+    return _counted(len(good), len(whole) - len(good), len(lost), first, is_cut=is_cut)
+
+
+def _state(left: _Left, table: str, whole: _Numbers, count: int | None, *, is_cut: bool) -> TableState:
+    good = left.numbers[table].joined(_Numbers())
+    start = FIRST[table]
+    bad = [key for key in left.bad[table] if key not in whole]
+    known = [whole.last, *(key for key in bad if isinstance(key, int))]
+    last = (
+        max((number for number in known if number is not None), default=start - 1)
+        if count is None
+        else count + start - 1
+    )
+    gone = whole.lacking(start, last)
+    others = [key for key in bad if not isinstance(key, int) or not start <= key <= last]
+    lost = sum(end - begin + 1 for begin, end in gone) + len(others)
+    lacking = good.lacking(start, max(last, whole.last or last))
+    first = min([*(begin for begin, _ in lacking), *left.bad[table]], key=_order, default=None)
+    # Their end is known all the same.
+    return _counted(len(good), len(whole) - len(good), lost, first, is_cut=is_cut and count is None)
+
+
+def _counted(good: int, added: int, lost: int, first: Any, *, is_cut: bool) -> TableState:  # noqa: ANN401 - a key
+    first_bad = "" if first is None else first if isinstance(first, str) else str(int(first))
+    if is_cut and not lost:
+        return TableState(good, added, 1, first_bad or "?")
+    return TableState(good, added, lost, first_bad)
+
+
+def _order(key: Any) -> tuple[bool, Any]:  # noqa: ANN401 - a key of any table
+    return isinstance(key, str), key
 
 
 def _salvage(journal: Path) -> _Left:
     if not journal.is_file():
         return _Left(cut=set(TABLES), problem="it is not there")
     try:
-        opened = OpenedJournal(journal)
+        opened = _opened(journal)
     except DataError as error:
         return _Left(cut=set(TABLES), problem=str(error.__cause__ or error))
-    # A text that is damaged is one whose checksum does not fit.
-    opened.db.text_factory = lambda content: content.decode("utf-8", "replace")
     try:
         left = _Left(problem=_problem(opened.db))
         for table in TABLES:
-            rows, is_cut = _readable(opened.db, table)
-            if is_cut:
-                left.cut.add(table)
-            for columns in rows:
-                kept = _checked(table, columns)
-                if kept is None:
-                    left.bad[table].append(columns[0])
-                else:
-                    left.rows[table][columns[0]] = kept
-        return replace(left, signals=signal_rows(opened.db, left.rows["signals"]))
+            for each in _readable(opened.db, table, left.cut, left.bad[table]):
+                left.add(each)
+        left.signals = signal_rows(opened.db, left.rows["signals"])
     finally:
         opened.close()
+    if damage := log_damage(journal.with_name(f"{journal.name}-wal")):
+        left.problem = left.problem or damage
+        left.cut |= FIRST.keys()
+    return left
+
+
+def _beside(seconds: Sequence[Path]) -> _Left:
+    """Return what second files have."""
+    found = _Left()
+    for second in seconds:
+        for each in read_mirror(second):
+            found.add(each)
+    return found
+
+
+def _rows_of(journal: Path, seconds: Sequence[Path], tables: Sequence[str]) -> Iterator[Entry]:
+    """Yield the good rows of some tables, last those of the journal itself, which may come a second time."""
+    for second in seconds:
+        yield from (each for each in read_mirror(second) if each.table in tables)
+    if journal.is_file():
+        with suppress(DataError), closing(_opened(journal)) as opened:
+            for table in tables:
+                yield from _readable(opened.db, table, set(), [])
+
+
+def _opened(journal: Path) -> OpenedJournal:
+    opened = OpenedJournal(journal)
+    # A text that is damaged is one whose checksum does not fit.
+    opened.db.text_factory = lambda content: content.decode("utf-8", "replace")
+    return opened
 
 
 def _problem(db: sqlite3.Connection) -> str:
@@ -234,53 +348,82 @@ def _problem(db: sqlite3.Connection) -> str:
     return "" if found == "ok" else found.replace("\n", " ")
 
 
-def _readable(db: sqlite3.Connection, table: str) -> tuple[list[tuple[Any, ...]], bool]:
-    """Return the rows of a table that SQLite can read, around what it cannot; and whether others may be unknown.
+def _readable(db: sqlite3.Connection, table: str, cut: set[str], bad: list[Any]) -> Iterator[Entry]:
+    """Yield the good rows of a table that SQLite can read, around what it cannot.
 
-    Where rows are numbered, those that lie between two that can be read are known.
+    The table is added to `cut` if there may be others, and the keys of bad rows to `bad`. Where rows are numbered,
+    those that lie between two that can be read are known.
     """
     key = _KEYS[table]
-    found: dict[Any, tuple[Any, ...]] = {}
-    ends = []
+    ends: list[Any] = []
     for order in ("ASC", "DESC"):
         last: Any = None
         try:
-            for row in db.execute(f"SELECT * FROM {table} ORDER BY {key} {order}"):  # noqa: S608 - own names
-                found[row[0]] = row
-                last = row[0]
+            for rows in _blocks(db, f"SELECT * FROM {table} ORDER BY {key} {order}"):  # noqa: S608 - own names
+                last = rows[-1][0]
+                yield from _checked(table, rows, bad)
         except sqlite3.DatabaseError:
             ends.append(last)
         else:
-            return list(found.values()), False
+            return
     if table in FIRST and isinstance(ends[0], int) and isinstance(ends[1], int):
         for number in range(ends[0] + 1, ends[1]):
             with suppress(sqlite3.DatabaseError):
                 row = db.execute(f"SELECT * FROM {table} WHERE {key} = ?", (number,)).fetchone()  # noqa: S608
                 if row is not None:
-                    found[number] = row
-    return list(found.values()), table not in FIRST or ends[1] is None
+                    yield from _checked(table, [row], bad)
+    if table not in FIRST or ends[1] is None:
+        cut.add(table)
 
 
-def _checked(table: str, columns: tuple[Any, ...]) -> Entry | None:
-    """Return a row if its checksum fits."""
+def _blocks(db: sqlite3.Connection, statement: str) -> Iterator[list[tuple[Any, ...]]]:
+    """Yield rows in blocks, also those before one that cannot be read; raises what SQLite does."""
+    rows = []
     try:
-        if table == "files":
-            kept = entry(table, columns)
-            return kept if hashlib.sha256(columns[2]).hexdigest() == columns[1] else None
-        kept = entry(table, columns[:-1])
-    except (ValueError, TypeError):
-        return None
-    return kept if kept.columns() == [columns] else None
+        for row in db.execute(statement):
+            rows.append(row)
+            if len(rows) == _BLOCK:
+                yield rows
+                rows = []
+    except sqlite3.DatabaseError:
+        if rows:
+            yield rows
+        raise
+    if rows:
+        yield rows
 
 
-def _write(copy: Path, whole: Mapping[str, Mapping[Any, Entry]], more: Mapping[str, object]) -> None:
+def _checked(table: str, rows: Sequence[tuple[Any, ...]], bad: list[Any]) -> Iterator[Entry]:
+    """Yield the rows whose checksums fit, ticks together; the keys of others are added to `bad`."""
+    if table == "telemetry" and rows:
+        with suppress(ValueError, TypeError):
+            numbers = np.array(rows, dtype=np.float64)
+            if (np.array(checksums(numbers[:, :-1]), dtype=np.float64) == numbers[:, -1]).all():
+                yield Entry(table, [row[:-1] for row in rows], canonical(numbers[:, :-1]).tobytes())
+                return
+    for columns in rows:
+        kept = None
+        with suppress(ValueError, TypeError):
+            if table != "files":
+                kept = entry(table, columns[:-1])
+            elif hashlib.sha256(columns[2]).hexdigest() == columns[1]:
+                kept = entry(table, columns)
+        if kept is not None and list(kept.columns()) == [columns]:
+            yield kept
+        else:
+            bad.append(columns[0])
+
+
+def _write(
+    copy: Path, whole: Mapping[str, Mapping[Any, Entry]], rows: Iterator[Entry], more: Mapping[str, object]
+) -> None:
     if copy.exists():
         raise ConfigurationError(f"{copy} exists already; nothing is overwritten, so name another one by --out")
-    entries = [each for table in TABLES for _, each in sorted(whole[table].items())]
-    entries += [entry("meta", meta_row(key, value)) for key, value in more.items()]
+    small = (each for table in whole for _, each in sorted(whole[table].items()))
+    added = (entry("meta", meta_row(key, value)) for key, value in more.items())
     try:
-        store = Store(copy)
-        store.create([each.row[1] for _, each in sorted(whole["signals"].items())], entries)
+        store = Store(copy, flushed=False)
+        store.create([each.row[1] for _, each in sorted(whole["signals"].items())], chain(small, rows, added))
         store.close()
     except (sqlite3.Error, OSError) as error:
         raise ConfigurationError(f"{copy} cannot be written: {error}; name another one by --out") from None

@@ -59,6 +59,9 @@ _FEW_ROWS = 3
 FIRST = {"steps": 0, "telemetry": 1, "events": 1}
 """The tables whose rows are numbered without a gap, by their first column, and the first number of each."""
 
+NUMBERS = {"steps": "step", "telemetry": "tick", "events": "event"}
+"""The column of their numbers."""
+
 
 @dataclass(frozen=True)
 class StepRecord:
@@ -204,6 +207,17 @@ def split(entries: Iterable[Entry]) -> Iterator[Entry]:
         size = len(several.payload) // len(several.rows)
         for i, row in enumerate(several.rows):
             yield Entry(several.table, (row,), several.payload[size * i : size * (i + 1)])
+
+
+def joined(entries: Iterable[Entry]) -> list[Entry]:
+    """Return entries with neighbouring rows of the telemetry in one."""
+    result: list[Entry] = []
+    for each in entries:
+        if result and each.table == result[-1].table == "telemetry":
+            former = result.pop()
+            each = Entry(each.table, [*former.rows, *each.rows], former.payload + each.payload)
+        result.append(each)
+    return result
 
 
 def _packed(numbers: Sequence[float]) -> bytes:

@@ -38,10 +38,9 @@ def signal_rows(db: sqlite3.Connection, found: Mapping[Any, Entry]) -> dict[Any,
     return {}
 
 
-def unnamed_signals(steps: Iterable[Entry], ticks: Iterable[Entry]) -> dict[Any, Entry]:
-    """Return rows for signals whose names are lost as well, as many as the rows of steps or ticks have values."""
-    quantities = [len(each.row) - columns for rows, columns in ((steps, 8), (ticks, 3)) for each in rows]
-    return _signals([f"signal_{i}" for i in range(max(quantities, default=0))])
+def unnamed_signals(quantity: int) -> dict[Any, Entry]:
+    """Return rows for signals whose names are lost as well."""
+    return _signals([f"signal_{i}" for i in range(quantity)])
 
 
 def _signals(names: Sequence[str]) -> dict[Any, Entry]:
@@ -49,7 +48,7 @@ def _signals(names: Sequence[str]) -> dict[Any, Entry]:
     return {i: entry("signals", (i, name, "?", lost, 3)) for i, name in enumerate(names)}
 
 
-def metadata(journal: Path, files: Mapping[Any, Entry], events: Iterable[Entry]) -> dict[str, Any]:
+def metadata(journal: Path, files: Mapping[Any, Entry], events: Iterable[Sequence[Any]]) -> dict[str, Any]:
     """Return metadata of a run, as far as the other rows and the name of its folder tell; the rest says so.
 
     What it takes to repeat or to resume the run is not among them.
@@ -90,7 +89,7 @@ def metadata(journal: Path, files: Mapping[Any, Entry], events: Iterable[Entry])
         "over_time": [],
         "laboratory_epoch": None,
     }
-    for t, kind, text in ((each.row[1], each.row[3], each.row[4]) for each in events):
+    for _, t, _, kind, text in events:
         if kind == "end" and text in _ENDS:
             found |= {"status": text, "finished": t, "reason": "", "safe_state": {}}
     return found

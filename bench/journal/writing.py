@@ -23,7 +23,7 @@ from bench.journal.mirror import NAME as MIRROR_NAME
 from bench.journal.mirror import read_mirror, second_files
 from bench.journal.models import add_model
 from bench.journal.record import Record
-from bench.journal.rows import FIRST, SCHEMA, Entry, Event, StepRecord, entry, meta_row, ticks
+from bench.journal.rows import FIRST, SCHEMA, Entry, Event, StepRecord, entry, meta_row, split, ticks
 from bench.journal.store import Store
 
 _READERS = 10.0
@@ -345,7 +345,7 @@ def take_in(path: Path) -> tuple[Path, tuple[Signal, ...], dict[str, int], dict[
     beside = {
         (each.table, each.row[0]): each
         for second in second_files(file)
-        for each in read_mirror(second)
+        for each in split(read_mirror(second))
         if each.table not in FIRST or each.row[0] not in numbers[each.table]
     }
     if not has_ended and ("meta", "status") in beside:

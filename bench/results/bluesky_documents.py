@@ -55,6 +55,7 @@ def documents(record: Record) -> Iterator[Document]:
             "owner": str(meta["operator"]),
             "hints": {},
             **{key: plain({key: meta[key]})[key] for key in _START if key in meta},
+            **({"missing_rows": record.missing.to_json()} if record.missing else {}),
         },
     )
     counts: dict[str, int] = {}

@@ -67,12 +67,13 @@ def epoch_of(record: Record) -> datetime:
 
 
 def metadata_of(record: Record) -> dict[str, Any]:
-    """Return the metadata of a run with its signals, for JSON."""
+    """Return the metadata of a run with its signals and what its record lacks, for JSON."""
     signals = [
         {"name": each.name, "unit": each.unit, "description": each.description, "precision": each.precision}
         for each in record.signals
     ]
-    return {**record.meta, "status": record.status, "signals": signals}
+    missing = record.missing.to_json() if record.missing else None
+    return {**record.meta, "status": record.status, "signals": signals, "missing_rows": missing}
 
 
 def _readings(record: Record, epoch: datetime) -> list[Column]:
