@@ -31,6 +31,9 @@ _SHORTEST_NAP = 1e-3
 _MOST_CATCHING_UP = 0.2
 """Lateness in s that a paced clock makes up for by running fast; what is beyond is lost."""
 
+LEAST_PARTING = 1.0
+"""Difference in s between laboratory time and time of day from which a wall clock notices that it has grown."""
+
 SHORTEST_SUSPENSION = 1.0
 """Suspension of the machine in s from which a wall clock notices it."""
 
@@ -105,6 +108,13 @@ class Clock(ABC):
         """Return for how many seconds the machine was suspended since the last call; 0 where it cannot matter."""
         return 0.0
 
+    def parting(self) -> float:
+        """Return by how many seconds the time of day was set forward, or back, since the last call.
+
+        0 where that is less than 1 s, or where laboratory time has nothing to do with the time of day.
+        """
+        return 0.0
+
     def timestamp(self) -> float:
         """Return the laboratory time as seconds since 1970-01-01 UTC."""
         return self.epoch.timestamp() + self.now()
@@ -125,12 +135,15 @@ class WallClock(Clock):
     ----------
     running, passing : callable, optional
         Sources of time in s: one that stands still while the machine is suspended, and one that goes on.
+    of_day : callable, optional
+        Source of the time of day, s since 1970, which somebody or the network may set.
     """
 
     def __init__(
         self,
         running: Callable[[], float] = time.monotonic,
         passing: Callable[[], float] = _seconds_with_suspension,
+        of_day: Callable[[], float] = time.time,
     ) -> None:
         super().__init__()
         self.epoch = datetime.now(UTC)
@@ -138,6 +151,8 @@ class WallClock(Clock):
         self._passing = passing
         self._start = running()
         self._lag = passing() - self._start
+        self._of_day = of_day
+        self._ahead = self._time_of_day_ahead()
 
     def now(self) -> float:
         """Return seconds since the clock was made."""
@@ -166,6 +181,24 @@ class WallClock(Clock):
             return 0.0
         self._lag = lag
         return grown
+
+    def parting(self) -> float:
+        """Return by how many seconds the time of day was set since the last call, if it was by more than 1 s.
+
+        A suspension of the machine is none: the time of day goes on meanwhile as it should.
+        """
+        least, most = self._time_of_day_ahead()
+        forward, back = least - self._ahead[1], self._ahead[0] - most
+        if max(forward, back) <= LEAST_PARTING:
+            return 0.0
+        self._ahead = least, most
+        return forward if forward > back else -back
+
+    def _time_of_day_ahead(self) -> tuple[float, float]:
+        """Return bounds of the lead of the time of day, s: a busy machine may wait between two readings."""
+        before = self._passing()
+        of_day = self._of_day()
+        return of_day - self._passing(), of_day - before
 
 
 class ScaledClock(Clock):

@@ -157,7 +157,8 @@ class Engine:
         self._clock.interrupted = self._interrupts.abort_requested
         if isinstance(self._clock, PacedClock):
             self._clock.restart_pace()
-        self._clock.suspension()  # what was before the run does not concern it
+        # What was before the run does not concern it.
+        self._clock.suspension(), self._clock.parting()
         error: Exception | None = None
         self._began = self._run.zero if past is None else self._clock.now()
         try:

@@ -263,6 +263,14 @@ class RunAtHand:
                 f"the machine was suspended for {seconds:.0f} s: the set-points stood, nothing was recorded, and "
                 "watchdogs may have switched outputs off",
             )
+        if (seconds := self.clock.parting()) != 0:
+            self.event(
+                "WARN",
+                "clock",
+                f"the time of day was set {'forward' if seconds > 0 else 'back'} by {abs(seconds):.1f} s: the record "
+                "goes on counting from the start of the run, and its times of day differ from those of other records "
+                "by so much from here on",
+            )
 
     def finish_step(
         self,

@@ -38,8 +38,8 @@ Schema, version 3
     One row a tick of a hold, numbered from 1: quick readings. `step` is that which the tick belongs to; -1 on the
     way back of a run that is resumed. A step that was not finished when its run died has ticks of both attempts.
 `events(event, t, level, kind, text, checksum)`
-    Phases, notes, pauses, suspensions of the machine, interlocks, errors, safe state, the factor that a paced clock
-    reached; numbered from 1; level is `INFO`, `WARN` or `ERROR`.
+    Phases, notes, pauses, suspensions of the machine, a time of day that was set, interlocks, errors, safe state, the
+    factor that a paced clock reached; numbered from 1; level is `INFO`, `WARN` or `ERROR`.
 `files(name, sha256, content)`
     The content of every file that the run was given.
 

@@ -285,6 +285,52 @@ class TestSuspension:
         assert PacedClock(1.0).suspension() == VirtualClock().suspension() == 0.0
 
 
+class TestParting:
+    def times(self):
+        class Times:
+            running = passing = 100.0
+            of_day = 1e9
+            step = 0.0
+
+            def read_passing(self):
+                """Return the time that passes, and let the machine wait."""
+                passing = self.passing
+                self.passing += self.step
+                self.of_day += self.step
+                return passing
+
+        times = Times()
+        return times, WallClock(lambda: times.running, times.read_passing, lambda: times.of_day)
+
+    @pytest.mark.parametrize("seconds", [1.5, -1.5])
+    def test_is_noticed_once(self, seconds):
+        times, clock = self.times()
+        times.of_day += seconds
+        assert clock.parting() == pytest.approx(seconds)
+        assert clock.parting() == 0.0
+
+    def test_below_a_second_is_none_until_it_adds_up(self):
+        times, clock = self.times()
+        times.of_day += 0.9
+        assert clock.parting() == 0.0
+        times.of_day += 0.2
+        assert clock.parting() == pytest.approx(1.1)
+
+    def test_a_suspension_is_none(self):
+        times, clock = self.times()
+        times.passing += 3600.0
+        times.of_day += 3600.0
+        assert clock.parting() == 0.0
+
+    def test_a_machine_that_waits_between_two_readings_has_none(self):
+        times, clock = self.times()
+        times.step = 5.0
+        assert clock.parting() == 0.0
+
+    def test_of_a_clock_in_process_cannot_matter(self):
+        assert PacedClock(1.0).parting() == VirtualClock().parting() == 0.0
+
+
 class TestMakeClock:
     def test_by_name(self):
         assert isinstance(make_clock("wall", in_process=False), WallClock)

@@ -1074,7 +1074,7 @@ class TestInterrupted:
     def test_a_suspension_of_the_machine_is_recorded(self, bench):
         suspended = [0.0]
         wall = WallClock()
-        clock = WallClock(wall.now, lambda: wall.now() + suspended[0])
+        clock = WallClock(wall.now, lambda: wall.now() + suspended[0], lambda: wall.timestamp() + suspended[0])
 
         def sleeper(parameters):
             yield Step({"tec": 30.0}, Dwell(0.05))
@@ -1088,6 +1088,28 @@ class TestInterrupted:
             (event,) = (event for event in run.events() if event.kind == "suspended")
             assert event.level == "WARN"
             assert "suspended for 3600 s" in event.text
+            assert not [event for event in run.events() if event.kind == "clock"]
+
+    @pytest.mark.parametrize("seconds", [3600.0, -7.5])
+    def test_a_time_of_day_that_was_set_is_recorded(self, bench, seconds):
+        set_by = [0.0]
+        wall = WallClock()
+
+        def setter(parameters):
+            yield Step({"tec": 30.0}, Dwell(0.05))
+            set_by[0] = seconds
+            yield Step({"tec": 31.0}, Dwell(0.05))
+            yield Step({"tec": 32.0}, Dwell(0.05))
+
+        self.b = b = bench(clock=WallClock(wall.now, wall.now, lambda: wall.timestamp() + set_by[0]))
+        assert b.run(define(setter)).status == "completed"
+        with b.record() as run:
+            (event,) = (event for event in run.events() if event.kind == "clock")
+            assert event.level == "WARN"
+            assert f"{'forward' if seconds > 0 else 'back'} by {abs(seconds):.1f} s" in event.text
+            # Laboratory time goes on as before.
+            assert np.all(np.diff(run.steps()["finished"]) < 60.0)
+            assert np.all(np.diff(run.steps()["finished"]) > 0.0)
 
     def test_the_clock_is_left_as_it_was(self, bench):
         self.b = b = bench()
