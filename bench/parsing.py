@@ -1,10 +1,18 @@
-"""JSON and TOML of files that somebody else may have written: whatever is wrong with them is a ValueError."""
+"""JSON and TOML: what somebody else wrote, where whatever is wrong is a ValueError, and what the bench writes itself.
+
+JSON has no number that is not finite (RFC 8259, section 6): where the bench has none, its files have null.
+"""
 
 from __future__ import annotations
 
 import json
+import math
 import tomllib
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
+
+from bench.errors import DataError
 
 _TOO_DEEP = "it is nested too deeply"
 
@@ -23,3 +31,27 @@ def parse_toml(text: str) -> dict[str, Any]:
         return tomllib.loads(text)
     except RecursionError:
         raise ValueError(_TOO_DEEP) from None
+
+
+def json_text(content: Any, *, indent: int | None = None) -> str:  # noqa: ANN401 - anything that JSON can hold
+    """Return a text of JSON, with null for a number that is not finite and the text of what JSON does not know."""
+    try:
+        return json.dumps(content, indent=indent, ensure_ascii=False, allow_nan=False, default=str)
+    except ValueError:
+        return json.dumps(_finite(content), indent=indent, ensure_ascii=False, allow_nan=False, default=str)
+
+
+def write_json_file(path: Path, content: Any) -> None:  # noqa: ANN401 - anything that JSON can hold
+    """Write a file of JSON for people too; raises DataError if that cannot be."""
+    try:
+        path.write_text(f"{json_text(content, indent=1)}\n", encoding="utf-8")
+    except OSError as error:
+        raise DataError(f"{path} cannot be written: {error.strerror or error}") from None
+
+
+def _finite(content: Any) -> Any:  # noqa: ANN401 - anything that JSON can hold
+    if isinstance(content, float):
+        return content if math.isfinite(content) else None
+    if isinstance(content, Mapping):
+        return {key: _finite(value) for key, value in content.items()}
+    return [_finite(each) for each in content] if isinstance(content, list | tuple) else content

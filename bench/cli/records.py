@@ -66,6 +66,15 @@ def export(
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder to write to; the folder of the run if not given.")
     ] = None,
+    escape_formulas: Annotated[
+        bool,
+        typer.Option(
+            "--escape-formulas/--formulas",
+            help="csv: put an apostrophe before a text, such as a note or what an instrument answered, that a "
+            "spreadsheet would carry out as a formula (it begins with =, +, -, @, a tab or a carriage return, and is "
+            "no number); or write every text as it was recorded.",
+        ),
+    ] = True,
     json_file: JsonOption = None,
 ) -> None:
     """Write a run's readings and telemetry for other programs, or rebuild its recording for the viewer.
@@ -76,7 +85,7 @@ def export(
     """
     from bench.results.export import export_run
 
-    paths = export_run(run, format_.value, out)
+    paths = export_run(run, format_.value, out, escape_formulas=escape_formulas)
     for path in paths:
         print_plain(console, f"{path}")
     write_json(json_file, {"files": [str(path) for path in paths]})

@@ -186,6 +186,11 @@ class Record:
                 raise self._damaged(f"step {step}: {error}") from error
             yield record
 
+    def places(self, first: int, last: int) -> dict[int, tuple[str, str]]:
+        """Return phase and label of the finished steps from number `first` to `last`, unchecked."""
+        rows = self._query(f"SELECT step, phase, label FROM steps WHERE step BETWEEN {first:d} AND {last:d}")  # noqa: S608
+        return {step: (phase, label) for step, phase, label in rows}
+
     def newest_ticks(self, count: int) -> list[tuple[float, ...]]:
         """Return the newest ticks, oldest first, unchecked: laboratory time in s, and one value a signal."""
         columns = ", ".join(quoted(name) for name in ("t", *(signal.name for signal in self.signals)))
@@ -214,6 +219,10 @@ class Record:
                 {name: whole[name] for name in names if name != "tick"},
                 {name: whole.units[name] for name in names if name != "tick"},
             )
+
+    def count(self, table: str) -> int:
+        """Return how many rows `steps`, `telemetry` or `events` have."""
+        return int(self._query(f"SELECT count(*) FROM {table}")[0][0])  # noqa: S608 - own names
 
     def numbers(self, table: str) -> set[int]:
         """Return the numbers of the rows of `steps`, `telemetry` or `events`, unchecked."""
@@ -253,7 +262,7 @@ class Record:
             for table in ("steps", "events"):
                 deque(self._checked(table), maxlen=0)
             self.files()
-            if self._query("SELECT count(*) FROM telemetry")[0][0] <= _QUICKLY_CHECKED:
+            if self.count("telemetry") <= _QUICKLY_CHECKED:
                 deque(self.ticks(), maxlen=0)
         except DataError as error:
             return str(error)

@@ -6,17 +6,18 @@ The form on disk is that of suitcase-jsonl: a line a document, `[name, document]
 
 from __future__ import annotations
 
-import json
 import math
 import uuid
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from bench.errors import DataError
 from bench.interlocks import SETPOINT
 from bench.journal import Record
-from bench.results.typed_tables import Column, epoch_of, plain, typed_tables
+from bench.parsing import json_text
+from bench.results.typed_tables import Column, TypedTable, epoch_of, plain, typed_tables
 
 Document = tuple[str, dict[str, Any]]
 
@@ -60,12 +61,10 @@ def documents(record: Record) -> Iterator[Document]:
     )
     counts: dict[str, int] = {}
     for table, stream in _STREAMS.items():
-        columns = tables[table]
-        times = next(each.values for each in columns if each.name == _TIMES[table])
-        if not times:
-            continue
-        counts[stream] = len(times)
-        yield from _stream(str(run), stream, columns, [epoch + t for t in times], meta)
+        for document in _stream(str(run), stream, tables[table], epoch, _TIMES[table], meta):
+            if document[0] == "event":
+                counts[stream] = document[1]["seq_num"]
+            yield document
     if "status" in meta:
         stop = {
             "uid": str(uuid.uuid5(run, "stop")),
@@ -83,9 +82,18 @@ _START = ("run", "rig", "rig_title", "protocol_summary", "seed", "clock", "git",
 
 
 def _stream(
-    run: str, stream: str, columns: Sequence[Column], times: Sequence[float], meta: Mapping[str, Any]
+    run: str, stream: str, table: TypedTable, epoch: float, clock: str, meta: Mapping[str, Any]
 ) -> Iterator[Document]:
-    kept = [each for each in columns if each.kind != "time"]
+    """Yield descriptor and events of a table, whose column `clock` has their times; nothing of one without rows."""
+    kept = [each for each in table.columns if each.kind != "time"]
+    clock_at = [each.name for each in table.columns].index(clock)
+    rows = (
+        (epoch + t, *row)
+        for block in table.blocks
+        for t, *row in zip(
+            block[clock_at], *(v for v, c in zip(block, table.columns, strict=True) if c in kept), strict=True
+        )
+    )
     descriptor = str(uuid.uuid5(uuid.UUID(run), stream))
     keys = {_key(each): _data_key(each, stream) for each in kept}
     devices = {
@@ -94,12 +102,15 @@ def _stream(
         if (found := [key for key in keys if key.startswith(f"{device}_")])
     }
     rest = [key for key in keys if not any(key in found for found in devices.values())]
+    first = next(rows, None)
+    if first is None:
+        return
     yield (
         "descriptor",
         {
             "uid": descriptor,
             "run_start": run,
-            "time": times[0],
+            "time": first[0],
             "name": stream,
             "data_keys": keys,
             "object_keys": {**devices, **({"bench": rest} if rest else {})},
@@ -107,8 +118,7 @@ def _stream(
             "hints": {},
         },
     )
-    rows = zip(*(each.values for each in kept), strict=True)
-    for number, (time, row) in enumerate(zip(times, rows, strict=True), start=1):
+    for number, (time, *row) in enumerate(chain([first], rows), start=1):
         values = ((_key(each), _value(each, value)) for each, value in zip(kept, row, strict=True))
         data = {key: value for key, value in values if value is not None}
         yield (
@@ -152,7 +162,6 @@ def write_documents(record: Record, path: Path) -> None:
     """
     try:
         with path.open("w", encoding="utf-8") as file:
-            for name, document in documents(record):
-                file.write(json.dumps([name, document], ensure_ascii=False, allow_nan=False) + "\n")
+            file.writelines(json_text(document) + "\n" for document in documents(record))
     except OSError as error:
         raise DataError(f"{path} cannot be written: {error.strerror}") from None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -26,6 +26,9 @@ FEWEST_ROWS = 10
 _OLD_SPREADSHEET = b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1"
 
 _STEPS, _TELEMETRY = "steps", "telemetry"
+
+_FORMULAS = ("=", "+", "-", "@", "\t", "\r")
+"""What a text begins with that a spreadsheet takes for a formula."""
 
 _LONGEST_PLATEAU = 0.5
 """Share of the samples that may repeat the one before without a word."""
@@ -133,18 +136,67 @@ def check_variation(columns: Columns, name: str) -> None:
 
 
 def write_csv(path: Path, header: Sequence[str], columns: Sequence[Floats | Sequence[object]]) -> None:
-    """Write columns of equal length as CSV, numbers with all their digits.
+    """Write columns of equal length as CSV, numbers with all their digits and formulas as texts; see `write_blocks`.
 
     Raises DataError if the file cannot be written.
     """
-    plain = [column.tolist() if isinstance(column, np.ndarray) else column for column in columns]
+    write_blocks(path, header, [columns])
+
+
+def write_blocks(
+    path: Path,
+    header: Sequence[str],
+    blocks: Iterable[Sequence[Floats | Sequence[object]]],
+    *,
+    escape_formulas: bool = True,
+) -> None:
+    """Write blocks of columns, one below the other, as CSV.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    header : sequence of str
+        Heads of the columns.
+    blocks : iterable
+        Columns of equal length.
+    escape_formulas : bool
+        Whether an apostrophe is put before a text that a spreadsheet would take for a formula, which may start
+        programs (https://owasp.org/www-community/attacks/CSV_Injection). Numbers stay as they are, also as texts.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be written.
+    """
+    shown = _as_text if escape_formulas else _as_it_is
     try:
         with path.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
-            writer.writerow(header)
-            writer.writerows(zip(*plain, strict=True))
+            writer.writerow(map(shown, header))
+            for columns in blocks:
+                plain = [
+                    column.tolist() if isinstance(column, np.ndarray) else list(map(shown, column))
+                    for column in columns
+                ]
+                writer.writerows(zip(*plain, strict=True))
     except OSError as error:
         raise DataError(f"{path} cannot be written: {error}") from None
+
+
+def _as_it_is(cell: object) -> object:
+    return cell
+
+
+def _as_text(cell: object) -> object:
+    """Return a cell that no spreadsheet takes for a formula."""
+    if not isinstance(cell, str) or not cell.startswith(_FORMULAS):
+        return cell
+    try:
+        float(cell)
+    except ValueError:
+        return f"'{cell}"
+    return cell
 
 
 def _reader(path: Path) -> Callable[[Path, Sequence[str], ReadingOptions], ReadColumns]:
@@ -173,7 +225,7 @@ def _from_run(path: Path, names: Sequence[str], chosen: str, at_least: int) -> C
                 raise DataError(f"{path}: has no column {name!r}; it has: {', '.join(known)}")
         values = {name: table[name] for name in names}
         units = {name: record.unit(name) for name in names}
-        if chosen == _STEPS and len(table) < at_least and (ticks := len(record.telemetry())) >= at_least:
+        if chosen == _STEPS and len(table) < at_least and (ticks := record.count("telemetry")) >= at_least:
             other = f"; --table {_TELEMETRY} takes the {ticks} readings within its steps"
             _check_rows(path, len(table), at_least, other)
     for name, column in values.items():

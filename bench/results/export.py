@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import json
+import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator
+from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -12,20 +13,23 @@ from typing import Any
 from bench.errors import ConfigurationError, DataError
 from bench.extras import needed_for
 from bench.journal import Record
+from bench.parsing import json_text, write_json_file
 from bench.results.bluesky_documents import write_documents
-from bench.results.data import write_csv
-from bench.results.typed_tables import Column, metadata_of, typed_tables
+from bench.results.data import write_blocks
+from bench.results.typed_tables import TypedTable, metadata_of, typed_tables
 from bench.runs import RECORDING_NAME
 
 FORMATS = ("csv", "parquet", "bluesky", "rrd", "png")
 """What a run can be exported to."""
 
 
-def export_run(run: Path, format_: str, out: Path | None) -> list[Path]:
+def export_run(run: Path, format_: str, out: Path | None, *, escape_formulas: bool = True) -> list[Path]:
     """Write a run for other programs; return the files.
 
     `csv` and `parquet` are readings, telemetry and events, with the metadata beside or in the schema; `bluesky` are
-    documents as JSON lines; `rrd` is the recording, `png` a picture of the dashboard.
+    documents as JSON lines; `rrd` is the recording, `png` a picture of the dashboard. `escape_formulas` is that of
+    `bench.results.data.write_blocks`, for CSV. Rows are read and written in blocks, and a file is there only as a
+    whole.
 
     Raises
     ------
@@ -48,21 +52,37 @@ def export_run(run: Path, format_: str, out: Path | None) -> list[Path]:
             return [_picture(record, folder)]
         if format_ == "bluesky":
             path = folder / "documents.jsonl"
-            write_documents(record, path)
+            with _made_whole(path) as part:
+                write_documents(record, part)
             return [path]
-        tables, metadata = typed_tables(record), metadata_of(record)
-    paths = []
-    for name, columns in tables.items():
-        paths.append(folder / f"{name}.{format_}")
-        if format_ == "csv":
-            cells = [[_cell(value) for value in column.values] for column in columns]
-            write_csv(paths[-1], [column.head for column in columns], cells)
-        else:
-            _write_parquet(paths[-1], columns, metadata)
+        metadata = metadata_of(record)
+        paths = []
+        for name, table in typed_tables(record).items():
+            paths.append(folder / f"{name}.{format_}")
+            with _made_whole(paths[-1]) as part:
+                if format_ == "csv":
+                    heads = [column.head for column in table.columns]
+                    blocks = ([list(map(_cell, values)) for values in block] for block in table.blocks)
+                    write_blocks(part, heads, blocks, escape_formulas=escape_formulas)
+                else:
+                    _write_parquet(part, table, metadata)
     if format_ == "csv":
         paths.append(folder / "metadata.json")
-        _write_text(paths[-1], json.dumps(metadata, indent=1, ensure_ascii=False, default=str) + "\n")
+        write_json_file(paths[-1], metadata)
     return paths
+
+
+@contextmanager
+def _made_whole(path: Path) -> Iterator[Path]:
+    """Give another name to write a file under, which becomes the file once it is whole."""
+    part = path.with_name(f"{path.name}.{os.getpid()}.part")
+    try:
+        yield part
+        part.replace(path)
+    except OSError as error:
+        raise DataError(f"{path} cannot be written: {error.strerror}") from None
+    finally:
+        part.unlink(missing_ok=True)
 
 
 def make_folder(path: Path) -> Path:
@@ -107,13 +127,6 @@ def _cell(value: Any) -> Any:  # noqa: ANN401 - of any kind of column
     return "" if value is None else value
 
 
-def _write_text(path: Path, text: str) -> None:
-    try:
-        path.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise DataError(f"{path} cannot be written: {error.strerror}") from None
-
-
 def _pyarrow() -> Any:  # noqa: ANN401 - a module
     # Takes a fifth of a second to import.
     with needed_for("a parquet file", "report"):
@@ -122,7 +135,7 @@ def _pyarrow() -> Any:  # noqa: ANN401 - a module
     return pa
 
 
-def _write_parquet(path: Path, columns: Sequence[Column], metadata: dict[str, Any]) -> None:
+def _write_parquet(path: Path, table: TypedTable, metadata: dict[str, Any]) -> None:
     pa = _pyarrow()
     types = {
         "integer": pa.int64(),
@@ -137,11 +150,13 @@ def _write_parquet(path: Path, columns: Sequence[Column], metadata: dict[str, An
             types[column.kind],
             metadata={"name": column.name, "unit": column.unit, "description": column.description},
         )
-        for column in columns
+        for column in table.columns
     ]
-    schema = pa.schema(fields, metadata={"bench": json.dumps(metadata, ensure_ascii=False, default=str)})
-    arrays = [pa.array(column.values, type=types[column.kind]) for column in columns]
+    schema = pa.schema(fields, metadata={"bench": json_text(metadata)})
     try:
-        pa.parquet.write_table(pa.table(arrays, schema=schema), path)
+        with pa.parquet.ParquetWriter(path, schema) as writer:
+            for block in table.blocks:
+                arrays = [pa.array(values, type=field.type) for values, field in zip(block, fields, strict=True)]
+                writer.write_table(pa.table(arrays, schema=schema))
     except OSError as error:
         raise DataError(f"{path} cannot be written: {error}") from None

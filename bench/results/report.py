@@ -29,9 +29,11 @@ from bench.results.models import ComparedModels, IdentifiedFile, errors_json
 from bench.results.models_on_run import ModelOnRun, apply_models, models_of
 from bench.results.page.render import write_page
 from bench.results.page.run_page import run_page
+from bench.results.page.run_parts import watched_pairs
 from bench.results.prediction_figures import draw_predictions
 from bench.results.predictions import Predictions
 from bench.results.published import Published
+from bench.results.telemetry_summary import TelemetrySummary, summarize, wider
 from bench.results.tracking import results_json
 from bench.units import format_numbers, with_unit
 
@@ -86,7 +88,8 @@ def report_run(
         if remark := record.remark():
             print_plain(console, remark)
         _print_status(record, len(steps), console)
-        extremes = _extremes(record, steps)
+        summary = summarize(record, watched_pairs(record))
+        extremes = _extremes(record, steps, summary)
         _print_extremes(record, extremes, console)
         _print_events(record, console)
         for line in lateness_lines(record.meta.get("lateness", {})):
@@ -104,7 +107,7 @@ def report_run(
         _print_comparison(comparison, applied, record, console)
         found = {"extremes": extremes, "models": comparison, **control}
         if page is not None:
-            write_page(page, run_page(record, steps, applied, found, published))
+            write_page(page, run_page(record, steps, summary, applied, found, published))
     for path in [*figures, *more]:
         print_plain(console, f"figure: {path}")
     if page is not None:
@@ -173,13 +176,10 @@ def _print_status(record: Record, steps: int, console: Console) -> None:
         console.print(f"  {device}: {state}", highlight=False, markup=False)
 
 
-def _extremes(record: Record, steps: Table) -> dict[str, dict[str, Any]]:
-    telemetry = record.telemetry()
+def _extremes(record: Record, steps: Table, summary: TelemetrySummary) -> dict[str, dict[str, Any]]:
     extremes: dict[str, dict[str, Any]] = {}
     for signal in record.signals:
-        values = np.concatenate([steps[signal.name], telemetry[signal.name]])
-        values = values[np.isfinite(values)]
-        low, high = (float(values.min()), float(values.max())) if values.size else (None, None)
+        low, high = wider(summary.extremes[signal.name], steps[signal.name])
         extremes[signal.name] = {"low": low, "high": high, "unit": signal.unit}
     return extremes
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from bench.journal import Record
+from bench.journal import Record, Table
 from bench.protocol import LATENESS
 
 Floats = npt.NDArray[np.float64]
@@ -126,14 +126,14 @@ def target_results(record: Record, output: str) -> TargetResults | None:
 
 def following_result(record: Record, output: str) -> FollowingResult | None:
     """Return a moving reference and its output, or None if there was none; arguments as `target_results`."""
-    ticks = record.telemetry()
-    if "reference" not in ticks.columns:
+    ticks = ticks_with(record, "reference", ("t", "step", output))
+    if ticks is None:
         return None
     parts = [ticks.ticks_of(step) for step in record.step_records() if step.label == FOLLOW]
     columns = [np.concatenate([part[name] for part in parts]) for name in ("t", "reference", output)] if parts else []
-    if not parts or not (rows := np.isfinite(columns[1])).any():
+    if not parts or not columns[0].size:
         return None
-    times, reference, outputs = (column[rows] for column in columns)
+    times, reference, outputs = columns
     return FollowingResult(times - times[0], reference, outputs)
 
 
@@ -142,14 +142,32 @@ def loop_results(record: Record, output: str) -> dict[str, LoopResult]:
 
     It is empty if the run had no such loop with a reference.
     """
-    ticks = record.telemetry()
-    if not {"reference", LATENESS.name} <= ticks.columns.keys():
-        return {}
-    reference = ticks["reference"]
-    rows = np.isfinite(reference) & np.isfinite(ticks[LATENESS.name])
     witness = record.meta.get("slots", {}).get(WITNESS, {}).get("signal", "")
+    ticks = ticks_with(record, "reference", (LATENESS.name, output, witness))
+    if ticks is None or LATENESS.name not in ticks.columns:
+        return {}
+    rows = np.isfinite(ticks[LATENESS.name])
+    reference = ticks["reference"][rows]
     signals = [name for name in (output, witness) if name in ticks.columns and np.isfinite(ticks[name][rows]).all()]
-    return {name: LoopResult(reference[rows], ticks[name][rows]) for name in signals} if rows.any() else {}
+    return {name: LoopResult(reference, ticks[name][rows]) for name in signals} if rows.any() else {}
+
+
+def ticks_with(record: Record, signal: str, others: Sequence[str] = ()) -> Table | None:
+    """Return the ticks at which a signal has a finite value: the columns of it and of others, those that there are.
+
+    None if the record has no such signal. What is kept of a long run are these columns of these ticks only.
+    """
+    columns = ("t", "step", *(each.name for each in record.signals))
+    names = [name for name in dict.fromkeys((signal, *others)) if name in columns]
+    if signal not in columns:
+        return None
+    parts: dict[str, list[Floats]] = {name: [np.empty(0)] for name in names}
+    for ticks in record.ticks():
+        if (rows := np.isfinite(ticks[signal])).any():
+            for name, several in parts.items():
+                several.append(ticks[name][rows])
+    units = {name: record.unit(name) for name in names}
+    return Table({name: np.concatenate(parts.pop(name)) for name in names}, units)
 
 
 def results_json(record: Record, output: str) -> Mapping[str, Any]:

@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
-from typing import Any, Literal, TypeAlias
+from itertools import islice
+from typing import Any, Literal, TypeAlias, TypeVar
 
 import numpy as np
 
 from bench.interlocks import SETPOINT
-from bench.journal import Record, Table
+from bench.journal import Record
 from bench.units import header_with_unit
 
 Kind: TypeAlias = Literal["integer", "number", "truth", "text", "time"]
+T = TypeVar("T")
+
+_PORTION = 4096
+"""Rows that are read together."""
 
 
 @dataclass(frozen=True)
@@ -27,8 +32,6 @@ class Column:
         The unit is empty for what has none.
     kind : {"integer", "number", "truth", "text", "time"}
         Type of its values; a time is a `datetime` in UTC.
-    values : sequence
-        None where there is no value.
     description : str
         What it is, in a few words.
     """
@@ -36,7 +39,6 @@ class Column:
     name: str
     unit: str
     kind: Kind
-    values: Sequence[Any]
     description: str
 
     @property
@@ -45,8 +47,29 @@ class Column:
         return header_with_unit(self.name, self.unit)
 
 
-def typed_tables(record: Record) -> dict[str, list[Column]]:
-    """Return readings, telemetry and events of a run by name, each as columns of equal length.
+Block: TypeAlias = Sequence[Sequence[Any]]
+"""Some rows of a table: the values of each column, None where there is no value."""
+
+
+@dataclass(frozen=True)
+class TypedTable:
+    """A table that is read in blocks, as it may be longer than the memory.
+
+    Attributes
+    ----------
+    columns : tuple of Column
+        Its columns.
+    blocks : iterator of blocks
+        Its rows in their order, each block a list of values a column; read once. Raises DataError if the record is
+        damaged.
+    """
+
+    columns: tuple[Column, ...]
+    blocks: Iterator[Block]
+
+
+def typed_tables(record: Record) -> dict[str, TypedTable]:
+    """Return readings, telemetry and events of a run by name; the record stays open while they are read.
 
     Times of day are laboratory times counted from the epoch of the run: one base for all tables.
 
@@ -76,78 +99,114 @@ def metadata_of(record: Record) -> dict[str, Any]:
     return {**record.meta, "status": record.status, "signals": signals, "missing_rows": missing}
 
 
-def _readings(record: Record, epoch: datetime) -> list[Column]:
-    steps, records = record.steps(), list(record.step_records())
+def _readings(record: Record, epoch: datetime) -> TypedTable:
     # Set-points as the protocol sent them in this step; those that stood are signals.
     actuators = [name.removesuffix(SETPOINT) for name in (s.name for s in record.signals) if name.endswith(SETPOINT)]
-    commanded = dict.fromkeys([*actuators, *(name for each in records for name in each.setpoints)])
-    return [
-        Column("step", "", "integer", [each.step for each in records], "number of the step"),
-        *_times(epoch, "started", [each.started for each in records], "begin of the step", time_of_day=False),
-        *_times(epoch, "finished", [each.finished for each in records], "reading of the step"),
-        Column("phase", "", "text", [each.phase for each in records], "phase of the protocol"),
-        Column("label", "", "text", [each.label for each in records], "what the protocol calls the step"),
-        Column("settled", "", "truth", [not each.settled.failed for each in records], "whether it settled"),
-        Column("settling", "", "text", [each.settled.value for each in records], "how it settled"),
+    commanded = dict.fromkeys(actuators)
+    for step in record.step_records():
+        commanded |= dict.fromkeys(step.setpoints)
+
+    def blocks() -> Iterator[Block]:
+        for records in _portions(record.step_records()):
+            finished = [each.finished for each in records]
+            yield [
+                [each.step for each in records],
+                [each.started for each in records],
+                finished,
+                _absolute(epoch, finished),
+                [each.phase for each in records],
+                [each.label for each in records],
+                [not each.settled.failed for each in records],
+                [each.settled.value for each in records],
+                *([each.setpoints.get(name) for each in records] for name in commanded),
+                *(list(map(_known, values)) for values in zip(*(each.values for each in records), strict=True)),
+            ]
+
+    columns = (
+        Column("step", "", "integer", "number of the step"),
+        Column("started", "s", "number", "begin of the step, laboratory time"),
+        *_times("finished", "reading of the step"),
+        Column("phase", "", "text", "phase of the protocol"),
+        Column("label", "", "text", "what the protocol calls the step"),
+        Column("settled", "", "truth", "whether it settled"),
+        Column("settling", "", "text", "how it settled"),
         *(
             Column(
                 f"commanded {name}",
                 _unit(record, f"{name}{SETPOINT}"),
                 "number",
-                [each.setpoints.get(name) for each in records],
                 f"set-point that the step sent to {name}",
             )
             for name in commanded
         ),
-        *_signals(record, steps),
-    ]
+        *_signals(record),
+    )
+    return TypedTable(columns, blocks())
 
 
-def _telemetry(record: Record, epoch: datetime) -> list[Column]:
-    ticks = record.telemetry()
-    numbers = ticks["step"].astype(np.int64).tolist()
-    of_steps = {each.step: (each.phase, each.label) for each in record.step_records()}
-    places = [of_steps.get(number, (None, None)) for number in numbers]
-    return [
-        *_times(epoch, "t", ticks["t"].tolist(), "time of the tick"),
-        Column("step", "", "integer", numbers, "step that the tick belongs to; -1 on the way back of a resumed run"),
-        Column("phase", "", "text", [phase for phase, _ in places], "phase of that step"),
-        Column("label", "", "text", [label for _, label in places], "what the protocol calls that step"),
-        *_signals(record, ticks),
-    ]
+def _telemetry(record: Record, epoch: datetime) -> TypedTable:
+    def blocks() -> Iterator[Block]:
+        for ticks in record.ticks():
+            numbers = ticks["step"].astype(np.int64).tolist()
+            places = record.places(min(numbers), max(numbers))
+            times = ticks["t"].tolist()
+            yield [
+                times,
+                _absolute(epoch, times),
+                numbers,
+                *([places.get(number, (None, None))[i] for number in numbers] for i in range(2)),
+                *(list(map(_known, ticks[signal.name].tolist())) for signal in record.signals),
+            ]
+
+    columns = (
+        *_times("t", "time of the tick"),
+        Column("step", "", "integer", "step that the tick belongs to; -1 on the way back of a resumed run"),
+        Column("phase", "", "text", "phase of that step"),
+        Column("label", "", "text", "what the protocol calls that step"),
+        *_signals(record),
+    )
+    return TypedTable(columns, blocks())
 
 
-def _events(record: Record, epoch: datetime) -> list[Column]:
-    events = record.events()
-    return [
-        *_times(epoch, "t", [each.t for each in events], "time of the event"),
-        Column("level", "", "text", [each.level for each in events], "INFO, WARN or ERROR"),
-        Column("kind", "", "text", [each.kind for each in events], "kind of event"),
-        Column("text", "", "text", [each.text for each in events], "what happened"),
-    ]
+def _events(record: Record, epoch: datetime) -> TypedTable:
+    def blocks() -> Iterator[Block]:
+        for events in _portions(record.each_event()):
+            times = [each.t for each in events]
+            texts = ([each.level for each in events], [each.kind for each in events], [each.text for each in events])
+            yield [times, _absolute(epoch, times), *texts]
+
+    columns = (
+        *_times("t", "time of the event"),
+        Column("level", "", "text", "INFO, WARN or ERROR"),
+        Column("kind", "", "text", "kind of event"),
+        Column("text", "", "text", "what happened"),
+    )
+    return TypedTable(columns, blocks())
 
 
-def _times(
-    epoch: datetime, name: str, seconds: Sequence[float], description: str, *, time_of_day: bool = True
-) -> list[Column]:
-    columns = [Column(name, "s", "number", seconds, f"{description}, laboratory time")]
-    if time_of_day:
-        absolute = [epoch + timedelta(seconds=each) for each in seconds]
-        columns.append(Column("time", "", "time", absolute, f"{description}, time of day"))
-    return columns
+def _portions(entries: Iterable[T]) -> Iterator[list[T]]:
+    entries = iter(entries)
+    while portion := list(islice(entries, _PORTION)):
+        yield portion
 
 
-def _signals(record: Record, table: Table) -> list[Column]:
-    return [
-        Column(
-            signal.name,
-            signal.unit,
-            "number",
-            [None if math.isnan(value) else value for value in table[signal.name].tolist()],
-            signal.description,
-        )
-        for signal in record.signals
-    ]
+def _times(name: str, description: str) -> tuple[Column, Column]:
+    return (
+        Column(name, "s", "number", f"{description}, laboratory time"),
+        Column("time", "", "time", f"{description}, time of day"),
+    )
+
+
+def _absolute(epoch: datetime, seconds: Sequence[float]) -> list[datetime]:
+    return [epoch + timedelta(seconds=each) for each in seconds]
+
+
+def _signals(record: Record) -> list[Column]:
+    return [Column(signal.name, signal.unit, "number", signal.description) for signal in record.signals]
+
+
+def _known(value: float) -> float | None:
+    return None if math.isnan(value) else value
 
 
 def _unit(record: Record, signal: str) -> str:

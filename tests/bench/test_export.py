@@ -3,13 +3,22 @@
 import csv
 import json
 import shutil
+import sqlite3
+import tracemalloc
+from contextlib import closing
 from datetime import UTC, datetime, timedelta
 
+import numpy as np
 import pytest
-from written_run import META, write_run
+from written_run import META, SIGNALS, write_run
 
-from bench.journal import FILE_NAME, Record
+from bench.journal import FILE_NAME, Event, Journal, Record, StepRecord
+from bench.journal.recovery import recover
 from bench.results.bluesky_documents import documents
+from bench.results.data import write_csv
+from bench.results.export import export_run
+from bench.results.telemetry_summary import summarize
+from bench.settling import Settled
 
 EPOCH = datetime(2000, 1, 1, tzinfo=UTC)
 STEPS = 20
@@ -172,3 +181,136 @@ def test_an_unfinished_run_is_exported_as_far_as_it_is(unfinished, tmp_path, ben
         found = [json.loads(line, parse_constant=refuse) for line in lines]
         rows = [document["data"] for name, document in found if name == "event" and "plate" in document["data"]]
         assert ["tip" in row for row in rows[:3]] == [False, False, True]
+
+
+class TestFormulas:
+    FORMULA = '=HYPERLINK("http://example.com","x")'
+
+    @pytest.fixture
+    def noted(self, tmp_path):
+        folder = tmp_path / "run"
+        folder.mkdir()
+        journal = Journal(folder / FILE_NAME, SIGNALS, {**META, "overrides": {}})
+        for text in (self.FORMULA, "+1+cmd|' /C calc'!A0", "-2+3", "@SUM(A1)", "\t=1", "-5.0", "plain"):
+            journal.event(Event(0.0, "INFO", "note", text))
+        values = (-1.0, -2.0, -3e-6, 0.0)
+        journal.step(StepRecord(0, 0.0, 1.0, "=phase", "-5", Settled.DWELL, {"plate": -1.0}, values))
+        journal.close()
+        return folder
+
+    def rows(self, folder, name):
+        with (folder / f"{name}.csv").open(newline="", encoding="utf-8") as file:
+            return list(csv.DictReader(file))
+
+    def test_are_texts_for_a_spreadsheet(self, noted, tmp_path, bench):
+        assert bench("export", noted, "--format", "csv", "--out", tmp_path)[0] == 0
+        texts = [row["text"] for row in self.rows(tmp_path, "events")]
+        assert texts[0] == f"'{self.FORMULA}"
+        assert [text[0] for text in texts] == ["'"] * 5 + ["-", "p"]
+        (reading,) = self.rows(tmp_path, "readings")
+        # Numbers are none, nor texts that are numbers.
+        assert (reading["phase"], reading["label"], reading["plate [°C]"]) == ("'=phase", "-5", "-2.0")
+
+    def test_are_as_they_were_recorded_where_that_is_asked_for(self, noted, tmp_path, bench):
+        assert bench("export", noted, "--format", "csv", "--formulas", "--out", tmp_path)[0] == 0
+        assert self.rows(tmp_path, "events")[0]["text"] == self.FORMULA
+
+    def test_of_a_name_in_a_head_is_one_too(self, tmp_path):
+        write_csv(tmp_path / "a.csv", ["=1+1", "b"], [[1.0], [-2.0]])
+        assert (tmp_path / "a.csv").read_text().splitlines() == ["'=1+1,b", "1.0,-2.0"]
+
+
+@pytest.fixture(scope="module")
+def long_runs(tmp_path_factory):
+    """Two runs, one with three times as many ticks as the other."""
+    folders = []
+    for count in (10_000, 30_000):
+        folder = tmp_path_factory.mktemp(f"long-{count}")
+        journal = Journal(folder / FILE_NAME, SIGNALS, {**META, "overrides": {}}, flushed=False)
+        for i in range(count):
+            journal.telemetry(0.01 * i, 0, (50.0, 50.0 + (i == count // 3), 1e-6 * (i % 100), 0.0))
+        values = (50.0, 50.0, 1e-6, 0.0)
+        journal.step(StepRecord(0, 0.0, 0.01 * count, "loops", "", Settled.DWELL, {"plate": 50.0}, values))
+        journal.finish(status="completed", reason="", finished=0.01 * count, safe_state={"plate": "safe"})
+        journal.close()
+        folders.append(folder)
+    return folders
+
+
+def peak(work):
+    """Return the peak of the memory of Python and numpy that work takes, bytes."""
+    tracemalloc.start()
+    try:
+        work()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+class TestLongRuns:
+    @pytest.mark.slow
+    @pytest.mark.parametrize("kind", ["csv", "parquet", "bluesky"])
+    def test_an_export_takes_no_more_memory_for_more_rows(self, long_runs, tmp_path, kind):
+        export_run(long_runs[0], kind, tmp_path / "first")
+        short, long = (peak(lambda run=run: export_run(run, kind, tmp_path / run.name)) for run in long_runs)
+        assert long - short < 10 * 20_000
+
+    def test_a_summary_of_the_telemetry_has_its_extremes_and_no_more_rows(self, long_runs):
+        for run, count in zip(long_runs, (10_000, 30_000), strict=True):
+            with Record(run) as record:
+                summary = summarize(record, [("plate", "plate_setpoint")])
+                whole = record.telemetry()
+            assert summary.count == count
+            assert len(summary.shown) <= 20_000
+            assert bool(summary.remark) == (count > 20_000)
+            for name in ("plate", "tip", "lateness"):
+                assert summary.extremes[name] == (whole[name].min(), whole[name].max())
+                assert (summary.shown[name].min(), summary.shown[name].max()) == summary.extremes[name]
+            assert summary.differences["plate", "plate_setpoint"] == (0.0, 1.0)
+            assert (summary.shown["t"][0], summary.shown["t"][-1]) == (whole["t"][0], whole["t"][-1])
+            assert (np.diff(summary.shown["t"]) > 0.0).all()
+
+    @pytest.mark.slow
+    def test_a_summary_takes_no_more_memory_for_more_rows(self, long_runs):
+        def read(run):
+            with Record(run) as record:
+                summarize(record)
+
+        short, long = (peak(lambda run=run: read(run)) for run in long_runs)
+        assert long - short < 10 * 20_000
+
+    @pytest.mark.slow
+    def test_a_page_says_that_a_figure_has_not_every_tick(self, long_runs, tmp_path, bench):
+        for run, is_whole in zip(long_runs, (True, False), strict=True):
+            assert bench("report", run, "--out", tmp_path / run.name)[0] == 0
+            page = (tmp_path / run.name / "report.html").read_text(encoding="utf-8")
+            assert ("ticks" in page and "are drawn" in page) is not is_whole
+
+    @pytest.mark.slow
+    def test_recovery_takes_no_more_memory_for_more_rows(self, long_runs, tmp_path):
+        short, long = (peak(lambda run=run: recover(damaged(run, tmp_path / run.name))) for run in long_runs)
+        assert long - short < 10 * 20_000
+
+
+def damaged(run, folder):
+    """Return a copy of a run that lacks a row."""
+    copy = shutil.copytree(run, folder)
+    with closing(sqlite3.connect(copy / FILE_NAME)) as db, db:
+        db.execute("DELETE FROM telemetry WHERE tick = 1000")
+    return copy
+
+
+def test_a_damaged_record_leaves_the_files_that_are_there(run, tmp_path, bench):
+    out = tmp_path / "out"
+    assert bench("export", run, "--format", "csv", "--out", out)[0] == 0
+    before = {path.name: path.read_bytes() for path in out.iterdir()}
+    copy = shutil.copytree(run, tmp_path / "run")
+    with closing(sqlite3.connect(copy / FILE_NAME)) as db, db:
+        db.execute("UPDATE telemetry SET t = 5 WHERE tick = 15")
+    for kind in ("csv", "parquet", "bluesky"):
+        assert bench("export", copy, "--format", kind, "--out", out)[0] == 3
+    left = {path.name: path.read_bytes() for path in out.iterdir()}
+    assert {name: left[name] for name in before if name != "readings.csv"} == {
+        name: content for name, content in before.items() if name != "readings.csv"
+    }
+    assert not [name for name in left if name.endswith(".part")]

@@ -33,7 +33,8 @@ from bench.results.page.run_parts import (
 )
 from bench.results.page.svg import inlined
 from bench.results.published import Published, concerning
-from bench.results.tracking import FollowingResult, following_result, target_results
+from bench.results.telemetry_summary import TelemetrySummary
+from bench.results.tracking import FollowingResult, following_result, target_results, ticks_with
 from bench.units import fitting_prefix, format_duration, format_numbers, with_unit
 
 Floats = npt.NDArray[np.float64]
@@ -46,6 +47,7 @@ _LATENESS = "lateness"
 def run_page(
     record: Record,
     steps: Table,
+    summary: TelemetrySummary,
     models: Sequence[ModelOnRun],
     result: Mapping[str, Any],
     published: Sequence[Published] = (),
@@ -58,6 +60,8 @@ def run_page(
         The run.
     steps : Table
         Its readings.
+    summary : TelemetrySummary
+        Its telemetry.
     models : sequence of ModelOnRun
         Models to show beside the readings.
     result : mapping
@@ -65,18 +69,18 @@ def run_page(
     published : sequence of Published
         Numbers of papers; those that concern the run are shown.
     """
-    meta, events, telemetry = record.meta, record.events(), record.telemetry()
+    meta, events = record.meta, record.events()
     extremes = result["extremes"]
     found = phases(record, steps, events)
     stated = concerning(published, meta)
     sections: list[PageSection] = []
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder)
-        if (control := _control_section(record, telemetry, result, stated, scratch)) is not None:
+        if (control := _control_section(record, result, stated, scratch)) is not None:
             sections.append(control)
         if models:
             sections.append(models_section(models, steps["finished"], scratch))
-        elif (loops := _loops_section(record, _samples(steps, telemetry)[0], scratch)) is not None:
+        elif (loops := _loops_section(record, steps, summary, scratch)) is not None:
             sections.append(loops)
         if stated:
             sections.append(published_section(stated, result))
@@ -84,12 +88,12 @@ def run_page(
             sections.append(given_section(list(given.items()), scratch))
         sections += [
             phases_section(found),
-            _signals_section(record, steps, telemetry, extremes, scratch),
-            interlocks_section(record, (steps, telemetry), extremes, events),
+            _signals_section(record, steps, summary, extremes, scratch),
+            interlocks_section(record, steps, summary, extremes, events),
             parameters_section(meta),
             devices_section(meta),
         ]
-        if (late := _lateness_section(record, telemetry, scratch)) is not None:
+        if (late := _lateness_section(record, scratch)) is not None:
             sections.append(late)
         sections += [events_section(events), repeat_section(record)]
     return Page(
@@ -168,10 +172,10 @@ def _errors_in_words(record: Record, controlled: str, errors: Mapping[str, float
 
 
 def _control_section(
-    record: Record, telemetry: Table, result: Mapping[str, Any], stated: Sequence[Published], scratch: Path
+    record: Record, result: Mapping[str, Any], stated: Sequence[Published], scratch: Path
 ) -> PageSection | None:
     controlled = str(record.meta.get("controls", ""))
-    followed = _followed(record, telemetry, controlled)
+    followed = _followed(record, controlled)
     if not controlled or not ("tracking" in result or followed is not None):
         return None
     unit, precision = record.unit(controlled), _precision(record, controlled)
@@ -219,22 +223,28 @@ def _control_section(
     return PageSection("Control", parts)
 
 
-def _followed(record: Record, telemetry: Table, controlled: str) -> FollowingResult | None:
+def _followed(record: Record, controlled: str) -> FollowingResult | None:
     """Return a moving reference and its output; of a protocol that marks none, whatever reference there was."""
     if (found := following_result(record, controlled)) is not None:
         return found
-    if not {"reference", controlled} <= telemetry.columns.keys():
+    ticks = ticks_with(record, "reference", ("t", controlled))
+    if ticks is None or controlled not in ticks.columns:
         return None
-    rows = np.isfinite(telemetry["reference"]) & np.isfinite(telemetry[controlled])
+    rows = np.isfinite(ticks[controlled])
     if rows.sum() < 2:
         return None
-    times = telemetry["t"][rows]
-    return FollowingResult(times - times[0], telemetry["reference"][rows], telemetry[controlled][rows])
+    times = ticks["t"][rows]
+    return FollowingResult(times - times[0], ticks["reference"][rows], ticks[controlled][rows])
 
 
-def _samples(steps: Table, telemetry: Table) -> tuple[Table, str]:
-    """Return the table of samples, and its column of times: a loop at a fixed rate is one step of many ticks."""
-    return (steps, "finished") if len(steps) > 1 else (telemetry, "t")
+def _samples(steps: Table, summary: TelemetrySummary) -> tuple[Table, str, str]:
+    """Return the table of samples, its column of times, and what a figure of it says beside its caption.
+
+    A loop at a fixed rate is one step of many ticks.
+    """
+    if len(steps) > 1:
+        return steps, "finished", ""
+    return summary.shown, "t", summary.remark and f" {summary.remark}"
 
 
 def _targets_table(targets: Floats, outputs: Floats, seconds: Floats, unit: str) -> PageTable:
@@ -253,7 +263,8 @@ def _targets_table(targets: Floats, outputs: Floats, seconds: Floats, unit: str)
     return PageTable(heads, rows, title="targets", folded=True, numbers_from=1)
 
 
-def _loops_section(record: Record, samples: Table, scratch: Path) -> PageSection | None:
+def _loops_section(record: Record, steps: Table, summary: TelemetrySummary, scratch: Path) -> PageSection | None:
+    samples, _, remark = _samples(steps, summary)
     layout = record.meta.get("dashboard")
     if not layout or len(samples) == 0:
         return None
@@ -272,16 +283,20 @@ def _loops_section(record: Record, samples: Table, scratch: Path) -> PageSection
             labels.append(with_unit(name, unit))
         path = scratch / f"loop-{i}.svg"
         plot_loops(path, scaled[0], scaled[1], None, input_label=labels[0], output_label=labels[1])
-        caption = f"{names[1]} over {names[0]}, one point a reading."
+        caption = f"{names[1]} over {names[0]}, one point a reading.{remark}"
         figures.append(PageFigure(inlined(path, caption), caption))
     return PageSection("Loops", figures) if figures else None
 
 
 def _signals_section(
-    record: Record, steps: Table, telemetry: Table, extremes: Mapping[str, Mapping[str, Any]], scratch: Path
+    record: Record,
+    steps: Table,
+    summary: TelemetrySummary,
+    extremes: Mapping[str, Mapping[str, Any]],
+    scratch: Path,
 ) -> PageSection:
     parts: list[PageFigure | PageTable | PageText] = [signals_table(record, extremes)]
-    table, over = _samples(steps, telemetry)
+    table, over, remark = _samples(steps, summary)
     names = [signal.name for signal in record.signals if np.isfinite(table[signal.name]).sum() > 1]
     if names:
         path = scratch / "signals.svg"
@@ -292,12 +307,12 @@ def _signals_section(
             columns[name] = factor * table[name]
             labels.append(label if factor == 1.0 else f"{name}\n/ {unit}")
         plot_signals(path, table[over] / 3600.0, columns, labels)
-        caption = f"{'Readings' if table is steps else 'Telemetry'} of all signals over laboratory time."
+        caption = f"{'Readings' if table is steps else 'Telemetry'} of all signals over laboratory time.{remark}"
         parts.append(PageFigure(inlined(path, caption), caption))
     return PageSection("Signals", parts)
 
 
-def _lateness_section(record: Record, telemetry: Table, scratch: Path) -> PageSection | None:
+def _lateness_section(record: Record, scratch: Path) -> PageSection | None:
     parts: list[PageFigure | PageTable | PageText] = []
     for label, each in record.meta.get("lateness", {}).items():
         rate = f" at {each['rate']:g} Hz" if each["rate"] is not None else ""
@@ -306,9 +321,9 @@ def _lateness_section(record: Record, telemetry: Table, scratch: Path) -> PageSe
         note = f"mean {1e3 * each['mean']:.3g} ms, worst {1e3 * each['worst']:.3g} ms"
         rows = [(end, str(count)) for end, count in zip(ends, each["counts"], strict=True) if count]
         parts.append(PageTable(("late by / ms", "samples"), rows, title=title, note=note, numbers_from=0))
-    late = telemetry[_LATENESS] if _LATENESS in telemetry.columns else np.empty(0)
-    late = late[np.isfinite(late)]
-    if late.size:
+    ticks = ticks_with(record, _LATENESS)
+    if ticks is not None and len(ticks):
+        late = ticks[_LATENESS]
         path = scratch / "lateness.svg"
         plot_histogram(path, 1e3 * late, label="lateness / ms")
         shares = np.percentile(late, [50, 95, 99, 100]) * 1e3

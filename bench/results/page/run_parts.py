@@ -21,6 +21,7 @@ from bench.journal import Event, Record, Table
 from bench.protocol import ParameterHelp, find_protocol
 from bench.results.page.elements import PageSection, PageTable, PageText
 from bench.results.published import Published
+from bench.results.telemetry_summary import TelemetrySummary, wider
 from bench.units import fitting_prefix, format_duration, format_numbers, with_unit
 
 Floats = npt.NDArray[np.float64]
@@ -181,7 +182,11 @@ def _margin(extremes: Mapping[str, Any], bounds: Sequence[tuple[float, float]]) 
 
 
 def interlocks_section(
-    record: Record, tables: Sequence[Table], extremes: Mapping[str, Mapping[str, Any]], events: Sequence[Event]
+    record: Record,
+    steps: Table,
+    summary: TelemetrySummary,
+    extremes: Mapping[str, Mapping[str, Any]],
+    events: Sequence[Event],
 ) -> PageSection:
     """Return each interlock with what it allows, what was seen, the margin, and how often it acted."""
     rows = []
@@ -189,7 +194,7 @@ def interlocks_section(
         if each.signal not in extremes:
             continue
         unit = extremes[each.signal]["unit"]
-        seen = extremes[each.signal] if not each.minus else _difference(tables, each.signal, each.minus)
+        seen = extremes[each.signal] if not each.minus else _difference(steps, summary, each.signal, each.minus)
         margin = _margin(seen, [(each.low, each.high)])
         acted = [event for event in events if event.kind == "interlock" and event.text.startswith(each.label)]
         rows.append(
@@ -228,11 +233,17 @@ def _with_unit(value: float | None, unit: str) -> str:
     return f"{factor * value:.4g} {'' if shown == '1' else shown}".rstrip()
 
 
-def _difference(tables: Sequence[Table], signal: str, minus: str) -> dict[str, Any]:
-    parts = [table[signal] - table[minus] for table in tables if minus in table.columns]
-    values = np.concatenate(parts) if parts else np.empty(0)
-    values = values[np.isfinite(values)]
-    return {"low": float(values.min()), "high": float(values.max())} if values.size else {"low": None, "high": None}
+def watched_pairs(record: Record) -> list[tuple[str, str]]:
+    """Return the signals of a run whose differences an interlock watched."""
+    names = {signal.name for signal in record.signals}
+    return [(each.signal, each.minus) for each in interlocks_of(record) if {each.signal, each.minus} <= names]
+
+
+def _difference(steps: Table, summary: TelemetrySummary, signal: str, minus: str) -> dict[str, Any]:
+    low = high = None
+    if (signal, minus) in summary.differences:
+        low, high = wider(summary.differences[signal, minus], steps[signal] - steps[minus])
+    return {"low": low, "high": high}
 
 
 def _allowed(interlock: Interlock, unit: str) -> str:
