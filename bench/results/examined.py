@@ -14,6 +14,7 @@ from bench.identification import Errors, measure_errors
 from bench.identification.recalibration import Recalibration
 from bench.model_file import ModelFile
 from bench.results.bands import BandedPrediction, predict_band
+from bench.results.predictions import check_finite
 from bench.results.recalibrations import Session
 from bench.results.times import bind_times
 
@@ -117,18 +118,25 @@ def examine(
     ------
     ConfigurationError
         If the session cannot be estimated, or a model with time has no times.
+    DataError
+        If an output is not finite.
     """
     bound = bind_times(model, times)
     times = times if isinstance(bound, TimedSequence) else None
     units = model.response.input_unit, model.response.output_unit
     if session is None:
-        predicted = np.asarray(bound.evaluate(inputs, state))
+        with np.errstate(over="ignore", invalid="ignore"):
+            predicted = np.asarray(bound.evaluate(inputs, state))
+        check_finite(model.name, "output", predicted, units[1], inputs, "input", units[0])
         return Examined(predicted, measured, None, predict_band(model, inputs, state, times), units, skip)
     if measured is None:
         raise ConfigurationError("--recalibrate needs measured outputs: name their column with --output")
     found = session.estimate(bound, inputs, measured, skip=skip, state=state)
+    with np.errstate(over="ignore", invalid="ignore"):
+        predicted = found.predict(bound, inputs, state)
+    check_finite(model.name, "output", predicted, units[1], inputs, "input", units[0])
     return Examined(
-        found.predict(bound, inputs, state),
+        predicted,
         measured,
         found,
         predict_band(model, inputs + found.values.get("input-offset", 0.0), state, times),

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bench.errors import ConfigurationError
+from bench.errors import ConfigurationError, DataError
 from bench.hysteresis import Policy, Reach
 from bench.hysteresis.timed import TimedSequence
 from bench.model_file import ModelFile
+from bench.results.predictions import check_finite
 from bench.results.starting_state import starting_state
 from bench.results.times import bind_times
 
@@ -138,10 +139,27 @@ def invert_targets(
     Raises
     ------
     DataError
-        If it is a model of several inputs.
+        If it is a model of several inputs, or a set-point or an output is not finite.
     ConfigurationError
         If a model with time has no times or another one has, or it has no inverse at these times.
     """
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = _inverted(model, targets, policy, initial, times, continue_memory=continue_memory)
+    units = model.response.input_unit, model.response.output_unit
+    check_finite(model.name, "set-point", found.setpoints, units[0], targets, "target", units[1])
+    check_finite(model.name, "output", found.predicted, units[1], found.setpoints, "set-point", units[0])
+    return found
+
+
+def _inverted(
+    model: ModelFile,
+    targets: Floats,
+    policy: Policy,
+    initial: str | None,
+    times: Floats | None,
+    *,
+    continue_memory: bool,
+) -> InvertedTargets:
     state = starting_state(model, initial=initial, continue_memory=continue_memory).state
     bound = bind_times(model, times)
     if isinstance(bound, TimedSequence):
@@ -151,7 +169,10 @@ def invert_targets(
             raise ConfigurationError(f"model {model.name} cannot be inverted: {error}") from None
     if times is not None:
         raise ConfigurationError(f"--time: {model.name} is a model without time")
-    found = bound.inverse(policy).follow(targets, state)
+    try:
+        found = bound.inverse(policy).follow(targets, state)
+    except (ValueError, ArithmeticError) as error:
+        raise DataError(f"model {model.name} cannot be inverted: {error}") from None
     flags = tuple(_flags(found.met, targets, found.outputs))
     return InvertedTargets(targets, found.setpoints, found.saturating, found.outputs, flags)
 

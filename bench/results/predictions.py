@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
+from bench.errors import DataError
 from bench.identification import Errors, measure_errors
 from bench.results.bands import BandedPrediction
 from bench.units import header_with_unit
@@ -44,9 +45,29 @@ class Quantity:
         return self.name.removesuffix(f"[{self.unit}]").rstrip() if self.unit else self.name
 
 
+def check_finite(
+    model: str, what: str, values: Floats, unit: str, given: Floats, of_given: str, unit_given: str
+) -> None:
+    """Check that what a model gave for N rows, shape (N,), is finite.
+
+    Raises DataError otherwise: names the model, the first wrong row (from 1), and what it was given there.
+    """
+    wrong = np.flatnonzero(~np.isfinite(values))
+    if wrong.size:
+        row = int(wrong[0])
+        value, at = f"{values[row]:g} {unit}".rstrip(), f"{given[row]:g} {unit_given}".rstrip()
+        raise DataError(
+            f"model {model}: its {what} is {value} in row {row + 1}, where the {of_given} is {at}, and not finite in "
+            f"{wrong.size} of {values.size} rows: its numbers overflow; check its coefficients, and that the input "
+            "is in the range that it was identified for"
+        )
+
+
 @dataclass(frozen=True)
 class Predictions:
     """Outputs of models for one sequence of inputs, beside what was measured.
+
+    Raises DataError if a model has an output that is not finite.
 
     Attributes
     ----------
@@ -73,6 +94,11 @@ class Predictions:
     time: Quantity | None = None
     skip: int = 0
     bands: Mapping[str, BandedPrediction] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Raise DataError if an output is not finite."""
+        for name, values in self.predicted.items():
+            check_finite(name, "output", values, self.unit, self.input.values, "input", self.input.unit)
 
     def residuals(self) -> dict[str, Floats]:
         """Return measured minus predicted output by model, shape (N,) each; none without measurements."""
