@@ -17,7 +17,6 @@ calibration.
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Mapping
 from datetime import date
@@ -33,7 +32,7 @@ from bench.configuration_errors import problems
 from bench.derived import Derived, DerivedSignal
 from bench.devices import Signal
 from bench.errors import DataError, DeviceError
-from bench.parsing import parse_json
+from bench.parsing import parse_json, write_json_file
 
 Floats = NDArray[np.float64]
 
@@ -87,10 +86,7 @@ class Calibration(BaseModel):
 
     def save(self, path: Path) -> None:
         """Write the file; raise DataError if that fails."""
-        try:
-            path.write_text(json.dumps(self.model_dump(mode="json"), indent=1) + "\n", encoding="utf-8")
-        except OSError as error:
-            raise DataError(f"{path}: cannot be written: {error.strerror}") from None
+        write_json_file(path, self.model_dump(mode="json"))
 
 
 def read_calibration(path: Path) -> Calibration:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
-import json
 import os
 import sys
 from collections.abc import Iterator
@@ -16,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from bench import registry
-from bench.parsing import parse_json
+from bench.parsing import json_text, parse_json
 
 
 def listing() -> dict[str, Any]:
@@ -39,7 +38,7 @@ def listing() -> dict[str, Any]:
         with suppress(OSError):
             file.parent.mkdir(parents=True, exist_ok=True)
             made = file.with_name(f"{file.name}.{os.getpid()}")
-            made.write_text(json.dumps({"state": state, "catalogue": found}), encoding="utf-8")
+            made.write_text(json_text({"state": state, "catalogue": found}), encoding="utf-8")
             made.replace(file)
     return found
 

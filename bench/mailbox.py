@@ -6,7 +6,6 @@ the folder is: in another session, on another computer, on Windows, and nothing 
 
 from __future__ import annotations
 
-import json
 import os
 import threading
 from contextlib import suppress
@@ -17,7 +16,7 @@ from typing import Any, Self
 
 from bench.clock import wall_time
 from bench.interrupts import Interrupts
-from bench.parsing import parse_json
+from bench.parsing import json_text, parse_json
 from bench.questions import Question
 
 _NAME = "operator"
@@ -158,7 +157,7 @@ class PanelMailbox:
 def _write(path: Path, content: dict[str, Any]) -> None:
     """Write a file that is never seen half written."""
     part = path.with_name(f"{path.name}.{os.getpid()}.part")
-    part.write_text(json.dumps(content), encoding="utf-8")
+    part.write_text(json_text(content), encoding="utf-8")
     part.replace(path)
 
 

@@ -29,7 +29,6 @@ A file of version 2 is an object with these keys:
 from __future__ import annotations
 
 import importlib.metadata
-import json
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -39,7 +38,7 @@ from typing import TYPE_CHECKING, Any
 from bench.control.dynamics import IdentifiedDynamics
 from bench.errors import DataError
 from bench.hysteresis import Operator, TimedModel, model_class, model_from_json
-from bench.parsing import parse_json
+from bench.parsing import json_text, parse_json
 
 if TYPE_CHECKING:
     from bench.identification.bands import Band
@@ -144,7 +143,7 @@ class ModelFile:
         registered.
         """
         content = self.to_json()
-        text = json.dumps(content, indent=1, ensure_ascii=False)
+        text = json_text(content, indent=1)
         reference = f"{type(self.model).__module__}:{type(self.model).__qualname__}"
         try:
             registered = model_class(self.model.kind)

@@ -9,7 +9,6 @@ A target is a command, the address of a mailbox, or that of a webhook::
 
 from __future__ import annotations
 
-import json
 import os
 import platform
 import queue
@@ -31,6 +30,7 @@ from typing import Any, Self
 from bench.clock import wall_time
 from bench.errors import ConfigurationError
 from bench.journal import Event, StepRecord
+from bench.parsing import json_text
 from bench.redaction import OPTION, redacted
 
 _OCCASIONS = {"pause": "pause", "prompt": "prompt", "warning": "warning", "interlock": "trip", "end": "end"}
@@ -88,7 +88,7 @@ def _call(command: Sequence[str], facts: Facts) -> None:
     said = {f"BENCH_{name.upper()}": str(value) for name, value in facts.items() if not isinstance(value, dict)}
     done = subprocess.run(  # noqa: S603 - the operator's own command
         command,
-        input=json.dumps(facts, ensure_ascii=False).encode(),
+        input=json_text(facts).encode(),
         env={**os.environ, **said},
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
@@ -104,7 +104,7 @@ def _call(command: Sequence[str], facts: Facts) -> None:
 
 
 def _post(url: str, facts: Facts) -> None:
-    body = json.dumps(facts, ensure_ascii=False).encode()
+    body = json_text(facts).encode()
     request = urllib.request.Request(  # noqa: S310 - http and https only, see `sender`
         url, body, {"Content-Type": "application/json", "User-Agent": "actuator-bench"}
     )

@@ -34,11 +34,11 @@ def parse_toml(text: str) -> dict[str, Any]:
 
 
 def json_text(content: Any, *, indent: int | None = None) -> str:  # noqa: ANN401 - anything that JSON can hold
-    """Return a text of JSON, with null for a number that is not finite and the text of what JSON does not know."""
+    """Return a text of JSON, with null for a number that is not finite; raise TypeError for what JSON cannot hold."""
     try:
-        return json.dumps(content, indent=indent, ensure_ascii=False, allow_nan=False, default=str)
+        return json.dumps(content, indent=indent, ensure_ascii=False, allow_nan=False)
     except ValueError:
-        return json.dumps(_finite(content), indent=indent, ensure_ascii=False, allow_nan=False, default=str)
+        return json.dumps(_finite(content), indent=indent, ensure_ascii=False, allow_nan=False)
 
 
 def write_json_file(path: Path, content: Any) -> None:  # noqa: ANN401 - anything that JSON can hold

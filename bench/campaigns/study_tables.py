@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import statistics
 from collections.abc import Mapping, Sequence
@@ -12,7 +11,7 @@ from typing import Any
 
 from rich.console import Console
 
-from bench.parsing import parse_json
+from bench.parsing import parse_json, write_json_file
 from bench.studies import ResultTable, StudyResult
 
 FILE_NAME = "study.json"
@@ -45,7 +44,7 @@ class OverSeeds:
 def write_study(found: StudyResult, folder: Path) -> None:
     """Write values and tables of a study with one seed into its folder."""
     content = {"values": found.values, "tables": [asdict(table) for table in found.tables]}
-    (folder / FILE_NAME).write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    write_json_file(folder / FILE_NAME, content)
 
 
 def print_over_seeds(name: str, folders: Sequence[Path], console: Console) -> str:
@@ -75,8 +74,9 @@ def over_seeds(values: Sequence[Any]) -> Any:  # noqa: ANN401 - as JSON holds it
         }
     if isinstance(first, list):
         return [over_seeds(each) for each in zip(*values, strict=False)]
-    if isinstance(first, (int, float)) and not isinstance(first, bool):
-        return OverSeeds(tuple(values))
+    if first is None or (isinstance(first, (int, float)) and not isinstance(first, bool)):
+        # JSON has null for a number that is not there.
+        return OverSeeds(tuple(math.nan if value is None else value for value in values))
     return first
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import math
 import shutil
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
@@ -19,7 +19,7 @@ from bench.campaigns.study_tables import write_study
 from bench.errors import AbortError, BenchError, DataError
 from bench.journal import FILE_NAME as JOURNAL_NAME
 from bench.journal import Record
-from bench.parsing import parse_json
+from bench.parsing import parse_json, write_json_file
 from bench.protocol import find_protocol
 from bench.results.models import compare_models, identify_file
 from bench.results.recalibrations import Session
@@ -127,7 +127,7 @@ class Task(ABC):
         except BenchError as error:
             return Done(self.identity, "refused", f"{error}{self._way_on(campaign, str(error))}")
         content = {"task": self.describe(), **asdict(done)}
-        (made / DONE_NAME).write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        write_json_file(made / DONE_NAME, content)
         target = campaign / self.name
         target.parent.mkdir(parents=True, exist_ok=True)
         # Nothing is there but what this very task has left when it was done twice, as by a worker thought dead.
@@ -156,7 +156,10 @@ class Task(ABC):
     def _said_in(self, folder: Path) -> Done | None:
         try:
             content = parse_json((folder / DONE_NAME).read_text(encoding="utf-8"))
-            results = {name: (value, unit) for name, (value, unit) in content["results"].items()}
+            results = {
+                name: (math.nan if value is None else value, unit)
+                for name, (value, unit) in content["results"].items()
+            }
             found = Done(content["identity"], content["status"], content["reason"], results)
         except (OSError, ValueError, KeyError, TypeError):
             return None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import sys
 import warnings
@@ -10,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any, NoReturn, TextIO
 
 import typer
 from rich.markup import escape
@@ -18,6 +17,7 @@ from rich.table import Table
 
 from bench.cli.streams import write_out
 from bench.errors import BenchError, ConfigurationError, DataError, IncompleteRecordWarning
+from bench.parsing import json_text
 from bench.printing import PlainConsole, show_table
 
 console = PlainConsole()
@@ -99,9 +99,16 @@ def warn(text: str) -> None:
 def told_of_records() -> Iterator[None]:
     """Print once what is missing in a record that is opened within; `write_json` writes it for programs too."""
 
-    def show(message: Warning | str, category: type[Warning], *others: Any) -> None:  # noqa: ANN401 - of `warnings`
+    def show(
+        message: Warning | str,
+        category: type[Warning],
+        filename: str,
+        lineno: int,
+        file: TextIO | None = None,
+        line: str | None = None,
+    ) -> None:
         if not issubclass(category, IncompleteRecordWarning):
-            otherwise(message, category, *others)
+            otherwise(message, category, filename, lineno, file, line)
         elif str(message) not in _of_records:
             _of_records.append(str(message))
             warn(str(message))
@@ -233,7 +240,7 @@ def write_json(path: Path | None, content: Any) -> None:  # noqa: ANN401 - anyth
         return
     if _of_records and isinstance(content, Mapping):
         content = {**content, "missing_rows": list(_of_records)}
-    text = json.dumps(content, indent=1, ensure_ascii=False) + "\n"
+    text = json_text(content, indent=1) + "\n"
     if path == STANDARD_OUTPUT:
         failure = write_out(text)
     else:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import queue
 import threading
@@ -12,6 +11,7 @@ from typing import Any
 
 from bench.clock import wall_time
 from bench.journal import BLACK_BOX_NAME
+from bench.parsing import json_text
 
 _KEPT = 150
 """Looks that are kept for the record of what went before a trip: 30 s at 5 Hz."""
@@ -38,8 +38,8 @@ class BlackBox:
     def note(self, what: str, **content: Any) -> None:  # noqa: ANN401 - anything that JSON can hold
         """Write down that something happened, and the looks before it."""
         while self._looks:
-            self._queue.put(json.dumps({"what": "look", **self._looks.popleft()}))
-        self._queue.put(json.dumps({"what": what, "at": wall_time().isoformat(), **content}))
+            self._queue.put(json_text({"what": "look", **self._looks.popleft()}))
+        self._queue.put(json_text({"what": what, "at": wall_time().isoformat(), **content}))
 
     def close(self) -> None:
         """Write what is left, for a second at most."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,7 +10,7 @@ from urllib.parse import quote, unquote
 
 from bench.errors import DataError
 from bench.journal.rows import FILE_NAME
-from bench.parsing import parse_json
+from bench.parsing import json_text, parse_json
 
 FOLDER = "models"
 
@@ -52,7 +51,7 @@ def add_model(path: Path, name: str, t: float, model: Mapping[str, Any]) -> None
     unfinished = file.with_suffix(f".{os.getpid()}.tmp")
     try:
         folder.mkdir(exist_ok=True)
-        unfinished.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        unfinished.write_text(json_text(content, indent=1) + "\n", encoding="utf-8")
         unfinished.replace(file)
     except OSError as error:
         raise DataError(f"model file {file} cannot be written: {error.strerror}") from None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ipaddress
-import json
 import os
 import secrets
 import socket
@@ -19,7 +18,7 @@ from rich.table import Table
 from bench.cli import JsonOption, console
 from bench.cli.console import STANDARD_OUTPUT, parse_assignments, parse_numbers, warn
 from bench.errors import ConfigurationError
-from bench.parsing import parse_json
+from bench.parsing import json_text, parse_json
 
 if TYPE_CHECKING:
     # Imported by the functions, as `bench --help` imports this module for its help text.
@@ -197,7 +196,7 @@ def _endpoints(served: Sequence[ServedLaboratory], clock: str, control: str, ide
 def _print_line(content: dict[str, Any]) -> None:
     """Write to the standard output, on one line: who reads it need not wait for the end of the server."""
     try:
-        sys.stdout.write(json.dumps(content, ensure_ascii=False) + "\n")
+        sys.stdout.write(json_text(content) + "\n")
         sys.stdout.flush()
     except OSError as error:
         raise ConfigurationError(f"--json - cannot be written: {error.strerror}") from None
@@ -207,7 +206,7 @@ def _write_at_once(path: Path, content: dict[str, Any]) -> None:
     """Write a file that is never seen half written."""
     beside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        beside.write_text(json.dumps(content, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+        beside.write_text(json_text(content, indent=1) + "\n", encoding="utf-8")
         beside.replace(path)
     except OSError as error:
         beside.unlink(missing_ok=True)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 import selectors
 from collections.abc import Collection, Iterator, Mapping, Sequence
@@ -10,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from bench.errors import ConfigurationError
+from bench.parsing import json_text
 from sim_devices.laboratory import TrueValue
 from sim_devices.serving import requests
 from sim_devices.serving.endpoints import Connection, Listener, socket_address
@@ -148,7 +148,7 @@ class ControlSocket:
 
     @staticmethod
     def _answer(client: _Client, content: Mapping[str, Any]) -> None:
-        client.unread += json.dumps(content, ensure_ascii=False).encode() + b"\n"
+        client.unread += json_text(content).encode() + b"\n"
 
     @staticmethod
     def _write(client: _Client) -> None:

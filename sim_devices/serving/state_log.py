@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
 from bench.errors import ConfigurationError
+from bench.parsing import json_text
 from sim_devices.serving.control import values_to_json
 from sim_devices.serving.served import ServedLaboratory
 
@@ -65,7 +65,7 @@ class StateLog:
         self._write(line)
 
     def _write(self, line: dict[str, Any]) -> None:
-        self._file.write(json.dumps(line, ensure_ascii=False) + "\n")
+        self._file.write(json_text(line) + "\n")
 
     def close(self) -> None:
         """Close the file."""
