@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -37,26 +38,43 @@ def safe(
     force: Annotated[
         bool, typer.Option("--force", help="Go on although another process holds the rig; says who it is.")
     ] = False,
+    limit: Annotated[
+        float | None, typer.Option(metavar="SECONDS", min=0.0, help="Give up after so long; without it, never.")
+    ] = None,
     attach: AttachOption = None,
     overrides: OverrideOption = None,
     json_file: JsonOption = None,
 ) -> None:
     """Bring every device of a rig into its safe state, whatever state the instruments are in.
 
-    For when a run has died, or an instrument reports an error. The lines are tried in parallel, for 3 s in all; a
-    device that does not confirm is named, with what to unplug. Nothing is configured, and errors stay (see
-    `bench recover`). A run that goes on holds its lines: end it, or use `--force`; a serial line that is open
-    elsewhere may still be refused then.
+    For when a run has died, or an instrument reports an error. The lines are tried in parallel. A device that does
+    not confirm its safe state is named at once, with what to unplug, and tried again each second until it does, also
+    one whose port is not there. Ctrl-C and every signal that would end the process end it; a script sets `--limit`.
+    Nothing is configured, and errors stay (see `bench recover`). A run that goes on holds its lines: end it, or use
+    `--force`; a serial line that is open elsewhere may still be refused then.
 
-    Exit codes: 0 every output is off; 2 the rig file is wrong, or the rig is in use; 7 at least one device did not
-    confirm its safe state.
+    Exit codes: 0 every output is off; 2 the rig file is wrong, or the rig is in use; 7 at least one device had not
+    confirmed its safe state when the command was ended, or at the limit.
     """
+    from bench.interrupts import Interrupts
     from bench.upkeep.opening import opened
-    from bench.upkeep.rescue import rescue
+    from bench.upkeep.rescue import UNANSWERED, rescue
 
     replaced = parse_assignments("--override", overrides or [])
-    with opened(rig, replaced, attach, "bench safe", warn if force else None) as place:
-        found = rescue(place)
+    with opened(rig, replaced, attach, "bench safe", warn if force else None) as place, Interrupts() as interrupts:
+
+        def is_ended() -> bool:
+            return interrupts.pause_requested or interrupts.abort_requested()
+
+        said: dict[str, str] = {}
+        for seconds, found in rescue(place, is_ended, math.inf if limit is None else limit):
+            unsafe = {each.device: each for each in found if not each.is_safe}
+            for name, each in unsafe.items():
+                if each.state not in (UNANSWERED, said.get(name)):
+                    said[name] = each.state
+                    warn(f"{name}: NOT CONFIRMED: {each.state}; {each.advice}")
+            if unsafe and seconds >= 1.0:
+                warn(f"not confirmed after {seconds:.0f} s: {', '.join(unsafe)}; trying again, Ctrl-C ends")
     table = Table("device", "state", "what to do", box=None, padding=(0, 2))
     for each in found:
         style = "green" if each.is_safe else "bold red"
