@@ -14,19 +14,26 @@ from typing import Self
 
 from bench.clock import Stopwatch
 
-_ABORTING = (
-    "SIGTERM",
-    "SIGHUP",
-    "SIGBREAK",
-    "SIGQUIT",
-    "SIGUSR1",
-    "SIGUSR2",
-    "SIGALRM",
-    "SIGVTALRM",
-    "SIGPROF",
-    "SIGXCPU",
+STACKS: int | None = getattr(signal, "SIGRTMIN", getattr(signal, "SIGINFO", None))
+"""Signal at which a guarded run writes where its threads stand, where the system has it; any other run ignores it.
+It is one that nobody sends to end a process."""
+
+_NOT_ENDING = frozenset(
+    getattr(signal, name)
+    for name in (
+        # A pause.
+        "SIGINT",
+        # They cannot be caught, or mean that the process itself is broken.
+        *("SIGKILL", "SIGSTOP", "SIGABRT", "SIGBUS", "SIGEMT", "SIGFPE", "SIGILL", "SIGSEGV", "SIGSYS", "SIGTRAP"),
+        # They do not end it: by themselves, or as Python ignores them.
+        *("SIGCHLD", "SIGCLD", "SIGCONT", "SIGINFO", "SIGPIPE", "SIGTSTP", "SIGTTIN", "SIGTTOU", "SIGURG"),
+        *("SIGWINCH", "SIGXFSZ"),
+    )
+    if hasattr(signal, name)
 )
-"""Signals that would end the process, and can be caught."""
+
+ENDING = frozenset(signal.valid_signals()) - _NOT_ENDING - {STACKS}
+"""Numbers of the signals that would end a process, and can be caught."""
 
 _UNHEARD = 2.0
 """Wall-clock time within which a run has to begin to end when it was asked to, s."""
@@ -42,8 +49,8 @@ class Interrupts:
     """Turns Ctrl-C and the signals of the system into requests that the engine looks at.
 
     The first Ctrl-C asks for a pause, the second for the end at once, as does every signal that would end the
-    process. Nothing is raised inside of a device's transaction. A run that does not begin to end within 2 s,
-    as its protocol computes for ever or a write hangs, is left by a thread of its own.
+    process, with a guardian as without one. Nothing is raised inside of a device's transaction. A run that does not
+    begin to end within 2 s, as its protocol computes for ever or a write hangs, is left by a thread of its own.
 
     Use it as a context manager, from before the first device is opened; the former handlers come back at the end. In
     a thread other than the main one it watches nothing, as Python runs handlers in the main thread only.
@@ -103,10 +110,10 @@ class Interrupts:
             each.setblocking(False)
         self._sockets = ours, theirs
         self._install(signal.SIGINT, self._interrupt)
-        for name in _ABORTING:
-            number = getattr(signal, name, None)
-            if number is not None:
-                self._install(number, self._terminate)
+        for number in ENDING:
+            self._install(number, self._terminate)
+        if STACKS is not None:
+            self._install(STACKS, signal.SIG_IGN)
         # Python's handlers wait for the main thread, these bytes do not.
         self._former_wakeup = signal.set_wakeup_fd(theirs.fileno(), warn_on_full_buffer=False)
         for work in (self._listen, self._speak):
@@ -132,7 +139,7 @@ class Interrupts:
         speaking.join(_LAST_WORDS)
         ours.close()
 
-    def _install(self, number: int, handler: Callable[[int, FrameType | None], None]) -> None:
+    def _install(self, number: int, handler: Callable[[int, FrameType | None], None] | signal.Handlers) -> None:
         former = signal.getsignal(number)
         # What was told to be ignored stays so: `nohup bench run …` outlives its terminal.
         if former is not signal.SIG_IGN:
@@ -146,7 +153,7 @@ class Interrupts:
             self._pause = True
 
     def _terminate(self, number: int, frame: FrameType | None) -> None:  # noqa: ARG002 - signal's form
-        self.abort_reason = signal.Signals(number).name
+        self.abort_reason = signal_name(number)
 
     def _listen(self) -> None:
         """Hear the signals beside the main thread, which may be unable to."""
@@ -168,7 +175,7 @@ class Interrupts:
             reason = "Ctrl-C, twice"
             self._words.put("ending at once, in the safe state")
         else:
-            reason = signal.Signals(number).name
+            reason = signal_name(number)
         if len(self._threads) == 2:
             watch = threading.Thread(target=self._watch_the_end, args=(reason,), name="end", daemon=True)
             self._threads.append(watch)
@@ -189,6 +196,14 @@ class Interrupts:
             # The terminal may be gone.
             with suppress(Exception):
                 self._notify(words)
+
+
+def signal_name(number: int) -> str:
+    """Return the name of a signal; those that a system numbers only have one of their own."""
+    try:
+        return signal.Signals(number).name
+    except ValueError:
+        return f"signal {number}"
 
 
 def say_at_once(text: str) -> None:

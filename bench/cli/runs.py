@@ -194,8 +194,9 @@ def run(
     """Carry a protocol out on a rig, record it, and leave every device in its safe state.
 
     The run is rehearsed on the rig's emulated twin before anything moves. Ctrl-C pauses at the next
-    step and asks; Ctrl-C again ends at once; so do SIGTERM and SIGHUP. However the run ends, every
-    device is brought into its safe state, and what was recorded so far is kept.
+    step and asks; Ctrl-C again ends at once; so does every signal that would end a process, such as
+    SIGTERM, SIGHUP and SIGUSR1. However the run ends, every device is brought into its safe state,
+    and what was recorded so far is kept.
     """
     from bench.protocol import find_protocol
 

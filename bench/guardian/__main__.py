@@ -9,21 +9,24 @@ from pathlib import Path
 from typing import Any
 
 from bench.attachment import attach
-from bench.clock import Stopwatch, WallClock
+from bench.clock import Clock, Stopwatch, WallClock
 from bench.guardian.channel import Channel, ChannelError, Message, to_message
 from bench.guardian.process import Guardian
+from bench.guardian.rescuer import Rescuer
 from bench.guardian.start import inherited
 from bench.locks import Holder, Locks, port_of
 from bench.rig import Rig
 from bench.rig_file import load_rig
-from bench.safety import make_safe
+from bench.safety import SAFE, make_safe
 
 _PATIENCE = 60.0
 """Time for the first message, s."""
 
 
-def _open(hello: Message, stack: ExitStack) -> Rig:
-    """Lock and connect the rig that the bench names; nothing is sent to an instrument that another bench uses.
+def _open(hello: Message, stack: ExitStack) -> tuple[Rig, Rescuer]:
+    """Lock and connect the rig that the bench names; return it and what makes it safe if this process cannot.
+
+    Nothing is sent to an instrument that another bench uses.
 
     Raises
     ------
@@ -33,21 +36,28 @@ def _open(hello: Message, stack: ExitStack) -> Rig:
         If a device cannot be connected.
     """
     file = load_rig(hello["rig"], hello["overrides"])
+    clock: Clock
     locks = stack.enter_context(Locks(Holder.of_this_process(file.name, hello["doing"], hello["process"])))
     if hello["attach"] is not None:
         attachment = attach(Path(hello["attach"]), file.name)
         ports = attachment.open()
         locks.take_lines(port_of(entry.wired(ports, file.path)) for entry in file.devices)
-        rig = Rig(file.served_by(attachment), attachment.clock, hello["seed"])
+        file, clock = file.served_by(attachment), attachment.clock
+    else:
+        locks.take_lines(port_of(entry.settings) for entry in file.devices)
+        clock = WallClock()
+    rescuer = Rescuer({key: hello[key] for key in ("rig", "overrides", "attach", "report")})
+    try:
+        rig = Rig(file, clock, hello["seed"])
         stack.callback(rig.close)
         # Served instruments of several laboratories may have the same serial numbers.
-        return rig
-    locks.take_lines(port_of(entry.settings) for entry in file.devices)
-    rig = Rig(file, WallClock(), hello["seed"])
-    stack.callback(rig.close)
-    for device in rig.devices.values():
-        locks.take_instrument(device.identity)
-    return rig
+        if hello["attach"] is None:
+            for device in rig.devices.values():
+                locks.take_instrument(device.identity)
+    except BaseException:
+        rescuer.release()
+        raise
+    return rig, rescuer
 
 
 def _describe(rig: Rig) -> dict[str, Any]:
@@ -68,20 +78,23 @@ def main() -> int:
             if hello is None:
                 return 1
             try:
-                rig = _open(hello, stack)
+                rig, rescuer = _open(hello, stack)
             except Exception as error:
                 channel.send({"n": hello["n"], "error": to_message(error)})
                 return 1
         except ChannelError:
             return 1
         try:
-            guardian = Guardian(channel, rig, hello["process"])
+            guardian = Guardian(channel, rig, hello["process"], rescuer)
             guardian.begin(hello, _describe(rig))
             guardian.serve()
         except BaseException:
             # A defect; its lines may not be closed before the devices are safe.
-            make_safe(rig.devices.values())
+            states = make_safe(rig.devices.values())
+            if all(state == SAFE for state in states.values()):
+                rescuer.release()
             raise
+        rescuer.release()
     # Whoever takes the rig next does not wait for a mail server.
     guardian.finish()
     return 0

@@ -1,4 +1,4 @@
-"""The process of the bench, as its guardian sees it: whether it lives, and how it is ended."""
+"""The parent of a process: whether it lives, and how it is ended."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ import signal
 import sys
 from contextlib import suppress
 
+SIGKILL: int = getattr(signal, "SIGKILL", signal.SIGTERM)
+"""What ends a process that does not listen; on Windows SIGTERM does."""
 
-class BenchProcess:
+
+class ParentProcess:
     """The parent of this process; no other one is taken for it that has its number once it is gone.
 
     Parameters
@@ -20,8 +23,8 @@ class BenchProcess:
     Attributes
     ----------
     descriptor : int or None
-        Becomes readable when it dies, where the system has such a thing. The channel alone does not do: a forked
-        child of the bench keeps its end open.
+        Becomes readable when it dies, where the system has such a thing. The end of a channel alone does not do: a
+        forked child of the parent keeps it open.
     """
 
     def __init__(self, number: int) -> None:
@@ -40,12 +43,17 @@ class BenchProcess:
             return bool(select.select([self.descriptor], [], [], 0.0)[0])
         return sys.platform != "win32" and os.getppid() != self._number
 
-    def send(self, name: str) -> None:
-        """Send it a signal, of those that the system has; on Windows SIGTERM ends it at once.
+    def await_end(self, seconds: float) -> bool:
+        """Wait until it is dead, for so many wall-clock seconds at most; return whether it is known to be."""
+        if self.descriptor is not None:
+            select.select([self.descriptor], [], [], seconds)
+        return self.has_died()
+
+    def send(self, number: int | None) -> None:
+        """Send it a signal, None for one that the system lacks; on Windows it is ended at once by any.
 
         There it is called only while the channel is open, so that the number is its own.
         """
-        number = getattr(signal, name, None)
         if number is None or self.has_died():
             return
         with suppress(OSError):

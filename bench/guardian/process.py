@@ -33,8 +33,10 @@ from bench.errors import BenchError, ConfigurationError, DeviceError, GuardianEr
 from bench.guardian.black_box import BlackBox
 from bench.guardian.channel import LONGEST_ANSWER, STILL_AT_IT, Channel, ChannelError, Message, to_message
 from bench.guardian.lines import BENCH, LOOK, SAFE, LineThreads, Result
-from bench.guardian.parent import BenchProcess
+from bench.guardian.parent import SIGKILL, ParentProcess
+from bench.guardian.rescuer import TRY_FOR, Rescuer
 from bench.interlocks import InterlockWatch
+from bench.interrupts import ENDING, STACKS
 from bench.journal import Event
 from bench.journal.ending import BEGIN, END, FAILED
 from bench.notify import WITHIN, Notifier
@@ -49,9 +51,6 @@ _SAFE_WITHIN = 3.0
 
 _TRY_AGAIN = 1.0
 """Time after which a device that is not safe is tried again, s."""
-
-_TRY_FOR = 600.0
-"""Time for which it is tried, s."""
 
 _BLIND = 2.0
 """Time for which what the interlocks need may not be seen, s; a request that is carried out counts as seen."""
@@ -100,12 +99,15 @@ class Guardian:
         Connected devices.
     bench : int
         Number of the bench's process.
+    rescuer : Rescuer
+        What makes the devices safe if this process cannot.
     """
 
-    def __init__(self, channel: Channel, rig: Rig, bench: int) -> None:
+    def __init__(self, channel: Channel, rig: Rig, bench: int, rescuer: Rescuer) -> None:
         self._channel = channel
         self._rig = rig
-        self._process = BenchProcess(bench)
+        self._process = ParentProcess(bench)
+        self._rescuer = rescuer
         self._wall: Clock = WallClock()
         safety = rig.file.safety
         self._factor = factor = float(getattr(rig.clock, "factor", 1.0))
@@ -159,9 +161,9 @@ class Guardian:
 
     def serve(self) -> None:
         """Serve until the run has ended and every device is safe, or 10 min were not enough for that."""
-        for name in ("SIGINT", "SIGHUP", "SIGQUIT", "SIGPIPE", "SIGUSR1", "SIGUSR2"):
-            if (number := getattr(signal, name, None)) is not None:
-                signal.signal(number, signal.SIG_IGN)
+        # They are meant for the bench.
+        for number in (*ENDING, signal.SIGINT):
+            signal.signal(number, signal.SIG_IGN)
         signal.signal(signal.SIGTERM, self._terminate)
         self._core.begin(self._wall.now())
         with selectors.DefaultSelector() as selector:
@@ -212,6 +214,7 @@ class Guardian:
 
     def _turn(self) -> None:
         now = self._wall.now()
+        self._rescuer.live(now)
         if self._terminated:
             self._core.trip(GuardianError("the guardian was asked to end by SIGTERM"))
         self._core.advance(now)
@@ -243,7 +246,7 @@ class Guardian:
         assert self._ending is not None
         clock = self._rig.clock
         gone = isinstance(clock, AttachedClock) and clock.is_alone
-        return gone or self._wall.now() - self._ending > _TRY_FOR
+        return gone or self._wall.now() - self._ending > TRY_FOR
 
     # The bench
 
@@ -499,7 +502,7 @@ class Guardian:
             self._box.note("safe", cause=None if cause is None else str(cause))
             if self._core.late and self._writes_stacks:
                 # It writes the stacks of its threads (`faulthandler`) into the folder of the run.
-                self._process.send("SIGUSR1")
+                self._process.send(STACKS)
         if not self._pending and self._stages:
             self._next_stage()
         complete = not self._pending and not self._stages
@@ -598,10 +601,10 @@ class Guardian:
             self._is_asked_to_end = True
             self._news.append(News("ERROR", "guardian", f"{self._core.lateness}; it was asked to end by SIGTERM"))
             self._box.note("ends the bench", by="SIGTERM")
-            self._process.send("SIGTERM")
+            self._process.send(signal.SIGTERM)
         elif now - self._told >= _COMES_BACK + _ENDS:
             self._box.note("ends the bench", by="SIGKILL")
-            self._process.send("SIGKILL")
+            self._process.send(SIGKILL)
             self._lose_bench("it hung, and was killed")
 
     # Devices

@@ -5,7 +5,6 @@ from __future__ import annotations
 import faulthandler
 import math
 import os
-import signal
 import subprocess
 import tempfile
 from collections.abc import Callable, Collection, Mapping, Sequence
@@ -17,12 +16,14 @@ from typing import Any, TextIO
 
 import numpy as np
 
-from bench.clock import Clock, Stopwatch
+from bench.clock import Clock, Stopwatch, WallClock
 from bench.description import RigDescription
 from bench.devices import DeviceDescription, Identity, Limits, Signal
 from bench.errors import AbortError, BenchError, GuardianError
 from bench.guardian.channel import LONGEST_ANSWER, ChannelError, Message, to_error
+from bench.guardian.rescuer import SILENCE, Report
 from bench.guardian.start import start_guardian
+from bench.interrupts import STACKS
 from bench.rig import Look
 from bench.rig_file import RigFile
 from bench.roles import Floats
@@ -32,8 +33,11 @@ from bench.upkeep.rescue import rescue_by_another_process
 _OPENING = 120.0
 """Longest wait until all devices are connected, s."""
 
-_SILENCE = 8.0
-"""Longest silence of the guardian while it carries a request out, s; it says each second that it is still at it."""
+_RESCUE = 20.0
+"""Longest wait for what a rescuer reports, s; it reports within 3 s unless the machine is busy."""
+
+_LOOK_AGAIN = 0.05
+"""Time between two looks for that, s."""
 
 _END = 5.0
 """Longest wait for the safe state of all devices, s."""
@@ -45,9 +49,6 @@ _SLICE = 0.2
 """Longest single wait, s, so that a signal to the process is noticed soon."""
 
 STACKS_NAME = "stacks.txt"
-
-_STACKS: int | None = getattr(signal, "SIGUSR1", None)
-"""Signal at which the stacks of all threads are written, where the system has it."""
 
 
 @dataclass(frozen=True)
@@ -81,8 +82,8 @@ class GuardedRig:
 class RemoteStation(Station):
     """A station in another process.
 
-    One request is outstanding at a time, and each has a number. If the guardian is lost, `bench safe` in a process of
-    its own makes the devices safe; this one never opens a line.
+    One request is outstanding at a time, and each has a number. If the guardian is lost, its rescuer makes the
+    devices safe, or `bench safe` in a process of its own if there is none; this one never opens a line.
 
     Parameters
     ----------
@@ -118,6 +119,9 @@ class RemoteStation(Station):
         self._keeps_record = False
         self._lost: GuardianError | None = None
         self._last_words = ""
+        # On Windows what is still open cannot be deleted.
+        self._scratch = tempfile.TemporaryDirectory(prefix="bench-rescuer-", ignore_cleanup_errors=True)
+        self._report = Report(Path(self._scratch.name) / "report.json")
         self._log = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `close`
         self._process, self._channel = start_guardian(self._log)
         try:
@@ -129,6 +133,7 @@ class RemoteStation(Station):
                 attach=None if guarded.attach is None else str(guarded.attach),
                 seed=guarded.seed,
                 doing=guarded.doing,
+                report=str(self._report.path),
                 process=os.getpid(),
             )
         except BaseException as error:
@@ -182,13 +187,13 @@ class RemoteStation(Station):
         epoch : str, optional
             Time of day of the laboratory at the start of the run, ISO 8601; now if not given.
         """
-        if _STACKS is not None:
+        if STACKS is not None:
             self._stacks = (folder / STACKS_NAME).open("w", encoding="utf-8")
-            faulthandler.register(_STACKS, self._stacks)
+            faulthandler.register(STACKS, self._stacks)
         self._ask(
             "record",
             folder=str(folder.resolve()),
-            stacks=_STACKS is not None,
+            stacks=STACKS is not None,
             targets=list(targets),
             facts=dict(facts),
             epoch=epoch or self.clock.date().isoformat(),
@@ -296,8 +301,8 @@ class RemoteStation(Station):
 
     def close(self) -> None:
         """Leave the guardian, which ends once every device is safe."""
-        if self._stacks is not None and _STACKS is not None:
-            faulthandler.unregister(_STACKS)
+        if self._stacks is not None and STACKS is not None:
+            faulthandler.unregister(STACKS)
             self._stacks.close()
             path = Path(self._stacks.name)
             # The folder may be gone.
@@ -315,6 +320,7 @@ class RemoteStation(Station):
         if not self._has_ended():
             # It goes on until what is not safe yet is safe.
             self._process.returncode = 0
+        self._scratch.cleanup()
         self._log.seek(0)
         lines = self._log.read().decode(errors="replace").splitlines()
         self._last_words = lines[-1] if lines else ""
@@ -330,6 +336,11 @@ class RemoteStation(Station):
         self._process.kill()
         self._has_ended()
         self._news.append(News("ERROR", "guardian", f"{error}; the devices are made safe without it"))
+        waited = Stopwatch()
+        while self._report.is_ready() and waited.seconds() < _RESCUE:
+            if states := self._report.states():
+                return states
+            WallClock().sleep(_LOOK_AGAIN)
         guarded = self._guarded
         try:
             return rescue_by_another_process(guarded.rig, guarded.overrides, guarded.attach, self.description.devices)
@@ -351,8 +362,8 @@ class RemoteStation(Station):
         if self._lost is not None:
             raise self._lost
         self._number += 1
-        waited, silent = Stopwatch(), Stopwatch()
-        silence = within or _SILENCE
+        waited, silent = Stopwatch(), 0.0
+        silence = within or SILENCE
         within = within or self._answer_within
         try:
             self._channel.send({"n": self._number, "do": do, **content})
@@ -361,9 +372,12 @@ class RemoteStation(Station):
                     for reply in self._channel.receive():
                         if reply.get("n") == self._number:
                             return self._taken(reply)
-                    silent = Stopwatch()
-                elif silent.seconds() > silence:
-                    raise ChannelError(f"it has said nothing for {silence:g} s")
+                    silent = 0.0
+                else:
+                    # Not the time in which this process got no processor: the guardian may not have got one either.
+                    silent += _SLICE
+                    if silent > silence:
+                        raise ChannelError(f"it has said nothing for {silence:g} s")
                 if waited.seconds() > within:
                     raise ChannelError(f"it has not answered for {within:g} s")
                 if do != "end" and self.clock.interrupted() and waited.seconds() > _ABORT:

@@ -16,13 +16,16 @@ from bench.guardian.channel import Channel
 _START = 30.0
 """Longest wait for a guardian to connect, s, where a descriptor cannot be inherited."""
 
+_GUARDIAN = "bench.guardian"
+
 _WINDOWS = sys.platform == "win32"
 
 
 def start_guardian(log: BinaryIO) -> tuple[subprocess.Popen[bytes], Channel]:
     """Start a guardian in a session of its own; return the process and the bench's end of the channel.
 
-    What fails before it can answer is written to `log`.
+    What fails before it can answer is written to `log`, not to where the bench writes: who reads there would wait
+    for the end of the guardian as well.
 
     Raises GuardianError if it does not start.
     """
@@ -30,7 +33,7 @@ def start_guardian(log: BinaryIO) -> tuple[subprocess.Popen[bytes], Channel]:
         return _start_by_port(log)
     ours, theirs = socket.socketpair()
     with theirs:
-        process = _spawn([str(theirs.fileno())], log, pass_fds=(theirs.fileno(),))
+        process = start_module(_GUARDIAN, str(theirs.fileno()), stderr=log, pass_fds=(theirs.fileno(),))
     return process, Channel(ours)
 
 
@@ -48,7 +51,7 @@ def _start_by_port(log: BinaryIO) -> tuple[subprocess.Popen[bytes], Channel]:
     token = secrets.token_hex(16)
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(_START)
-        process = _spawn([str(server.getsockname()[1]), token], log)
+        process = start_module(_GUARDIAN, str(server.getsockname()[1]), token, stderr=log)
         try:
             while True:
                 connection, _ = server.accept()
@@ -62,7 +65,33 @@ def _start_by_port(log: BinaryIO) -> tuple[subprocess.Popen[bytes], Channel]:
             raise GuardianError(f"the guardian does not start: {error}") from None
 
 
-def _spawn(arguments: Sequence[str], log: BinaryIO, pass_fds: Sequence[int] = ()) -> subprocess.Popen[bytes]:
+def start_module(
+    module: str,
+    *arguments: str,
+    stdin: int = subprocess.DEVNULL,
+    stderr: BinaryIO | None = None,
+    pass_fds: Sequence[int] = (),
+) -> subprocess.Popen[bytes]:
+    """Start a module of the bench in a process with a session of its own.
+
+    Parameters
+    ----------
+    module : str
+        Its name.
+    *arguments : str
+        Of its command line.
+    stdin : int
+        As of `subprocess.Popen`.
+    stderr : file, optional
+        Where it writes what goes wrong; where this process does if not given.
+    pass_fds : sequence of int
+        Descriptors that it gets.
+
+    Raises
+    ------
+    GuardianError
+        If it cannot be started.
+    """
     # The modules of the rig have to be found as here; -P keeps the working folder out of the way of ours.
     path = os.pathsep.join(entry for entry in sys.path if entry)
     flags = 0
@@ -70,15 +99,15 @@ def _spawn(arguments: Sequence[str], log: BinaryIO, pass_fds: Sequence[int] = ()
         flags = subprocess.CREATE_NEW_PROCESS_GROUP | subprocess.CREATE_NO_WINDOW
     try:
         return subprocess.Popen(  # noqa: S603 - this interpreter
-            [sys.executable, "-P", "-m", "bench.guardian", *arguments],
-            stdin=subprocess.DEVNULL,
+            [sys.executable, "-P", "-m", module, *arguments],
+            stdin=stdin,
             stdout=subprocess.DEVNULL,
-            # Not that of the bench: who reads there would wait for the end of the guardian as well.
-            stderr=log,
+            stderr=stderr,
             env={**os.environ, "PYTHONPATH": path},
             pass_fds=pass_fds,
+            bufsize=0,
             start_new_session=True,
             creationflags=flags,
         )
     except OSError as error:
-        raise GuardianError(f"the guardian cannot be started: {error}") from None
+        raise GuardianError(f"the process {module} cannot be started: {error}") from None

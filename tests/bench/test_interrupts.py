@@ -42,13 +42,46 @@ class TestFlags:
 
     @pytest.mark.parametrize(
         "name",
-        ["SIGTERM", "SIGHUP", "SIGQUIT", "SIGUSR1", "SIGUSR2", "SIGALRM", "SIGVTALRM", "SIGPROF", "SIGXCPU"],
+        [
+            "SIGTERM",
+            "SIGHUP",
+            "SIGQUIT",
+            "SIGUSR1",
+            "SIGUSR2",
+            "SIGALRM",
+            "SIGVTALRM",
+            "SIGPROF",
+            "SIGXCPU",
+            "SIGPOLL",
+        ],
     )
     def test_the_system_ends_at_once(self, name):
         with Interrupts() as interrupts:
             signal.raise_signal(getattr(signal, name))
             assert interrupts.abort_requested()
             assert interrupts.abort_reason == name
+
+    def test_no_signal_but_a_defect_ends_the_process_itself(self):
+        broken = {signal.SIGABRT, signal.SIGBUS, signal.SIGFPE, signal.SIGILL, signal.SIGSEGV, signal.SIGSYS}
+        not_caught = {signal.SIGKILL, signal.SIGSTOP}
+        code = (
+            "import signal, sys, time\n"
+            "from bench.interrupts import Interrupts\n"
+            "with Interrupts() as interrupts:\n"
+            "    for number in map(int, sys.argv[1:]):\n"
+            "        signal.raise_signal(number)\n"
+            "    print('lives', interrupts.abort_requested())\n"
+        )
+        # Those that stop a process are not sent, as nobody would continue it.
+        stopping = {signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU, signal.SIGTRAP}
+        sent = signal.valid_signals() - broken - not_caught - stopping
+        done = subprocess.run(
+            [sys.executable, "-c", code, *(str(int(number)) for number in sent)],
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        assert (done.returncode, done.stdout) == (0, "lives True\n"), done.stderr
 
     def test_former_handlers_come_back(self):
         numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)

@@ -7,6 +7,7 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
 
 from bench.attachment import attach
 from bench.guardian.remote import GuardedRig, RemoteStation
@@ -39,9 +40,42 @@ def _leave(station: RemoteStation) -> None:
     if station._process.returncode is None:
         station.clock.interrupted = lambda: False
         station.end()
+    rescuer = rescuer_of(station._process.pid)
     station.close()
     with suppress(ProcessLookupError):
         os.kill(station._process.pid, signal.SIGKILL)
+    # Until then it may hold the rig.
+    seconds_until(lambda: not is_alive(rescuer))
+
+
+def children(process: int) -> list[int]:
+    """Return the processes that one has started and that live."""
+    found = []
+    for entry in Path("/proc").iterdir():
+        with suppress(OSError, ValueError):
+            if int((entry / "stat").read_text().rpartition(")")[2].split()[1]) == process:
+                found.append(int(entry.name))
+    return found
+
+
+def rescuer_of(guardian: int) -> int:
+    """Return the process that a guardian has started to make safe what it cannot; 0 if there is none."""
+    return next((each for each in children(guardian) if _is_rescuer(each)), 0)
+
+
+def _is_rescuer(process: int) -> bool:
+    with suppress(OSError):
+        return b"bench.guardian.rescuer" in (Path("/proc") / str(process) / "cmdline").read_bytes()
+    return False
+
+
+def is_alive(process: int) -> bool:
+    """Whether a process lives; one that nobody has waited for does not."""
+    try:
+        stat = (Path("/proc") / str(process) / "stat").read_text()
+    except OSError:
+        return False
+    return stat.rpartition(")")[2].split()[0] != "Z"
 
 
 def is_on(rig: EmulatedRig) -> bool:

@@ -1,4 +1,9 @@
-"""A bench that switches an output on, leaves a child, whose number it prints, and is killed."""
+"""A bench that switches an output on, and leaves a child, whose number it prints, and is killed.
+
+With `stop`, it prints the number of its guardian and waits.
+
+    python fork_and_die.py ENDPOINTS [stop]
+"""
 
 import os
 import signal
@@ -15,6 +20,9 @@ guarded = GuardedRig(load_rig("vo2"), "vo2", {}, endpoints, 0, "a test")
 station = RemoteStation(guarded, attach(endpoints, "vo2").clock)
 station.promise(600.0, "a child lives on")
 station.apply({"tec": 40.0})
+if sys.argv[2:]:
+    print(station._process.pid, flush=True)
+    time.sleep(600.0)
 child = os.fork()
 if child == 0:
     time.sleep(600.0)

@@ -17,6 +17,8 @@ from tempfile import TemporaryDirectory
 from types import TracebackType
 from typing import Any, Self
 
+from benches import children, is_alive, rescuer_of, seconds_until
+
 from sim_devices.serving.process import EmulatedRig
 
 PROTOCOLS = Path(__file__).with_name("hanging_protocols.py")
@@ -103,7 +105,7 @@ class GuardedRun:
             if stalled:
                 os.close(out)
             stack.callback(self._end)
-            self.guardian = 0
+            self.guardian = self.rescuer = 0
             self._stack = stack.pop_all()
 
     def __enter__(self) -> Self:
@@ -130,6 +132,7 @@ class GuardedRun:
         self.await_note("everything is on")
         assert len(found := outputs_on(self._rig)) >= count, f"only {found} is on"
         self.guardian = find_guardian(self.process.pid)
+        self.rescuer = rescuer_of(self.guardian)
 
     def await_note(self, text: str) -> float:
         """Wait until the run has recorded a note; return the laboratory time at which it did, s."""
@@ -169,7 +172,7 @@ class GuardedRun:
         """Wait until the guardian has left the lines; return whether it has."""
         since = time.monotonic()
         while time.monotonic() - since < 30.0:
-            if not _is_alive(self.guardian):
+            if not is_alive(self.guardian):
                 return True
             time.sleep(0.02)
         return False
@@ -182,24 +185,17 @@ class GuardedRun:
             self._rig.control.plug_in(instrument)
         if self.guardian and not self.has_freed_lines():
             os.kill(self.guardian, signal.SIGKILL)
+        # Until then it may hold the rig.
+        seconds_until(lambda: not is_alive(self.rescuer))
 
 
 def find_guardian(process: int) -> int:
     """Return the guardian that a bench has started."""
-    for entry in Path("/proc").iterdir():
-        with suppress(OSError, ValueError):
-            if b"bench.guardian" in (entry / "cmdline").read_bytes():
-                parent = int((entry / "stat").read_text().rpartition(")")[2].split()[1])
-                if parent == process:
-                    return int(entry.name)
+    for child in children(process):
+        with suppress(OSError):
+            if b"bench.guardian" in (Path("/proc") / str(child) / "cmdline").read_bytes():
+                return child
     raise AssertionError("the bench has no guardian")
-
-
-def _is_alive(process: int) -> bool:
-    try:
-        return (Path("/proc") / str(process) / "stat").read_text().rpartition(")")[2].split()[0] != "Z"
-    except OSError:
-        return False
 
 
 def start_busy(count: int, stack: ExitStack) -> None:

@@ -26,6 +26,7 @@ from dataclasses import dataclass
 
 from guarded_run import SETPOINTS, GuardedRun, hear_signals, outputs_on, start_busy
 
+from bench.guardian.rescuer import SILENCE
 from bench.rig_file import load_rig
 from sim_devices.serving.process import EmulatedRig, serve
 
@@ -33,14 +34,8 @@ DEATH, PROMISE, PATIENCE = 0.2, 5.0, 4.0
 """Time within which every output has to be off, s: the bench died; it broke the promise of a hold (its period of 1 to
 2 s and 2 s), or of a computation (set to 3 s here, and 1 s for the last step)."""
 
-RESCUE = 6.0
-"""Time within which another process makes every device safe, s: it starts, and opens the lines."""
-
-SILENCE = 8.0
-"""Time after which the bench gives up a guardian that does not answer, s."""
-
-TICK = 2.0
-"""Longest time between two requests of a hold to the guardian, s."""
+RESCUE = 2.0
+"""Time within which the rescuer makes every device safe, s: it opens the lines."""
 
 LINES = {
     "vo2": {"tec_output": "tec"},
@@ -80,6 +75,7 @@ TRIALS = {
     "SIGKILL": Trial("hold", signal.SIGKILL, DEATH),
     "SIGTERM": Trial("hold", signal.SIGTERM, 3.0),
     "SIGQUIT": Trial("hold", signal.SIGQUIT, 3.0),
+    "SIGUSR1": Trial("hold", signal.SIGUSR1, 3.0),
     "SIGSTOP": Trial("hold", signal.SIGSTOP, PROMISE),
     "endless loop": Trial("spin", None, PATIENCE),
     "endless loop, SIGTERM": Trial("spin", signal.SIGTERM, 3.0),
@@ -152,8 +148,8 @@ def harm_bench(rig: EmulatedRig, trial: Trial, wait: float) -> dict[str, Found]:
 
 
 def harm_guardian(rig: EmulatedRig, sent: signal.Signals, wait: float) -> dict[str, Found]:
-    """Kill or stop the guardian: the bench makes the devices safe by another process, and ends with exit code 7."""
-    within = TICK + RESCUE + (SILENCE if sent is signal.SIGSTOP else 0.0)
+    """Kill or stop the guardian: its rescuer makes the devices safe, and the bench ends with exit code 7."""
+    within = RESCUE + (SILENCE if sent is signal.SIGSTOP else 0.0)
     with started(rig, "hold") as run:
         run.await_on(len(SETPOINTS[rig.name]))
         time.sleep(wait)

@@ -11,7 +11,7 @@ import threading
 from pathlib import Path
 
 import pytest
-from benches import IN_TIME, LONG, connected, is_on, seconds_until
+from benches import IN_TIME, LONG, connected, is_alive, is_on, rescuer_of, seconds_until
 
 from bench.clock import VirtualClock
 from bench.errors import (
@@ -326,16 +326,53 @@ class TestGuardianGone:
         assert news.level == "ERROR"
         assert "was lost" in news.text
 
-    def test_stopped(self, station, vo2):
+    def test_stopped_while_the_bench_asks_for_nothing(self, station, vo2):
         """It is killed before the rescue, as it would keep the lines."""
         it = station()
-        it._answer_within = 1.0
         guardian_of(it).send_signal(signal.SIGSTOP)
-        with pytest.raises(GuardianError, match="has not answered for 1 s"):
+        seconds_until(lambda: not is_on(vo2))
+        with pytest.raises(GuardianError, match="was lost"):
             it.look(Look.GLANCE)
         assert it.end() == SAFE
         assert guardian_of(it).poll() == -signal.SIGKILL
+
+    def test_killed_while_the_bench_is_stopped(self, vo2):
+        bench = subprocess.Popen(
+            [sys.executable, str(HERE / "fork_and_die.py"), str(vo2.endpoints_file), "stop"],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+        try:
+            guardian = int(bench.stdout.readline())
+            rescuer = rescuer_of(guardian)
+            assert is_on(vo2)
+            bench.send_signal(signal.SIGSTOP)
+            os.kill(guardian, signal.SIGKILL)
+            seconds_until(lambda: not is_on(vo2))
+            seconds_until(lambda: not is_alive(rescuer))
+        finally:
+            bench.kill()
+            bench.wait()
+            bench.stdout.close()
+            vo2.control.power_cycle("tec")
+
+    def test_without_a_rescuer(self, station, vo2):
+        it = station()
+        os.kill(rescuer_of(guardian_of(it).pid), signal.SIGKILL)
+        it._report.path.unlink(missing_ok=True)
+        guardian_of(it).kill()
+        assert it.end() == SAFE
         assert not is_on(vo2)
+
+    def test_a_rescuer_that_is_not_needed_leaves(self, station, vo2):
+        it = station()
+        rescuer = rescuer_of(guardian_of(it).pid)
+        assert it.end() == SAFE
+        it.close()
+        seconds_until(lambda: not is_alive(rescuer))
+        with connected(vo2):
+            pass
 
     def test_a_rescue_that_fails_is_no_safe_state(self, station, vo2):
         it = station(safety__reconnect="0.5")

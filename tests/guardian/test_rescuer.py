@@ -1,0 +1,49 @@
+"""When a rescuer takes a rig over."""
+
+import queue
+
+import pytest
+
+from bench.guardian.rescuer import SILENCE, is_needed
+
+
+class Signs:
+    """What a guardian has written; `None` for a wait in which nothing has come, however long that took."""
+
+    def __init__(self, *signs):
+        self._signs = list(signs)
+        self.waited = 0.0
+
+    def get(self, timeout):
+        sign = self._signs.pop(0)
+        if sign is None:
+            self.waited += timeout
+            raise queue.Empty
+        self.waited = 0.0
+        return sign
+
+
+SILENT = [None] * 1000
+
+
+@pytest.mark.parametrize(
+    ("signs", "needed"),
+    [
+        ([b".", b""], True),
+        ([b""], True),
+        ([b".", b".!"], False),
+        # It is released while it still opens its lines.
+        ([None] * 100 + [b"!"], False),
+        ([None] * 100 + [b""], True),
+        ([b".", *SILENT], True),
+    ],
+)
+def test_a_guardian_that_is_gone_or_silent_and_no_other(signs, needed):
+    assert is_needed(Signs(*signs)) is needed
+
+
+def test_silence_is_told_from_signs_that_come_late():
+    signs = Signs(b".", *[None, None, b"."] * 50, *SILENT)
+    assert is_needed(signs)
+    assert SILENCE <= signs.waited < SILENCE + 0.5
+    assert len(signs._signs) < 1000
