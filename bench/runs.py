@@ -58,6 +58,9 @@ _DEFINITE = 1.1
 _LAST_WORDS = 1.0
 """Longest wait for a terminal at the end, s."""
 
+_PREPARATION = 120.0
+"""Wall-clock time (s) from the connection of the devices to the first step: a record and its views are opened."""
+
 
 @dataclass(frozen=True)
 class Run:
@@ -222,6 +225,7 @@ def carry_out(
         with _written_into(folder):
             if guardian is not None:
                 began = (meta if again is None else again.meta)["epoch"]
+                guardian.promise(_PREPARATION, "the run is prepared")
                 guardian.keep_record(folder, run.notify, facts_of(meta, folder), began)
             if again is None:
                 (folder / RIG_FILE_NAME).write_text(rig_file.text, encoding="utf-8")

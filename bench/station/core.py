@@ -23,14 +23,11 @@ class State(Enum):
     IDLE = "idle"
     """Nothing has been sent to a device yet."""
     ARMED = "armed"
-    """An output may be on: the bench has to keep its promises."""
+    """An output may be on."""
     TRIPPED = "tripped"
     """In the safe state, for good: what the bench still asks for is refused."""
     ENDED = "ended"
     """In the safe state, as the bench asked for it."""
-
-
-_ARMED = State.ARMED
 
 
 class StationCore:
@@ -84,11 +81,13 @@ class StationCore:
     def promise(self, seconds: float, why: str) -> None:
         """Take the promise that each request is followed by the next one within so many seconds.
 
+        It binds the bench from the first one on, also while nothing is on yet: the rig is not free meanwhile.
+
         Raises ValueError if that is no time.
         """
         if not 0.0 <= seconds < math.inf:
             raise ValueError(f"a promise of {seconds} s; expected a time, s")
-        self._promised, self._why = seconds, why
+        self._promised, self._why, self._is_bound = seconds, why, True
 
     def arm(self) -> None:
         """Note that an output may be on from now on."""
@@ -120,7 +119,7 @@ class StationCore:
             return math.inf
         # Plain comparisons: this is asked with each sample of a fast loop.
         due = self._next_look if self._next_look < self._acts_at else self._acts_at
-        if self.state is _ARMED and not self._asked and self._lease_end < due:
+        if self._is_bound and not self._asked and self._lease_end < due:
             due = self._lease_end
         return due
 

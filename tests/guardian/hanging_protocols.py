@@ -42,6 +42,15 @@ def spin(parameters: Parameters) -> Messages:
 
 
 @protocol(needs=())
+def think(parameters: Parameters) -> Messages:
+    """Compute for ever before anything is set."""
+    yield Note("computing")
+    reading = yield Step({}, Dwell(parameters.before))
+    while reading.values:
+        pass
+
+
+@protocol(needs=())
 def keep_interpreter(parameters: Parameters) -> Messages:
     """Run code that never gives up Python's lock."""
     reading = yield from _hold(parameters, 1.0)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from benches import LONG, connected, seconds_until
-from guarded_run import SETPOINTS, GuardedRun
+from guarded_run import SETPOINTS, GuardedRun, find_guardian
 
 from bench.errors import ConfigurationError
 from bench.journal import BLACK_BOX_NAME, Record, ending_of
@@ -101,6 +101,24 @@ def test_it_is_told_once_and_recorded_and_the_rig_is_free(started, listener, pro
         assert "http://127.0.0.1/\\u2026 was not told of the end" in notes
         texts = [run.said, *(path.read_bytes().decode(errors="replace") for path in run.folder.rglob("*.*"))]
         assert not [text for text in texts if TOKEN in text]
+
+
+@pytest.mark.parametrize("sent", [None, signal.SIGSTOP])
+def test_a_bench_that_hangs_before_it_has_set_anything_is_told_and_ended(started, listener, sent):
+    _, told = listener
+    with started("think") as run:
+        run.await_note("computing")
+        run.guardian = find_guardian(run.process.pid)
+        if sent is not None:
+            run.process.send_signal(sent)
+        seconds_until(told)
+        run.process.wait(LONG)
+        assert run.has_freed_lines()
+        (facts,) = told()
+        assert re.fullmatch(rf"failed: {HUNG}; tec: safe, psd: safe", facts["text"])
+        with Record(run.folder) as record:
+            assert record.status == "failed"
+            assert re.fullmatch(HUNG, record.reason)
 
 
 def test_a_bench_that_comes_back_does_not_tell_it_again(started, listener):

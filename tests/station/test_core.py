@@ -42,7 +42,7 @@ class Bench(RuleBasedStateMachine):
         self.core.begin(0.0)
         self.values = dict.fromkeys((each.signal for each in INTERLOCKS), 0.0)
         self.seen_outside = {}
-        self.is_on = False
+        self.is_on = self.is_bound = False
         self.is_asking = False
         self.promised = 10.0
         self.lease_end = math.inf
@@ -85,7 +85,7 @@ class Bench(RuleBasedStateMachine):
 
     def ask(self):
         """Begin a request; return whether it was not refused."""
-        late = self.core.state is State.ARMED and self.now >= self.lease_end
+        late = self.is_bound and not self.core.over and self.now >= self.lease_end
         refusal = None
         try:
             self.core.request(self.now)
@@ -112,7 +112,7 @@ class Bench(RuleBasedStateMachine):
     def promise(self, seconds):
         if self.ask():
             self.core.promise(seconds, "it computes")
-            self.promised = seconds
+            self.promised, self.is_bound = seconds, True
             self.reply()
 
     @precondition(lambda self: not self.is_asking)
@@ -120,7 +120,7 @@ class Bench(RuleBasedStateMachine):
     def apply(self):
         if self.ask():
             self.core.arm()
-            self.is_on = True
+            self.is_on = self.is_bound = True
             self.reply()
 
     @precondition(lambda self: not self.is_asking)
@@ -136,7 +136,7 @@ class Bench(RuleBasedStateMachine):
     def begin_slow_request(self):
         if self.ask():
             self.core.arm()
-            self.is_on = self.is_asking = True
+            self.is_on = self.is_bound = self.is_asking = True
 
     @precondition(lambda self: self.is_asking)
     @rule()
@@ -221,14 +221,22 @@ def test_a_broken_promise_ends_the_run_and_says_which_it_was():
         it.request(1.1)
 
 
-def test_a_bench_that_has_moved_nothing_may_take_its_time():
+def test_a_promise_binds_before_anything_has_moved():
     it = core()
     it.begin(0.0)
     it.request(0.0)
-    it.promise(1.0, "it computes")
     it.reply(0.0)
+    # Nothing was promised yet.
     it.advance(1e6)
     assert it.state is State.IDLE
+    it.request(1e6)
+    it.promise(30.0, "it computes")
+    it.reply(1e6)
+    it.advance(1e6 + 29.0)
+    assert it.state is State.IDLE
+    it.advance(1e6 + 31.0)
+    assert it.state is State.TRIPPED
+    assert it.late
 
 
 def test_an_output_is_not_left_on_by_a_bench_that_promised_nothing():
