@@ -42,6 +42,11 @@ _CLOCK_WITH_SUSPENSION: int | None = getattr(time, "CLOCK_BOOTTIME", getattr(tim
 on macOS CLOCK_MONOTONIC. Windows has none that can be read here; there `time.monotonic` itself goes on."""
 
 
+_PROBE = 0.01
+"""Processor time in s by which slowness is measured: several slices that Linux gives at once, of some 3 ms each
+(`sched(7)`, EEVDF), so that others come in between."""
+
+
 class Clock(ABC):
     """Laboratory time in seconds since the clock was made.
 
@@ -377,6 +382,18 @@ class Stopwatch:
     def seconds(self) -> float:
         """Return the elapsed wall-clock seconds."""
         return time.perf_counter() - self._start
+
+
+def slowness() -> float:
+    """Return how many times as long as alone on the computer this process takes for its work at present, at least 1.
+
+    Measured by some milliseconds of work: other processes that want the processors make it take longer, and so does
+    a limit that the system has set.
+    """
+    wall, used = time.perf_counter(), time.thread_time()
+    while (worked := time.thread_time() - used) < _PROBE:
+        pass
+    return max(1.0, (time.perf_counter() - wall) / worked)
 
 
 def wall_time() -> datetime:

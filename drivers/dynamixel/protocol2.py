@@ -14,7 +14,7 @@ import serial
 from pydantic import Field
 
 from bench.clock import Clock
-from drivers.serial_line import RESENDS, SerialSettings, forget_received, lost_line, no_answer, open_port
+from drivers.serial_line import RESENDS, SerialSettings, forget_received, lost_line, no_answer, open_port, patience_of
 
 PING, READ, WRITE, REBOOT = 0x01, 0x02, 0x03, 0x08
 RANGE_ERROR = 4
@@ -151,7 +151,7 @@ class ServoLine:
 
     def _expect_late(self) -> None:
         """Take note that an answer to what is sent now may come late."""
-        self._quiet_at = self._clock.now() + _LATEST * self._settings.timeout
+        self._quiet_at = self._clock.now() + _LATEST * patience_of(self._port, self._settings)
 
     def _answer(self, length: int) -> tuple[str, bytes]:
         """Return what is wrong with the answer, if anything; its error byte and its content."""

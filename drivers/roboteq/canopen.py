@@ -230,7 +230,7 @@ class NodeLine:
     def tell(self, item: Entry, value: int, sub: int) -> None:
         """Write a number without waiting for the answer; raises `DeviceConnectionError` if the line is lost."""
         self.transmit(self._download(item, value, sub)[0])
-        self._quiet_at = self._clock.now() + _LATEST * self._settings.timeout
+        self._quiet_at = self._clock.now() + _LATEST * self._adapter.patience
 
     def transmit(self, line: bytes) -> None:
         """Send a line; raises `DeviceConnectionError` if the line is lost."""
@@ -269,7 +269,7 @@ class NodeLine:
             if matched:
                 self.answered = True
                 return matched
-            end = clock.now() + self._settings.timeout
+            sent_at = clock.now()
             for _ in range(_MOST_FRAMES):
                 line = adapter.line()
                 if line is None:
@@ -286,7 +286,7 @@ class NodeLine:
                             return found
                 else:
                     self._notice(line)
-                if clock.now() >= end:
+                if clock.now() >= sent_at + adapter.patience:
                     break
         except (can.CanError, serial.SerialException, OSError) as error:
             raise self._lost(error) from None
@@ -340,7 +340,7 @@ class NodeLine:
                     raise MissedError
                 if number:
                     # The answer to the first one may come as well, after the one that is taken.
-                    self._quiet_at = sent_at + _LATEST * self._settings.timeout
+                    self._quiet_at = sent_at + _LATEST * self._adapter.patience
                     self.repeats += 1
                 adapter.transmit(request)
                 answer = self._answer(multiplexer, sent_at)
@@ -350,7 +350,7 @@ class NodeLine:
                     if answer[0] == _ABORT:
                         raise AbortedError(int.from_bytes(answer[4:], "little"))
                     return answer
-            self._quiet_at = sent_at + _LATEST * self._settings.timeout
+            self._quiet_at = sent_at + _LATEST * self._adapter.patience
         except (can.CanError, serial.SerialException, OSError) as error:
             raise self._lost(error) from None
         raise self._silence(adapter.refusals - refusals)
@@ -375,7 +375,7 @@ class NodeLine:
                     return answer
                 if not multiplexer and (answer[0] >> 5 == 0 or answer[0] == _ABORT):
                     return answer
-            if self._clock.now() >= sent_at + self._settings.timeout:
+            if self._clock.now() >= sent_at + adapter.patience:
                 return None
         return None
 

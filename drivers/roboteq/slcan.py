@@ -14,7 +14,7 @@ import serial
 from can import CanError
 from can.interfaces.slcan import slcanBus
 
-from drivers.serial_line import SerialSettings
+from drivers.serial_line import SerialSettings, patience_of, patient
 
 _MOST_READS = 4096
 _LONGEST_LINE = 64
@@ -24,9 +24,9 @@ _ACKNOWLEDGEMENTS = frozenset((b"z\r", b"z\rz\r", b"\r"))
 class SlcanAdapter(slcanBus):
     """The slcan adapter of python-can, in lines instead of messages, which reads what has arrived, not byte by byte.
 
-    The only wait is the port's own timeout, so the port decides which clock it uses. An empty read means silence
-    for the whole timeout. Adapters differ in how they acknowledge a line: by a carriage return, by a line feed, or
-    not at all. So an acknowledgement is not waited for.
+    The only wait is the port's own, so the port decides which clock it uses, and how long a busy computer waits. An
+    empty read means silence for the whole wait. Adapters differ in how they acknowledge a line: by a carriage
+    return, by a line feed, or not at all. So an acknowledgement is not waited for.
 
     Attributes
     ----------
@@ -50,12 +50,18 @@ class SlcanAdapter(slcanBus):
                 sleep_after_open=0,
                 timeout=settings.timeout,
             )
-            self._port = self.serialPortOrig
-            self._port.write_timeout = settings.timeout
+            self.serialPortOrig.write_timeout = settings.timeout
+            self._port = patient(self.serialPortOrig, settings)
+            self._settings = settings
             self.transmit = self._port.write
         except BaseException:
             self._abandon()
             raise
+
+    @property
+    def patience(self) -> float:
+        """How long an answer is waited for at present, s."""
+        return patience_of(self._port, self._settings)
 
     def line(self) -> bytes | None:
         """Return the next line with a standard data frame, without its end; None after silence for the timeout."""

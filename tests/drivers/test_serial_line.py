@@ -7,9 +7,18 @@ import tty
 
 import pytest
 
-from bench.clock import VirtualClock
+from bench.clock import VirtualClock, slowness
 from bench.errors import DeviceConnectionError
-from drivers.serial_line import MOST_STRAY, SerialSettings, forget_received, open_port, settle_line
+from drivers.serial_line import (
+    MOST_STRAY,
+    RESENDS,
+    PatientPort,
+    SerialSettings,
+    forget_received,
+    open_port,
+    patient,
+    settle_line,
+)
 from sim_devices.protocol_emulated import register, unregister
 from sim_devices.wire import WireServer
 
@@ -59,8 +68,11 @@ def test_a_port_in_use_is_refused_and_free_when_its_process_was_killed(node):
 
 def test_a_port_that_is_open_here_is_refused_until_it_is_closed(node):
     port = opened(node)
-    with pytest.raises(DeviceConnectionError, match="in use by"):
+    with pytest.raises(DeviceConnectionError) as refusal:
         opened(node)
+    # Nobody can end this program first.
+    assert "end that program" not in str(refusal.value)
+    assert ("opened it already" in str(refusal.value)) == (sys.platform == "linux")
     port.close()
     opened(node).close()
 
@@ -132,3 +144,76 @@ def test_what_a_port_has_received_cannot_be_forgotten_once_it_is_gone():
     port.close()
     with pytest.raises(OSError, match="not open"):
         forget_received(port)
+
+
+class LatePort:
+    """A port whose answer comes some seconds of waiting after the request, whatever the machine does meanwhile."""
+
+    def __init__(self, answer, late):
+        self.answer, self.left = answer, late
+        self.timeout = 0.1
+        self.waited = 0.0
+
+    def read(self, size=1):
+        step = min(self.timeout, max(self.left, 0.0))
+        self.left -= step
+        if self.left > 1e-9:
+            self.waited += step
+            return b""
+        found, self.answer = self.answer[:size], self.answer[size:]
+        self.waited += self.timeout if len(found) < size else step
+        return found
+
+    def read_until(self, _, size):
+        return self.read(size)
+
+
+class TestPatience:
+    @pytest.mark.parametrize("read", [lambda port: port.read(4), lambda port: port.read_until(b"\n", 4)])
+    @pytest.mark.parametrize(
+        ("late", "slowness", "comes"),
+        [
+            (0.05, 1.0, True),
+            (0.5, 1.0, False),
+            (0.5, 8.0, True),
+            # A hiccup is no busy machine.
+            (0.12, 1.3, False),
+            # Not for ever.
+            (1.5, 100.0, False),
+        ],
+    )
+    def test_an_answer_is_waited_for_as_long_as_the_machine_is_slow(self, read, late, slowness, comes):
+        late_port = LatePort(b"yes\n", late)
+        port = PatientPort(late_port, 1.0, lambda: slowness)
+        assert read(port) == (b"yes\n" if comes else b"")
+        assert late_port.timeout == port.timeout == 0.1
+        assert late_port.waited <= 1.0 + 1e-9
+
+    def test_what_has_come_in_part_is_completed(self):
+        late_port = LatePort(b"", 0.0)
+        pieces = [b"ye", b"s\n"]
+        late_port.read = lambda _: pieces.pop(0)
+        assert PatientPort(late_port, 1.0, lambda: 5.0).read(4) == b"yes\n"
+
+    @pytest.mark.parametrize(("watchdog", "longest"), [(5.0, 1.0), (1.0, 0.2), (0.0, 1.0)])
+    def test_a_request_and_its_repetitions_stay_within_the_watchdog(self, watchdog, longest):
+        class Settings(SerialSettings):
+            watchdog: float
+
+        settings = Settings(port="/dev/ttyX", baudrate=9600, timeout=0.1, watchdog=watchdog)
+        late_port = LatePort(b"", 0.0)
+        port = patient(late_port, settings, lambda: 1e6)
+        for _ in range(1 + RESENDS):
+            assert port.read(1) == b""
+        assert port.patience == pytest.approx(longest)
+        assert late_port.waited == pytest.approx((1 + RESENDS) * longest)
+        assert not watchdog or late_port.waited < watchdog
+
+    def test_an_emulated_line_has_the_time_of_its_laboratory(self):
+        settings = SerialSettings(port="emulated://tec", baudrate=9600)
+        port = LatePort(b"", 0.0)
+        assert patient(port, settings) is port
+
+
+def test_slowness_is_that_of_this_process():
+    assert slowness() >= 1.0
