@@ -39,10 +39,14 @@ EMULATED = "emulated://"
 FOLDER_VARIABLE = "ACTUATOR_BENCH_LOCKS"
 """Variable of the environment that names another folder of the locks, for a container that has none of them."""
 
+IN_FOLDER = "in-use.lock"
+"""Name of the lock in a folder in which one process at a time works; it goes with its holder."""
+
 _SHARED = Path("/run/lock"), Path("/tmp")  # noqa: S108 - that of all users is what is wanted
 """Folders for the locks: the first that everybody may use is taken. Filesystem Hierarchy Standard 3.0, 5.9."""
 _EVERYBODY = 0o1777
 _SAFELY = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0)
+_REMEDY = f"; name a folder of a local disk for the locks by the variable {FOLDER_VARIABLE}"
 _ATTEMPTS = 20
 """How often a lock is opened that others remove or replace meanwhile."""
 _TCP_PORT = 502
@@ -53,6 +57,10 @@ _VISA_SOCKET = re.compile(r"TCPIP\d*::(?P<host>[^:]+|\[.+\])::(?P<port>\d+)::SOC
 _VISA_SERIAL = re.compile(r"ASRL(?P<node>.+?)(::INSTR)?", re.IGNORECASE)
 _BUS_ADDRESS = re.compile(r"(|0+|none|unknown|id \d+)", re.IGNORECASE)
 """Serial numbers that tell no instrument from another: missing ones, and the address on a bus in the place of one."""
+
+
+class NoLockError(Exception):
+    """A lock cannot be had, whoever else wants it."""
 
 
 @dataclass(frozen=True)
@@ -108,7 +116,7 @@ class Locks:
 
     def __init__(self, holder: Holder) -> None:
         self._holder = holder
-        self._taken: set[str] = set()
+        self._taken: set[Path] = set()
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
@@ -131,7 +139,8 @@ class Locks:
 
         Raises ConfigurationError if another process, or another bench of this one, holds one of them.
         """
-        self._take({name: f"line {port}" for port in ports for name in line_names(port)})
+        lines = {_path(name): f"line {port}" for port in ports for name in line_names(port)}
+        self._take(lines, f"rig {self._holder.rig}")
 
     def take_instrument(self, identity: Identity) -> None:
         """Take an instrument, which another line may lead to as well; call it once it has been identified.
@@ -144,41 +153,56 @@ class Locks:
         number = identity.serial_number.strip()
         if not _BUS_ADDRESS.fullmatch(number):
             what = f"{identity.maker} {identity.model}, serial number {number}"
-            self._take({f"instrument {what}".lower(): what})
+            self._take({_path(f"instrument {what}".lower()): what}, f"rig {self._holder.rig}")
 
     def take_folder(self, folder: Path) -> None:
         """Take a folder in which one process at a time works.
 
+        By a lock of this computer and one in the folder itself, which a bench that has its locks elsewhere sees as
+        well: one in a container, or on another computer, where the file system of the folder has locks.
+
         Raises ConfigurationError if another process holds it.
         """
-        self._take({f"folder {folder.resolve()}": "it"}, f"folder {folder}")
+        here = folder / IN_FOLDER
+        self._take({_path(f"folder {folder.resolve()}"): "it", here: "it"}, f"folder {folder}", here)
 
-    def _take(self, wanted: dict[str, str], what: str = "") -> None:
+    def _take(self, wanted: dict[Path, str], what: str, optional: Path | None = None) -> None:
+        """Take locks, all or none; an optional one is left out if its file system cannot give it."""
         with ExitStack() as taken:
             # Two benches that ask in the same order cannot refuse each other.
-            for name in sorted(wanted.keys() - self._taken):
-                file = _take_file(_path(name))
+            for path in sorted(wanted.keys() - self._taken):
+                try:
+                    file = _take_file(path)
+                    if file is None:
+                        # One that has just come has to write its name, and one that is about to go is not in the way.
+                        WallClock().sleep(_WRITING)
+                        file = _take_file(path)
+                except NoLockError as error:
+                    if path == optional:
+                        continue
+                    raise ConfigurationError(str(error)) from None
                 if file is None:
-                    # One that has just come has to write its name, and one that is about to go is not in the way.
-                    WallClock().sleep(_WRITING)
-                    file = _take_file(_path(name))
-                if file is None:
-                    what = what or f"rig {self._holder.rig}"
                     raise ConfigurationError(
-                        f"{what} is in use: {wanted[name]} is held by {_holder(name)}; wait for it, or end it"
+                        f"{what} is in use: {wanted[path]} is held by {_holder(path)}; wait for it, or end it"
                     )
-                taken.callback(_free, _path(name), file)
+                taken.callback(_free, path, file)
                 _write(file, self._holder)
             self._taken |= wanted.keys()
             self._stack.push(taken.pop_all().__exit__)
 
 
 def is_in_use(folder: Path) -> bool:
-    """Return whether a process of this computer works in a folder, as `Locks.take_folder` says."""
-    path = _path(f"folder {folder.resolve()}")
+    """Return whether a process works in a folder, as `Locks.take_folder` says."""
+    return any(_is_held(path) for path in (_path(f"folder {folder.resolve()}"), folder / IN_FOLDER))
+
+
+def _is_held(path: Path) -> bool:
     if not os.path.lexists(path):
         return False
-    file = _take_file(path)
+    try:
+        file = _take_file(path)
+    except NoLockError:
+        return False
     if file is None:
         return True
     _free(path, file)
@@ -283,7 +307,10 @@ def _take_file(path: Path) -> int | None:
         file = _open(path)
         taken = False
         try:
-            taken = _try_lock(file)
+            try:
+                taken = _try_lock(file)
+            except OSError as error:
+                raise NoLockError(f"the lock {path} cannot be taken: {error.strerror}{_REMEDY}") from None
             if not taken:
                 return None
             # Its last holder removed it, perhaps after it was opened here.
@@ -294,7 +321,7 @@ def _take_file(path: Path) -> int | None:
         finally:
             if not taken:
                 os.close(file)
-    raise ConfigurationError(f"the lock {path} cannot be taken: it is replaced again and again")
+    raise NoLockError(f"the lock {path} cannot be taken: it is replaced again and again")
 
 
 def _open(path: Path) -> int:
@@ -312,8 +339,8 @@ def _open(path: Path) -> int:
                 return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)
         except OSError as error:
             why = "it is a link; remove it" if error.errno == errno.ELOOP else error.strerror
-            raise ConfigurationError(f"the lock {path} cannot be opened: {why}") from None
-    raise ConfigurationError(f"the lock {path} cannot be opened: it comes and goes")
+            raise NoLockError(f"the lock {path} cannot be opened: {why}{_REMEDY}") from None
+    raise NoLockError(f"the lock {path} cannot be opened: it comes and goes")
 
 
 def _checked(file: int) -> int:
@@ -349,7 +376,7 @@ if sys.platform == "win32":
         os.lseek(file, _LOCKED_BYTE, os.SEEK_SET)
         try:
             msvcrt.locking(file, msvcrt.LK_NBLCK, 1)
-        except OSError:
+        except PermissionError:
             return False
         return True
 
@@ -359,7 +386,7 @@ else:
     def _try_lock(file: int) -> bool:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+        except BlockingIOError:
             return False
         return True
 
@@ -372,9 +399,8 @@ def _write(file: int, holder: Holder) -> None:
     os.write(file, json.dumps(asdict(holder)).encode())
 
 
-def _holder(name: str) -> str:
+def _holder(path: Path) -> str:
     """Return who holds a lock, as it says itself if it is of this user or of root."""
-    path = _path(name)
     try:
         found = path.lstat()
         if not is_own(found):

@@ -51,7 +51,7 @@ class Connection:
         self.ended = False
 
     @property
-    def is_new(self) -> bool:
+    def has_one_user(self) -> bool:
         """Whether one device alone uses it."""
         return self._users == 1
 

@@ -125,7 +125,7 @@ class T7InputDevice(T7Device[InputSettingsT]):
 
     def _start(self) -> None:
         settings, instrument = self._settings, self._line
-        instrument.claim()
+        instrument.claim(self._clock)
         instrument.set({STREAM_RESOLUTION_INDEX: settings.resolution_index})
         instrument.set({STREAM_SETTLING_US: settings.settling_us})
         for channel in settings.channels:

@@ -14,13 +14,14 @@ import math
 import secrets
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from typing import Literal, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.clock import Clock
 from bench.devices import Identity
 from bench.errors import DeviceConnectionError, DeviceError, DeviceRestartedError
 from drivers.modbus import (
@@ -204,6 +205,11 @@ _FRAME_HEAD = 4  # bytes of a frame of function 76 before its values
 _MOST_FRAMES = 1040 - 8  # bytes of all frames of a packet
 
 _OWNER = USER_RAM.of(39)  # the last one, as scripts of the instrument take the first ones
+_ASKED = 1 << 31
+"""Bit of the owner number by which an owner is asked whether it is still there."""
+_ANSWERS = 3.0
+"""Time within which an owner answers, s: longer than it may be between two readings, 2 s in a long hold."""
+_LOOKS_AGAIN = 0.25  # s
 _OWNER_SPAN = Span.of(_OWNER)
 _HASTE = 0.5  # s, longest wait for a connection or a reply where time is short
 
@@ -281,7 +287,7 @@ class LabJackT7:
                     f"cannot connect to {self._address}{reason}; check the address, the cable and "
                     "that the instrument has power",
                 ) from None
-            is_new = connection.is_new
+            is_new = connection.has_one_user
             try:
                 with connection.lock:
                     if self._in_haste:
@@ -314,21 +320,40 @@ class LabJackT7:
                 f"is another instrument now: the T7 at {self._address} has serial number {found}; it was "
                 f"{self._serial_number}",
             )
-        self._check_owner(int.from_bytes(client.read(_OWNER.address, 2), "big"))
+        self._check_owner(int.from_bytes(client.read(_OWNER.address, 2), "big"), client)
 
-    def claim(self) -> None:
+    def claim(self, clock: Clock) -> None:
         """Leave the owner number of this process in the instrument, by which a restart and another program are seen.
 
-        The devices of a process share it.
+        The devices of a process share it. An owner that has left one is asked first whether it is still there, by a
+        bit of the number: with its next request it sets the number again. No lock of this computer is needed for
+        that, so another computer, too, is kept from an instrument in use.
+
+        Raises DeviceError if another program, on whichever computer, has answered that it uses the instrument.
         """
         with self._lock:
             known = _owners.get(self._address)
-            if self.read_integer(_OWNER) != known:
-                known = _owners[self._address] = 1 + secrets.randbelow(0xFFFFFFFF)
+            found = self.read_integer(_OWNER)
+            if found != known:
+                if found:
+                    self._ask_owner(found, clock)
+                known = _owners[self._address] = 1 + secrets.randbelow(_ASKED - 1)
                 self.write(_OWNER, known)
             self._serial_number = self.read_integer(SERIAL_NUMBER)
             assert known is not None
             self._owner = known
+
+    def _ask_owner(self, found: int, clock: Clock) -> None:
+        self.write(_OWNER, found | _ASKED)
+        end = clock.now() + _ANSWERS
+        while clock.now() < end:
+            clock.sleep(_LOOKS_AGAIN)
+            if not self.read_integer(_OWNER) & _ASKED:
+                raise DeviceError(
+                    self._name,
+                    f"the LabJack T7 at {self._address} is in use by another program, on this or another computer, "
+                    "which has just answered; end that program, or wait for it",
+                )
 
     def reopen(self) -> None:
         """Use the connection that other devices have opened, or open one, if the present one has ended.
@@ -362,8 +387,13 @@ class LabJackT7:
             self._connection.end()
         self.reopen()
 
-    def _check_owner(self, found: int) -> None:
+    def _check_owner(self, found: int, client: ModbusClient) -> None:
         if found == self._owner:
+            return
+        if found == self._owner | _ASKED:
+            # One that is lost is asked for again.
+            with suppress(OSError, RefusedError):
+                client.write(_OWNER.address, self.encode(_OWNER, self._owner))
             return
         if found in (0, _owners.get(self._address)):
             raise DeviceRestartedError(
@@ -401,8 +431,14 @@ class LabJackT7:
                     connection.wait_for_reply(max(self._timeout, connection.timeout))
 
     def close(self) -> None:
-        """Release the connection; it is closed with its last user."""
+        """Release the connection; it is closed with its last user, who leaves no owner number behind."""
         if self._connected:
+            if self._owner and self._connection.has_one_user and not self._connection.ended:
+                # The next program need not ask then; on a line that is lost it has to.
+                with suppress(OSError, RefusedError), self._lock:
+                    self._client.wait_for(min(self._timeout, _HASTE))
+                    if int.from_bytes(self._client.read(_OWNER.address, 2), "big") == self._owner:
+                        self._client.write(_OWNER.address, self.encode(_OWNER, 0))
             self._connected = False
             self._connection.close()
 
@@ -440,7 +476,7 @@ class LabJackT7:
         values = packet.reply.unpack(reply)
         owner = values[-1]
         if owner != self._owner and self.checks_owner:
-            self._check_owner(owner)
+            self._check_owner(owner, self._client)
         return values[:-1]
 
     def read_spans(self, spans: Sequence[Span], *writes: tuple[int, bytes]) -> list[list[float]]:
@@ -467,7 +503,7 @@ class LabJackT7:
             values.append(list(span.values.unpack_from(reply, position)))
             position += span.values.size
         if checks:
-            self._check_owner(int(values.pop()[0]))
+            self._check_owner(int(values.pop()[0]), self._client)
         return values
 
     def shares_connection(self, other: LabJackT7) -> bool:
@@ -635,11 +671,11 @@ class LabJackT7:
         return self._silence(error)
 
     def _silence(self, error: OSError) -> DeviceConnectionError:
-        return DeviceConnectionError(
-            self._name,
-            f"no reply from {self._address} within {self._timeout:g} s, or the connection broke; check cable and "
-            f"power ({error})",
-        )
+        if isinstance(error, ConnectionError):
+            why = ": the connection broke; a T7 takes two at a time: end other users of it, or check the cable"
+        else:
+            why = f" within {self._timeout:g} s; check cable and power"
+        return DeviceConnectionError(self._name, f"no reply from {self._address}{why} ({error})")
 
     def _refusal(self, refusal: RefusedError, doing: str) -> DeviceError:
         message = exception_text(refusal.code, doing)

@@ -20,7 +20,7 @@ class T7Switch(T7LineDevice[T7LineSettings], Switch):
     Settings: ClassVar[type[T7LineSettings]] = T7LineSettings
 
     def _start(self) -> None:
-        self._line.claim()
+        self._line.claim(self._clock)
         self._output.switch(False)
         self._output.guard(self._settings.watchdog)
 

@@ -1,17 +1,19 @@
 """Locks of lines and instruments: one bench each, whatever name it uses; freed by the death of the holder."""
 
+import errno
 import json
 import os
 import signal
 import socket
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from bench.devices import Identity
 from bench.errors import ConfigurationError
-from bench.locks import Holder, Locks, line_names
+from bench.locks import Holder, Locks, is_in_use, line_names
 
 HOLDER = """
 import subprocess, sys
@@ -305,3 +307,53 @@ class TestOtherUsers:
             locks("mine").take_lines([node])
         assert "cannot say who it is" in str(caught.value)
         assert "bench test" not in str(caught.value)
+
+
+class TestFolders:
+    def test_benches_with_locks_in_different_places_see_each_other(self, locks, tmp_path, monkeypatch):
+        record = tmp_path / "record"
+        record.mkdir()
+        first, second = locks("vo2"), locks("sma")
+        first.take_folder(record)
+        elsewhere = tmp_path / "elsewhere"
+        elsewhere.mkdir()
+        monkeypatch.setenv("ACTUATOR_BENCH_LOCKS", str(elsewhere))
+        assert is_in_use(record)
+        with pytest.raises(ConfigurationError, match=rf"in use: it is held by .*process {os.getpid()}, bench test"):
+            second.take_folder(record)
+        first.close()
+        assert not is_in_use(record)
+        second.take_folder(record)
+        second.close()
+        assert list(record.iterdir()) == []
+
+    @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="it looks for files as on Linux")
+    def test_a_folder_on_a_file_system_without_locks_has_that_of_the_computer(self, locks, tmp_path, monkeypatch):
+        record = tmp_path / "record"
+        record.mkdir()
+        without_locks(monkeypatch, record)
+        first, second = locks("vo2"), locks("sma")
+        first.take_folder(record)
+        assert is_in_use(record)
+        with pytest.raises(ConfigurationError, match="is held by"):
+            second.take_folder(record)
+
+    @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="it looks for files as on Linux")
+    def test_a_place_for_locks_without_locks_is_named_with_a_remedy(self, locks, tmp_path, monkeypatch, folder):
+        without_locks(monkeypatch, folder)
+        with pytest.raises(ConfigurationError, match=r"cannot be taken: No locks available; .*ACTUATOR_BENCH_LOCKS"):
+            locks("vo2").take_lines([str(tmp_path / "port")])
+
+
+def without_locks(monkeypatch, folder):
+    """Let the file system of a folder have no locks."""
+    import fcntl
+
+    flock = fcntl.flock
+
+    def refuse(file, operation):
+        if Path(f"/proc/self/fd/{file}").readlink().is_relative_to(folder):
+            raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
+        flock(file, operation)
+
+    monkeypatch.setattr(fcntl, "flock", refuse)

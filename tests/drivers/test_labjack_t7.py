@@ -740,6 +740,49 @@ def test_a_lost_connection_is_masked_and_counted(bench):
     unregister(address)
 
 
+class TestUseByAnother:
+    """Another program has no owner number of ours; it may be on another computer."""
+
+    def another(self, bench, monkeypatch):
+        with monkeypatch.context() as patch:
+            patch.setattr(registers, "_owners", {})
+            return bench.switch(line=6)
+
+    def test_one_that_answers_keeps_its_instrument(self, bench, monkeypatch):
+        fan = bench.switch(line=6)
+        with monkeypatch.context() as patch:
+            sleep = bench.clock.sleep
+
+            def go_on(seconds):
+                sleep(seconds)
+                if bench.clock.now() > 2.0:
+                    fan.glance()
+
+            patch.setattr(bench.clock, "sleep", go_on)
+            with pytest.raises(DeviceError, match="in use by another program, on this or another computer"):
+                self.another(bench, monkeypatch)
+        fan.set(1.0)
+        assert fan.measure() == {"fan_state": 1.0}
+
+    def test_one_that_died_is_not_waited_for_for_long(self, bench, monkeypatch):
+        fan = bench.switch(line=6)
+        before = bench.clock.now()
+        self.another(bench, monkeypatch).measure()
+        assert 2.0 < bench.clock.now() - before < 10.0
+        with pytest.raises(DeviceError, match="another program has taken the LabJack T7"):
+            fan.glance()
+
+    def test_one_that_has_left_is_not_asked(self, bench, monkeypatch):
+        psd, fan = bench.sensor(channels=(3,)), bench.switch(line=6)
+        fan.close()
+        # The other device uses it still.
+        psd.measure()
+        psd.close()
+        before = bench.clock.now()
+        self.another(bench, monkeypatch)
+        assert bench.clock.now() - before < 1.0
+
+
 def test_another_program_that_takes_the_instrument_is_told(bench):
     bench.wire()
     supply, psd, fan = bench.supply(), bench.sensor(channels=(3,)), bench.switch(line=6)
@@ -1329,11 +1372,11 @@ def test_what_a_watchdog_that_is_off_was_set_to_is_not_taken_over(bench):
 
 
 def test_a_watchdog_that_is_set_up_already_is_not_written(bench):
-    bench.switch().set(1.0)  # as after a host that died
+    bench.switch().set(1.0)  # as after a host that died, which is asked first
     recorded = Recorded(bench.t7)
     with ModbusTcpServer(recorded) as server:
         switch = T7Switch.connect("fan", SwitchSettings(port=server.address, line=5), bench.clock)
-        assert [address for kind, address, _ in recorded.requests if kind == "write"] == [OWNER[1], 2005]
+        assert [address for kind, address, _ in recorded.requests if kind == "write"] == [OWNER[1], OWNER[1], 2005]
         switch.close()
 
 
@@ -2218,3 +2261,13 @@ def test_every_request_of_a_closed_device_says_so(bench, in_process):
         with pytest.raises(DeviceConnectionError, match="was closed by its device; connect again"):
             act()
     assert bench.t7.tdac_volts(0) == 0.0
+
+
+def test_a_connection_that_the_instrument_refuses_is_no_matter_of_the_cable(bench):
+    taken = [socket.create_connection(("127.0.0.1", int(bench.server.address.rpartition(":")[2]))) for _ in range(2)]
+    try:
+        with pytest.raises(DeviceConnectionError, match="a T7 takes two at a time: end other users of it"):
+            bench.switch()
+    finally:
+        for each in taken:
+            each.close()
