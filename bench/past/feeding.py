@@ -36,8 +36,9 @@ from bench.settling import Dwell, Settle
 _LEAST_TURN = 0.01
 """Smallest turn under a controller that counts as a corner, as a share of what the actuator went through."""
 
-_AS_BEFORE = 10
-"""Places at the end of the record that are gone through again, as far back as the last corner."""
+_AS_BEFORE, _LONG_BEFORE = 10, 120.0
+"""Places at the end of the record that are gone through again: so many, and those of the last so many seconds. What
+creeps is near to where it was then."""
 
 _FEWEST_VALUES = 3
 """Different set-points from which an actuator is taken for one that is not just switched on and off."""
@@ -65,11 +66,14 @@ class Place:
         How the rig settled there; None while a controller moved it.
     prompt : Prompt or None
         What had been done by hand last.
+    seconds : float
+        How long the rig stood there, s; 0 while a controller moved it.
     """
 
     setpoints: Mapping[str, float]
     settle: Settle | None
     prompt: Prompt | None
+    seconds: float
 
 
 @dataclass(frozen=True)
@@ -157,19 +161,17 @@ class Fed:
         """Return the shortest way to the state in which the record left the specimen, its last place last.
 
         A place to which the run came by a small step is not jumped at from far, as that would overshoot it: there are
-        stops before it. The end of the last branch is gone through as the run did, so that what creeps is near to
-        where it was.
+        stops before it. The end is gone through as the run did, so that what creeps is near to where it was.
         """
         if not self.places:
             return []
+        end = self._end()
         # Also where nothing was set: something may have been done by hand there.
-        found = {len(self.places) - 1}
+        found = set(range(end, len(self.places)))
         for actuator in self._actuators:
             path = self._path(actuator)
             first = len(self.places) - len(path)
-            found |= {first + i for i in corners(path)}
-        last = len(self.places) - 1
-        found |= set(range(max(last - _AS_BEFORE, max(found - {last}, default=last)), last))
+            found |= {first + i for i in corners(path[: max(0, end + 1 - first)])}
         switches = {name for name in self._actuators if len({*self._path(name)}) < _FEWEST_VALUES}
         way: list[Place] = []
         for i in sorted(found):
@@ -179,6 +181,17 @@ class Fed:
                 way += [replace(place, setpoints={**place.setpoints, **stop}) for stop in stops]
             way.append(place)
         return way
+
+    def _end(self) -> int:
+        """Return the place from which on the way back goes through every one."""
+        last = len(self.places) - 1
+        end, seconds = last, self.places[last].seconds
+        while end and (before := self.places[end - 1]).prompt is self.places[last].prompt:
+            if last - end >= _AS_BEFORE and (before.settle is None or seconds >= _LONG_BEFORE):
+                break
+            end -= 1
+            seconds += before.seconds
+        return end
 
     @property
     def _actuators(self) -> set[str]:
@@ -429,15 +442,17 @@ class _Feeding:
     def _add(self, setpoints: Mapping[str, float], settle: Settle | None, prompt: Prompt | None = None) -> None:
         """Note where the actuators are now; a further wait in the same place makes it longer."""
         places = self._fed.places
+        seconds = 0.0 if settle is None else self._record.finished - self._record.started
         if not places:
-            places.append(Place(dict(setpoints), settle, prompt))
+            places.append(Place(dict(setpoints), settle, prompt, seconds))
             return
         before = places[-1]
         there = {**before.setpoints, **setpoints}
         if there != before.setpoints or prompt is not None:
-            places.append(Place(there, settle, prompt or before.prompt))
+            places.append(Place(there, settle, prompt or before.prompt, seconds))
         elif isinstance(settle, Dwell) and isinstance(before.settle, Dwell):
-            places[-1] = replace(before, settle=Dwell(before.settle.seconds + settle.seconds))
+            dwell = Dwell(before.settle.seconds + settle.seconds)
+            places[-1] = replace(before, settle=dwell, seconds=before.seconds + seconds)
 
     def _check_label(self, label: str) -> None:
         if label != self._record.label:

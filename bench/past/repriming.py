@@ -28,6 +28,9 @@ _READINGS = 10
 _CREEP = 0.005
 """Share of what a signal went through in the record by which creep and the way back may make it differ."""
 
+_FINE = 0.1
+"""Share of what a signal went through in the record that its smallest step may be at most."""
+
 _MOVED = 5.0
 """Standard deviations by which a drive has to move so that a slope can be told."""
 
@@ -51,8 +54,8 @@ class Resumption:
     drive : str
         Signal of the slot `drive`; empty if there is none.
     sigmas : float
-        Standard deviations by which they may differ, beside the larger of one unit of the last digit
-        that is shown and 0.5 % of what the signal went through.
+        Standard deviations by which they may differ, beside the larger of the resolution and 0.5 % of what the
+        signal went through. A response may differ by what the same makes of it on the slope of the branch, too.
     required : bool
         Whether the run ends if they differ by more; otherwise that is recorded, and the run goes on.
     by_hand : bool
@@ -132,7 +135,9 @@ def _disagreements(run: RunAtHand, past: Resumption, readings: Sequence[Mapping[
     fed = past.fed
     described: Mapping[str, Signal] = run.station.description.by_name
     found = []
-    for name in past.compared:
+    allowed_of_drive = 0.0
+    # The drive first: where it is allowed to differ, the response has to be as well.
+    for name in sorted(past.compared, key=lambda name: name != past.drive):
         before = _last_readings(fed, name)
         now = np.array([reading[name] for reading in readings])
         if not (np.isfinite(before).all() and np.isfinite(now).all()):
@@ -140,17 +145,19 @@ def _disagreements(run: RunAtHand, past: Resumption, readings: Sequence[Mapping[
         recorded = max(_noise(fed, name), _spread(before) if len(before) > 2 else 0.0)
         # A mean of readings that are near in time shares what wanders slowly: it counts as one reading.
         sigma = math.hypot(recorded, max(recorded, _spread(now)))
-        if past.drive and name != past.drive:
-            # On a steep branch the noise of the drive is that of the response.
-            sigma = math.hypot(sigma, math.sqrt(2.0) * _slope(fed, past.drive, name) * _noise(fed, past.drive))
         signal = described[name]
-        allowed = past.sigmas * sigma + max(10.0**-signal.precision, _CREEP * _span(fed, name))
+        allowed = past.sigmas * sigma + max(_resolution(fed, signal), _CREEP * _span(fed, name))
+        if name == past.drive:
+            allowed_of_drive = allowed
+        elif past.drive:
+            allowed += _slope(fed, past.drive, name) * allowed_of_drive
         difference = float(now.mean() - before.mean())
         if abs(difference) > allowed:
             *numbers, unit = format_numbers([now.mean(), before.mean(), allowed], signal.unit, signal.precision + 1)
             found.append(
                 f"{name} reads {numbers[0]} {unit} and read {numbers[1]} {unit} in the record; a difference of "
-                f"{numbers[2]} {unit} ({past.sigmas:g} σ, and the resolution or 0.5 % of its span) is allowed"
+                f"{numbers[2]} {unit} ({past.sigmas:g} σ, the resolution or 0.5 % of its span, and what "
+                f"the same of the drive makes of it) is allowed"
             )
     return found
 
@@ -184,12 +191,37 @@ def _slope(fed: Fed, drive: str, name: str) -> float:
 
 
 def _noise(fed: Fed, name: str) -> float:
-    """Return the noise of a signal in the last ticks of the record, free of drift: from tick to tick in one step."""
+    """Return the noise of a signal at rest: the larger of that of ticks and that of readings.
+
+    That of the last ticks is free of drift: a median of differences within one step. It is zero for a signal that
+    stands on one digit and jumps now and then: readings that differ from the tick before them show such jumps.
+    """
     ticks = fed.past.ticks
     values, steps = ticks[name][-_TICKS:], ticks["step"][-_TICKS:]
     differences = np.abs(np.diff(values))[np.diff(steps) == 0]
     differences = differences[np.isfinite(differences)]
-    return float(np.median(differences)) / _NORMAL if differences.size else 0.0
+    of_ticks = float(np.median(differences)) / _NORMAL if differences.size else 0.0
+    return max(of_ticks, _jumps(fed, name))
+
+
+def _jumps(fed: Fed, name: str) -> float:
+    """Return the standard deviation, of one reading, of the differences of readings from the ticks before them."""
+    column = fed.past.names.index(name)
+    ticks = fed.past.ticks
+    last = dict(zip(ticks["step"].tolist(), ticks[name].tolist(), strict=True))
+    steps = [step for step in fed.past.steps if step.step in last and not step.settled.failed]
+    differences = np.array([step.values[column] - last[step.step] for step in steps])
+    differences = differences[np.isfinite(differences)]
+    return _spread(differences) / math.sqrt(2.0) if differences.size > 1 else 0.0
+
+
+def _resolution(fed: Fed, signal: Signal) -> float:
+    """Return the smallest step of a signal: one unit of the last digit that is shown, or as the record has it."""
+    shown = 10.0**-signal.precision
+    gaps = np.diff(np.unique(fed.past.ticks[signal.name]))
+    # Equal values may differ by their rounding, and a signal that knows few values may well take the other one.
+    gaps = gaps[(gaps > 1e-6 * shown) & (gaps <= _FINE * _span(fed, signal.name))]
+    return max(shown, float(gaps.min())) if gaps.size else shown
 
 
 def _spread(values: np.ndarray[tuple[int], np.dtype[np.float64]]) -> float:

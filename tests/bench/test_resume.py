@@ -2,6 +2,7 @@ import io
 import random
 import shutil
 import sqlite3
+from dataclasses import replace
 from functools import reduce
 from hashlib import sha256
 from itertools import pairwise
@@ -15,11 +16,13 @@ from rich.console import Console
 
 import bench
 from bench.cli import main
-from bench.errors import AgreementError, ConfigurationError, DataError
+from bench.engine import Engine
+from bench.errors import AbortError, AgreementError, ConfigurationError, DataError
 from bench.hysteresis import MemoryCurve
 from bench.journal import FILE_NAME, Journal, Record
 from bench.journal.recovery import RECOVERED_NAME
 from bench.locks import Holder, Locks
+from bench.past import Past
 from bench.past.corners import corners, turning_points
 from bench.resume import Resume, resume
 
@@ -276,6 +279,58 @@ class TestResume:
         again = resume(Resume(folder=folder, accept_disagreement=True), silent())
         assert again.outcome.status == "completed"
         assert [step.step for step in steps_of(folder)] == list(range(6))
+
+
+@pytest.mark.slow
+class TestAgreement:
+    """A battery that is read in steps, a room that wanders and a piezo that creeps are no change of the specimen."""
+
+    @pytest.fixture(scope="class", params=["hybrid", "sma"])
+    def whole(self, request, tmp_path_factory):
+        out = tmp_path_factory.mktemp(request.param)
+        return bench.run("random-validation", request.param, out=out, count=150).folder
+
+    def compared(self, whole, copy, steps, monkeypatch):
+        """Bring the specimen back from where a run died; return what the events say of the comparison."""
+        shutil.copytree(whole, copy)
+        cut(copy, steps)
+        # What follows the comparison is not what is tested.
+        monkeypatch.setattr(Engine, "_step", _leave)
+        with Record(copy) as record:
+            before = len(record.events())
+        outcome = resume(Resume(folder=copy, accept_changes=True), silent()).outcome
+        with Record(copy) as record:
+            return outcome.error, [event.text for event in record.events()[before:] if event.kind == "resumed"]
+
+    @pytest.mark.parametrize("steps", [17, 31, 61, 78, 95, 122, 140, 149])
+    def test_the_specimen_of_the_run_is_accepted(self, whole, tmp_path, monkeypatch, steps):
+        error, texts = self.compared(whole, tmp_path / "run", steps, monkeypatch)
+        assert not isinstance(error, AgreementError), error
+        assert texts[-1].endswith("as in the last readings of the record")
+
+    @pytest.mark.parametrize("share", [-0.1, 0.1])
+    def test_one_that_is_elsewhere_is_refused(self, whole, tmp_path, monkeypatch, share):
+        read = Past.of
+        monkeypatch.setattr(Past, "of", lambda record: _shifted(read(record), share))
+        for steps in (61, 122):
+            error, _ = self.compared(whole, tmp_path / str(steps), steps, monkeypatch)
+            assert isinstance(error, AgreementError)
+
+
+def _leave(*_):
+    raise AbortError("the comparison is over")
+
+
+def _shifted(past, share):
+    """Return a past in which the response was elsewhere, by a share of what it went through."""
+    (column,) = (past.names.index(n) for n in ("displacement_position", "wire_end_position") if n in past.names)
+    values = [step.values[column] for step in past.steps]
+    shift = share * (max(values) - min(values))
+    moved = [
+        replace(step, values=(*step.values[:column], step.values[column] + shift, *step.values[column + 1 :]))
+        for step in past.steps
+    ]
+    return replace(past, steps=tuple(moved))
 
 
 @pytest.mark.parametrize("rig", [pytest.param("vo2", marks=pytest.mark.seeds), "sma", "hybrid"])
