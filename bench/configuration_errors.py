@@ -8,6 +8,8 @@ from typing import Any, get_args
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
+from bench.parsing import comma_remark
+
 
 def problems(error: ValidationError, model: type[BaseModel], prefix: str = "") -> Iterator[str]:
     """Yield one sentence a problem: key, value, and what is allowed.
@@ -36,7 +38,7 @@ def problems(error: ValidationError, model: type[BaseModel], prefix: str = "") -
             meaning = f" ({field.description})" if field and field.description else ""
             value = problem["input"]
             shown = f" = {value!r}" if not isinstance(value, dict) else ""
-            yield f"{key or 'file'}{shown}: {message}{meaning}"
+            yield f"{key or 'file'}{shown}: {message}{meaning}{comma_remark(value)}"
 
 
 def _find(model: type[BaseModel], location: Sequence[Any]) -> tuple[type[BaseModel] | None, FieldInfo | None]:

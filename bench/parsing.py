@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,6 +16,7 @@ from typing import Any
 from bench.errors import DataError
 
 _TOO_DEEP = "it is nested too deeply"
+_WITH_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
 
 
 def parse_json(text: str | bytes) -> Any:  # noqa: ANN401 - anything that JSON can hold
@@ -55,3 +57,10 @@ def _finite(content: Any) -> Any:  # noqa: ANN401 - anything that JSON can hold
     if isinstance(content, Mapping):
         return {key: _finite(value) for key, value in content.items()}
     return [_finite(each) for each in content] if isinstance(content, list | tuple) else content
+
+
+def comma_remark(value: object) -> str:
+    """Return what to add to an error about a text that is a number but for its decimal comma; empty for any other."""
+    if isinstance(value, str) and _WITH_COMMA.fullmatch(value.strip()):
+        return f"; the decimal sign is a point: {value.strip().replace(',', '.')}"
+    return ""

@@ -44,3 +44,13 @@ def missing(path: Path) -> str:
 def way_back(path: Path) -> str:
     """Return how an error about an unreadable file goes on: by what to do, if it is a journal by its name."""
     return f"; `bench recover-journal {path}` says what is left of it" if path.suffix == ".sqlite" else ""
+
+
+def cause_of(error: Exception) -> str:
+    """Return what is wrong with a journal, and what can be done about a lock."""
+    if "locked" not in str(error):
+        return str(error)
+    return (
+        f"{error}: another program keeps it, or its folder is on a file system without locks, such as some network "
+        "drives; end that program, or use a folder on a disk of this computer"
+    )

@@ -9,7 +9,7 @@ import tempfile
 from pathlib import Path
 
 from bench.errors import DataError
-from bench.journal.finding import way_back
+from bench.journal.finding import cause_of, way_back
 
 
 class OpenedJournal:
@@ -52,7 +52,7 @@ class OpenedJournal:
                 self.db = _connected(path, "mode=ro&immutable=1")
         except (sqlite3.DatabaseError, OSError) as error:
             self._remove()
-            raise DataError(f"{path} is not a readable journal: {error}{way_back(path)}") from error
+            raise DataError(f"{path} is not a readable journal: {cause_of(error)}{way_back(path)}") from error
 
     def _copied(self, path: Path, why: str) -> sqlite3.Connection:
         self._copy = tempfile.TemporaryDirectory(prefix="bench-journal-")

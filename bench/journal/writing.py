@@ -17,7 +17,7 @@ from bench.devices import Signal, check_signal_names
 from bench.errors import ConfigurationError, DataError, RecordError
 from bench.journal.background import LONGEST_UNWRITTEN, Background
 from bench.journal.ending import Ending
-from bench.journal.finding import files_of
+from bench.journal.finding import cause_of, files_of
 from bench.journal.keeping import RESERVE_NAME, Keeper
 from bench.journal.mirror import NAME as MIRROR_NAME
 from bench.journal.mirror import read_mirror, second_files
@@ -96,7 +96,7 @@ class Journal:
                 made.callback(keeper.close, is_whole=True)
                 keeper.begin(entries)
             except (sqlite3.Error, OSError) as error:
-                raise ConfigurationError(f"{path} cannot be made: {error}") from None
+                raise ConfigurationError(f"{path} cannot be made: {cause_of(error)}") from None
             made.pop_all()
         self._begin(keeper, signals, dict.fromkeys(FIRST, 0), patience)
 
@@ -138,7 +138,7 @@ class Journal:
         except (sqlite3.Error, OSError) as error:
             if keeper is not None:
                 keeper.close(is_whole=False)
-            raise DataError(f"{file} cannot be written on: {error}") from None
+            raise DataError(f"{file} cannot be written on: {cause_of(error)}") from None
         keeper.keep([entry("meta", meta_row(key, value)) for key, value in meta.items()])
         journal._begin(keeper, signals, counts, patience, lost)
         return journal
@@ -370,7 +370,7 @@ def take_in(path: Path) -> tuple[Path, tuple[Signal, ...], dict[str, int], dict[
             with closing(Store(file, _READERS)) as store:
                 store.write(missing)
         except (sqlite3.Error, OSError) as error:
-            raise DataError(f"{file} cannot be written on: {error}") from None
+            raise DataError(f"{file} cannot be written on: {cause_of(error)}") from None
     return file, signals, counts, {table: count for table, count in lost.items() if count}
 
 

@@ -13,6 +13,7 @@ from pydantic_core import PydanticUndefined
 from bench.binding import RoleTable, Slots, check_bound, rate_unit
 from bench.devices import Device, Signal
 from bench.errors import ConfigurationError
+from bench.parsing import comma_remark
 from bench.protocol.changes import ParameterChange
 from bench.protocol.views import Views
 from bench.protocol.vocabulary import Messages
@@ -399,7 +400,7 @@ class ProtocolDefinition:
                     given += f" (nor does the rig file say it: [protocols.{self.name}] {name} = ...)"
                 yield (
                     f"{from_file.get(name, '')}protocol {self.name}: parameter {name} {given}; "
-                    f"allowed: {self._allowed(name, roles)} ({problem['msg']})"
+                    f"allowed: {self._allowed(name, roles)} ({problem['msg']}){comma_remark(problem['input'])}"
                 )
             else:
                 yield f"protocol {self.name}: {problem['msg'].removeprefix('Value error, ')}"

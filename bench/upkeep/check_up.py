@@ -149,7 +149,7 @@ def _failure(name: str, error: BenchError) -> Finding:
     if isinstance(error, DeviceConnectionError):
         return Finding("connection", text, "see that it is on and connected as the rig file says")
     if isinstance(error, DeviceError):
-        return Finding("error", text, "remove the cause; `bench recover` clears an error that the instrument keeps")
+        return Finding("error", text, "do as it says; `bench recover` clears an error that the instrument keeps")
     return Finding("rig file", text, "correct the rig file")
 
 
