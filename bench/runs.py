@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -188,6 +189,9 @@ def carry_out(
         rehearsal = None
         if run.rehearse and again is None and run.clock != "virtual":
             rehearsal = _rehearsed(run, rig_file, parameters, console, interrupts)
+        elif clock.sleep_waits:
+            # Loading the filters takes a second, as a rehearsal would have done: no device waits for that later.
+            import_module("filterpy.kalman")
         if rehearsal is not None:
             rehearsal.raise_if_wrong()
         # Removed again after all that may write there is closed.

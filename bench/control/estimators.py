@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.hysteresis._checks import Floats
+from bench.deferred import DeferredModule
+
+if TYPE_CHECKING:
+    from filterpy import kalman
+else:
+    kalman = DeferredModule("filterpy.kalman")
 
 
 def agility_for(*, drift: float, noise: float, period: float) -> float:
@@ -63,9 +69,10 @@ class DriftEstimator:
     def __init__(self, *, noise: float, agility: float) -> None:
         if not (0 < noise < math.inf and 0 < agility < math.inf):
             raise ValueError(f"noise, agility: expected positive numbers, got {noise} and {agility}")
-        self._state: Floats
-        self._covariance: Floats
-        self._noise = noise
+        self._filter = kalman.KalmanFilter(dim_x=2, dim_z=1)
+        self._filter.H, self._filter.R = np.array([[1.0, 0.0]]), np.array([[noise**2]])
+        # Nothing is known of the drift; the first reading fixes the value.
+        self._filter.P = np.diag([noise**2, (1e6 * max(noise, agility)) ** 2])
         self._agility = agility
         self._time: float | None = None
         self._readings = 0
@@ -90,43 +97,26 @@ class DriftEstimator:
         if not math.isfinite(t):
             raise ValueError(f"t: expected a finite number, got {t}")
         if self._time is None:
-            self._state = np.array([value, 0.0])
-            # Nothing is known of the drift; the first reading fixes the value.
-            self._covariance = np.diag([self._noise**2, (1e6 * max(self._noise, self._agility)) ** 2])
+            self._filter.x = np.array([value, 0.0])
         else:
             dt = t - self._time
             if dt < 0:
                 raise ValueError(f"t: expected a time not before {self._time}, got {t}")
-            self._predict(dt)
-            self._correct(value)
+            walk = self._agility**2 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
+            self._filter.predict(F=np.array([[1.0, dt], [0.0, 1.0]]), Q=walk)
+            self._filter.update(value)
         self._time = t
         self._readings += 1
-
-    def _predict(self, dt: float) -> None:
-        transition = np.array([[1.0, dt], [0.0, 1.0]])
-        walk = self._agility**2 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
-        self._state = np.dot(transition, self._state)
-        self._covariance = np.dot(np.dot(transition, self._covariance), transition.T) + walk
-
-    def _correct(self, value: float) -> None:
-        variance = self._noise**2
-        # Only the value is read, so its column of the covariance is all that the reading sees.
-        column = self._covariance[:, 0]
-        gain = column * (1.0 / (column[0] + variance))
-        self._state = self._state + gain * (value - self._state[0])
-        # Joseph's form, which stays symmetric and positive.
-        kept = np.array([[1.0 - gain[0], 0.0], [-gain[1], 1.0]])
-        self._covariance = np.dot(np.dot(kept, self._covariance), kept.T) + np.outer(gain * variance, gain)
 
     @property
     def drift(self) -> float:
         """The estimated drift, in units/s; nan before two readings."""
-        return float(self._state[1]) if self._readings >= 2 else math.nan
+        return float(self._filter.x[1]) if self._readings >= 2 else math.nan
 
     @property
     def uncertainty(self) -> float:
         """Standard deviation of the estimated drift, in units/s; infinite before two readings."""
-        return math.sqrt(float(self._covariance[1, 1])) if self._readings >= 2 else math.inf
+        return math.sqrt(float(self._filter.P[1, 1])) if self._readings >= 2 else math.inf
 
     def is_steady(self, limit: float) -> bool:
         """Return whether drift and uncertainty together are within `limit` (units/s)."""
@@ -224,10 +214,3 @@ class DisturbanceEstimator:
         """The part K, 0 to 1, that the next value will have in the estimate."""
         predicted = self._variance + self._walk
         return predicted / (predicted + self._noise)
-
-    @property
-    def steady_gain(self) -> float:
-        """The gain K that many readings lead to."""
-        q, r = self._walk, self._noise
-        predicted = 0.5 * (q + math.sqrt(q * q + 4.0 * q * r))
-        return predicted / (predicted + r)

@@ -21,14 +21,20 @@ import math
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Mapping
-from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias, cast, get_args
+from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, TypeAlias, cast, get_args
 
 import numpy as np
 
 from bench.control.tuning import Spans
+from bench.deferred import DeferredModule
 from bench.hysteresis import Operator, Preisach
 from bench.hysteresis._checks import Floats
 from bench.hysteresis.transport import transported, widened, widening
+
+if TYPE_CHECKING:
+    from filterpy import kalman
+else:
+    kalman = DeferredModule("filterpy.kalman")
 
 AdaptationName: TypeAlias = Literal["off", "session", "density"]
 ADAPTATIONS: tuple[AdaptationName, ...] = get_args(AdaptationName)
@@ -95,10 +101,10 @@ class ModelFilter(ABC):
         self.uncertainty = self._last = math.nan
         # Of the last readings: errors of the adapted and the identified model if it was refused, else None.
         self._lately: deque[tuple[float, float] | None] = deque(maxlen=_LATELY)
-        self._values, self._first = self._prior()
-        self._covariance = self._first
+        self._start, self._first = self._prior()
+        self._filter = kalman.ExtendedKalmanFilter(dim_x=self._start.size, dim_z=1)
+        self._filter.x, self._filter.P = self._start, self._first
         self._excess = 1.0
-        self._start = self._values
 
     @abstractmethod
     def _prior(self) -> tuple[Floats, Floats]:
@@ -127,14 +133,14 @@ class ModelFilter(ABC):
         if abs(value - self._last) < APART * self._spans.input:
             return False
         row = self._row(state)
-        covariance = self._covariance + FORGETTING**2 * self._first
-        seen = covariance @ row
-        explained = float(row @ seen)
+        covariance = self._filter.P + FORGETTING**2 * self._first
+        explained = float(row @ (covariance @ row))
         step = 2.0 * INPUT_ERROR * self._spans.input
         slope = (self.model.step(state, value + step)[1] - self.model.step(state, value - step)[1]) / (2.0 * step)
         noise = (MODEL_ERROR * self._spans.output) ** 2 + (INPUT_ERROR * self._spans.input * slope) ** 2
         noise *= self._excess
-        error = output - self.model.value(state)
+        expected = self.model.value(state)
+        error = output - expected
         surprise = min(error**2 / (explained + noise), GATE**2)
         self._excess = min(max(self._excess * (1.0 + _SHARE * (surprise - 1.0)), 1.0), WORST)
         if abs(error) > GATE * math.sqrt(explained + noise):
@@ -142,13 +148,12 @@ class ModelFilter(ABC):
         self._lately.append(None)
         self._last = value
         self.taken += 1
-        gain = seen / (explained + noise)
-        # Joseph's form, which stays positive.
-        kept = np.eye(row.size) - np.outer(gain, row)
-        self._covariance = kept @ covariance @ kept.T + noise * np.outer(gain, gain)
-        self._values = self._bounded(self._values + gain * error)
-        self.model = self._built(self._values)
-        self.uncertainty = math.sqrt(max(float(row @ self._covariance @ row), 0.0))
+        # Not by `predict`, as nothing is forgotten of a reading that is refused.
+        self._filter.P = covariance
+        self._filter.update(output, lambda _: row[np.newaxis], lambda _: expected, noise)
+        self._filter.x = self._bounded(self._filter.x)
+        self.model = self._built(self._filter.x)
+        self.uncertainty = math.sqrt(max(float(row @ self._filter.P @ row), 0.0))
         return True
 
     def _refuse(self, error: float, identified_error: float) -> bool:
@@ -223,7 +228,7 @@ class SessionFilter(ModelFilter):
         return np.array([0.0, 1.0, 0.0, 1.0])[: units.size], np.diag(deviation**2)
 
     def _row(self, state: Any) -> Floats:  # noqa: ANN401
-        _, gain, *others = self._values.tolist()
+        _, gain, *others = self._filter.x.tolist()
         row = [1.0, self._inner(*others).value(state)]
         for k, value in enumerate(others):
             step = 0.02 * math.sqrt(self._first[2 + k, 2 + k])
@@ -251,8 +256,8 @@ class SessionFilter(ModelFilter):
     def estimates(self) -> Mapping[str, Estimate]:
         """Return those of `name`s offset, gain, and for a Preisach operator input-offset and width."""
         units = (self.identified.output_unit, "", self.identified.input_unit, "")
-        deviations = np.sqrt(np.diag(self._covariance)).tolist()
-        found = zip(self._names, self._values.tolist(), deviations, units, strict=False)
+        deviations = np.sqrt(np.diag(self._filter.P)).tolist()
+        found = zip(self._names, self._filter.x.tolist(), deviations, units, strict=False)
         return {name: Estimate(value, deviation, unit) for name, value, deviation, unit in found}
 
 
@@ -334,13 +339,13 @@ class DensityFilter(ModelFilter):
 
     def estimates(self) -> Mapping[str, Estimate]:
         """Return `offset`, that of the bias, and `mass`, that of the whole density in parts of the identified one."""
-        cells, covariance = self._areas.size, self._covariance
+        cells, values, covariance = self._areas.size, self._filter.x, self._filter.P
         whole = float(self._start[:cells].sum())
         mass, deviation = (
-            float(self._values[:cells].sum()),
+            float(values[:cells].sum()),
             math.sqrt(max(float(covariance[:cells, :cells].sum()), 0)),
         )
-        moved = float(self._values[cells] - self._start[cells])
+        moved = float(values[cells] - self._start[cells])
         return {
             "offset": Estimate(moved, math.sqrt(float(covariance[cells, cells])), self.identified.output_unit),
             "mass": Estimate(mass / whole, abs(deviation / whole), "") if whole else Estimate(math.nan, math.nan, ""),

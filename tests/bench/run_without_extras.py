@@ -19,7 +19,6 @@ EXTRAS = {
     "pyarrow",
     "matplotlib",
     "mpl_toolkits",
-    "filterpy",
     "openpyxl",
     "pandas",
 }

@@ -170,29 +170,3 @@ class TestErrors:
         estimator.update(1.0, 5.0)
         estimator.update(1.0, 5.0)
         assert not estimator.is_steady(0.02)
-
-
-def test_the_drift_is_that_of_an_independent_kalman_filter():
-    noise, agility = 0.013, 0.003
-    rng = np.random.default_rng(3)
-    estimator = DriftEstimator(noise=noise, agility=agility)
-    from filterpy.kalman import KalmanFilter
-
-    reference = KalmanFilter(dim_x=2, dim_z=1)
-    reference.H, reference.R = np.array([[1.0, 0.0]]), np.array([[noise**2]])
-    times = np.cumsum(rng.choice([0.1, 0.25, 0.5], 500))
-    for k, time in enumerate(times):
-        value = 30.0 + math.exp(-time / 20.0) + noise * rng.standard_normal()
-        if k == 0:
-            reference.x, reference.P = np.array([value, 0.0]), np.diag([noise**2, (1e6 * noise) ** 2])
-        else:
-            # Of the times themselves: the first readings cancel all but the last digits.
-            dt = time - times[k - 1]
-            reference.F = np.array([[1.0, dt], [0.0, 1.0]])
-            reference.Q = agility**2 * np.array([[dt**3 / 3, dt**2 / 2], [dt**2 / 2, dt]])
-            reference.predict()
-            reference.update(np.array([value]))
-        estimator.update(time, value)
-        if k > 0:
-            assert estimator.drift == pytest.approx(reference.x[1], rel=1e-9, abs=1e-12)
-            assert estimator.uncertainty == pytest.approx(math.sqrt(reference.P[1, 1]), rel=1e-9)

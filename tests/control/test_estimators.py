@@ -1,9 +1,10 @@
-"""The estimate of a disturbance against the closed form of its filter."""
+"""The estimate of a disturbance against the closed form of its filter, and against filterpy."""
 
 import math
 
 import numpy as np
 import pytest
+from filterpy.kalman import KalmanFilter
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -21,22 +22,21 @@ class TestAgainstClosedForm:
             estimator.update(0.0)
         predicted = 0.5 * (q + math.sqrt(q * q + 4.0 * q * r))
         assert estimator.gain == pytest.approx(predicted / (predicted + r), rel=1e-9)
-        assert estimator.steady_gain == pytest.approx(estimator.gain, rel=1e-9)
         assert estimator.uncertainty == pytest.approx(math.sqrt(predicted * r / (predicted + r)), rel=1e-9)
 
     @given(st.lists(st.floats(-1e3, 1e3) | st.none(), min_size=1, max_size=30), st.floats(0.01, 100.0))
-    def test_each_update_is_the_scalar_recursion(self, values, q):
-        r, d, variance = 1.0, 0.0, 25.0
-        estimator = DisturbanceEstimator(walk_variance=q, reading_variance=r, initial_variance=25.0)
+    def test_each_update_is_that_of_filterpy(self, values, q):
+        reference = KalmanFilter(dim_x=1, dim_z=1)
+        reference.x, reference.P, reference.H = np.zeros(1), np.array([[25.0]]), np.eye(1)
+        estimator = DisturbanceEstimator(walk_variance=q, reading_variance=1.0, initial_variance=25.0)
         for value in values:
-            variance += q
+            gain = estimator.gain
+            reference.predict(Q=np.array([[q]]))
+            reference.update(value)
             if value is not None:
-                gain = variance / (variance + r)
-                assert estimator.gain == pytest.approx(gain, rel=1e-12)
-                d += gain * (value - d)
-                variance *= 1.0 - gain
-            assert estimator.update(value) == pytest.approx(d, rel=1e-9, abs=1e-9)
-            assert estimator.uncertainty == pytest.approx(math.sqrt(variance), rel=1e-9)
+                assert gain == pytest.approx(reference.K[0, 0], rel=1e-12)
+            assert estimator.update(value) == pytest.approx(reference.x[0], rel=1e-12, abs=1e-12)
+            assert estimator.uncertainty == pytest.approx(math.sqrt(reference.P[0, 0]), rel=1e-12)
 
     def test_the_first_reading_fixes_the_value(self):
         estimator = DisturbanceEstimator(walk_variance=3.0, reading_variance=1.0)
@@ -78,6 +78,11 @@ class TestStability:
     """A controller that takes the estimate away from its next target: e goes on by 1 - K g."""
 
     @staticmethod
+    def gain(q):
+        predicted = 0.5 * (q + math.sqrt(q * q + 4.0 * q))
+        return predicted / (predicted + 1.0)
+
+    @staticmethod
     def errors(q, g, count=200):
         estimator = DisturbanceEstimator(walk_variance=q, reading_variance=1.0)
         for _ in range(200):
@@ -87,19 +92,17 @@ class TestStability:
             output = g * model
             errors.append(1.0 - output)
             model = 1.0 - estimator.update(output - model)
-        return np.abs(errors), estimator.steady_gain
+        return np.abs(errors)
 
     @given(st.floats(0.01, 100.0), st.floats(0.02, 0.97))
     def test_within_the_bound_the_error_dies_out(self, q, part):
-        gain = self.errors(q, 1.0, 1)[1]
-        errors, _ = self.errors(q, 2.0 * part / gain)
+        errors = self.errors(q, 2.0 * part / self.gain(q))
         assert errors[-1] < errors[0] * max(abs(1.0 - 2.0 * part), 0.05) ** 100 + 1e-6
 
     @pytest.mark.parametrize("q", [0.1, 3.0, 30.0])
     def test_beyond_the_bound_it_grows(self, q):
-        gain = self.errors(q, 1.0, 1)[1]
-        assert self.errors(q, 2.1 / gain)[0][-1] > 1e3
-        assert self.errors(q, -0.1 / gain)[0][-1] > 1e3
+        assert self.errors(q, 2.1 / self.gain(q))[-1] > 1e3
+        assert self.errors(q, -0.1 / self.gain(q))[-1] > 1e3
 
 
 @pytest.mark.parametrize("wrong", [0.0, -1.0, math.nan, math.inf])

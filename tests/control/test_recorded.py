@@ -187,7 +187,7 @@ def estimating():
         rows.append((disturbance.value, disturbance.uncertainty, disturbance.gain))
     disturbance.reset()
     found |= {str(i): [row[i] for row in rows] for i in range(3)}
-    return found | {"end": [disturbance.value, disturbance.uncertainty, disturbance.steady_gain]}
+    return found | {"end": [disturbance.value, disturbance.uncertainty]}
 
 
 def referring():
