@@ -12,7 +12,8 @@ written, a row is durable in that one, and goes into the journal later; see docs
 Schema, version 3
 -----------------
 `meta(key, value, checksum)`
-    Values are JSON. Keys: `schema`, `run` (identifier), `rig`, `rig_file` (its text), `rig_content` (with what it
+    Values are JSON. Keys: `schema`, `identity` (random number of the journal, which its second files have as well),
+    `run` (identifier), `rig`, `rig_file` (its text), `rig_content` (with what it
     extends and the overrides), `overrides`, `protocol`, `protocol_source` (its module, whether that is of an
     installed package, and the checksum of its file), `parameters`, `changed` (those that differ from their defaults),
     `repeats` (the run that this one repeats), `slots` (device and signal by name), `seed`,

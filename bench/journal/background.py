@@ -94,7 +94,7 @@ class Background:
         try:
             if self._aside is None:
                 _, path = elsewhere(self._keeper.store.path)
-                self._aside = Mirror(path)
+                self._aside = Mirror(path, self._keeper.identity)
                 self._keeper.notices.append(f"the disk of the journal is slow; rows that wait are in {path} as well")
             self._aside.append(entries)
             self._aside.sync()

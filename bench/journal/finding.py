@@ -7,7 +7,7 @@ from pathlib import Path
 
 from bench.journal.keeping import RESERVE_NAME
 from bench.journal.mirror import NAME as MIRROR_NAME
-from bench.journal.mirror import second_files
+from bench.journal.mirror import readable_second_files
 from bench.journal.rows import FILE_NAME, RECOVERED_NAME
 
 _TRACES = {FILE_NAME, MIRROR_NAME, RECOVERED_NAME}
@@ -33,7 +33,7 @@ def missing(path: Path) -> str:
                 f"{path} has lost its {FILE_NAME}; {copy} is a recovered copy of it, to be read in its place, and "
                 f"`bench resume {copy}` says how it is resumed"
             )
-        if any(second.is_file() for second in second_files(folder / FILE_NAME)):
+        if readable_second_files(folder / FILE_NAME):
             return (
                 f"{path} has lost its {FILE_NAME}, but a second file has its rows: "
                 f"`bench recover-journal {folder}` writes {RECOVERED_NAME} from them"

@@ -36,10 +36,19 @@ _LAST_WAIT = 5.0
 class Keeper:
     """Keeps the rows of one journal; used by one thread at a time.
 
-    Attributes
+    Parameters
     ----------
     store : Store
         The SQLite file.
+    identity : str
+        Number of the journal, which its second files have as well; empty for one that has none.
+
+    Attributes
+    ----------
+    store : Store
+        The SQLite file; another one once the first was removed.
+    identity : str
+        Number of the journal.
     notices : list of str
         What happened to the journal, for the log; who reads them takes them out.
     is_short : bool
@@ -48,8 +57,9 @@ class Keeper:
         Further second files, to be closed with the journal.
     """
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, store: Store, identity: str = "") -> None:
         self.store = store
+        self.identity = identity
         self.notices: list[str] = []
         self.is_short = False
         self.spare: list[Mirror] = []
@@ -58,7 +68,7 @@ class Keeper:
         self._why = ""
         self._is_closed = False
         folder = store.path.parent
-        self._mirror: Mirror | None = Mirror(folder / MIRROR_NAME)
+        self._mirror: Mirror | None = Mirror(folder / MIRROR_NAME, identity)
         self._elsewhere: Mirror | None = None
         self._is_whole = True
         """Whether the second file has every row."""
@@ -193,7 +203,7 @@ class Keeper:
         try:
             if self._elsewhere is None:
                 path, _ = elsewhere(self.store.path)
-                self._elsewhere = Mirror(path)
+                self._elsewhere = Mirror(path, self.identity)
                 self._elsewhere.append(self._waiting)
                 self.notices.append(f"the disk of the journal takes nothing; rows wait in {path}")
             else:
@@ -229,7 +239,7 @@ class Keeper:
             signals = [each.row[1] for each in rows.values() if each.table == "signals"]
             self.store = Store(folder / FILE_NAME)
             self.store.create(signals, rows.values())
-            mirror = Mirror(folder / MIRROR_NAME)
+            mirror = Mirror(folder / MIRROR_NAME, self.identity)
             mirror.append(list(rows.values()))
         except (OSError, sqlite3.Error) as error:
             raise RecordError(f"{message}what is recorded could not be written anew: {error}") from None

@@ -5,6 +5,9 @@ the disk is full, a row is durable as soon as this file is; where the journal is
 
 An entry is a mark, a head (table, quantity of rows and of numbers in each, length and CRC-32 of the rest), and the
 rows' numbers and texts as in `bench.journal.rows.Entry`. What is damaged or cut off is left out when it is read.
+
+Before the rows of a journal stands the random number that its metadata has, as a row of these. Rows that follow
+another number, or none, are not of this journal, and are left out.
 """
 
 from __future__ import annotations
@@ -17,10 +20,11 @@ import struct
 import tempfile
 import zlib
 from collections.abc import Iterable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import IO
 
-from bench.journal.rows import TABLES, TEXTS, Entry, split, unpacked
+from bench.journal.rows import IDENTITY, TABLES, TEXTS, Entry, entry, meta_row, split, unpacked
 from bench.locks import is_own
 
 NAME = "journal.mirror"
@@ -48,16 +52,19 @@ class Mirror:
     ----------
     path : Path
         The file; what is there already is kept, up to the first entry that is cut off.
+    identity : str
+        Number of the journal; empty for one that has none.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, identity: str = "") -> None:
         self.path = path
+        self._unsaid = [entry("meta", meta_row(IDENTITY, identity))] if identity else []
         self._file = os.fdopen(_open(path, os.O_RDWR | os.O_CREAT), "r+b", buffering=0)
         self._end = self._file.seek(0, os.SEEK_END)
 
     def append(self, entries: Iterable[Entry]) -> None:
         """Append rows, all or none; they are durable after `sync` only."""
-        data = b"".join(map(_encoded, entries))
+        data = b"".join(map(_encoded, (*self._unsaid, *entries)))
         try:
             if self._file.write(data) != len(data):
                 raise OSError(f"{self.path} takes no more")
@@ -67,6 +74,7 @@ class Mirror:
             self._file.seek(self._end)
             raise
         self._end += len(data)
+        self._unsaid = []
 
     def sync(self) -> None:
         """Make what was appended durable."""
@@ -89,11 +97,35 @@ def second_files(journal: Path) -> list[Path]:
     return [journal.parent / NAME, *elsewhere(journal)]
 
 
-def read_mirror(path: Path) -> Iterator[Entry]:
-    """Yield the intact rows as they were written: ticks of one write together; none of a missing or foreign file."""
+def readable_second_files(journal: Path) -> list[Path]:
+    """Return the second files of a journal that are there and may be read; whose rows they have is not looked at."""
+    readable = []
+    for path in second_files(journal):
+        with suppress(FileNotFoundError, _ForeignFileError):
+            os.close(_open(path, os.O_RDONLY))
+            readable.append(path)
+    return readable
+
+
+def read_mirror(path: Path, identity: str | None = None) -> Iterator[Entry]:
+    """Yield the intact rows as they were written: ticks of one write together; none of a missing or foreign file.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    identity : str, optional
+        Number of the journal whose rows are wanted, empty for a journal without one; if not given, rows of any.
+    """
+    wanted = meta_row(IDENTITY, identity) if identity else None
+    journal = None
     try:
         with os.fdopen(_open(path, os.O_RDONLY), "rb") as file:
-            yield from _decoded(file)
+            for rows in _decoded(file):
+                if rows.table == "meta" and rows.row[0] == IDENTITY:
+                    journal = rows.row
+                if identity is None or journal == wanted:
+                    yield rows
     except (FileNotFoundError, _ForeignFileError):
         return
 
@@ -113,10 +145,11 @@ def _open(path: Path, flags: int) -> int:
         return os.open(path, flags, 0o666)
     try:
         file = os.open(path, flags | os.O_NOFOLLOW | os.O_NONBLOCK, 0o600)
-    except OSError as error:
-        if error.errno == errno.ELOOP:
-            raise _ForeignFileError(errno.ELOOP, "it is a link", str(path)) from None
+    except FileNotFoundError:
         raise
+    except OSError as error:
+        why = "it is a link" if error.errno == errno.ELOOP else os.strerror(error.errno or 0)
+        raise _ForeignFileError(error.errno, why, str(path)) from None
     found = os.fstat(file)
     if stat.S_ISREG(found.st_mode) and found.st_nlink == 1 and is_own(found):
         return file

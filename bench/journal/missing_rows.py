@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.journal.mirror import read_mirror, second_files
-from bench.journal.rows import FIRST, NUMBERS, RECOVERED_NAME
+from bench.journal.rows import FIRST, IDENTITY, NUMBERS, RECOVERED_NAME
 from bench.journal.write_ahead_log import log_damage
 
 Range = tuple[int, int]
@@ -78,7 +78,7 @@ def find_missing_rows(db: sqlite3.Connection, journal: Path, meta: Mapping[str, 
         ranges = {table: list(_gaps(db, table)) for table in FIRST}
         last = {table: _last(db, table) for table in FIRST}
         if counts is None:
-            waiting = _waiting(journal, last, is_whole=not damage)
+            waiting = _waiting(journal, str(meta.get(IDENTITY, "")), last, is_whole=not damage)
             step = db.execute("SELECT step FROM telemetry ORDER BY tick DESC LIMIT 1").fetchone()
             # The step at the last tick need not be finished, those before it are.
             waiting["steps"] = max(waiting["steps"], -1 if step is None else int(step[0]) - 1)
@@ -112,7 +112,7 @@ def _last(db: sqlite3.Connection, table: str) -> int:
     return FIRST[table] - 1 if last is None else int(last)
 
 
-def _waiting(journal: Path, last: Mapping[str, int], *, is_whole: bool) -> dict[str, int]:
+def _waiting(journal: Path, identity: str, last: Mapping[str, int], *, is_whole: bool) -> dict[str, int]:
     """Return the last numbers of the rows in the second files of a journal.
 
     A row is handed over when the one before it is durable: of a journal that is whole, the last step or event and the
@@ -121,7 +121,7 @@ def _waiting(journal: Path, last: Mapping[str, int], *, is_whole: bool) -> dict[
     ends = {table: FIRST[table] - 1 for table in FIRST}
     behind: list[str] = []
     for second in second_files(journal):
-        for each in read_mirror(second):
+        for each in read_mirror(second, identity):
             if each.table in ends:
                 number = int(each.rows[-1][0])
                 ends[each.table] = max(ends[each.table], number)

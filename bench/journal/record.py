@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import math
 import sqlite3
 import warnings
@@ -25,6 +24,7 @@ from bench.journal.models import models_beside
 from bench.journal.opening import OpenedJournal
 from bench.journal.rows import (
     FILE_NAME,
+    IDENTITY,
     NUMBERS,
     SCHEMA,
     Event,
@@ -35,6 +35,7 @@ from bench.journal.rows import (
 )
 from bench.journal.table import Table
 from bench.locks import is_in_use
+from bench.parsing import parse_json
 from bench.settling import Settled
 
 _QUICKLY_CHECKED = 20_000
@@ -95,6 +96,11 @@ class Record:
                 self.close()
                 raise
 
+    @property
+    def identity(self) -> str:
+        """Random number of the journal, which its second files have as well; empty if it has none."""
+        return str(self.meta.get(IDENTITY, ""))
+
     def remark(self) -> str:
         """Return what is unusual: how the journal is read, and which rows are missing; else nothing."""
         return "; ".join(filter(None, (self._opened.remark, str(self.missing) if self.missing else "")))
@@ -102,7 +108,7 @@ class Record:
     def _read_heading(self) -> None:
         try:
             meta = self._db.execute("SELECT * FROM meta").fetchall()
-            self.meta: dict[str, Any] = {key: json.loads(value) for key, value, *_ in meta}
+            self.meta: dict[str, Any] = {key: parse_json(value) for key, value, *_ in meta}
             signals = self._db.execute("SELECT * FROM signals ORDER BY position").fetchall()
             self.signals = tuple(Signal(*row[1:5]) for row in signals)
         except (sqlite3.DatabaseError, ValueError, TypeError) as error:
@@ -178,9 +184,9 @@ class Record:
                     phase,
                     label,
                     Settled(settled),
-                    json.loads(setpoints),
+                    parse_json(setpoints),
                     tuple(math.nan if value is None else float(value) for value in values),
-                    tuple(map(float, json.loads(row[end]))),
+                    tuple(map(float, parse_json(row[end]))),
                 )
             except (ValueError, TypeError) as error:
                 raise self._damaged(f"step {step}: {error}") from error

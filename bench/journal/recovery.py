@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
@@ -17,12 +16,13 @@ import numpy as np
 from bench.errors import ConfigurationError, DataError
 from bench.journal.finding import missing
 from bench.journal.mirror import NAME as MIRROR_NAME
-from bench.journal.mirror import read_mirror, second_files
+from bench.journal.mirror import read_mirror, readable_second_files
 from bench.journal.missing_rows import Range, joined_ranges
 from bench.journal.opening import OpenedJournal
 from bench.journal.rows import (
     FILE_NAME,
     FIRST,
+    IDENTITY,
     NUMBERS,
     RECOVERED_NAME,
     SCHEMA,
@@ -36,6 +36,7 @@ from bench.journal.rows import (
 from bench.journal.store import Store
 from bench.journal.substitutes import metadata, signal_rows, unnamed_signals
 from bench.journal.write_ahead_log import log_damage
+from bench.parsing import parse_json
 
 _SMALL = tuple(table for table in TABLES if table not in FIRST)
 """Tables that are held as a whole; the others may have millions of rows."""
@@ -121,26 +122,28 @@ def recover(path: Path, others: Sequence[Path] = (), out: Path | None = None) ->
         If the copy exists already or cannot be written, or there is no second file that was named.
     """
     journal = path / FILE_NAME if path.is_dir() else path
-    seconds = (*second_files(journal), *others)
     if absent := [other for other in others if not other.is_file()]:
         raise ConfigurationError(f"there is no second file {absent[0]}")
-    found = tuple(each for each in seconds if each.is_file())
+    found = (*readable_second_files(journal), *others)
     if not journal.is_file() and not found:
         raise DataError(missing(path))
     left = _salvage(journal)
-    beside = _beside(found)
+    identity = _identity(left.rows["meta"], found)
+    if strange := [other for other in others if not any(read_mirror(other, identity)) and any(read_mirror(other))]:
+        raise ConfigurationError(f"{strange[0]} is the second file of another journal")
+    beside = _beside(found, identity)
     whole = {table: {**beside.rows[table], **left.rows[table]} for table in _SMALL}
     numbers = {table: left.numbers[table].joined(beside.numbers[table]) for table in FIRST}
     if not any(whole.values()) and not any(numbers.values()):
         raise DataError(_hopeless(journal, left.problem, found))
-    meta = {key: json.loads(each.row[1]) for key, each in whole["meta"].items()}
+    meta = {key: parse_json(each.row[1]) for key, each in whole["meta"].items()}
     # A second file has every row.
-    is_lost = {table: table in left.cut and not beside.rows["meta"] for table in TABLES}
+    is_lost = {table: table in left.cut and not beside.rows["meta"].keys() - {IDENTITY} for table in TABLES}
     if meta.get("schema", None if whole["meta"] and not left.bad["meta"] else SCHEMA) != SCHEMA:
         raise DataError(f"{journal} has schema version {meta.get('schema')}; this bench reads version {SCHEMA}")
     substitutes: dict[str, Any] = {}
     if is_lost["meta"] or set(left.bad["meta"]).difference(whole["meta"]):
-        events = chain.from_iterable(each.rows for each in _rows_of(journal, found, ("events",)))
+        events = chain.from_iterable(each.rows for each in _rows_of(journal, found, identity, ("events",)))
         guessed = metadata(journal, whole["files"], events)
         substitutes = {key: value for key, value in guessed.items() if key not in meta}
     named = left.signals or unnamed_signals(max(left.signals_of_rows, beside.signals_of_rows))
@@ -165,7 +168,7 @@ def recover(path: Path, others: Sequence[Path] = (), out: Path | None = None) ->
         more["recovered"] = {"from": str(journal), "lost": lost, "substituted": sorted(substitutes)}
         meta |= more
         whole["signals"] |= signals
-        _write(copy, whole, _rows_of(journal, found, tuple(FIRST)), more)
+        _write(copy, whole, _rows_of(journal, found, identity, tuple(FIRST)), more)
     return Recovery(journal, str(meta.get("status", "unfinished")), left.problem, tables, found, copy)
 
 
@@ -259,7 +262,7 @@ def _small_state(left: _Left, table: str, whole: Mapping[Any, Entry], *, is_cut:
     good, bad = left.rows[table], left.bad[table]
     lost = set(bad) - set(whole)
     lacking = set(bad) | (set(whole) - set(good))
-    first = min(lacking, key=lambda key: (isinstance(key, str), key)) if lacking else None
+    first = min(lacking, key=_order, default=None)
     return _counted(len(good), len(whole) - len(good), len(lost), first, is_cut=is_cut)
 
 
@@ -283,14 +286,15 @@ def _state(left: _Left, table: str, whole: _Numbers, count: int | None, *, is_cu
 
 
 def _counted(good: int, added: int, lost: int, first: Any, *, is_cut: bool) -> TableState:  # noqa: ANN401 - a key
-    first_bad = "" if first is None else first if isinstance(first, str) else str(int(first))
+    # The key of a damaged row may be anything.
+    first_bad = "" if first is None else str(int(first)) if isinstance(first, int | float) else str(first)
     if is_cut and not lost:
         return TableState(good, added, 1, first_bad or "?")
     return TableState(good, added, lost, first_bad)
 
 
 def _order(key: Any) -> tuple[bool, Any]:  # noqa: ANN401 - a key of any table
-    return isinstance(key, str), key
+    return (False, key) if isinstance(key, int | float) else (True, str(key))
 
 
 def _salvage(journal: Path) -> _Left:
@@ -314,19 +318,29 @@ def _salvage(journal: Path) -> _Left:
     return left
 
 
-def _beside(seconds: Sequence[Path]) -> _Left:
+def _identity(meta: Mapping[Any, Entry], seconds: Sequence[Path]) -> str:
+    """Return the number of a journal; where it has lost it, that of the first second file that has rows."""
+    if IDENTITY in meta:
+        return str(parse_json(meta[IDENTITY].row[1]))
+    first = next(chain.from_iterable(map(read_mirror, seconds)), None)
+    if first is None or (first.table, first.row[0]) != ("meta", IDENTITY):
+        return ""
+    return str(parse_json(first.row[1]))
+
+
+def _beside(seconds: Sequence[Path], identity: str) -> _Left:
     """Return what second files have."""
     found = _Left()
     for second in seconds:
-        for each in read_mirror(second):
+        for each in read_mirror(second, identity):
             found.add(each)
     return found
 
 
-def _rows_of(journal: Path, seconds: Sequence[Path], tables: Sequence[str]) -> Iterator[Entry]:
+def _rows_of(journal: Path, seconds: Sequence[Path], identity: str, tables: Sequence[str]) -> Iterator[Entry]:
     """Yield the good rows of some tables, last those of the journal itself, which may come a second time."""
     for second in seconds:
-        yield from (each for each in read_mirror(second) if each.table in tables)
+        yield from (each for each in read_mirror(second, identity) if each.table in tables)
     if journal.is_file():
         with suppress(DataError), closing(_opened(journal)) as opened:
             for table in tables:

@@ -18,6 +18,8 @@ from bench.settling import Settled
 
 SCHEMA = 3
 FILE_NAME = "journal.sqlite"
+IDENTITY = "identity"
+"""Key of the metadata: a random number that tells a journal from every other one."""
 RECOVERED_NAME = "journal.recovered.sqlite"
 """The copy that `bench recover-journal` writes."""
 

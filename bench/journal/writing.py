@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import secrets
 import sqlite3
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, closing, suppress
@@ -23,7 +24,7 @@ from bench.journal.mirror import NAME as MIRROR_NAME
 from bench.journal.mirror import read_mirror, second_files
 from bench.journal.models import add_model
 from bench.journal.record import Record
-from bench.journal.rows import FIRST, SCHEMA, Entry, Event, StepRecord, entry, meta_row, split, ticks
+from bench.journal.rows import FIRST, IDENTITY, SCHEMA, Entry, Event, StepRecord, entry, meta_row, split, ticks
 from bench.journal.store import Store
 
 _READERS = 10.0
@@ -75,7 +76,9 @@ class Journal:
             raise ConfigurationError(f"{path} exists already; a record of a run is never overwritten")
         names = [signal.name for signal in signals]
         check_signal_names(names)
-        entries = [entry("meta", meta_row(key, value)) for key, value in {"schema": SCHEMA, **meta}.items()]
+        identity = secrets.token_hex(16)
+        heading = {"schema": SCHEMA, IDENTITY: identity, **meta}
+        entries = [entry("meta", meta_row(key, value)) for key, value in heading.items()]
         entries += [
             entry("signals", (position, signal.name, signal.unit, signal.description, signal.precision))
             for position, signal in enumerate(signals)
@@ -84,7 +87,9 @@ class Journal:
             entry("files", (name, hashlib.sha256(content).hexdigest(), content)) for name, content in files.items()
         ]
         for former in second_files(path):
-            former.unlink(missing_ok=True)
+            # What another user has put there stays, and is not believed.
+            with suppress(OSError):
+                former.unlink(missing_ok=True)
         with ExitStack() as made:
             made.callback(_remove, path)
             try:
@@ -92,7 +97,7 @@ class Journal:
                 made.callback(store.close)
                 store.create(names, entries)
                 store.wait_for_others(0.0)
-                keeper = Keeper(store)
+                keeper = Keeper(store, identity)
                 made.callback(keeper.close, is_whole=True)
                 keeper.begin(entries)
             except (sqlite3.Error, OSError) as error:
@@ -125,12 +130,14 @@ class Journal:
             If the run was completed.
         """
         file, signals, counts, lost = take_in(path)
+        with Record(file) as record:
+            identity = record.identity
         journal = cls.__new__(cls)
         was_mirrored = (file.parent / MIRROR_NAME).exists()
         keeper: Keeper | None = None
         try:
             # A reader may have it for a moment.
-            keeper = Keeper(Store(file, _READERS))
+            keeper = Keeper(Store(file, _READERS), identity)
             keeper.store.forget(_END)
             keeper.store.wait_for_others(0.0)
             if not was_mirrored:
@@ -340,12 +347,13 @@ def take_in(path: Path) -> tuple[Path, tuple[Signal, ...], dict[str, int], dict[
         # Each row is checked, also where only its number is needed.
         record.steps(), record.telemetry(), record.events()
         numbers = {table: record.numbers(table) for table in FIRST}
+        identity = record.identity
         lost: dict[str, int] = dict(record.meta.get("recovered", {}).get("lost", {}))
         has_ended = "status" in record.meta
     beside = {
         (each.table, each.row[0]): each
         for second in second_files(file)
-        for each in split(read_mirror(second))
+        for each in split(read_mirror(second, identity))
         if each.table not in FIRST or each.row[0] not in numbers[each.table]
     }
     if not has_ended and ("meta", "status") in beside:

@@ -1,6 +1,7 @@
 """The parts of a journal by themselves: second file, keeper, thread, SQLite file, and reading damaged ones."""
 
 import json
+import math
 import os
 import sqlite3
 import sys
@@ -32,7 +33,7 @@ from bench.journal.mirror import NAME as MIRROR_NAME
 from bench.journal.mirror import Mirror, elsewhere, read_mirror
 from bench.journal.models import add_model
 from bench.journal.recovery import recover
-from bench.journal.rows import SCHEMA, checksum, checksums, entry, meta_row, split, ticks
+from bench.journal.rows import RECOVERED_NAME, SCHEMA, TABLES, checksum, checksums, entry, meta_row, split, ticks
 from bench.journal.store import Store
 from bench.journal.writing import abandon, take_in
 from bench.settling import Settled
@@ -164,6 +165,42 @@ class TestMirror:
         assert (first.parent, first.suffix, late.suffix) == (other_disk, ".mirror", ".late")
         assert len(first.stem) == len("bench-") + 24
         assert elsewhere(tmp_path / "other.sqlite")[0] != first
+
+    def test_every_row_comes_back_as_it_was_kept(self, tmp_path):
+        rows = {
+            "meta": ("run", '"µ"'),
+            "signals": (0, "force", "N", "a load cell", 3),
+            "steps": (0, 0.0, 0.5, "up", "", "dwell", '{"tec": 1.5}', 1.0, None, "[0.25]"),
+            "telemetry": (1, 0.25, 0, 1.5, None),
+            "events": (1, 0.5, "INFO", "note", "text with = and four"),
+            "files": ("a.bin", "digest", bytes(range(256))),
+        }
+        assert rows.keys() == set(TABLES)
+        file = Mirror(tmp_path / "rows.mirror")
+        file.append([entry(table, row) for table, row in rows.items()])
+        file.close()
+        read = {each.table: each.row for each in read_mirror(file.path)}
+        for table, row in rows.items():
+            # A missing number is nan in the file.
+            np.testing.assert_equal(read[table], tuple(math.nan if value is None else value for value in row))
+
+    @pytest.mark.parametrize("count", [1, 3, 4, 20])
+    def test_ticks_are_kept_alike_one_by_one_and_together(self, count):
+        rows = [(i, 0.1 * i, 0, -0.0, math.nan, math.inf) for i in range(count)]
+        together = ticks(rows).payload
+        assert together == b"".join(ticks([row]).payload for row in rows)
+        # Neither the sign of a zero nor that of a nan is kept.
+        assert together == ticks([(*row[:3], 0.0, -math.nan, math.inf) for row in rows]).payload
+
+    def test_rows_of_another_journal_are_left_out(self, tmp_path):
+        path = tmp_path / "rows.mirror"
+        for identity, number in (("", 1), ("one", 2), ("other", 3), ("one", 4)):
+            file = Mirror(path, identity)
+            file.append([note(number)])
+            file.append([note(number + 10)])
+            file.close()
+        for identity, numbers in (("one", [2, 12, 4, 14]), ("other", [3, 13]), ("", [1, 11]), ("none of them", [])):
+            assert [each.row[0] for each in read_mirror(path, identity) if each.table == "events"] == numbers
 
     @pytest.mark.skipif(sys.platform == "win32", reason="needs links and users of POSIX")
     @pytest.mark.parametrize("forged", ["link", "second name", "of another user"])
@@ -467,6 +504,81 @@ class TestStore:
         store.path.write_bytes(b"")
         assert store.loss() == "replaced"
         store.close()
+
+
+@pytest.mark.parametrize("table", ["meta", "signals", "steps", "telemetry", "events", "files"])
+def test_a_row_whose_checksum_does_not_fit_is_told_and_left_out(tmp_path, table):
+    journal = Journal(tmp_path / FILE_NAME, SIGNALS, {"rig": "vo2"}, {"a.txt": b"a", "b.txt": b"b"})
+    for number in range(4):
+        journal.telemetry(number, number, (1.0,))
+        journal.step(step(number))
+        journal.event(Event(float(number), "INFO", "note", f"event {number}"))
+    journal.finish(**STATUS)
+    journal.close()
+    key, wanted, column = {
+        "meta": ("key", "'rig'", "value"), "signals": ("position", 0, "unit"), "steps": ("step", 1, "force"),
+        "telemetry": ("tick", 3, "force"), "events": ("event", 2, "text"), "files": ("name", "'b.txt'", "content"),
+    }[table]  # fmt: skip
+    with closing(sqlite3.connect(tmp_path / FILE_NAME)) as db, db:
+        (rows,) = db.execute(f"SELECT count(*) FROM {table}").fetchone()
+        db.execute(f"UPDATE {table} SET {column} = 7 WHERE {key} = {wanted}")
+    found = recover(tmp_path)
+    state = found.tables[table]
+    assert (state.good, state.missing, state.first_bad) == (rows - 1, 1, str(wanted).strip("'"))
+    assert [name for name, other in found.tables.items() if other.missing] == [table]
+    assert found.copy is not None
+
+
+@pytest.mark.parametrize("table", ["steps", "telemetry", "events"])
+@pytest.mark.parametrize("number", [1, 2, 4])
+def test_rows_that_are_gone_from_a_completed_record_are_told(tmp_path, table, number):
+    journal = Journal(tmp_path / FILE_NAME, SIGNALS, {})
+    for i in range(5):
+        journal.telemetry(i, i, (1.0,))
+        journal.step(step(i))
+        journal.event(Event(float(i), "INFO", "note", f"event {i}"))
+    journal.finish(**STATUS)
+    journal.close()
+    read = {"steps": Record.steps, "telemetry": Record.telemetry, "events": Record.events}[table]
+    with Record(tmp_path) as record:
+        assert record.remark() == record.damage() == ""
+        assert len(read(record)) == 5
+    with closing(sqlite3.connect(tmp_path / FILE_NAME)) as db, db:
+        key = {"steps": "step", "telemetry": "tick", "events": "event"}[table]
+        db.execute(f"DELETE FROM {table} WHERE {key} = {number}")
+    with Record(tmp_path) as record:
+        with pytest.raises(DataError, match=f"{table} has 4 rows of 5"):
+            read(record)
+        assert table in record.damage()
+        assert f"1 of {table}" in record.remark()
+
+
+def test_a_second_file_of_another_journal_is_not_believed(tmp_path, other_disk):
+    for name in ("mine", "other"):
+        folder = tmp_path / name
+        folder.mkdir()
+        journal = Journal(folder / FILE_NAME, SIGNALS, {})
+        journal.event(Event(0.0, "INFO", "note", name))
+        content = {path: path.read_bytes() for path in folder.iterdir()}
+        journal.close()
+        for path, data in content.items():
+            path.write_bytes(data)
+    forged, _ = elsewhere(tmp_path / "mine" / FILE_NAME)
+    file = Mirror(forged, "0123456789abcdef0123456789abcdef")
+    file.append([entry("events", (9, 9.0, "INFO", "note", "forged"))])
+    file.close()
+    with Record(tmp_path / "mine") as record:
+        assert "forged" not in record.remark()
+        assert record.remark() == ""
+    assert recover(tmp_path / "mine").tables["events"].added == 0
+    with pytest.raises(ConfigurationError, match="of another journal"):
+        recover(tmp_path / "mine", [tmp_path / "other" / MIRROR_NAME])
+    # Where the journal has lost its number, the file beside it has it.
+    for name in (FILE_NAME, f"{FILE_NAME}-wal", f"{FILE_NAME}-shm"):
+        (tmp_path / "mine" / name).unlink(missing_ok=True)
+    assert recover(tmp_path / "mine").tables["events"].added == 1
+    journal = Journal.reopen(tmp_path / "mine" / RECOVERED_NAME)
+    journal.close()
 
 
 class TestReading:
