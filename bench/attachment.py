@@ -15,8 +15,9 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import ConfigDict, Field, ValidationError
 
+from bench.checked_table import CheckedTable
 from bench.clock import Clock, ScaledClock
 from bench.configuration_errors import problems
 from bench.errors import ConfigurationError, DeviceConnectionError
@@ -30,8 +31,8 @@ _LONGEST_NAP = 0.2
 """Wall-clock time (s) that a sleep waits at once, so that an interruption is noticed soon."""
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(extra="ignore", frozen=True)
+class _Table(CheckedTable):
+    model_config = ConfigDict(extra="ignore")
 
 
 class Endpoint(_Table):

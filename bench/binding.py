@@ -27,8 +27,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Protocol, Self
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
+from bench.checked_table import CheckedTable
 from bench.devices import Device, DeviceDescription, Signal
 from bench.errors import ConfigurationError
 from bench.layout import Range
@@ -36,11 +37,7 @@ from bench.settling import Dwell, Settle, UntilSteady
 from bench.units import format_numbers
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class ResetTable(_Table):
+class ResetTable(CheckedTable):
     """The table `[roles.NAME.reset]`: how the memory of the specimen is reset."""
 
     setpoint: float | None = Field(
@@ -62,7 +59,7 @@ class ResetTable(_Table):
         return self
 
 
-class RoleTable(_Table):
+class RoleTable(CheckedTable):
     """A table `[roles.NAME]`: a device that takes set-points, or a signal."""
 
     device: str = Field(default="", description="device that takes the set-points")

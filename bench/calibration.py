@@ -26,8 +26,9 @@ from typing import Literal
 import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
+from bench.checked_table import CheckedTable
 from bench.configuration_errors import problems
 from bench.derived import Derived, DerivedSignal
 from bench.devices import Signal
@@ -47,10 +48,8 @@ _MARGIN = 0.01
 """Part of the calibrated range by which a reading may be beyond it."""
 
 
-class Calibration(BaseModel):
+class Calibration(CheckedTable):
     """What a sensor reads against a reference: `correction` is added to what it reads."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     format: Literal["bench-calibration"] = "bench-calibration"
     version: Literal[1] = 1

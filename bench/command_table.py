@@ -37,8 +37,9 @@ from functools import cache, cached_property
 from string import Formatter
 from typing import Annotated
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationInfo, field_validator
+from pydantic import AfterValidator, Field, ValidationInfo, field_validator
 
+from bench.checked_table import CheckedTable
 from bench.units import check_unit
 
 NUMBER = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
@@ -240,11 +241,7 @@ LimitPair = Annotated[tuple[float, float], AfterValidator(_range)]
 """A lower and a higher limit."""
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class QuantityTable(_Table):
+class QuantityTable(CheckedTable):
     """A quantity that an instrument of the rig file measures: its unit, and which readings of it are good."""
 
     unit: Unit = Field(description="unit of the signal, such as V, °C, or 1")
@@ -276,7 +273,7 @@ class SignalTable(QuantityTable):
         return text
 
 
-class ArrivalTable(_Table):
+class ArrivalTable(CheckedTable):
     """When a set-point has been reached: `[devices.NAME.setpoint.arrival]`."""
 
     signal: str = Field(description="signal of this device that follows the set-point")
@@ -284,7 +281,7 @@ class ArrivalTable(_Table):
     timeout: float = Field(default=60.0, gt=0, le=86400, description="time after which it has failed to arrive, s")
 
 
-class TargetTable(_Table):
+class TargetTable(CheckedTable):
     """A set-point of an instrument of the rig file: its unit, its limits, and when it has been reached."""
 
     unit: Unit = Field(description="unit of the set-point, such as V")
@@ -359,7 +356,7 @@ def written_number(command: Template, number: float) -> float:
     return read[name]
 
 
-class OutputTable(_Table):
+class OutputTable(CheckedTable):
     """How the output is switched: `[devices.NAME.output]`."""
 
     on: tuple[Message, ...] = Field(
@@ -374,10 +371,8 @@ class OutputTable(_Table):
     is_off: Expected = Field(default="0", description="answer when it is off")
 
 
-class CommandTable(BaseModel):
+class CommandTable(CheckedTable):
     """What every text instrument has; a driver's settings extend it."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     identity_query: OptionalMessage = Field(
         default="*IDN?", description="question for the identity; empty for an instrument that has none"

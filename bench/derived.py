@@ -27,9 +27,10 @@ from functools import reduce
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator
+from pydantic import Field, field_validator
 from simpleeval import SimpleEval
 
+from bench.checked_table import CheckedTable
 from bench.devices import Signal
 from bench.errors import DeviceError
 from bench.units import quantity, unit_registry
@@ -78,10 +79,8 @@ class Derived:
     compute: Callable[[Mapping[str, float]], float]
 
 
-class DerivedSignal(BaseModel, ABC):
+class DerivedSignal(CheckedTable, ABC):
     """Base of the kinds of derived signals; its fields are the keys of the table in the rig file."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     kind: str = Field(default="expression", description="which class computes it")
 

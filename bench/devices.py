@@ -32,8 +32,9 @@ from dataclasses import dataclass, field
 from datetime import date
 from typing import Any, ClassVar, Self, TypedDict
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
 
+from bench.checked_table import CheckedTable
 from bench.clock import Clock
 from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, LimitError
 
@@ -306,15 +307,13 @@ class Status:
                 stack.callback(callback, self)
 
 
-class DriverSettings(BaseModel):
+class DriverSettings(CheckedTable):
     """What a rig file says of one device; every driver extends it with its own keys.
 
     A driver class carries its extension as `Settings`, and opens its instrument by the class method
     `connect(name, settings, clock)`, which checks that the right instrument answers, configures it and
     moves nothing. An unknown key is an error.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     calibrated: date | None = Field(default=None, description="day of the last calibration, such as 2026-03-01")
     calibration_due: date | None = Field(default=None, description="day from which a new calibration is due")

@@ -23,8 +23,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Protocol, Self, runtime_checkable
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
+from bench.checked_table import CheckedTable
 from bench.configuration_errors import problems
 from bench.errors import ConfigurationError
 from bench.parsing import parse_json, parse_toml
@@ -33,10 +34,8 @@ _LONGEST = 1e9
 _HIGHEST_RATE = 36_000.0
 
 
-class ScheduledFault(BaseModel):
+class ScheduledFault(CheckedTable):
     """A fault at an instant, or again and again at random instants."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     fault: str = Field(min_length=1, description="name of a fault of the laboratory")
     at: float | None = Field(default=None, ge=0, le=_LONGEST, description="laboratory time from the start, s")

@@ -42,8 +42,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from enum import StrEnum
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import ConfigDict, Field, model_validator
 
+from bench.checked_table import CheckedTable
 from bench.errors import ConfigurationError, InterlockError
 
 SETPOINT = "_setpoint"
@@ -66,20 +67,18 @@ class Level(StrEnum):
     """The run ends in the safe state."""
 
 
-class Stuck(BaseModel):
+class Stuck(CheckedTable):
     """How a signal has to follow a set-point."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     moved: float = Field(gt=0, description="change of the set-point that the signal has to follow, in its unit")
     follows: float = Field(gt=0, description="smallest change of the signal that follows it, in the signal's unit")
     within: float = Field(gt=0, le=3600, description="time that the signal has for it, s")
 
 
-class Interlock(BaseModel):
+class Interlock(CheckedTable):
     """What a signal may not do while a run goes on. A value that is nan counts as outside of any range."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(allow_inf_nan=True)
 
     signal: str = Field(description="signal that is watched")
     low: float = Field(default=-math.inf, description="smallest value allowed, in the signal's unit")

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, Field
+
+from bench.checked_table import CheckedTable
 
 
 def _check_range(ends: tuple[float, float]) -> tuple[float, float]:
@@ -16,10 +18,8 @@ def _check_range(ends: tuple[float, float]) -> tuple[float, float]:
 Range = Annotated[tuple[float, float], AfterValidator(_check_range)]
 
 
-class XYPlot(BaseModel):
+class XYPlot(CheckedTable):
     """A table `[[dashboard.loops]]`: a further plot of one signal over another, in the units of the signals."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     input: str = Field(description="signal on the horizontal axis of the loop")
     output: str = Field(description="signal on the vertical axis of the loop")

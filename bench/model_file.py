@@ -45,6 +45,11 @@ if TYPE_CHECKING:
 
 FORMAT = "bench-model"
 VERSION = 2
+_PROVENANCE: Mapping[str, tuple[type | tuple[type, ...], str]] = {
+    "skipped": (int, "a whole number"), "rms": ((int, float), "a number"), "input": (str, "a text"),
+    "output": (str, "a text"), "time": (str, "a text"), "input_sha256": (str, "a text"),
+}  # fmt: skip
+"""What commands take from the provenance, where it is there."""
 
 
 @dataclass(frozen=True)
@@ -227,6 +232,7 @@ def parse_model(content: object, source: str) -> ModelFile:
     if (version := content.get("version")) != VERSION:
         raise DataError(f"model file {source} has version {version!r}; this bench reads version {VERSION}")
     try:
+        _check_numbers(content)
         model = model_from_json(content["model"])
         if content["kind"] != model.kind:
             raise ValueError(f"kind: expected {model.kind!r}, the type of the model, got {content['kind']!r}")
@@ -242,11 +248,29 @@ def parse_model(content: object, source: str) -> ModelFile:
         band = None if content.get("band") is None else _read_band(content["band"])
         known = content.get("dynamics")
         dynamics = None if known is None else IdentifiedDynamics.from_json(known)
-        return ModelFile(str(content["name"]), model, memory, dict(content["provenance"]), initial, band, dynamics)
+        provenance = dict(content["provenance"])
+        for key, (kind, what) in _PROVENANCE.items():
+            value = provenance.get(key)
+            if value is not None and (isinstance(value, bool) or not isinstance(value, kind)):
+                raise TypeError(f"provenance: expected {what} for {key}, got {value!r}")
+        return ModelFile(str(content["name"]), model, memory, provenance, initial, band, dynamics)
     except KeyError as error:
         raise DataError(f"model file {source} is damaged: key {error} is missing") from None
     except (ValueError, TypeError, AttributeError, OverflowError) as error:
         raise DataError(f"model file {source} is damaged: {error}") from None
+
+
+def _check_numbers(content: object) -> None:
+    """Raise ValueError for a list of numbers with `true` or `false`, which would be taken for 1 or 0."""
+    waiting = [content]
+    while waiting:
+        value = waiting.pop()
+        if isinstance(value, dict):
+            waiting += value.values()
+        elif isinstance(value, list):
+            waiting += (each for each in value if isinstance(each, dict | list))
+            if {type(each) for each in value} >= {bool, float}:
+                raise ValueError("a list of numbers has true or false in it")
 
 
 def _read_band(content: Mapping[str, Any]) -> Band:

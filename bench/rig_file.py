@@ -68,11 +68,12 @@ from importlib import resources
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError
 
 from bench import registry
 from bench.binding import RoleTable
 from bench.calibration import read_calibration
+from bench.checked_table import CheckedTable
 from bench.clock import Clock
 from bench.configuration_errors import problems
 from bench.derived import DerivedSignal
@@ -84,11 +85,7 @@ from bench.locks import EMULATED
 from bench.parsing import parse_toml
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class RigTable(_Table):
+class RigTable(CheckedTable):
     """The table `[rig]`."""
 
     title: str = Field(min_length=1, description="what the rig is, in one line")
@@ -98,13 +95,13 @@ class RigTable(_Table):
     )
 
 
-class TelemetryTable(_Table):
+class TelemetryTable(CheckedTable):
     """The table `[telemetry]`."""
 
     period: float = Field(default=1.0, ge=0.01, le=60, description="s between two quick readings in a hold")
 
 
-class SafetyTable(_Table):
+class SafetyTable(CheckedTable):
     """The table `[safety]`: how a rig is guarded while a run goes on."""
 
     rate: float = Field(
@@ -128,7 +125,7 @@ class SafetyTable(_Table):
     )
 
 
-class _RigFileContent(_Table):
+class _RigFileContent(CheckedTable):
     rig: RigTable
     devices: dict[str, dict[str, Any]] = Field(min_length=1, description="one table a device")
     roles: dict[str, RoleTable] = Field(default_factory=dict, description="one table a role")
@@ -141,13 +138,11 @@ class _RigFileContent(_Table):
     emulation: dict[str, Any] | None = None
 
 
-class LaboratorySettings(BaseModel):
+class LaboratorySettings(CheckedTable):
     """Base of what the table `[emulation]` may say; a laboratory extends it with its own keys.
 
     One that has a field `devices` is given the settings of the rig's devices in it, by name.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class Laboratory(Protocol):

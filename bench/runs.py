@@ -356,6 +356,9 @@ def foresee(run: Run, console: Console, interrupts: Interrupts | None = None) ->
         If the rehearsal was asked to end.
     """
     rig_file, _, parameters = _read(run)
+    if run.faults is not None:
+        # None of them happens in a rehearsal, but a file that the run would refuse is refused here, too.
+        read_schedule(run.faults)
     with ExitStack() as stack:
         if interrupts is None:
             interrupts = stack.enter_context(Interrupts(say_at_once))

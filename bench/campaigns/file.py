@@ -44,8 +44,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
+from bench.checked_table import CheckedTable
 from bench.configuration_errors import problems
 from bench.errors import ConfigurationError
 from bench.parsing import parse_toml
@@ -92,11 +93,7 @@ Seeds = Annotated[
 ]
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class RunsTable(_Table):
+class RunsTable(CheckedTable):
     """A table `[[runs]]`: a grid of runs."""
 
     name: str = Field(default="", pattern=f"^({_NAME})?$", description="its name; the protocol's if not given")
@@ -134,7 +131,7 @@ class RunsTable(_Table):
         return self.name or self.protocol[0]
 
 
-class ModelsTable(_Table):
+class ModelsTable(CheckedTable):
     """A table `[[models]]`: a model that is identified from each run of a table; other keys are its options.
 
     One that takes several runs (`bench.results.whole_models`) is identified from those of a rig and seed together.
@@ -164,7 +161,7 @@ class ModelsTable(_Table):
         return dict(self.model_extra or {})
 
 
-class ComparisonsTable(_Table):
+class ComparisonsTable(CheckedTable):
     """A table `[[comparisons]]`: the errors of models on each run of a table."""
 
     name: str = Field(pattern=f"^{_NAME}$", description="its name, before those of the models in the results")
@@ -187,7 +184,7 @@ class ComparisonsTable(_Table):
         return Session.parse(self.recalibrate or None, self.recalibrate_rows)
 
 
-class StudiesTable(_Table):
+class StudiesTable(CheckedTable):
     """A table `[[studies]]`: a study with several seeds."""
 
     name: str = Field(min_length=1, description="study, as `bench list` names it")
@@ -201,7 +198,7 @@ class StudiesTable(_Table):
         return self
 
 
-class _Content(_Table):
+class _Content(CheckedTable):
     most_runs: int = Field(default=10_000, ge=1, le=1_000_000, description="most runs that the file may ask for")
     runs: tuple[RunsTable, ...] = ()
     models: tuple[ModelsTable, ...] = ()

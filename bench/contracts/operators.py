@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from bench.hysteresis import Operator
 from bench.hysteresis.reach import Reach
+from bench.parsing import parse_json
 
 _SEED = 1
 _ROUNDING = 1e-9
@@ -90,9 +91,9 @@ class OperatorContract:
         self, operator: Operator[Any], inputs: NDArray[np.float64]
     ) -> None:
         """Operator and state come back from JSON, and go on to the same outputs."""
-        again: Any = type(operator).from_json(json.loads(json.dumps(operator.to_json())))
+        again: Any = type(operator).from_json(parse_json(json.dumps(operator.to_json())))
         state = operator.advance(operator.initial_state(), inputs[:17])
-        read = again.state_from_json(json.loads(json.dumps(operator.state_to_json(state))))
+        read = again.state_from_json(parse_json(json.dumps(operator.state_to_json(state))))
         np.testing.assert_array_equal(again.evaluate(inputs[17:], read), operator.evaluate(inputs[17:], state))
 
     def test_an_input_that_is_no_number_is_refused(self, operator: Operator[Any]) -> None:

@@ -14,6 +14,7 @@ from typing import Any
 
 from bench import errors
 from bench.errors import BenchError, DeviceError
+from bench.parsing import parse_json
 
 _HEAD = struct.Struct(">I")
 _LONGEST = 1 << 24
@@ -125,8 +126,8 @@ class Channel:
         body = bytes(self._received[_HEAD.size : end])
         del self._received[:end]
         try:
-            message = json.loads(body)
-        except (ValueError, RecursionError) as error:
+            message = parse_json(body)
+        except ValueError as error:
             raise ChannelError(f"no JSON: {error}") from None
         if not isinstance(message, dict):
             raise ChannelError("a message is an object of JSON")

@@ -8,6 +8,8 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Self
 
+from bench.parsing import parse_json
+
 PARAMETER = "parameter"
 """Kind of the event that records a change."""
 
@@ -46,7 +48,7 @@ class ParameterChange:
         found = _TEXT.fullmatch(text)
         if found is None:
             raise ValueError(f"{text!r} is not a change of a parameter")
-        return cls(int(found["step"]), found["name"], json.loads(found["value"]), json.loads(found["former"]))
+        return cls(int(found["step"]), found["name"], parse_json(found["value"]), parse_json(found["former"]))
 
     @classmethod
     def among(cls, events: Iterable[tuple[str, str]]) -> tuple[Self, ...]:

@@ -7,10 +7,11 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, cast, get_args, get_origin, get_type_hints
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import Field, ValidationError
 from pydantic_core import PydanticUndefined
 
 from bench.binding import RoleTable, Slots, check_bound, rate_unit
+from bench.checked_table import CheckedTable
 from bench.devices import Device, Signal
 from bench.errors import ConfigurationError
 from bench.parsing import comma_remark
@@ -65,10 +66,8 @@ def unit_of(slot: str) -> str:
     return f"@{slot}"
 
 
-class ProtocolParameters(BaseModel):
+class ProtocolParameters(CheckedTable):
     """Base of a protocol's parameters; declare each with `parameter`."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 def parameter(

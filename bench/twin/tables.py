@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import json
 from typing import Any, Self
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import Field, field_validator, model_validator
 
+from bench.checked_table import CheckedTable
 from bench.control.dynamics import ActuatorDynamics, ResponseDynamics
 from bench.devices import Signal
 from bench.hysteresis import Operator, operator_from_json
+from bench.parsing import parse_json
 from bench.rig_file import LaboratorySettings
 from bench.twin.specimen import Dynamics, Unevenness, Wander
 
 
-class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
-
-
-class SignalTable(_Table):
+class SignalTable(CheckedTable):
     """A signal of a twin's device."""
 
     name: str = Field(min_length=1, description="name of the signal on the rig")
@@ -49,7 +46,7 @@ class SetpointTable(SignalTable):
         return limits
 
 
-class WanderTable(_Table):
+class WanderTable(CheckedTable):
     """A quantity that wanders: `[emulation.wander]`, of the drive, and `[emulation.drift]`, of the response."""
 
     deviation: float = Field(default=0.0, ge=0, description="standard deviation, in the unit of the quantity")
@@ -61,14 +58,14 @@ class WanderTable(_Table):
         return Wander(self.deviation, self.time)
 
 
-class UnevennessTable(_Table):
+class UnevennessTable(CheckedTable):
     """What the model does not know, as a shift of the drive: `[emulation.unevenness]`."""
 
     deviation: float = Field(default=0.0, ge=0, description="standard deviation, input units")
     length: float = Field(default=1.0, gt=0, description="travel after which it is forgotten, input units")
 
 
-class InexactTable(_Table):
+class InexactTable(CheckedTable):
     """How exactly something is read or carried out."""
 
     resolution: float = Field(default=0.0, ge=0, description="last digit; 0 for none")
@@ -97,7 +94,7 @@ class NoiseTable(InexactTable):
     quick: float = Field(default=0.0, ge=0, description="noise of a quick reading, standard deviation")
 
 
-class DriveTable(_Table):
+class DriveTable(CheckedTable):
     """The actuator: `[emulation.drive]`; see `ActuatorDynamics`."""
 
     device: str = Field(description="device that takes its set-points")
@@ -124,7 +121,7 @@ class DriveTable(_Table):
         return ActuatorDynamics(self.delay, self.frequency, self.damping, rate, self.gain, self.offset)
 
 
-class ResponseTable(_Table):
+class ResponseTable(CheckedTable):
     """The response: `[emulation.response]`; see `ResponseDynamics`."""
 
     signal: str = Field(description="signal that a device measures")
@@ -200,6 +197,6 @@ class TwinTable(LaboratorySettings):
 
 def _operator(text: str) -> Operator[Any]:
     try:
-        return operator_from_json(json.loads(text))
+        return operator_from_json(parse_json(text))
     except (TypeError, KeyError, AttributeError, RecursionError) as error:
         raise ValueError(f"is no operator: {type(error).__name__}: {error}") from None

@@ -12,8 +12,9 @@ from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import Field
 
+from bench.checked_table import CheckedTable
 from sim_devices.world import World
 
 Floats = NDArray[np.float64]
@@ -30,13 +31,11 @@ _ITERATIONS = 24
 """Steps to the quantity behind a reading; each leaves the part of the error that the nonlinearity's slope is."""
 
 
-class SensorErrors(BaseModel):
+class SensorErrors(CheckedTable):
     """Systematic errors of a sensor, a table in `[emulation]`; all 0 for an ideal sensor.
 
     Lengths are in m, temperatures in K, forces in N: "unit" is that of the quantity.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     gain_error: float = Field(default=0.0, ge=-0.5, le=0.5, description="error of the gain, as a share")
     offset: float = Field(default=0.0, ge=-100, le=100, description="error at zero, in the unit of the quantity")

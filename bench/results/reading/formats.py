@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
 
 from bench.errors import DataError
+from bench.parsing import end_of_json
 from bench.results.reading.text import WHAT_IS_READ
 
 _MARKUP = re.compile(r"\s*<(?:\?xml|!doctype|svg|html|table)\b", re.IGNORECASE)
@@ -45,10 +45,8 @@ def _is_json(text: str, start: re.Pattern[str]) -> bool:
         return False
     text = text.strip()
     try:
-        _, end = json.JSONDecoder().raw_decode(text)
-    except json.JSONDecodeError as error:
-        return error.pos >= len(text) - 1
-    except RecursionError:
-        return False
+        end = end_of_json(text)
+    except ValueError as error:
+        return getattr(error, "pos", 0) >= len(text) - 1
     rest = text[end:]
     return not rest.strip() or start.match(rest) is not None
