@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import queue
+import re
 import threading
 from collections import deque
 from collections.abc import Mapping
@@ -15,6 +16,8 @@ from bench.interlocks import Interlock
 
 _MOST_LINES = 500
 """Lines of the log that are kept for the display; the journal has all events."""
+
+_NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -84,12 +87,12 @@ def parse_command(line: str) -> Command:
 
     Raises ConfigurationError if it stands for nothing; says what is expected.
     """
-    word, *rest = line.split()
+    word, *rest = line.split() or [""]
     word = word.lower()
     try:
         if word in ("set", "ramp"):
             device, *numbers = rest
-            value, *rate = (float(number.replace(",", ".")) for number in numbers)
+            value, *rate = map(_number, numbers)
             if len(rate) == (word == "ramp") and (not rate or rate[0] > 0):
                 return SetPoint(device, value, *rate)
         elif word == "tare" and len(rest) == 1:
@@ -103,6 +106,14 @@ def parse_command(line: str) -> Command:
         pass
     expected = SYNTAX.get(word)
     raise ConfigurationError(f"{line!r}: expected {expected or '; '.join(SYNTAX.values())}")
+
+
+def _number(text: str) -> float:
+    """Return the number in a word; raise ValueError for what Python alone takes for one, such as `nan` or `1_0`."""
+    value = float(text.replace(",", ".")) if _NUMBER.fullmatch(text) else math.nan
+    if not math.isfinite(value):
+        raise ValueError(text)
+    return value
 
 
 @dataclass(frozen=True)

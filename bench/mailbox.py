@@ -12,7 +12,9 @@ from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Annotated, Any, Literal, Self, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Strict
 
 from bench.clock import wall_time
 from bench.interrupts import Interrupts
@@ -30,6 +32,30 @@ _PRESENT = 5.0
 
 PAUSE = "pause"
 END = "end"
+
+
+class _Letter(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class _Asked(_Letter):
+    number: int
+    text: str
+    commands: Annotated[tuple[str, ...], Strict(False)]
+    title: str
+    parameters: dict[str, str]
+    problem: str
+
+
+class _Answer(_Letter):
+    answer: str
+
+
+class _Request(_Letter):
+    do: Literal["pause", "end"]
+
+
+_Kind = TypeVar("_Kind", bound=_Letter)
 
 
 class RunMailbox:
@@ -86,8 +112,8 @@ class RunMailbox:
 
     def answer(self) -> str | None:
         """Return what a panel has answered to the question, None while it has not."""
-        content = _read(self._folder / _ANSWER.format(self._asked))
-        return None if content is None else str(content.get("answer", ""))
+        letter = _read(self._folder / _ANSWER.format(self._asked), _Answer)
+        return None if letter is None else letter.answer
 
     def withdraw(self) -> None:
         """Take the question back, as it was answered."""
@@ -98,14 +124,14 @@ class RunMailbox:
     def _listen(self) -> None:
         path = self._folder / _REQUEST
         while not self._over.wait(_INTERVAL):
-            content = _read(path)
-            if content is None:
+            letter = _read(path, _Request)
+            if letter is None:
                 continue
             with suppress(OSError):
                 path.unlink()
-            if content.get("do") == PAUSE:
+            if letter.do == PAUSE:
                 self._interrupts.pause_requested = True
-            elif content.get("do") == END:
+            else:
                 self._interrupts.abort_reason = "the operator at a panel"
 
     def _remove(self) -> None:
@@ -139,11 +165,10 @@ class PanelMailbox:
 
     def question(self) -> tuple[int, Question] | None:
         """Return the number of the question that is open, and the question; None if there is none."""
-        content = _read(self._folder / _QUESTION)
-        if content is None:
+        letter = _read(self._folder / _QUESTION, _Asked)
+        if letter is None:
             return None
-        number = int(content.pop("number"))
-        return number, Question(**{**content, "commands": tuple(content["commands"])})
+        return letter.number, Question(**letter.model_dump(exclude={"number"}))
 
     def reply(self, number: int, answer: str) -> None:
         """Answer a question; raises OSError if the folder cannot be written."""
@@ -161,9 +186,9 @@ def _write(path: Path, content: dict[str, Any]) -> None:
     part.replace(path)
 
 
-def _read(path: Path) -> dict[str, Any] | None:
+def _read(path: Path, kind: type[_Kind]) -> _Kind | None:
+    """Return a letter; None if there is none, or something else is in its place."""
     try:
-        content = parse_json(path.read_text(encoding="utf-8"))
+        return kind.model_validate(parse_json(path.read_text(encoding="utf-8")))
     except (OSError, ValueError):
         return None
-    return content if isinstance(content, dict) else None

@@ -66,6 +66,14 @@ class TestCommands:
             ("ramp tec 40 -1", "expected ramp DEVICE VALUE RATE"),
             ("hold tec", "expected hold"),
             ("heat", "expected set DEVICE VALUE; ramp"),
+            ("", "expected set DEVICE VALUE; ramp"),
+            (" \t", "expected set DEVICE VALUE; ramp"),
+            ("set tec nan", "expected set DEVICE VALUE"),
+            ("set tec inf", "expected set DEVICE VALUE"),
+            ("set tec 1_0", "expected set DEVICE VALUE"),
+            ("set tec ４０", "expected set DEVICE VALUE"),
+            ("set tec 1,5.2", "expected set DEVICE VALUE"),
+            ("ramp tec 40 1e999", "expected ramp DEVICE VALUE RATE"),
         ],
     )
     def test_are_refused_with_what_is_expected(self, line, message):
