@@ -334,7 +334,7 @@ def _open(path: Path) -> int:
         try:
             # Without O_CREAT where it is there: Linux may refuse that for a file of another user in such a folder.
             with suppress(FileNotFoundError):
-                return _checked(os.open(path, (os.O_RDWR if is_own(path.lstat()) else os.O_RDONLY) | _SAFELY))
+                return _checked(os.open(path, (os.O_RDWR if _is_writable(path.lstat()) else os.O_RDONLY) | _SAFELY))
             with suppress(FileExistsError):
                 return os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o644)
         except OSError as error:
@@ -357,6 +357,11 @@ def _checked(file: int) -> int:
 def is_own(found: os.stat_result) -> bool:
     """Return whether a file can be believed in a folder that everybody may write to: it is this user's or root's."""
     return sys.platform == "win32" or found.st_uid in (os.geteuid(), 0)
+
+
+def _is_writable(found: os.stat_result) -> bool:
+    """Return whether this user may write a lock: one of root is believed, but only root writes it."""
+    return is_own(found) and (sys.platform == "win32" or os.geteuid() in (found.st_uid, 0))
 
 
 def _user(number: int) -> str:
@@ -392,7 +397,7 @@ else:
 
 
 def _write(file: int, holder: Holder) -> None:
-    if not is_own(os.fstat(file)):
+    if not _is_writable(os.fstat(file)):
         return
     os.lseek(file, 0, os.SEEK_SET)
     os.truncate(file, 0)
