@@ -57,6 +57,21 @@ class TestInterlock:
         with pytest.raises(ValidationError):
             Interlock(signal="sink", **keys)
 
+    @pytest.mark.parametrize(
+        ("key", "least", "below", "greatest", "above"),
+        [
+            ("seconds", 0.0, -1e-9, 3600.0, 3600.1),
+            ("warn", 0.0, -1e-9, 0.5, 0.51),
+            ("stale", 1e-9, 0.0, 86400.0, 86400.1),
+        ],
+    )
+    def test_what_its_numbers_may_be(self, key, least, below, greatest, above):
+        for number in (least, 0.5 * (least + greatest), greatest):
+            assert getattr(Interlock(signal="sink", high=1.0, **{key: number}), key) == number
+        for number in (below, above, math.nan, True):
+            with pytest.raises(ValidationError):
+                Interlock(signal="sink", high=1.0, **{key: number})
+
     def test_one_that_watches_nothing_is_refused(self):
         with pytest.raises(ValidationError, match="low or high"):
             Interlock(signal="sink")

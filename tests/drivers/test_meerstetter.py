@@ -2,6 +2,7 @@
 
 import math
 import struct
+import sys
 from binascii import crc_hqx
 from itertools import pairwise
 
@@ -11,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
 
-from bench.clock import VirtualClock
+from bench.clock import VirtualClock, WallClock
 from bench.errors import (
     ConfigurationError,
     DeviceConnectionError,
@@ -131,6 +132,33 @@ def tec(script, clock):
     tec = connect(clock)
     script.received.clear()
     return tec
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs pseudo-terminals")
+def test_over_a_pseudo_terminal(pseudo_terminal):
+    class Whole(Script):
+        """A device whose requests may come in pieces."""
+
+        waiting = b""
+
+        def receive(self, data):
+            self.waiting += data
+            if not self.waiting.endswith(b"\r"):
+                return b""
+            request, self.waiting = self.waiting, b""
+            return super().receive(request)
+
+    script = Whole()
+    with pseudo_terminal(script) as path:
+        tec = connect(WallClock(), port=path, timeout=10.0)
+        script.received.clear()
+        assert tec.measure()["tec_temperature"] == 25.5
+        tec.set(30.0)
+        # Nothing was sent twice, as no answer was missed.
+        assert len(set(script.received)) == len(script.received) > 0
+        assert tec.setpoint == 30.0
+        tec.safe()
+        tec.close()
 
 
 @pytest.mark.parametrize(

@@ -77,6 +77,24 @@ class TestReconnection:
         assert "tec: line lost for " in news.text
         assert station.news() == []
 
+    def test_a_line_that_is_lost_at_every_reading_has_the_devices_read_three_times(self, vo2, monkeypatch):
+        station, tec, rig = vo2()
+        psd, read = rig.devices["psd"], []
+        measure = psd.measure
+
+        def lose_the_other_line():
+            read.append(measure())
+            tec.unplug()
+            station.clock.after(1.0, tec.plug_in)
+            return read[-1]
+
+        monkeypatch.setattr(psd, "measure", lose_the_other_line)
+        tec.unplug()
+        station.clock.after(1.0, tec.plug_in)
+        values = station.look(Look.MEASURE)
+        assert len(read) == 3
+        assert values["psd_position"] == read[-1]["psd_position"]
+
     def test_a_line_that_stays_away_ends_the_run_in_time(self, vo2):
         station, tec, _ = vo2(safety__reconnect="2.0")
         tec.unplug()
