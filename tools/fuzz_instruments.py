@@ -1,6 +1,6 @@
 """Random and mutated frames for the wire servers of every emulated laboratory, in process.
 
-    python tests/fuzz/fuzz_instruments.py --frames 100000 --instrument all --seed 0
+    python tools/fuzz_instruments.py --frames 100000 --instrument all --seed 0
 
 Checks: no exception escapes and no instrument says that it failed; every answer is a whole frame of the protocol;
 what a server keeps of unfinished frames stays short; after garbage a request is answered properly; an input costs
@@ -153,7 +153,7 @@ SMA = make(SMALaboratory)
 QUESTIONS = ("MEAS:VOLT?", "MEAS:CURR?", "VOLT?", "VOLT? MAX", "OUTP?", "SYST:ERR?", "*IDN?")
 SUPPLY = Scpi(QUESTIONS, ("VOLT {}", "OUTP ON", "OUTP OFF", "CURR 1.5"))
 METER = Scpi(("READ?", "SYST:ERR?", "*IDN?"), ("CONF:TEMP TC,K",))
-BENCH_SUPPLY = Path(__file__).parents[2] / "examples" / "bench-supply.toml"
+BENCH_SUPPLY = Path(__file__).parents[1] / "examples" / "bench-supply.toml"
 
 
 def make_bench_supply(clock, seed):
