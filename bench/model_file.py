@@ -232,8 +232,9 @@ def parse_model(content: object, source: str) -> ModelFile:
     if (version := content.get("version")) != VERSION:
         raise DataError(f"model file {source} has version {version!r}; this bench reads version {VERSION}")
     try:
-        _check_numbers(content)
-        model = model_from_json(content["model"])
+        document = content["model"]
+        model = model_from_json(document)
+        _check_numbers(document, model.to_json())
         if content["kind"] != model.kind:
             raise ValueError(f"kind: expected {model.kind!r}, the type of the model, got {content['kind']!r}")
         memory, initial = content["memory"], content.get("initial")
@@ -260,17 +261,16 @@ def parse_model(content: object, source: str) -> ModelFile:
         raise DataError(f"model file {source} is damaged: {error}") from None
 
 
-def _check_numbers(content: object) -> None:
-    """Raise ValueError for a list of numbers with `true` or `false`, which would be taken for 1 or 0."""
-    waiting = [content]
-    while waiting:
-        value = waiting.pop()
-        if isinstance(value, dict):
-            waiting += value.values()
-        elif isinstance(value, list):
-            waiting += (each for each in value if isinstance(each, dict | list))
-            if {type(each) for each in value} >= {bool, float}:
-                raise ValueError("a list of numbers has true or false in it")
+def _check_numbers(said: object, held: object) -> None:
+    """Raise ValueError if a model holds a number where its file says `true` or `false`."""
+    if isinstance(said, dict) and isinstance(held, dict):
+        for key in said.keys() & held.keys():
+            _check_numbers(said[key], held[key])
+    elif isinstance(said, list) and isinstance(held, list | tuple):
+        for each, other in zip(said, held, strict=False):
+            _check_numbers(each, other)
+    elif isinstance(said, bool) and isinstance(held, int | float) and not isinstance(held, bool):
+        raise ValueError("expected a number, got true or false")
 
 
 def _read_band(content: Mapping[str, Any]) -> Band:

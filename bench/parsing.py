@@ -29,7 +29,7 @@ def parse_json(text: str | bytes) -> Any:  # noqa: ANN401 - anything that JSON c
     take one of two values, or infinity, in silence.
     """
     try:
-        return _DECODER.decode(text if isinstance(text, str) else text.decode())
+        return _DECODER.decode(text.decode() if isinstance(text, bytes) else text)
     except RecursionError:
         raise ValueError(_TOO_DEEP) from None
 

@@ -50,7 +50,8 @@ class OpenedJournal:
                 self.db = self._copied(path, "cannot be changed and was not closed")
             else:
                 self.db = _connected(path, "mode=ro&immutable=1")
-        except (sqlite3.DatabaseError, OSError) as error:
+        # Names in a damaged file may be no text.
+        except (sqlite3.DatabaseError, OSError, UnicodeDecodeError) as error:
             self._remove()
             raise DataError(f"{path} is not a readable journal: {cause_of(error)}{way_back(path)}") from error
 
@@ -76,7 +77,7 @@ def _connected(path: Path, options: str) -> sqlite3.Connection:
     db = sqlite3.connect(f"{path.absolute().as_uri()}?{options}", uri=True, isolation_level=None)
     try:
         db.execute("SELECT count(*) FROM sqlite_master").fetchall()
-    except sqlite3.DatabaseError:
+    except (sqlite3.DatabaseError, UnicodeDecodeError):
         db.close()
         raise
     return db

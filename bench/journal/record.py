@@ -344,5 +344,5 @@ class Record:
         # All at once: damage may show at any row.
         try:
             return self._db.execute(statement).fetchall()
-        except sqlite3.DatabaseError as error:
+        except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
             raise self._damaged(str(error)) from error

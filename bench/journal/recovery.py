@@ -357,7 +357,7 @@ def _opened(journal: Path) -> OpenedJournal:
 def _problem(db: sqlite3.Connection) -> str:
     try:
         found = str(db.execute("PRAGMA quick_check(1)").fetchone()[0])
-    except sqlite3.DatabaseError as error:
+    except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
         return str(error)
     return "" if found == "ok" else found.replace("\n", " ")
 
@@ -376,13 +376,13 @@ def _readable(db: sqlite3.Connection, table: str, cut: set[str], bad: list[Any])
             for rows in _blocks(db, f"SELECT * FROM {table} ORDER BY {key} {order}"):  # noqa: S608 - own names
                 last = rows[-1][0]
                 yield from _checked(table, rows, bad)
-        except sqlite3.DatabaseError:
+        except (sqlite3.DatabaseError, UnicodeDecodeError):
             ends.append(last)
         else:
             return
     if table in FIRST and isinstance(ends[0], int) and isinstance(ends[1], int):
         for number in range(ends[0] + 1, ends[1]):
-            with suppress(sqlite3.DatabaseError):
+            with suppress(sqlite3.DatabaseError, UnicodeDecodeError):
                 row = db.execute(f"SELECT * FROM {table} WHERE {key} = ?", (number,)).fetchone()  # noqa: S608
                 if row is not None:
                     yield from _checked(table, [row], bad)
@@ -399,7 +399,7 @@ def _blocks(db: sqlite3.Connection, statement: str) -> Iterator[list[tuple[Any, 
             if len(rows) == _BLOCK:
                 yield rows
                 rows = []
-    except sqlite3.DatabaseError:
+    except (sqlite3.DatabaseError, UnicodeDecodeError):
         if rows:
             yield rows
         raise

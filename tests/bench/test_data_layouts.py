@@ -661,3 +661,20 @@ class TestNoRowVanishes:
         read = read_columns(path, ["t", "u", "y"])
         assert [len(column) for column in read.values.values()] == [self.ROWS] * 3
         assert "1 line of comment" in read.assumptions
+
+
+@pytest.mark.parametrize("delimiter", [",", "\t", " ", "|", ";"])
+@pytest.mark.parametrize("wrong", ["5.5 5 6 7", "5 .5 6 7", "5 6 7 8 9"])
+def test_a_row_of_more_numbers_than_columns_is_refused(tmp_path, delimiter, wrong):
+    """A decimal comma, or a blank within a number, would move all that follow into other columns."""
+    rows = [f"{i}.5 {2 * i}.25 {3 * i}.125" for i in range(30)]
+    rows[20] = wrong
+    path = write(tmp_path, ("\n".join(["time u y", *rows]) + "\n").replace(" ", delimiter).encode())
+    with pytest.raises(DataError, match=r"line 22, row 21: has \d cells; the table has 3 columns"):
+        read_columns(path, ["u", "y"])
+
+
+def test_a_remark_behind_the_last_column_is_left_alone(tmp_path):
+    rows = [f"{i}.5,{2 * i}.25,{3 * i}.125" + ",looks odd" * (i == 20) for i in range(30)]
+    path = write(tmp_path, ("\n".join(["time,u,y", *rows]) + "\n").encode())
+    assert read_columns(path, ["y"]).values["y"].tolist() == [3 * i + 0.125 for i in range(30)]

@@ -529,6 +529,26 @@ def test_a_row_whose_checksum_does_not_fit_is_told_and_left_out(tmp_path, table)
     assert found.copy is not None
 
 
+@pytest.mark.parametrize("change", ["UPDATE meta SET value = x'ff' WHERE key = 'rig'", "a name that is no text"])
+def test_a_journal_with_bytes_that_are_no_text_is_a_message(tmp_path, change):
+    journal = Journal(tmp_path / FILE_NAME, SIGNALS, {"rig": "vo2"})
+    journal.finish(**STATUS)
+    journal.close()
+    path = tmp_path / FILE_NAME
+    if change.startswith("UPDATE"):
+        with closing(sqlite3.connect(path)) as db, db:
+            db.execute(change)
+    else:
+        path.write_bytes(path.read_bytes().replace(b"CREATE TABLE telemetry", b"CREATE TABLE \xdf\xdf\xdfemetry"))
+    with pytest.raises(DataError, match=r"not a readable journal|damaged"), Record(tmp_path) as record:
+        record.telemetry()
+    if change.startswith("UPDATE"):
+        assert recover(tmp_path).copy is not None
+    else:
+        with pytest.raises(DataError, match="nothing of it is readable"):
+            recover(tmp_path)
+
+
 @pytest.mark.parametrize("table", ["steps", "telemetry", "events"])
 @pytest.mark.parametrize("number", [1, 2, 4])
 def test_rows_that_are_gone_from_a_completed_record_are_told(tmp_path, table, number):

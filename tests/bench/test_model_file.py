@@ -481,3 +481,36 @@ class TestUnregistered:
     def test_kind_and_type_must_agree(self):
         with pytest.raises(DataError, match="kind: expected 'preisach', the type of the model, got 'polynomial'"):
             parse_model(content() | {"kind": "polynomial"}, "m.json")
+
+
+def places_of_numbers(document, path=()):
+    items = document.items() if isinstance(document, dict) else enumerate(document)
+    for key, value in items:
+        if isinstance(value, dict | list):
+            yield from places_of_numbers(value, (*path, key))
+        elif isinstance(value, int | float) and not isinstance(value, bool):
+            yield *path, key
+
+
+@pytest.mark.parametrize("name", MODELS)
+@pytest.mark.parametrize("other", [True, False, "x", [], 10**400])
+def test_nothing_else_is_taken_for_a_number(name, other):
+    for *path, key in places_of_numbers(content(name)["model"]):
+        changed = content(name)
+        table = changed["model"]
+        for step in path:
+            table = table[step]
+        table[key] = other
+        with pytest.raises(DataError, match="is damaged"):
+            parse_model(changed, "m.json")
+
+
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("skipped", ""), ("skipped", {}), ("skipped", True), ("rms", "0.1"), ("input", ["u"]), ("time", 1)],
+)
+def test_what_is_taken_from_the_provenance_has_its_type(key, value):
+    changed = content()
+    changed["provenance"][key] = value
+    with pytest.raises(DataError, match=f"provenance: expected .* for {key}"):
+        parse_model(changed, "m.json")

@@ -3,12 +3,10 @@
 import ast
 import json
 import math
-from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
 
 import pytest
-from pydantic import ValidationError
+from pydantic import Field, ValidationError
 
 from bench.checked_table import CheckedTable
 from bench.parsing import parse_json, parse_toml
@@ -58,7 +56,7 @@ class Limits(CheckedTable):
     count: int | None = None
     either: bool | float = False
     levels: tuple[float, ...] = ()
-    named: Mapping[str, float | None] = MappingProxyType({})
+    named: dict[str, float | None] = Field(default_factory=dict)
 
 
 class Tables(CheckedTable):

@@ -79,6 +79,8 @@ def reading_errors(path: Path) -> Iterator[None]:
             f"{path} cannot be read as text ({error}); say its encoding with --encoding, such as cp1252, utf-16 "
             "or shift_jis"
         ) from None
+    except MemoryError:
+        raise DataError(f"{path} cannot be read: by what it says of itself it is larger than the memory") from None
     except (OSError, EOFError, LookupError, zlib.error) as error:
         raise DataError(f"{path} cannot be read: {error}") from None
 

@@ -23,6 +23,7 @@ from bench.results.reading.layout import (
     find_layout,
     header_only,
     is_comment,
+    is_number,
     split_rows,
 )
 from bench.results.reading.moments import moment_in, since_first, with_moments
@@ -166,6 +167,7 @@ class _Body:
 
     def __init__(self, file: TextFile, layout: Layout, names: Sequence[str], places: Sequence[int]) -> None:
         self._file, self._layout, self._names, self._places = file, layout, names, places
+        self._width = max(layout.columns, len(layout.heads))
         self.ending: Ending | None = None
         self.comments = 0
         self.moments: frozenset[int] = frozenset()
@@ -205,6 +207,11 @@ class _Body:
         values: list[list[float]] = [[] for _ in self._places]
         lines = self._closed(self._file.lines(layout.start, self._end()))
         for number, row in enumerate(split_rows(lines, layout.delimiter, layout.start), start=1):
+            if any(is_number(cell, layout.decimal) for cell in row.cells[self._width :]):
+                raise DataError(
+                    f"{path}: line {row.line}, row {number}: has {len(row.cells)} cells; the table has {self._width} "
+                    "columns, so that its numbers may stand in the wrong ones; remove what is too much"
+                )
             if number == 1:
                 self.moments = with_moments(row.cells, self._places)
             for name, place, column in zip(self._names, self._places, values, strict=True):
@@ -246,10 +253,22 @@ class _Body:
             blank = 0
             if self.ending is None and _LETTER.search(line) and self._has_label(line):
                 raise _BreakError
+            if self._is_longer(line):
+                raise ValueError("more cells than columns")
             if comma:
                 # A point within numbers of decimal comma is none; it may not become one.
                 line = line.replace(".", "?").replace(",", ".")
             yield _D_EXPONENT.sub(r"\1E", line) if exponents else line
+
+    def _is_longer(self, line: str) -> bool:
+        """Return whether a line may have more cells than the table has columns."""
+        delimiter = self._layout.delimiter
+        if delimiter == " ":
+            return len(line.split()) > self._width
+        return (
+            line.count(delimiter) >= self._width
+            and len(line.rstrip(f"{delimiter} \r\n\t").split(delimiter)) > self._width
+        )
 
     def _closed(self, lines: Iterator[str]) -> Iterator[str]:
         """Yield lines of data; raise DataError for a quote that opens a cell and does not close it in its line."""
