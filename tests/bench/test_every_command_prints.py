@@ -1,0 +1,176 @@
+"""Every command with streams that lack characters, take nothing or are closed: its work is the same."""
+
+import io
+import math
+import os
+import shutil
+import sys
+from contextlib import ExitStack, suppress
+from pathlib import Path
+
+import pytest
+
+from bench.cli import main
+from bench.cli.app import BenchCommands, app
+
+CREEP = ["--set", "duration=2", "--set", "settling=1"]
+COLUMNS = ["--input", "u", "--output", "y"]
+MODEL = ["--model", "polynomial", "--degree", "3"]
+# What each command does in a folder with measurements, a model and a run; an error of those that serve or take long.
+COMMANDS = {
+    "list": [],
+    "run": ["creep", "--rig", "vo2", "--clock", "virtual", "--no-rehearse", *CREEP, "--out", "new"],
+    "rehearse": ["creep", "--rig", "vo2", *CREEP],
+    "repeat": ["run", "--out", "new"],
+    "campaign": ["campaign.toml", "--dry-run"],
+    "resume": ["run"],
+    "runs": ["."],
+    "safe": ["vo2"],
+    "recover": ["vo2"],
+    "doctor": ["vo2"],
+    "panel": ["no-rig"],
+    "identify": ["m.csv", *COLUMNS, *MODEL, "--time", "none", "--out", "new.json"],
+    "predict": ["model.json", "m.csv", "--input", "u", "--out", "new.csv"],
+    "invert": ["model.json", "targets.csv", "--column", "y", "--out", "new.csv"],
+    "design": ["--levels", "5"],
+    "compare": ["model.json", "--data", "m.csv", *COLUMNS],
+    "calibrate": ["run", "--sensor", "psd_position"],
+    "report": ["missing"],
+    "export": ["run", "--format", "csv", "--out", "new"],
+    "import": ["m.csv", *COLUMNS, "--out", "new"],
+    "watch": ["missing"],
+    "replay": ["missing"],
+    "recover-journal": ["run"],
+    "twin": ["run", "--rig", "vo2", "--out", "new.toml"],
+    "tune": ["model.json", "--rig", "missing", "--out", "new.toml"],
+    "new": ["rig", "bench-of-mine"],
+    "reproduce": ["vo2", "--workers", "0"],
+    "emulate": ["no-rig"],
+    "identify-hybrid": ["missing"],
+    "identify-muscle": ["missing"],
+}
+STREAMS = ("cp1252", "latin-1", "ascii", "full", "nobody reads", "no input", "no output", "no errors")
+
+
+def test_every_command_is_in_the_table():
+    with app_context() as context:
+        assert set(COMMANDS) == set(BenchCommands.list_commands(context.command, context))
+
+
+def app_context():
+    import typer
+
+    command = typer.main.get_command(app)
+    return command.make_context("bench", ["list"], resilient_parsing=True)
+
+
+@pytest.fixture(scope="module")
+def prepared(tmp_path_factory):
+    """A folder with what the commands read."""
+    folder = tmp_path_factory.mktemp("prepared")
+    rows = [(math.sin(0.1 * i), math.sin(0.1 * i - 0.3)) for i in range(100)]
+    (folder / "m.csv").write_text("u,y\n" + "".join(f"{u:.5f},{y:.5f}\n" for u, y in rows))
+    (folder / "targets.csv").write_text("y\n0.1\n0.2\n0.3\n")
+    (folder / "campaign.toml").write_text('[[runs]]\nprotocol = "creep"\nrigs = ["vo2"]\nseeds = [0, 1]\n')
+    before = Path.cwd()
+    os.chdir(folder)
+    try:
+        assert carried_out(["identify", "m.csv", *COLUMNS, *MODEL, "--time", "none", "--out", "model.json"])[0] == 0
+        assert carried_out(["run", *COMMANDS["run"]])[0] == 0
+        next((folder / "new").iterdir()).rename(folder / "run")
+        (folder / "new").rmdir()
+    finally:
+        os.chdir(before)
+    return folder
+
+
+def carried_out(words, output=None, errors=None, **streams):
+    """Carry a command out with these streams; return its exit code, and what was printed to streams that keep it."""
+    output, errors = output or io.StringIO(), errors or io.StringIO()
+    former = sys.stdin, sys.stdout, sys.stderr
+    sys.stdin, sys.stdout, sys.stderr = (
+        streams.get("stdin", io.StringIO()), streams.get("stdout", output), streams.get("stderr", errors)
+    )  # fmt: skip
+    try:
+        with pytest.raises(SystemExit) as ended:
+            main(words)
+    finally:
+        sys.stdin, sys.stdout, sys.stderr = former
+    return ended.value.code or 0, text_of(output), text_of(errors)
+
+
+def text_of(stream):
+    if isinstance(stream, io.StringIO):
+        return stream.getvalue()
+    with suppress(OSError, ValueError):
+        stream.flush()
+    # /dev/full never ends.
+    is_kept = isinstance(stream.name, str) and Path(stream.name).is_file()
+    return Path(stream.name).read_text(encoding=stream.encoding) if is_kept else ""
+
+
+def written(folder):
+    """Return the files that a command has left; the folder of a run, which is named after its start, is RUN."""
+    return {
+        Path(*("RUN" if part.endswith(tuple("0123456789")) else part for part in path.relative_to(folder).parts))
+        for path in folder.rglob("*")
+        if path.is_file()
+    }
+
+
+@pytest.fixture(scope="module")
+def as_usual(prepared, tmp_path_factory):
+    """Return how a command ends with streams that keep everything, and the files that it leaves."""
+    known = {}
+
+    def ends(command, monkeypatch):
+        if command not in known:
+            folder = tmp_path_factory.mktemp("usual") / "work"
+            shutil.copytree(prepared, folder)
+            monkeypatch.chdir(folder)
+            known[command] = (*carried_out([command, *COMMANDS[command]]), written(folder))
+        return known[command]
+
+    return ends
+
+
+@pytest.mark.parametrize("streams", STREAMS)
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_command_does_its_work(prepared, as_usual, tmp_path, monkeypatch, command, streams):
+    if streams == "full" and not Path("/dev/full").exists():
+        pytest.skip("needs /dev/full, a disk that is always full")
+    expected, usual_output, usual_errors, files = as_usual(command, monkeypatch)
+    folder = tmp_path / "work"
+    shutil.copytree(prepared, folder)
+    monkeypatch.chdir(folder)
+    with ExitStack() as stack:
+        given = {}
+        if streams == "full":
+            given["output"] = open("/dev/full", "w", encoding="utf-8")  # noqa: PTH123, SIM115 - closed below
+            stack.callback(close, given["output"])
+        elif streams == "nobody reads":
+            reader, writer = os.pipe()
+            os.close(reader)
+            given["output"] = os.fdopen(writer, "w", encoding="utf-8")
+            stack.callback(close, given["output"])
+        elif streams.startswith("no "):
+            given[{"input": "stdin", "output": "stdout", "errors": "stderr"}[streams[3:]]] = None
+        else:
+            for name in ("output", "errors"):
+                given[name] = stack.enter_context((tmp_path / name).open("w", encoding=streams))
+        code, output, errors = carried_out([command, *COMMANDS[command]], **given)
+    assert code == expected, errors
+    assert "Traceback" not in output + errors
+    assert written(folder) == files
+    if streams in ("full", "nobody reads"):
+        assert ("the standard output cannot be written: " in errors) == bool(usual_output)
+    elif streams in ("cp1252", "latin-1", "ascii"):
+        # A character that is missing is written as an escape.
+        assert (bool(output), bool(errors)) == (bool(usual_output), bool(usual_errors))
+        assert errors == "" or errors.count("\n") == usual_errors.count("\n")
+        assert "cannot be written" not in errors.replace(usual_errors, "")
+
+
+def close(stream):
+    with suppress(OSError):
+        stream.close()
