@@ -8,7 +8,7 @@ numba's cache does not see the change; they are compared with brute-force oracle
     python tests/mutants.py bench/control/tracking.py
 
 Those of a line that is executed when the module is loaded, such as a constant, may be killed by any test that
-executes a line of the module or has its name, and by the tables of all settings and values. A mutant counts as
+executes a line of the module or has its name, and by the tests of all settings and values. A mutant counts as
 killed if a test fails or does not end within a minute; the latter are listed, as a busy machine can be the reason.
 The sample is drawn with a seed. Needs POSIX, as each mutant is a fork of a process that has loaded the libraries.
 """

@@ -1,0 +1,35 @@
+"""A table of cases in one test."""
+
+import pytest
+from each_case import each_case
+
+
+def halve(fixture, value, half):
+    fixture.append(value)
+    assert value / 2 == half
+
+
+def test_every_case_is_tried_and_each_failure_names_its_case():
+    tried = []
+    with pytest.raises(BaseExceptionGroup, match="1 of 3 cases failed") as raised:
+        each_case(("value", "half"), [(2, 1), (4, 3), (6, 3)])(halve)(fixture=tried)
+    assert tried == [2, 4, 6]
+    (failure,) = raised.value.exceptions
+    assert failure.__notes__ == ["case 1: {'value': 4, 'half': 3}"]
+    each_case("value", [2, 4])(lambda fixture, value: fixture.append(value))(fixture=tried)
+    assert tried[3:] == [2, 4]
+
+
+def test_an_exception_that_is_not_raised_is_a_failure():
+    def wants_an_error(value):
+        with pytest.raises(ValueError, match="x"):
+            int(value)
+
+    with pytest.raises(BaseExceptionGroup, match="2 of 2 cases failed"):
+        each_case("value", ["1", "2"])(wants_an_error)()
+
+
+@each_case("number", [1, 2])
+def test_fixtures_are_those_of_pytest(tmp_path, number):
+    assert tmp_path.is_dir()
+    assert number in (1, 2)
