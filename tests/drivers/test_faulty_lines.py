@@ -9,6 +9,7 @@ from collections import Counter
 from contextlib import contextmanager
 
 import pytest
+from each_case import each_case
 
 from bench.clock import VirtualClock
 from bench.errors import DeviceError
@@ -23,7 +24,7 @@ from sim_devices.wire.canopen_slcan import CanopenSlcanServer
 from sim_devices.wire.dynamixel2 import Dynamixel2Server
 from sim_devices.world import World
 
-CALLS = 1000
+CALLS = 300
 TIMEOUT = 0.1
 LATEST = 2.8 * TIMEOUT
 FAULTS = {
@@ -194,8 +195,8 @@ def count_servo(faults, share, seed=0, calls=CALLS):
     return counts
 
 
-@pytest.mark.parametrize("faults", FAULTS.values(), ids=FAULTS)
-@pytest.mark.parametrize("count", [count_supply, count_servo])
+@each_case("faults", FAULTS.values())
+@each_case("count", [count_supply, count_servo])
 def test_no_answer_is_taken_for_what_it_is_not(count, faults):
     counts = count(faults, 0.35)
     assert counts["wrong"] == 0

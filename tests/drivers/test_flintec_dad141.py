@@ -7,17 +7,17 @@ import struct
 import sys
 import threading
 from collections.abc import Callable, Iterator
-from itertools import pairwise
 
 import numpy as np
 import pytest
+from each_case import each_case
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from pydantic import ValidationError
+from refusals import blamed
 
 from bench.clock import VirtualClock, WallClock
 from bench.errors import DeviceConnectionError, DeviceError, DeviceRestartedError
-from drivers.flintec_dad141 import CUTOFF_HZ, FlintecDAD141, _agree
+from drivers.flintec_dad141 import CUTOFF_HZ, FlintecDAD141
 from drivers.pymodbus_client import SerialClient
 from sim_devices import protocol_emulated
 from sim_devices.instruments.flintec_dad141 import EmulatedDAD141
@@ -121,45 +121,12 @@ def bench(request, monkeypatch) -> Iterator[Bench]:
 # Settings
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"port": ""},
-        {"address": 0},
-        {"address": 248},
-        {"baudrate": 1200},
-        {"baudrate": 230400},
-        {"parity": "M"},
-        {"timeout": 0.0},
-        {"timeout": math.nan},
-        {"pause": -1.0},
-        {"filter": -1},
-        {"filter": 9},
-        {"samples": 0},
-        {"interval": -0.1},
-        {"newtons_per_unit": 0.0},
-        {"newtons_per_unit": math.inf},
-        {"zero_newtons": math.nan},
-        {"force_limits": (1.0, 1.0)},
-        {"force_limits": (1.0, math.nan)},
-        {"stale_after": -1.0},
-        {"still_timeout": 1e9},
-        {"device_ids": ()},
-        {"colour": "red"},
-    ],
-)
-def test_wrong_settings_are_refused(wrong):
-    with pytest.raises(ValidationError):
-        Settings(**{"port": "/dev/ttyUSB0", "force_limits": WIDE} | wrong)
-
-
-def test_the_calibrated_range_has_to_be_given():
-    with pytest.raises(ValidationError, match="force_limits"):
-        Settings(port="/dev/ttyUSB0")
-
-
-def test_every_setting_is_described():
-    assert all(field.description for field in Settings.model_fields.values())
+def test_the_calibrated_range_has_to_be_given_and_is_not_empty():
+    assert blamed(Settings, {"port": "/dev/ttyUSB0"}) == {"force_limits"}
+    assert blamed(Settings, {"port": "/dev/ttyUSB0", "force_limits": (1.0, 1.0)}) == {"force_limits"}
+    assert blamed(Settings, {"port": "/dev/ttyUSB0", "force_limits": WIDE, "newtons_per_unit": 0.0}) == {
+        "newtons_per_unit"
+    }
 
 
 # Bytes
@@ -246,7 +213,7 @@ def test_a_look_at_the_filter_leaves_the_noise_as_it_was():
     assert records[0] == records[1]
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("settings", "pause"),
     [
         ({}, 1.75e-3),
@@ -276,7 +243,7 @@ def test_the_pause_between_frames(bench, settings, pause):
         assert bench.clock.now() - begin == pytest.approx(pause + wire)
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("settings", "interval"),
     [({}, 0.125), ({"filter": 7}, 1.0), ({"filter": 0}, 0.5 / 17), ({"interval": 0.05}, 0.05)],
 )
@@ -298,8 +265,11 @@ def test_no_interval_is_as_fast_as_the_line(bench):
 
 
 needs_pty = pytest.mark.skipif(sys.platform == "win32", reason="needs pseudo-terminals")
+# On a real line there is one client.
+on_a_real_line = pytest.mark.parametrize("bench", ["pymodbus"], indirect=True)
 
 
+@on_a_real_line
 @needs_pty
 def test_over_a_pseudo_terminal(bench, pseudo_terminal):
     bench.put(12.0)
@@ -312,6 +282,7 @@ def test_over_a_pseudo_terminal(bench, pseudo_terminal):
         cell.close()
 
 
+@on_a_real_line
 @needs_pty
 def test_a_line_that_is_pulled_out(bench, pseudo_terminal):
     with pseudo_terminal(bench.tap) as path:
@@ -325,6 +296,7 @@ def test_a_line_that_is_pulled_out(bench, pseudo_terminal):
         cell.glance()
 
 
+@on_a_real_line
 def test_over_tcp(bench):
     bench.put(-3.5)
     with socket.create_server(("127.0.0.1", 0)) as listener:
@@ -360,7 +332,7 @@ def only(register: int, words: list[int]) -> Callable[[int, list[int]], list[int
     return lambda address, actual: words if address == register else actual
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("alter", "message"),
     [
         (lambda _, words: words[::-1], "words of a value in swapped order"),
@@ -393,15 +365,15 @@ def test_a_device_without_these_registers_is_refused(bench):
         bench.cell()
 
 
-@pytest.mark.parametrize("number", [1410, 0x1410, 1411])
+@each_case("number", [1410, 0x1410, 1411])
 def test_identities_that_are_accepted(bench, number):
     bench.bank.alter = only(0x202C, [0, number])
     known = {} if number != 1411 else {"device_ids": (1411,)}
     bench.cell(**known).glance()
 
 
-@pytest.mark.parametrize("decimals", range(6))
-@pytest.mark.parametrize("force", [-7.5, 0.0, 0.02, 8.25])
+@each_case("decimals", range(6))
+@each_case("force", [-7.5, 0.0, 0.02, 8.25])
 def test_any_decimal_point_agrees(decimals, force):
     bench = Bench(decimals=decimals, weight_limits=(-9.0, 9.0))
     try:
@@ -428,7 +400,7 @@ def test_a_noisy_cell_does_not_make_a_wrong_device():
         protocol_emulated.unregister("load")
 
 
-@pytest.mark.parametrize("tracking", [1, 100])
+@each_case("tracking", [1, 100])
 def test_zero_tracking_is_refused_and_nothing_is_changed(tracking):
     bench = Bench(zero_tracking=tracking)
     try:
@@ -441,13 +413,6 @@ def test_zero_tracking_is_refused_and_nothing_is_changed(tracking):
         bench.cell().close()
     finally:
         protocol_emulated.unregister("load")
-
-
-def test_connecting_to_an_overloaded_cell(bench):
-    bench.put(1e6)
-    cell = bench.cell()
-    with pytest.raises(DeviceError, match="over its range"):
-        cell.measure()
 
 
 def test_a_setting_that_is_not_taken_is_noticed(bench):
@@ -479,11 +444,6 @@ def test_a_port_that_does_not_exist(caplog, capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_a_scheme_that_does_not_exist():
-    with pytest.raises(DeviceConnectionError, match="cannot open nowhere://load"):
-        FlintecDAD141.connect("load", Settings(port="nowhere://load", force_limits=WIDE), VirtualClock())
-
-
 def test_an_instrument_that_falls_silent_and_comes_back(bench, caplog, capfd):
     cell = bench.cell()
     bench.put(3.0)
@@ -496,40 +456,6 @@ def test_an_instrument_that_falls_silent_and_comes_back(bench, caplog, capfd):
         assert cell.measure() == {"load_force": 3.0}
     assert not caplog.records
     assert capfd.readouterr() == ("", "")
-
-
-def test_a_silence_in_which_the_instrument_restarted_is_found(bench):
-    cell = bench.cell(filter=6)
-    bench.tap.alter = lambda _: b""
-    with pytest.raises(DeviceConnectionError):
-        cell.glance()
-    bench.instrument.power_cycle()
-    bench.tap.alter = lambda reply: reply
-    for take in (cell.glance, cell.measure, cell.tare, cell.clear_tare, cell.glance):
-        with pytest.raises(DeviceRestartedError, match=r"^load: the instrument was switched off.*\(FL\) is 3, not 6"):
-            take()
-    cell.safe()
-
-
-def test_an_emulated_line_that_is_unplugged_and_plugged_in_again(bench):
-    cell = bench.cell()
-    bench.put(3.0)
-    protocol_emulated.unregister("load")
-    with pytest.raises(DeviceConnectionError, match=r"lost the line emulated://load \(.*unplugged\)"):
-        cell.glance()
-    with pytest.raises(DeviceConnectionError, match="cannot open emulated://load"):
-        cell.glance()
-    protocol_emulated.register("load", bench.tap, bench.clock)
-    assert cell.glance() == {"load_force": 3.0}
-
-
-def test_closed_is_closed(bench):
-    cell = bench.cell()
-    cell.close()
-    cell.close()
-    cell.safe()
-    with pytest.raises(DeviceConnectionError, match="closed"):
-        cell.measure()
 
 
 class Once:
@@ -549,7 +475,7 @@ class Once:
 OTHERS = sealed("05 03 0A 00 00 00 00 00 00 00 00 00 00")
 
 
-@pytest.mark.parametrize(
+@each_case(
     "damage",
     [
         lambda _: b"",
@@ -562,7 +488,6 @@ OTHERS = sealed("05 03 0A 00 00 00 00 00 00 00 00 00 00")
         lambda _: OTHERS,
         lambda _: b"\xa5" * 40,
     ],
-    ids=["none", "head", "cut", "crc", "length", "garbage", "byte", "other", "noise"],
 )
 def test_a_damaged_reply_is_asked_for_again(bench, damage):
     cell = bench.cell()
@@ -574,6 +499,7 @@ def test_a_damaged_reply_is_asked_for_again(bench, damage):
     assert cell.glance() == {"load_force": 8.0}
 
 
+@on_a_real_line
 @needs_pty
 @pytest.mark.slow
 def test_a_late_reply_is_not_taken_for_the_next(bench, pseudo_terminal):
@@ -598,30 +524,6 @@ def test_a_late_reply_is_not_taken_for_the_next(bench, pseudo_terminal):
         cell.close()
 
 
-def test_stray_bytes_before_a_request_are_forgotten(bench):
-    cell = bench.cell()
-    bench.put(2.0)
-    stray = sealed("01 03 0A 00 00 00 00 00 00 00 00 00 10")
-    bench.line(cell)._received += stray
-    assert cell.glance() == {"load_force": 2.0}
-
-
-def test_a_line_that_does_not_fall_silent(bench):
-    cell = bench.cell()
-    port = bench.line(cell)
-    port.read = lambda size: b"\xa5" * size
-    port.ask = lambda _: b"\xa5" * 5
-    with pytest.raises(DeviceConnectionError, match="does not fall silent"):
-        cell.glance()
-
-
-def test_too_few_registers_are_noticed(bench):
-    cell = bench.cell()
-    bench.tap.alter = lambda _: sealed("01 03 04 00 00 00 00")
-    with pytest.raises(DeviceError, match=r"6 bytes where 12 were expected .*no other master"):
-        cell.glance()
-
-
 def test_a_failure_in_the_instrument_is_passed_on(bench):
     cell = bench.cell()
 
@@ -638,7 +540,7 @@ def test_a_failure_in_the_instrument_is_passed_on(bench):
 # Bad readings
 
 
-@pytest.mark.parametrize(("bits", "side"), [(0x0001, "under"), (0x0002, "over"), (0x0033, "over")])
+@each_case(("bits", "side"), [(0x0001, "under"), (0x0002, "over"), (0x0033, "over")])
 def test_range_bits(bench, bits, side):
     cell = bench.cell()
     bench.bank.alter = only(0x3500, [0x4140, 0, 0x4140, 0, bits])
@@ -649,8 +551,8 @@ def test_range_bits(bench, bits, side):
             take()
 
 
-@pytest.mark.parametrize("position", [0, 2])
-@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@each_case("position", [0, 2])
+@each_case("value", [math.nan, math.inf, -math.inf])
 def test_a_weight_that_is_no_number(bench, position, value):
     cell = bench.cell()
     words = [0, 0, 0, 0, 0x10]
@@ -659,20 +561,6 @@ def test_a_weight_that_is_no_number(bench, position, value):
     for take in (cell.measure, cell.glance, cell.tare):
         with pytest.raises(DeviceError, match="not finite"):
             take()
-
-
-def test_outside_of_the_calibration(bench):
-    cell = bench.cell(force_limits=(-5.0, 50.0))
-    bench.put(50.1)
-    with pytest.raises(DeviceError, match=r"force 50\.1 N is outside of its calibrated range -5 to 50 N"):
-        cell.measure()
-    bench.put(40.0)
-    cell.tare()
-    bench.put(45.0)
-    assert cell.measure()["load_force"] == pytest.approx(5.0)
-    bench.put(51.0)
-    with pytest.raises(DeviceError, match="force 51 N"):
-        cell.glance()
 
 
 def test_one_bad_reading_spoils_a_mean(bench):
@@ -720,13 +608,13 @@ def test_another_tare_of_somebody_else_is_noticed(bench):
     assert cell.glance()["load_force"] == pytest.approx(1.5)
 
 
-@pytest.mark.parametrize("weight", [1e-3, 0.123, 59.999, -59.999])
+@each_case("weight", [1e-3, 0.123, 59.999, -59.999])
 def test_a_tare_is_the_same_whatever_the_digits_of_the_weights(bench, weight):
     cell = bench.cell()
     bench.put(weight)
     cell.tare()
-    for step in range(200):
-        bench.put(-50.0 + 0.517 * step)
+    for step in range(50):
+        bench.put(-50.0 + 2.017 * step)
         cell.glance()
 
 
@@ -779,7 +667,7 @@ def test_a_quiet_load_is_not_stale(bench):
     cell = bench.cell(stale_after=1.0)
     bench.put(5.0)
     readings = []
-    for _ in range(200):
+    for _ in range(50):
         bench.clock.sleep(1.0)
         readings.append(cell.glance()["load_force"])
     assert set(readings) == {5.0}
@@ -817,7 +705,7 @@ def test_any_reply_is_a_reading_or_an_error(bench, reply, whole, head):
     assert math.isfinite(force)
 
 
-@pytest.mark.parametrize("function", [*range(32), 43, 0x80, 0x83, 0x84, 0x90, 0xAB, 0xFF])
+@each_case("function", [*range(8), 15, 16, 22, 23, 43, 0x80, 0x83, 0x84, 0x90, 0xFF])
 def test_a_reply_of_another_form_is_an_error(bench, function):
     for length in (0, 1, 2, 3, 4, 5, 9, 10, 12):
         cell = bench.cell()
@@ -889,36 +777,6 @@ def test_a_line_that_was_lost_is_not_asked(bench):
     cell.glance()
 
 
-def test_a_tare_is_waited_for_a_second(bench):
-    cell = bench.cell()
-    cell.glance()
-    bench.put(1.0)
-    cell.glance()
-    bench.bank.write_registers = lambda *_: None
-    begin = bench.clock.now()
-    with pytest.raises(DeviceError, match="took no tare"):
-        cell.tare()
-    assert bench.clock.now() - begin == pytest.approx(1.0, abs=0.06)
-
-
-@pytest.mark.parametrize(
-    ("weight", "digits", "agree"),
-    [
-        (0.5, 1, True),
-        (0.4, 1, False),
-        (-0.5, -1, True),
-        (12.3, 123, True),
-        (1e-5, 1, True),
-        (1e-6, 1, False),
-        (1e6, 1_000_001, True),
-        (1e6, 1_000_002, False),
-        (1.0, 0, False),
-    ],
-)
-def test_digits_of_a_weight(weight, digits, agree):
-    assert _agree(weight, digits) is agree
-
-
 def test_a_force_at_its_limits_is_good(bench):
     cell = bench.cell(force_limits=(-4.0, 8.0), newtons_per_unit=2.0, zero_newtons=-2.0)
     for weight, force in ((5.0, 8.0), (-1.0, -4.0)):
@@ -947,43 +805,6 @@ def test_own_check_reads_the_filter_and_looks_at_the_converter(bench):
     filtered, converter = cell.self_check()
     assert "from 3" in filtered.advice
     assert "off and on" in converter.advice
-
-
-def test_firmware_of_the_instrument(bench):
-    bench.bank.alter = lambda address, words: [0, 0x0C05] if address == 0x202E else words
-    assert bench.cell().identity.firmware == "5.12"
-    for wrong in ([1, 0x0C05], [0, 0]):
-        bench.bank.alter = lambda address, words, wrong=wrong: wrong if address == 0x202E else words
-        with pytest.raises(DeviceConnectionError, match="for its firmware, which no DAD 141"):
-            bench.cell()
-
-
-def test_settings_of_a_range_that_is_empty():
-    Settings(port="x", force_limits=(1.0, 1.001))
-    with pytest.raises(ValidationError):
-        Settings(port="x", force_limits=(1.0, 1.0))
-
-
-def test_the_order_of_words_is_looked_at_three_times(bench):
-    bench.bank.alter = lambda address, words: [0x4120, 0, 0, 7] if address == 0x2080 else words
-    with pytest.raises(DeviceConnectionError, match="gives the same weight as 10 and, as an integer, 7"):
-        bench.cell()
-    assert sum(frame[2:4] == b"\x20\x80" for frame in bench.tap.sent) == 3
-
-
-def test_a_still_signal_is_waited_for_in_steps(bench):
-    cell = bench.cell(still_timeout=2.0)
-    cell.glance()
-    bench.put(1.0)
-    cell.glance()
-    times = []
-    bench.bank.alter = lambda address, words: (
-        times.append(bench.clock.now())
-        or ([*words[:4], 0 if len(times) < 9 else 0x30] if address == 0x3500 else words)
-    )
-    cell.tare()
-    steps = sorted(b - a for a, b in pairwise(times[:8]))
-    assert steps[3] == pytest.approx(0.05, abs=0.005)
 
 
 def test_a_cell_over_its_range_is_told_on_reconnecting(bench):

@@ -57,7 +57,7 @@ def counting(clock):
 
 @pytest.mark.parametrize(
     ("kinds", "overtaking", "calls"),
-    [*(((kind,), False, 500) for kind in KINDS), (KINDS, False, 2000), (("drop", "corrupt", "delay"), True, 2000)],
+    [*(((kind,), False, 200) for kind in KINDS), (KINDS, False, 600), (("drop", "corrupt", "delay"), True, 600)],
     ids=[*KINDS, "all", "overtaking"],
 )
 @pytest.mark.slow

@@ -2,9 +2,9 @@
 
 import pytest
 import serial
+from each_case import each_case
 from faulty_line import InPieces
 
-from drivers import modbus
 from drivers.modbus import (
     NoReplyError,
     RefusedError,
@@ -96,7 +96,7 @@ def test_values_in_registers():
     assert swapped(known[::-1], lambda _: False) == ""
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("head", "length"),
     [("0103 0A", 15), ("0104 02", 7), ("0110 20", 8), ("0106 20", 8), ("0183 02", 5), ("014C 09", 5), ("0105 09", 5)],
 )
@@ -276,13 +276,6 @@ def test_echo_of_another_write(client, wrong):
         client(Answers(sealed(wrong))).write(0x2106, bytes.fromhex("0000 0003"))
 
 
-def test_so_many_replies_of_another_form_are_too_many(plug):
-    client = RtuClient(plug(Answers(STRAY * 7 + REPLY, STRAY * 8 + REPLY)), 1)
-    assert client.read(0x3500, 5) == bytes.fromhex(VALUES)
-    with pytest.raises(UnexpectedReplyError):
-        client.read(0x3500, 5)
-
-
 def test_what_comes_before_a_request_is_forgotten(client):
     made = client(Answers(REPLY))
     port = made._line.socket if isinstance(made, SerialClient) else made._port
@@ -331,8 +324,3 @@ def test_pymodbus_waits_as_long_as_it_is_told(plug, clock):
     made.wait_for(0.7)
     assert made._line.comm_params.timeout_connect == 0.7
     made.close()
-
-
-def test_cost_of_what_is_kept_is_bounded():
-    assert modbus.crc16.cache_info().maxsize == 1024
-    assert modbus.read_request.cache_info().maxsize == 64

@@ -6,6 +6,7 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
+from each_case import each_case
 
 from bench.clock import VirtualClock
 from bench.command_table import ActuatorTable
@@ -78,7 +79,7 @@ def test_what_is_sent_is_what_pymeasure_expects():
         assert math.isnan(supply.setpoint)
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("exchange", "text"),
     [
         ([(":MEAS:VOLT?", "OL")], "voltage is 'OL', expected a number"),
@@ -125,9 +126,7 @@ def test_closing_shuts_the_instrument_down_unless_told_otherwise():
         on_protocol(instrument, table={**TABLE, "shutdown": False}).close()
 
 
-@pytest.mark.parametrize(
-    "text", ["output_enabled", "a.b = c", "f(x)", "f(); g()", "_x = 1", "f(*[1])", "import os", "="]
-)
+@each_case("text", ["output_enabled", "a.b = c", "f(x)", "f(); g()", "_x = 1", "f(*[1])", "import os", "="])
 def test_an_action_is_a_call_or_an_assignment_of_literals(text):
     with pytest.raises(ValueError, match="expected a call such as"):
         parse_action(text)

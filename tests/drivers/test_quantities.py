@@ -1,6 +1,7 @@
 """Signals, ranges, read-back and arrival of instruments that the rig file describes."""
 
 import pytest
+from each_case import each_case
 
 from bench.command_table import QuantityTable, TargetTable
 from bench.errors import DeviceError, DeviceRestartedError
@@ -68,7 +69,7 @@ def test_arrival_is_within_the_tolerance_and_asked_for_in_steps(clock):
     assert arrival_of("supply", clock, target(), 5.0, dict).done
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("answer", "fields"),
     [
         ("ACME,PSU-1,42,2.0", ("ACME", "PSU-1", "42", "2.0")),
