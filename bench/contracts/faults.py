@@ -144,6 +144,9 @@ class RestartedActuatorContract(RestartedInstrumentContract):
             assert output_limits[0] <= output() <= output_limits[1]
         in_use.safe()
         assert output() == 0.0
+        # What made it safe does not make it usable.
+        with pytest.raises(DeviceRestartedError, match=f"^{in_use.name}: "):
+            in_use.set(set_points[1])
 
     def test_a_restart_at_rest_is_found_before_the_output_goes_on(
         self,

@@ -5,6 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
+from each_case import each_case
 
 from bench.clock import VirtualClock
 from bench.contracts.faults import (
@@ -326,15 +327,6 @@ def test_rescue_switches_off_what_another_program_left_on(stack, kind):
         device.glance()
 
 
-@actuators
-def test_the_declared_facts(stack, kind):
-    device = kind(stack).device
-    assert device.watchdog == 5.0
-    assert device.safe_within <= 3.0
-    assert device.repeats == 0
-    assert device.heats is (kind is not Fan)
-
-
 class RestartingServer(WireServer):
     """A wire server of a device that restarts at a request of a number, and does not answer that one."""
 
@@ -356,7 +348,7 @@ class RestartingCooler(Cooler):
         return RestartingServer(instrument)
 
 
-@pytest.mark.parametrize("number", range(1, 8))
+@each_case("number", range(1, 8))
 def test_a_restart_while_the_output_goes_on_is_found(stack, number):
     laboratory = RestartingCooler(stack)
     laboratory.server.left = number
@@ -387,16 +379,6 @@ def test_what_another_program_switches_is_an_error(stack):
             call()
     device.safe()
     assert laboratory.output() == 0.0
-
-
-@pytest.mark.parametrize(("number", "value"), [(50001, 0.9), (2030, 3.5), (2060, 0.0), (2000, 0)])
-def test_what_another_program_changes_is_found_by_the_reconnection(stack, number, value):
-    laboratory = Cooler(stack)
-    laboratory.device.set(0.5)
-    laboratory.device.reconnect()
-    laboratory.instrument.write_parameter(number, value)
-    with pytest.raises(DeviceError, match=rf"tec: its .* \(parameter {number}\) is {value:g} where .* was written"):
-        laboratory.device.reconnect()
 
 
 def test_an_output_that_would_come_back_by_itself_is_refused(stack):

@@ -4,6 +4,7 @@ import math
 from dataclasses import dataclass
 
 import pytest
+from each_case import each_case
 from emulated_bench import Bench, OnABench, OnALine, OnAServo, OnATorque, over_the_wire, serial_port
 
 from bench.clock import VirtualClock
@@ -110,16 +111,9 @@ class TestSilence(OnADrum, SilentInstrumentContract):
             status.wait()
 
 
-def test_initial_state(bench):
-    bench.clock.sleep(2.0)
-    assert not bench.device.force_enabled
-    assert math.isnan(bench.device.setpoint)
-    assert bench.device.measure() == {"stage_position": 0.0, "stage_velocity": 0.0, "stage_load": 0.0}
-    assert bench.where() == 0.0
-
-
-@pytest.mark.parametrize("goal", [0.01, -0.02, 2.5 * TURN, -1.5 * TURN])
-def test_arrives_and_holds(bench, goal):
+@each_case("goal", [0.01, -0.02, 2.5 * TURN, -1.5 * TURN])
+def test_arrives_and_holds(kind, stack, goal):
+    bench = connected(kind, stack)
     status = bench.device.set(goal)
     assert not status.update()
     assert bench.device.force_enabled
@@ -192,10 +186,9 @@ def error_with_force_off(bench):
     bench.instrument.trip(HardwareError.OVERLOAD)
 
 
-@pytest.mark.parametrize(
-    "state", [never_moved, moves, stands, watchdog_expired, error_with_force_on, error_with_force_off]
-)
-def test_safe_from_any_state_and_again_changes_nothing(bench, state):
+@each_case("state", [never_moved, moves, stands, watchdog_expired, error_with_force_on, error_with_force_off])
+def test_safe_from_any_state_and_again_changes_nothing(kind, stack, state):
+    bench = connected(kind, stack)
     state(bench)
     bench.device.safe()
     assert not bench.device.force_enabled
@@ -230,15 +223,6 @@ def test_silence_of_the_host_stops_the_stage(bench):
     bench.device.safe()
     bench.device.measure()
     bench.device.set(0.01).wait()
-
-
-def test_drum_that_is_blocked_ends_in_an_overload(bench):
-    bench.plant.stop = math.pi - 1.0
-    status = bench.device.set(0.05)
-    with pytest.raises(DeviceError, match=r"stage: .*overload"):
-        status.wait()
-    assert bench.where() == pytest.approx(RADIUS, abs=0.01 * RADIUS)
-    assert not bench.device.force_enabled
 
 
 # What only a wire can do.
@@ -306,7 +290,7 @@ def test_shaft_that_was_turned_a_whole_turn_is_off_by_a_circumference_after_a_re
     assert bench.drum.position == pytest.approx(TURN, abs=RESOLUTION)
 
 
-@pytest.mark.parametrize(("radius", "direction"), [(0.0, 1), (-1.0, 1), (math.nan, 1), (math.inf, 1), (0.01, 0)])
+@each_case(("radius", "direction"), [(0.0, 1), (-1.0, 1), (math.nan, 1), (math.inf, 1), (0.01, 0)])
 def test_drum_that_makes_no_sense(radius, direction):
     plant = Wall()
     servo = EmulatedMX28("stage", World(plant, VirtualClock()))
@@ -314,9 +298,9 @@ def test_drum_that_makes_no_sense(radius, direction):
         EmulatedDrum(servo, radius, direction=direction)
 
 
-@pytest.mark.parametrize("radius", [0.001, 0.007, 0.012, 0.033, 0.1])
-@pytest.mark.parametrize("zero_counts", [0, 1, 1000, -12345])
-@pytest.mark.parametrize("direction", [1, -1])
+@each_case("radius", [0.001, 0.007, 0.012, 0.033, 0.1])
+@each_case("zero_counts", [0, 1, 1000, -12345])
+@each_case("direction", [1, -1])
 def test_rounding_keeps_no_limit_of_the_drum_from_being_reached(radius, zero_counts, direction):
     servo = EmulatedMX28("stage", World(Wall(), VirtualClock()))
     drum = EmulatedDrum(servo, radius, zero_counts=zero_counts, direction=direction)

@@ -5,6 +5,7 @@ import math
 import sys
 
 import pytest
+from each_case import each_case
 from emulated_bench import Bench, OnABench, OnALine, OnAServo, OnATorque, Spoilt, over_the_wire, serial_port
 
 from bench.clock import VirtualClock, WallClock
@@ -121,8 +122,9 @@ class TestSilence(OnAShaft, SilentInstrumentContract):
             status.wait()
 
 
-@pytest.mark.parametrize("goal", [3.5, 1.25, 0.0, -2.0, 2.5 * TURN, -1.5 * TURN])
-def test_arrives_and_holds(bench, goal):
+@each_case("goal", [3.5, 0.0, 2.5 * TURN, -1.5 * TURN])
+def test_arrives_and_holds(kind, stack, goal):
+    bench = connected(kind, stack)
     start = bench.clock.now()
     status = bench.device.set(goal)
     assert not status.update()
@@ -217,15 +219,7 @@ def test_no_jump_to_the_goal_of_before(bench):
     assert max(position for _, position in bench.plant.seen) <= where + COUNT
 
 
-def test_safe_from_an_error_state(bench):
-    bench.device.set(9.0)
-    bench.instrument.trip(HardwareError.OVERLOAD)
-    bench.device.safe()
-    bench.device.safe()
-    assert not bench.device.torque_enabled
-
-
-@pytest.mark.parametrize(
+@each_case(
     ("error", "text"),
     [
         (HardwareError.INPUT_VOLTAGE, r"0x01 \(input voltage"),
@@ -235,7 +229,8 @@ def test_safe_from_an_error_state(bench):
         (HardwareError.OVERLOAD, r"0x20 \(overload"),
     ],
 )
-def test_every_call_tells_of_a_hardware_error(bench, error, text):
+def test_every_call_tells_of_a_hardware_error_and_safe_succeeds(kind, stack, error, text):
+    bench = connected(kind, stack)
     status = bench.device.set(9.0)
     bench.instrument.trip(error)
     for call in (bench.device.measure, bench.device.glance, bench.device.read, lambda: bench.device.set(5.0)):
@@ -247,6 +242,9 @@ def test_every_call_tells_of_a_hardware_error(bench, error, text):
     assert not status.success
     # As delivered, an encoder or a voltage error leaves the torque on.
     assert bench.device.torque_enabled is (error in (HardwareError.INPUT_VOLTAGE, HardwareError.MOTOR_ENCODER))
+    bench.device.safe()
+    bench.device.safe()
+    assert not bench.device.torque_enabled
 
 
 def test_silence_of_the_host_stops_the_shaft_at_that_instant(bench):
@@ -368,11 +366,12 @@ def test_motion_during_which_it_restarts_does_not_arrive_one_turn_off(bench):
 
 
 @over_the_wire
-@pytest.mark.parametrize(
+@each_case(
     ("address", "value", "text"),
     [(116, 100, "goal was changed to .* by another host"), (64, 0, "torque was switched")],
 )
 def test_what_another_host_changed_is_an_error_of_the_next_reading(bench, address, value, text):
+    bench.device.safe()
     bench.device.set(5.0).wait()
     bench.instrument.write_item(address, value)
     with pytest.raises(DeviceError, match=f"servo: its {text}"):
@@ -471,15 +470,6 @@ def test_zero_and_direction(bench):
     assert device.measure()["servo_position"] == pytest.approx(1.0, abs=COUNT)
     device.stop()
     assert device.setpoint == pytest.approx(1.0, abs=COUNT)
-    device.close()
-
-
-@over_the_wire
-def test_connecting_under_torque_switches_it_off(bench):
-    bench.device.set(9.0)
-    bench.device.close()
-    device = bench.connect()
-    assert not device.torque_enabled
     device.close()
 
 

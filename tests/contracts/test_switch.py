@@ -6,11 +6,12 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
+from each_case import each_case
 from emulated_bench import tcp_port
 
 from bench.clock import VirtualClock
 from bench.contracts.roles import SwitchContract
-from bench.errors import DeviceError, LimitError
+from bench.errors import DeviceError
 from bench.roles import Switch
 from drivers.labjack_t7 import T7Switch
 from sim_devices.instruments.labjack_t7 import EmulatedT7
@@ -101,7 +102,7 @@ class TestContract(SwitchContract):
         return lambda: len(lab.t7.requests)
 
 
-@pytest.mark.parametrize("line", [0, 7, 22])
+@each_case("line", [0, 7, 22])
 def test_off_at_first(lab, line):
     fan = lab.connect(line)
     assert not lab.on(line)
@@ -127,33 +128,6 @@ def test_switches_on_and_off(fan, lab):
         assert fan.read()["fan_state"]["value"] == float(value)
 
 
-@pytest.mark.parametrize("value", [-1.0, 0.5, 1.0 + 1e-9, 2.0, math.nan, math.inf])
-@pytest.mark.parametrize("before", [0.0, 1.0])
-def test_other_set_points_are_refused_and_nothing_is_sent(fan, lab, before, value):
-    fan.set(before)
-    lab.t7.requests.clear()
-    for call in (fan.set, fan.check):
-        with pytest.raises(LimitError, match=r"fan: set-point .* is neither 0 \(off\) nor 1 \(on\)"):
-            call(value)
-    assert lab.t7.requests == []
-    assert fan.setpoint == before
-    assert lab.on(3) == bool(before)
-
-
-def test_a_good_set_point_is_sent(fan, lab):
-    lab.t7.requests.clear()
-    fan.set(1.0)
-    assert ("write", 2003, [int(lab.active_high)]) in lab.t7.requests
-
-
-def test_stop_keeps_the_state(fan, lab):
-    fan.set(1.0)
-    fan.stop()
-    fan.stop(success=False)
-    assert lab.on(3)
-    assert fan.measure() == {"fan_state": 1.0}
-
-
 def bring_on(lab: Laboratory, fan: Switch) -> None:
     fan.set(1.0)
 
@@ -176,7 +150,7 @@ def switch_on_from_elsewhere(lab: Laboratory, fan: Switch) -> None:
     lab.t7.write_value(2003, lab.active_high)
 
 
-@pytest.mark.parametrize("bring", [None, bring_on, bring_off, run_out, make_an_input, switch_on_from_elsewhere])
+@each_case("bring", [None, bring_on, bring_off, run_out, make_an_input, switch_on_from_elsewhere])
 def test_safe_is_off_from_any_state(fan, lab, bring):
     if bring is not None:
         bring(lab, fan)

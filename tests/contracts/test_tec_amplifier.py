@@ -5,6 +5,7 @@ from itertools import dropwhile
 
 import numpy as np
 import pytest
+from each_case import each_case
 from emulated_bench import Bench, OnABench, Spoilt, over_the_wire, serial_port
 
 from bench.clock import VirtualClock
@@ -206,16 +207,9 @@ def test_safe_releases_the_plate(bench):
     bench.device.set(50.0).wait()
 
 
-def test_safe_from_an_error_state(bench):
-    bench.device.set(60.0)
-    bench.instrument.trip(138)
-    bench.device.safe()
-    bench.device.safe()
-    assert not bench.device.output_enabled
-
-
-@pytest.mark.parametrize("number", [11, 30, 60, 100, 108, 134, 137, 138, 139, 143, 176, 182, 183])
-def test_every_call_tells_of_an_error(bench, number):
+@each_case("number", [11, 30, 60, 100, 108, 134, 137, 138, 139, 143, 176, 182, 183])
+def test_every_call_tells_of_an_error_and_safe_succeeds(kind, stack, number):
+    bench = connected(kind, stack)
     status = bench.device.set(60.0)
     bench.instrument.trip(number)
     for call in (bench.device.measure, bench.device.glance, bench.device.read, lambda: bench.device.set(50.0)):
@@ -225,6 +219,8 @@ def test_every_call_tells_of_an_error(bench, number):
         status.wait()
     assert status.done
     assert not status.success
+    bench.device.safe()
+    bench.device.safe()
     assert not bench.device.output_enabled
 
 
