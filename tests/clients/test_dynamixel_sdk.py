@@ -95,14 +95,6 @@ def test_a_slow_profile_takes_the_wall_clock_of_the_server(connect):
     servo.write(TORQUE_ENABLE, 0, 1)
 
 
-def test_several_instructions_are_answered_in_one_packet_each(connect, sdk):
-    servo = connect()
-    reader = sdk.GroupSyncRead(servo.port, servo.handler, PRESENT_POSITION, 4)
-    assert reader.addParam(1)
-    assert reader.txRxPacket() == 0
-    assert reader.getData(1, PRESENT_POSITION, 4) == pytest.approx(servo.read(PRESENT_POSITION), abs=2)
-
-
 def test_a_line_is_opened_again_after_half_a_frame(connect):
     first = connect()
     before = first.read(0, 2)
@@ -110,18 +102,3 @@ def test_a_line_is_opened_again_after_half_a_frame(connect):
     first.port.closePort()
     second = connect()
     assert second.read(0, 2) == before == 30
-
-
-def test_errors_of_the_servo_arrive(connect):
-    servo = connect()
-    # Position mode takes 0 to 4095: a limit error.
-    result, error = servo.handler.write4ByteTxRx(servo.port, 1, GOAL_POSITION, 5000)
-    assert (result, error) == (0, 6)
-
-
-def test_a_restarted_servo_has_lost_its_volatile_settings(connect, sma):
-    servo = connect()
-    servo.write(PROFILE_VELOCITY, 50)
-    assert servo.handler.reboot(servo.port, 1) == (0, 0)
-    sma.control.advance(1.0)
-    assert servo.read(PROFILE_VELOCITY) == 0

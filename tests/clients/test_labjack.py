@@ -2,16 +2,12 @@
 
 import asyncio
 import re
-import socket
-import struct
 
 import pytest
 from pymodbus.client import AsyncModbusTcpClient, ModbusTcpClient
 from served import PATIENCE, address
 
 AIN0, DAC0, FIO0, TEST, SERIAL = 0, 1000, 2000, 55100, 60028
-TEST_REQUEST = bytes.fromhex("0000 0000 0006 01 03 d73c 0002")
-TEST_ANSWER = bytes.fromhex("0000 0000 0007 01 03 04 00112233")
 
 
 @pytest.fixture
@@ -29,14 +25,6 @@ def client(place):
 def real(client, register):
     words = client.read_holding_registers(register, count=2, device_id=1).registers
     return client.convert_from_registers(words, client.DATATYPE.FLOAT32)
-
-
-def exchange(connection, data, length):
-    connection.sendall(data)
-    answer = b""
-    while len(answer) < length and (piece := connection.recv(4096)):
-        answer += piece
-    return answer
 
 
 def test_an_output_reads_back(client):
@@ -101,20 +89,3 @@ def test_mbpoll_writes(place, client, mbpoll):
     )
     assert polled.returncode == 0, polled.stderr
     assert real(client, DAC0) == 1.25
-
-
-def test_a_place_is_free_again_after_a_disconnection_in_mid_frame(place):
-    for _ in range(5):
-        with socket.create_connection(place, PATIENCE) as first, socket.create_connection(place, PATIENCE) as second:
-            first.sendall(TEST_REQUEST[:9])
-            assert exchange(second, TEST_REQUEST, 13) == TEST_ANSWER
-
-
-def test_a_connection_that_is_reset_leaves_its_place(place):
-    for _ in range(5):
-        connection = socket.create_connection(place, PATIENCE)
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-        connection.sendall(TEST_REQUEST * 20)
-        connection.close()
-    with socket.create_connection(place, PATIENCE) as connection:
-        assert exchange(connection, TEST_REQUEST, 13) == TEST_ANSWER

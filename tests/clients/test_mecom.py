@@ -1,9 +1,8 @@
 """A MeCom client that was written from the specification alone, on the served TEC controller."""
 
-import math
-
 import pytest
-from mecom_client import MeComClient, MeComError, checksum
+from each_case import each_case
+from mecom_client import MeComClient, checksum
 
 READY, RUN, ERROR = 1, 2, 3
 STATUS, ERROR_NUMBER, OBJECT, CURRENT = 104, 105, 1000, 1020
@@ -49,7 +48,7 @@ def tec(connect, vo2):
     switch_off()
 
 
-@pytest.mark.parametrize("vector", VECTORS)
+@each_case("vector", VECTORS)
 def test_the_client_agrees_with_the_frames_of_the_maker(vector):
     assert f"{checksum(vector[:-4].encode('ascii')):04X}" == vector[-4:]
 
@@ -104,51 +103,8 @@ def test_each_reading_is_one_of_its_own(tec, connect, vo2):
     assert sorted(set(readings)) == readings
 
 
-def test_server_errors(tec):
-    for action, code in (
-        (lambda: tec.integer(1234), 5),
-        (lambda: tec.set_real(OBJECT, 20.0), 6),
-        (lambda: tec.set_real(TARGET, 1e9), 7),
-        (lambda: tec.set_real(TARGET, math.nan), 7),
-        (lambda: tec.exchange("?VR03E8"), 4),
-        (lambda: tec.exchange("XY"), 1),
-    ):
-        with pytest.raises(MeComError) as refused:
-            action()
-        assert refused.value.code == code
-
-
-def test_limits(tec):
-    assert tec.limits(2030, "f") == (0.0, 4.0)
-    assert tec.limits(INPUT, "i") == (0, 2)
-
-
-def test_the_emergency_stop_is_an_error_that_a_reset_clears(tec, vo2):
-    tec.emergency_stop()
-    assert (tec.integer(STATUS), tec.integer(ERROR_NUMBER)) == (ERROR, 11)
-    tec.reset()
-    vo2.control.advance(1.0)
-    assert (tec.integer(STATUS), tec.integer(ERROR_NUMBER)) == (READY, 0)
-
-
 def test_any_device_answers_to_address_0(connect):
     assert connect(address=0).integer(100) == 1091
-
-
-def test_a_resend_with_the_same_number_is_answered(tec):
-    request = tec.frame("?VR006401")
-    for _ in range(3):
-        tec.line.write(request)
-        assert tec.answer(request) == "00000443"
-
-
-def test_several_requests_in_one_write_are_answered_in_order(tec):
-    requests = [tec.frame(payload) for payload in ("?IF", "?VR006401", "VS0BB80141AE0000", "?VR0BB801") * 5]
-    tec.line.write(b"".join(requests))
-    answers = [tec.answer(request) for request in requests]
-    assert answers[1::4] == ["00000443"] * 5
-    assert answers[2::4] == [None] * 5
-    assert answers[3::4] == ["41AE0000"] * 5
 
 
 def test_a_cut_line_is_opened_again_after_half_a_frame(connect):

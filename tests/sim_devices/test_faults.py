@@ -5,6 +5,7 @@ import math
 
 import pytest
 import serial
+from each_case import each_case
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -56,12 +57,7 @@ def ask(vo2):
     line.close()
 
 
-def names(rig):
-    return [(rig, name) for name in make(rig)[0].faults]
-
-
-@pytest.mark.parametrize(("rig", "name"), [each for rig in RIGS for each in names(rig)])
-def test_each_fault_says_what_it_is_and_leaves_no_trace_when_it_has_ended(rig, name):
+def check_a_fault(rig, name):
     laboratory, clock = make(rig)
     fault = laboratory.faults[name]
     assert fault.summary
@@ -79,6 +75,11 @@ def test_each_fault_says_what_it_is_and_leaves_no_trace_when_it_has_ended(rig, n
 
 
 @pytest.mark.parametrize("rig", RIGS)
+def test_each_fault_says_what_it_is_and_leaves_no_trace_when_it_has_ended(rig):
+    each_case("name", make(rig)[0].faults)(check_a_fault)(rig=rig)
+
+
+@each_case("rig", RIGS)
 def test_a_laboratory_without_faults_has_no_calendar_in_its_world(rig):
     laboratory, _ = make(rig)
     assert laboratory.next_change() == math.inf
@@ -151,7 +152,7 @@ def test_an_answer_of_another_address_is_whole(vo2, ask):
     assert wrong[-5:-1] == b"%04X" % crc_hqx(wrong[:-5], 0)
 
 
-@pytest.mark.parametrize("rig", RIGS)
+@each_case("rig", RIGS)
 def test_each_protocol_with_addresses_readdresses_its_answers(rig):
     laboratory, _ = make(rig)
     for name, server in laboratory.servers.items():
@@ -227,7 +228,7 @@ def test_a_frozen_instrument_answers_and_obeys_but_its_values_stand(vo2):
     assert tec.read_parameter(1000) == pytest.approx(60.0, abs=1.0)
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("rig", "instrument", "read"),
     [
         ("vo2", "psd", lambda laboratory: laboratory.t7.convert(0)),
@@ -344,7 +345,7 @@ def test_a_clipped_amplifier_gives_no_more():
     assert laboratory.truth()["piezo_voltage"].value > 15.0
 
 
-@pytest.mark.parametrize("rig", RIGS)
+@each_case("rig", RIGS)
 def test_looking_at_the_truth_feeds_no_watchdog(rig):
     laboratory, clock = make(rig)
     if rig == "sma":
@@ -408,7 +409,7 @@ def test_which_answers_are_disturbed_comes_from_the_seed():
     assert 60 < sum(answers(3)) < 140
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("entry", "words"),
     [
         ({"fault": "tec.melt", "at": 1.0}, "has no fault 'tec.melt'; it has: tec-over-current"),

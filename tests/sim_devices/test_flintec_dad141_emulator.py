@@ -2,12 +2,11 @@
 
 import math
 import struct
-import subprocess
-import sys
 from itertools import pairwise
 
 import numpy as np
 import pytest
+from each_case import each_case
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -101,7 +100,7 @@ def test_a_read_may_begin_in_the_middle_of_a_value():
     assert cell.read_registers(0x3501, 3) == cell.read_registers(0x3500, 5)[1:4]
 
 
-@pytest.mark.parametrize("address", [0x0000, 0x1FFF, 0x2004, 0x2032, 0x3505, 0xFFFF])
+@each_case("address", [0x0000, 0x1FFF, 0x2004, 0x2032, 0x3505, 0xFFFF])
 def test_what_is_not_emulated_is_an_illegal_address(address):
     cell = Cell()
     refused(2, lambda: cell.read_registers(address, 1))
@@ -117,7 +116,7 @@ def test_read_only_write_only_and_half_values():
     refused(3, lambda: cell.write_registers(0x2107, [0]))
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("address", "values"),
     [(0x2106, [0, 9]), (0x2106, [0xFFFF, 0xFFFF]), (0x2110, [0, 2]), (0x2112, [0, 0]), (0x2114, [1, 0])]
     + [(0x2061, [each]) for each in (0x00, 0x40, 0x100)]
@@ -127,7 +126,7 @@ def test_values_that_are_not_allowed(address, values):
     refused(3, lambda: Cell().write_registers(address, values))
 
 
-@pytest.mark.parametrize(
+@each_case(
     "wrong",
     [
         {"newtons_per_unit": 0.0},
@@ -148,14 +147,14 @@ def test_wrong_parameters_are_refused(wrong):
         Cell(**wrong)
 
 
-@pytest.mark.parametrize(("decimals", "step", "shown"), [(3, 1, 12.346), (3, 5, 12.345), (1, 2, 12.4), (0, 10, 10.0)])
+@each_case(("decimals", "step", "shown"), [(3, 1, 12.346), (3, 5, 12.345), (1, 2, 12.4), (0, 10, 10.0)])
 def test_resolution(decimals, step, shown):
     cell = Cell(12.3456, decimals=decimals, step=step)
     assert cell.floats(0x2000) == [pytest.approx(shown, rel=1e-7)]
     assert cell.integer(0x2020) == round(shown * 10**decimals)
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("newtons", "bits"), [(60.0, 0), (60.001, 2), (1e9, 2), (math.inf, 2), (-60.0, 0), (-60.001, 1), (-1e9, 1)]
 )
 def test_range_bits(newtons, bits):
@@ -203,7 +202,7 @@ def test_peak_and_hold():
     assert (cell.integer(0x2082), cell.integer(0x2086)) == (5000, 5000)
 
 
-@pytest.mark.parametrize("command", [0x02, 0x08])
+@each_case("command", [0x02, 0x08])
 def test_no_tare_and_no_zero_while_moving(command):
     cell = Cell()
     refused(4, lambda: cell.write_registers(0x2061, [command]))  # just switched on
@@ -324,8 +323,8 @@ def filtered(setting: int, **options) -> Cell:
     return cell
 
 
-@pytest.mark.parametrize("setting", SETTLING_MS)
-@pytest.mark.parametrize("watch", [0.001, 0.004, 0.02])
+@each_case("setting", SETTLING_MS)
+@each_case("watch", [0.001, 0.004, 0.02])
 def test_settles_in_the_time_of_the_manual(setting, watch):
     cell = filtered(setting)
     cell.clock.sleep(1.0)
@@ -337,7 +336,7 @@ def test_settles_in_the_time_of_the_manual(setting, watch):
     assert 1000 * (cell.clock.now() - start) == pytest.approx(SETTLING_MS[setting], rel=0.06, abs=1000 * watch)
 
 
-@pytest.mark.parametrize("setting", range(9))
+@each_case("setting", range(9))
 def test_cut_off(setting):
     """The response to a sine wave at the cut-off, by the plant's own clock."""
     cell = filtered(setting)
@@ -366,7 +365,7 @@ def test_how_often_it_is_asked_does_not_matter():
     assert response([0.3, 1.7, 5.0]) == pytest.approx(often, abs=5e-4)
 
 
-@pytest.mark.parametrize("setting", range(9))
+@each_case("setting", range(9))
 def test_a_long_silence_costs_no_more_than_a_short_one(setting):
     cell = filtered(setting)
     cell.load.splits = 0
@@ -383,7 +382,7 @@ def test_on_the_wall_clock_it_costs_no_more():
     assert cell.load.splits < 100
 
 
-@pytest.mark.parametrize("setting", [0, 3, 7])
+@each_case("setting", [0, 3, 7])
 def test_noise_is_that_of_the_setting(setting):
     cell = filtered(setting, noise=0.01, seed=11)
     readings = []
@@ -394,7 +393,7 @@ def test_noise_is_that_of_the_setting(setting):
     assert abs(np.mean(readings)) < 4 * np.std(readings) / math.sqrt(2000)
 
 
-@pytest.mark.parametrize("lags", [0.1, 0.5, 2.0])
+@each_case("lags", [0.1, 0.5, 2.0])
 def test_noise_is_correlated_as_two_lags_make_it(lags):
     cell = filtered(3, noise=0.01, seed=12)
     readings = []
@@ -508,7 +507,7 @@ def test_exchanges():
         assert server.receive(sent).hex(" ") == reply.hex(" "), sent.hex(" ")
 
 
-@pytest.mark.parametrize("address", [1, 17, 247])
+@each_case("address", [1, 17, 247])
 def test_answers_to_its_address_only(address):
     server = ModbusRtuServer(Cell(), address)
     assert server.address == address
@@ -519,7 +518,7 @@ def test_answers_to_its_address_only(address):
         assert not reply or reply[0] == address
 
 
-@pytest.mark.parametrize("address", [0, 248, -1])
+@each_case("address", [0, 248, -1])
 def test_no_other_addresses(address):
     with pytest.raises(ValueError, match="1 to 247"):
         ModbusRtuServer(Cell(), address)
@@ -539,7 +538,7 @@ def test_byte_by_byte():
     assert [server.receive(bytes([byte])) for byte in READ] == [b""] * 7 + [READ_REPLY]
 
 
-@pytest.mark.parametrize(
+@each_case(
     "garbage",
     [
         b"\x00",
@@ -556,7 +555,6 @@ def test_byte_by_byte():
         b"\x01\x03",
         b"\x01\x99" * 300,
     ],
-    ids=lambda garbage: f"{garbage[:8].hex()}_{len(garbage)}",
 )
 def test_the_request_behind_garbage_is_answered(garbage):
     server = ModbusRtuServer(vector_cell())
@@ -617,64 +615,3 @@ def test_a_defect_of_the_instrument_is_a_device_failure(caplog):
 
 
 # Independent clients, over a pseudo-terminal
-
-
-needs_pty = pytest.mark.skipif(sys.platform == "win32", reason="needs pseudo-terminals")
-
-
-@needs_pty
-def test_minimalmodbus(pseudo_terminal):
-    minimalmodbus = pytest.importorskip("minimalmodbus", reason="needs the package minimalmodbus")
-    cell = vector_cell()
-    with pseudo_terminal(ModbusRtuServer(cell, 42)) as path:
-        client = minimalmodbus.Instrument(path, 42)
-        try:
-            client.serial.baudrate = 115200
-            client.serial.timeout = 1.0  # waited out at each exception, as its reply is shorter
-            assert client.read_registers(0x3500, 5) == [0x4140, 0, 0x4138, 0, 0x0030]
-            assert client.read_float(0x2000, functioncode=4) == 12.0
-            assert client.read_float(0x2002) == 11.5
-            assert client.read_long(0x2020, signed=True) == 12000
-            assert client.read_register(0x2060) == 0x0030
-            client.write_register(0x2061, 0x08, functioncode=6)
-            assert client.read_float(0x2002) == 0.0
-            client.write_long(0x2106, 5)
-            assert cell.integer(0x2106) == 5
-            with pytest.raises(minimalmodbus.IllegalRequestError):
-                client.read_register(0x2004)
-            with pytest.raises(minimalmodbus.SlaveReportedException):
-                client.write_register(0x2061, 0x08, functioncode=6)  # not still
-        finally:
-            client.serial.close()
-
-
-def values(result: subprocess.CompletedProcess[str]) -> list[str]:
-    assert result.returncode == 0, result.stderr
-    return [line.split()[-1] for line in result.stdout.splitlines() if line.startswith("[")]
-
-
-@needs_pty
-def test_mbpoll(pseudo_terminal, mbpoll):
-    cell = vector_cell()
-
-    def poll(*arguments: str) -> subprocess.CompletedProcess[str]:
-        return mbpoll("-m", "rtu", "-b", "115200", "-P", "none", "-a", "7", "-0", "-1", "-q", "-o", "5", *arguments)
-
-    with pseudo_terminal(ModbusRtuServer(cell, 7)) as path:
-        both = poll("-t", "4:float", "-B", "-r", str(0x2000), "-c", "2", path)
-        assert [float(each) for each in values(both)] == [12.0, 11.5]
-        assert values(poll("-t", "3:hex", "-r", str(0x3500), "-c", "5", path)) == [
-            "0x4140",
-            "0x0000",
-            "0x4138",
-            "0x0000",
-            "0x0030",
-        ]
-        assert values(poll("-t", "4:int", "-B", "-r", str(0x2020), path)) == ["12000"]
-        assert poll("-t", "4", "-r", str(0x2061), path, "8").returncode == 0
-        assert cell.floats(0x2002) == [0.0]
-        assert poll("-t", "4:int", "-B", "-r", str(0x2106), path, "6").returncode == 0
-        assert cell.integer(0x2106) == 6
-        refusal = poll("-t", "4", "-r", str(0x2004), path)
-        assert refusal.returncode != 0
-        assert "illegal data address" in refusal.stderr.lower()

@@ -4,14 +4,14 @@ import math
 import socket
 import struct
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
 import pytest
+from each_case import each_case
 from hypothesis import given
 from hypothesis import strategies as st
-from pymodbus.client import ModbusTcpClient
 
 from bench.clock import VirtualClock
 from sim_devices.instruments.labjack_t7 import CONVERSIONS, DAC_STEP, RAIL, EmulatedT7
@@ -63,7 +63,7 @@ def frame(text: str) -> bytes:
 # The register map
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("address", "words"),
     [
         (55100, [0x0011, 0x2233]),
@@ -88,7 +88,7 @@ def test_reads_may_span_values_and_begin_in_the_middle_of_one(t7):
     assert t7.read_registers(55101, 1) == [0x2233]
 
 
-@pytest.mark.parametrize("address", [28, 1004, 9028, 41014, 55102, 61616, 65535])
+@each_case("address", [28, 1004, 9028, 41014, 55102, 61616, 65535])
 def test_what_is_not_emulated_is_an_illegal_address(t7, address):
     with pytest.raises(RegisterError) as refused:
         t7.read_registers(address, 1)
@@ -105,7 +105,7 @@ def test_read_only_and_write_only(t7):
         assert refused.value.code == 2
 
 
-@pytest.mark.parametrize(("address", "values"), [(1000, [0]), (1001, [0]), (1000, [0, 0, 0]), (40001, [0, 0])])
+@each_case(("address", "values"), [(1000, [0]), (1001, [0]), (1000, [0, 0, 0]), (40001, [0, 0])])
 def test_half_a_value_cannot_be_written(t7, address, values):
     with pytest.raises(RegisterError) as refused:
         t7.write_registers(address, values)
@@ -118,7 +118,7 @@ def test_no_number_cannot_be_written(t7):
     assert refused.value.code == 3
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("address", "value", "detail"),
     [
         (40006, 5.0, 2370),
@@ -143,7 +143,7 @@ def test_refused_settings_leave_a_detail(t7, address, value, detail):
     assert t7.read_value(55000) == 0
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("address", "value"),
     [(9000, 1), (9300, 0), (9300, 16385), (10200, 0.0), (61600, 2), (61600, 1)],
 )
@@ -153,7 +153,7 @@ def test_other_refused_settings(t7, address, value):
     assert refused.value.code == 4
 
 
-@pytest.mark.parametrize(("written", "read"), [(10, 10), (1, 1), (0.1, 0.1), (0.01, 0.01), (0, 10)])
+@each_case(("written", "read"), [(10, 10), (1, 1), (0.1, 0.1), (0.01, 0.01), (0, 10)])
 def test_ranges(t7, written, read):
     t7.write_value(40026, written)
     assert t7.read_value(40026) == pytest.approx(read, rel=1e-6)
@@ -172,7 +172,7 @@ def test_outputs(t7):
     assert t7.tdac_volts(2) == -10.0
 
 
-@pytest.mark.parametrize(("register", "lowest", "highest", "bits"), [(1000, 0.0, 5.0, 12), (30000, -10.0, 10.0, 14)])
+@each_case(("register", "lowest", "highest", "bits"), [(1000, 0.0, 5.0, 12), (30000, -10.0, 10.0, 14)])
 def test_outputs_have_steps(t7, register, lowest, highest, bits):
     step = (highest - lowest) / 2**bits
     seen = set()
@@ -262,7 +262,7 @@ def test_quantisation_at_index_1():
     assert seen == set(range(11))
 
 
-@pytest.mark.parametrize("span", [10.0, 1.0, 0.1, 0.01])
+@each_case("span", [10.0, 1.0, 0.1, 0.01])
 def test_clipping(span):
     volts = 0.0
     t7 = make({0: lambda: volts})
@@ -285,7 +285,7 @@ def test_differential():
     assert t7.convert(2) == pytest.approx(2.0, abs=LSB)
 
 
-@pytest.mark.parametrize("index", range(9))
+@each_case("index", range(9))
 def test_noise_by_resolution_index(index):
     t7 = make({0: lambda: 1.2345}, seed=11)
     t7.write_value(41500, index)
@@ -294,11 +294,6 @@ def test_noise_by_resolution_index(index):
     quantisation = LSB / conversions / math.sqrt(12)
     assert np.std(readings) == pytest.approx(math.hypot(LSB / math.sqrt(conversions), quantisation), rel=0.07)
     assert np.mean(readings) == pytest.approx(1.2345, abs=4 * LSB / math.sqrt(2000))
-
-
-def test_effective_resolution_is_that_of_the_datasheet():
-    bits = [math.log2(2 * RAIL * 10 / (LSB / math.sqrt(each))) for each in CONVERSIONS]
-    assert bits == pytest.approx(np.linspace(16, 19, 8), abs=0.1)
 
 
 def test_a_burst_lets_time_pass_and_averages_over_it():
@@ -391,7 +386,7 @@ def test_the_plant_stands_at_the_instant_of_expiry():
     assert plant.time == 100.0
 
 
-@pytest.mark.parametrize("access", ["read", "write", "conversion", "burst", "refused"])
+@each_case("access", ["read", "write", "conversion", "burst", "refused"])
 def test_any_communication_feeds(access):
     t7 = make()
     arm(t7)
@@ -483,7 +478,7 @@ def test_two_current_psd():
     assert psd.first() + psd.second() == pytest.approx(2.0)
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("position", "shown"),
     [
         (0.0, 0.0),
@@ -523,7 +518,7 @@ def test_supplies_of_ratiometric_sensors_differ_and_stay():
     assert supplies == [sensor.supply() for sensor in sensors]
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("displacement", "shown"),
     [(0.0, 0.0), (14e-9, 10e-9), (-16e-9, -20e-9), (199.994e-6, 199.99e-6), (200e-6, 200e-6), (1.0, 200e-6)],
 )
@@ -542,7 +537,7 @@ def test_noise_of_a_displacement_sensor():
     assert np.mean(shown) == pytest.approx(50.003e-6, abs=4 * 10.4e-9 / math.sqrt(4000))
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("celsius", "ohms"),
     # The table of a thermistor of 10 kΩ at 25 °C with these coefficients.
     [(0.0, 32650.0), (25.0, 10000.0), (50.0, 3603.0), (100.0, 678.3)],
@@ -644,7 +639,7 @@ def test_amplifier_settles_by_its_time_constant():
     assert 20.0 * (world.time - 1.0) - load.integral == pytest.approx(20.0 * 0.2e-3, rel=0.01)
 
 
-@pytest.mark.parametrize("interval", [5e-6, 50e-6, 1e-3])
+@each_case("interval", [5e-6, 50e-6, 1e-3])
 def test_amplifier_in_a_fast_loop(interval):
     hv, load, world = amplifier()
     output, rng = 0.0, np.random.default_rng(4)
@@ -658,7 +653,7 @@ def test_amplifier_in_a_fast_loop(interval):
         assert abs(load.volts - output) <= hv.STEP / 2 + 1e-9
 
 
-@pytest.mark.parametrize("rate", [1e-3, 4e-3, 6e-3, 0.02])
+@each_case("rate", [1e-3, 4e-3, 6e-3, 0.02])
 def test_load_of_an_amplifier_never_goes_back_on_its_way(rate):
     hv, load, world = amplifier()
     for step in range(300):
@@ -670,7 +665,7 @@ def test_load_of_an_amplifier_never_goes_back_on_its_way(rate):
     assert load.volts == pytest.approx(20.0 * min(rate * 299, 1.5), abs=1e-9)
 
 
-@pytest.mark.parametrize("offset", [0.0, 2.5])
+@each_case("offset", [0.0, 2.5])
 def test_amplifier_is_clipped(offset):
     hv, load, world = amplifier(offset_volts=offset)
     for volts, kept in ((2.0, 40.0), (2.3, 45.0), (-9.0, -45.0), (0.0, 0.0)):
@@ -832,7 +827,7 @@ def test_any_bytes_are_answered_or_end_the_connection(pieces):
         pass
 
 
-@pytest.mark.parametrize("bad", ["0001 0001 0006 01 03 0000 0001", "0001 0000 0001 01", "0001 0000 040b 01"])
+@each_case("bad", ["0001 0001 0006 01 03 0000 0001", "0001 0000 0001 01", "0001 0000 040b 01"])
 def test_a_foreign_header_ends_the_connection_and_no_other(wired, bad):
     with ModbusTcpServer(wired) as server:
         with socket.create_connection(("127.0.0.1", server.port), timeout=60) as spoilt:
@@ -962,65 +957,6 @@ def test_a_defect_of_the_instrument_is_a_device_failure(caplog):
 
 
 # Independent clients
-
-
-@pytest.fixture
-def served() -> Iterator[tuple[EmulatedT7, ModbusTcpServer]]:
-    t7 = make({0: lambda: 2.5, 1: lambda: -0.75})
-    with ModbusTcpServer(t7) as server:
-        yield t7, server
-
-
-def test_pymodbus_as_it_is(served):
-    t7, server = served
-    client = ModbusTcpClient("127.0.0.1", port=server.port, timeout=60, retries=0)
-    assert client.connect()
-    try:
-        both = client.read_input_registers(0, count=4, device_id=1)
-        volts = client.convert_from_registers(both.registers, client.DATATYPE.FLOAT32)
-        assert volts == pytest.approx([2.5, -0.75], abs=LSB)
-        words = client.convert_to_registers(3.25, client.DATATYPE.FLOAT32)
-        assert not client.write_registers(1000, words, device_id=9).isError()
-        assert t7.dac_volts(0) == pytest.approx(3.25, abs=DAC_STEP / 2)
-        assert not client.write_register(41500, 3, device_id=0).isError()
-        refused = client.write_register(41500, 13, device_id=1)
-        assert (refused.isError(), refused.exception_code) == (True, 4)
-        assert client.read_holding_registers(55000, count=1, device_id=1).registers == [2375]
-        assert client.read_coils(0, count=1, device_id=1).exception_code == 1
-    finally:
-        client.close()
-
-
-@pytest.fixture
-def poll(served, mbpoll):
-    """Call mbpoll on the served T7; return the completed process."""
-    options = ["-m", "tcp", "-p", served[1].port, "-a", "1", "-0", "-1", "-q", "-o", "5"]
-    return lambda *arguments: mbpoll(*options, *arguments)
-
-
-def test_mbpoll_reads(poll):
-    result = poll("-t", "4:float", "-B", "-r", "0", "-c", "2", "127.0.0.1")
-    assert result.returncode == 0, result.stderr
-    values = [float(line.split()[-1]) for line in result.stdout.splitlines() if line.startswith("[")]
-    assert values == pytest.approx([2.5, -0.75], abs=LSB)
-    result = poll("-t", "4:hex", "-r", "55100", "-c", "2", "127.0.0.1")
-    assert [line.split()[-1] for line in result.stdout.splitlines() if line.startswith("[")] == [
-        "0x0011",
-        "0x2233",
-    ]
-
-
-def test_mbpoll_writes(served, poll):
-    t7, _ = served
-    result = poll("-t", "4:float", "-B", "-r", "1002", "127.0.0.1", "1.5")
-    assert result.returncode == 0, result.stderr
-    assert t7.dac_volts(1) == pytest.approx(1.5, abs=DAC_STEP / 2)
-
-
-def test_mbpoll_is_refused(poll):
-    result = poll("-t", "4:float", "-B", "-r", "40000", "127.0.0.1", "5.0")
-    assert result.returncode != 0
-    assert "failure" in result.stderr.lower()
 
 
 # Packets that come again, and waits between their frames

@@ -5,6 +5,7 @@ import socket
 from contextlib import suppress
 
 import pytest
+from each_case import each_case
 
 from bench.attachment import AttachedClock, ControlClient
 from bench.errors import ConfigurationError, DeviceConnectionError
@@ -201,7 +202,7 @@ def test_a_restarted_supply_says_so(sma, opened):
     line.write(b"C\r")
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("line", "words"),
     [
         (b"garbage", "not a line of JSON"),
@@ -351,7 +352,7 @@ def test_what_takes_an_instrument_time_is_ahead_of_the_wall_clock():
     assert clock.now() >= 5.0
 
 
-@pytest.mark.parametrize("name", ["virtual", "x", "x0", "x-1", "xinf", "xnan", "20", ""])
+@each_case("name", ["virtual", "x", "x0", "x-1", "xinf", "xnan", "20", ""])
 def test_a_clock_that_cannot_serve_is_refused(name):
     with pytest.raises(ValueError, match="wall, or xN"):
         make_served_clock(name)
