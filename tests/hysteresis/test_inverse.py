@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from each_case import each_case
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -80,12 +81,12 @@ def targets_for(rng, operator, state):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("make", [film, plain], ids=["non-monotonic", "monotone"])
-def test_1000_random_states_against_a_dense_scan(make):
+def test_random_states_against_a_dense_scan(make):
     rng = np.random.default_rng(1)
     # Coarse and fine planes, most of whose cells are empty.
     inverses = [PreisachInverse(make(order)) for order in (5, 12, 20, 50)]
     compared = 0
-    for i in range(1000):
+    for i in range(320):
         inverse = inverses[i % len(inverses)]
         operator = inverse.operator
         state = random_state(rng, *operator.input_range)
@@ -113,7 +114,7 @@ def test_1000_random_states_against_a_dense_scan(make):
                 travel = abs(found.setpoints[0] - state.input)
                 assert travel <= min(distances) + 1e-6
                 compared += travel >= min(distances) - 1e-6
-    assert compared > 900
+    assert compared > 290
 
 
 @settings(max_examples=200)
@@ -133,8 +134,8 @@ def test_paper_policy_goes_towards_the_target(seed, outside):
         assert found.setpoints[0] == pytest.approx(expected, abs=1e-6)
 
 
-@pytest.mark.parametrize("policy", ["nearest", "paper"])
-@pytest.mark.parametrize("order", [1, 3, 20])
+@each_case("policy", ["nearest", "paper"])
+@each_case("order", [1, 3, 20])
 def test_unreachable_targets_are_clamped_and_flagged(order, policy):
     operator = film(order, zeros=0.0)
     inverse = PreisachInverse(operator, policy)
@@ -267,7 +268,7 @@ def test_tracks_what_forward_evaluation_made():
     assert following.state == operator.initial_state().advance(path)
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("make", "message"),
     [
         (lambda: PreisachInverse(plain(), "fast"), "policy: expected 'nearest' or 'paper'"),

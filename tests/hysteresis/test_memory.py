@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from each_case import each_case
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -125,7 +126,7 @@ def test_description_tells_branch_and_reversals():
     assert "on a major branch" in driven([5.0]).describe()
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("make", "message"),
     [
         (lambda: MemoryCurve((1.0, 5.0), 3.0), "extrema"),

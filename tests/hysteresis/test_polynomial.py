@@ -1,13 +1,13 @@
 """The polynomial baseline."""
 
-import json
 import math
 
 import numpy as np
 import pytest
+from each_case import each_case
 from numpy.polynomial import chebyshev
 
-from bench.hysteresis import Polynomial, operator_from_json
+from bench.hysteresis import Polynomial
 
 
 def make(seed=0, degree=6):
@@ -25,7 +25,7 @@ def test_evaluates_its_series():
     assert p.step(p.initial_state(), u[7]) == (None, pytest.approx(expected[7]))
 
 
-@pytest.mark.parametrize("seed", range(10))
+@each_case("seed", range(10))
 def test_output_range_is_that_of_a_dense_scan(seed):
     p = make(seed)
     y = p.evaluate(np.linspace(21.0, 84.0, 20001))
@@ -41,13 +41,7 @@ def test_output_range_of_a_line():
     assert Polynomial([0.0, 0.0], (0.0, 1.0), 1.0).output_range() == (1.0, 1.0)
 
 
-def test_json_round_trip():
-    p = make()
-    copy = operator_from_json(json.loads(json.dumps(p.to_json())))
-    assert copy.to_json() == p.to_json()
-
-
-@pytest.mark.parametrize(
+@each_case(
     ("make_it", "message"),
     [
         (lambda: Polynomial([], (0.0, 1.0)), "series"),

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from each_case import each_case
 
 from bench.hysteresis import PolynomialPlays, operator_from_json
 from bench.identification import identify
@@ -47,7 +48,7 @@ def test_it_is_identified_and_inverted():
     np.testing.assert_allclose(rising.evaluate(answers.setpoints), targets, atol=1e-6)
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("change", "message"),
     [
         ({"thresholds": [0.0, 0.5]}, "thresholds: expected positive"),

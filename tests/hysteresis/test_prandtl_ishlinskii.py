@@ -5,6 +5,7 @@ import math
 
 import numpy as np
 import pytest
+from each_case import each_case
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -149,7 +150,7 @@ def test_dead_zones():
     np.testing.assert_allclose(one_sided([-1.0, 0.0, 1.0, 3.0, 5.0]), [-2.0, 0.0, 2.0, 4.0, 5.0])
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("make", "message"),
     [
         (lambda: PrandtlIshlinskii([1.0, 2.0], [1.0, 1.0]), "thresholds: expected the first to be 0"),

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from each_case import each_case
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -57,7 +58,7 @@ def test_it_is_identified_beside_a_density():
     assert worse.errors.rms > 100 * found.errors.rms
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("arguments", "word"),
     [
         (((), 0.0, 1.0), "series"),
@@ -71,7 +72,7 @@ def test_wrong_arguments_are_named(arguments, word):
         PolynomialTerm(*arguments)
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("numbers", "word"),
     [
         ((1.0, 2.0, 30.0, 30.0, 20.0), "low: expected a value below high = 30"),
@@ -86,7 +87,7 @@ def test_wrong_numbers_of_a_thermal_expansion_are_named(numbers, word):
         ThermalExpansion(*numbers)
 
 
-@pytest.mark.parametrize("coefficients", [[1.0], [1.0, 2.0, 3.0]])
+@each_case("coefficients", [[1.0], [1.0, 2.0, 3.0]])
 def test_a_thermal_expansion_has_two_coefficients(coefficients):
     with pytest.raises(ValueError, match="expected k0 and k1"):
         ThermalExpansion(1.0, 2.0, 30.0, 70.0, 20.0).with_coefficients(coefficients)

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from each_case import each_case
 from other_plants import damped, measured, random_reversals
 
 from bench.identification.by_name import set_up_problem
@@ -47,13 +48,13 @@ def dense_variance(problem, found, smoothing, ridge, inputs):
     return np.sqrt(variance), rho, freedom, variance * inflation * np.einsum("ij,jk,ik->i", b, posterior, b)
 
 
-@pytest.mark.parametrize(("model", "options", "smoothing", "ridge"), [
+@each_case(("model", "options", "smoothing", "ridge"), [
     ("preisach", {"levels": 8, "plane": (-1.0, 1.0), "reversible": "linear"}, 0.0, 0.0),
     ("preisach", {"levels": 8, "plane": (-1.0, 1.0)}, 0.1, 0.0),
     ("preisach-signed", {"levels": 8, "plane": (-1.0, 1.0)}, 0.01, 0.1),
     ("prandtl-ishlinskii", {"plays": 8}, 0.0, 0.0),
 ])  # fmt: skip
-@pytest.mark.parametrize("skip", [0, 40])
+@each_case("skip", [0, 40])
 def test_it_is_the_dense_one(model, options, smoothing, ridge, skip):
     weights = np.random.default_rng(1).uniform(0.5, 2.0, problem_of(model, options).inputs.size)
     problem = problem_of(model, options, smoothing, weights, skip)
@@ -93,7 +94,7 @@ def test_no_samples_to_spare():
         prediction_variance(problem, problem.fit(0.0), 0.0)
 
 
-@pytest.mark.parametrize(("key", "value", "words"), [
+@each_case(("key", "value", "words"), [
     ("residual", -1.0, "expected a residual"),
     ("constant", "x", "constant: expected a number"),
     ("columns", [3, 1], "as many finite means and factors as columns"),

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from each_case import each_case
 
 from bench.hysteresis import MemoryCurve, Polynomial, PrandtlIshlinskii, Preisach, uniform_levels
 from bench.identification import compare, measure_errors
@@ -50,7 +51,7 @@ def test_states_and_skipped_samples():
     assert found["hysterons"].residuals[0] > 40.0
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("arguments", "message"),
     [
         (({}, [0.0], [0.0]), "models: expected at least one"),
@@ -64,9 +65,7 @@ def test_wrong_comparison_is_named(arguments, message):
         compare(*arguments)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"), [({"skip": 2}, "skip"), ({"states": {"spline": None}}, "states: .* got spline")]
-)
+@each_case(("options", "message"), [({"skip": 2}, "skip"), ({"states": {"spline": None}}, "states: .* got spline")])
 def test_wrong_options_are_named(options, message):
     with pytest.raises(ValueError, match=message):
         compare(models(), [0.0, 1.0], [0.0, 1.0], **options)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from each_case import each_case
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hysteretic_plants import random_reversals, through
@@ -49,7 +50,7 @@ def test_visits_are_counted_and_said():
     assert found.to_json()["holds"] is True
 
 
-@pytest.mark.parametrize("inputs", [REPEATED, first_order_reversals(uniform_levels(-1.0, 1.0, 24), (-1.0, 1.0))])
+@each_case("inputs", [REPEATED, first_order_reversals(uniform_levels(-1.0, 1.0, 24), (-1.0, 1.0))])
 def test_what_ratchets_may_not_be_a_preisach_model(inputs):
     found = check_return_points(inputs, ratcheting(inputs))
     assert found.holds is False

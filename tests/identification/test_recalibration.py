@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from each_case import each_case
 from hypothesis import given
 from hypothesis import strategies as st
 from other_plants import random_reversals
@@ -45,8 +46,8 @@ def session(rng, kinds=KINDS, noise=0.0):
     return inputs, outputs + noise * rng.normal(size=inputs.size)
 
 
-@pytest.mark.parametrize("kinds", [("offset",), ("gain",), ("input-offset",), ("gain", "drift"), KINDS])
-@pytest.mark.parametrize("rows", [None, 400])
+@each_case("kinds", [("offset",), ("gain",), ("input-offset",), ("gain", "drift"), KINDS])
+@each_case("rows", [None, 400])
 def test_what_moved_is_found(kinds, rows):
     inputs, outputs = session(np.random.default_rng(1), kinds)
     found = recalibrate(PREISACH, inputs, outputs, kinds, rows=rows)
@@ -87,7 +88,7 @@ def test_later_rows_change_nothing_and_skipped_ones_neither():
     assert recalibrate(PREISACH, inputs, outputs, KINDS, rows=300, skip=20) == first
 
 
-@pytest.mark.parametrize(("kinds", "rows", "words"), [
+@each_case(("kinds", "rows", "words"), [
     ((), 100, "expected at least one of offset"),
     (("zero",), 100, "expected some of offset, gain, drift, input-offset, got 'zero'"),
     (("gain", "gain"), 100, "gain is given twice"),
@@ -139,7 +140,7 @@ def test_a_model_that_cannot_be_corrected():
     assert not hasattr(TwoStage, "shifted")
 
 
-@pytest.mark.parametrize("text", ["", "offset,,x", "gain,gain", "zero"])
+@each_case("text", ["", "offset,,x", "gain,gain", "zero"])
 def test_kinds_that_are_not_understood(text):
     with pytest.raises(ValueError, match="expected some of offset, gain, drift, input-offset, each once"):
         parse_kinds(text)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from each_case import each_case
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -33,8 +34,8 @@ def test_equals_the_singular_value_decomposition(seed, order, samples):
     assert found.diagonal.sum() == pytest.approx(found.rank, abs=1e-6)
 
 
-@pytest.mark.parametrize("term", [None, QuadraticTerm(1.0, 0.0)])
-@pytest.mark.parametrize("seed", range(3))
+@each_case("term", [None, QuadraticTerm(1.0, 0.0)])
+@each_case("seed", range(3))
 def test_with_penalties_it_is_the_map_from_true_to_found_coefficients(seed, term):
     """Found coefficients are linear in the outputs, so that the map's columns are fits of the regressor's."""
     _, regressor, weights, _ = problem(seed, 4, 80, term)

@@ -92,9 +92,8 @@ def test_of_few_rows_the_least_error_of_those_that_the_fit_to_all_supports_decid
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("plant", ["bouc-wen", "butterfly"])
-def test_a_plane_that_is_asked_for_does_not_make_it_worse(plant):
-    assert ratio(plant, 10, PLANES, {"levels": 20, "reversible": "linear"}) <= MOST
+def test_a_plane_that_is_asked_for_does_not_make_it_worse():
+    assert ratio("butterfly", 10, PLANES, {"levels": 20, "reversible": "linear"}) <= MOST
 
 
 def test_a_fine_plane_that_is_asked_for_is_tried_with_some_smoothing_from_the_start():

@@ -4,6 +4,7 @@ import re
 
 import numpy as np
 import pytest
+from each_case import each_case
 
 from bench.hysteresis import PrandtlIshlinskii, Preisach, QuadraticTerm, uniform_levels
 from bench.identification import cross_validate, identify, ramps
@@ -28,13 +29,13 @@ def butterfly():
     return inputs, (polarization - 0.5 * (polarization.min() + polarization.max())) ** 2
 
 
-@pytest.mark.parametrize("name", ["preisach", "preisach-nonmonotonic", "prandtl-ishlinskii", "polynomial"])
-@pytest.mark.parametrize("sign", [1, -1])
+@each_case("name", ["preisach", "preisach-nonmonotonic", "prandtl-ishlinskii", "polynomial"])
+@each_case("sign", [1, -1])
 def test_good_data_give_no_warning(name, sign):
     assert identify(name, INPUTS, sign * measured(INPUTS)).warnings == ()
 
 
-@pytest.mark.parametrize(
+@each_case(
     "options",
     [{"smoothing": 1e-3}, {"reversible": "polynomial"}, {"initial": "skip"}, {"initial": "estimate"}, {"levels": 12}],
 )
@@ -56,7 +57,7 @@ def noise():
     return INPUTS, np.random.default_rng(3).normal(size=INPUTS.size)
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("data", "name", "options", "message"),
     [
         (few(), "preisach", {}, r"^61 samples are few for 210 coefficients, .*--cross-validate$"),
@@ -107,7 +108,7 @@ def test_the_remedies_help():
     assert identify("preisach-nonmonotonic", INPUTS, measured(INPUTS), input_unit="°C").warnings == ()
 
 
-@pytest.mark.parametrize("name", ["preisach", "preisach-signed", "prandtl-ishlinskii", "polynomial"])
+@each_case("name", ["preisach", "preisach-signed", "prandtl-ishlinskii", "polynomial"])
 def test_a_constant_record_is_refused(name):
     with pytest.raises(ValueError, match=rf"^outputs: constant at 0.1 in all {INPUTS.size} samples that count"):
         identify(name, INPUTS, np.full(INPUTS.size, 0.1))

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from each_case import each_case
 
 from bench.identification.bands import Band
 from bench.identification.excitation_class import ExcitationClass
@@ -43,7 +44,7 @@ def calibrated(name, times, inputs, outputs, **options):
 @pytest.mark.parametrize(
     ("name", "options", "sequences"),
     [
-        ("hammerstein", {**LAG, "plays": 8, "skip": 50}, 3),
+        ("hammerstein", {**LAG, "plays": 8, "skip": 50}, 2),
         pytest.param("hammerstein", {"dynamics": "lag", "levels": 10, "skip": 50}, 8, marks=pytest.mark.seeds),
         pytest.param("rate-dependent-plays", {"time_constants": 1, "skip": 50}, 8, marks=pytest.mark.seeds),
     ],
@@ -67,7 +68,7 @@ def test_nine_of_ten_are_covered_at_the_rates_of_the_calibration(name, options, 
 
 def test_what_the_fit_chose_is_kept_without_a_block():
     rng = np.random.default_rng(0)
-    times, inputs = reversals(rng, 30, 600)
+    times, inputs = reversals(rng, 20, 400)
     outputs = lagging(times, inputs, rng)
     free = {"static": "prandtl-ishlinskii", "plays": 5}
     found, band = calibrated("hammerstein", times, inputs, outputs, **free)
@@ -76,7 +77,7 @@ def test_what_the_fit_chose_is_kept_without_a_block():
     assert same.pointwise == pytest.approx(band.pointwise, rel=0.05)
 
 
-@pytest.mark.parametrize(
+@each_case(
     "dynamics", ["none", "lag", "resonance,drift", "lag,delay,creep", "resonance,kelvin-voigt", "fading-drift"]
 )
 def test_a_hammerstein_model_knows_what_follows_its_operator(dynamics):

@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from each_case import each_case
 
 from bench.hysteresis import BoucWen, PrandtlIshlinskii, Preisach, uniform_levels
 from bench.identification import identify, measure_errors, ramps
@@ -48,7 +49,7 @@ def test_a_model_is_the_same_after_json():
     np.testing.assert_array_equal(again.densities()[0].values, model.densities()[0].values)
 
 
-@pytest.mark.parametrize("sign", [1.0, -1.0])
+@each_case("sign", [1.0, -1.0])
 def test_every_element_is_found_again_on_uneven_times(sign):
     rng = np.random.default_rng(5)
     t, u = record(rng)
@@ -139,7 +140,7 @@ def test_a_shape_and_a_lag_at_one_rate_are_found_together():
     assert found.linear.lag == (pytest.approx(1.5e-3, rel=0.2), 0.0)
 
 
-@pytest.mark.parametrize("static", ["preisach", "preisach-signed"])
+@each_case("static", ["preisach", "preisach-signed"])
 def test_smoothing_is_that_of_the_operators(static):
     rng = np.random.default_rng(0)
     t, u = record(rng)
@@ -211,7 +212,7 @@ def test_what_the_data_do_not_determine_is_said():
     assert not identify_in_time("hammerstein", t, u, y, **options).model.parameters()
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("options", "message"),
     [
         ({"dynamics": "lag,echo"}, "echo"),

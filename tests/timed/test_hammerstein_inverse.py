@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from each_case import each_case
 
 from bench.errors import ConfigurationError
 from bench.hysteresis import PrandtlIshlinskii, Preisach, uniform_levels
@@ -43,12 +44,11 @@ def span(model):
     return float(np.ptp(model.static.output_range()))
 
 
-@pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("drift", [{}, {"drift": 0.2}, {"drift": -0.3, "drift_time": 0.4}])
-@pytest.mark.parametrize("make", [preisach, plays])
-@pytest.mark.parametrize("part", PARTS)
-def test_the_prediction_of_the_setpoints_is_the_targets(part, make, drift, seed):
-    rng = np.random.default_rng(seed)
+@each_case("drift", [{}, {"drift": 0.2}, {"drift": -0.3, "drift_time": 0.4}])
+@each_case("make", [preisach, plays])
+@each_case("part", PARTS)
+def test_the_prediction_of_the_setpoints_is_the_targets(part, make, drift):
+    rng = np.random.default_rng(0)
     model = Hammerstein(make(rng), LinearPart(**PARTS[part]), **drift)
     t, wanted = targets(model, rng)
     # Ringing after the first row, where the targets begin with a slope, takes more room beside a long lag.
@@ -96,7 +96,7 @@ def test_ringing_is_warned_of_where_steps_are_short_beside_the_lag():
     assert smooth.warnings() == []
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("linear", "step", "message"),
     [
         ({"delay": 0.038}, 0.002, r"delay of 0.038 s is as long as the 0.038 s of the targets"),
@@ -110,7 +110,7 @@ def test_what_cannot_be_inverted_is_refused(linear, step, message):
         invert_targets(ModelFile("m", model), np.linspace(0.0, 0.1, 20), times=step * np.arange(20))
 
 
-@pytest.mark.parametrize("drift", [{}, {"drift": 0.2}, {"drift": -0.3, "drift_time": 0.4}])
+@each_case("drift", [{}, {"drift": 0.2}, {"drift": -0.3, "drift_time": 0.4}])
 def test_what_is_ahead_is_the_output_a_delay_later(drift):
     rng = np.random.default_rng(4)
     model = Hammerstein(preisach(rng), LinearPart(0.014, **PARTS["lag and creep"]), **drift)
@@ -124,11 +124,10 @@ def test_what_is_ahead_is_the_output_a_delay_later(drift):
     np.testing.assert_allclose(prompt.evaluate(t[100:], u[100:], state)[:-7], outputs[7:], rtol=0.0, atol=1e-12)
 
 
-@pytest.mark.parametrize("seed", range(2))
-@pytest.mark.parametrize("drift", [{}, {"drift": 0.2}, {"drift": -0.3, "drift_time": 0.4}])
-@pytest.mark.parametrize("part", ["none", "lag", "lag and creep"])
-def test_targets_behind_a_delay_of_whole_steps_are_met_after_it(part, drift, seed):
-    rng = np.random.default_rng(seed)
+@each_case("drift", [{}, {"drift": 0.2}, {"drift": -0.3, "drift_time": 0.4}])
+@each_case("part", ["none", "lag", "lag and creep"])
+def test_targets_behind_a_delay_of_whole_steps_are_met_after_it(part, drift):
+    rng = np.random.default_rng(0)
     model = Hammerstein(preisach(rng), LinearPart(0.014, **PARTS[part]), **drift)
     low, high = model.static.output_range()
     t = 5.0 + 0.002 * np.arange(400)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from each_case import each_case
 from scipy.integrate import solve_ivp
 
 from bench.timed import FilterState, LinearPart, logarithmic_creep
@@ -20,8 +21,8 @@ def record(rng, samples=60):
     return np.cumsum(rng.uniform(0.001, 0.03, samples)), np.cumsum(rng.normal(size=samples))
 
 
-@pytest.mark.parametrize("name", list(LAGS))
-@pytest.mark.parametrize("delay", [0.0, 0.0137])
+@each_case("name", list(LAGS))
+@each_case("delay", [0.0, 0.0137])
 def test_responses_on_uneven_times_are_those_of_the_differential_equations(name, delay):
     t, u = record(np.random.default_rng(1))
     first, second = LAGS[name]
@@ -73,7 +74,7 @@ def test_creep_is_nearly_logarithmic():
     assert slope == pytest.approx(np.full(slope.size, 0.1), rel=0.03)
 
 
-@pytest.mark.parametrize(
+@each_case(
     "arguments",
     [
         {"delay": -1.0},

@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from each_case import each_case
 from scipy.integrate import solve_ivp
 
 from bench.timed import BoucWenOscillator, identify_in_time
@@ -33,7 +34,7 @@ def reference(t, u_of, m=PUBLISHED):
     return found.y[0] + m.offset
 
 
-@pytest.mark.parametrize("interpolation", ["linear", "smooth"])
+@each_case("interpolation", ["linear", "smooth"])
 def test_responses_on_uneven_times_are_those_of_the_differential_equations(interpolation):
     t = np.cumsum(np.random.default_rng(0).uniform(5e-4, 2e-3, 200))
 
