@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from each_case import each_case
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -126,8 +127,8 @@ def reference(count=4000):
     return 0.3 + 0.6 * np.sin(2 * np.pi * t / 200) * (0.7 + 0.3 * np.sin(2 * np.pi * t / 1370))
 
 
-@pytest.mark.parametrize("seed", range(2))
-@pytest.mark.parametrize(("noise", "ratio"), [(0.0, 0.15), (0.002, 0.2)])
+@each_case("seed", range(2))
+@each_case(("noise", "ratio"), [(0.0, 0.15), (0.002, 0.2)])
 def test_adaptation_follows_a_drifting_gain(seed, noise, ratio):
     truth, targets = plant(seed=seed), reference()
     drift = np.linspace(1.0, 1.05, targets.size)
@@ -145,7 +146,7 @@ def test_adaptation_follows_a_drifting_gain(seed, noise, ratio):
 def test_density_stays_bounded_under_noise():
     truth = plant()
     # Half a percent of the output's span in each reading.
-    targets = np.tile(reference(), 5)
+    targets = np.tile(reference(), 3)
     errors, after = track(Adapter(truth, noise=0.01), truth, targets, np.ones(targets.size), 0.01, 1)
     masses = after.model.density * after.model.cell_areas()
     assert (after.model.density >= 0.0).all()
@@ -155,7 +156,7 @@ def test_density_stays_bounded_under_noise():
     assert np.std(after.model.evaluate(fresh) - truth.evaluate(fresh)) < 0.03
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("make", "message"),
     [
         (lambda: Adapter(Preisach([0.0, 1.0], [-1.0])), "model: expected a density >= 0"),

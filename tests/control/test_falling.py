@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from each_case import each_case
 
 from bench.control.dynamics import IdentifiedDynamics
 from bench.controllers import ControllerSetup, controller_names, make_controller
@@ -34,7 +35,7 @@ def reach(controller, plant, sign, targets):
     return np.array(rows)
 
 
-@pytest.mark.parametrize("name", controller_names("target"))
+@each_case("name", controller_names("target"))
 def test_targets_are_reached_as_with_the_opposite_output(name):
     found = {}
     low, high = actuator(1).output_range()
@@ -51,7 +52,7 @@ def test_targets_are_reached_as_with_the_opposite_output(name):
         assert found[-1][-1, 1] == pytest.approx(targets[-1], abs=0.01 * (high - low))
 
 
-@pytest.mark.parametrize("name", controller_names("follow"))
+@each_case("name", controller_names("follow"))
 def test_a_reference_is_followed_as_with_the_opposite_output(name):
     found = {}
     low, high = actuator(1).output_range()

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from each_case import each_case
 
 from bench.control.dynamics import ActuatorDynamics, IdentifiedDynamics, ResponseDynamics
 from bench.control.loops import FollowReference, Playback, ReachTarget
@@ -27,9 +28,7 @@ class Follower:
         return reference
 
 
-@pytest.mark.parametrize(
-    ("period", "duration"), [(0.0, 1.0), (1.0, 0.0), (-1.0, 1.0), (math.nan, 1.0), (1.0, math.nan)]
-)
+@each_case(("period", "duration"), [(0.0, 1.0), (1.0, 0.0), (-1.0, 1.0), (math.nan, 1.0), (1.0, math.nan)])
 def test_times_that_make_no_sense(period, duration):
     with pytest.raises(ValueError, match="period, duration: expected positive numbers of s"):
         FollowReference(Follower(), abs, period, duration)
@@ -89,7 +88,7 @@ def test_playback():
     assert out.tolist() == [[2.0, 1.0], [4.0, 1.0]]
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("make", "words"),
     [
         (

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from each_case import each_case
 
 from bench.control.model_filters import DensityFilter, SessionFilter, model_filter
 from bench.control.tracking import ClosedLoopInverse, OpenLoopInverse
@@ -85,13 +86,13 @@ class TestBoth:
 
     def test_a_sensor_that_jumps_changes_nothing_for_however_long(self, identified, name):
         adaptation = model_filter(name, identified)
-        found = readings(specimen(identified, gain=1.05), 260)
+        found = readings(specimen(identified, gain=1.05), 160)
         learnt(adaptation, found[:60])
         model = adaptation.model
-        learnt(adaptation, [(state, output + 0.3 * SPAN) for state, output in found[60:200]])
+        learnt(adaptation, [(state, output + 0.3 * SPAN) for state, output in found[60:130]])
         assert adaptation.model is model
-        assert adaptation.refused >= 130
-        assert rms(learnt(adaptation, found[200:])) < 3.0 * NOISE
+        assert adaptation.refused >= 65
+        assert rms(learnt(adaptation, found[130:])) < 3.0 * NOISE
 
     def test_a_first_reading_that_is_wrong_is_got_over(self, identified, name):
         adaptation = model_filter(name, identified)
@@ -158,11 +159,10 @@ class TestBoth:
 
 
 @pytest.mark.parametrize("name", ["session", "density"])
-@pytest.mark.parametrize("signed", [False, True])
-def test_other_units_of_the_output_change_nothing_but_the_units(identified, name, signed):
+def test_other_units_of_the_output_change_nothing_but_the_units(identified, name):
     """A model in nm and one in km learn the same."""
     areas = np.ones(identified.coefficients.size)
-    areas[:40:3] = -0.3 if signed else 1.0
+    areas[:40:3] = -0.3
     plain = identified.with_coefficients(areas * identified.coefficients, identified.bias)
     found = [
         (state, output + 60.0 * (number in (20, 21)))
@@ -186,9 +186,9 @@ def test_refusals_that_lie_far_apart_do_not_begin_it_anew(identified):
     adaptation = SessionFilter(identified)
     moved = specimen(identified, offset=25.0)
     learnt(adaptation, readings(moved, 60))
-    for k, (state, output) in enumerate(readings(moved, 120, seed=1)):
+    for k, (state, output) in enumerate(readings(moved, 90, seed=1)):
         adaptation.update(state, identified.value(state) if k % 30 < 5 else output)
-    assert adaptation.refused >= 15
+    assert adaptation.refused >= 11
     assert adaptation.restarts == 0
     assert adaptation.estimates()["offset"].value == pytest.approx(25.0, abs=3.0)
 
@@ -232,7 +232,7 @@ def test_a_density_that_falls_stays_without_positive_values(identified):
     assert (adaptation.model.density <= 0.0).all()
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("name", "operator", "words"),
     [
         ("session", Polynomial([0.0, 1.0], (0.0, 1.0)), "memory"),

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from each_case import each_case
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -45,7 +46,7 @@ def test_inverse_by_samples_does_not_drift():
     assert voltages == pytest.approx(operator.inverse_operator().evaluate(wanted + operator.bias), abs=1e-9)
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("make", "message"),
     [
         (lambda: PlayInverse(plays(), 0.0), "stroke: expected a positive"),

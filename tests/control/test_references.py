@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from each_case import each_case
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -63,7 +64,7 @@ class TestSine:
         assert peaks.max() > 1450.0
         assert peaks.min() < 1200.0
 
-    @pytest.mark.parametrize(
+    @each_case(
         ("arguments", "match"),
         [
             (([0.0], 1.0, 0.0, 60.0), "low, high"),
@@ -160,7 +161,7 @@ def test_staircase_and_sine():
     assert abs(sine(0.01) - stairs(0.01)) < 1e-3 * NANO
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("make", "message"),
     [
         (lambda: SmoothMoves([0.0], SPEED), "positions: expected at least 2"),

@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from each_case import each_case
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -97,7 +98,7 @@ def reachable_forces(model, state, argument):
     return tuple(model.first.step(state.first, voltage)[1] + argument for voltage in ends)
 
 
-@pytest.mark.parametrize("kinds", KINDS, ids=["-".join(k) for k in KINDS])
+@each_case("kinds", KINDS)
 def test_random_states_at_a_known_force(kinds):
     rng = np.random.default_rng(1)
     met = 0
@@ -120,7 +121,7 @@ def test_random_states_at_a_known_force(kinds):
     assert met > COUNTS[kinds] // 2
 
 
-@pytest.mark.parametrize("kinds", KINDS, ids=["-".join(k) for k in KINDS])
+@each_case("kinds", KINDS)
 def test_random_states_between_fixed_ends(kinds):
     rng = np.random.default_rng(2)
     met = 0
@@ -278,7 +279,7 @@ def signed():
     return Preisach(uniform_levels(0.0, 3.0, 2), [1.0, -0.5, 1.0])
 
 
-@pytest.mark.parametrize(
+@each_case(
     ("make", "message"),
     [
         (
