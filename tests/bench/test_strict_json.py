@@ -121,7 +121,7 @@ def test_a_model_beside_a_run(run):
 def test_a_value_that_a_study_does_not_have_is_none_again(tmp_path):
     for seed, value in enumerate((NAN, 2.0)):
         (tmp_path / str(seed)).mkdir()
-        write_study(StudyResult({"error": value, "name": "x"}, ()), tmp_path / str(seed))
+        write_study(StudyResult({"error": value, "name": "x"}, (), ()), tmp_path / str(seed))
     contents = [strict(tmp_path / str(seed) / "study.json")[0] for seed in (0, 1)]
     error = over_seeds([content["values"] for content in contents])["error"]
     assert math.isnan(error.values[0])
