@@ -1,6 +1,7 @@
 """`Arrived`: a step ends when its devices have arrived, and its record says so, or that they have not."""
 
 import pytest
+from cases import cases
 
 from bench.clock import VirtualClock
 from bench.dashboard.timeline import _NOT_SETTLED, Timeline
@@ -85,7 +86,7 @@ class TestOnTheHeater:
         assert isinstance(outcome.error, SettleTimeoutError)
         assert [record.settled for record, _ in records] == [Settled.NOT_STEADY]
 
-    @pytest.mark.parametrize("bad", [{"timeout": 0.0}, {"timeout": 5.0, "minimum": 5.0}, {"timeout": float("inf")}])
+    @cases("bad", [{"timeout": 0.0}, {"timeout": 5.0, "minimum": 5.0}, {"timeout": float("inf")}])
     def test_times_that_do_not_fit(self, bad):
         with pytest.raises(ValueError, match=r"Arrived: expected finite timeout > minimum ≥ 0"):
             Arrived(**bad)

@@ -1,6 +1,7 @@
 """Slots: what a rig file binds, what protocols take from it, and what is refused before anything moves."""
 
 import pytest
+from cases import cases
 from heater_laboratory import CLOSED
 
 from bench.binding import RoleTable
@@ -77,7 +78,7 @@ def refused(path, definition=PLAIN, settings=None):
 
 
 class TestRefused:
-    @pytest.mark.parametrize(
+    @cases(
         ("old", "new", "expected"),
         [
             ('"tec"', '"oven"', "roles.drive.device = 'oven' is not a device of this rig; allowed: tec"),
@@ -158,7 +159,7 @@ class TestRefused:
             "fitting devices: tec"
         )
 
-    @pytest.mark.parametrize(
+    @cases(
         ("table", "expected"),
         [
             ("cuont = 3", "protocols.go.cuont: there is no such parameter; there are: low, middle, speed, count"),

@@ -5,6 +5,7 @@ from datetime import date
 
 import numpy as np
 import pytest
+from cases import cases
 
 from bench.calibration import Calibrated, Calibration, calibrate, read_calibration
 from bench.errors import DataError, DeviceError
@@ -64,7 +65,7 @@ def test_few_weights_give_a_line():
     assert 1.01 * 5.0 + 0.05 + found.correction(1.01 * 5.0 + 0.05) == pytest.approx(5.0, abs=2e-3)
 
 
-@pytest.mark.parametrize("readings", [[1.0, 2.0], [1.0, 1.0, 1.0], [1.0, np.nan, 2.0]])
+@cases("readings", [[1.0, 2.0], [1.0, 1.0, 1.0], [1.0, np.nan, 2.0]])
 def test_too_few_readings_are_refused(readings):
     with pytest.raises(DataError, match="at least 3 readings that differ"):
         calibrate(readings, readings, **TEXTS)
@@ -76,7 +77,7 @@ def test_a_file_keeps_it(tmp_path):
     assert read_calibration(tmp_path / "calibration.json") == record
 
 
-@pytest.mark.parametrize(
+@cases(
     ("change", "words"),
     [
         ({"low": 1.0}, "expected low < high"),

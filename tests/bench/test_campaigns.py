@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 import pytest
+from cases import cases
 from rich.console import Console
 
 from bench import registry
@@ -458,7 +459,7 @@ def test_a_killed_worker_is_replaced_and_its_run_equals_one_alone(campaign, tmp_
         assert content(alone.folder) == content(out / task.name)
 
 
-@pytest.mark.parametrize("address", ["tls://lab-7:8786", "tcp://127.0.0.1:8786", "tcp://localhost:1", "[::1]:8786"])
+@cases("address", ["tls://lab-7:8786", "tcp://127.0.0.1:8786", "tcp://localhost:1", "[::1]:8786"])
 def test_a_scheduler_is_encrypted_or_here(address):
     check_address(address)
 

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cases import cases
 
 from bench.cli import main
 from bench.journal import FILE_NAME, Record
@@ -60,7 +61,7 @@ def assert_shown(bench, listed, protocol, parameters):
 
 
 class TestHelp:
-    @pytest.mark.parametrize(
+    @cases(
         "command",
         [
             "",
@@ -85,7 +86,7 @@ class TestHelp:
         assert code == 0
         assert "Usage" in out
 
-    @pytest.mark.parametrize(
+    @cases(
         ("command", "words"),
         [
             ("identify-muscle", ["FORCE_RUN", "LENGTH_RUN", "two-stage-prandtl-ishlinskii", "--verify", "--json"]),
@@ -100,7 +101,7 @@ class TestHelp:
         for word in words:
             assert word in out
 
-    @pytest.mark.parametrize(
+    @cases(
         ("protocol", "parameters"),
         [
             ("force-voltage", {"points": ("37", "1"), "pretension": ("the rig's: `rest` of force", "N")}),
@@ -212,7 +213,7 @@ class TestRun:
         assert first[2:] == second[2:]
         assert not np.array_equal(first[0]["curvature"], other[0]["curvature"])
 
-    @pytest.mark.parametrize(
+    @cases(
         ("arguments", "words"),
         [
             (["nothing", *FAST], ["there is no protocol", "creep"]),
@@ -401,7 +402,7 @@ class TestIdentifyAndPredict:
         for word in ["bad.csv", *words]:
             assert word in re.sub(r"\s+", " ", err)
 
-    @pytest.mark.parametrize(
+    @cases(
         ("options", "words"),
         [
             (["--model", "nothing"], ["preisach-signed"]),
@@ -421,7 +422,7 @@ class TestIdentifyAndPredict:
         for word in words:
             assert word in err
 
-    @pytest.mark.parametrize(
+    @cases(
         ("mend", "word"),
         [
             (lambda model: {**model, "version": 99}, "version 99"),
@@ -816,7 +817,7 @@ class TestIdentifyHybrid:
 
 
 class TestHelpOfTheHybrid:
-    @pytest.mark.parametrize(
+    @cases(
         ("command", "words"),
         [
             ("identify-hybrid", ["STEPS_RUN", "STATIC_RUN", "LOOPS_RUN", "STEP_RUN", "--plays", "--out", "--json"]),
@@ -831,7 +832,7 @@ class TestHelpOfTheHybrid:
         for word in words:
             assert word in out
 
-    @pytest.mark.parametrize(
+    @cases(
         ("protocol", "parameters"),
         [
             (

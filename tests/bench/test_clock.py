@@ -4,6 +4,7 @@ import threading
 from datetime import UTC, datetime, timedelta
 
 import pytest
+from cases import cases
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -154,7 +155,7 @@ class TestInterruptedSleep:
 
 
 class TestScaledClock:
-    @pytest.mark.parametrize("factor", [0.0, -1.0, math.nan, math.inf])
+    @cases("factor", [0.0, -1.0, math.nan, math.inf])
     def test_refuses_a_factor_that_is_not_positive(self, factor):
         with pytest.raises(ValueError, match="factor: expected a positive number"):
             ScaledClock(factor)
@@ -174,7 +175,7 @@ def compute(seconds):
 
 
 class TestPacedClock:
-    @pytest.mark.parametrize("factor", [0.0, -1.0, math.nan, math.inf])
+    @cases("factor", [0.0, -1.0, math.nan, math.inf])
     def test_refuses_a_factor_that_is_not_positive(self, factor):
         with pytest.raises(ValueError, match="factor: expected a positive number"):
             PacedClock(factor)
@@ -345,7 +346,7 @@ class TestMakeClock:
             assert isinstance(clock, PacedClock)
             assert clock.factor == factor
 
-    @pytest.mark.parametrize("name", ["", "x", "x0", "x-3", "xnan", "xinf", "20", "Virtual", "real", "xx2"])
+    @cases("name", ["", "x", "x0", "x-3", "xnan", "xinf", "20", "Virtual", "real", "xx2"])
     def test_names_what_is_allowed(self, name):
         with pytest.raises(ConfigurationError) as caught:
             make_clock(name, in_process=True)

@@ -4,6 +4,7 @@ import math
 import re
 
 import pytest
+from cases import cases
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -14,7 +15,7 @@ from bench.rig_file import load_rig
 finite = st.floats(-1e30, 1e30)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("form", "message", "numbers"),
     [
         ("{value}", " +1.50E+00 ", {"value": 1.5}),
@@ -129,7 +130,7 @@ WRONG = {
 """Wrong keys, and what the message has to say."""
 
 
-@pytest.mark.parametrize("change", WRONG)
+@cases("change", WRONG)
 def test_a_wrong_key_is_one_clear_message_before_anything_is_opened(change, tmp_path):
     (tmp_path / "rig.toml").write_text(RIG)
     key, _, value = change.partition("=")
@@ -165,7 +166,7 @@ WRONG_PHYSICS = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("change", WRONG_PHYSICS)
+@cases("change", WRONG_PHYSICS)
 def test_wrong_physics_is_one_clear_message(change, tmp_path):
     (tmp_path / "rig.toml").write_text(RIG + "\n[emulation.signals]\n")
     key, _, value = change.partition("=")

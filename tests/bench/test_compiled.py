@@ -5,6 +5,7 @@ import subprocess
 import sys
 
 import pytest
+from cases import cases
 
 from bench.compiled import inlined, inner, kernel, reordered
 
@@ -37,7 +38,7 @@ def test_python_calls_kernels_and_these_the_others():
     assert total((1.0, 2.0, 3.0)) == 12.0
 
 
-@pytest.mark.parametrize("function", [doubled, increased])
+@cases("function", [doubled, increased])
 def test_the_others_refuse_a_call_from_python(function):
     both(2.0)
     with pytest.raises(TypeError, match=f"{function.py_func.__name__} is called by compiled functions only"):

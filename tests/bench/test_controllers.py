@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from cases import cases
 
 from bench.control.dynamics import ActuatorDynamics, IdentifiedDynamics, ResponseDynamics
 from bench.controllers import ControllerSetup, controller_names, controller_spec, make_controller, saturated_below
@@ -20,7 +21,7 @@ def setup(model=PREISACH, dwell=6.0, **options):
     return ControllerSetup(model=model, limits=(0.0, 3.0), dwell=dwell, options=options)
 
 
-@pytest.mark.parametrize(("name", "model"), [("open-loop-inverse", PREISACH), ("polynomial", POLYNOMIAL)])
+@cases(("name", "model"), [("open-loop-inverse", PREISACH), ("polynomial", POLYNOMIAL)])
 def test_the_time_at_each_target_is_that_of_the_rig(name, model):
     for options, wait in (({}, 6.0), ({"wait": 40}, 40.0), ({"wait": 3, "dwell": None}, 3.0)):
         controller = make_controller("target", name, setup(model, **options))
@@ -58,7 +59,7 @@ def test_the_closed_loop_knows_the_lag_and_has_ten_of_them_to_arrive():
         assert slow.operator.present_input(controller.state) < low + 0.05 * (high - low)
 
 
-@pytest.mark.parametrize("task", ["target", "follow"])
+@cases("task", ["target", "follow"])
 def test_a_number_that_a_controller_does_not_have_is_refused(task):
     for name in controller_names(task):
         if name in ("latched", "polynomial"):

@@ -6,6 +6,7 @@ from datetime import datetime, timedelta
 
 import numpy as np
 import pytest
+from cases import cases
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -117,7 +118,7 @@ def check(columns, names, units=None):
         assert tuple(columns.units.values()) == units
 
 
-@pytest.mark.parametrize("name", LAYOUTS)
+@cases("name", LAYOUTS)
 def test_a_layout_is_read(tmp_path, name):
     content, names, units, words = LAYOUTS[name]
     columns = read_columns(write(tmp_path, content), names)
@@ -125,7 +126,7 @@ def test_a_layout_is_read(tmp_path, name):
     assert words in columns.assumptions
 
 
-@pytest.mark.parametrize("name", ["semicolon, decimal comma", "plain", "preamble", "gzip"])
+@cases("name", ["semicolon, decimal comma", "plain", "preamble", "gzip"])
 def test_a_column_by_its_number(tmp_path, name):
     check(read_columns(write(tmp_path, LAYOUTS[name][0]), ("2", "3")), ("2", "3"))
 
@@ -161,7 +162,7 @@ class TestOtherFormats:
         with pytest.raises(DataError, match="columns differ in length: U 40, y 39"):
             read_columns(path, ("U", "y"))
 
-    @pytest.mark.parametrize(
+    @cases(
         "content",
         [b"\x89HDF\r\n\x1a\n" + bytes(100), b"MATLAB 7.3 MAT-file, Platform: GLNXA64" + b" " * 86 + b"\0\2IM"],
     )
@@ -217,7 +218,7 @@ class TestOtherFormats:
         with pytest.raises(DataError, match="cannot be read as Parquet"):
             read_columns(tmp_path / "data.parquet", ("note",))
 
-    @pytest.mark.parametrize(
+    @cases(
         ("name", "content", "words"),
         [
             ("data.xls", b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1" + bytes(600), "save it as .xlsx or CSV"),
@@ -248,8 +249,8 @@ MOMENTS = {
 class TestDatesAndTimes:
     """Of a column of dates or times the seconds since its first row are read."""
 
-    @pytest.mark.parametrize("name", MOMENTS)
-    @pytest.mark.parametrize("layout", ["{},{},{}", '"{}";"{}";"{}"'])
+    @cases("name", MOMENTS)
+    @cases("layout", ["{},{},{}", '"{}";"{}";"{}"'])
     def test_text(self, tmp_path, name, layout):
         rows = [layout.format(MOMENTS[name](t), u, y) for t, u, y in zip(TIME, U, Y, strict=True)]
         head = layout.format("time", "U", "y")
@@ -283,7 +284,7 @@ class TestDatesAndTimes:
             assert columns.units["time"] == "s"
             np.testing.assert_allclose(columns.values["time"], TIME, atol=1e-5)
 
-    @pytest.mark.parametrize("cell", ["23:59", "late", "", "2026-11-25 23:61:00"])
+    @cases("cell", ["23:59", "late", "", "2026-11-25 23:61:00"])
     def test_another_cell_among_them_is_named(self, tmp_path, cell):
         rows = [f"23:59:{t:06.3f},{u},{y}" for t, u, y in zip(TIME, U, Y, strict=True)]
         rows[5] = f"{cell},1,2"
@@ -356,7 +357,7 @@ class TestRefused:
         self.refused(tmp_path, b"U,y\n1,2\n\x81,3\n", "--encoding")
         self.refused(tmp_path, content, "--encoding", encoding="utf-8")
 
-    @pytest.mark.parametrize(
+    @cases(
         ("options", "words"),
         [
             ({"delimiter": "some"}, "--delimiter 'some': expected a character"),
@@ -387,7 +388,7 @@ BREAKS = {
 
 
 class TestSeveralTables:
-    @pytest.mark.parametrize("name", BREAKS)
+    @cases("name", BREAKS)
     def test_a_table_is_chosen(self, tmp_path, name):
         first, second = BREAKS[name]
         path = write(tmp_path, first + second)
@@ -413,7 +414,7 @@ class TestSeveralTables:
 
 
 class TestHeads:
-    @pytest.mark.parametrize(
+    @cases(
         ("head", "name", "unit"),
         [
             ("force (N)", "force", "N"),
@@ -433,7 +434,7 @@ class TestHeads:
     def test_a_unit_in_a_head(self, head, name, unit):
         assert split_unit(head) == (name, unit)
 
-    @pytest.mark.parametrize(
+    @cases(
         ("texts", "units"),
         [
             (("time_s", "voltage_V", "displacement_um"), ["s", "V", "µm"]),
@@ -446,11 +447,11 @@ class TestHeads:
     def test_units_after_underscores_only_where_all_have_one(self, texts, units):
         assert [head.unit for head in make_heads(texts)] == units
 
-    @pytest.mark.parametrize("text", ["V", "µm", "μm", "kA/m", "1/m", "m/s²", "m/s^2", "°C", "%", "N m", "N·m", "-"])
+    @cases("text", ["V", "µm", "μm", "kA/m", "1/m", "m/s²", "m/s^2", "°C", "%", "N m", "N·m", "-"])
     def test_units(self, text):
         assert is_unit(text)
 
-    @pytest.mark.parametrize("text", ["voltage", "U1", "raw", "0", "channel 1", "run", ""])
+    @cases("text", ["voltage", "U1", "raw", "0", "channel 1", "run", ""])
     def test_what_is_no_unit(self, text):
         assert not is_unit(text)
 
@@ -642,15 +643,13 @@ class TestNoRowVanishes:
         assert code == 3
         assert "a.csv: line 201: a quotation mark opens a cell" in err
 
-    @pytest.mark.parametrize(
-        "remark", ['"5 N, hung on"', '5" disc', '"a ""b"" c"', "a\x0bb\x0cc\x1cd", "a\u2028b\x85c", ""]
-    )
+    @cases("remark", ['"5 N, hung on"', '5" disc', '"a ""b"" c"', "a\x0bb\x0cc\x1cd", "a\u2028b\x85c", ""])
     def test_what_stays_in_its_cell_costs_no_row(self, tmp_path, remark):
         path = self.write(tmp_path / "a.csv", {201: remark})
         read = read_columns(path, ["t", "u", "y"])
         assert [len(column) for column in read.values.values()] == [self.ROWS] * 3
 
-    @pytest.mark.parametrize("remark", ["a\0b", "a\rb", "fine\nt,u,y,remark", "fine\n1.0", "fine\n\n\n1,2,3,fine"])
+    @cases("remark", ["a\0b", "a\rb", "fine\nt,u,y,remark", "fine\n1.0", "fine\n\n\n1,2,3,fine"])
     def test_what_breaks_a_table_is_refused(self, tmp_path, remark):
         path = self.write(tmp_path / "a.csv", {201: remark})
         with pytest.raises(DataError, match=r"a\.csv"):

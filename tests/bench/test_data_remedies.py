@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from cases import cases
 
 from bench.errors import DataError
 from bench.results.data import read_columns
@@ -49,8 +50,8 @@ LABVIEW = (
 
 
 class TestNamesAndValues:
-    @pytest.mark.parametrize("decimal", [".", ","])
-    @pytest.mark.parametrize("end", ["\n", "\t\n"])
+    @cases("decimal", [".", ","])
+    @cases("end", ["\n", "\t\n"])
     def test_the_header_of_labview_is_no_table(self, tmp_path, decimal, end):
         content = LABVIEW.replace("0.0", "0" + decimal + "0") + BODY.replace(",", "\t").replace("\n", end).replace(
             ".", decimal
@@ -88,8 +89,8 @@ SUMMARIES = {
 
 
 class TestSummaries:
-    @pytest.mark.parametrize("names", [("U", "y"), ("time", "U", "y"), ("2", "3")])
-    @pytest.mark.parametrize("name", SUMMARIES)
+    @cases("names", [("U", "y"), ("time", "U", "y"), ("2", "3")])
+    @cases("name", SUMMARIES)
     def test_a_summary_ends_the_table(self, tmp_path, name, names):
         below, lines = SUMMARIES[name]
         columns = read(tmp_path, TABLE + below, names)
@@ -124,7 +125,7 @@ class TestSummaries:
         check(columns)
         assert columns.assumptions == "table 2, comma-separated, 1 line above the header"
 
-    @pytest.mark.parametrize("mark", ["n/a", "OVLD", "--", "NaN", ""])
+    @cases("mark", ["n/a", "OVLD", "--", "NaN", ""])
     def test_a_missing_value_ends_no_table(self, tmp_path, mark):
         columns = read(tmp_path, TABLE.replace("\n1.95,", f"\n{mark},"))
         check(columns)
@@ -156,7 +157,7 @@ class TestSummaries:
 
 
 class TestExponents:
-    @pytest.mark.parametrize(("decimal", "letter"), [(".", "D"), (".", "d"), (",", "D")])
+    @cases(("decimal", "letter"), [(".", "D"), (".", "d"), (",", "D")])
     def test_of_fortran_are_read(self, tmp_path, decimal, letter):
         rows = "".join(f"{u:16.8E}{y:16.8E}\n" for u, y in zip(U, Y, strict=True))
         content = "  U  y\n" + rows.replace("E", letter).replace(".", decimal)
@@ -171,7 +172,7 @@ class TestExponents:
 
 
 class TestWhatWouldHelp:
-    @pytest.mark.parametrize(
+    @cases(
         ("cell", "said"),
         [
             ("n/a", "'n/a' is not a number"),
@@ -205,13 +206,13 @@ class TestWhatWouldHelp:
     def test_another_minus(self, tmp_path):
         assert "replace '−' by '-' in the file" in refused(tmp_path, TABLE.replace("-", "−"))
 
-    @pytest.mark.parametrize(("header", "names"), [("time:U:y\n", ("U",)), ("time:U:y\n", ("2",)), ("", ("1",))])
+    @cases(("header", "names"), [("time:U:y\n", ("U",)), ("time:U:y\n", ("2",)), ("", ("1",))])
     def test_another_delimiter(self, tmp_path, header, names):
         content = header + BODY.replace(",", ":")
         assert refused(tmp_path, content, names).endswith("if ':' stands between columns, say --delimiter ':'")
         check(read(tmp_path, content, ("2", "3"), delimiter=":"), "2", "3")
 
-    @pytest.mark.parametrize(
+    @cases(
         ("encoding", "heads"),
         [("shift_jis", "時間,電圧,変位"), ("cp1251", "время,вход,выход"), ("gb18030", "时间,电压,位移")],
     )
@@ -227,7 +228,7 @@ class TestWhatWouldHelp:
         assert "was read as cp1252: if names look wrong, say --encoding, such as shift_jis" in message
         assert "--encoding" not in refused(tmp_path, ("t,U (V),x (µm)\n" + BODY).encode("cp1252"))
 
-    @pytest.mark.parametrize(
+    @cases(
         "above",
         [
             "".join(f"note line {line} about things\n" for line in range(1500)),
@@ -250,8 +251,8 @@ RECORDS = [{"U": float(u), "y": float(y)} for u, y in zip(U, Y, strict=True)]
 
 
 class TestOtherFormats:
-    @pytest.mark.parametrize("names", [("U", "y"), ("1", "2"), ("2", "3")])
-    @pytest.mark.parametrize(
+    @cases("names", [("U", "y"), ("1", "2"), ("2", "3")])
+    @cases(
         ("content", "kind"),
         [
             (json.dumps({"U": U.tolist(), "y": Y.tolist()}), "JSON"),
@@ -274,7 +275,7 @@ class TestOtherFormats:
     def test_an_array_in_a_file_of_json(self, tmp_path):
         assert "is JSON, not a table" in refused(tmp_path, "[1.5, 2.5,\n3.5]", ("1",), "file.json")
 
-    @pytest.mark.parametrize("above", ['{"sample": 3}\n', '{"sample": {\n"a": 3}}\n', "[[Data]]\n", "[Header]\n"])
+    @cases("above", ['{"sample": 3}\n', '{"sample": {\n"a": 3}}\n', "[[Data]]\n", "[Header]\n"])
     def test_what_stands_above_a_table(self, tmp_path, above):
         check(read(tmp_path, above + TABLE))
 

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import heater_laboratory
 import pytest
+from cases import cases
 from heater_laboratory import RIG
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -28,7 +29,7 @@ def compute(expression, unit, values=None, **constants):
 
 
 class TestValues:
-    @pytest.mark.parametrize(
+    @cases(
         ("expression", "unit", "constants", "expected"),
         [
             ("a", "V", {}, 2.0),
@@ -59,7 +60,7 @@ class TestValues:
     def test_value(self, expression, unit, constants, expected):
         assert compute(expression, unit, **constants) == pytest.approx(expected, rel=1e-14)
 
-    @pytest.mark.parametrize(
+    @cases(
         ("expression", "unit", "expected"),
         [("t", "°C", 40.0), ("t", "K", 40.0), ("t - room", "K", 15.0), ("t", "mK", 4e4), ("t * t", "K**2", 1600.0)],
     )
@@ -67,7 +68,7 @@ class TestValues:
         constants = {"room": "25 °C"} if "room" in expression else {}
         assert compute(expression, unit, **constants) == pytest.approx(expected, rel=1e-14)
 
-    @pytest.mark.parametrize("unit", ["degC", "degF"])
+    @cases("unit", ["degC", "degF"])
     def test_a_scale_with_an_offset_is_refused(self, unit):
         with pytest.raises(ValueError, match=f"unit = '1 {unit}': expected .* a unit whose scale begins at 0"):
             compute("t", unit)
@@ -108,7 +109,7 @@ def test_any_expression_agrees_with_python(text, a, b):
 
 
 class TestRefused:
-    @pytest.mark.parametrize(
+    @cases(
         ("expression", "reason"),
         [
             ("a +", "is not an arithmetic expression"),
@@ -141,7 +142,7 @@ class TestRefused:
             Expression(expression=expression, unit="V")
         assert reason in str(caught.value)
 
-    @pytest.mark.parametrize(
+    @cases(
         ("expression", "unit", "reason"),
         [
             ("a", "m", "'a' is in V, not in unit = 'm'"),
@@ -162,7 +163,7 @@ class TestRefused:
             compute(expression, unit)
         assert reason in str(caught.value)
 
-    @pytest.mark.parametrize("value", ["3V", "V", "nan V", "inf V", "1 bogus", "", "1 degC"])
+    @cases("value", ["3V", "V", "nan V", "inf V", "1 bogus", "", "1 degC"])
     def test_a_constant_that_is_no_quantity(self, value):
         with pytest.raises(ValueError, match=r"constants.k = .*: expected a (finite )?number and a unit"):
             compute("k * a", "V", k=value)
@@ -171,7 +172,7 @@ class TestRefused:
 class TestNoValue:
     """What has no value for a reading ends the run as a device does that fails; nothing hangs."""
 
-    @pytest.mark.parametrize(
+    @cases(
         ("expression", "unit", "values", "shown"),
         [
             ("a / b", "1", {"b": 0.0}, "a = 2, b = 0"),
@@ -212,7 +213,7 @@ class TestOnARig:
                 rig.sample(["doubled"])
             assert set(rig.quick_reader(["doubled"])()) >= {"tec_temperature", "half", "doubled"}
 
-    @pytest.mark.parametrize(
+    @cases(
         ("old", "new", "key"),
         [
             (

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cases import cases
 
 from bench.journal import Record
 from bench.results.data import read_columns
@@ -62,7 +63,7 @@ def test_a_sequence_is_written_and_carried_out(bench, tmp_path):
     np.testing.assert_allclose(held, 0.5, atol=0.2)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("text", "settings", "words"),
     [
         ("input,dwell\n30,1\n95,1\n", (), ["row 2", "column input", "95", "21 to 84 °C"]),

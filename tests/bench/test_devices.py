@@ -4,6 +4,7 @@ import warnings
 from contextlib import nullcontext
 
 import pytest
+from cases import cases
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -110,7 +111,7 @@ class TestStatus:
         status.update()
         assert came == [("first", True), ("second", True)]
 
-    @pytest.mark.parametrize("end", ["arrives", "fails", "times out"])
+    @cases("end", ["arrives", "fails", "times out"])
     def test_the_watcher_ends(self, end):
         clock = VirtualClock()
 
@@ -168,7 +169,7 @@ class TestLimits:
         assert b in limits
         assert (value in limits) == (min(a, b) <= value <= max(a, b))
 
-    @pytest.mark.parametrize(("low", "high"), [(2.0, 1.0), (math.nan, 1.0), (1.0, math.nan)])
+    @cases(("low", "high"), [(2.0, 1.0), (math.nan, 1.0), (1.0, math.nan)])
     def test_refuses_an_empty_range(self, low, high):
         with pytest.raises(ValueError, match="expected low ≤ high"):
             Limits(low, high, "V")
@@ -196,7 +197,7 @@ class TestSetpoints:
 
 
 class TestRoles:
-    @pytest.mark.parametrize(
+    @cases(
         "role",
         [TECAmplifier, VoltageSupply, LoadCell, PositionSensor, TemperatureSensor, Servo, LinearStage, Switch],
     )
@@ -205,7 +206,7 @@ class TestRoles:
         with pytest.raises(TypeError, match="abstract"):
             role("x", VirtualClock())
 
-    @pytest.mark.parametrize("role", [LoadCell, PositionSensor, Servo, VoltageSupply])
+    @cases("role", [LoadCell, PositionSensor, Servo, VoltageSupply])
     def test_signals_are_named_after_the_device(self, role):
         class Minimal(role):
             output = "dc"
@@ -280,7 +281,7 @@ class TestGeneralRoles:
             coil.set(4.0)
         assert coil.sent == (2.0,)
 
-    @pytest.mark.parametrize("fails", [False, True])
+    @cases("fails", [False, True])
     def test_safe_forgets_the_set_point_even_if_it_cannot_be_confirmed(self, fails):
         coil = self.coil()
         coil.set(2.0)

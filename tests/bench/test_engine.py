@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from cases import cases
 from heater_protocols import Settle, Stairs, Watcher, settle, stairs
 
 from bench.clock import PacedClock, VirtualClock, WallClock
@@ -690,9 +691,7 @@ class TestControl:
                     plan(control(Integrator(50.0), response="absent"), Nothing()),
                 )
 
-    @pytest.mark.parametrize(
-        "keys", [{"limits": (2.0, 1.0)}, {"limits": (math.nan, 1.0)}, {"timeout": 0.0}, {"timeout": math.nan}]
-    )
+    @cases("keys", [{"limits": (2.0, 1.0)}, {"limits": (math.nan, 1.0)}, {"timeout": 0.0}, {"timeout": math.nan}])
     def test_nonsense_is_refused(self, keys):
         with pytest.raises(ConfigurationError, match="Control: expected finite limits"):
             plan(control(Integrator(50.0), **keys), Nothing())

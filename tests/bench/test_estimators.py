@@ -2,6 +2,7 @@ import math
 
 import numpy as np
 import pytest
+from cases import cases
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -35,7 +36,7 @@ def batch(times, values, noise, agility):
 
 
 class TestAgainstExactSolutions:
-    @pytest.mark.parametrize("times", [np.arange(8.0), [0.0, 0.1, 0.5, 2.0, 2.2, 7.0]])
+    @cases("times", [np.arange(8.0), [0.0, 0.1, 0.5, 2.0, 2.2, 7.0]])
     def test_a_steadfast_drift_is_the_least_squares_line(self, times):
         rng = np.random.default_rng(3)
         values = 50.0 + 0.3 * np.asarray(times) + 0.01 * rng.standard_normal(len(times))
@@ -46,7 +47,7 @@ class TestAgainstExactSolutions:
         assert estimator.drift == pytest.approx(slope, abs=1e-3 * deviation)
         assert estimator.uncertainty == pytest.approx(deviation, rel=1e-3)
 
-    @pytest.mark.parametrize("seed", range(5))
+    @cases("seed", range(5))
     def test_a_wandering_drift_is_the_generalized_least_squares_solution(self, seed):
         rng = np.random.default_rng(seed)
         times = np.cumsum(rng.uniform(0.2, 3.0, 12))
@@ -95,8 +96,8 @@ class TestSteadiness:
             assert not estimator.is_steady(0.02)
         assert estimator.drift == pytest.approx(0.1, rel=1e-3)
 
-    @pytest.mark.parametrize("noise", [0.002, 0.01, 0.05])
-    @pytest.mark.parametrize("period", [0.1, 0.5, 2.0, 5.0, 20.0])
+    @cases("noise", [0.002, 0.01, 0.05])
+    @cases("period", [0.1, 0.5, 2.0, 5.0, 20.0])
     def test_a_signal_at_rest_is_declared_steady(self, period, noise):
         limit = 0.02
         estimator = DriftEstimator(noise=noise, agility=agility_for(drift=limit, noise=noise, period=period))
@@ -105,8 +106,8 @@ class TestSteadiness:
         assert estimator.uncertainty == pytest.approx(0.4 * limit, rel=0.5)
         assert estimator.is_steady(limit)
 
-    @pytest.mark.parametrize("tau", [1.0, 4.0])
-    @pytest.mark.parametrize("period", [0.5, 2.0, 5.0])
+    @cases("tau", [1.0, 4.0])
+    @cases("period", [0.5, 2.0, 5.0])
     def test_a_settling_signal_is_not_declared_steady_too_early(self, period, tau):
         limit, noise, amplitude = 0.02, 0.01, 30.0
         allowed_from = tau * math.log(amplitude / tau / limit)
@@ -137,20 +138,20 @@ class TestSteadiness:
 
 
 class TestErrors:
-    @pytest.mark.parametrize("noise", [0.0, -1.0, math.nan, math.inf])
+    @cases("noise", [0.0, -1.0, math.nan, math.inf])
     def test_parameters(self, noise):
         with pytest.raises(ValueError, match="positive"):
             DriftEstimator(noise=noise, agility=1.0)
         with pytest.raises(ValueError, match="positive"):
             DriftEstimator(noise=1.0, agility=noise)
 
-    @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+    @cases("value", [math.nan, math.inf, -math.inf])
     def test_readings(self, value):
         estimator = DriftEstimator(noise=1.0, agility=1.0)
         with pytest.raises(ValueError, match="value: expected a finite number"):
             estimator.update(0.0, value)
 
-    @pytest.mark.parametrize("t", [math.nan, math.inf])
+    @cases("t", [math.nan, math.inf])
     def test_times(self, t):
         estimator = DriftEstimator(noise=1.0, agility=1.0)
         with pytest.raises(ValueError, match="t: expected"):

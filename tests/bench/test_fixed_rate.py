@@ -6,6 +6,7 @@ import re
 
 import numpy as np
 import pytest
+from cases import cases
 from heater_protocols import Watcher
 
 from bench.clock import VirtualClock, WallClock
@@ -646,7 +647,7 @@ class TestTrouble:
         assert b.sent == controller.seen == []
         b.assert_safe()
 
-    @pytest.mark.parametrize(
+    @cases(
         ("keys", "word"),
         [
             ({"inputs": ("prob_temperature",)}, "prob_temperature"),

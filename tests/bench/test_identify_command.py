@@ -4,7 +4,7 @@ import json
 import re
 
 import numpy as np
-import pytest
+from cases import cases
 
 from bench.hysteresis import Preisach, uniform_levels
 from bench.model_file import load_model
@@ -23,7 +23,7 @@ def loops(rows):
     return inputs, Preisach(uniform_levels(0.0, 10.0, 8), np.ones(36), 3.0).evaluate(inputs)
 
 
-@pytest.mark.parametrize(("sign", "orientation"), [(1, "rising"), (-1, "falling")])
+@cases(("sign", "orientation"), [(1, "rising"), (-1, "falling")])
 def test_the_orientation_is_printed_and_kept(bench, tmp_path, sign, orientation):
     inputs, outputs = loops(400)
     data, model, result = write(tmp_path / "d.csv", inputs, sign * outputs), tmp_path / "m.json", tmp_path / "r.json"

@@ -3,6 +3,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from cases import cases
 from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import ValidationError
@@ -22,7 +23,7 @@ def watch(*interlocks):
 
 
 class TestInterlock:
-    @pytest.mark.parametrize(
+    @cases(
         "keys",
         [
             {"low": 2.0, "high": 1.0},
@@ -83,7 +84,7 @@ class TestWatch:
         for t, value in enumerate((0.0, 30.0, 60.0)):
             guard.check(float(t), {"sink": value})
 
-    @pytest.mark.parametrize("value", [-0.001, 60.001, math.inf, -math.inf, math.nan])
+    @cases("value", [-0.001, 60.001, math.inf, -math.inf, math.nan])
     def test_trips_at_once_without_seconds(self, value):
         guard = watch(Interlock(signal="sink", low=0.0, high=60.0))
         with pytest.raises(InterlockError) as caught:
@@ -185,9 +186,7 @@ class TestLooks:
         assert watch().signals == frozenset()
         assert watch().due == math.inf
 
-    @pytest.mark.parametrize(
-        "keys", [{"signal": "skin"}, {"signal": "sink", "minus": "skin"}, {"signal": "sink", "setpoint": "skin"}]
-    )
+    @cases("keys", [{"signal": "skin"}, {"signal": "sink", "minus": "skin"}, {"signal": "sink", "setpoint": "skin"}])
     def test_a_signal_that_does_not_exist_is_refused(self, keys):
         with pytest.raises(ConfigurationError, match="no signal skin"):
             watch(Interlock(high=1.0, **keys))
@@ -413,7 +412,7 @@ class TestWarning:
             [True], [], [], [False],
         ]  # fmt: skip
 
-    @pytest.mark.parametrize("keys", [{"warn": 0.0}, {"level": "warn"}, {"high": 0.0}, {"low": 59.0, "warn": 0.2}])
+    @cases("keys", [{"warn": 0.0}, {"level": "warn"}, {"high": 0.0}, {"low": 59.0, "warn": 0.2}])
     def test_none_where_there_is_no_room_or_no_wish(self, keys):
         guard = watch(Interlock(signal="sink", **{"high": 60.0, **keys}))
         top = keys.get("high", 60.0)

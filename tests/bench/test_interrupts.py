@@ -8,6 +8,7 @@ import threading
 from pathlib import Path
 
 import pytest
+from cases import cases
 
 from bench.errors import DataError
 from bench.interrupts import Interrupts
@@ -40,7 +41,7 @@ class TestFlags:
             assert interrupts.pause_requested
             assert not interrupts.abort_requested()
 
-    @pytest.mark.parametrize(
+    @cases(
         "name",
         [
             "SIGTERM",

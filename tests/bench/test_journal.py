@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cases import cases
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -100,7 +101,7 @@ class TestRoundTrip:
             np.testing.assert_array_equal(run.steps()["force"], [-value for value in values])
             assert [entry.values[0] for entry in run.step_records()] == values
 
-    @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+    @cases("value", [math.nan, math.inf, -math.inf])
     def test_what_is_not_finite(self, tmp_path, value):
         journal = Journal(tmp_path / FILE_NAME, SIGNALS, {"odd": value})
         journal.telemetry(0.0, 0, (value, 1.0))
@@ -136,7 +137,7 @@ class TestRoundTrip:
             assert len(run.steps()) == len(run.telemetry()) == 0
             assert list(run.step_records()) == []
 
-    @pytest.mark.parametrize(
+    @cases(
         "name", ['a"b', "a b", "5", "Größe °C", "select", "a'b", "a;DROP TABLE steps;--", "%s", "?", "[x]", "a.b", ""]
     )
     def test_signals_with_odd_names(self, tmp_path, name):
@@ -146,7 +147,7 @@ class TestRoundTrip:
             np.testing.assert_array_equal(run.steps()[name], [20.0, 21.0, 22.0])
             np.testing.assert_array_equal(run.telemetry()[name][:2], [20.0, 20.1])
 
-    @pytest.mark.parametrize("name", ["step", "t", "T", "Phase", "setpoints", "label", "tick", "finished"])
+    @cases("name", ["step", "t", "T", "Phase", "setpoints", "label", "tick", "finished"])
     def test_signals_named_like_its_own_columns_are_refused(self, tmp_path, name):
         with pytest.raises(ConfigurationError, match=name):
             Journal(tmp_path / FILE_NAME, (Signal(name, "m", "odd"),), {})
@@ -347,7 +348,7 @@ class TestUnusable:
         with pytest.raises(DataError, match="is not a run"):
             add_model(tmp_path, "m", 0.0, {})
 
-    @pytest.mark.parametrize("content", [b"", b"no database at all", b"SQLite format 3\x00" + b"\xff" * 5000])
+    @cases("content", [b"", b"no database at all", b"SQLite format 3\x00" + b"\xff" * 5000])
     def test_no_journal(self, tmp_path, content):
         path = tmp_path / "x.sqlite"
         path.write_bytes(content)
@@ -362,7 +363,7 @@ class TestUnusable:
         with pytest.raises(DataError, match="is not a readable journal"):
             Record(path)
 
-    @pytest.mark.parametrize("version", [0, 1, 2, 4, "3", None])
+    @cases("version", [0, 1, 2, 4, "3", None])
     def test_another_schema(self, tmp_path, version):
         path = tmp_path / FILE_NAME
         write(path)
@@ -376,7 +377,7 @@ class TestUnusable:
         with pytest.raises(DataError, match=r"schema version .*; this bench reads version 3"):
             Record(path)
 
-    @pytest.mark.parametrize(
+    @cases(
         "statement",
         [
             "UPDATE meta SET value = '{'",
@@ -435,7 +436,7 @@ class TestModels:
             assert list(run.models().items()) == [("a/b: ü", {"order": 1}), ("preisach", {"order": 21})]
             assert len(run.steps()) == 3
 
-    @pytest.mark.parametrize("content", ["{", '{"kept": 3}', '{"kept": {"position": "x"}}'])
+    @cases("content", ["{", '{"kept": 3}', '{"kept": {"position": "x"}}'])
     def test_a_damaged_one_is_named(self, tmp_path, content):
         write(tmp_path / FILE_NAME)
         add_model(tmp_path, "good", 1.0, {})
@@ -460,7 +461,7 @@ class TestFiles:
 
 
 class TestChecksums:
-    @pytest.mark.parametrize(
+    @cases(
         ("statement", "row"),
         [
             ("UPDATE steps SET force = force + 1e-12 WHERE step = 1", "table steps, row 1"),

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from cases import cases
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
@@ -60,7 +61,7 @@ class TestRight:
         assert read_columns(path, ["force"]).values["force"][0] == 1.0
         assert read_columns(path, ["force [kN]"]).units == {"force [kN]": "kN"}
 
-    @pytest.mark.parametrize(
+    @cases(
         ("header", "expected"),
         [
             ("force [N]", ("force", "N")),

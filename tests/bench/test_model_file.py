@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from cases import cases
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -50,7 +51,7 @@ def content(name="non-monotonic"):
 
 
 class TestRoundTrip:
-    @pytest.mark.parametrize("name", list(MODELS))
+    @cases("name", list(MODELS))
     def test_every_operator(self, tmp_path, name):
         path = tmp_path / "model.json"
         memory = None if name == "polynomial" else MEMORY
@@ -103,24 +104,24 @@ class TestUnusable:
         with pytest.raises(DataError, match=r"m\.json"):
             load_model(path)
 
-    @pytest.mark.parametrize("document", [None, [], "x", 5, {}, {"format": "other"}])
+    @cases("document", [None, [], "x", 5, {}, {"format": "other"}])
     def test_no_model_file(self, document):
         with pytest.raises(DataError, match=rf"m\.json is not a model file: its `format` is not '{FORMAT}'"):
             parse_model(document, "m.json")
 
-    @pytest.mark.parametrize("version", [0, 1, 3, "2", None, [2]])
+    @cases("version", [0, 1, 3, "2", None, [2]])
     def test_another_version(self, version):
         with pytest.raises(DataError, match=f"has version .*; this bench reads version {VERSION}"):
             parse_model({**content(), "version": version}, "m.json")
 
-    @pytest.mark.parametrize("key", ["name", "kind", "model", "memory", "provenance"])
+    @cases("key", ["name", "kind", "model", "memory", "provenance"])
     def test_a_missing_key_is_named(self, key):
         document = content()
         del document[key]
         with pytest.raises(DataError, match=rf"m\.json is damaged: key '{key}' is missing"):
             parse_model(document, "m.json")
 
-    @pytest.mark.parametrize(
+    @cases(
         ("path", "value"),
         [
             (("model",), None),
@@ -226,9 +227,7 @@ def test_any_mutation_is_a_usable_model_or_a_data_error(name, data):
     assert isinstance(file.operator.output_unit, str)
 
 
-@pytest.mark.parametrize(
-    ("name", "key"), [("non-monotonic", "k0"), ("non-monotonic", "high"), ("with a quadratic", "quadratic")]
-)
+@cases(("name", "key"), [("non-monotonic", "k0"), ("non-monotonic", "high"), ("with a quadratic", "quadratic")])
 def test_a_whole_number_of_any_size_is_a_number(name, key):
     document = copy.deepcopy(content(name))
     document["model"]["reversible"][key] = 10**30
@@ -249,7 +248,7 @@ COUPLED = {
 
 
 class TestCoupled:
-    @pytest.mark.parametrize("name", list(COUPLED))
+    @cases("name", list(COUPLED))
     def test_round_trip(self, tmp_path, name):
         path = tmp_path / "model.json"
         ModelFile(name, COUPLED[name], provenance={"source": "runs"}).save(path)
@@ -268,7 +267,7 @@ class TestCoupled:
         with pytest.raises(DataError, match="model two-stage is of the kind two-stage; expected one of one input"):
             _ = ModelFile("two-stage", COUPLED["two-stage"]).operator
 
-    @pytest.mark.parametrize(
+    @cases(
         "change",
         [
             {"model": None},
@@ -284,7 +283,7 @@ class TestCoupled:
         with pytest.raises(DataError, match=r"m\.json"):
             parse_model(document, "m.json")
 
-    @pytest.mark.parametrize("key", ["name", "model", "provenance"])
+    @cases("key", ["name", "model", "provenance"])
     def test_a_missing_key(self, key):
         document = ModelFile("two-stage", COUPLED["two-stage"]).to_json()
         del document[key]
@@ -380,12 +379,12 @@ class TestHybrid:
             with pytest.raises(DataError, match=r"m\.json"):
                 load_model(tmp_path / "m.json")
 
-    @pytest.mark.parametrize("version", [0, 1, 3, "2", None])
+    @cases("version", [0, 1, 3, "2", None])
     def test_another_version(self, hybrid_file, version):
         with pytest.raises(DataError, match=f"has version .*; this bench reads version {VERSION}"):
             load_model(hybrid_file([(("version",), version)]))
 
-    @pytest.mark.parametrize(
+    @cases(
         "path",
         [
             ("model",),
@@ -401,7 +400,7 @@ class TestHybrid:
         with pytest.raises(DataError, match=rf"m\.json is damaged: .*{path[-1]}"):
             load_model(hybrid_file(missing=[path]))
 
-    @pytest.mark.parametrize(
+    @cases(
         ("path", "value"),
         [
             (("model",), None),

@@ -8,6 +8,7 @@ import shlex
 
 import numpy as np
 import pytest
+from cases import cases
 from matplotlib.figure import Figure
 
 from bench.errors import DataError
@@ -189,7 +190,7 @@ class TestFigures:
 
 
 class TestPlaces:
-    @pytest.mark.parametrize(
+    @cases(
         ("options", "words"),
         [
             (["--out", "DIR/none/m.json"], ["--out", "no folder"]),

@@ -4,6 +4,7 @@ import io
 import re
 
 import pytest
+from cases import cases
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
@@ -28,7 +29,7 @@ def drawn(columns):
 
 
 class TestProgress:
-    @pytest.mark.parametrize("columns", [160, 120, 100, 80, 60, 50, 40])
+    @cases("columns", [160, 120, 100, 80, 60, 50, 40])
     def test_nothing_is_cut(self, columns):
         lines = drawn(columns)
         assert all(len(line) <= columns for line in lines)
@@ -68,8 +69,8 @@ def shown(made, columns):
 
 
 class TestTables:
-    @pytest.mark.parametrize("box", [True, False])
-    @pytest.mark.parametrize("columns", [*range(20, 80, 3)])
+    @cases("box", [True, False])
+    @cases("columns", [*range(20, 80, 3)])
     def test_every_word_is_whole(self, columns, box):
         text = shown(table(box=box), columns)
         for row in CELLS:
@@ -114,7 +115,7 @@ class TestTextsOfOthers:
 
     HOSTILE = "x\x1b[2K\x1b[1Gerror\x07\r\x9b31mz\u202egnp.exe\u2066\u200f"
 
-    @pytest.mark.parametrize("is_terminal", [True, False])
+    @cases("is_terminal", [True, False])
     def test_characters_that_command_a_terminal_are_shown_as_such(self, is_terminal):
         console = PlainConsole(file=io.StringIO(), width=200, force_terminal=is_terminal, color_system=None)
         print_plain(console, self.HOSTILE)

@@ -4,6 +4,7 @@ import io
 from pathlib import Path
 
 import pytest
+from cases import cases
 from rich.console import Console
 from written_run import HOSTILE, META, write_run
 
@@ -71,7 +72,7 @@ class TestPageOfARun:
         assert "Interlocks acted 1 times" in text
         assert "Model preisach is off by at most" in text
 
-    @pytest.mark.parametrize(
+    @cases(
         ("section", "words"),
         [
             ("parameters", ["high", "80", "set", "emulation.noise", "drive"]),

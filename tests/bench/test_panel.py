@@ -6,6 +6,7 @@ import threading
 from functools import partial
 
 import pytest
+from cases import cases
 from heater_protocols import stairs
 from rich.console import Console
 
@@ -39,7 +40,7 @@ async def enter(pilot, line):
 
 
 class TestCommands:
-    @pytest.mark.parametrize(
+    @cases(
         ("line", "command"),
         [
             ("set tec 40", SetPoint("tec", 40.0)),
@@ -56,7 +57,7 @@ class TestCommands:
     def test_are_understood(self, line, command):
         assert parse_command(line) == command
 
-    @pytest.mark.parametrize(
+    @cases(
         ("line", "message"),
         [
             ("set tec", "expected set DEVICE VALUE"),
@@ -82,7 +83,7 @@ class TestCommands:
 
 
 class TestMargins:
-    @pytest.mark.parametrize(
+    @cases(
         ("signal", "value", "distance", "limit", "by", "warned"),
         [
             ("tec_setpoint", 90.0, 5.0, 95.0, "device", False),

@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 
 import pytest
+from cases import cases
 from pydantic import Field, ValidationError
 
 from bench.checked_table import CheckedTable
@@ -16,7 +17,7 @@ TOML, JSON = f"rig = {DEEP}\n", f'{{"kind": {DEEP}}}'
 CREEP = ["run", "creep", "--clock", "virtual"]
 
 
-@pytest.mark.parametrize("parse", [parse_json, parse_toml])
+@cases("parse", [parse_json, parse_toml])
 def test_what_is_too_deep_is_a_value_error(parse):
     with pytest.raises(ValueError, match="nested too deeply"):
         parse(f"a = {DEEP}" if parse is parse_toml else DEEP)

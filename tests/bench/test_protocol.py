@@ -3,6 +3,7 @@ import sys
 
 import numpy as np
 import pytest
+from cases import cases
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -76,7 +77,7 @@ class TestParse:
             ramp.parse({"lwo": "3", "needed": "1"})
         assert "there is no parameter 'lwo'; there are: low, count, slow, free, title, needed" in str(caught.value)
 
-    @pytest.mark.parametrize(
+    @cases(
         ("name", "value", "allowed"),
         [
             ("low", "151", "-20 to 150 °C"),
@@ -179,12 +180,12 @@ class TestDefinition:
 
 
 class TestMessages:
-    @pytest.mark.parametrize("seconds", [-1.0, math.nan, math.inf])
+    @cases("seconds", [-1.0, math.nan, math.inf])
     def test_dwell_refuses(self, seconds):
         with pytest.raises(ValueError, match="finite number ≥ 0"):
             Dwell(seconds)
 
-    @pytest.mark.parametrize(
+    @cases(
         "keys",
         [
             {"drift": 0.0},
@@ -231,7 +232,7 @@ class TestPlan:
         assert expected.extremes["tec"] == (40.0, 43.0)
         assert expected.finished == (1.0, 2.0, 3.0, 4.0)
 
-    @pytest.mark.parametrize(
+    @cases(
         "decide",
         [
             lambda reading: reading["curvature"] < 100.0,
@@ -285,7 +286,7 @@ class TestPlan:
         assert (expected.complete, expected.steps, expected.at_most) == (True, 2, 4.0)
         assert said == ["unknown unknown"]
 
-    @pytest.mark.parametrize("caught", [Exception, BaseException])
+    @cases("caught", [Exception, BaseException])
     def test_a_protocol_that_catches_everything_gets_no_reading_either(self, caught):
         def stubborn(parameters):
             reading = yield Step({"tec": 40.0}, Dwell(1.0))
@@ -344,7 +345,7 @@ class TestPlan:
         with pytest.raises(ConfigurationError, match="protocol broken: settling must be shorter"):
             plan(define(broken), Nothing())
 
-    @pytest.mark.parametrize("nonsense", [None, 42, "tec", {"tec": 20.0}, Step])
+    @cases("nonsense", [None, 42, "tec", {"tec": 20.0}, Step])
     def test_nonsense_is_found_before_anything_moves(self, nonsense):
         def odd(parameters):
             yield Step({"tec": 20.0}, Dwell(1.0))
@@ -353,7 +354,7 @@ class TestPlan:
         with pytest.raises(ConfigurationError, match="protocol odd yielded"):
             plan(define(odd), Nothing())
 
-    @pytest.mark.parametrize("value", [math.nan, math.inf, "warm", None])
+    @cases("value", [math.nan, math.inf, "warm", None])
     def test_a_setpoint_that_is_no_number_is_found_before_anything_moves(self, value):
         def odd(parameters):
             yield Step({"tec": 20.0}, Dwell(1.0))
@@ -424,7 +425,7 @@ def soak(parameters: Parameters) -> Messages:
         with pytest.raises(ConfigurationError, match=r"folder\.py"):
             find_protocol(str(tmp_path / "folder.py"))
 
-    @pytest.mark.parametrize(
+    @cases(
         "text",
         [
             "def broken(:\n",
@@ -671,7 +672,7 @@ class TestFixedRate:
         with pytest.raises(ConfigurationError, match="endless does not end within 10000 steps"):
             plan(define(endless), Nothing())
 
-    @pytest.mark.parametrize(
+    @cases(
         "keys",
         [
             {"rate": 0.0},

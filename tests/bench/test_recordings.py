@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from cases import cases
 
 import bench
 from bench.dashboard.from_journal import rebuild
@@ -19,7 +20,7 @@ def test_there_is_a_run_of_each_rig():
     assert sum(file.stat().st_size for file in FOLDER.rglob("*")) < 2e6
 
 
-@pytest.mark.parametrize("name", RUNS)
+@cases("name", RUNS)
 def test_the_record_is_whole(name, tmp_path):
     found = recover(FOLDER / name / "journal.sqlite", [], tmp_path / "copy.sqlite")
     assert found.copy is None
@@ -30,7 +31,7 @@ def test_the_record_is_whole(name, tmp_path):
 
 
 # Each number as it was found when the runs were made; the same code gives the same to rounding.
-@pytest.mark.parametrize(
+@cases(
     ("rig", "signals", "model", "options", "rms", "largest", "passive", "bias"),
     [
         (

@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from cases import cases
 
 from bench import registry
 from bench.cli import main
@@ -77,7 +78,7 @@ class TestEntries:
         assert (entries["wait"].own, entries["wait"].package) == (False, "outside-coil")
         assert entries["wait"].load().__name__ == "outside_wait"
 
-    @pytest.mark.parametrize("group", registry.GROUPS)
+    @cases("group", registry.GROUPS)
     def test_each_of_our_own_can_be_imported(self, group):
         """`bench list` imports none of the groups that it does not show."""
         for entry in registry.entries(group).values():
@@ -88,9 +89,7 @@ class TestEntries:
         with pytest.raises(ValueError, match="group: expected one of rigs, protocols"):
             registry.entries("colours")
 
-    @pytest.mark.parametrize(
-        ("group", "what"), [("models", "model"), ("studies", "study"), ("laboratories", "laboratory")]
-    )
+    @cases(("group", "what"), [("models", "model"), ("studies", "study"), ("laboratories", "laboratory")])
     def test_an_unknown_name_lists_what_there_is(self, group, what):
         with pytest.raises(ConfigurationError, match=f"there is no {what} 'magic'; there are: ") as caught:
             registry.load(group, "magic")
@@ -162,9 +161,7 @@ def run_list(command, folder, **environment):
 class TestHidden:
     """A foreign folder or module of the name of one of ours is an error that says so."""
 
-    @pytest.mark.parametrize(
-        "place", ["protocols/__init__.py", "protocols/notes.txt", "protocols.py", "drivers/x.py"]
-    )
+    @cases("place", ["protocols/__init__.py", "protocols/notes.txt", "protocols.py", "drivers/x.py"])
     def test_in_the_working_directory(self, tmp_path, place):
         (tmp_path / place).parent.mkdir(exist_ok=True)
         (tmp_path / place).write_text("")

@@ -12,6 +12,7 @@ import numpy as np
 import pexpect
 import pytest
 from adaptive_protocols import bisect, climb, secant, wait_for_ever
+from cases import cases
 from heater_laboratory import CLOSED, HeaterLaboratory
 from heater_protocols import stairs
 from rich.console import Console
@@ -304,7 +305,7 @@ class TestTwin:
             notes = [event.text for event in record.events() if event.kind == "note"]
         assert notes == ["of 2 readings the greatest is the last: True"]
 
-    @pytest.mark.parametrize(
+    @cases(
         ("change", "message"),
         [
             ('twin = "vo3"', "there is no rig 'vo3'"),
@@ -408,7 +409,7 @@ class TestCommand:
         assert re.search(r"in the rehearsal on vo2, protocol climb ends after \d+ steps", re.sub(r"\s+", " ", err))
         assert json.loads(result.read_text())["status"] == "failed"
 
-    @pytest.mark.parametrize(
+    @cases(
         ("arguments", "message"),
         [
             (["rehearse", "creep", "--rig", "vo3"], "there is no rig 'vo3'"),

@@ -1,6 +1,7 @@
 import math
 
 import pytest
+from cases import cases
 
 from bench.remaining_time import Expectation, RemainingTime
 
@@ -28,7 +29,7 @@ class TestRemainingTime:
         assert left.share == 0.4
         assert left.laboratory > 60.0
 
-    @pytest.mark.parametrize("slower", [0.7, 1.5])
+    @cases("slower", [0.7, 1.5])
     def test_a_pace_that_differs_is_found(self, slower):
         t = 10.0 * slower * 4
         assert t + after(4, slower=slower).at(t, t).laboratory == pytest.approx(100.0 * slower, rel=0.05)

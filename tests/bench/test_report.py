@@ -5,6 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from cases import cases
 from rich.console import Console
 
 from bench.devices import Signal
@@ -154,7 +155,7 @@ def test_a_model_with_time_at_the_times_of_the_steps(report, tmp_path):
 
 
 class TestUnits:
-    @pytest.mark.parametrize(
+    @cases(
         ("unit", "greatest", "expected"),
         [
             ("m", 8e-3, (1e3, "mm")),

@@ -7,6 +7,7 @@ import sqlite3
 from contextlib import closing
 
 import pytest
+from cases import cases
 from heater_laboratory import RIG
 from heater_protocols import stairs
 from rich.console import Console
@@ -167,7 +168,7 @@ def test_of_a_list_only_what_differs_is_named(bench, tmp_path, rig_file):
     assert str(Difference(key, *different[key])) == f"{key}: 9.0 → 0.0"
 
 
-@pytest.mark.parametrize(
+@cases(
     ("arguments", "expected"),
     [
         (["a.json", "b.json"], "model files are compared on measurements: add --data FILE"),

@@ -3,6 +3,7 @@ from dataclasses import replace
 from datetime import date
 
 import pytest
+from cases import cases
 
 from bench.clock import VirtualClock
 from bench.description import RigDescription
@@ -209,7 +210,7 @@ class TestInterlocks:
         )
 
 
-@pytest.mark.parametrize("name", sorted(name for name in packaged_rigs() if "hardware" not in name))
+@cases("name", sorted(name for name in packaged_rigs() if "hardware" not in name))
 def test_the_packaged_rigs_can_be_left_to_themselves(name):
     file = load_rig(name)
     rig = Rig(file, VirtualClock(), seed=0)
@@ -234,7 +235,7 @@ class TestCalibrations:
         path.write_text(f'extends = "vo2"\n[devices.psd]\n{lines}\n')
         return load_rig(str(path))
 
-    @pytest.mark.parametrize("day", ["2027-03-01", '"2027-03-01"'])
+    @cases("day", ["2027-03-01", '"2027-03-01"'])
     def test_is_due_from_its_day_on(self, tmp_path, day):
         file = self.rig(tmp_path, f"calibrated = 2026-03-01\ncalibration_due = {day}")
         assert overdue_calibrations(file, date(2027, 2, 28)) == ()
@@ -243,7 +244,7 @@ class TestCalibrations:
         # As the record of a run has it.
         assert json.loads(json.dumps(file.content))["devices"]["psd"]["calibration_due"] == "2027-03-01"
 
-    @pytest.mark.parametrize(
+    @cases(
         ("lines", "message"),
         [
             ('calibrated = "last spring"', r"devices\.psd\.calibrated"),

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cases import cases
 
 from bench.control.dynamics import ActuatorDynamics, IdentifiedDynamics, ResponseDynamics
 from bench.errors import DataError
@@ -47,7 +48,7 @@ def recording(lag, power, *, period=1.0, hold=20.0, error=0.0, setpoints=SINE):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("power", [1.0, 2.0])
+@cases("power", [1.0, 2.0])
 def test_a_lag_and_its_power_are_found_beside_errors_at_rest(power):
     found = identify_dynamics(identify_transients([recording(4.0, power, error=0.05)]), [MODEL.evaluate])
     assert found.actuator.order == 0
@@ -56,7 +57,7 @@ def test_a_lag_and_its_power_are_found_beside_errors_at_rest(power):
     assert 0.0 < found.uncertainties["lag"] < 0.2
 
 
-@pytest.mark.parametrize("power", [1.0, 2.0])
+@cases("power", [1.0, 2.0])
 def test_moves_over_the_whole_range_tell_the_power_that_lags(power):
     # The small steps speak for the other power, as those of a specimen that relaxes may do.
     small = recording(4.0, 3.0 - power, setpoints=2.0 + 0.2 * SINE)
@@ -88,8 +89,8 @@ def test_a_part_of_a_recording_keeps_the_set_point_that_stood():
     np.testing.assert_array_equal(part.driven, whole.driven[(whole.times >= 50.0) & (whole.times <= 90.0)])
 
 
-@pytest.mark.parametrize("step", [0.02, 0.0131])
-@pytest.mark.parametrize(
+@cases("step", [0.02, 0.0131])
+@cases(
     "dynamics",
     [
         ActuatorDynamics(frequency=2.5),
@@ -133,7 +134,7 @@ def test_dynamics_are_kept_in_a_model_file(tmp_path):
     assert parse_model(content, "here").dynamics is None
 
 
-@pytest.mark.parametrize(
+@cases(
     ("change", "said"),
     [
         ({"response": {"lag": -1.0}}, "response.lag"),

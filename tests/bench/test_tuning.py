@@ -5,6 +5,7 @@ import tomllib
 
 import numpy as np
 import pytest
+from cases import cases
 
 from bench.cli import main
 from bench.control.dynamics import IdentifiedDynamics, ResponseDynamics
@@ -245,7 +246,7 @@ def test_a_tuning_file_is_read_by_the_parameter_of_a_protocol(tmp_path):
         assert parameters.tuning == {"closed-loop-inverse": NUMBERS}
 
 
-@pytest.mark.parametrize(
+@cases(
     ("content", "said"),
     [("[tuning", "not TOML"), ("[rig]\na = 1\n", r"expected tables \[tuning.CONTROLLER\]"), (None, "cannot be read")],
 )

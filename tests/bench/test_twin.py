@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cases import cases
 
 import bench
 from bench.cli import main
@@ -249,7 +250,7 @@ def recording_from(times, drive, changes, setpoints):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize(
+@cases(
     "dynamics",
     [
         ActuatorDynamics(delay=0.3, frequency=1.5),
@@ -266,7 +267,7 @@ def test_the_order_of_an_actuator_is_found_with_its_numbers(dynamics):
     assert math.isinf(dynamics.rate) or found.rate == pytest.approx(dynamics.rate, rel=0.05)
 
 
-@pytest.mark.parametrize("relative", [True, False])
+@cases("relative", [True, False])
 def test_outliers_in_proportion_to_the_drive_are_told_from_others(relative):
     rng = np.random.default_rng(2)
     changes, setpoints = 50.0 * np.arange(60), rng.uniform(1.0, 5.0, 60)
@@ -283,7 +284,7 @@ def test_outliers_in_proportion_to_the_drive_are_told_from_others(relative):
     assert noise.reading == pytest.approx(1e-4, rel=0.1)
 
 
-@pytest.mark.parametrize("carried_out", [True, False])
+@cases("carried_out", [True, False])
 def test_set_points_that_are_not_carried_out_exactly_are_seen(carried_out):
     """A supply gives steps of 0.01, and one voltage in 25 is off by 1 %; or all of that is in its readings alone."""
     rng = np.random.default_rng(7)
@@ -310,7 +311,7 @@ def test_set_points_that_are_not_carried_out_exactly_are_seen(carried_out):
     assert np.abs(found.outliers) == pytest.approx(0.01, rel=0.3)
 
 
-@pytest.mark.parametrize(("share", "alike"), [(0.012, True), (0.06, False)])
+@cases(("share", "alike"), [(0.012, True), (0.06, False)])
 def test_outliers_of_few_set_points_are_those_of_the_readings_if_these_explain_them(share, alike):
     """A supply reads its battery when it sets a voltage and when it reads one: 1 % off in 12 of 1000."""
     rng = np.random.default_rng(3)

@@ -8,6 +8,7 @@ import sys
 from contextlib import ExitStack, contextmanager
 
 import pytest
+from cases import cases
 
 from bench.clock import Stopwatch
 from bench.upkeep.rescue import rescue_by_another_process
@@ -350,7 +351,7 @@ class TestDoctor:
             if finding["advice"]
         }
 
-    @pytest.mark.parametrize("rig", ["vo2", "hybrid"])
+    @cases("rig", ["vo2", "hybrid"])
     def test_identifies_each_instrument(self, bench, tmp_path, rig):
         file = tmp_path / "check.json"
         bench("doctor", rig, "--json", file)
@@ -361,7 +362,7 @@ class TestDoctor:
     def test_a_healthy_rig(self, bench, tmp_path):
         assert self.findings(bench, tmp_path, "vo2", "--exercise") == (0, {})
 
-    @pytest.mark.parametrize(
+    @cases(
         ("override", "place", "words"),
         [
             ("roles.drive.range=[0.0,120.0]", ("tec", "limits"), "0 and 120 beyond 15 to 95 °C"),

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cases import cases
 from rich.console import Console
 
 from bench.errors import AbortError, BenchError, DeviceError
@@ -193,7 +194,7 @@ def test_one_worker_is_this_process():
     assert late.result() == (2, os.getpid())
 
 
-@pytest.mark.parametrize("number", [1, 2])
+@cases("number", [1, 2])
 def test_the_end_raises_what_nobody_has_asked_for(number):
     with pytest.raises(DeviceError), Workers(number) as workers:
         workers.submit(worker_tasks.fail, "tec")

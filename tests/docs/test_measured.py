@@ -5,6 +5,7 @@ import re
 from pathlib import Path
 
 import pytest
+from cases import cases
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -59,7 +60,7 @@ ROWS = {
 """Rows of the README, by what they begin with, and the cells that their numbers come from."""
 
 
-@pytest.mark.parametrize("row", ROWS)
+@cases("row", ROWS)
 def test_the_readme_shows_median_and_worst_of_the_tables(row):
     (line,) = (line for line in README.splitlines() if line.startswith(f"| {row}"))
     shown = SHOWN.findall(line.split("|")[3].strip())
@@ -72,7 +73,7 @@ def test_the_readme_shows_median_and_worst_of_the_tables(row):
             assert float(number) == pytest.approx(float(printed), abs=0.501 * 10.0**-digits), (row, place)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("study", "number", "place"),
     [
         ("vo2", "identification.nonmonotonic.max", ROWS["VO2: proposed model, identification"][0]),

@@ -5,6 +5,7 @@ import shlex
 from pathlib import Path
 
 import pytest
+from cases import cases
 from typer.main import get_command
 
 from bench.cli.app import app
@@ -42,7 +43,7 @@ def test_the_readme_has_commands():
     assert {line.split()[0] for line in found} == {"bench", "make"}
 
 
-@pytest.mark.parametrize("line", sorted({line for line in commands() if line.startswith("bench ")}))
+@cases("line", sorted({line for line in commands() if line.startswith("bench ")}))
 def test_every_command_and_option_exists(line):
     command, arguments = get_command(app), shlex.split(line)[1:]
     context = None
@@ -55,7 +56,7 @@ def test_every_command_and_option_exists(line):
     assert {argument for argument in arguments if argument.startswith("--")} <= known
 
 
-@pytest.mark.parametrize("target", sorted({line.split()[1] for line in commands() if line.startswith("make ")}))
+@cases("target", sorted({line.split()[1] for line in commands() if line.startswith("make ")}))
 def test_every_target_of_make_exists(target):
     assert re.search(rf"^\.PHONY:.* {target}( |$)", (ROOT / "Makefile").read_text(), re.MULTILINE)
 

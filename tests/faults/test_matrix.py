@@ -4,6 +4,7 @@ import importlib.util
 from pathlib import Path
 
 import pytest
+from cases import cases
 
 HERE = Path(__file__).parent
 
@@ -16,7 +17,7 @@ def matrix():
     return module
 
 
-@pytest.mark.parametrize(
+@cases(
     ("rig", "fault"),
     [
         ("vo2", "psd.drop"),

@@ -6,6 +6,7 @@ import socket
 import struct
 
 import pytest
+from cases import cases
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -190,7 +191,7 @@ def test_an_error_of_a_driver_arrives_as_the_nearest_that_both_sides_know():
     assert str(arrived) == "tec: wrong check sum"
 
 
-@pytest.mark.parametrize("error", [ZeroDivisionError("division by zero"), KeyboardInterrupt(), SystemExit(3)])
+@cases("error", [ZeroDivisionError("division by zero"), KeyboardInterrupt(), SystemExit(3)])
 def test_a_defect_arrives_with_its_kind(error):
     arrived = to_error(to_message(error))
     assert type(arrived) is BenchError

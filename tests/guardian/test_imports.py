@@ -3,12 +3,12 @@
 import subprocess
 import sys
 
-import pytest
+from cases import cases
 
 HEAVY = ("numba", "scipy", "rerun", "matplotlib", "pandas", "pyarrow")
 
 
-@pytest.mark.parametrize("rig", ["vo2-hardware", "sma-hardware", "hybrid-hardware"])
+@cases("rig", ["vo2-hardware", "sma-hardware", "hybrid-hardware"])
 def test_a_guardian_of_hardware_loads_nothing_heavy(rig):
     """It has to start fast, stay small, and do no computing beside its lines."""
     code = (

@@ -5,6 +5,7 @@ import threading
 from itertools import count
 
 import pytest
+from cases import cases
 
 from bench.clock import VirtualClock, WallClock
 from bench.devices import Device
@@ -109,7 +110,7 @@ def test_devices_on_one_line_are_asked_one_after_another():
     assert max(most) == 1
 
 
-@pytest.mark.parametrize("error", [ValueError("x"), KeyboardInterrupt(), SystemExit(1), GeneratorExit()])
+@cases("error", [ValueError("x"), KeyboardInterrupt(), SystemExit(1), GeneratorExit()])
 def test_an_error_of_any_kind_is_the_answer_and_the_thread_goes_on(error):
     bench = Bench({"a": "line"})
 

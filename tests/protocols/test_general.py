@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cases import cases
 
 from bench.hysteresis import Preisach, uniform_levels
 from bench.journal import Record
@@ -209,7 +210,7 @@ REFUSED = [
 ]
 
 
-@pytest.mark.parametrize(("protocol", "settings", "words"), REFUSED)
+@cases(("protocol", "settings", "words"), REFUSED)
 def test_a_parameter_is_refused_by_its_name_with_its_value_and_what_is_allowed(
     bench, tmp_path, protocol, settings, words
 ):

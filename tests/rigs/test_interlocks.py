@@ -3,6 +3,7 @@
 import math
 
 import pytest
+from cases import cases
 
 from bench.clock import VirtualClock
 from bench.interlocks import InterlockWatch
@@ -45,7 +46,7 @@ def test_none_acts_in_hours_without_a_fault(name):
         rig.close()
 
 
-@pytest.mark.parametrize("name", [*RIGS, "vo2-hardware", "sma-hardware", "hybrid-hardware"])
+@cases("name", [*RIGS, "vo2-hardware", "sma-hardware", "hybrid-hardware"])
 def test_each_limit_acts_within_a_period_and_its_seconds(name):
     file = load_rig(name)
     limits = [(lock, limit) for lock in file.interlocks for limit in (lock.low, lock.high) if math.isfinite(limit)]

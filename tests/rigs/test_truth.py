@@ -3,6 +3,7 @@
 import math
 
 import pytest
+from cases import cases
 
 from bench.clock import VirtualClock
 from bench.rig import Rig
@@ -11,7 +12,7 @@ from bench.rig_file import load_rig, packaged_rigs
 RIGS = sorted(name for name in packaged_rigs() if "hardware" not in name)
 
 
-@pytest.mark.parametrize("name", RIGS)
+@cases("name", RIGS)
 def test_it_feeds_no_watchdog(name):
     """An output that its instrument switches off without its host goes off as well while somebody looks."""
     rig = Rig(load_rig(name), VirtualClock(), seed=0)
@@ -54,8 +55,8 @@ SENSORS = [
 ]
 
 
-@pytest.mark.parametrize(("name", "table", "quantity", "as_shown"), SENSORS)
-@pytest.mark.parametrize("sensors", ["data-sheet", "ideal"])
+@cases(("name", "table", "quantity", "as_shown"), SENSORS)
+@cases("sensors", ["data-sheet", "ideal"])
 def test_sensors_have_the_errors_of_their_data_sheets_or_none(name, table, quantity, as_shown, sensors):
     rig = Rig(load_rig(name, {"emulation.sensors": sensors}), VirtualClock(), seed=0)
     try:
@@ -65,7 +66,7 @@ def test_sensors_have_the_errors_of_their_data_sheets_or_none(name, table, quant
         rig.close()
 
 
-@pytest.mark.parametrize(("name", "table", "quantity", "as_shown"), SENSORS)
+@cases(("name", "table", "quantity", "as_shown"), SENSORS)
 def test_it_has_the_true_quantity_beside_the_one_that_a_sensor_shows(name, table, quantity, as_shown):
     errors = {"gain_error": "0.01", "offset": "1e-6", "nonlinearity": "0"}
     rig = Rig(

@@ -3,6 +3,7 @@
 import math
 
 import pytest
+from cases import cases
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
@@ -249,7 +250,7 @@ def test_an_output_is_not_left_on_by_a_bench_that_promised_nothing():
     assert it.state is State.TRIPPED
 
 
-@pytest.mark.parametrize("seconds", [math.nan, math.inf, -1.0])
+@cases("seconds", [math.nan, math.inf, -1.0])
 def test_a_promise_without_end_is_none(seconds):
     it = armed(1.0)
     it.request(0.5)

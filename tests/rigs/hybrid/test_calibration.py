@@ -3,7 +3,7 @@
 import json
 from pathlib import Path
 
-import pytest
+from cases import cases
 
 from bench.clock import VirtualClock
 from bench.protocol import find_protocol
@@ -76,7 +76,7 @@ def test_a_calibration_stands_beside_its_rig_file_and_is_kept_with_the_run(tmp_p
     assert rig.derived["displacement"].calibration.uncertainty == 1e-9
 
 
-@pytest.mark.parametrize(("rig", "accuracy"), [("hybrid-witness", None), ("calibrated", 1e-9)])
+@cases(("rig", "accuracy"), [("hybrid-witness", None), ("calibrated", 1e-9)])
 def test_a_protocol_knows_how_accurate_its_response_is(tmp_path, rig, accuracy):
     if accuracy is not None:
         test_a_calibration_stands_beside_its_rig_file_and_is_kept_with_the_run(tmp_path)

@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from cases import cases
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
 from bench.control.notch_loop import NotchLoopParameters
@@ -238,8 +239,8 @@ def test_comparisons_are_far_worse(model):
     assert (thermal.voltages == 0.0).all()
 
 
-@pytest.mark.parametrize("offset", [0.0, 0.03, -0.03])
-@pytest.mark.parametrize("seed", range(4))
+@cases("offset", [0.0, 0.03, -0.03])
+@cases("seed", range(4))
 def test_fine_step(model, seed, offset):
     for size in (5 * MICRO, -5 * MICRO):
         settling, overshoot, rest = step_response(fine(model, step(size)), size, seed, resonance_offset=offset)
@@ -248,7 +249,7 @@ def test_fine_step(model, seed, offset):
         assert rest < 4 * NANO
 
 
-@pytest.mark.parametrize("current", [-0.08, 0.08])
+@cases("current", [-0.08, 0.08])
 def test_fine_step_where_the_thermal_part_has_gone(model, current):
     """Far from the middle, on a beam that is some 15 K colder or warmer, while its temperature still drifts."""
     plant = plant_of(8, 5)
@@ -277,8 +278,8 @@ def test_fine_loop_needs_its_notch(model):
     assert overshoot > 0.015
 
 
-@pytest.mark.parametrize(("seed", "change"), [(0, 5.0), (1, -5.0)])
-@pytest.mark.parametrize("place", [0.0, -40 * MICRO])
+@cases(("seed", "change"), [(0, 5.0), (1, -5.0)])
+@cases("place", [0.0, -40 * MICRO])
 def test_step_of_the_room_by_5_kelvin(model, seed, change, place):
     moves = SmoothMoves([0.0, place], SPEED, hold=40.0)
     at = moves.duration - 30.0
@@ -323,7 +324,7 @@ def test_errors_of_the_model_do_not_matter_much(model):
 # Limits.
 
 
-@pytest.mark.parametrize("estimator", ["unscented", "low-pass"])
+@cases("estimator", ["unscented", "low-pass"])
 def test_a_jump_beyond_the_limits_comes_in_without_overshoot(model, estimator):
     reference = step(60 * MICRO, 5.0)
     run = follow(HybridController(model, reference, settings(), estimator=estimator), reference, 40.0, 0)
@@ -376,7 +377,7 @@ def test_current_is_new_every_fourth_sample_and_time_counts_from_the_first(model
     assert all(k % 4 == 0 for k in changes)
 
 
-@pytest.mark.parametrize("estimator", ["unscented", "low-pass"])
+@cases("estimator", ["unscented", "low-pass"])
 def test_missing_readings_hold_and_are_got_over(model, estimator):
     moves = SmoothMoves([0.0, 30 * MICRO], SPEED, hold=30.0)
     controller = HybridController(model, moves, settings(), estimator=estimator)
@@ -414,7 +415,7 @@ def test_fine_loop_holds_at_a_missing_reading(model):
     assert -1 * MICRO < trace.disturbance < 0.0
 
 
-@pytest.mark.parametrize(
+@cases(
     ("part", "said"),
     [(0.07, ""), (0.09, "its error at rest is 8.1e-07 m RMS, and that of a model that holds at most 1.1e-06")],
 )
@@ -474,7 +475,7 @@ def test_reduced_network_agrees_with_the_whole_one():
         assert (reduced.numbers[-1] - before) / 1e-3 == pytest.approx(expected[:2].mean(), rel=1e-6)
 
 
-@pytest.mark.parametrize("current", [-0.15, -0.05, 0.02, 0.1])
+@cases("current", [-0.15, -0.05, 0.02, 0.1])
 def test_heat_fed_forward_is_that_of_the_steady_state(current):
     whole = Design().network()
     reduced = ReducedNetwork(whole, 22.0)
@@ -502,7 +503,7 @@ def test_bending_is_inverted_and_goes_on_straight(model):
     assert bending.rise(1.0) == bending.low
 
 
-@pytest.mark.parametrize("room", [22.0, 22.5])
+@cases("room", [22.0, 22.5])
 def test_kalman_filter_finds_deflection_and_offset(room):
     """On a simulation of the network itself, in a room that may be warmer than assumed; the sensor has an offset."""
     network = Design().network()
@@ -589,7 +590,7 @@ def folded():
     return identify_polynomial(rises, MICRO * rises**2, 2).model
 
 
-@pytest.mark.parametrize(
+@cases(
     ("make", "message"),
     [
         (lambda: settings(gain=-1.0), "gain: expected a positive"),
@@ -616,7 +617,7 @@ def test_wrong_input_is_named(make, message):
         make()
 
 
-@pytest.mark.parametrize(
+@cases(
     ("make", "message"),
     [
         (lambda m: fine(m, RANGE, rate=1e3), "frequency: expected rad/s between"),

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from cases import cases
 from short_runs import record_run
 
 from bench.errors import DataError
@@ -147,9 +148,7 @@ class TestReading:
 
 
 class TestSine:
-    @pytest.mark.parametrize(
-        ("rate", "frequency", "count"), [(0.5, 0.001, 1000), (50.0, 1.7, 400), (10.0, 0.1, 1000)]
-    )
+    @cases(("rate", "frequency", "count"), [(0.5, 0.001, 1000), (50.0, 1.7, 400), (10.0, 0.1, 1000)])
     def test_amplitude_and_phase_with_offset_and_drift(self, rate, frequency, count):
         times = np.arange(count) / rate
         wanted = 3e-6 * np.exp(0.7j)
@@ -180,7 +179,7 @@ class TestSine:
             found = sine_at(made_up(2.0, y=values), "y", 0.003)
             assert abs(found - np.exp(0.2j)) < 1e-9, periods
 
-    @pytest.mark.parametrize("count", [1, 50, 150, 198])
+    @cases("count", [1, 50, 150, 198])
     def test_less_than_two_periods_are_refused(self, count):
         with pytest.raises(DataError, match=r"a sine of 0.1 Hz needs at least two periods"):
             sine_at(made_up(0.1, y=np.zeros(count)), "y", 0.1)
@@ -196,8 +195,8 @@ class TestSine:
 
 
 class TestBandwidth:
-    @pytest.mark.parametrize("corner", [2.5e-3, 4.2e-3, 7.0e-3])
-    @pytest.mark.parametrize("lowest", [1e-4, 1e-3])
+    @cases("corner", [2.5e-3, 4.2e-3, 7.0e-3])
+    @cases("lowest", [1e-4, 1e-3])
     def test_of_a_lag_of_first_order(self, corner, lowest):
         frequencies = np.geomspace(lowest, 20e-3, 100)
         gains = 5.0 / np.sqrt(1 + (frequencies / corner) ** 2)
@@ -218,7 +217,7 @@ class TestBandwidth:
         gains = np.array([1.0, 0.8, 1.5, 0.6, 0.9])
         assert 3.0 < bandwidth_of(np.array([1.0, 2.0, 3.0, 4.0, 5.0]), gains) < 4.0
 
-    @pytest.mark.parametrize("gains", [[1.0, 0.9, 0.8], [1.0, math.nan, 0.8]])
+    @cases("gains", [[1.0, 0.9, 0.8], [1.0, math.nan, 0.8]])
     def test_one_that_is_not_reached(self, gains):
         with pytest.raises(DataError, match=r"the gain has not fallen by 3 dB up to 0.008 Hz"):
             bandwidth_of(np.array([0.001, 0.004, 0.008]), np.array(gains))
@@ -245,7 +244,7 @@ class TestPiezo:
         assert found.errors.rms < 1e-12
         np.testing.assert_allclose(found.operator.weights, self.OPERATOR.weights, atol=1e-12)
 
-    @pytest.mark.parametrize("drift", [lambda t: 2e-8 * t, lambda t: 1e-9 * t**2, lambda t: -3e-8 * t + 5e-10 * t**2])
+    @cases("drift", [lambda t: 2e-8 * t, lambda t: 1e-9 * t**2, lambda t: -3e-8 * t + 5e-10 * t**2])
     def test_without_what_drifts(self, drift):
         samples = self.samples(drift, noise=10e-9)
         found = identify_piezo(samples)
@@ -262,7 +261,7 @@ class TestPiezo:
         assert found.voltages[0] == 0.0
         np.testing.assert_array_equal(found.voltages[1:], samples[VOLTAGE][:-1])
 
-    @pytest.mark.parametrize("plays", [1, 5, 30])
+    @cases("plays", [1, 5, 30])
     def test_as_many_plays_as_wanted(self, plays):
         found = identify_piezo(self.samples(np.zeros_like), plays)
         assert found.operator.thresholds.size == plays
@@ -300,8 +299,8 @@ class TestIdentifying:
         found = identify_hybrid(*(runs[name] for name in PARTS), plays=4)
         assert found.model.hysteresis.thresholds.size == 4
 
-    @pytest.mark.parametrize("place", range(4))
-    @pytest.mark.parametrize("other", [*PARTS, "hybrid-excitation"])
+    @cases("place", range(4))
+    @cases("other", [*PARTS, "hybrid-excitation"])
     def test_a_run_of_another_kind_is_refused(self, runs, place, other):
         names = list(PARTS)
         if names[place] == other:

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import serial
+from cases import cases
 from short_runs import assert_refused
 
 from bench.clock import VirtualClock
@@ -112,13 +113,13 @@ class TestNoise:
             truth = plant.deflection, plant.base_temperature, plant.tip_temperature, plant.ambient_temperature
             return seen, bench.devices["tec"].glance(), truth
 
-    @pytest.mark.parametrize("name", RIGS)
+    @cases("name", RIGS)
     def test_the_same_seed_gives_the_same_readings(self, name):
         assert self.readings(name, 3) == self.readings(name, 3)
         for ours, theirs in zip(self.readings(name, 3), self.readings(name, 4), strict=True):
             assert ours != theirs
 
-    @pytest.mark.parametrize("name", RIGS)
+    @cases("name", RIGS)
     def test_how_often_one_instrument_is_asked_does_not_change_what_another_says(self, name):
         seldom = self.readings(name, 3)
         assert self.readings(name, 3, tec=5)[0] == seldom[0]
@@ -154,7 +155,7 @@ class TestAmplifier:
         wait(bench, 3.0)
         assert bench.plant.piezo_voltage == 0.0
 
-    @pytest.mark.parametrize("name", RIGS)
+    @cases("name", RIGS)
     def test_the_supply_drives_the_plant(self, name):
         with rig(name) as bench:
             lab, piezo = bench.laboratory, bench.devices["piezo"]
@@ -171,7 +172,7 @@ class TestAmplifier:
             assert lab.t7.tdac_volts(0) == 0.0
             assert not lab.t7.dio_level(ENABLE_LINE, pulled_down=True)
 
-    @pytest.mark.parametrize("name", RIGS)
+    @cases("name", RIGS)
     def test_a_silent_host_lets_the_line_fall(self, name):
         with rig(name) as bench:
             bench.devices["piezo"].set(30.0)
@@ -186,8 +187,8 @@ class TestAmplifier:
 
 
 class TestCooler:
-    @pytest.mark.parametrize("name", RIGS)
-    @pytest.mark.parametrize("current", [0.1501, -0.2, 0.4])
+    @cases("name", RIGS)
+    @cases("current", [0.1501, -0.2, 0.4])
     def test_no_more_than_its_current_limit(self, name, current):
         with rig(name) as bench:
             with pytest.raises(LimitError, match=r"tec: set-point .* A is outside of -0.15 to 0.15 A"):
@@ -207,8 +208,8 @@ class TestCooler:
             tec.set(0.06)
         tec.set(-0.05)
 
-    @pytest.mark.parametrize("name", RIGS)
-    @pytest.mark.parametrize("sign", [1.0, -1.0])
+    @cases("name", RIGS)
+    @cases("sign", [1.0, -1.0])
     def test_a_positive_current_heats_and_bends_down(self, name, sign):
         with rig(name) as bench:
             bench.devices["tec"].set(sign * 0.1)
@@ -247,7 +248,7 @@ class TestRoom:
 
 
 class TestResonance:
-    @pytest.mark.parametrize("offset", [-0.03, 0.0, 0.03, 0.1])
+    @cases("offset", [-0.03, 0.0, 0.03, 0.1])
     def test_is_where_it_is_told(self, offset):
         bench = laboratory(ambient_deviation=0.0, resonance_offset=offset)
         bench.plant.apply(20.0)
@@ -273,7 +274,7 @@ class TestFaults:
         ("amplifier-trips", "piezo", "piezo: the amplifier went off by itself"),
     )
 
-    @pytest.mark.parametrize(("fault", "device", "words"), FAULTS)
+    @cases(("fault", "device", "words"), FAULTS)
     def test_each_comes_at_its_instant_and_only_there(self, fault, device, words):
         with rig(fault=fault, fault_time=8.0) as bench:
             bench.devices["tec"].set(0.05)
@@ -304,7 +305,7 @@ class TestFaults:
         wait(bench, 4.0)
         assert bench.plant.piezo_voltage == pytest.approx(6.0 * GAIN, rel=5e-3)
 
-    @pytest.mark.parametrize(("fault", "number"), [("tec-over-current", 100), ("tec-over-temperature", 138)])
+    @cases(("fault", "number"), [("tec-over-current", 100), ("tec-over-temperature", 138)])
     def test_a_controller_that_tripped_drives_no_current(self, fault, number):
         with rig(fault=fault, fault_time=5.0) as bench:
             bench.devices["tec"].set(0.1)
@@ -335,7 +336,7 @@ class TestOpening:
                 with pytest.raises(serial.SerialException, match="there are: none"):
                     serial.serial_for_url(port)
 
-    @pytest.mark.parametrize("name", RIGS)
+    @cases("name", RIGS)
     def test_two_in_one_process_do_not_disturb_each_other(self, name):
         with rig(name, seed=1) as first, rig(name, seed=2) as second:
             second.devices["piezo"].set(20.0)
@@ -381,7 +382,7 @@ class TestWitness:
         finally:
             bench.close()
 
-    @pytest.mark.parametrize("request_", ["03 0000 0002", "03 0001 0004", "10 0000 0004 08 0000 0000 0000 0000"])
+    @cases("request_", ["03 0000 0002", "03 0001 0004", "10 0000 0004 08 0000 0000 0000 0000"])
     def test_has_one_value_that_can_only_be_read(self, request_):
         bench = laboratory()
         stream = bench.servers["witness"].connect()
@@ -420,8 +421,8 @@ class TestWitness:
 
 
 class TestSettings:
-    @pytest.mark.parametrize("name", RIGS)
-    @pytest.mark.parametrize(
+    @cases("name", RIGS)
+    @cases(
         ("key", "value", "words"),
         [
             ("ambient_deviation", "-0.1", "greater than or equal to 0"),

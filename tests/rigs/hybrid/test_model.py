@@ -6,6 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from cases import cases
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy import signal
@@ -266,7 +267,7 @@ def fitted():
 RISES = np.linspace(-10.0, 10.0, 21)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("make", "message"),
     [
         (lambda: model(polynomial=Polynomial([1e-6], (5.0, 10.0))), "expected a range of rises that extends to 0 K"),

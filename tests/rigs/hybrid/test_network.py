@@ -5,6 +5,7 @@ from dataclasses import fields, replace
 
 import numpy as np
 import pytest
+from cases import cases
 from scipy.integrate import solve_ivp
 
 from rigs.hybrid.design import Design, Geometry, Materials, Tec
@@ -86,7 +87,7 @@ def test_sensitivities():
     assert Design().piezo_sensitivity == pytest.approx(0.2687e-6, rel=1e-3)
 
 
-@pytest.mark.parametrize("seed", range(5))
+@cases("seed", range(5))
 def test_thermal_sensitivity_is_that_of_timoshenkos_bimetal(seed):
     rng = np.random.default_rng(seed)
     e_p, e_c, s_p, s_c = np.exp(rng.normal(0.0, 1.0, 4)) * [2e-4, 1e-4, 15e-12, 9e-12]
@@ -107,7 +108,7 @@ def test_piezo_and_thermal_strain_bend_alike():
     assert design.piezo_sensitivity / design.thermal_sensitivity == pytest.approx(-strain / expansion)
 
 
-@pytest.mark.parametrize("seed", range(10))
+@cases("seed", range(10))
 def test_rates_follow_kirchhoff(seed):
     rng = np.random.default_rng(seed)
     network = varied(rng)
@@ -116,7 +117,7 @@ def test_rates_follow_kirchhoff(seed):
     assert network.rates(temperatures, current, ambient) == pytest.approx(expected, rel=1e-9, abs=1e-10)
 
 
-@pytest.mark.parametrize("seed", range(10))
+@cases("seed", range(10))
 def test_stored_heat_is_electrical_power_less_heat_to_air(seed):
     rng = np.random.default_rng(seed)
     network = varied(rng, 0.3)
@@ -126,7 +127,7 @@ def test_stored_heat_is_electrical_power_less_heat_to_air(seed):
     assert stored == pytest.approx(taken, abs=1e-9)
 
 
-@pytest.mark.parametrize("current", [-0.4, -0.1, -0.025, 0.0, 0.025, 0.1, 0.3])
+@cases("current", [-0.4, -0.1, -0.025, 0.0, 0.025, 0.1, 0.3])
 def test_energy_balance_of_the_steady_state(current):
     settled = NETWORK.steady_state(current, 22.0)
     assert abs(heat_to_air(NETWORK, settled) - electrical_power(NETWORK, settled, current)) <= 1e-9
@@ -138,14 +139,14 @@ def test_heat_at_a_tenth_of_an_ampere():
     assert heat_to_air(NETWORK, settled) == pytest.approx(0.074556, rel=1e-4)
 
 
-@pytest.mark.parametrize("ambient", [-5.0, 22.0, 37.3])
+@cases("ambient", [-5.0, 22.0, 37.3])
 def test_rest_is_exactly_the_ambient_temperature(ambient):
     assert (NETWORK.steady_rises(0.0, ambient) == 0.0).all()
     assert (NETWORK.simulate(np.zeros(50), 7.0, ambient) == ambient).all()
     assert (NETWORK.rates(np.full(4, ambient), 0.0, ambient) == 0.0).all()
 
 
-@pytest.mark.parametrize(
+@cases(
     ("current", "base", "tip"),
     [(-0.1, -20.8, -17.3), (-0.05, -11.4, -9.5), (-0.025, -6.0, -5.0), (0.1, 30.1, 24.9)],
 )
@@ -259,7 +260,7 @@ def test_fit_to_exact_steps_finds_the_network():
     assert found.base.maximum < 1e-6
 
 
-@pytest.mark.parametrize("seed", range(3))
+@cases("seed", range(3))
 def test_fit_to_noisy_steps_is_right_within_its_uncertainties(seed):
     found = identify_network(STEPS, *measured(STEPS, 0.02, seed), 1.0)
     errors = [
@@ -311,7 +312,7 @@ def test_data_that_do_not_identify_are_refused():
         identify_network(single, *measured(single, 0.02), 1.0)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("make", "message"),
     [
         (lambda: Geometry(beam_length=0.0), "beam_length: expected a positive"),

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cases import cases
 from rich.console import Console
 from short_runs import all_messages
 
@@ -120,7 +121,7 @@ EXTREMES = {
 
 
 class TestPlan:
-    @pytest.mark.parametrize(("protocol", "steps", "seconds", "watched"), DEFAULTS)
+    @cases(("protocol", "steps", "seconds", "watched"), DEFAULTS)
     def test_as_they_are(self, files, protocol, steps, seconds, watched):
         settings = {"model": files["hybrid"]} if protocol in ("hybrid-control", "fine-step") else {}
         expected = planned(protocol, **settings)
@@ -132,8 +133,8 @@ class TestPlan:
         assert expected.prompts == 0
         assert expected.extremes == EXTREMES.get(protocol, {})
 
-    @pytest.mark.parametrize("protocol", [entry[0] for entry in DEFAULTS])
-    @pytest.mark.parametrize("rig", [PLAIN, WITNESSED])
+    @cases("protocol", [entry[0] for entry in DEFAULTS])
+    @cases("rig", [PLAIN, WITNESSED])
     def test_both_rigs_have_what_they_need(self, files, rig, protocol):
         settings = {"model": files["hybrid"]} if protocol in ("hybrid-control", "fine-step") else {}
         definition, parameters = parsed(protocol, settings)
@@ -142,7 +143,7 @@ class TestPlan:
             check_before_moving(connected.description, definition, plan(definition, parameters, slots))
             assert definition.controlled(slots) in ("", DEFLECTION)
 
-    @pytest.mark.parametrize("protocol", ["hybrid-control", "fine-step"])
+    @cases("protocol", ["hybrid-control", "fine-step"])
     def test_a_witness_only_where_there_is_one(self, files, protocol):
         settings = {"model": files["hybrid"], "witness": True}
         expected = planned(protocol, WITNESSED, **settings)
@@ -163,9 +164,7 @@ class TestPlan:
 
 
 class TestSetpoints:
-    @pytest.mark.parametrize(
-        "protocol", ["current-sine", "current-steps", "piezo-loops", "piezo-step", "hybrid-excitation"]
-    )
+    @cases("protocol", ["current-sine", "current-steps", "piezo-loops", "piezo-step", "hybrid-excitation"])
     def test_stay_within_what_the_rig_allows(self, protocol):
         for loop in loops(protocol):
             for k, actuator in enumerate(loop.actuators):
@@ -284,7 +283,7 @@ class TestReferences:
         loop.controller.update(12.0, (0.0, 22.0, 22.0))
         assert loop.controller.trace.reference > 1e-6
 
-    @pytest.mark.parametrize(
+    @cases(
         ("name", "kind"),
         [
             ("hybrid", HybridController),
@@ -302,7 +301,7 @@ class TestReferences:
         assert abs(voltage) <= 40.0
         assert (voltage == 0.0) or name != "thermal-feedback"
 
-    @pytest.mark.parametrize(("error", "said"), [(0.7e-6, []), (0.75e-6, [Caution])])
+    @cases(("error", "said"), [(0.7e-6, []), (0.75e-6, [Caution])])
     def test_an_open_loop_that_errs_is_warned_of(self, files, error, said):
         settings = {"model": files["hybrid"], "controller": "open-loop", "reference": "hold"}
         definition, parameters = parsed("hybrid-control", settings)
@@ -312,14 +311,14 @@ class TestReferences:
             loop.controller.update(k / loop.rate, (error if k else 0.0, 22.0, 22.0))
         assert [type(message) for message in messages] == said
 
-    @pytest.mark.parametrize(("rate", "record_rate", "every"), [(200, 200, 1), (200, 1000, 1), (100, 3, 33)])
+    @cases(("rate", "record_rate", "every"), [(200, 200, 1), (200, 1000, 1), (100, 3, 33)])
     def test_as_many_samples_as_wanted_are_recorded(self, files, rate, record_rate, every):
         (loop,) = loops("hybrid-control", model=files["hybrid"], rate=rate, record_rate=record_rate)
         assert loop.record_every == every
 
 
 class TestRefused:
-    @pytest.mark.parametrize(
+    @cases(
         ("protocol", "settings", "words"),
         [
             (
@@ -396,8 +395,8 @@ class TestRefused:
         assert line.startswith(f"protocol {protocol}: ")
         assert words in line
 
-    @pytest.mark.parametrize("protocol", ["hybrid-control", "fine-step"])
-    @pytest.mark.parametrize(
+    @cases("protocol", ["hybrid-control", "fine-step"])
+    @cases(
         ("name", "words"),
         [
             ("none", "cannot be read: No such file"),
@@ -410,7 +409,7 @@ class TestRefused:
             planned(protocol, model=files[name])
         assert str(files[name]) in str(caught.value)
 
-    @pytest.mark.parametrize("protocol", ["hybrid-control", "fine-step"])
+    @cases("protocol", ["hybrid-control", "fine-step"])
     def test_a_model_must_be_given(self, protocol):
         with pytest.raises(ConfigurationError, match=f"protocol {protocol}: parameter model is missing"):
             planned(protocol)
@@ -634,7 +633,7 @@ class TestBadInput:
         )  # fmt: skip
         assert (code, err) == (0, "")
 
-    @pytest.mark.parametrize(
+    @cases(
         ("protocol", "settings", "words"),
         [
             ("piezo-loops", {"amplitudes": "10, 60"}, "would set piezo to between -60 and 60 V"),

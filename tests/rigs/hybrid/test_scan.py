@@ -1,6 +1,7 @@
 """The sensors of the hybrid in one compiled call: the same readings as one conversion after the other."""
 
 import pytest
+from cases import cases
 
 from bench.clock import VirtualClock
 from bench.rig import Rig
@@ -30,11 +31,11 @@ def readings(*, scanned, then=None, **emulation):
 
 
 class TestScan:
-    @pytest.mark.parametrize("emulation", [{}, {"sensors": "ideal"}, {"tip_thermistor": "{lag = 0.5}"}])
+    @cases("emulation", [{}, {"sensors": "ideal"}, {"tip_thermistor": "{lag = 0.5}"}])
     def test_the_readings_are_those_of_single_conversions_to_the_last_bit(self, emulation):
         assert readings(scanned=True, **emulation) == readings(scanned=False, **emulation)
 
-    @pytest.mark.parametrize("fault", ["tip.drifting", "displacement.noisy", "base.stuck", "cantilever-stuck"])
+    @cases("fault", ["tip.drifting", "displacement.noisy", "base.stuck", "cantilever-stuck"])
     def test_they_are_while_a_fault_goes_on(self, fault):
         def then(laboratory):
             laboratory.inject(fault, duration=1.0)

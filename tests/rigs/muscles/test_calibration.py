@@ -4,13 +4,14 @@ import json
 from pathlib import Path
 
 import pytest
+from cases import cases
 
 from bench.calibration import Calibration
 
 ERRORS = {"gain_error": 0.01, "offset": 5e-4, "nonlinearity": 0.0}
 
 
-@pytest.mark.parametrize(
+@cases(
     ("protocol", "table", "signal", "place", "known"),
     [
         ("calibration-load", "force_sensor", "load_cell_force", 5.0, 0.01),

@@ -5,6 +5,7 @@ from dataclasses import MISSING, fields, replace
 
 import numpy as np
 import pytest
+from cases import cases
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -282,7 +283,7 @@ def test_force_between_fixed_ends(rounds):
     assert np.abs(errors[:, 1]).max() <= 0.15
 
 
-@pytest.mark.parametrize("load", ROUNDS)
+@cases("load", ROUNDS)
 def test_feedback_beats_open_loop_and_the_model_beats_feedback_alone(rounds, load):
     names = ("closed-loop-inverse", "proportional-integral", "open-loop-inverse")
     closed, proportional_integral, opened = (rms(rounds[load, name]) for name in names)
@@ -311,8 +312,8 @@ def test_length_while_the_load_changes(inverse):
     assert rms(errors) <= 0.02 * MILLIMETRE
 
 
-@pytest.mark.parametrize("name", ["closed-loop-inverse", "proportional-integral"])
-@pytest.mark.parametrize(("load", "side"), [(4.9, 0), (4.9, 1), (None, 0), (None, 1)])
+@cases("name", ["closed-loop-inverse", "proportional-integral"])
+@cases(("load", "side"), [(4.9, 0), (4.9, 1), (None, 0), (None, 1)])
 def test_out_of_reach_for_long_and_then_not(inverse, name, load, side):
     low, high = output_range(load)
     span = high - low
@@ -460,7 +461,7 @@ def test_proportional_integral_steps():
     assert controller.reach is Reach.TOO_LOW
 
 
-@pytest.mark.parametrize("name", ["closed-loop-inverse", "proportional-integral", "open-loop-inverse"])
+@cases("name", ["closed-loop-inverse", "proportional-integral", "open-loop-inverse"])
 def test_lasts_its_time_and_then_holds(inverse, name):
     controller = controllers(inverse, 4.9)[name]()
     loop, t = ReachTarget(controller, 1e-3), 7.0
@@ -481,7 +482,7 @@ def test_lasts_its_time_and_then_holds(inverse, name):
 # Wrong input.
 
 
-@pytest.mark.parametrize(
+@cases(
     ("make", "message"),
     [
         (lambda: Lag(-1.0), "time_constant: expected a finite"),
@@ -511,7 +512,7 @@ def test_wrong_input_is_named(make, message):
         make()
 
 
-@pytest.mark.parametrize(
+@cases(
     ("make", "message"),
     [
         (lambda i: replace(task(i, 4.9), walk_variance=0.0), "walk_variance: expected a positive"),
@@ -545,7 +546,7 @@ def test_time_does_not_go_back_and_targets_come_first(inverse):
 # Another specimen than the one that was identified.
 
 
-@pytest.mark.parametrize(("load", "factor"), [(4.9, 0.7), (None, 1.3)])
+@cases(("load", "factor"), [(4.9, 0.7), (None, 1.3)])
 def test_another_time_constant_is_found_while_the_wire_is_controlled(inverse, factor, load):
     low, high = output_range(load)
     found, constants = [], []

@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from cases import cases
 from short_runs import record_run
 
 from bench.errors import DataError
@@ -113,14 +114,14 @@ class TestReading:
         with pytest.raises(DataError, match="the run is failed; a model needs a completed one"):
             read_series(result.folder)
 
-    @pytest.mark.parametrize("other", ["length-voltage", "length-force", "length-verification", "creep"])
+    @cases("other", ["length-voltage", "length-force", "length-verification", "creep"])
     def test_another_protocol_is_no_resting_one(self, runs, other):
         with pytest.raises(
             DataError, match=f"{re.escape(runs[other].name)}: is a run of {other}; expected one of force-voltage$"
         ):
             read_resting(runs[other])
 
-    @pytest.mark.parametrize("other", ["force-voltage", "creep"])
+    @cases("other", ["force-voltage", "creep"])
     def test_another_protocol_has_no_series(self, runs, other):
         expected = "length-voltage or length-force or length-verification"
         with pytest.raises(
@@ -219,7 +220,7 @@ class TestIdentifying:
         rms = np.sqrt(np.mean(missed**2))
         assert errors_json(errors)["rms"] == pytest.approx(100 * rms / np.ptp(lengths), rel=1e-9)
 
-    @pytest.mark.parametrize("name", MODELS)
+    @cases("name", MODELS)
     def test_without_lengths_nothing_is_identified(self, name, resting):
         with pytest.raises(DataError, match=f"model {name} cannot be identified: .*series"):
             identify_muscle(name, resting, [])

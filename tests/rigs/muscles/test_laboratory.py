@@ -5,6 +5,7 @@ from contextlib import closing
 import numpy as np
 import pytest
 import serial
+from cases import cases
 from short_runs import assert_refused
 
 from bench.clock import VirtualClock
@@ -114,7 +115,7 @@ class TestFrame:
         # The stage stands still where it was.
         assert bench.frame.drum.position == pytest.approx(-6e-3, abs=8e-6)
 
-    @pytest.mark.parametrize("turns", [-256, 256])
+    @cases("turns", [-256, 256])
     def test_the_stage_has_end_stops(self, turns):
         bench = laboratory()
         bench.operate(STAGE, 0.0)
@@ -124,7 +125,7 @@ class TestFrame:
         assert abs(bench.frame.drum.position) > 6.0
         assert bench.muscle.parameters.reach == pytest.approx(abs(bench.muscle.position), rel=1e-3)
 
-    @pytest.mark.parametrize(("command", "volts"), [(-1000, 0.0), (1000, 5.0), (300, 3.0)])
+    @cases(("command", "volts"), [(-1000, 0.0), (1000, 5.0), (300, 3.0)])
     def test_the_muscle_gets_no_voltage_that_it_does_not_take(self, command, volts):
         bench = laboratory(battery_voltage=10.0)
         bench.supply.write_object(0x2000, command, 1)
@@ -178,7 +179,7 @@ class TestFrame:
 
 
 class TestOperator:
-    @pytest.mark.parametrize("name", RIGS)
+    @cases("name", RIGS)
     def test_hangs_a_load_and_fastens_the_end(self, name):
         with rig(name) as bench:
             bench.laboratory.operate(LOAD, 2.0)
@@ -197,7 +198,7 @@ class TestOperator:
         with pytest.raises(ConfigurationError, match="cannot carry out 'paint'; it can: load, stage"):
             laboratory().operate("paint", 1.0)
 
-    @pytest.mark.parametrize("load", [-1.0, 100.0, float("nan")])
+    @cases("load", [-1.0, 100.0, float("nan")])
     def test_a_load_that_the_muscle_does_not_bear_is_refused(self, load):
         bench = laboratory()
         bench.operate(LOAD, 1.0)
@@ -210,7 +211,7 @@ class TestOperator:
 
 
 class TestFaults:
-    @pytest.mark.parametrize(
+    @cases(
         ("fault", "device", "words"),
         [
             ("missing-heartbeat", "supply", "no heartbeat"),
@@ -231,7 +232,7 @@ class TestFaults:
                 bench.devices[device].glance()
             assert caught.value.device == device
 
-    @pytest.mark.parametrize(("fault", "expected"), [("forgotten-load", 0.3), ("heavy-load", 4.0), ("none", 2.0)])
+    @cases(("fault", "expected"), [("forgotten-load", 0.3), ("heavy-load", 4.0), ("none", 2.0)])
     def test_the_operator_errs_from_its_time_on(self, fault, expected):
         bench = laboratory(fault=fault, fault_time=10.0)
         bench.operate(LOAD, 0.3)
@@ -330,8 +331,8 @@ class TestNoise:
 
 
 class TestSettings:
-    @pytest.mark.parametrize("name", RIGS)
-    @pytest.mark.parametrize(
+    @cases("name", RIGS)
+    @cases(
         ("key", "value", "words"),
         [
             ("battery_voltage", "0", "greater than 0"),
@@ -348,7 +349,7 @@ class TestSettings:
     def test_what_is_wrong_is_one_message(self, name, key, value, words):
         assert_refused(name, key, value, words)
 
-    @pytest.mark.parametrize(
+    @cases(
         ("name", "key"),
         [("sma", "ambient_deviation"), ("coiled-polymer", "ambient_deviation"), ("mckibben", "pressure_deviation")],
     )
@@ -357,7 +358,7 @@ class TestSettings:
             load_rig(name, {f"emulation.{key}": "-1"})
         assert getattr(load_rig(name, {f"emulation.{key}": "0"}).laboratory_settings, key) == 0.0
 
-    @pytest.mark.parametrize("kind", [SMALaboratory, McKibbenLaboratory, CoiledPolymerLaboratory])
+    @cases("kind", [SMALaboratory, McKibbenLaboratory, CoiledPolymerLaboratory])
     def test_those_of_another_laboratory_are_refused(self, kind):
         other = SMALaboratory if kind is McKibbenLaboratory else McKibbenLaboratory
         with pytest.raises(TypeError, match=f"settings: expected {kind.Settings.__name__}"):

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cases import cases
 from short_runs import all_messages
 
 from bench.cli import main
@@ -142,7 +143,7 @@ class TestPlan:
         assert 0.0 <= min(first) < 1.0 < 2.0 < max(first) <= 3.0
         assert next(iter(samples_by_phase(dry("length-verification", sequence_seed=2)).values())) != first
 
-    @pytest.mark.parametrize(
+    @cases(
         ("protocol", "seconds", "prompts"),
         [
             # Fastening 10, reset 5 + 30 + 0.1, 2 cycles of 2 · 30, 37 samples of 30.
@@ -160,8 +161,8 @@ class TestPlan:
         assert found.at_most >= found.seconds
         assert found.prompts == prompts
 
-    @pytest.mark.parametrize("rig", ["sma", "sma-hardware"])
-    @pytest.mark.parametrize("protocol", [*CHARACTERIZATION, *CONTROL])
+    @cases("rig", ["sma", "sma-hardware"])
+    @cases("protocol", [*CHARACTERIZATION, *CONTROL])
     def test_set_points_lie_within_what_the_rig_allows(self, protocol, rig, files):
         limits = {entry.name: entry.settings for entry in load_rig(rig).devices}
         allowed = {
@@ -212,7 +213,7 @@ class TestPlan:
 
 
 class TestRefused:
-    @pytest.mark.parametrize("text", ["", ",", "1,,2", "1;2", "one", "1, nan", "inf", "1 2"])
+    @cases("text", ["", ",", "1,,2", "1;2", "one", "1, nan", "inf", "1 2"])
     def test_what_are_no_numbers(self, text):
         with pytest.raises(ConfigurationError, match=r"loads .*is not a finite number"):
             find_protocol("length-voltage").parse({"loads": text})
@@ -300,7 +301,7 @@ class TestRefused:
         assert f"vo2.toml: protocol {protocol} needs {missing}; the file binds: drive, response" in text
         assert not list(tmp_path.iterdir())
 
-    @pytest.mark.parametrize(
+    @cases(
         ("protocol", "settings", "words"),
         [
             (

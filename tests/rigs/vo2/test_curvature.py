@@ -2,6 +2,7 @@ import math
 
 import numpy as np
 import pytest
+from cases import cases
 from hypothesis import assume, given
 from hypothesis import strategies as st
 from pydantic import ValidationError
@@ -34,7 +35,7 @@ class TestForward:
         expected = curvature * LENGTH**2 / 2
         assert float(curvature_to_deflection(curvature, LENGTH)) == pytest.approx(expected, rel=1e-9)
 
-    @pytest.mark.parametrize("residual", [0.0, 200.0, -500.0, 1000.0])
+    @cases("residual", [0.0, 200.0, -500.0, 1000.0])
     def test_no_change_no_deflection(self, residual):
         assert float(curvature_to_deflection(0.0, LENGTH, residual)) == 0.0
 
@@ -85,15 +86,15 @@ class TestInverse:
         assert np.all(np.diff(curvatures) > 0)
         assert np.abs(curvatures).max() * LENGTH < LARGEST_ANGLE
 
-    @pytest.mark.parametrize("below", [1e-3, 1e-6, 1e-9, 1e-12, 1e-15, 1.2e-16])
+    @cases("below", [1e-3, 1e-6, 1e-9, 1e-12, 1e-15, 1.2e-16])
     def test_is_right_close_to_where_it_ends(self, below):
         deflection = LARGEST_DEFLECTION * (1.0 - below) * LENGTH
         angle = float(deflection_to_curvature(deflection, LENGTH)) * LENGTH
         # The curve is flat there: half of the digits of the angle are lost, none of the deflection.
         assert angle == pytest.approx(LARGEST_ANGLE, abs=3.0 * math.sqrt(below) + 1e-7)
 
-    @pytest.mark.parametrize("share", [0.7247, 1.0, 10.0, math.inf, math.nan])
-    @pytest.mark.parametrize("sign", [1.0, -1.0])
+    @cases("share", [0.7247, 1.0, 10.0, math.inf, math.nan])
+    @cases("sign", [1.0, -1.0])
     def test_is_nan_beyond_reach(self, share, sign):
         assert math.isnan(float(deflection_to_curvature(sign * share * LENGTH, LENGTH)))
 
@@ -106,13 +107,13 @@ class TestInverse:
         assert float(deflection_to_curvature(1e-15, LENGTH)) == pytest.approx(2e-15 / LENGTH**2, rel=1e-9)
         assert float(deflection_to_curvature(0.0, LENGTH)) == 0.0
 
-    @pytest.mark.parametrize(("at", "gain"), [(0.0, 22.2), (1846.0, 24.1)])
+    @cases(("at", "gain"), [(0.0, 22.2), (1846.0, 24.1)])
     def test_local_gain(self, at, gain):
         start = float(curvature_to_deflection(at, LENGTH))
         low, high = deflection_to_curvature([start - 0.5e-6, start + 0.5e-6], LENGTH)
         assert high - low == pytest.approx(gain, abs=0.1)
 
-    @pytest.mark.parametrize(("residual", "error"), [(200.0, -18.0), (500.0, -51.0), (1000.0, -123.0)])
+    @cases(("residual", "error"), [(200.0, -18.0), (500.0, -51.0), (1000.0, -123.0)])
     def test_error_of_taking_the_beam_for_straight(self, residual, error):
         deflection = curvature_to_deflection(1846.0, LENGTH, residual)
         naive = float(deflection_to_curvature(deflection, LENGTH))
@@ -120,8 +121,8 @@ class TestInverse:
         assert float(deflection_to_curvature(deflection, LENGTH, residual)) == pytest.approx(1846.0, rel=1e-10)
 
 
-@pytest.mark.parametrize("length", [0.0, -1e-6, math.nan, math.inf])
-@pytest.mark.parametrize("convert", [curvature_to_deflection, deflection_to_curvature])
+@cases("length", [0.0, -1e-6, math.nan, math.inf])
+@cases("convert", [curvature_to_deflection, deflection_to_curvature])
 def test_refuses_a_length_that_is_none(convert, length):
     with pytest.raises(ValueError, match="length: expected a positive number"):
         convert(1.0, length)
