@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
@@ -81,6 +82,15 @@ def is_alive(process: int) -> bool:
 def is_on(rig: EmulatedRig) -> bool:
     """Whether the true output of the TEC is on."""
     return bool(rig.control.state()["tec_output"])
+
+
+def check_at_once(names: Iterable[str], check: Callable[[str], None]) -> None:
+    """Carry checks out beside each other, as each mostly waits; all that fail are named."""
+    with ThreadPoolExecutor(16) as pool:
+        pending = {name: pool.submit(check, name) for name in names}
+    failures = {name: error for name, future in pending.items() if (error := future.exception()) is not None}
+    if failures:
+        raise BaseExceptionGroup(f"failed: {', '.join(failures)}", [*failures.values()])
 
 
 def seconds_until(condition: Callable[[], bool], longest: float = LONG) -> float:

@@ -82,11 +82,12 @@ class GuardedRun:
         self._rig = rig
         command = [sys.executable, "-P", "-m", "bench", "run", f"{PROTOCOLS}:{protocol}", "--rig", rig.name]
         command += ["--attach", str(rig.endpoints_file), "--no-rehearse", *options]
-        for option, values in (("--override", overrides), ("--set", parameters)):
-            for key, value in values.items():
-                command += [option, f"{key}={value}"]
         with ExitStack() as stack:
             folder = Path(stack.enter_context(TemporaryDirectory(prefix="guarded-run-")))
+            self._go = folder / "go"
+            for option, values in (("--override", overrides), ("--set", {"until": str(self._go), **parameters})):
+                for key, value in values.items():
+                    command += [option, f"{key}={value}"]
             self._runs = folder / "runs"
             self._runs.mkdir()
             self._said = folder / "said.txt"
@@ -128,11 +129,16 @@ class GuardedRun:
         return " ".join(self._said.read_text(errors="replace").split())
 
     def await_on(self, count: int) -> None:
-        """Wait until everything is on, and find the guardian."""
+        """Wait until everything is on, and find the guardian; then the protocol may go wrong."""
         self.await_note("everything is on")
         assert len(found := outputs_on(self._rig)) >= count, f"only {found} is on"
         self.guardian = find_guardian(self.process.pid)
         self.rescuer = rescuer_of(self.guardian)
+        self.let_it_go_wrong()
+
+    def let_it_go_wrong(self) -> None:
+        """Make the file at which the protocol goes wrong."""
+        self._go.touch()
 
     def await_note(self, text: str) -> float:
         """Wait until the run has recorded a note; return the laboratory time at which it did, s."""

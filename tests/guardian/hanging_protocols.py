@@ -14,7 +14,7 @@ class Parameters(ProtocolParameters):
     setpoints: str = parameter("{}", unit="", help="set-points by device, JSON")
     then: str = parameter("{}", unit="", help="set-points by device, JSON, sent once everything is on")
     seconds: float = parameter(600.0, unit="s", low=0, high=86400, help="how long it holds")
-    before: float = parameter(1.0, unit="s", low=0, high=86400, help="how long it holds before it computes")
+    until: str = parameter("", unit="", help="file at which it goes wrong, once everything is on")
 
 
 def _hold(parameters: Parameters, seconds: float) -> Generator[Message, Reading, Reading]:
@@ -23,6 +23,15 @@ def _hold(parameters: Parameters, seconds: float) -> Generator[Message, Reading,
         yield Step({device: value}, Dwell(0.2))
     yield Note("everything is on")
     return (yield Step(json.loads(parameters.then), Dwell(seconds)))
+
+
+def _hold_until(parameters: Parameters) -> Generator[Message, Reading, bool]:
+    """Hold everything on until the file is there; return False in the dry run, whose readings are empty."""
+    reading = yield from _hold(parameters, 0.2)
+    while reading.values and not Path(parameters.until).exists():
+        reading = yield Step({}, Dwell(0.2))
+    yield Note("computing")
+    return bool(reading.values)
 
 
 @protocol(needs=())
@@ -34,10 +43,8 @@ def hold(parameters: Parameters) -> Messages:
 @protocol(needs=())
 def spin(parameters: Parameters) -> Messages:
     """Compute for ever."""
-    reading = yield from _hold(parameters, parameters.before)
-    yield Note("computing")
-    # Not in the dry run, whose readings are empty.
-    while reading.values:
+    goes_wrong = yield from _hold_until(parameters)
+    while goes_wrong:
         pass
 
 
@@ -45,7 +52,9 @@ def spin(parameters: Parameters) -> Messages:
 def think(parameters: Parameters) -> Messages:
     """Compute for ever before anything is set."""
     yield Note("computing")
-    reading = yield Step({}, Dwell(parameters.before))
+    reading = yield Step({}, Dwell(0.2))
+    while reading.values and not Path(parameters.until).exists():
+        reading = yield Step({}, Dwell(0.2))
     while reading.values:
         pass
 
@@ -53,9 +62,7 @@ def think(parameters: Parameters) -> Messages:
 @protocol(needs=())
 def keep_interpreter(parameters: Parameters) -> Messages:
     """Run code that never gives up Python's lock."""
-    reading = yield from _hold(parameters, 1.0)
-    yield Note("computing")
-    if reading.values:
+    if (yield from _hold_until(parameters)):
         # PyDLL keeps the lock while the function runs.
         ctypes.PyDLL(None).sleep(60)
     yield Note("computed")
@@ -74,8 +81,7 @@ def talk(parameters: Parameters) -> Messages:
 @protocol(needs=())
 def leave(parameters: Parameters) -> Messages:
     """End the process as if all were well."""
-    reading = yield from _hold(parameters, parameters.before)
-    if reading.values:
+    if (yield from _hold_until(parameters)):
         os._exit(0)
 
 

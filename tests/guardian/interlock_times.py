@@ -246,7 +246,8 @@ def carry_out(rig: EmulatedRig, case: Case, protocol: str) -> Found:
     setpoints = SETPOINTS[rig.name] if case.setpoints is None else case.setpoints
     parameters = {"setpoints": json.dumps(setpoints), "then": json.dumps(case.then)}
     if protocol == "spin":
-        parameters["before"] = "0.02"
+        # A file that there is: it computes as soon as everything is on.
+        parameters["until"] = __file__
     with ExitStack() as stack:
         stack.callback(rig.control.advance, REST)
         if case.fault:

@@ -5,20 +5,23 @@ import json
 import re
 import signal
 import sys
+from functools import partial
 from pathlib import Path
 
 import pytest
-from benches import LONG, connected, seconds_until
+from benches import IN_TIME, LONG, check_at_once, connected, is_on, seconds_until
 from guarded_run import SETPOINTS, GuardedRun, find_guardian
+from kill_safe import DEATH, PATIENCE, PROMISE
 
 from bench.errors import ConfigurationError
 from bench.journal import BLACK_BOX_NAME, Record, ending_of
 from bench.locks import is_in_use
 from bench.results.run_list import list_runs
+from sim_devices.serving.process import serve
 
 pytestmark = [
     pytest.mark.usefixtures("warm_popen"),
-    pytest.mark.timeout(300),
+    pytest.mark.timeout(600),
     pytest.mark.skipif(not sys.platform.startswith("linux"), reason="it looks for processes as on Linux"),
 ]
 
@@ -30,11 +33,22 @@ HUNG = r"the bench hung: it has not come back within the \d s that it promised \
 GONE = "the bench is gone: its process was killed, crashed or left"
 
 
+def start_telling(rig, protocol, *targets):
+    """Start a run that switches everything on, and tells targets of its end."""
+    parameters = {"setpoints": json.dumps(SETPOINTS["vo2"])}
+    options = [f"--notify={target}" for target in targets]
+    return GuardedRun(rig, protocol, {"safety.patience": "3"}, parameters, options=options)
+
+
 @pytest.fixture
 def listener(tmp_path):
     """A program that writes down what it is told, a line each time; its command, and what it has written."""
-    out = tmp_path / "told.jsonl"
-    program = tmp_path / "listen.py"
+    return make_listener(tmp_path)
+
+
+def make_listener(folder):
+    out = folder / "told.jsonl"
+    program = folder / "listen.py"
     program.write_text(
         "import json, sys\n"
         "facts = json.loads(sys.stdin.buffer.read())\n"
@@ -53,31 +67,35 @@ def started(vo2, listener):
     """What starts a run that switches everything on, and tells the listener and one that cannot be reached."""
 
     def start(protocol, *targets):
-        # Time to find its guardian before it goes wrong.
-        parameters = {"setpoints": json.dumps(SETPOINTS["vo2"]), "before": "4"}
-        targets = targets or (f"http://127.0.0.1:1/{TOKEN}", listener[0])
-        options = [f"--notify={target}" for target in targets]
-        return GuardedRun(vo2, protocol, {"safety.patience": "3"}, parameters, options=options)
+        return start_telling(vo2, protocol, *(targets or (f"http://127.0.0.1:1/{TOKEN}", listener[0])))
 
     yield start
     vo2.control.power_cycle("tec")
 
 
-@pytest.mark.parametrize(
-    ("protocol", "sent", "reason"),
-    [
-        pytest.param("spin", None, HUNG, id="endless loop"),
-        pytest.param("hold", signal.SIGSTOP, HUNG, id="SIGSTOP"),
-        pytest.param("hold", signal.SIGKILL, GONE, id="SIGKILL"),
-        pytest.param("leave", None, GONE, id="os._exit(0)"),
-    ],
-)
-def test_it_is_told_once_and_recorded_and_the_rig_is_free(started, listener, protocol, sent, reason):
-    _, told = listener
-    with started(protocol) as run:
+ENDINGS = {
+    "endless loop": ("spin", None, HUNG, PATIENCE),
+    "SIGSTOP": ("hold", signal.SIGSTOP, HUNG, PROMISE),
+    "SIGKILL": ("hold", signal.SIGKILL, GONE, DEATH),
+    "os._exit(0)": ("leave", None, GONE, DEATH),
+}
+"""By name: what runs, what the bench is sent, what is told, and the time within which the outputs are off, s."""
+
+
+def test_it_is_told_once_and_recorded_and_the_rig_is_free(tmp_path):
+    check_at_once(ENDINGS, partial(check_what_is_told, tmp_path))
+
+
+def check_what_is_told(folder, name):
+    protocol, sent, reason, within = ENDINGS[name]
+    own = folder / protocol / str(sent)
+    own.mkdir(parents=True)
+    command, told = make_listener(own)
+    with serve("vo2", clock="x1") as rig, start_telling(rig, protocol, f"http://127.0.0.1:1/{TOKEN}", command) as run:
         run.await_on(1)
         if sent is not None:
             run.process.send_signal(sent)
+        assert seconds_until(lambda: not is_on(rig)) < within + IN_TIME
         seconds_until(told)
         # By its guardian, where it has not ended by itself.
         run.process.wait(LONG)
@@ -109,6 +127,7 @@ def test_a_bench_that_hangs_before_it_has_set_anything_is_told_and_ended(started
     with started("think") as run:
         run.await_note("computing")
         run.guardian = find_guardian(run.process.pid)
+        run.let_it_go_wrong()
         if sent is not None:
             run.process.send_signal(sent)
         seconds_until(told)
