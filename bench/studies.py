@@ -69,6 +69,8 @@ class Campaign:
         Of the figures.
     records : bool
         Whether to make recordings.
+    settings : mapping of str to mapping of str to str
+        Parameters that are set in each run of a protocol, by the name of the protocol.
     started : list of Pending
         The runs that were started so far, in the parts of this campaign as well.
     """
@@ -80,6 +82,7 @@ class Campaign:
     workers: Workers
     figure_format: str = "png"
     records: bool = True
+    settings: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     started: list[Pending[RunResult]] = field(default_factory=list)
     _recordings: dict[Path, Pending[list[Path]]] = field(default_factory=dict)
     _seeds: Iterator[int] = field(init=False)
@@ -111,12 +114,13 @@ class Campaign:
         Its seed depends on how many were started before it. Its `result()` raises BenchError if the run did not
         complete, or the safe state was not confirmed; its record is kept.
         """
+        settings = {**settings, **self.settings.get(protocol, {})}
         telling = [f"{key}={value}" for key, value in settings.items() if len(value) <= _TELLING]
         run = self.workers.submit_as(
             " ".join([protocol, *telling]),
             _carry_out,
             protocol,
-            dict(settings),
+            settings,
             rig or self.rig,
             dict(overrides or {}),
             next(self._seeds),
@@ -346,6 +350,7 @@ def reproduce(
     console: Console,
     workers: int | None = None,
     figure_format: str = "png",
+    settings: Mapping[str, Mapping[str, str]] | None = None,
 ) -> dict[str, Any]:
     """Carry out a study, export the recordings of its runs, and print its tables.
 
@@ -373,12 +378,14 @@ def reproduce(
         given. The values do not depend on it.
     figure_format : {"png", "pdf", "svg"}
         Of the figures.
+    settings : mapping of str to mapping of str to str, optional
+        Parameters that are set in each run of a protocol, such as `{"tracking": {"count": "20"}}`.
 
     Raises
     ------
     ConfigurationError
-        If a rig is given to a study that runs on several, a live view is asked for with several workers, or
-        matplotlib is not installed.
+        If a rig is given to a study that runs on several, a live view is asked for with several workers, a protocol
+        or a parameter that is set does not exist, or matplotlib is not installed.
     BenchError
         If a run did not complete; its record is kept.
     """
@@ -386,6 +393,9 @@ def reproduce(
         raise ConfigurationError(f"--rig {rig}: the study {name} runs on several rigs of its own")
     if live and workers not in (None, 1):
         raise ConfigurationError(f"--workers {workers}: with the live view runs follow one another; leave it out")
+    settings = settings or {}
+    for protocol in settings:
+        find_protocol(protocol)
     check_extra("a figure", "matplotlib", "report")
     try:
         check_extra("an .rrd file", "rerun", "dashboard")
@@ -402,9 +412,12 @@ def reproduce(
         from bench.compilation_display import CompilationDisplay
 
         with CompilationDisplay(console, console):
-            campaign = Campaign(rig or study.rig or "", folder, seed, live, pool, figure_format, recorded)
+            on = rig or study.rig or ""
+            campaign = Campaign(on, folder, seed, live, pool, figure_format, recorded, settings)
             found = study.carry_out(campaign)
             recordings = campaign.recordings()
+    for protocol in settings.keys() - {_protocol_of(run) for run in campaign.runs if settings}:
+        print_plain(console, f"note: parameters of {protocol} are set, but the study has no run of it")
     values = {
         "seed": seed,
         **found.values,
@@ -419,6 +432,11 @@ def reproduce(
         console.print()
     _print_end(found.verdict, values, console)
     return values
+
+
+def _protocol_of(run: RunResult) -> str:
+    with Record(run.folder) as record:
+        return str(record.meta["protocol"])
 
 
 def reached_targets(run: RunResult, signal: str) -> TargetResults:

@@ -19,6 +19,7 @@ from bench.cli.console import (
     LiveOption,
     check_outputs,
     console,
+    parse_assignments,
     show_compilation,
     write_json,
 )
@@ -83,6 +84,14 @@ class Studies(RegisteredCommands):
                 str | None,
                 typer.Option("--rig", metavar="RIG", help="Another rig with the same signals."),
             ] = None,
+            set_: Annotated[
+                list[str] | None,
+                typer.Option(
+                    "--set",
+                    metavar="PROTOCOL.KEY=VALUE",
+                    help="Set a parameter in each run of a protocol; repeatable.",
+                ),
+            ] = None,
             seed: Annotated[
                 int, typer.Option(min=0, help="Seed of all noise in the emulated laboratory and of random sequences.")
             ] = 0,
@@ -102,6 +111,12 @@ class Studies(RegisteredCommands):
             from bench.studies import reproduce
 
             check_outputs(folder=out)
+            settings: dict[str, dict[str, str]] = {}
+            for name_of_parameter, text in parse_assignments("--set", set_ or []).items():
+                protocol, dot, parameter = name_of_parameter.partition(".")
+                if not dot:
+                    raise ConfigurationError(f"--set {name_of_parameter}={text}: expected PROTOCOL.KEY=VALUE")
+                settings.setdefault(protocol, {})[parameter] = text
             result = reproduce(
                 name,
                 part,
@@ -112,6 +127,7 @@ class Studies(RegisteredCommands):
                 console=console,
                 workers=workers,
                 figure_format=figures.value,
+                settings=settings,
             )
             write_json(json_file, result)
 

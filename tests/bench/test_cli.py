@@ -115,6 +115,12 @@ class TestHelp:
     def test_parameters_of_the_muscles_protocols(self, bench, tmp_path, protocol, parameters):
         assert_shown(bench, tmp_path / "list.json", protocol, parameters)
 
+    def test_a_parameter_of_a_study_is_set_with_its_protocol(self, bench, tmp_path):
+        for wrong in ("count=9", "nothing.count=9"):
+            code, _, err = bench("reproduce", "vo2", "--set", wrong, "--out", tmp_path / "out")
+            assert (code, err.count("error: ")) == (2, 1)
+            assert not (tmp_path / "out").exists()
+
     def test_help_says_what_exit_codes_mean(self, bench):
         _, out, _ = bench("--help")
         assert "Exit codes" in out

@@ -49,6 +49,19 @@ def test_a_study_gives_the_same_to_the_last_bit_with_one_worker_and_with_two(car
     assert results[1] == results[2]
 
 
+def test_parameters_are_set_in_each_run_of_a_protocol(carried_out, tmp_path):
+    with pytest.raises(ConfigurationError, match="there is no protocol 'creeps'"):
+        carried_out(small_study.STUDY, 1, settings={"creeps": {"duration": "3"}})
+    assert not (tmp_path / "1").exists()
+    _, text = carried_out(small_study.STUDY, 1, settings={"creep": {"duration": "3"}, "tracking": {"count": "9"}})
+    assert "parameters of tracking are set" in text
+    folders = [*(tmp_path / "1").glob("*/vo2-creep-*")]
+    assert len(folders) == 4
+    for folder in folders:
+        with Record(folder) as record:
+            assert record.meta["parameters"]["duration"] == 3.0
+
+
 def test_a_run_that_fails_ends_the_study_with_its_error(carried_out, tmp_path):
     with pytest.raises(BenchError, match="1000"):
         carried_out(small_study.WRONG, 2)

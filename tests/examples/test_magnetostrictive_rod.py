@@ -113,7 +113,8 @@ def test_its_protocol_finds_the_coercivity(python, tmp_path):
 def test_its_study_is_reproduced(python, tmp_path):
     # In processes that have to find its package as well.
     out = ("--workers", "2", "--out", tmp_path, "--json", tmp_path / "study.json")
-    shown = python(*BENCH, "reproduce", "magnetostrictive-rod", *out)
+    short = ("--set", "tracking.count=8", "--set", "damped-oscillation.half_cycles=16")
+    shown = python(*BENCH, "reproduce", "magnetostrictive-rod", *short, *out)
     found = json.loads((tmp_path / "study.json").read_text())
     assert "models of the rod, RMS errors in µm/m (seed 0)" in shown
     for model in ("quadratic-play", "preisach-signed"):
