@@ -80,7 +80,6 @@ def test_the_readme_shows_median_and_worst_of_the_tables(row):
         ("vo2", "tracking.open_loop_inverse.rms", ROWS["VO2: 60 targets"][0]),
         ("vo2", "tracking.integral_equal_time.rms", (VO2, "integral, time", "RMS")),
         ("sma", "verification.two_stage.rms", ROWS["SMA wire: two-stage model"][0]),
-        ("sma", "control.length_4.9N.closed_loop_inverse.rms", ROWS["SMA wire: length"][1]),
         (
             "muscles",
             "mckibben.verification.summed.rms",
