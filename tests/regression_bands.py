@@ -15,8 +15,11 @@ RECORDED = Path(__file__).parent / "reproduce" / "recorded"
 ERRORS = {"rms", "max", "median", "average", "settling", "seconds"}
 BAND = 1.5
 RECORDED_SEED = 0
-SHORT = {"sma": ("length-control.count=10", "force-control.count=10")}
-"""Settings with which a study takes a third of its time, with fewer targets; the others are recorded whole."""
+SHORT = {
+    "sma": ("length-control.count=10", "force-control.count=10"),
+    "hybrid": ("hybrid-control.positions=90e-6, -120e-6",),
+}
+"""Settings with which a study takes less time, with fewer targets and moves; the others are recorded whole."""
 
 
 def options_of(study):
