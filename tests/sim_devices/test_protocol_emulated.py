@@ -262,6 +262,13 @@ class TestUnsolicited:
         assert clock.now() == 0.5
         assert port.in_waiting == 1
 
+    def test_a_question_forgets_what_came_before_and_keeps_what_comes_meanwhile(self, port, clock):
+        clock.sleep(0.7)
+        port.baudrate = 100
+        assert port.ask(b"1234") == b"b"
+        assert clock.now() == pytest.approx(1.1)
+        assert port.in_waiting == 0
+
     def test_it_can_be_forgotten(self, port, clock):
         clock.sleep(0.7)
         port.reset_input_buffer()
