@@ -177,7 +177,8 @@ def main() -> int:
 
 
 def _read(signs: queue.SimpleQueue[bytes]) -> None:
-    while sign := os.read(sys.stdin.fileno(), 4096):
+    # From the buffer, which may have taken in more than the first line.
+    while sign := sys.stdin.buffer.read1(4096):
         signs.put(sign)
     signs.put(b"")
 

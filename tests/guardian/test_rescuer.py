@@ -1,6 +1,9 @@
 """When a rescuer takes a rig over."""
 
+import json
 import queue
+import subprocess
+import sys
 
 import pytest
 
@@ -47,3 +50,13 @@ def test_silence_is_told_from_signs_that_come_late():
     assert is_needed(signs)
     assert SILENCE <= signs.waited < SILENCE + 0.5
     assert len(signs._signs) < 1000
+
+
+def test_one_that_is_released_before_it_is_ready_does_nothing(tmp_path):
+    """As by a guardian that is refused the rig: what it writes comes at once."""
+    report = tmp_path / "report.json"
+    content = {"rig": "vo2", "overrides": {}, "attach": None, "report": str(report), "guardian": 1}
+    command = [sys.executable, "-P", "-m", "bench.guardian.rescuer"]
+    done = subprocess.run(command, input=json.dumps(content).encode() + b"\n.!", check=False)
+    assert done.returncode == 0
+    assert json.loads(report.read_text())["devices"] == {}
