@@ -16,10 +16,11 @@ ERRORS = {"rms", "max", "median", "average", "settling", "seconds"}
 BAND = 1.5
 RECORDED_SEED = 0
 SHORT = {
+    "vo2": ("tracking.count=20", "following.duration=400"),
     "sma": ("length-control.count=10", "force-control.count=10"),
     "hybrid": ("hybrid-control.positions=90e-6, -120e-6",),
 }
-"""Settings with which a study takes less time, with fewer targets and moves; the others are recorded whole."""
+"""Settings with which a study takes less time, with fewer targets and moves; another one is recorded whole."""
 
 
 def options_of(study):
