@@ -45,7 +45,7 @@ test-quick: lint
 	$(PYTEST) --hypothesis-profile=brief -m 'not benchmark and not seeds and not slow' \
 		tests/hysteresis tests/identification tests/control tests/contracts tests/drivers
 
-# Everything, the first seed of each study.
+# Everything, with a short run of each study.
 test: preflight tests check
 
 # Everything, all seeds.

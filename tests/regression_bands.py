@@ -18,14 +18,15 @@ RECORDED_SEED = 0
 SHORT = {
     "vo2": ("tracking.count=20", "following.duration=400"),
     "sma": ("length-control.count=10", "force-control.count=10"),
+    "muscles": ("length-voltage.points=19", "length-verification.points=9", "length-force.points=8"),
     "hybrid": ("hybrid-control.positions=90e-6, -120e-6",),
 }
-"""Settings with which a study takes less time, with fewer targets and moves; another one is recorded whole."""
+"""Settings with which a study takes less time: fewer targets, points and moves."""
 
 
 def options_of(study):
-    """Return the options of `bench reproduce` for the study as it is recorded."""
-    return [text for setting in SHORT.get(study, ()) for text in ("--set", setting)]
+    """Return the options of `bench reproduce` for the short study."""
+    return [text for setting in SHORT[study] for text in ("--set", setting)]
 
 
 def errors_of(result):

@@ -78,11 +78,6 @@ def test_the_readme_shows_median_and_worst_of_the_tables(row):
     [
         ("vo2", "identification.nonmonotonic.max", ROWS["VO2: proposed model, identification"][0]),
         ("sma", "verification.two_stage.rms", ROWS["SMA wire: two-stage model"][0]),
-        (
-            "muscles",
-            "mckibben.verification.summed.rms",
-            ("McKibben muscle", "verification | Summed", "bench"),
-        ),
     ],
 )
 def test_the_session_that_is_recorded_lies_within_the_ten(study, number, place):
