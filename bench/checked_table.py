@@ -34,11 +34,11 @@ def _with_numbers(schema: Any) -> Any:  # noqa: ANN401 - a schema, or part of on
                 (_with_numbers(each[0]), *each[1:]) if isinstance(each, tuple) else _with_numbers(each)
                 for each in inner
             ]
-        elif "type" in inner:
-            changed[key] = _with_numbers(inner)
-        else:
-            # Fields by name, or the choices of a union by tag.
+        elif key in ("fields", "choices"):
+            # Fields by name, of which one may be `type`, and choices of a union by tag.
             changed[key] = {name: _with_numbers(each) for name, each in inner.items()}
+        else:
+            changed[key] = _with_numbers(inner)
     return changed
 
 
@@ -59,4 +59,5 @@ class CheckedTable(BaseModel):
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:  # noqa: ANN401
         """Return the schema of pydantic, with numbers that may not be `true` or `false`."""
-        return _with_numbers(handler(source))
+        schema: CoreSchema = _with_numbers(handler(source))
+        return schema

@@ -1,3 +1,5 @@
+import struct
+
 import numpy as np
 import pytest
 from cases import cases
@@ -259,3 +261,16 @@ class TestExcitation:
 
     def test_a_few_repetitions_are_no_plateau(self):
         assert check_excitation(self.columns(np.repeat(np.arange(10), 2)), "force") == []
+
+
+def test_a_damaged_page_of_a_parquet_file_is_refused(tmp_path):
+    pa, pq = pytest.importorskip("pyarrow"), pytest.importorskip("pyarrow.parquet")
+    path = tmp_path / "m.parquet"
+    values = [float(i) for i in range(100)]
+    pq.write_table(pa.table({"u": values}), path, write_page_checksum=True, compression="none", use_dictionary=False)
+    assert read_columns(path, ["u"]).values["u"].tolist() == values
+    content = bytearray(path.read_bytes())
+    content[content.index(struct.pack("<d", 50.0)) + 6] ^= 1
+    path.write_bytes(content)
+    with pytest.raises(DataError, match="cannot be read"):
+        read_columns(path, ["u"])

@@ -61,6 +61,8 @@ class Limits(CheckedTable):
 
 
 class Tables(CheckedTable):
+    # A name that schemas of pydantic have as well.
+    type: str = ""
     limits: tuple[Limits, ...] = ()
 
 

@@ -37,7 +37,9 @@ def read_parquet(path: Path, names: Sequence[str], options: ReadingOptions) -> R
             texts = pq.read_schema(path).names
             heads = make_heads(texts)
             places = [find_place(path, heads, len(heads), name) for name in names]
-            table = pq.ParquetFile(path).read(columns=[texts[place] for place in places])
+            table = pq.ParquetFile(path, page_checksum_verification=True).read(
+                columns=[texts[place] for place in places]
+            )
             found = [table.column(texts[place]) for place in places]
             are_moments = [pa.types.is_timestamp(column.type) for column in found]
             found = [
