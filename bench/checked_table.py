@@ -59,5 +59,5 @@ class CheckedTable(BaseModel):
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:  # noqa: ANN401
         """Return the schema of pydantic, with numbers that may not be `true` or `false`."""
-        schema: CoreSchema = _with_numbers(handler(source))
+        schema: dict[str, Any] = _with_numbers(handler(source))
         return schema
