@@ -179,7 +179,9 @@ def models() -> dict[str, tuple[str, str]]:
 def write_measurements(folder: Path) -> Path:
     """Write measurements of a hysteresis; return the file."""
     file = folder / "data.csv"
-    rows = (f"{0.1 * i},{math.sin(0.1 * i) * (1 + 0.002 * i)},{math.sin(0.1 * i - 0.3)}" for i in range(200))
+    rows = (
+        f"{0.1 * i},{52 + 20 * math.sin(0.1 * i) * (1 + 0.002 * i)},{math.sin(0.1 * i - 0.3)}" for i in range(200)
+    )
     file.write_text("\n".join(["t,u,y", *rows, ""]), encoding="utf-8")
     return file
 
@@ -219,7 +221,7 @@ def try_tuning(folder: Path, rng: random.Random) -> str:
     document["model"] |= {"input_unit": "°C", "output_unit": "1/m"}
     model.write_text(json.dumps(document), encoding="utf-8")
     words = ["run", "following", "--rig", "vo2", "--dry-run", "--set", f"model={model}", "--set", f"tuning={file}",
-             "--set", "controller=closed-loop-inverse", "--set", "low=0", "--set", "high=0.5"]  # fmt: skip
+             "--set", "controller=open-loop-inverse", "--set", "low=0", "--set", "high=0.5"]  # fmt: skip
     return try_document(file, toml_of(TUNING), rng, lambda: call(*words).code == 0, ("provenance", "tuning"))
 
 
