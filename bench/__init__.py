@@ -8,7 +8,7 @@ What scripts and notebooks need::
     model = bench.identify(run, "preisach", levels=20)
     setpoints = bench.invert(model, [500.0, 900.0]).setpoints
 
-`open_rig`, `run`, `identify`, `predict`, `invert`, `load` and `report` are documented in `bench.face`; each is
+`open_rig`, `run`, `identify`, `predict`, `invert`, `load` and `report` are documented in `bench.api`; each is
 imported when it is first used.
 """
 
@@ -17,7 +17,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from bench.face import identify, invert, load, open_rig, predict, report, run
+    from bench.api import identify, invert, load, open_rig, predict, report, run
 
 __all__ = ["identify", "invert", "load", "open_rig", "predict", "report", "run"]
 
@@ -25,7 +25,7 @@ __all__ = ["identify", "invert", "load", "open_rig", "predict", "report", "run"]
 def __getattr__(name: str) -> Any:  # noqa: ANN401 - any of the names above
     if name not in __all__:
         raise AttributeError(f"module 'bench' has no attribute {name!r}")
-    from bench import face
+    from bench import api as face
 
     return getattr(face, name)
 

@@ -19,14 +19,10 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 from typer.main import get_command
 
-from bench import registry
-from bench.binding import RoleTable
-from bench.catalogue import Catalogue
-from bench.cli.app import app
-from bench.interlocks import Interlock
-from bench.journal import rows
-from bench.layout import DashboardLayout
-from bench.rig_file import RigTable, SafetyTable, TelemetryTable
+from bench.base import registry
+from bench.cli import Catalogue, app
+from bench.record import rows
+from bench.rig import DashboardLayout, Interlock, RigTable, RoleTable, SafetyTable, TelemetryTable
 
 _COLUMNS = {
     "meta": "Facts about the run, one a row, as JSON: protocol, parameters, rig, seed, versions, outcome.",
@@ -112,10 +108,10 @@ def _default(parameter: Any) -> str:  # noqa: ANN401 - the types of click are a 
 
 def rig_file() -> Iterator[str]:
     """Yield the lines of the page about rig files."""
-    import bench.rig_file
+    import bench.rig.file
 
     yield "# Rig files\n"
-    summary, _, text = inspect.getdoc(bench.rig_file).partition("\n")  # type: ignore[union-attr]
+    summary, _, text = inspect.getdoc(bench.rig.file).partition("\n")  # type: ignore[union-attr]
     yield f"{summary}\n{_literal_blocks(text)}\n"
     tables: tuple[tuple[str, type[BaseModel]], ...] = (
         ("[rig]", RigTable),
@@ -193,7 +189,7 @@ def journal_schema() -> Iterator[str]:
         )
     connection.close()
     yield "## Records\n"
-    yield "```{eval-rst}\n.. autoclass:: bench.journal.rows.StepRecord\n.. autoclass:: bench.journal.rows.Event\n```"
+    yield "```{eval-rst}\n.. autoclass:: bench.record.rows.StepRecord\n.. autoclass:: bench.record.rows.Event\n```"
 
 
 def _fields(model: type[BaseModel]) -> Iterator[str]:

@@ -9,9 +9,8 @@ from typing import Annotated, Any, Generic, Protocol, Self, TypeVar
 
 from pydantic import AfterValidator, Field
 
-from bench.clock import Clock
+from bench.base import Clock, DeviceConnectionError, DeviceError
 from bench.devices import Actuator, Device, DriverSettings, Identity
-from bench.errors import DeviceConnectionError, DeviceError
 
 STATUS_AGE = 0.1
 """Time after which `set` looks at the status of its instrument again, s: a fast loop sets more often than that."""

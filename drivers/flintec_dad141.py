@@ -36,11 +36,8 @@ from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple, TypeVar
 
 from pydantic import Field, field_validator
 
-from bench.clock import Clock
-from bench.deferred import DeferredModule
-from bench.devices import Finding, Identity
-from bench.errors import DeviceConnectionError, DeviceError, DeviceRestartedError
-from bench.roles import LoadCell
+from bench.base import Clock, DeferredModule, DeviceConnectionError, DeviceError, DeviceRestartedError
+from bench.devices import Finding, Identity, LoadCell
 from drivers.device import LineDevice, Slope
 from drivers.modbus import (
     EMULATED,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import serial
 
-from bench.deferred import DeferredModule
+from bench.base import DeferredModule
 from drivers.modbus import EMULATED, ModbusClient, TcpClient
 
 if TYPE_CHECKING:

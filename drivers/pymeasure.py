@@ -33,21 +33,23 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import AfterValidator, Field, ValidationInfo, field_validator
 
-from bench import registry
-from bench.clock import Clock
-from bench.command_table import (
+from bench.base import Clock, ConfigurationError, DeviceConnectionError, DeviceError, DeviceRestartedError, registry
+from bench.devices import (
     ANY_TEXT,
+    DriverSettings,
     Expected,
+    GeneralActuator,
+    GeneralSensor,
+    Identity,
+    Limits,
     Name,
     QuantityTable,
+    Status,
     TargetTable,
     check_arrival,
     not_empty,
     template,
 )
-from bench.devices import DriverSettings, Identity, Limits, Status
-from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, DeviceRestartedError
-from bench.roles import GeneralActuator, GeneralSensor
 from drivers.device import LineDevice, attempt
 from drivers.quantities import arrival_of, check_ranges, check_read_back, identity_of, output_lost, signals_of
 

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from bench.clock import Clock
-from bench.command_table import QuantityTable, TargetTable
-from bench.devices import Identity, Signal, Status
-from bench.errors import DeviceError, DeviceRestartedError
+from bench.base import Clock, DeviceError, DeviceRestartedError
+from bench.devices import Identity, QuantityTable, Signal, Status, TargetTable
 
 _ARRIVAL_INTERVAL = 0.1  # s
 

@@ -11,17 +11,16 @@ from typing import Any
 import serial
 from pydantic import Field
 
-from bench.clock import slowness
+from bench.base import DeviceConnectionError, slowness
 from bench.devices import DriverSettings
-from bench.errors import DeviceConnectionError
-from bench.locks import EMULATED
+from bench.rig import EMULATED
 
 RESENDS = 2
 """How often a request that brought no good answer is sent again."""
 
 _SHARE_OF_WATCHDOG = 0.6
 """Share of the time of an instrument's watchdog that a request and its repetitions may take together on a busy
-computer; as long as its line may be lost (`bench.station.reconnection`)."""
+computer; as long as its line may be lost (`bench.run.station.reconnection`)."""
 
 _LONGEST_WITHOUT_WATCHDOG = 1.0
 """Longest wait for an answer on a busy computer, s, of an instrument that has no watchdog."""
@@ -63,7 +62,7 @@ class PatientPort:
     longest : float
         The bound, s; a longer time-out of the port stays as it is.
     measure : callable
-        Returns the slowness; see `bench.clock.slowness`.
+        Returns the slowness; see `bench.base.clock.slowness`.
 
     Attributes
     ----------

@@ -5,10 +5,9 @@ from __future__ import annotations
 import math
 from typing import ClassVar
 
-from bench.clock import Clock
+from bench.base import Clock, DeviceConnectionError, DeviceError
 from bench.devices import Actuator, Identity, Limits, Signal, Status
-from bench.errors import DeviceConnectionError, DeviceError
-from bench.twin.device import DONE, END, GLANCE, IDENTITY, MEASURE, OFF, OUTPUT, SET, TwinSettings, number_text
+from bench.specimen import DONE, END, GLANCE, IDENTITY, MEASURE, OFF, OUTPUT, SET, TwinSettings, number_text
 from drivers.device import LineActuator, LineDevice
 from drivers.quantities import identity_of
 from drivers.serial_line import RESENDS, SerialSettings, forget_received, lost_line, open_port

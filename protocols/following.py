@@ -7,13 +7,19 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.control.loops import FollowReference
-from bench.control.references import fastest_slope, modulated_sine
-from bench.control.supervision import SupervisedFollower
-from bench.controllers import ControllerSetup, Fallback, controller_names, make_supervised
-from bench.protocol import Caution, Control, Messages, Phase, Slots, from_slot, parameter, protocol, unit_of
-from bench.results.data import read_columns
-from bench.results.tracking import FOLLOW
+from bench.analysis import FOLLOW, read_columns
+from bench.control import (
+    ControllerSetup,
+    Fallback,
+    FollowReference,
+    SupervisedFollower,
+    controller_names,
+    fastest_slope,
+    make_supervised,
+    modulated_sine,
+)
+from bench.protocol import Caution, Control, Messages, Phase, from_slot, parameter, protocol, unit_of
+from bench.rig import Slots
 from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LOOP, check_order, load_checked_model
 from protocols.session import SessionParameters, begin_session, keep_adapted, session_kinds
 

@@ -5,27 +5,24 @@ from __future__ import annotations
 from collections.abc import Generator, Mapping
 from typing import TypeAlias, TypeVar
 
-from bench.controllers import load_model_for, saturated_below
-from bench.devices import Actuator, Signal
-from bench.model_file import ModelFile
+from bench.control import Tuning, load_model_for, saturated_below
+from bench.devices import Actuator, Dwell, Signal
+from bench.identification import ModelFile
 from bench.protocol import (
-    Dwell,
+    LONGEST,
     Message,
     Note,
     Phase,
     Prompt,
     ProtocolParameters,
     Reading,
-    Slot,
-    Slots,
     Step,
     Views,
     from_slot,
     parameter,
     unit_of,
 )
-from bench.protocol.plan import LONGEST
-from bench.tuning_file import Tuning
+from bench.rig import Slot, Slots
 
 DRIVE_AND_RESPONSE: Mapping[str, type[Actuator] | type[Signal]] = {"drive": Actuator, "response": Signal}
 """What a characterization needs of a rig."""

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from bench.devices import Dwell
 from bench.identification import excitation
-from bench.protocol import Dwell, Messages, Phase, Slots, Step, from_slot, parameter, protocol
+from bench.protocol import Messages, Phase, Step, from_slot, parameter, protocol
+from bench.rig import Slots
 from protocols.preparation import (
     DRIVE,
     DRIVE_AND_RESPONSE,

@@ -6,9 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.errors import DataError
-from bench.protocol import Dwell, Messages, Phase, Slot, Slots, Step, parameter, protocol
-from bench.results.data import read_columns
+from bench.analysis import read_columns
+from bench.base import DataError
+from bench.devices import Dwell
+from bench.protocol import Messages, Phase, Step, parameter, protocol
+from bench.rig import Slot, Slots
 from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LOOP, SweepParameters, check_order, reset
 
 _LONGEST_DWELL = 86400.0

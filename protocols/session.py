@@ -7,13 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from bench.binding import RoleTable
-from bench.control.model_filters import ADAPTATIONS, AdaptationName
-from bench.controllers import time_to_rest
-from bench.identification.excitation import ramps
-from bench.identification.recalibration import Kind, parse_kinds, recalibrate
-from bench.model_file import ModelFile
-from bench.protocol import Caution, Dwell, KeptModel, Note, Phase, Reading, Slots, Step, from_slot, parameter
+from bench.control import ADAPTATIONS, AdaptationName, time_to_rest
+from bench.devices import Dwell
+from bench.identification import Kind, ModelFile, parse_kinds, ramps, recalibrate
+from bench.protocol import Caution, KeptModel, Note, Phase, Reading, Step, from_slot, parameter
+from bench.rig import RoleTable, Slots
 from protocols.preparation import ControlledParameters, Part, reset, reset_unknown_memory
 
 SESSION = "session"

@@ -6,27 +6,20 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.control.loops import ReachTarget
-from bench.control.references import tracking_targets
-from bench.control.supervision import Supervised
-from bench.controllers import ControllerSetup, Fallback, controller_names, make_supervised
-from bench.hysteresis import Policy
-from bench.protocol import (
-    Caution,
-    Control,
-    Dwell,
-    Messages,
-    Note,
-    Phase,
-    Slots,
-    Step,
-    from_slot,
-    parameter,
-    protocol,
-    unit_of,
+from bench.analysis import REACH, READING, read_columns
+from bench.control import (
+    ControllerSetup,
+    Fallback,
+    ReachTarget,
+    Supervised,
+    controller_names,
+    make_supervised,
+    tracking_targets,
 )
-from bench.results.data import read_columns
-from bench.results.tracking import REACH, READING
+from bench.devices import Dwell
+from bench.models import Policy
+from bench.protocol import Caution, Control, Messages, Note, Phase, Step, from_slot, parameter, protocol, unit_of
+from bench.rig import Slots
 from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LOOP, check_order, load_checked_model
 from protocols.session import SessionParameters, begin_session, keep_adapted, session_kinds
 

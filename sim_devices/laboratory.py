@@ -11,9 +11,8 @@ from typing import ClassVar
 
 import numpy as np
 
-from bench.clock import Clock
-from bench.errors import ConfigurationError
-from bench.faults import ScheduledFault
+from bench.base import Clock, ConfigurationError
+from bench.rig import ScheduledFault
 from sim_devices import protocol_emulated
 from sim_devices.faults.calendar import Calendar
 from sim_devices.faults.fault import Fault, FaultEvent
@@ -56,7 +55,7 @@ def tec_faults(tec: EmulatedTEC) -> dict[str, Fault]:
 
 
 class EmulatedLaboratory:
-    """A `bench.rig.Laboratory` whose instruments are served on lines, and where nothing is done by hand.
+    """A `bench.rig.connected.Laboratory` whose instruments are served on lines, and where nothing is done by hand.
 
     Parameters
     ----------
@@ -77,7 +76,7 @@ class EmulatedLaboratory:
     Attributes
     ----------
     kernels : tuple of str
-        Packages of the compiled loops of its plant and instruments, see `bench.compiled.kernels_of`. They are ready
+        Packages of the compiled loops of its plant and instruments, see `bench.base.kernels_of`. They are ready
         when it is made: a driver must not wait for an answer while its instrument compiles.
     faults : mapping of str to Fault
         What can go wrong, by name: `FAULT`, or `INSTRUMENT.FAULT`.
@@ -102,7 +101,7 @@ class EmulatedLaboratory:
     ) -> None:
         if self.kernels:
             # Here, as numba is slow to load.
-            from bench.compiled import kernels_of
+            from bench.base import kernels_of
 
             for kernel in kernels_of(self.kernels):
                 kernel.prepare()

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import serial
 from serial.serialutil import PortNotOpenError, SerialBase, SerialException
 
-from bench.clock import Clock
+from bench.base import Clock
 from sim_devices.wire import Connection, Stream, TcpServer, WireServer
 from sim_devices.wire.modbus_tcp import FramingError
 

@@ -27,11 +27,9 @@ from typing import ClassVar
 import numpy as np
 from pydantic import Field, InstanceOf, field_validator
 
-from bench.clock import Clock
-from bench.command_table import ActuatorTable, CommandTable
-from bench.derived import Expression
-from bench.devices import DriverSettings
-from bench.rig_file import LaboratorySettings
+from bench.base import Clock
+from bench.devices import ActuatorTable, CommandTable, DriverSettings
+from bench.rig import Expression, LaboratorySettings
 from sim_devices.instruments.scpi import EmulatedTextInstrument, Meter
 from sim_devices.laboratory import EmulatedLaboratory
 from sim_devices.plants.lag_network import Lag, LagNetwork

@@ -11,13 +11,10 @@ from typing import ClassVar
 import numpy as np
 from pydantic import Field, InstanceOf
 
-from bench.clock import Clock
+from bench.base import Clock, ConfigurationError
 from bench.devices import DriverSettings
-from bench.errors import ConfigurationError
-from bench.rig_file import LaboratorySettings
-from bench.twin.device import TwinSettings
-from bench.twin.specimen import Specimen
-from bench.twin.tables import NoiseTable, TwinTable
+from bench.rig import LaboratorySettings
+from bench.specimen import NoiseTable, Specimen, TwinSettings, TwinTable
 from sim_devices.instruments.twin import EmulatedTwin, TwinServer
 from sim_devices.laboratory import EmulatedLaboratory, TrueValue
 from sim_devices.world import World
@@ -39,7 +36,7 @@ class TwinLaboratorySettings(TwinTable):
 
 
 class SpecimenPlant:
-    """A specimen on its grid of time, however calls divide the time; see `bench.twin.specimen`.
+    """A specimen on its grid of time, however calls divide the time; see `bench.specimen.specimen`.
 
     A set-point acts from the instant at which it comes, as the mean over the step of the grid in which it does. An
     actuator that follows at once has it at the end of that step.

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from functools import partial
 from typing import Protocol
 
-from bench.clock import Clock
+from bench.base import Clock
 
 
 class Plant(Protocol):

@@ -330,8 +330,8 @@ def bench(capsys):
 
     Without the line of a first use, which depends on what ran before on this machine.
     """
+    from bench.base.compilation_display import MESSAGE
     from bench.cli import main
-    from bench.compilation_display import MESSAGE
 
     def run(*arguments):
         with pytest.raises(SystemExit) as stopped:
@@ -350,10 +350,10 @@ def reproduce(bench, tmp_path):
     """
     from kernels import OWN
 
-    from bench.compiled import kernels_of
-    from bench.journal import Record
-    from bench.model_file import models_among
-    from bench.registry import load
+    from bench.base import kernels_of
+    from bench.base.registry import load
+    from bench.identification import models_among
+    from bench.record import Record
 
     def loaded():
         return {kernel.py_func for kernel in kernels_of(OWN) if kernel.overloads}
@@ -393,7 +393,7 @@ def reproduce(bench, tmp_path):
 @pytest.fixture
 def edit_journal():
     """Change the journal of a run by SQL, as if it had been written so."""
-    from bench.journal.rows import checksum
+    from bench.record.rows import checksum
 
     def edit(path, *statements):
         with closing(sqlite3.connect(path)) as db, db:

@@ -14,6 +14,6 @@ OWN = sorted(
 if __name__ == "__main__":
     from rich.console import Console
 
-    from bench.compilation_display import compile_kernels
+    from bench.base import compile_kernels
 
     compile_kernels(OWN, Console(stderr=True))

@@ -29,17 +29,17 @@ from PIL import Image
 from rerun.chunk import RrdReader
 
 import bench
-from bench.catalogue import Catalogue
-from bench.clock import WallClock
+from bench.base import DataError, WallClock
+from bench.cli import Catalogue
 from bench.dashboard import rebuild
-from bench.dashboard.recording import LOOPBACK, free_port
+from bench.dashboard.rerun_recording import LOOPBACK, free_port
 from bench.dashboard.screenshot import Camera
 from bench.dashboard.viewers import start_viewer, wait_until_it_listens
-from bench.errors import DataError
-from bench.journal import FILE_NAME, Record
-from bench.model_file import FORMAT, load_model
+from bench.identification import load_model
+from bench.identification.model_file import FORMAT
 from bench.protocol import find_protocol
-from bench.rig_file import load_rig
+from bench.record import FILE_NAME, Record
+from bench.rig import load_rig
 
 HERE = Path(__file__).parent
 SIZE = (1440, 900)
@@ -80,7 +80,7 @@ LOOK = 400
 """Wall-clock time between two looks at what the browser shows, ms."""
 
 SOURCES = ("bench", "drivers", "protocols", "rigs", "sim_devices")
-VIEWS = ("bench/dashboard", "bench/lateness.py", "bench/units.py")
+VIEWS = ("bench/dashboard", "bench/record/lateness.py", "bench/base/units.py")
 WITHOUT_EFFECT = ("bench/cli", "bench/contracts", "bench/panel", "bench/skeletons", "bench/upkeep", *VIEWS)
 """Of the sources, those that a run does not depend on."""
 

@@ -32,7 +32,7 @@ def options_of(study):
 def errors_of(result):
     """Return the errors among the numbers of a study by their dotted names."""
     # Imported late: most tests do not need it.
-    from bench.campaigns.tasks import flat_numbers
+    from bench.batch.campaign.tasks import flat_numbers
 
     return {
         name: value

@@ -20,9 +20,8 @@ import traceback
 from contextlib import suppress
 from pathlib import Path
 
-from bench import registry
-from bench.compiled import kernels_of
-from bench.protocol.discovery import packaged_protocols
+from bench.base import kernels_of, registry
+from bench.protocol import packaged_protocols
 
 # Nothing that reads the width of the terminal or the entry points when it is imported.
 LIBRARIES = (
@@ -43,8 +42,8 @@ LIBRARIES = (
     "typer.main",
     "bench.controllers",
     "bench.dashboard",
-    "bench.results.report",
-    "bench.runs",
+    "bench.analysis.report.run_report",
+    "bench.run.run",
 )
 
 

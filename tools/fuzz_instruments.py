@@ -23,8 +23,8 @@ from typing import Any
 
 from dialects import Dynamixel, MalformedError, MeCom, ModbusRtu, ModbusTcp, Scpi, SlcanCanopen, reads, writes
 
-from bench.clock import VirtualClock
-from bench.rig_file import load_rig
+from bench.base import VirtualClock
+from bench.rig import load_rig
 from rigs.hybrid.laboratory import HybridLaboratory
 from rigs.muscles.laboratory import LOAD, STAGE, SMALaboratory
 from rigs.vo2.laboratory import VO2Laboratory

@@ -16,7 +16,7 @@ import numpy as np
 from commands import call
 from mutations import EXTREMES, STRANGE, mutated_bytes, mutated_lines
 
-from bench.journal import Record
+from bench.record import Record
 
 HEAD = ("t", "u", "y")
 NUMBERS = [(0.5 * i, 1.0 + i + 0.125 * (i % 7), 1000.0 - 3.0625 * i - 0.25 * (i % 5)) for i in range(30)]

@@ -14,8 +14,8 @@ from typing import Any
 from commands import call
 from mutations import mutated_bytes, mutated_document, mutated_lines, objections
 
-from bench.errors import BenchError
-from bench.rig_file import load_rig
+from bench.base import BenchError
+from bench.rig import load_rig
 
 ROOT = Path(__file__).parents[1]
 

@@ -11,14 +11,9 @@ from pathlib import Path
 from fuzz_instruments import TARGETS, fuzz
 from mutations import EXTREMES, STRANGE, mutated_bytes, mutated_document, mutated_lines, objections
 
-from bench.clock import VirtualClock
-from bench.desk import SetPoint, parse_command
-from bench.errors import BenchError
-from bench.interrupts import Interrupts
-from bench.mailbox import PanelMailbox, RunMailbox
-from bench.questions import Question
-from bench.rig import Rig
-from bench.rig_file import RigFile, load_rig
+from bench.base import BenchError, Interrupts, VirtualClock
+from bench.operator import PanelMailbox, Question, RunMailbox, SetPoint, parse_command
+from bench.rig import Rig, RigFile, load_rig
 from sim_devices.serving.requests import parse_request
 
 COMMANDS = ("set tec 45.5", "ramp tec 60 0.5", "hold", "tare cell", "zero y", "safe", "note a lamp", "quit")

@@ -14,12 +14,9 @@ from typing import Any
 from commands import call
 from mutations import STRANGE, mutated_bytes
 
-from bench.devices import Signal
-from bench.errors import DataError
-from bench.journal import FILE_NAME, Event, Journal, Record, StepRecord, Table
-from bench.journal.mirror import NAME as MIRROR_NAME
-from bench.journal.rows import RECOVERED_NAME
-from bench.settling import Settled
+from bench.base import DataError
+from bench.devices import Settled, Signal
+from bench.record import FILE_NAME, NAME as MIRROR_NAME, RECOVERED_NAME, Event, Journal, Record, StepRecord, Table
 
 SIGNALS = (Signal("u", "V", "input", 3), Signal("y", "m", "output", 6))
 STEPS = 40

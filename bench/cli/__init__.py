@@ -1,6 +1,5 @@
 """The `bench` command."""
 
-from bench.cli.app import main
-from bench.cli.console import JsonOption, console, print_rows, write_json
+from lazy_loader import attach_stub
 
-__all__ = ["JsonOption", "console", "main", "print_rows", "write_json"]
+__getattr__, __dir__, __all__ = attach_stub(__name__, __file__)

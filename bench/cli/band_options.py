@@ -6,15 +6,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bench.cli.console import console, print_rows, warn
-from bench.printing import print_plain
+from bench.base import print_plain
+from bench.cli.command_support import console, print_rows, warn
 
 if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from bench.results.bands import BandedPrediction
-    from bench.results.examined import Examined
+    from bench.analysis import BandedPrediction, Examined
 
 BandOption = Annotated[
     bool,
@@ -55,7 +54,7 @@ def print_band(found: BandedPrediction, residuals: npt.NDArray[np.float64] | Non
 
 def print_examined(found: Examined, name: str = "", *, bands: bool = True) -> None:
     """Print what was estimated of a session, and the band unless it is unwanted; `name` is that of the model."""
-    from bench.results.recalibrations import session_rows
+    from bench.analysis import session_rows
 
     for text in found.warnings():
         warn(f"{name}: {text}" if name else text)

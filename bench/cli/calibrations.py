@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
-from bench.cli.console import JsonOption, check_outputs, console, print_rows, write_json
-from bench.printing import print_plain
+from bench.base import print_plain
+from bench.cli.command_support import JsonOption, check_outputs, console, print_rows, write_json
 
 app = typer.Typer()
 
@@ -39,7 +39,7 @@ def calibrate(
     calibration removes. A rig file applies the file by a derived signal: kind = "calibrated", source = SIGNAL,
     calibration = "calibration.json".
     """
-    from bench.results.calibrations import calibrate_run
+    from bench.analysis import calibrate_run
 
     check_outputs(out=out, json_file=json_file, read=[run])
     found = calibrate_run(run, sensor, reference, reference_name=name, reference_uncertainty=uncertainty)

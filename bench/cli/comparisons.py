@@ -9,18 +9,17 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
+from bench.analysis import ReadingOptions
+from bench.base import ConfigurationError, print_plain, show_table
 from bench.cli.band_options import BandsOption, RecalibrateOption, RecalibrateRowsOption, print_examined
-from bench.cli.console import JsonOption, check_outputs, console, show_compilation, warn, write_json
+from bench.cli.command_support import JsonOption, check_outputs, console, show_compilation, warn, write_json
 from bench.cli.data_options import layout_options, print_assumptions
-from bench.cli.models import InitialOption
+from bench.cli.model_commands import InitialOption
 from bench.cli.patience import show_patience
 from bench.cli.written import print_figures, write_rows
-from bench.errors import ConfigurationError
-from bench.printing import print_plain, show_table
-from bench.results.reading.options import ReadingOptions
 
 if TYPE_CHECKING:
-    from bench.results.run_comparison import RunComparison
+    from bench.analysis import RunComparison
 
 app = typer.Typer()
 
@@ -96,8 +95,7 @@ def compare_(
         return
     if html is not None:
         raise ConfigurationError("--html is for two runs, without --data; --figures draws models")
-    from bench.results.models import compare_models
-    from bench.results.recalibrations import Session
+    from bench.analysis import Session, compare_models
 
     session = Session.parse(recalibrate, recalibrate_rows)
     check_outputs(out=out, figures=figures, json_file=json_file, read=(data, *compared))
@@ -134,15 +132,15 @@ def compare_(
     if out is not None:
         write_rows(out, result.predictions)
     if figures is not None:
-        from bench.results.report import draw_comparison
+        from bench.analysis import draw_comparison
 
         print_figures(draw_comparison(result, figures))
     write_json(json_file, result.to_json())
 
 
 def _compare_runs(runs: list[Path], html: Path | None, json_file: Path | None) -> None:
-    from bench.journal import Record
-    from bench.results.run_comparison import compare_runs
+    from bench.analysis import compare_runs
+    from bench.record import Record
 
     if any(path.suffix == ".json" for path in runs):
         raise ConfigurationError("model files are compared on measurements: add --data FILE")
@@ -152,8 +150,7 @@ def _compare_runs(runs: list[Path], html: Path | None, json_file: Path | None) -
         found = compare_runs(first, second)
         _print_runs(found)
         if html is not None:
-            from bench.results.page.comparison_page import comparison_page
-            from bench.results.page.render import write_page
+            from bench.analysis import comparison_page, write_page
 
             write_page(html, comparison_page(first, second, found))
             print_plain(console, f"page: {html}")

@@ -9,9 +9,9 @@ from typing import Annotated, Any
 
 import typer
 
-from bench.cli.console import console
-from bench.printing import print_plain
-from bench.results.reading.options import ReadingOptions
+from bench.analysis import ReadingOptions
+from bench.base import print_plain
+from bench.cli.command_support import console
 
 
 def _layout(

@@ -8,15 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.table import Table
 
-from bench.cli.console import JsonOption, check_outputs, console, print_rows, show_compilation, write_json
+from bench.analysis import ReadingOptions
+from bench.base import ConfigurationError, show_table
+from bench.cli.command_support import JsonOption, check_outputs, console, print_rows, show_compilation, write_json
 from bench.cli.data_options import layout_options
 from bench.cli.patience import show_patience
-from bench.errors import ConfigurationError
-from bench.printing import show_table
-from bench.results.reading.options import ReadingOptions
 
 if TYPE_CHECKING:
-    from bench.identification.continuation import Continuation
+    from bench.identification import Continuation
 
 app = typer.Typer()
 
@@ -84,12 +83,12 @@ def design(
     each where it tells most per second. Each tail visits its first maximum again: outputs that differ there by more
     than the noise say that the specimen has no return-point memory, so that no Preisach model fits it.
     """
-    from bench.results.designs import assess_designs, write_sequence
+    from bench.analysis import assess_designs, write_sequence
 
     check_outputs(out=out, json_file=json_file, read=[path for path in (model, data) if path is not None])
     unit = ""
     if rig is not None:
-        from bench.rig_file import load_rig
+        from bench.rig import load_rig
 
         file = load_rig(rig)
         drive = file.roles.get("drive")
@@ -147,8 +146,8 @@ def _continue(
     json_file: Path | None,
     reading: ReadingOptions,
 ) -> None:
-    from bench.model_file import load_model
-    from bench.results.designs import continue_file, write_sequence
+    from bench.analysis import continue_file, write_sequence
+    from bench.identification import load_model
 
     model = load_model(path)
     with show_patience(f"designing {hours:g} h of measurements"):

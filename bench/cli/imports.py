@@ -7,10 +7,10 @@ from typing import Annotated
 
 import typer
 
-from bench.cli.console import JsonOption, check_outputs, console, write_json
+from bench.analysis import ReadingOptions
+from bench.base import print_plain
+from bench.cli.command_support import JsonOption, check_outputs, console, write_json
 from bench.cli.data_options import layout_options, print_assumptions
-from bench.printing import print_plain
-from bench.results.reading.options import ReadingOptions
 
 app = typer.Typer()
 
@@ -43,7 +43,7 @@ def import_(
     `bench report`, `bench identify`, `bench compare` and `bench export` then take its folder as that of any run. The
     file is kept in the record. Without times, rows are 1 s apart; the time of day is that of the file.
     """
-    from bench.results.imported import import_file
+    from bench.analysis import import_file
 
     check_outputs(json_file=json_file, folder=out, read=[file])
     found = import_file(

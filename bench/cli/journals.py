@@ -10,9 +10,8 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from bench.cli.console import JsonOption, check_outputs, console, write_json
-from bench.errors import RecordError
-from bench.printing import print_plain, show_table
+from bench.base import RecordError, print_plain, show_table
+from bench.cli.command_support import JsonOption, check_outputs, console, write_json
 
 app = typer.Typer()
 
@@ -39,7 +38,7 @@ def recover_journal(
 
     Exit codes: 0 no row is lost; 2 the copy cannot be written; 3 it is no journal; 8 rows are lost.
     """
-    from bench.journal.recovery import recover
+    from bench.record import recover
 
     check_outputs(json_file=json_file, read=[journal, *(second or [])])
     found = recover(journal, second or [], out)

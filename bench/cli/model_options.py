@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Table
 
-from bench.cli.console import console, parse_assignments, print_rows
+from bench.base import ConfigurationError
+from bench.cli.command_support import console, parse_assignments, print_rows
 from bench.cli.data_options import offer_options
-from bench.errors import ConfigurationError
 
 if TYPE_CHECKING:
-    from bench.hysteresis import ModelSpec
+    from bench.models import ModelSpec
 
 # Of the Preisach plane.
 _FEWEST_LEVELS, _MOST_LEVELS = 2, 1000
@@ -146,7 +146,7 @@ def inverse_of(spec: ModelSpec) -> str:
 
 def options_json(spec: ModelSpec) -> dict[str, dict[str, str]]:
     """Return default and meaning of each option of a model, for programs."""
-    from bench.identification.options import model_options
+    from bench.identification import model_options
 
     return {option.name: {"default": option.default, "text": option.text} for option in model_options(spec)}
 

@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from bench.cli.console import console
-from bench.printing import print_plain
-from bench.skeletons import Part
+from bench.base import print_plain
+from bench.cli.command_support import console
+from bench.cli.skeletons import Part
 
 app = typer.Typer()
 
@@ -29,7 +29,7 @@ def new(
     The folder is a package of its own. Installed, its part is known to the bench by its name; nothing of the bench
     is changed.
     """
-    from bench.skeletons import write_skeleton
+    from bench.cli.skeletons import write_skeleton
 
     for file in write_skeleton(part, name, out):
         print_plain(console, str(file))

@@ -9,8 +9,8 @@ from threading import Event, Thread
 from rich.console import Console
 from rich.errors import LiveError
 
-from bench.cli.console import console
-from bench.shares import shares_to
+from bench.base import shares_to
+from bench.cli.command_support import console
 
 PATIENCE = 2.0
 """Seconds of work after which a terminal shows that it goes on."""

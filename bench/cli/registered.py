@@ -11,8 +11,8 @@ import typer
 from typer.core import TyperGroup
 from typer.models import CommandInfo
 
-from bench import registry
-from bench.cli.console import (
+from bench.base import ConfigurationError, registry
+from bench.cli.command_support import (
     FigureFormat,
     FigureFormatOption,
     JsonOption,
@@ -23,7 +23,6 @@ from bench.cli.console import (
     show_compilation,
     write_json,
 )
-from bench.errors import ConfigurationError
 
 
 class RegisteredCommands(TyperGroup):
@@ -108,7 +107,7 @@ class Studies(RegisteredCommands):
             figures: FigureFormatOption = FigureFormat.PNG,
             json_file: JsonOption = None,
         ) -> None:
-            from bench.studies import reproduce
+            from bench.batch import reproduce
 
             check_outputs(folder=out)
             settings: dict[str, dict[str, str]] = {}

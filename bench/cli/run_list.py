@@ -10,11 +10,11 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.text import Text
 
-from bench.cli.console import JsonOption, console, parse_assignments, write_json
-from bench.errors import ConfigurationError
+from bench.base import ConfigurationError
+from bench.cli.command_support import JsonOption, console, parse_assignments, write_json
 
 if TYPE_CHECKING:
-    from bench.results.run_list import ListedRun
+    from bench.analysis import ListedRun
 
 app = typer.Typer()
 
@@ -59,7 +59,7 @@ def runs_(
     is left of it. Shown are the parameters that differ from their defaults; any can be searched for:
     `bench runs --where controller=integral`.
     """
-    from bench.results.run_list import list_runs, select_runs
+    from bench.analysis import list_runs, select_runs
 
     runs = list_runs(folder)
     _check_named("--protocol", protocol, [run.protocol for run in runs])

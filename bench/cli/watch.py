@@ -9,10 +9,8 @@ from typing import Annotated
 
 import typer
 
-from bench.cli.console import console, show_compilation
-from bench.errors import DataError
-from bench.extras import needed_for
-from bench.printing import print_plain
+from bench.base import DataError, needed_for, print_plain
+from bench.cli.command_support import console, show_compilation
 
 app = typer.Typer()
 
@@ -54,16 +52,15 @@ def watch(
     display; otherwise the address is printed, for `rerun ADDRESS`. Ends when the window is closed, or by Ctrl-C.
     """
     with needed_for("a viewer", "dashboard"):
-        from bench.dashboard.from_journal import JournalView
-        from bench.dashboard.viewers import check_address
+        from bench.dashboard import JournalView, check_address
 
     if "://" in run:
         check_address(run)
         with _viewer(run, browser=browser) as is_open:
             _wait(is_open)
         return
-    from bench.clock import WallClock
-    from bench.locks import is_in_use
+    from bench.base import WallClock
+    from bench.rig import is_in_use
 
     folder = _run_in_progress(Path(run))
     clock = WallClock()
@@ -99,8 +96,8 @@ def replay(
     window is closed, or by Ctrl-C.
     """
     with needed_for("a viewer", "dashboard"):
-        from bench.dashboard.from_journal import JournalView
-    from bench.clock import WallClock
+        from bench.dashboard import JournalView
+    from bench.base import WallClock
 
     with suppress(KeyboardInterrupt), JournalView(run, port) as view:
         entries = view.entries()
@@ -124,8 +121,8 @@ def _run_in_progress(path: Path) -> Path:
 
     Raises DataError if there is none.
     """
-    from bench.journal import FILE_NAME
-    from bench.locks import is_in_use
+    from bench.record import FILE_NAME
+    from bench.rig import is_in_use
 
     if path.name == FILE_NAME:
         path = path.parent
@@ -144,7 +141,7 @@ def _viewer(uri: str, *, browser: bool) -> Iterator[Callable[[], bool]]:
     """Open a viewer meanwhile, or print the address; yield what says whether it is still wanted."""
     import webbrowser
 
-    from bench.dashboard.viewers import has_display, open_viewer, web_viewer
+    from bench.dashboard import has_display, open_viewer, web_viewer
 
     if browser:
         with web_viewer(uri) as address:
@@ -162,7 +159,7 @@ def _viewer(uri: str, *, browser: bool) -> Iterator[Callable[[], bool]]:
 
 def _wait(is_open: Callable[[], bool]) -> None:
     """Wait until a viewer is closed, or for Ctrl-C."""
-    from bench.clock import WallClock
+    from bench.base import WallClock
 
     clock = WallClock()
     while is_open():

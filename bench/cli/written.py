@@ -8,13 +8,12 @@ from typing import TYPE_CHECKING
 
 import typer
 
+from bench.base import print_plain
 from bench.cli.command_line import command_line
-from bench.cli.console import console
-from bench.printing import print_plain
+from bench.cli.command_support import console
 
 if TYPE_CHECKING:
-    from bench.results.models import IdentifiedFile
-    from bench.results.predictions import Predictions
+    from bench.analysis import IdentifiedFile, Predictions
 
 
 def print_figures(paths: Iterable[Path]) -> None:
@@ -39,12 +38,12 @@ def write_fit(
     """
     drawn: list[Path] = []
     if figures is not None:
-        from bench.results.report import draw_identification
+        from bench.analysis import draw_identification
 
         drawn = draw_identification(found, figures)
         print_figures(drawn)
     if card is not None:
-        from bench.results.model_card import write_card
+        from bench.analysis import write_card
 
         write_card(card, found, data, command=command_line(context), model=out, figures=drawn)
         print_plain(console, f"card: {card}")
@@ -55,7 +54,7 @@ def write_rows(path: Path, found: Predictions) -> None:
 
     Raises DataError if the file cannot be written.
     """
-    from bench.results.data import write_csv
+    from bench.analysis import write_csv
 
     table = found.table()
     write_csv(path, [head for head, _ in table], [values for _, values in table])

@@ -8,9 +8,8 @@ from typing import ClassVar
 
 import pytest
 
-from bench.clock import Clock
+from bench.base import Clock, LimitError
 from bench.devices import Actuator, Device
-from bench.errors import LimitError
 
 
 def _values(device: Device, values: dict[str, float]) -> dict[str, float]:

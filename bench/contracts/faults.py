@@ -9,9 +9,8 @@ from collections.abc import Callable
 
 import pytest
 
-from bench.clock import Clock
+from bench.base import Clock, DeviceConnectionError, DeviceError, DeviceRestartedError
 from bench.devices import Actuator, Device
-from bench.errors import DeviceConnectionError, DeviceError, DeviceRestartedError
 
 _LONGEST_RECONNECTION = 1.0  # s, as `Device.reconnect` says
 _LONGEST_SAFE = 3.0  # s, on a line that stays dead

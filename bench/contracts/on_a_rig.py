@@ -9,12 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from bench.clock import Clock, VirtualClock, WallClock
+from bench.base import BenchError, Clock, VirtualClock, WallClock
 from bench.contracts import roles
 from bench.devices import Actuator, Device
-from bench.errors import BenchError
-from bench.rig import Rig
-from bench.rig_file import DeviceEntry, RigFile, load_rig
+from bench.rig import DeviceEntry, Rig, RigFile, load_rig
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What every hysteresis operator promises; see `bench.hysteresis.Operator`."""
+"""What every hysteresis operator promises; see `bench.models.Operator`."""
 
 from __future__ import annotations
 
@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from bench.hysteresis import Operator
-from bench.hysteresis.reach import Reach
-from bench.parsing import parse_json
+from bench.base import parse_json
+from bench.models import Operator, Reach
 
 _SEED = 1
 _ROUNDING = 1e-9

@@ -7,11 +7,11 @@ from typing import ClassVar
 
 import pytest
 
-from bench.clock import Clock
+from bench.base import Clock, DeviceError
 from bench.contracts.devices import ActuatorContract, DeviceContract
-from bench.devices import Actuator, Device
-from bench.errors import DeviceError
-from bench.roles import (
+from bench.devices import (
+    Actuator,
+    Device,
     LinearStage,
     LoadCell,
     PositionSensor,

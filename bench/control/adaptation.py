@@ -9,8 +9,8 @@ from typing import Literal
 
 import numpy as np
 
-from bench.hysteresis import MemoryCurve, Preisach, _checks
-from bench.hysteresis.inverse import PreisachInverse
+from bench.base import checks as _checks
+from bench.models import MemoryCurve, Preisach, PreisachInverse
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +111,7 @@ class Adapter:
         ValueError
             If a number is not finite.
         """
-        from bench.control import _kernels
+        from bench.control import adaptation_kernels as _kernels
 
         state = self.state
         after = state.step(value)

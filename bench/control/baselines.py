@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 from bench.control.tracking import Sample, Script, Scripted, Trace, check_positive
 from bench.control.tuning import Spans
-from bench.hysteresis import Operator, Reach
-from bench.hysteresis.inverse import TableInverse
+from bench.models import Operator, Reach, TableInverse
 
 
 class LookUp(Scripted):

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.deferred import DeferredModule
+from bench.base import DeferredModule
 
 if TYPE_CHECKING:
     from filterpy import kalman

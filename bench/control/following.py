@@ -7,12 +7,13 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any
 
+from bench.base import checks as _checks
 from bench.control.baselines import IntegralParameters, saturation
 from bench.control.estimators import DisturbanceEstimator
 from bench.control.model_filters import ModelFilter
 from bench.control.tracking import ControllerBase, check_positive
 from bench.control.tuning import Spans
-from bench.hysteresis import Inverse, Reach, _checks
+from bench.models import Inverse, Reach
 
 
 @dataclass(frozen=True)

@@ -7,18 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from bench.control.estimators import DisturbanceEstimator
-from bench.control.tracking import (
-    Arrival,
-    Correcting,
-    CorrectionParameters,
-    Move,
-    Sample,
-    Script,
-    check_positive,
-)
+from bench.control.tracking import Arrival, Correcting, CorrectionParameters, Move, Sample, Script, check_positive
 from bench.control.tuning import Spans
-from bench.hysteresis import MemoryCurve, Preisach
-from bench.hysteresis.inverse import PreisachInverse
+from bench.models import MemoryCurve, Preisach, PreisachInverse
 
 Direction = Literal[-1, 1]
 

@@ -25,11 +25,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, TypeAlias,
 
 import numpy as np
 
+from bench.base import DeferredModule, Floats
 from bench.control.tuning import Spans
-from bench.deferred import DeferredModule
-from bench.hysteresis import Operator, Preisach
-from bench.hysteresis._checks import Floats
-from bench.hysteresis.transport import transported, widened, widening
+from bench.models import Operator, Preisach, transported, widened, widening
 
 if TYPE_CHECKING:
     from filterpy import kalman

@@ -7,12 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from bench.base import ConvergenceError, Floats, checks as _checks
 from bench.control.play_inverse import PlayInverse
 from bench.control.references import Reference
 from bench.control.tracking import Trace, check_positive
-from bench.errors import ConvergenceError
-from bench.hysteresis import PrandtlIshlinskii, _checks
-from bench.hysteresis._checks import Floats
+from bench.models import PrandtlIshlinskii
 
 
 def notch(frequency: float, rate: float, zero_damping: float, pole_damping: float = 0.7) -> Floats:

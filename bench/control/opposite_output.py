@@ -6,8 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from bench.control.tracking import Command, TargetController, Trace
-from bench.hysteresis import Reach
-from bench.hysteresis.falling_inverse import OPPOSITE
+from bench.models import OPPOSITE, Reach
 
 
 class OppositeOutput:

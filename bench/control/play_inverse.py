@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 
-from bench.hysteresis import PrandtlIshlinskii
+from bench.models import PrandtlIshlinskii
 
 
 class PlayInverse:

@@ -19,14 +19,13 @@ from numpy.typing import NDArray
 from scipy.linalg import expm
 from scipy.optimize import lsq_linear
 
-from bench.control import _prediction_kernels as kernels
-from bench.control.dynamics import IdentifiedDynamics
+from bench.base import Floats, checks as _checks
+from bench.control import prediction_kernels as kernels
 from bench.control.estimators import DisturbanceEstimator
 from bench.control.model_filters import ModelFilter
 from bench.control.tracking import ControllerBase, check_positive
 from bench.control.tuning import Spans
-from bench.hysteresis import Inverse, Reach, _checks
-from bench.hysteresis._checks import Floats
+from bench.models import IdentifiedDynamics, Inverse, Reach
 
 _PARTS = 4
 """Steps of time in a period."""

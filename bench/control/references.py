@@ -11,8 +11,8 @@ from typing import TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bench.hysteresis import Inverse, _checks
-from bench.hysteresis._checks import Floats
+from bench.base import Floats, checks as _checks
+from bench.models import Inverse
 
 S = TypeVar("S")
 Reference: TypeAlias = Callable[[float], float]

@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from bench.base import ConvergenceError
 from bench.control.convergence import MOST_SWINGS, LimitCycleWatch
 from bench.control.loops import Foreseeing, Reaching
 from bench.control.model_filters import ModelFilter
 from bench.control.tracking import Command, Follower, Trace
-from bench.errors import ConvergenceError
-from bench.hysteresis import Reach
+from bench.models import Reach
 
 TARGETS = 5
 """Number of targets in a row over which errors are judged."""

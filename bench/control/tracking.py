@@ -29,14 +29,12 @@ from collections.abc import Generator
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple, Protocol
 
-from bench.control.dynamics import ResponseDynamics, SeenInput
+from bench.base import checks as _checks
 from bench.control.estimators import DisturbanceEstimator
 from bench.control.model_filters import ModelFilter
 from bench.control.overshoot import Overshoot, Passing
 from bench.control.tuning import Spans
-from bench.hysteresis import Inverse, Inversion, Operator, Reach, _checks
-from bench.hysteresis.inverse_stream import InverseStream
-from bench.hysteresis.stream import Stream
+from bench.models import Inverse, InverseStream, Inversion, Operator, Reach, ResponseDynamics, SeenInput, Stream
 
 _LOOK = 0.25
 """Time between two readings of an input that settles, s: the peak of one that rings at 2 rad/s is seen to 2 %."""

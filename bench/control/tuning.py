@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, NamedTuple, TypeVar
 
-from bench.hysteresis import Operator
+from bench.models import Operator
 
 T = TypeVar("T")
 

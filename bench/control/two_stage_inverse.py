@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from bench.hysteresis import Inverse, Reach, _checks
-from bench.hysteresis.two_stage import Stage, TwoStage
-from bench.hysteresis.two_stage_state import TwoStageState
+from bench.base import checks as _checks
+from bench.models import Inverse, Reach, Stage, TwoStage, TwoStageState
 
 # Part of an output range within which a target counts as met.
 _TOLERANCE = 1e-10

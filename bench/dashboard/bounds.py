@@ -11,9 +11,9 @@ import numpy as np
 import rerun as rr
 
 from bench.dashboard.drawing import ALARM, CAUTION, LIMIT, Colour
-from bench.dashboard.recording import Floats, Ints, Recording, times
+from bench.dashboard.rerun_recording import Floats, Ints, Recording, times
 from bench.devices import Signal
-from bench.interlocks import SETPOINT, Interlock, Level
+from bench.rig import SETPOINT, Interlock, Level
 
 _NEAR = 1.0
 """Spans of the data within which a bound is drawn over time; one that is farther away would flatten them."""

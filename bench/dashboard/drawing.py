@@ -20,10 +20,10 @@ import rerun.blueprint as rrb
 from rerun.components import LineStrip2DBatch
 from rerun.encodings import Vec2DBatch
 
-from bench.dashboard.recording import Floats, Recording
+from bench.base import fitting_prefix
+from bench.dashboard.rerun_recording import Floats, Recording
 from bench.devices import Signal
-from bench.layout import XYPlot
-from bench.units import fitting_prefix
+from bench.rig import XYPlot
 
 Colour = tuple[int, int, int] | tuple[int, int, int, int]
 """Red, green and blue, and how opaque it is, 0 to 255."""

@@ -9,11 +9,10 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from bench.dashboard.recording import Floats, Ints
-from bench.hysteresis import Density
-from bench.hysteresis.documents import Model
-from bench.journal import Event, StepRecord
-from bench.model_file import ModelFile
+from bench.dashboard.rerun_recording import Floats, Ints
+from bench.identification import ModelFile
+from bench.models import Density, Model
+from bench.record import Event, StepRecord
 
 
 class Tick(NamedTuple):
@@ -83,7 +82,7 @@ def densities_of(models: Iterable[ModelFile]) -> list[ModelDensity]:
 
 @dataclass(frozen=True)
 class End:
-    """How a run ended: `completed`, `aborted` or `failed`, and why; how late its loops were (`bench.lateness`)."""
+    """How a run ended: `completed`, `aborted` or `failed`, and why; how late its loops were (`Lateness`)."""
 
     status: str
     reason: str

@@ -9,12 +9,12 @@ from typing import Self
 
 import numpy as np
 
+from bench.base import ConfigurationError, DataError
 from bench.dashboard.entries import End, Entry, Part, Ticks, densities_of, merged, portions, single, size
 from bench.dashboard.live import CHUNK_ROWS
 from bench.dashboard.writer import Writer
-from bench.errors import ConfigurationError, DataError
-from bench.journal import Record
-from bench.model_file import ModelFile, is_model, models_among, parse_model
+from bench.identification import ModelFile, is_model, models_among, parse_model
+from bench.record import Record
 
 
 def rebuild(record: Record, path: Path) -> None:

@@ -9,8 +9,8 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from bench.dashboard.drawing import INK, MARKER, lines, texts
-from bench.dashboard.recording import Recording
-from bench.lateness import bins_of, headline_of
+from bench.dashboard.rerun_recording import Recording
+from bench.record import bins_of, headline_of
 
 _PATH = "lateness"
 _ROW = 0.04

@@ -9,15 +9,13 @@ from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import Any, Self
 
-from bench.clock import WallClock
+from bench.base import WallClock, print_plain, task_console
 from bench.dashboard.entries import End, Entry, Part, Tick, densities_of, portions
-from bench.dashboard.recording import is_whole
+from bench.dashboard.rerun_recording import is_whole
 from bench.dashboard.writer import Writer
 from bench.devices import Signal
-from bench.journal import Event, StepRecord
-from bench.model_file import ModelFile
-from bench.printing import print_plain
-from bench.workers import task_console
+from bench.identification import ModelFile
+from bench.record import Event, StepRecord
 
 QUEUED_TICKS = 20_000
 """Entries waiting for Rerun beyond which telemetry is dropped (about 10 MB)."""

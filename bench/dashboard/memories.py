@@ -8,9 +8,8 @@ from typing import Any, cast
 
 from bench.dashboard.entries import ModelDensity
 from bench.devices import Signal
-from bench.hysteresis import MemoryCurve
-from bench.hysteresis.two_stage import Coupled
-from bench.interlocks import SETPOINT
+from bench.models import Coupled, MemoryCurve
+from bench.rig import SETPOINT
 
 
 class SignalMemory:

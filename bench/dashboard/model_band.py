@@ -15,17 +15,15 @@ import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
-from bench.control.tracking import widened
+from bench.base import fitting_prefix
+from bench.control import widened
 from bench.dashboard.drawing import CAUTION, Colour
 from bench.dashboard.entries import Part, Tick, Ticks, single
-from bench.dashboard.recording import Floats, Recording, times
-from bench.devices import Signal
-from bench.hysteresis import Operator
-from bench.identification.bands import Band, input_half_widths
-from bench.journal import StepRecord
-from bench.model_file import ModelFile
-from bench.settling import Settled
-from bench.units import fitting_prefix
+from bench.dashboard.rerun_recording import Floats, Recording, times
+from bench.devices import Settled, Signal
+from bench.identification import Band, ModelFile, input_half_widths
+from bench.models import Operator
+from bench.record import StepRecord
 
 _FIRST = 16
 """Rows after which the class of the input is judged first; then whenever they are an eighth more."""

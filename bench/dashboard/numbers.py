@@ -9,16 +9,15 @@ from typing import Any
 
 import rerun as rr
 
+from bench.base import Expectation, fitting_prefix, format_duration, format_numbers
 from bench.dashboard.bounds import Bound, nearest
-from bench.dashboard.control import Errors
+from bench.dashboard.controlled_run import Errors
 from bench.dashboard.entries import End, Part, Ticks
 from bench.dashboard.model_band import ModelBand
-from bench.dashboard.recording import Recording, times
+from bench.dashboard.rerun_recording import Recording, times
 from bench.dashboard.signal_plots import likely_magnitude
 from bench.devices import Signal
-from bench.journal import Event, StepRecord, expected_steps
-from bench.remaining_time import Expectation
-from bench.units import fitting_prefix, format_duration, format_numbers
+from bench.record import Event, StepRecord, expected_steps
 
 _SHORT = 10.0
 """Durations below are shown in s."""

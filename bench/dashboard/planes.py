@@ -8,15 +8,15 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
+from bench.base import fitting_prefix
 from bench.dashboard.drawing import FAINT, INK, MARKER, Frame, line_style, lines, point_style, texts, xy_view
 from bench.dashboard.entries import ModelDensity
 from bench.dashboard.memories import SignalMemory, StageMemory, memory_of
-from bench.dashboard.recording import Floats, Recording, times
+from bench.dashboard.rerun_recording import Floats, Recording, times
 from bench.dashboard.xy_plots import Points
 from bench.devices import Signal
-from bench.hysteresis.density import density_unit
-from bench.layout import DashboardLayout
-from bench.units import fitting_prefix
+from bench.models import density_unit
+from bench.rig import DashboardLayout
 
 
 class Planes:

@@ -10,10 +10,9 @@ from typing import Self, TypeVar
 
 from rerun.experimental import ViewerClient
 
-from bench.clock import WallClock
-from bench.dashboard.recording import LOOPBACK, free_port
+from bench.base import ConfigurationError, DataError, WallClock
+from bench.dashboard.rerun_recording import LOOPBACK, free_port
 from bench.dashboard.viewers import start_viewer, wait_until_it_listens
-from bench.errors import ConfigurationError, DataError
 
 _PATIENCE = 120.0
 """Wall-clock time within which the viewer of a busy machine answers and has drawn a picture, s."""

@@ -9,12 +9,11 @@ from typing import Any
 import rerun as rr
 import rerun.blueprint as rrb
 
+from bench.base import ConfigurationError, fitting_prefix
 from bench.dashboard.drawing import Colour, time_view
-from bench.dashboard.recording import Floats
+from bench.dashboard.rerun_recording import Floats
 from bench.devices import Signal
-from bench.errors import ConfigurationError
-from bench.interlocks import SETPOINT
-from bench.units import fitting_prefix
+from bench.rig import SETPOINT
 
 _SETPOINT_PART = 0.45
 """Part of a device's colour in that of its set-point, whose broad line lies below the measured one."""

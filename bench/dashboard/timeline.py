@@ -8,8 +8,8 @@ import rerun as rr
 
 from bench.dashboard.drawing import Colour
 from bench.dashboard.entries import Part, Ticks
-from bench.dashboard.recording import Recording, times
-from bench.journal import Event, StepRecord
+from bench.dashboard.rerun_recording import Recording, times
+from bench.record import Event, StepRecord
 
 _RUNNING = "running"
 _NOT_SETTLED = "not settled"

@@ -13,9 +13,8 @@ from urllib.parse import quote, urlsplit
 
 import rerun_cli
 
-from bench.clock import WallClock
-from bench.dashboard.recording import LOOPBACK, free_port
-from bench.errors import ConfigurationError, DataError
+from bench.base import ConfigurationError, DataError, WallClock
+from bench.dashboard.rerun_recording import LOOPBACK, free_port
 
 _START_SECONDS = 30.0
 

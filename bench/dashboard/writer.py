@@ -13,27 +13,24 @@ import rerun as rr
 import rerun.blueprint as rrb
 from pydantic import ValidationError
 
-from bench.configuration_errors import problems
+from bench.base import ConfigurationError, problems
 from bench.dashboard.arrangement import Arranged, blueprint, seldom
 from bench.dashboard.bounds import BoundLines, bounds_of
-from bench.dashboard.control import TRACE_NAMES, WITNESS, ControlPlots, Errors
+from bench.dashboard.controlled_run import TRACE_NAMES, WITNESS, ControlPlots, Errors
 from bench.dashboard.entries import End, Entry, ModelDensity, Part, Ticks, densities_of, in_parts
 from bench.dashboard.lateness_plot import LatenessPlot
 from bench.dashboard.model_band import ModelBand, Plotted
 from bench.dashboard.numbers import LIVE_SECONDS, Numbers
 from bench.dashboard.planes import Planes
-from bench.dashboard.recording import Recording, times
+from bench.dashboard.rerun_recording import Recording, times
 from bench.dashboard.signal_plots import plots_by_unit
 from bench.dashboard.timeline import Timeline
 from bench.dashboard.xy_plots import Points, XYPlots
 from bench.devices import Signal
-from bench.errors import ConfigurationError
-from bench.interlocks import SETPOINT
-from bench.journal import StepRecord, run_card
-from bench.lateness import lateness_lines
-from bench.layout import DashboardLayout
-from bench.model_file import ModelFile
-from bench.protocol.vocabulary import LATENESS
+from bench.identification import ModelFile
+from bench.protocol import LATENESS
+from bench.record import StepRecord, lateness_lines, run_card
+from bench.rig import SETPOINT, DashboardLayout
 
 
 class Writer:

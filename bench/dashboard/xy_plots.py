@@ -21,10 +21,10 @@ import rerun.blueprint as rrb
 from bench.dashboard.bounds import Bound
 from bench.dashboard.drawing import Colour, Frame, line_style, lines, point_style, strips_at_once, xy_view
 from bench.dashboard.entries import Ticks
-from bench.dashboard.recording import Floats, Recording, times
+from bench.dashboard.rerun_recording import Floats, Recording, times
 from bench.dashboard.signal_plots import find_column
 from bench.devices import Signal
-from bench.layout import DashboardLayout
+from bench.rig import DashboardLayout
 
 _REDRAW_SECONDS = 0.1
 _VISIBLE = 0.002

@@ -19,16 +19,15 @@ from typing import Any
 
 import numpy as np
 
-from bench.hysteresis import Operator, TimedModel, _checks
-from bench.hysteresis._checks import Floats
+from bench.base import Floats, checks as _checks, say_share, shares_to
 from bench.identification.branches import turning_points
 from bench.identification.by_name import FitProblem
-from bench.identification.cell_layout import Flags, Indices
-from bench.identification.covariance import PredictionVariance, prediction_variance
-from bench.identification.excitation_class import LEAST_SWING, ExcitationClass
-from bench.identification.folds import near
-from bench.identification.least_squares import Fit
-from bench.shares import say_share, shares_to
+from bench.identification.choose.folds import near
+from bench.identification.design.excitation_class import LEAST_SWING, ExcitationClass
+from bench.identification.fit.cell_layout import Flags, Indices
+from bench.identification.fit.covariance import PredictionVariance, prediction_variance
+from bench.identification.fit.least_squares import Fit
+from bench.models import Operator, TimedModel
 
 LEVEL = 0.9
 """Nominal coverage of a band, unless another is asked for."""

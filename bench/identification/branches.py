@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bench.hysteresis import _checks
+from bench.base import checks as _checks
 
 
 def turning_points(inputs: ArrayLike, least: float = 0.0) -> NDArray[np.int64]:

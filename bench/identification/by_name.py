@@ -9,13 +9,10 @@ from typing import Any, Generic, Literal, TypeAlias, TypeVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bench.hysteresis import ModelSpec, Operator, Regressor, TimedModel, _checks, find_model
-from bench.hysteresis._checks import Floats
-from bench.identification.inspection import check_data
-from bench.identification.least_squares import Certificate, Fit, counted_weights
-from bench.identification.measures import Errors, measure_errors
-from bench.identification.options import check_options
-from bench.identification.orientation import (
+from bench.base import Floats, checks as _checks
+from bench.identification.choose.trust import check_interpolation, check_record, check_skipped, judge_fit
+from bench.identification.fit.least_squares import Certificate, Fit, counted_weights
+from bench.identification.fit.orientation import (
     NAMES,
     ORIENTATIONS,
     Orientation,
@@ -24,9 +21,12 @@ from bench.identification.orientation import (
     has_orientation,
     possible_signs,
 )
-from bench.identification.regularization import Regularization, choose_regularization
-from bench.identification.shape import fit_operator, fit_shape, undetermined_shape
-from bench.identification.trust import check_interpolation, check_record, check_skipped, judge_fit
+from bench.identification.fit.regularization import Regularization, choose_regularization
+from bench.identification.fit.shape import fit_operator, fit_shape, undetermined_shape
+from bench.identification.inspection import check_data
+from bench.identification.measures import Errors, measure_errors
+from bench.identification.options import check_options
+from bench.models import ModelSpec, Operator, Regressor, TimedModel, find_model
 
 M = TypeVar("M", bound=Operator[Any] | TimedModel[Any])
 Initial: TypeAlias = Literal["negative", "positive", "skip", "estimate"]

@@ -6,17 +6,10 @@ from typing import Annotated, Any, TypeAlias
 
 import numpy as np
 
-from bench.hysteresis import (
-    BoucWen,
-    Duhem,
-    GeneralizedPrandtlIshlinskii,
-    KrasnoselskiiPokrovskii,
-    MaxwellSlip,
-    ModelSpec,
-)
-from bench.hysteresis._checks import Floats
+from bench.base import Floats
 from bench.identification.options import OptionHelp
-from bench.identification.own_models import InputRange, input_span
+from bench.identification.plane_models import InputRange, input_span
+from bench.models import BoucWen, Duhem, GeneralizedPrandtlIshlinskii, KrasnoselskiiPokrovskii, MaxwellSlip, ModelSpec
 
 _Origin: TypeAlias = Annotated[
     float | None,

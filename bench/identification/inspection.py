@@ -7,8 +7,7 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bench.hysteresis import _checks
-from bench.hysteresis._checks import Floats
+from bench.base import Floats, checks as _checks
 
 # Part of the samples that may repeat the one before, and part of the range that one step may take.
 _PLATEAU = 0.1

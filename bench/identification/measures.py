@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bench.hysteresis import Operator, _checks
-from bench.hysteresis._checks import Floats
-from bench.hysteresis.timed import TimedSequence
+from bench.base import Floats, checks as _checks
+from bench.models import Operator, TimedSequence
 
 
 @dataclass(frozen=True)

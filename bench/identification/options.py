@@ -11,7 +11,7 @@ from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from bench.hysteresis import ModelSpec, find_model
+from bench.models import ModelSpec, find_model
 
 _OF_ALL = ("weights", "skip", "initial", "orientation")
 """Keywords of a fit in time that are no options of one model."""

@@ -13,9 +13,8 @@ from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 
-from bench.hysteresis import Operator, _checks
-from bench.hysteresis._checks import Floats
-from bench.hysteresis.timed import TimedSequence
+from bench.base import Floats, checks as _checks
+from bench.models import Operator, TimedSequence
 
 Kind: TypeAlias = Literal["offset", "gain", "drift", "input-offset"]
 KINDS: tuple[Kind, ...] = get_args(Kind)

@@ -6,8 +6,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from bench.desk import Shown
-from bench.interlocks import SETPOINT, Level
+from bench.operator import Shown
+from bench.rig import SETPOINT, Level
 
 _BLOCKS = "▁▂▃▄▅▆▇█"
 

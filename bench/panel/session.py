@@ -8,11 +8,10 @@ from pathlib import Path
 
 from rich.console import Console
 
-from bench.desk import Desk
-from bench.interrupts import Interrupts
-from bench.protocol import Messages, ProtocolDefinition, ProtocolParameters, protocol
-from bench.protocol.vocabulary import ByHand
-from bench.runs import Run, RunResult, carry_out
+from bench.base import Interrupts
+from bench.operator import Desk
+from bench.protocol import ByHand, Messages, ProtocolDefinition, ProtocolParameters, protocol
+from bench.run import Run, RunResult, carry_out
 
 
 class _Log(io.StringIO):
@@ -53,7 +52,7 @@ def carry_out_by_hand(
 ) -> RunResult:
     """Connect a rig, carry the commands of a desk out, and leave every device in its safe state.
 
-    Raises what `bench.runs.carry_out` does before anything moves.
+    Raises what `bench.run.run.carry_out` does before anything moves.
     """
     run = Run(
         protocol=protocol_of(desk),

@@ -8,13 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from bench.desk import SYNTAX, Desk, Leave, Shown, parse_command
-from bench.errors import BenchError, ConfigurationError, DataError
-from bench.journal import Record
-from bench.locks import is_in_use
-from bench.mailbox import END, PAUSE, PanelMailbox
-from bench.rig_file import rig_of_content
-from bench.units import format_duration
+from bench.base import BenchError, ConfigurationError, DataError, format_duration
+from bench.operator import END, PAUSE, SYNTAX, Desk, Leave, PanelMailbox, Shown, parse_command
+from bench.record import Record
+from bench.rig import is_in_use, rig_of_content
 
 _TICKS = 240
 """Newest ticks of a run that are shown."""

@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Self
 
-from bench.parsing import parse_json
+from bench.base import parse_json
 
 PARAMETER = "parameter"
 """Kind of the event that records a change."""

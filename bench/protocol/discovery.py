@@ -13,8 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 
-from bench import registry
-from bench.errors import ConfigurationError
+from bench.base import ConfigurationError, registry
 from bench.protocol.parameters import ProtocolDefinition
 
 

@@ -10,14 +10,12 @@ from typing import Any, Literal, cast, get_args, get_origin, get_type_hints
 from pydantic import Field, ValidationError
 from pydantic_core import PydanticUndefined
 
-from bench.binding import RoleTable, Slots, check_bound, rate_unit
-from bench.checked_table import CheckedTable
+from bench.base import CheckedTable, ConfigurationError, comma_remark
 from bench.devices import Device, Signal
-from bench.errors import ConfigurationError
-from bench.parsing import comma_remark
 from bench.protocol.changes import ParameterChange
 from bench.protocol.views import Views
 from bench.protocol.vocabulary import Messages
+from bench.rig import RoleTable, Slots, check_bound, rate_unit
 
 Needs = Mapping[str, type[Device] | type[Signal]] | Sequence[str]
 """Slots by name with the kind of each, or names of devices and signals of one rig."""

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from bench.binding import Slot, Slots
-from bench.layout import DashboardLayout, Range, XYPlot
+from bench.rig import DashboardLayout, Range, Slot, Slots, XYPlot
 
 _ROOM = 0.05
 """Part of a slot's range that an axis shows beyond either end."""

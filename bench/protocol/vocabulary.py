@@ -13,7 +13,7 @@ once the step had settled::
         yield Note(f"arrived at {reading['plate_temperature']:.2f} °C")
 
 Messages name devices and signals of a rig. A protocol for any rig asks for slots instead, and takes the names from
-their binding in the rig file; see `bench.binding`.
+their binding in the rig file; see `bench.rig.slots`.
 
 A protocol touches no device and no clock, and is deterministic given its parameters and its readings. So
 it can be planned and rehearsed, to learn what it does before anything moves.
@@ -28,10 +28,9 @@ from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from bench.control.loops import BlockController, ControlTask, DelayedController, SampledController
-from bench.desk import Desk
-from bench.devices import Signal
-from bench.settling import Arrived, Dwell, Settle, Settled, UntilSteady, durations
+from bench.control import BlockController, ControlTask, DelayedController, SampledController
+from bench.devices import Arrived, Dwell, Settle, Settled, Signal, UntilSteady, durations
+from bench.operator import Desk
 
 
 class Message(ABC):

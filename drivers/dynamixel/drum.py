@@ -6,7 +6,7 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from bench.roles import LinearStage
+from bench.devices import LinearStage
 from drivers.dynamixel.mx28 import MX28, MX28Settings
 
 

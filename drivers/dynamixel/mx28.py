@@ -26,9 +26,8 @@ from typing import ClassVar, Literal, NamedTuple, Self, TypeVar
 
 from pydantic import Field, field_validator, model_validator
 
-from bench.clock import Clock
+from bench.base import Clock, ConfigurationError, DeviceConnectionError, DeviceError, DeviceRestartedError
 from bench.devices import Actuator, Finding, Identity, Limits, Status
-from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, DeviceRestartedError
 from drivers.device import RecoverableDevice, attempt, watchdog_field
 from drivers.dynamixel.protocol2 import (
     PING,

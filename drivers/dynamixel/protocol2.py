@@ -13,7 +13,7 @@ from functools import lru_cache, partial
 import serial
 from pydantic import Field
 
-from bench.clock import Clock
+from bench.base import Clock
 from drivers.serial_line import RESENDS, SerialSettings, forget_received, lost_line, no_answer, open_port, patience_of
 
 PING, READ, WRITE, REBOOT = 0x01, 0x02, 0x03, 0x08

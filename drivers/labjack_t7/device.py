@@ -7,7 +7,7 @@ from typing import TypeVar
 
 from pydantic import Field, field_validator
 
-from bench.clock import Clock
+from bench.base import Clock
 from bench.devices import DriverSettings, Identity
 from drivers.device import LineDevice
 from drivers.labjack_t7.registers import LabJackT7

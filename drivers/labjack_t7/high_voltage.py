@@ -16,10 +16,8 @@ from typing import ClassVar, Self
 import numpy as np
 from pydantic import Field, model_validator
 
-from bench.clock import Clock
-from bench.devices import Device, Limits, Status
-from bench.errors import DeviceError
-from bench.roles import VoltageSupply
+from bench.base import Clock, DeviceError
+from bench.devices import Device, Limits, Status, VoltageSupply
 from drivers.device import STATUS_AGE, Slope, attempt
 from drivers.labjack_t7.inputs import RAIL, Channel, T7InputDevice, T7InputSettings
 from drivers.labjack_t7.lines import LINES, T7LineDevice, T7LineSettings

@@ -17,9 +17,8 @@ from typing import Annotated, Self, TypeVar
 import numpy as np
 from pydantic import Field, field_validator, model_validator
 
-from bench.clock import Clock
+from bench.base import Clock, DeviceError
 from bench.devices import Device
-from bench.errors import DeviceError
 from drivers.labjack_t7.device import T7ConnectionSettings, T7Device
 from drivers.labjack_t7.registers import (
     AIN,

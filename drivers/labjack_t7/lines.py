@@ -15,9 +15,8 @@ from typing import TypeVar
 
 from pydantic import Field
 
-from bench.clock import Clock
+from bench.base import Clock, DeviceError
 from bench.devices import Finding
-from bench.errors import DeviceError
 from drivers.device import LineActuator
 from drivers.labjack_t7.device import T7ConnectionSettings, T7Device
 from drivers.labjack_t7.registers import (

@@ -12,10 +12,8 @@ from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from bench.clock import Clock
-from bench.devices import Limits
-from bench.errors import DeviceError
-from bench.roles import PositionSensor
+from bench.base import Clock, DeviceError
+from bench.devices import Limits, PositionSensor
 from drivers.device import Slope
 from drivers.labjack_t7.inputs import T7InputDevice, T7InputSettings
 from drivers.labjack_t7.registers import Floats, LabJackT7

@@ -21,9 +21,8 @@ from typing import Literal, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.clock import Clock
+from bench.base import Clock, DeviceConnectionError, DeviceError, DeviceRestartedError
 from bench.devices import Identity
-from bench.errors import DeviceConnectionError, DeviceError, DeviceRestartedError
 from drivers.modbus import (
     FEEDBACK,
     ModbusClient,

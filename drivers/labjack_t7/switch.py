@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from bench.devices import Status
-from bench.errors import DeviceError
-from bench.roles import Switch
+from bench.base import DeviceError
+from bench.devices import Status, Switch
 from drivers.labjack_t7.lines import T7LineDevice, T7LineSettings
 
 

@@ -11,10 +11,8 @@ from typing import ClassVar, Self
 
 from pydantic import Field, model_validator
 
-from bench.clock import Clock
-from bench.devices import Limits
-from bench.errors import DeviceError
-from bench.roles import TemperatureSensor
+from bench.base import Clock, DeviceError
+from bench.devices import Limits, TemperatureSensor
 from drivers.labjack_t7.inputs import RAIL, Channel, T7InputDevice, T7InputSettings
 from drivers.labjack_t7.registers import LabJackT7
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import serial
 from pydantic import Field
 
-from bench.errors import DeviceError
+from bench.base import DeviceError
 from drivers.serial_line import RESENDS, SerialSettings, forget_received, lost_line, no_answer, open_port
 
 _MOST_STALE_ANSWERS = 8

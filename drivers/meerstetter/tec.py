@@ -20,16 +20,15 @@ from typing import ClassVar
 
 from pydantic import Field, field_validator
 
-from bench.clock import Clock
-from bench.devices import Finding, Identity, Limits, Status
-from bench.errors import (
+from bench.base import (
+    Clock,
     ConfigurationError,
     DeviceConnectionError,
     DeviceError,
     DeviceRestartedError,
     WatchdogError,
 )
-from bench.roles import TECAmplifier, TECMode
+from bench.devices import Finding, Identity, Limits, Status, TECAmplifier, TECMode
 from drivers.device import STATUS_AGE, RecoverableDevice, attempt, watchdog_field
 from drivers.meerstetter.device_errors import DEVICE_ERRORS, UNKNOWN_ERROR
 from drivers.meerstetter.mecom import (

@@ -20,9 +20,7 @@ from typing import TYPE_CHECKING, Literal
 import serial
 from pydantic import Field
 
-from bench.clock import Clock
-from bench.deferred import DeferredModule
-from bench.errors import DeviceConnectionError, DeviceError
+from bench.base import Clock, DeferredModule, DeviceConnectionError, DeviceError
 from drivers.serial_line import RESENDS, SerialSettings, lost_line, no_answer
 
 if TYPE_CHECKING:

@@ -19,7 +19,7 @@ from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-from bench.errors import DeviceConnectionError, DeviceError
+from bench.base import DeviceConnectionError, DeviceError
 from drivers.roboteq.canopen import AbortedError, Entry, NodeLine
 
 _VARIABLE = 16

@@ -31,10 +31,8 @@ from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
-from bench.clock import Clock
-from bench.devices import Finding, Identity, Limits, Status
-from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, DeviceRestartedError
-from bench.roles import VoltageSupply
+from bench.base import Clock, ConfigurationError, DeviceConnectionError, DeviceError, DeviceRestartedError
+from bench.devices import Finding, Identity, Limits, Status, VoltageSupply
 from drivers.device import RecoverableDevice, attempt
 from drivers.roboteq.canopen import ABSENT, AbortedError, Entry, MissedError, NodeLine, NodeSettings, described
 from drivers.roboteq.process_data import ProcessData, Report

@@ -1,4 +1,4 @@
-"""Supplies, meters and other text instruments that a rig file describes (`bench.command_table`), without Python."""
+"""Supplies, meters and other text instruments that a rig file describes (`bench.devices.CommandTable`)."""
 
 from drivers.scpi.devices import SCPIActuator, SCPISensor, SCPIVoltageSupply
 

@@ -12,19 +12,23 @@ from typing import ClassVar, Self
 
 from pydantic import ValidationInfo, field_validator, model_validator
 
-from bench.clock import Clock
-from bench.command_table import (
+from bench.base import Clock, ConfigurationError, DeviceConnectionError, DeviceError, DeviceRestartedError
+from bench.devices import (
     ANY_TEXT,
     ActuatorTable,
+    GeneralActuator,
+    GeneralSensor,
+    Identity,
+    Limits,
     SetpointTable,
+    Signal,
+    Status,
     Template,
+    VoltageSupply,
     signals_by_query,
     template,
     written_number,
 )
-from bench.devices import Identity, Limits, Signal, Status
-from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, DeviceRestartedError
-from bench.roles import GeneralActuator, GeneralSensor, VoltageSupply
 from drivers.device import LineDevice, attempt
 from drivers.quantities import arrival_of, check_ranges, check_read_back, identity_of, output_lost, signals_of
 from drivers.scpi.line import LineTable, TextLine

@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from bench.clock import Clock
-from bench.command_table import ANY_TEXT, CommandTable, Template, template
-from bench.errors import DeviceConnectionError, DeviceError
+from bench.base import Clock, DeviceConnectionError, DeviceError
+from bench.devices import ANY_TEXT, CommandTable, Template, template
 from drivers.scpi.transport import TextLineSettings, open_transport
 from drivers.serial_line import RESENDS
 

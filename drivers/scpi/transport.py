@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, Protocol
 
 from pydantic import AfterValidator, Field
 
-from bench.errors import DeviceConnectionError
+from bench.base import DeviceConnectionError
 from drivers.serial_line import SerialSettings, forget_received, lost_line, open_port
 
 TCP = "tcp://"

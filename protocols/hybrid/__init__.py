@@ -1,8 +1,7 @@
 """Operator scripts of the thermo-piezoelectric hybrid, and the slots that they ask for."""
 
-from bench.devices import Signal
+from bench.devices import Signal, TECAmplifier, VoltageSupply
 from bench.protocol import Views
-from bench.roles import TECAmplifier, VoltageSupply
 
 SENSORS = ("response", "base", "tip")
 """Slots of the deflection (m) and of the temperatures of base and tip (°C)."""

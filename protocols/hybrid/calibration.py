@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 
-from bench.control.loops import Playback
-from bench.protocol import FixedRate, Messages, Phase, ProtocolParameters, Slots, parameter, protocol
+from bench.control import Playback
+from bench.protocol import FixedRate, Messages, Phase, ProtocolParameters, parameter, protocol
+from bench.rig import Slots
 from protocols.hybrid import THERMAL, WITNESS
 
 

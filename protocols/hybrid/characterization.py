@@ -12,22 +12,21 @@ from collections.abc import Callable
 
 import numpy as np
 
-from bench.binding import RoleTable
-from bench.control.loops import Playback
+from bench.control import Playback
+from bench.devices import Dwell
 from bench.protocol import (
-    Dwell,
     FixedRate,
     Messages,
+    NumberList,
     Phase,
     ProtocolParameters,
-    Slots,
     Step,
     Views,
     from_slot,
     parameter,
     protocol,
 )
-from bench.protocol.number_list import NumberList
+from bench.rig import RoleTable, Slots
 from protocols.hybrid import BOTH_LOOPS, FINE, FINE_OVER_TIME, HEATING, SENSORS, THERMAL
 
 

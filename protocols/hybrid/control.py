@@ -6,23 +6,21 @@ import math
 from pathlib import Path
 from typing import Literal
 
-from bench.control.references import AddedSine, Reference, SmoothMoves, staircase
-from bench.controllers import ControllerSetup, make_controller
-from bench.model_file import load_model
+from bench.control import AddedSine, ControllerSetup, Reference, SmoothMoves, Tuning, make_controller, staircase
+from bench.identification import load_model
 from bench.protocol import (
     Caution,
     FixedRate,
     Messages,
     Note,
+    NumberList,
     Phase,
     ProtocolParameters,
-    Slots,
     from_slot,
     parameter,
     protocol,
 )
-from bench.protocol.number_list import NumberList
-from bench.tuning_file import Tuning
+from bench.rig import Slots
 from protocols.hybrid import BOTH_LOOPS, FINE, FINE_OVER_TIME, SENSORS, THERMAL, WITNESS
 from protocols.preparation import check_order
 

@@ -7,29 +7,34 @@ from typing import Literal
 
 import numpy as np
 
-from bench.control.loops import ReachTarget
-from bench.control.supervision import Supervised
-from bench.controllers import ControllerSetup, Fallback, controller_names, make_supervised
-from bench.errors import DataError
-from bench.hysteresis import TwoStage, TwoStageState
-from bench.model_file import ModelFile, load_model
+from bench.analysis import REACH, READING
+from bench.base import DataError
+from bench.control import (
+    ControllerSetup,
+    Fallback,
+    ReachTarget,
+    Supervised,
+    Tuning,
+    controller_names,
+    make_supervised,
+)
+from bench.devices import Dwell
+from bench.identification import ModelFile, load_model
+from bench.models import TwoStage, TwoStageState
 from bench.protocol import (
     Caution,
     Control,
-    Dwell,
     Messages,
     Note,
     Phase,
     ProtocolParameters,
-    Slots,
     Step,
     Views,
     from_slot,
     parameter,
     protocol,
 )
-from bench.results.tracking import REACH, READING
-from bench.tuning_file import Tuning
+from bench.rig import Slots
 from protocols.muscles.parts import (
     LENGTH_LOOPS,
     ON_STAGE,

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from bench.protocol import Dwell, Messages, Phase, Slots, Step, Views, from_slot, parameter, protocol
-from bench.protocol.number_list import NumberList
+from bench.devices import Dwell
+from bench.protocol import Messages, NumberList, Phase, Step, Views, from_slot, parameter, protocol
+from bench.rig import Slots
 from protocols.muscles.parts import (
     ON_STAGE,
     SAMPLE,

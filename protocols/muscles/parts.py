@@ -14,24 +14,22 @@ from typing import Any
 
 import numpy as np
 
-from bench.binding import RoleTable
-from bench.control.approach import Approach
-from bench.devices import Actuator, Signal
+from bench.control import Approach
+from bench.devices import Actuator, Dwell, Signal
 from bench.protocol import (
     Control,
-    Dwell,
+    NumberList,
     Phase,
     Prompt,
     ProtocolParameters,
     Reading,
-    Slots,
     Step,
     Views,
     from_slot,
     parameter,
     unit_of,
 )
-from bench.protocol.number_list import NumberList
+from bench.rig import RoleTable, Slots
 from protocols.preparation import DRIVE_AND_RESPONSE, SETTLE_LOAD, Part, prompt_for
 
 SAMPLE = "sample"

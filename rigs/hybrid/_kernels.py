@@ -8,8 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from bench.compiled import Table, inner, kernel
-from bench.hysteresis._checks import Floats
+from bench.base import Floats, Table, inner, kernel
 
 NETWORK = 13
 """Numbers of a `Network`; the last one is its state."""

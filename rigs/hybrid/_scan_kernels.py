@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from bench.compiled import Table, inner, kernel
-from bench.hysteresis._checks import Floats
+from bench.base import Floats, Table, inner, kernel
 from sim_devices.instruments._labjack_t7_kernels import converted
 from sim_devices.plants._hybrid_kernels import FACE, INCREMENT, NODES, deflection
 from sim_devices.transducers._imperfect_kernels import shown

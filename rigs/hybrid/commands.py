@@ -7,8 +7,8 @@ from typing import Annotated
 
 import typer
 
+from bench.base import print_plain
 from bench.cli import JsonOption, console, print_rows, write_json
-from bench.printing import print_plain
 
 
 def identify(

@@ -19,13 +19,18 @@ from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar
 
 import numpy as np
 
-from bench.control.notch_loop import NotchLoop, NotchLoopParameters
-from bench.control.play_inverse import PlayInverse
-from bench.control.references import ApproachedReference, Reference
-from bench.control.tracking import Trace, check_positive
-from bench.controllers import ControllerSetup, ControllerSpec
-from bench.deferred import DeferredModule
-from bench.errors import ConfigurationError, ConvergenceError
+from bench.base import ConfigurationError, ConvergenceError, DeferredModule
+from bench.control import (
+    ApproachedReference,
+    ControllerSetup,
+    ControllerSpec,
+    NotchLoop,
+    NotchLoopParameters,
+    PlayInverse,
+    Reference,
+    Trace,
+    check_positive,
+)
 from protocols.hybrid.control import MID_RANGING
 from rigs.hybrid.estimates import (
     Bending,

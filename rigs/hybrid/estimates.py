@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.control.tracking import check_positive
-from bench.deferred import DeferredModule
-from bench.hysteresis import Polynomial
+from bench.base import DeferredModule
+from bench.control import check_positive
+from bench.models import Polynomial
 from rigs.hybrid.network import ABSOLUTE_ZERO, ThermalNetwork
 
 if TYPE_CHECKING:

@@ -13,9 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from bench.calibration import Calibration
-from bench.errors import ConfigurationError
-from bench.rig_file import load_rig
+from bench.base import ConfigurationError
+from bench.rig import Calibration, load_rig
 from rigs.hybrid.identification import WITNESS, read_loop
 
 if TYPE_CHECKING:

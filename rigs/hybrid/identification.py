@@ -14,14 +14,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from bench.errors import DataError
-from bench.hysteresis import Polynomial, PrandtlIshlinskii
-from bench.identification import Errors, Identification
-from bench.identification.dynamics import DynamicsIdentification, identify_dynamics
-from bench.journal import Record, Table
-from bench.model_file import ModelFile
+from bench.analysis import WholeIdentification
+from bench.base import DataError
+from bench.identification import DynamicsIdentification, Errors, Identification, ModelFile, identify_dynamics
+from bench.models import Polynomial, PrandtlIshlinskii
 from bench.protocol import LATENESS
-from bench.results.whole_models import WholeIdentification
+from bench.record import Record, Table
 from rigs.hybrid.model import HybridModel, OrderChoice, choose_order, identify_pi, identify_polynomial
 from rigs.hybrid.network_identification import NetworkIdentification, identify_network
 

@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from bench.clock import Clock
+from bench.base import Clock
 from rigs.hybrid.scan import SensorScan
 from rigs.hybrid.witness import WitnessRegisters
 from sim_devices.faults.fault import Fault, Quantity

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from bench.control.references import Reference
+from bench.control import Reference
 
 BEGIN = 1.0
 """Time from the start at which the wave begins, s."""

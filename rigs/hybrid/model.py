@@ -13,11 +13,9 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bench.hysteresis import Model, ModelSpec, Operator, Polynomial, PrandtlIshlinskii, _checks
-from bench.hysteresis._checks import Floats
-from bench.hysteresis.documents import Parts
-from bench.identification.by_name import Identification, Initial, identify
-from bench.identification.dynamics import ThirdOrder
+from bench.base import Floats, checks as _checks
+from bench.identification import Identification, Initial, ThirdOrder, identify
+from bench.models import Model, ModelSpec, Operator, Parts, Polynomial, PrandtlIshlinskii
 from rigs.hybrid.network import NODES, ThermalNetwork
 
 # Allowed use of a part beyond the range that it was fitted on, as a share of that range.

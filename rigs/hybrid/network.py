@@ -26,8 +26,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bench.hysteresis import _checks
-from bench.hysteresis._checks import Floats
+from bench.base import Floats, checks as _checks
 
 Node: TypeAlias = Literal["block end", "block front", "base", "tip"]
 

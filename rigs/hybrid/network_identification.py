@@ -9,9 +9,8 @@ from dataclasses import dataclass, fields, replace
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bench.hysteresis import _checks
-from bench.hysteresis._checks import Floats
-from bench.identification.measures import Errors, measure_errors
+from bench.base import Floats, checks as _checks
+from bench.identification import Errors, measure_errors
 from rigs.hybrid.design import Design
 from rigs.hybrid.network import NODES, ThermalNetwork
 

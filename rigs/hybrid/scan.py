@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.deferred import DeferredModule
+from bench.base import DeferredModule
 from sim_devices.faults.sensor import FaultySensor
 from sim_devices.plants.hybrid import HybridCantilever
 from sim_devices.transducers.displacement import DisplacementSensor

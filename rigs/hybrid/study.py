@@ -13,13 +13,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
+from bench.analysis import Published, calibrate_run, errors_text, plot_fit, plot_tracking
+from bench.batch import Campaign, ResultTable, Study, StudyResult
 from bench.identification import measure_errors
-from bench.journal import Record
-from bench.results.calibrations import calibrate_run
-from bench.results.figures import plot_fit, plot_tracking
-from bench.results.prediction_figures import errors_text
-from bench.results.published import Published
-from bench.studies import Campaign, ResultTable, Study, StudyResult
+from bench.record import Record
 from rigs.hybrid.design import Design
 from rigs.hybrid.evaluation import (
     HELD,
@@ -52,9 +49,9 @@ from rigs.hybrid.identification import (
 from rigs.hybrid.model import PUBLISHED_DYNAMICS
 
 if TYPE_CHECKING:
-    from bench.calibration import Calibration
-    from bench.runs import RunResult
-    from bench.workers import Pending
+    from bench.base import Pending
+    from bench.rig import Calibration
+    from bench.run import RunResult
 
 Floats = npt.NDArray[np.float64]
 
@@ -568,7 +565,7 @@ STUDY = Study(
     carry_out=_carry_out,
     published=PUBLISHED,
     kernels=(
-        "bench.identification._mode_kernels",
+        "bench.identification.kernels.mode_kernels",
         "sim_devices.plants._hybrid_kernels",
         "sim_devices.plants._voltage_course_kernels",
         "sim_devices.transducers",

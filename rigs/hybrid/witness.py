@@ -12,10 +12,8 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from bench.clock import Clock
-from bench.devices import DriverSettings, Identity
-from bench.errors import DeviceConnectionError
-from bench.roles import PositionSensor
+from bench.base import Clock, DeviceConnectionError
+from bench.devices import DriverSettings, Identity, PositionSensor
 from drivers.device import LineDevice
 from drivers.modbus import RefusedError, read_request
 from drivers.modbus_tcp import Connection, share

@@ -14,11 +14,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import numpy.typing as npt
 
-from bench.hysteresis import TwoStage
-from bench.identification.two_stage import CoupledIdentification, FirstStage, Series, measure_series
-from bench.model_file import ModelFile
-from bench.results.figures import Curve, plot_panels
-from bench.studies import Campaign, ResultTable
+from bench.analysis import Curve, plot_panels
+from bench.batch import Campaign, ResultTable
+from bench.identification import CoupledIdentification, FirstStage, ModelFile, Series, measure_series
+from bench.models import TwoStage
 from rigs.muscles.identification import (
     MODELS,
     ModelName,
@@ -33,8 +32,8 @@ from rigs.muscles.identification import (
 )
 
 if TYPE_CHECKING:
-    from bench.runs import RunResult
-    from bench.workers import Pending
+    from bench.base import Pending
+    from bench.run import RunResult
 
 Floats = npt.NDArray[np.float64]
 

@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 
 import typer
 
+from bench.base import print_plain
 from bench.cli import JsonOption, console, print_rows, write_json
-from bench.printing import print_plain
 
 
 def identify_muscle(
@@ -32,7 +32,7 @@ def identify_muscle(
     The two-stage model is length = H2[force - H1[voltage]]; the protocols length-control and force-control use it.
     Errors are the average and the RMS in percent of the measured range.
     """
-    from bench.identification.two_stage import measure_series
+    from bench.identification import measure_series
     from rigs.muscles import identification as muscle
 
     series = [one for run in length_runs for one in muscle.read_series(run)]

@@ -25,17 +25,23 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
-from bench.control.baselines import saturation
-from bench.control.dynamics import IdentifiedDynamics, ResponseDynamics
-from bench.control.estimators import DisturbanceEstimator
-from bench.control.loops import SHORTEST_WAIT
-from bench.control.tracking import Command, ControllerBase, Trace, check_positive, widened
-from bench.control.tuning import tuned
-from bench.control.two_stage_inverse import TwoStageInverse
-from bench.controllers import ControllerSetup, ControllerSpec, greatest_error
-from bench.errors import ConfigurationError, DataError
-from bench.hysteresis import Reach, TwoStageState, _checks
-from bench.hysteresis.coupled_stream import TwoStageStream
+from bench.base import ConfigurationError, DataError, checks as _checks
+from bench.control import (
+    SHORTEST_WAIT,
+    Command,
+    ControllerBase,
+    ControllerSetup,
+    ControllerSpec,
+    DisturbanceEstimator,
+    Trace,
+    TwoStageInverse,
+    check_positive,
+    greatest_error,
+    saturation,
+    tuned,
+    widened,
+)
+from bench.models import IdentifiedDynamics, Reach, ResponseDynamics, TwoStageState, TwoStageStream
 from rigs.muscles.lag import Lag, LagSearch
 from rigs.muscles.tasks import ForceTask, LengthTask, Task
 

@@ -16,25 +16,29 @@ from typing import Any, Literal, NamedTuple, cast
 import numpy as np
 import numpy.typing as npt
 
-from bench.control.dynamics import IdentifiedDynamics
-from bench.errors import DataError
-from bench.hysteresis import Model, PrandtlIshlinskii, TwoStage
-from bench.identification import Errors
-from bench.identification.regularization import SMOOTHING
-from bench.identification.two_stage import (
+from bench.analysis import (
+    Recording,
+    WholeIdentification,
+    identify_dynamics,
+    identify_transients,
+    noise_of,
+    read_transients,
+)
+from bench.base import DataError
+from bench.identification import (
+    SMOOTHING,
     CoupledIdentification,
+    Errors,
     FirstStage,
+    ModelFile,
     Series,
     identify_first_stage,
     identify_linear,
     identify_second_stage,
     identify_summed,
 )
-from bench.journal import Record
-from bench.model_file import ModelFile
-from bench.results.whole_models import WholeIdentification
-from bench.transients.identification import identify_dynamics, identify_transients, noise_of, read_transients
-from bench.transients.recording import Recording
+from bench.models import IdentifiedDynamics, Model, PrandtlIshlinskii, TwoStage
+from bench.record import Record
 from protocols.muscles.parts import CONDITIONING, SAMPLE
 
 Floats = npt.NDArray[np.float64]

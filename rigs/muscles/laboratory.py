@@ -15,8 +15,7 @@ from typing import ClassVar, Literal, Protocol
 import numpy as np
 from pydantic import Field
 
-from bench.clock import Clock
-from bench.errors import ConfigurationError
+from bench.base import Clock, ConfigurationError
 from sim_devices.faults.fault import Fault, Quantity
 from sim_devices.faults.sensor import FaultySensor
 from sim_devices.instruments.dynamixel import EmulatedMX28

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from bench.control.tracking import check_positive
-from bench.hysteresis import _checks
+from bench.base import checks as _checks
+from bench.control import check_positive
 
 
 @dataclass(frozen=True, slots=True)

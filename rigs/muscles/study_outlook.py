@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from bench.results.figures import Curve, plot_panels
-from bench.studies import Campaign, Study, StudyResult
+from bench.analysis import Curve, plot_panels
+from bench.batch import Campaign, Study, StudyResult
 from rigs.muscles.characterization import Characterization, characterize, errors_table, plot_lengths, start_runs
 
 MUSCLES = {
@@ -53,7 +53,7 @@ STUDY = Study(
     "coiled-polymer, and identifies the models. The outlook of Zhang and Yip, 2017.",
     carry_out,
     kernels=(
-        "bench.transients",
+        "bench.models.kernels.actuator_kernels",
         "sim_devices.plants._friction_kernels",
         "sim_devices.instruments._flintec_kernels",
         "sim_devices.transducers._imperfect_kernels",

@@ -12,20 +12,20 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from bench.hysteresis import Density
-from bench.identification.two_stage import predict_series
-from bench.results.figures import (
+from bench.analysis import (
     Curve,
+    Published,
+    TargetResults,
     plot_densities,
     plot_errors,
     plot_panels,
     plot_sequence_and_errors,
     plot_tracking,
 )
-from bench.results.published import Published
-from bench.results.tracking import TargetResults
-from bench.rig_file import load_rig
-from bench.studies import Campaign, ResultTable, Study, StudyResult, reached_targets, true_errors
+from bench.batch import Campaign, ResultTable, Study, StudyResult, reached_targets, true_errors
+from bench.identification import predict_series
+from bench.models import Density
+from bench.rig import load_rig
 from rigs.muscles.characterization import (
     KINDS,
     PAPER,
@@ -209,9 +209,9 @@ STUDY = Study(
     carry_out,
     PUBLISHED,
     (
-        "bench.hysteresis._inverse_kernels",
-        "bench.hysteresis._stream_kernels",
-        "bench.transients",
+        "bench.models.kernels.inverse_kernels",
+        "bench.models.kernels.stream_kernels",
+        "bench.models.kernels.actuator_kernels",
         "sim_devices.plants._sma_kernels",
         "sim_devices.instruments._flintec_kernels",
         "sim_devices.transducers._imperfect_kernels",

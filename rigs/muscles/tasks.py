@@ -8,11 +8,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, Self
 
-from bench.control.tracking import check_positive, widened
-from bench.control.two_stage_inverse import TwoStageInverse, TwoStageInversion
-from bench.errors import DataError
-from bench.hysteresis import TwoStageState, _checks
-from bench.hysteresis.coupled_stream import TwoStageStream
+from bench.base import DataError, checks as _checks
+from bench.control import TwoStageInverse, TwoStageInversion, check_positive, widened
+from bench.models import TwoStageState, TwoStageStream
 
 _READING = 1e-3
 """Noise of one reading where it is not known, as a part of the output's range."""

@@ -10,9 +10,9 @@ import numpy as np
 import numpy.typing as npt
 from pydantic import Field, model_validator
 
-from bench.derived import Derived, DerivedSignal
+from bench.base import DeviceError
 from bench.devices import Signal
-from bench.errors import DeviceError
+from bench.rig import Derived, DerivedSignal
 
 Floats = npt.NDArray[np.float64]
 

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 from pydantic import Field
 
-from bench.clock import Clock
+from bench.base import Clock
 from sim_devices.faults.fault import Fault, Quantity
 from sim_devices.faults.sensor import FaultySensor
 from sim_devices.faults.supply import ClippedPeltier

@@ -14,22 +14,34 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from bench.errors import DataError
-from bench.hysteresis import MemoryCurve
+from bench.analysis import (
+    FollowingResult,
+    IdentifiedFile,
+    Published,
+    TargetResults,
+    errors_json,
+    errors_text,
+    following_result,
+    identify_file,
+    plot_densities,
+    plot_errors,
+    plot_fit,
+    plot_sequence_and_errors,
+    plot_tracking,
+    predict,
+    transients_of,
+)
+from bench.base import DataError
+from bench.batch import Campaign, ResultTable, Study, StudyResult, reached_targets, true_errors
 from bench.identification import measure_errors
-from bench.journal import Record
-from bench.results.figures import plot_densities, plot_errors, plot_fit, plot_sequence_and_errors, plot_tracking
-from bench.results.models import IdentifiedFile, errors_json, identify_file, predict, transients_of
-from bench.results.prediction_figures import errors_text
-from bench.results.published import Published
-from bench.results.tracking import FollowingResult, TargetResults, following_result
-from bench.rig_file import load_rig
-from bench.studies import Campaign, ResultTable, Study, StudyResult, reached_targets, true_errors
+from bench.models import MemoryCurve
+from bench.record import Record
+from bench.rig import load_rig
 from rigs.vo2.curvature import CantileverCurvature, curvature_to_deflection, deflection_to_curvature
 
 if TYPE_CHECKING:
-    from bench.runs import RunResult
-    from bench.workers import Pending
+    from bench.base import Pending
+    from bench.run import RunResult
 
 Floats = npt.NDArray[np.float64]
 
@@ -346,9 +358,9 @@ STUDY = Study(
     carry_out,
     PUBLISHED,
     (
-        "bench.hysteresis._inverse_kernels",
-        "bench.hysteresis._stream_kernels",
-        "bench.transients",
+        "bench.models.kernels.inverse_kernels",
+        "bench.models.kernels.stream_kernels",
+        "bench.models.kernels.actuator_kernels",
         "sim_devices.plants._vo2_kernels",
         "sim_devices.transducers._imperfect_kernels",
     ),

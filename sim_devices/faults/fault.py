@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from bench.errors import ConfigurationError
+from bench.base import ConfigurationError
 
 
 @dataclass(frozen=True)

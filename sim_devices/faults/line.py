@@ -17,7 +17,7 @@ from typing import ClassVar, Protocol
 
 import numpy as np
 
-from bench.clock import Clock
+from bench.base import Clock
 from sim_devices.faults.fault import Fault, Quantity
 from sim_devices.wire import Answering, Connection, Stream, TcpServer, WireServer
 

@@ -8,7 +8,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.compiled import kernel
+from bench.base import kernel
 
 Floats = NDArray[np.float64]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bench.compiled import inner
+from bench.base import inner
 from sim_devices.plants.grid import Floats
 
 NOISE, STEP, LOWEST, HIGHEST = range(4)

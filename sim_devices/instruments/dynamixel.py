@@ -36,9 +36,8 @@ from typing import Any
 
 import numpy as np
 
-from bench.devices import Identity, Limits, Status
-from bench.errors import DeviceError
-from bench.roles import Servo
+from bench.base import DeviceError
+from bench.devices import Identity, Limits, Servo, Status
 from sim_devices.instruments.dynamixel_motion import (
     NO_LOAD_SPEED_PER_VOLT,
     STALL_TORQUE_PER_VOLT,

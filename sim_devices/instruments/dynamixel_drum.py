@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 
-from bench.devices import Identity, Limits, Status
-from bench.roles import LinearStage
+from bench.devices import Identity, Limits, LinearStage, Status
 from sim_devices.instruments.dynamixel import EmulatedMX28
 from sim_devices.instruments.dynamixel_table import COUNT
 from sim_devices.instruments.emulated import EmulatedDevice

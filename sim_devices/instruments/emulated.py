@@ -11,8 +11,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from bench.base import DeviceConnectionError
 from bench.devices import Device, Identity
-from bench.errors import DeviceConnectionError
 from sim_devices.noise import normals
 from sim_devices.world import World
 

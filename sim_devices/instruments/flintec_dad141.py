@@ -43,10 +43,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.deferred import DeferredModule
-from bench.devices import Identity
-from bench.errors import DeviceError
-from bench.roles import LoadCell
+from bench.base import DeferredModule, DeviceError
+from bench.devices import Identity, LoadCell
 from sim_devices.instruments.emulated import EmulatedDevice, LineFaults
 from sim_devices.instruments.registers import Register, RegisterInstrument
 from sim_devices.wire.modbus import DEVICE_FAILURE, ILLEGAL_VALUE, Frame, Packet, RegisterError

@@ -33,9 +33,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from bench.devices import Identity, Limits, Status
-from bench.errors import DeviceError
-from bench.roles import TECAmplifier, TECMode
+from bench.base import DeviceError
+from bench.devices import Identity, Limits, Status, TECAmplifier, TECMode
 from sim_devices.instruments.emulated import EmulatedInstrument, FreezingReadings, RequestRefusedError
 from sim_devices.instruments.meerstetter_table import (
     CONTROLLER,

@@ -37,9 +37,8 @@ from typing import Any, Literal, NamedTuple, Protocol
 
 import numpy as np
 
-from bench.devices import Identity, Limits, Status
-from bench.errors import DeviceError
-from bench.roles import VoltageSupply
+from bench.base import DeviceError
+from bench.devices import Identity, Limits, Status, VoltageSupply
 from sim_devices.instruments.emulated import EmulatedInstrument, FreezingReadings, RequestRefusedError
 from sim_devices.instruments.roboteq_objects import (
     CHANNELS,

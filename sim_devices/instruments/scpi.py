@@ -1,4 +1,4 @@
-"""An emulated supply or meter that speaks the messages of a table of the rig file (`bench.command_table`).
+"""An emulated supply or meter that speaks the messages of a table of the rig file (`bench.devices.command_table`).
 
 It answers the questions of the table, takes its messages, and keeps a queue of errors (SCPI-99 volume 2, 21.8). The
 common commands `*CLS`, `*RST`, `*OPC` and `*OPC?` of IEEE 488.2 are there even if the table does not name them. A
@@ -18,8 +18,7 @@ from functools import partial
 
 import numpy as np
 
-from bench.command_table import VALUE, ActuatorTable, CommandTable, signals_by_query, template
-from bench.devices import Identity, Signal
+from bench.devices import VALUE, ActuatorTable, CommandTable, Identity, Signal, signals_by_query, template
 from sim_devices.instruments.emulated import EmulatedInstrument
 from sim_devices.world import World
 

@@ -8,7 +8,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from bench.devices import Identity, Signal
-from bench.twin.device import (
+from bench.specimen import (
     DONE,
     END,
     GLANCE,
@@ -18,10 +18,10 @@ from bench.twin.device import (
     OUTPUT,
     REFUSED,
     SET,
+    NoiseTable,
     TwinSettings,
     number_text,
 )
-from bench.twin.tables import NoiseTable
 from sim_devices.instruments.emulated import EmulatedInstrument
 from sim_devices.wire import WireServer
 from sim_devices.world import World

@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 from typing import Annotated, Any, NamedTuple
 
-from bench.compiled import Table, inner, kernel
+from bench.base import Table, inner, kernel
 from sim_devices.plants.grid import Floats, record_type
 from sim_devices.plants.muscle import CLAMPED, FAN, LOAD, PLACE, VOLTAGE
 

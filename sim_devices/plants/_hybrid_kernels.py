@@ -10,9 +10,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from bench.compiled import inner, kernel
-from sim_devices.plants import _voltage_course_kernels as course_kernels
-from sim_devices.plants import cooler
+from bench.base import inner, kernel
+from sim_devices.plants import _voltage_course_kernels as course_kernels, cooler
 from sim_devices.plants.cooler import CLOSED, COMMAND, LIMIT, TARGET
 from sim_devices.plants.grid import Floats
 

@@ -12,7 +12,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.compiled import Table, inner, kernel
+from bench.base import Table, inner, kernel
 from sim_devices.plants.grid import Floats, record_type
 from sim_devices.plants.muscle import CLAMPED, FAN, LOAD, PLACE, VOLTAGE
 

@@ -12,7 +12,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.compiled import Table, inner, kernel
+from bench.base import Table, inner, kernel
 from sim_devices.plants.cooler import CLOSED, COMMAND, LIMIT, TARGET
 from sim_devices.plants.grid import Floats, record_type
 

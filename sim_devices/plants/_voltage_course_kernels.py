@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from bench.compiled import kernel
+from bench.base import kernel
 from sim_devices.plants.grid import Floats
 
 START, TARGET, STEPS, TAKEN, TIME_CONSTANT = range(5)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 
-from bench.deferred import DeferredModule
+from bench.base import DeferredModule
 from sim_devices.plants.grid import Floats, NotNegative, Record, fluctuation
 from sim_devices.plants.muscle import MILLIMETRE, Muscle, MuscleParameters
 

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Generic, TypeVar, get_type_hints
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.errors import ConfigurationError
+from bench.base import ConfigurationError
 
 # A grid point counts as reached this early (s), so that rounding in the caller's clock, even one that counts from
 # 1970, does not decide on which side of a call a step falls.

@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from bench.deferred import DeferredModule
+from bench.base import DeferredModule
 from sim_devices.plants.cooler import CooledPlant
 from sim_devices.plants.grid import (
     ABSOLUTE_ZERO,

@@ -20,7 +20,7 @@ class Lag:
     sources : tuple of str
         Names of the inputs and quantities from which the target is computed.
     target : callable
-        Computes it from the values by name; may raise `bench.errors.DeviceError`.
+        Computes it from the values by name; may raise `bench.base.errors.DeviceError`.
     time_constant : float
         In s, at least 0.
     initial : float or None

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.deferred import DeferredModule
+from bench.base import DeferredModule
 from sim_devices.plants.cooler import COMMAND_SIZE, CooledParameters, CooledPlant
 from sim_devices.plants.grid import Floats, NotNegative, Record, Seed, Signed, check_temperature, fluctuation, record
 

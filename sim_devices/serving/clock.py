@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from bench.clock import Clock, Stopwatch, wall_time
+from bench.base import Clock, Stopwatch, wall_time
 
 LONGEST_STEP = 0.1
 """Laboratory time (s) by which the clock follows at most at once; a process that was stalled loses the rest."""

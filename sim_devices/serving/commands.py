@@ -15,14 +15,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Table
 
-from bench.cli import JsonOption, console
-from bench.cli.console import STANDARD_OUTPUT, parse_assignments, parse_numbers, warn
-from bench.errors import ConfigurationError
-from bench.parsing import json_text, parse_json
+from bench.base import ConfigurationError, json_text, parse_json
+from bench.cli import STANDARD_OUTPUT, JsonOption, console, parse_assignments, parse_numbers, warn
 
 if TYPE_CHECKING:
     # Imported by the functions, as `bench --help` imports this module for its help text.
-    from bench.rig_file import RigFile
+    from bench.rig import RigFile
     from sim_devices.laboratory import EmulatedLaboratory
     from sim_devices.serving.endpoints import Listener
     from sim_devices.serving.served import ServedLaboratory
@@ -75,8 +73,8 @@ def emulate(
     of the laboratory, injects faults such as {"do": "fault", "fault": "tec.delay", "duration": 5}, and lists them by
     {"do": "help"}; the file of `--state` says when each began and ended. Ctrl-C and SIGTERM end it.
     """
-    from bench.interrupts import Interrupts
-    from bench.rig_file import load_rig
+    from bench.base import Interrupts
+    from bench.rig import load_rig
     from sim_devices.serving.clock import make_served_clock
     from sim_devices.serving.control import ControlSocket
     from sim_devices.serving.served import ServedLaboratory, Serving

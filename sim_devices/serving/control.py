@@ -8,8 +8,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from bench.errors import ConfigurationError
-from bench.parsing import json_text
+from bench.base import ConfigurationError, json_text
 from sim_devices.laboratory import TrueValue
 from sim_devices.serving import requests
 from sim_devices.serving.endpoints import Connection, Listener, socket_address

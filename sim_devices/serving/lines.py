@@ -8,7 +8,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator
 from typing import Protocol
 
-from bench.clock import Stopwatch
+from bench.base import Stopwatch
 from sim_devices.serving.clock import ServedClock
 from sim_devices.serving.endpoints import Connection, End, Listener, PseudoTerminal, socket_address
 from sim_devices.wire import Stream, TcpServer, WireServer

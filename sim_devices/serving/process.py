@@ -20,9 +20,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from bench.attachment import ControlClient, Endpoint, read_endpoints
-from bench.clock import Stopwatch
-from bench.errors import BenchError, ConfigurationError
+from bench.base import BenchError, ConfigurationError, Stopwatch
+from bench.rig import ControlClient, Endpoint, read_endpoints
 
 _LONGEST_START = 300.0  # s of wall-clock time; a first start on a busy machine compiles
 _LONGEST_END = 30.0

@@ -9,10 +9,8 @@ from typing import Any, ClassVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from bench.configuration_errors import problems
-from bench.errors import ConfigurationError
-from bench.faults import ScheduledFault
-from bench.parsing import parse_json
+from bench.base import ConfigurationError, parse_json, problems
+from bench.rig import ScheduledFault
 
 _LONGEST_SKIP = 3600.0
 _RIG = Field(default=None, description="which rig is meant, where several are served")

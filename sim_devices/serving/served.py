@@ -8,8 +8,8 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any
 
-from bench.errors import ConfigurationError
-from bench.rig_file import RigFile
+from bench.base import ConfigurationError
+from bench.rig import RigFile
 from sim_devices.faults.line import Cable
 from sim_devices.laboratory import EmulatedLaboratory, TrueValue
 from sim_devices.serving.clock import LONGEST_STEP, ServedClock

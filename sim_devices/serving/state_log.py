@@ -6,8 +6,7 @@ from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
-from bench.errors import ConfigurationError
-from bench.parsing import json_text
+from bench.base import ConfigurationError, json_text
 from sim_devices.serving.control import values_to_json
 from sim_devices.serving.served import ServedLaboratory
 

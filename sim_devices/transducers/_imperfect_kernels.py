@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.compiled import inner, kernel
+from bench.base import inner, kernel
 
 Floats = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from bench.compiled import kernel
+from bench.base import kernel
 
 _KELVIN = 273.15
 

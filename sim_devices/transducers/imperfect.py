@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from bench.checked_table import CheckedTable
+from bench.base import CheckedTable
 from sim_devices.world import World
 
 Floats = NDArray[np.float64]

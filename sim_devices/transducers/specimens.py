@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from bench.rig_file import LaboratorySettings
+from bench.rig import LaboratorySettings
 from sim_devices.transducers.imperfect import Characteristic, SensorErrors
 
 

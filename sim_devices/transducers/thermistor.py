@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.deferred import DeferredModule
+from bench.base import DeferredModule
 from sim_devices.noise import normals
 
 if TYPE_CHECKING:

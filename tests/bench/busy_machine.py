@@ -27,7 +27,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from bench.journal import Record
+from bench.record import Record
 
 SHORT = ["--set", "hot=70", "--set", "cool=50"]
 PROCESSES, RUNS_EACH = 4, 5

@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 
-from bench.control.tracking import Trace
+from bench.control import Trace
 from bench.protocol import FixedRate, Messages, ProtocolParameters, parameter, protocol
 
 _HEAD = """

@@ -10,11 +10,18 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
-from bench.clock import Clock
-from bench.devices import DriverSettings, Identity, Limits, Status
-from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
-from bench.rig_file import LaboratorySettings
-from bench.roles import PositionSensor, TECAmplifier, TECMode, TemperatureSensor
+from bench.base import Clock, ConfigurationError, DeviceConnectionError, DeviceError
+from bench.devices import (
+    DriverSettings,
+    Identity,
+    Limits,
+    PositionSensor,
+    Status,
+    TECAmplifier,
+    TECMode,
+    TemperatureSensor,
+)
+from bench.rig import LaboratorySettings
 
 RIG = """
 [rig]

@@ -1,16 +1,7 @@
 """Protocols for the heater."""
 
-from bench.protocol import (
-    Dwell,
-    Messages,
-    Note,
-    Phase,
-    ProtocolParameters,
-    Step,
-    UntilSteady,
-    parameter,
-    protocol,
-)
+from bench.devices import Dwell, UntilSteady
+from bench.protocol import Messages, Note, Phase, ProtocolParameters, Step, parameter, protocol
 
 
 class Stairs(ProtocolParameters):

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 import bench
-from bench.journal import FILE_NAME, Record
+from bench.record import FILE_NAME, Record
 
 LONG = 120.0
 """Wall-clock time that a busy machine may take, s."""

@@ -6,7 +6,7 @@ from pathlib import Path
 from rich.console import Console
 
 from bench.protocol import find_protocol
-from bench.runs import Run, carry_out
+from bench.run import Run, carry_out
 
 
 def main() -> int:

@@ -4,7 +4,7 @@ import sys
 
 import worker_tasks
 
-from bench.workers import Workers
+from bench.base import Workers
 
 with Workers(2) as workers:
     for _ in range(2):

@@ -1,8 +1,8 @@
 """A study of seconds: four short runs, one of which another waits for, and a figure."""
 
-from bench.journal import Record
-from bench.results.figures import plot_errors
-from bench.studies import Campaign, ResultTable, Study, StudyResult
+from bench.analysis import plot_errors
+from bench.batch import Campaign, ResultTable, Study, StudyResult
+from bench.record import Record
 
 SETTINGS = {"duration": "4", "settling": "2"}
 

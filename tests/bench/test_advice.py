@@ -5,8 +5,8 @@ from contextlib import closing
 
 import pytest
 
-from bench.errors import DataError
-from bench.journal import Journal, Record
+from bench.base import DataError
+from bench.record import Journal, Record
 
 
 @pytest.mark.parametrize("value", ["0,5", "1,5e1", "-0,25"])

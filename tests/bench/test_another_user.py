@@ -13,13 +13,12 @@ from pathlib import Path
 
 import pytest
 
+from bench.base import BenchError
 from bench.devices import Signal
-from bench.errors import BenchError
-from bench.journal import FILE_NAME, Event, Journal, Record
-from bench.journal.mirror import Mirror, elsewhere, read_mirror
-from bench.journal.recovery import recover
-from bench.journal.rows import entry
-from bench.locks import Holder, Locks
+from bench.record import FILE_NAME, Event, Journal, Record, recover
+from bench.record.mirror import Mirror, elsewhere, read_mirror
+from bench.record.rows import entry
+from bench.rig import Holder, Locks
 
 pytestmark = pytest.mark.skipif(
     sys.platform == "win32" or os.geteuid() != 0, reason="needs root, who can act as other users"

@@ -3,17 +3,14 @@
 import pytest
 from cases import cases
 
-from bench.clock import VirtualClock
+from bench.base import DeviceError, Interrupts, SettleTimeoutError, VirtualClock
 from bench.dashboard.timeline import _NOT_SETTLED, Timeline
-from bench.engine import Engine
-from bench.errors import DeviceError, SettleTimeoutError
-from bench.interrupts import Interrupts
-from bench.journal import FILE_NAME, Journal, Record
-from bench.protocol import Arrived, Dwell, Prompt, ProtocolParameters, Step, UntilSteady, plan, protocol
-from bench.rig import Rig
-from bench.rig_file import load_rig
-from bench.settling import Settled
-from bench.station.local import LocalStation
+from bench.devices import Arrived, Dwell, Settled, UntilSteady
+from bench.protocol import Prompt, ProtocolParameters, Step, plan, protocol
+from bench.record import FILE_NAME, Journal, Record
+from bench.rig import Rig, load_rig
+from bench.run.engine import Engine
+from bench.run.station.local import LocalStation
 
 
 class Nothing(ProtocolParameters):

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from bench.journal import Record
-from bench.protocol.changes import PARAMETER, ParameterChange
+from bench.protocol import PARAMETER, ParameterChange
+from bench.record import Record
 
 pexpect = pytest.importorskip("pexpect")
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="needs pseudo-terminals")

@@ -4,15 +4,11 @@ import pytest
 from cases import cases
 from heater_laboratory import CLOSED
 
-from bench.binding import RoleTable
+from bench.base import ConfigurationError, VirtualClock
 from bench.cli import main
-from bench.clock import VirtualClock
-from bench.devices import Signal
-from bench.errors import ConfigurationError
-from bench.protocol import Dwell, ProtocolParameters, Step, UntilSteady, find_protocol, from_slot, parameter, protocol
-from bench.rig import Rig
-from bench.rig_file import load_rig
-from bench.roles import Servo, TECAmplifier
+from bench.devices import Dwell, Servo, Signal, TECAmplifier, UntilSteady
+from bench.protocol import ProtocolParameters, Step, find_protocol, from_slot, parameter, protocol
+from bench.rig import Rig, RoleTable, load_rig
 
 ROLES = """
 [roles.drive]

@@ -5,13 +5,12 @@ from contextlib import closing
 import pytest
 from heater_protocols import stairs
 
-from bench.clock import VIRTUAL_EPOCH, VirtualClock
-from bench.engine import check_before_moving
-from bench.errors import DeviceError, LimitError
-from bench.face import open_rig
+from bench.api import open_rig
+from bench.base import DeviceError, LimitError, VirtualClock
+from bench.base.clock import VIRTUAL_EPOCH
 from bench.protocol import plan
-from bench.rig import Rig
-from bench.rig_file import load_rig
+from bench.rig import Rig, load_rig
+from bench.run import check_before_moving
 
 bluesky = pytest.importorskip("bluesky")
 plans = pytest.importorskip("bluesky.plans")

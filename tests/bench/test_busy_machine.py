@@ -6,8 +6,8 @@ import sys
 import pytest
 from busy_machine import busy, fingerprint, run
 
-from bench.compilation_display import MESSAGE
-from bench.journal import Record
+from bench.base.compilation_display import MESSAGE
+from bench.record import Record
 
 
 @pytest.mark.slow

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 from cases import cases
 
-from bench.calibration import Calibrated, Calibration, calibrate, read_calibration
-from bench.errors import DataError, DeviceError
+from bench.base import DataError, DeviceError
+from bench.rig import Calibration, calibrate
+from bench.rig.calibration import Calibrated, read_calibration
 
 DAY = date(2026, 3, 1)
 TEXTS = {"signal": "spot_position", "unit": "m", "named": "interferometer", "day": DAY}

@@ -14,21 +14,28 @@ import pytest
 from cases import cases
 from rich.console import Console
 
-from bench import registry
-from bench.campaigns.cluster import ClusterExecutor, check_address
-from bench.campaigns.execution import WorkersExecutor, carry_out_tasks, done_before, opened_folder
-from bench.campaigns.expansion import expand
-from bench.campaigns.file import read_campaign
-from bench.campaigns.study_tables import OverSeeds, over_seeds
-from bench.campaigns.tasks import DONE_NAME, UNFINISHED
+from bench.base import ConfigurationError, Workers, registry
+from bench.batch import (
+    UNFINISHED,
+    ClusterExecutor,
+    ResultTable,
+    Study,
+    StudyResult,
+    WorkersExecutor,
+    carry_out_tasks,
+    check_address,
+    done_before,
+    expand,
+    opened_folder,
+    read_campaign,
+)
+from bench.batch.campaign.study_tables import OverSeeds, over_seeds
+from bench.batch.campaign.tasks import DONE_NAME
 from bench.cli import main
-from bench.cli.campaign import SayingExecutor
-from bench.errors import ConfigurationError
-from bench.journal import Record
-from bench.locks import Holder, Locks
-from bench.runs import carry_out
-from bench.studies import ResultTable, Study, StudyResult
-from bench.workers import Workers
+from bench.cli.campaign_command import SayingExecutor
+from bench.record import Record
+from bench.rig import Holder, Locks
+from bench.run import carry_out
 
 pytestmark = pytest.mark.usefixtures("warm_popen")
 

@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from cases import cases
 
+from bench.analysis import read_columns
 from bench.cli import main
-from bench.journal import FILE_NAME, Record
-from bench.model_file import load_model
-from bench.results.data import read_columns
+from bench.identification import load_model
+from bench.record import FILE_NAME, Record
 
 FAST = ["--rig", "vo2", "--clock", "virtual"]
 # On the clock of a busy machine: neither the watchdog of the output nor a late answer ends the run.
@@ -320,7 +320,7 @@ class TestRun:
 
 def wait_for_a_tick(process, folder):
     """Return once the run that a process carries out has recorded telemetry."""
-    from bench.clock import WallClock
+    from bench.base import WallClock
 
     clock = WallClock()
     while clock.now() < 200:

@@ -5,11 +5,10 @@ from datetime import UTC, datetime, timedelta
 
 import pytest
 from cases import cases
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
-from bench.clock import (
-    VIRTUAL_EPOCH,
+from bench.base import (
+    ConfigurationError,
     Pace,
     PacedClock,
     ScaledClock,
@@ -19,7 +18,7 @@ from bench.clock import (
     make_clock,
     wall_time,
 )
-from bench.errors import ConfigurationError
+from bench.base.clock import VIRTUAL_EPOCH
 
 
 def every_clock():

@@ -5,12 +5,11 @@ import re
 
 import pytest
 from cases import cases
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
-from bench.command_table import Template, written_number
-from bench.errors import ConfigurationError
-from bench.rig_file import load_rig
+from bench.base import ConfigurationError
+from bench.devices import Template, written_number
+from bench.rig import load_rig
 
 finite = st.floats(-1e30, 1e30)
 

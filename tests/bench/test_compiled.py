@@ -7,7 +7,7 @@ import sys
 import pytest
 from cases import cases
 
-from bench.compiled import inlined, inner, kernel, reordered
+from bench.base import inlined, inner, kernel, reordered
 
 
 @inner
@@ -46,10 +46,8 @@ def test_the_others_refuse_a_call_from_python(function):
 
 
 SCALE = "FACTOR = {factor}\n"
-STEPS = (
-    "from bench.compiled import inner\nfrom loops.scale import FACTOR\n\n\n@inner\ndef step(x):\n    return {step}\n"
-)
-USES = "from bench.compiled import kernel\nfrom loops import _steps_kernels as steps\n\nstep = steps.step\n\n\n"
+STEPS = "from bench.base import inner\nfrom loops.scale import FACTOR\n\n\n@inner\ndef step(x):\n    return {step}\n"
+USES = "from bench.base.compiled import kernel\nfrom loops import _steps_kernels as steps\n\nstep = steps.step\n\n\n"
 USES += "@kernel\ndef use(x):\n    return step(x)\n"
 
 

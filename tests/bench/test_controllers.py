@@ -7,11 +7,18 @@ import numpy as np
 import pytest
 from cases import cases
 
-from bench.control.dynamics import ActuatorDynamics, IdentifiedDynamics, ResponseDynamics
-from bench.controllers import ControllerSetup, controller_names, controller_spec, make_controller, saturated_below
-from bench.errors import ConfigurationError
-from bench.hysteresis import Polynomial, PrandtlIshlinskii, Preisach, uniform_levels
-from bench.model_file import ModelFile
+from bench.base import ConfigurationError
+from bench.control import ControllerSetup, controller_names, controller_spec, make_controller, saturated_below
+from bench.identification import ModelFile
+from bench.models import (
+    ActuatorDynamics,
+    IdentifiedDynamics,
+    Polynomial,
+    PrandtlIshlinskii,
+    Preisach,
+    ResponseDynamics,
+    uniform_levels,
+)
 
 PREISACH = ModelFile("preisach", Preisach(uniform_levels(0.0, 3.0, 4), np.ones(10), input_range=(0.0, 3.0)))
 POLYNOMIAL = ModelFile("polynomial", Polynomial([1.0], (0.0, 3.0)))

@@ -16,15 +16,16 @@ import rerun_cli
 from rerun.chunk import RrdReader
 from rerun.experimental import ViewerClient
 
-from bench.clock import Stopwatch, WallClock
+from bench.base import ConfigurationError, DataError, Stopwatch, WallClock
 from bench.dashboard import Dashboard, picture, rebuild
 from bench.dashboard.live import QUEUED_TICKS
-from bench.devices import Signal
-from bench.errors import ConfigurationError, DataError
-from bench.hysteresis import (
+from bench.devices import Settled, Signal
+from bench.identification import ModelFile
+from bench.models import (
     Density,
     Linear,
     MemoryCurve,
+    Model,
     Polynomial,
     PrandtlIshlinskii,
     Preisach,
@@ -32,14 +33,10 @@ from bench.hysteresis import (
     TwoStage,
     uniform_levels,
 )
-from bench.hysteresis.documents import Model
-from bench.journal import FILE_NAME, Event, Journal, Record, StepRecord, add_model
-from bench.journal.rows import Entry
-from bench.lateness import Lateness
-from bench.layout import DashboardLayout, XYPlot
-from bench.model_file import ModelFile
 from bench.protocol import TRACES
-from bench.settling import Settled
+from bench.record import FILE_NAME, Event, Journal, Lateness, Record, StepRecord, add_model
+from bench.record.rows import Entry
+from bench.rig import DashboardLayout, XYPlot
 
 
 def xy_plot(x: str, y: str, x_range: tuple[float, float], y_range: tuple[float, float]) -> XYPlot:

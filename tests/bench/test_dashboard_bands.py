@@ -7,24 +7,21 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
+from bench.analysis import identify_file, invert_band
+from bench.analysis.band_columns import predict_band
 from bench.dashboard.entries import End, Tick
 from bench.dashboard.writer import Writer
-from bench.devices import Signal
-from bench.identification import identify
-from bench.identification.by_name import set_up_problem
-from bench.journal import StepRecord
-from bench.layout import DashboardLayout
-from bench.model_file import ModelFile
+from bench.devices import Settled, Signal
+from bench.identification import ModelFile, identify, set_up_problem
 from bench.protocol import TRACES
-from bench.results.bands import invert_band, predict_band
-from bench.results.models import identify_file
-from bench.settling import Settled
+from bench.record import StepRecord
+from bench.rig import DashboardLayout
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "identification"))
 
 from other_plants import damped, measured, random_reversals
 
-from bench.identification.bands import calibrate_band
+from bench.identification import calibrate_band
 
 SIGNALS = (
     Signal("supply_setpoint", "V", "set-point", 3),

@@ -5,17 +5,15 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 pytest.importorskip("rerun")
 
-from bench.dashboard.control import ControlPlots, Errors
+from bench.dashboard.controlled_run import ControlPlots, Errors
 from bench.dashboard.entries import Entry, Tick, Ticks, in_parts, merged, portions, single, size
-from bench.devices import Signal
-from bench.journal import Event, StepRecord
+from bench.devices import Settled, Signal
 from bench.protocol import TRACES
-from bench.settling import Settled
+from bench.record import Event, StepRecord
 
 SIGNALS = (Signal("input", "V", "input"), Signal("output", "m", "output"), *TRACES)
 """Of a run under control of `output`."""

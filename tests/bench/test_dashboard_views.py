@@ -8,19 +8,15 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from bench.binding import RoleTable, Slot
 from bench.dashboard.bounds import bounds_of, nearest
-from bench.dashboard.control import ControlPlots, Errors
+from bench.dashboard.controlled_run import ControlPlots, Errors
 from bench.dashboard.drawing import Frame
 from bench.dashboard.entries import End, Tick, in_parts
 from bench.dashboard.writer import Writer
-from bench.devices import Signal
-from bench.journal import Event, StepRecord
-from bench.lateness import Lateness
-from bench.layout import DashboardLayout
-from bench.protocol import TRACES, Views, find_protocol
-from bench.protocol.vocabulary import LATENESS
-from bench.settling import Settled
+from bench.devices import Settled, Signal
+from bench.protocol import LATENESS, TRACES, Views, find_protocol
+from bench.record import Event, Lateness, StepRecord
+from bench.rig import DashboardLayout, RoleTable, Slot
 
 SIGNALS = (
     Signal("tec_setpoint", "°C", "temperature set-point", 3),

@@ -7,13 +7,11 @@ from datetime import datetime, timedelta
 import numpy as np
 import pytest
 from cases import cases
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
-from bench.errors import BenchError, ConfigurationError, DataError
-from bench.results.data import read_columns
-from bench.results.reading.heads import is_unit, make_heads, split_unit
-from bench.results.reading.options import ReadingOptions
+from bench.analysis import ReadingOptions, read_columns
+from bench.analysis.tables.reading.heads import is_unit, make_heads, split_unit
+from bench.base import BenchError, ConfigurationError, DataError
 
 ROWS = 40
 U = np.round(2.0 + 1.75 * np.sin(0.3 * np.arange(ROWS)), 4)

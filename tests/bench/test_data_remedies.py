@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from cases import cases
 
-from bench.errors import DataError
-from bench.results.data import read_columns
-from bench.results.reading.options import ReadingOptions
+from bench.analysis import ReadingOptions, read_columns
+from bench.base import DataError
 
 ROWS = 40
 U = np.round(2.0 + 1.75 * np.sin(0.3 * np.arange(ROWS)), 4)

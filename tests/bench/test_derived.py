@@ -9,15 +9,11 @@ import heater_laboratory
 import pytest
 from cases import cases
 from heater_laboratory import RIG
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from pydantic import ValidationError
 
-from bench.clock import VirtualClock
-from bench.derived import Expression
-from bench.errors import ConfigurationError, DeviceError
-from bench.rig import Rig
-from bench.rig_file import load_rig
+from bench.base import ConfigurationError, DeviceError, VirtualClock
+from bench.rig import Expression, Rig, load_rig
 
 UNITS = {"a": "V", "b": "V", "c": "1", "t": "°C", "x": "m", "p": "mbar"}
 VALUES = {"a": 2.0, "b": 0.5, "c": 3.0, "t": 40.0, "x": 1e-3, "p": 250.0}
@@ -253,7 +249,7 @@ class TestOnARig:
 
 
 OWN_CLASS = """
-from bench.derived import Derived, DerivedSignal
+from bench.rig import Derived, DerivedSignal
 from bench.devices import Signal
 
 
@@ -279,9 +275,9 @@ second = "probe_temperature"
 """
 READ = """
 import sys
-from bench.clock import VirtualClock
+from bench.base import VirtualClock
 from bench.rig import Rig
-from bench.rig_file import load_rig
+from bench.rig import load_rig
 
 with Rig(load_rig(sys.argv[1]), VirtualClock(), 1) as rig:
     values = rig.measure()

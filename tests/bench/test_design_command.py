@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from cases import cases
 
-from bench.journal import Record
-from bench.results.data import read_columns
+from bench.analysis import read_columns
+from bench.record import Record
 
 RUN = ("--rig", "vo2", "--clock", "virtual")
 
@@ -16,10 +16,9 @@ RUN = ("--rig", "vo2", "--clock", "virtual")
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory):
     """A file of a play's output, and its model."""
-    from bench.hysteresis import uniform_levels
+    from bench.analysis import identify_file, write_csv
     from bench.identification import covering_sequence
-    from bench.results.data import write_csv
-    from bench.results.models import identify_file
+    from bench.models import uniform_levels
 
     folder = tmp_path_factory.mktemp("measured")
     inputs = np.concatenate([[21.0], covering_sequence(uniform_levels(21.0, 84.0, 8), per_cell=2)])

@@ -5,26 +5,27 @@ from contextlib import nullcontext
 
 import pytest
 from cases import cases
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
-from bench.clock import VirtualClock
-from bench.devices import Device, Identity, Limits, Signal, Status
-from bench.errors import DeviceError, LimitError
-from bench.rig import Rig
-from bench.rig_file import load_rig
-from bench.roles import (
+from bench.base import DeviceError, LimitError, VirtualClock
+from bench.devices import (
+    Device,
     GeneralActuator,
     GeneralSensor,
+    Identity,
+    Limits,
     LinearStage,
     LoadCell,
     PositionSensor,
     Servo,
+    Signal,
+    Status,
     Switch,
     TECAmplifier,
     TemperatureSensor,
     VoltageSupply,
 )
+from bench.rig import Rig, load_rig
 
 with warnings.catch_warnings():
     warnings.filterwarnings("ignore", category=DeprecationWarning, module="(bluesky|event_model|toolz|historydict).*")

@@ -9,42 +9,43 @@ import pytest
 from cases import cases
 from heater_protocols import Settle, Stairs, Watcher, settle, stairs
 
-from bench.clock import PacedClock, VirtualClock, WallClock
-from bench.control.tracking import Command, Trace
-from bench.engine import Engine, check_before_moving
-from bench.errors import (
+from bench.base import (
     AbortError,
     ConfigurationError,
     ConvergenceError,
     DeviceError,
     InterlockError,
+    Interrupts,
     LimitError,
+    PacedClock,
     RecordError,
     SettleTimeoutError,
+    VirtualClock,
+    WallClock,
 )
-from bench.interrupts import Interrupts
-from bench.journal import FILE_NAME, Journal, Record
-from bench.journal.store import Store
-from bench.past import Past
-from bench.past.feeding import feed
+from bench.control import Command, Trace
+from bench.devices import Dwell, UntilSteady
+from bench.operator import ABORT, RESUME
 from bench.protocol import (
+    PARAMETER,
     TRACES,
     Control,
-    Dwell,
     Note,
+    ParameterChange,
     Phase,
     Prompt,
     ProtocolParameters,
     Step,
-    UntilSteady,
     plan,
     protocol,
 )
-from bench.protocol.changes import PARAMETER, ParameterChange
-from bench.questions import ABORT, RESUME
-from bench.rig import Rig
-from bench.rig_file import load_rig
-from bench.station.local import LocalStation
+from bench.record import FILE_NAME, Journal, Record
+from bench.record.store import Store
+from bench.rig import Rig, load_rig
+from bench.run import check_before_moving
+from bench.run.engine import Engine
+from bench.run.resumption.feeding import Past, feed
+from bench.run.station.local import LocalStation
 
 
 class Nothing(ProtocolParameters):
@@ -698,7 +699,7 @@ class TestControl:
 
     @pytest.mark.timeout(60)
     def test_a_protocol_that_controls_for_ever_has_no_plan(self, monkeypatch):
-        monkeypatch.setattr(sys.modules["bench.protocol.plan"], "LONGEST", 10_000)
+        monkeypatch.setattr(sys.modules["bench.protocol.planning"], "LONGEST", 10_000)
 
         def endless(parameters):
             message = next(control(Integrator(50.0)).generator(parameters))

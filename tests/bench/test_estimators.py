@@ -3,10 +3,9 @@ import math
 import numpy as np
 import pytest
 from cases import cases
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
-from bench.control.estimators import DriftEstimator, agility_for
+from bench.control import DriftEstimator, agility_for
 
 
 def line_fit(times, values, noise):

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from bench.cli import main
-from bench.cli.app import BenchCommands, app
+from bench.cli import app, main
+from bench.cli.application import BenchCommands
 
 CREEP = ["--set", "duration=2", "--set", "settling=1"]
 COLUMNS = ["--input", "u", "--output", "y"]

@@ -12,13 +12,11 @@ import numpy as np
 import pytest
 from written_run import META, SIGNALS, write_run
 
-from bench.journal import FILE_NAME, Event, Journal, Record, StepRecord
-from bench.journal.recovery import recover
-from bench.results.bluesky_documents import documents
-from bench.results.data import write_csv
-from bench.results.export import export_run
-from bench.results.telemetry_summary import summarize
-from bench.settling import Settled
+from bench.analysis import export_run, write_csv
+from bench.analysis.export.bluesky_documents import documents
+from bench.analysis.report.telemetry_summary import summarize
+from bench.devices import Settled
+from bench.record import FILE_NAME, Event, Journal, Record, StepRecord, recover
 
 EPOCH = datetime(2000, 1, 1, tzinfo=UTC)
 STEPS = 20

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from bench.compilation_display import MESSAGE
-from bench.journal import Record
+from bench.base.compilation_display import MESSAGE
+from bench.record import Record
 
 SCRIPT = Path(__file__).with_name("run_without_extras.py")
 RUN = ("run", "creep", "--rig", "vo2", "--clock", "virtual", "--set", "duration=4", "--set", "settling=2")
@@ -57,7 +57,7 @@ def without_extras(folder, finished_process):
 
 def test_all_modules_but_those_of_the_dashboard_are_imported(without_extras):
     _, imported = without_extras
-    assert {"drivers.meerstetter.tec", "sim_devices.laboratory", "bench.results.figures", "rigs.vo2.study"} <= set(
+    assert {"drivers.meerstetter.tec", "sim_devices.laboratory", "bench.analysis.figures", "rigs.vo2.study"} <= set(
         imported
     )
 

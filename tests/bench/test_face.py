@@ -8,17 +8,17 @@ import sys
 import pytest
 
 import bench
-import bench.face
-from bench.errors import BenchError, ConfigurationError, DataError, InterlockError
-from bench.model_file import ModelFile
+import bench.api
+from bench.base import BenchError, ConfigurationError, DataError, InterlockError
+from bench.identification import ModelFile
 
 
 @pytest.mark.parametrize("name", ["", "run", "identify"])
 def test_examples(name, request, tmp_path):
-    tested = getattr(bench.face, name) if name else bench.face
-    names = {**vars(bench.face), "getfixture": request.getfixturevalue, "bench": bench}
+    tested = getattr(bench.api, name) if name else bench.api
+    names = {**vars(bench.api), "getfixture": request.getfixturevalue, "bench": bench}
     finder = doctest.DocTestFinder(recurse=False)
-    examples = finder.find(tested, name or "bench.face", module=bench.face, globs=names)
+    examples = finder.find(tested, name or "bench.api", module=bench.api, globs=names)
     results = [doctest.DocTestRunner().run(example) for example in examples]
     assert sum(result.attempted for result in results) > 1
     assert not sum(result.failed for result in results)

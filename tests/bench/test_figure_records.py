@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from bench.results.figures.canvas import outline
+from bench.analysis.figures.canvas import outline
 
 COLUMNS = 700
 

@@ -9,29 +9,25 @@ import pytest
 from cases import cases
 from heater_protocols import Watcher
 
-from bench.clock import VirtualClock, WallClock
-from bench.control.loops import Playback
-from bench.control.tracking import Trace
-from bench.engine import Engine, check_before_moving
-from bench.errors import AbortError, ConfigurationError, DeviceError, InterlockError, LimitError
-from bench.interrupts import Interrupts
-from bench.journal import FILE_NAME, Journal, Record
-from bench.protocol import (
-    LATENESS,
-    TRACES,
-    Dwell,
-    FixedRate,
-    ProtocolParameters,
-    Settled,
-    Step,
-    find_protocol,
-    plan,
-    protocol,
+from bench.base import (
+    AbortError,
+    ConfigurationError,
+    DeviceError,
+    InterlockError,
+    Interrupts,
+    LimitError,
+    VirtualClock,
+    WallClock,
 )
-from bench.rig import Rig
-from bench.rig_file import load_rig
-from bench.runs import trace_signals
-from bench.station.local import LocalStation
+from bench.control import Playback, Trace
+from bench.devices import Dwell, Settled
+from bench.protocol import LATENESS, TRACES, FixedRate, ProtocolParameters, Step, find_protocol, plan, protocol
+from bench.record import FILE_NAME, Journal, Record
+from bench.rig import Rig, load_rig
+from bench.run import check_before_moving
+from bench.run.context import trace_signals
+from bench.run.engine import Engine
+from bench.run.station.local import LocalStation
 
 PERIOD = 0.5
 """Of the telemetry of the heater's rig, s."""
@@ -173,7 +169,7 @@ def slow_down(bench, device, seconds):
     read, numbers = device.glance, itertools.count()
 
     def glance():
-        bench.clock.sleep(seconds.get(next(numbers), 0.0) if isinstance(seconds, dict) else seconds)
+        bench.base.clock.sleep(seconds.get(next(numbers), 0.0) if isinstance(seconds, dict) else seconds)
         return read()
 
     device.glance = glance

@@ -6,8 +6,8 @@ import re
 import numpy as np
 from cases import cases
 
-from bench.hysteresis import Preisach, uniform_levels
-from bench.model_file import load_model
+from bench.identification import load_model
+from bench.models import Preisach, uniform_levels
 
 COLUMNS = ("--input", "voltage", "--output", "displacement")
 

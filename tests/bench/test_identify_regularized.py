@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from bench.model_file import load_model
+from bench.identification import load_model
 
 
 @pytest.fixture

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from written_run import measured
 
-from bench.journal import Record
+from bench.record import Record
 
 ROWS = 60
 

@@ -4,12 +4,11 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from cases import cases
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from pydantic import ValidationError
 
-from bench.errors import ConfigurationError, InterlockError
-from bench.interlocks import Interlock, InterlockWatch, Level
+from bench.base import ConfigurationError, InterlockError
+from bench.rig import Interlock, InterlockWatch, Level
 
 UNITS = {"sink": "°C", "force": "N", "plate_setpoint": "°C", "supply_setpoint": "V"}
 

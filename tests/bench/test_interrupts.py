@@ -10,9 +10,8 @@ from pathlib import Path
 import pytest
 from cases import cases
 
-from bench.errors import DataError
-from bench.interrupts import Interrupts
-from bench.journal import Record
+from bench.base import DataError, Interrupts
+from bench.record import Record
 
 pytestmark = pytest.mark.usefixtures("warm_popen")
 
@@ -67,7 +66,7 @@ class TestFlags:
         not_caught = {signal.SIGKILL, signal.SIGSTOP}
         code = (
             "import signal, sys, time\n"
-            "from bench.interrupts import Interrupts\n"
+            "from bench.base.interrupts import Interrupts\n"
             "with Interrupts() as interrupts:\n"
             "    for number in map(int, sys.argv[1:]):\n"
             "        signal.raise_signal(number)\n"

@@ -11,14 +11,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cases import cases
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
-from bench.clock import Stopwatch
-from bench.devices import Signal
-from bench.errors import ConfigurationError, DataError
-from bench.journal import FILE_NAME, SCHEMA, Event, Journal, Record, StepRecord, add_model
-from bench.settling import Settled
+from bench.base import ConfigurationError, DataError, Stopwatch
+from bench.devices import Settled, Signal
+from bench.record import FILE_NAME, SCHEMA, Event, Journal, Record, StepRecord, add_model
 
 SIGNALS = (Signal("tec_temperature", "°C", "object temperature"), Signal("force", "N", "force", 4))
 

@@ -14,17 +14,26 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.clock import Stopwatch
-from bench.devices import Signal
-from bench.errors import ConfigurationError, DataError, RecordError
-from bench.journal import FILE_NAME, Event, Journal, Record, StepRecord, background, keeping, opening, store
-from bench.journal.mirror import NAME as MIRROR_NAME
-from bench.journal.mirror import elsewhere, read_mirror
-from bench.journal.recovery import RECOVERED_NAME, recover
-from bench.journal.rows import split
-from bench.journal.store import Store
-from bench.locks import Holder, Locks
-from bench.settling import Settled
+from bench.base import ConfigurationError, DataError, RecordError, Stopwatch
+from bench.devices import Settled, Signal
+from bench.record import (
+    FILE_NAME,
+    NAME as MIRROR_NAME,
+    RECOVERED_NAME,
+    Event,
+    Journal,
+    Record,
+    StepRecord,
+    background,
+    keeping,
+    opening,
+    recover,
+    store,
+)
+from bench.record.mirror import elsewhere, read_mirror
+from bench.record.rows import split
+from bench.record.store import Store
+from bench.rig import Holder, Locks
 
 SIGNALS = (Signal("tec_temperature", "°C", "object temperature"), Signal("force", "N", "force", 4))
 STATUS = {"status": "completed", "reason": "", "finished": 9.0, "safe_state": {"tec": "safe"}}

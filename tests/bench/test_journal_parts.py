@@ -13,30 +13,32 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from bench.devices import Signal
-from bench.errors import ConfigurationError, DataError, RecordError
-from bench.journal import (
+from bench.base import ConfigurationError, DataError, RecordError
+from bench.devices import Settled, Signal
+from bench.record import (
     BLACK_BOX_NAME,
     FILE_NAME,
+    NAME as MIRROR_NAME,
+    RECOVERED_NAME,
+    SCHEMA,
     Ending,
     Event,
     Journal,
     Record,
     StepRecord,
+    abandon,
+    add_model,
     background,
     keeping,
     opening,
+    recover,
+    take_in,
 )
-from bench.journal.background import Background
-from bench.journal.keeping import RESERVE_NAME, Keeper
-from bench.journal.mirror import NAME as MIRROR_NAME
-from bench.journal.mirror import Mirror, elsewhere, read_mirror
-from bench.journal.models import add_model
-from bench.journal.recovery import recover
-from bench.journal.rows import RECOVERED_NAME, SCHEMA, TABLES, checksum, checksums, entry, meta_row, split, ticks
-from bench.journal.store import Store
-from bench.journal.writing import abandon, take_in
-from bench.settling import Settled
+from bench.record.background import Background
+from bench.record.keeping import RESERVE_NAME, Keeper
+from bench.record.mirror import Mirror, elsewhere, read_mirror
+from bench.record.rows import TABLES, checksum, checksums, entry, meta_row, split, ticks
+from bench.record.store import Store
 
 SIGNALS = (Signal("force", "N", "force"),)
 STATUS = {"status": "completed", "reason": "", "finished": 9.0, "safe_state": {}}

@@ -13,14 +13,21 @@ from heater_laboratory import RIG
 from heater_protocols import stairs
 
 import bench as face
+from bench.base import ConfigurationError, DataError, RecordError
 from bench.devices import Signal
-from bench.errors import ConfigurationError, DataError, RecordError
-from bench.journal import FILE_NAME, Event, Journal, Record, find_journals
-from bench.journal.keeping import Keeper
-from bench.journal.mirror import NAME as MIRROR_NAME
-from bench.journal.mirror import Mirror
-from bench.journal.recovery import RECOVERED_NAME, recover
-from bench.journal.rows import checksum, ticks
+from bench.record import (
+    FILE_NAME,
+    NAME as MIRROR_NAME,
+    RECOVERED_NAME,
+    Event,
+    Journal,
+    Record,
+    find_journals,
+    recover,
+)
+from bench.record.keeping import Keeper
+from bench.record.mirror import Mirror
+from bench.record.rows import checksum, ticks
 
 
 @pytest.fixture(params=["America/Los_Angeles"])

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 import typer
 
-from bench.cli.app import app
-from bench.errors import InterlockError
+from bench.base import InterlockError
+from bench.cli import app
 
 COMMANDS = [
     ["run", "creep", "--rig", "vo2", "--clock", "virtual"],

@@ -1,6 +1,7 @@
 import pytest
 
-from bench.lateness import EDGES, Lateness, lateness_lines
+from bench.record import Lateness, lateness_lines
+from bench.record.lateness import EDGES
 
 
 def test_each_sample_is_in_one_bin():

@@ -6,8 +6,8 @@ import sys
 
 import pytest
 
-from bench import listing, registry
-from bench.catalogue import Catalogue
+from bench.base import registry
+from bench.cli import Catalogue, listing
 
 
 @pytest.fixture

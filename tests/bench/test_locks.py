@@ -11,13 +11,13 @@ from pathlib import Path
 
 import pytest
 
+from bench.base import ConfigurationError
 from bench.devices import Identity
-from bench.errors import ConfigurationError
-from bench.locks import Holder, Locks, is_in_use, line_names
+from bench.rig import Holder, Locks, is_in_use, line_names
 
 HOLDER = """
 import subprocess, sys
-from bench.locks import Holder, Locks
+from bench.rig import Holder, Locks
 locks = Locks(Holder.of_this_process("other", "recordings/other-creep"))
 locks.take_lines(sys.argv[1:])
 child = subprocess.Popen([sys.executable, "-c", "input()"], stdin=sys.stdin, close_fds=False)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bench.results.tracking import LoopResult
+from bench.analysis.tracking_errors import LoopResult
 
 
 def test_held_is_the_second_half_of_the_long_rests_after_the_first_move():

@@ -4,9 +4,8 @@ import json
 
 import pytest
 
-from bench.interrupts import Interrupts
-from bench.mailbox import PanelMailbox, RunMailbox
-from bench.questions import Question
+from bench.base import Interrupts
+from bench.operator import PanelMailbox, Question, RunMailbox
 
 ASKED = Question("hang a load", ("resume", "abort"), "PROMPT", {"rate": "3 K/s"}, "not a number")
 

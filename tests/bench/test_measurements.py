@@ -3,16 +3,14 @@ import struct
 import numpy as np
 import pytest
 from cases import cases
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
+from hypothesis import example, given, settings, strategies as st
 
-from bench.devices import Signal
-from bench.errors import ConfigurationError, DataError
-from bench.journal import FILE_NAME, Journal, StepRecord
-from bench.results.data import Columns, check_excitation, read_columns, write_csv
-from bench.results.reading.heads import split_unit
-from bench.results.reading.options import ReadingOptions
-from bench.settling import Settled
+from bench.analysis import ReadingOptions, read_columns, write_csv
+from bench.analysis.tables.data import Columns, check_excitation
+from bench.analysis.tables.reading.heads import split_unit
+from bench.base import ConfigurationError, DataError
+from bench.devices import Settled, Signal
+from bench.record import FILE_NAME, Journal, StepRecord
 
 
 @pytest.fixture

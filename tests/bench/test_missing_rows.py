@@ -11,10 +11,9 @@ from contextlib import closing, suppress
 import pytest
 from written_run import META, SIGNALS, write_run
 
-from bench.errors import DataError, IncompleteRecordWarning
-from bench.journal import FILE_NAME, Event, Journal, Record, StepRecord
-from bench.journal.mirror import NAME as MIRROR_NAME
-from bench.settling import Settled
+from bench.base import DataError, IncompleteRecordWarning
+from bench.devices import Settled
+from bench.record import FILE_NAME, NAME as MIRROR_NAME, Event, Journal, Record, StepRecord
 
 STEPS = 14
 LOG_NAME = f"{FILE_NAME}-wal"

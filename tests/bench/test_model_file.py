@@ -5,11 +5,12 @@ import math
 import numpy as np
 import pytest
 from cases import cases
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
-from bench.errors import DataError
-from bench.hysteresis import (
+from bench.base import DataError
+from bench.identification import ModelFile, load_model, parse_model
+from bench.identification.model_file import FORMAT, VERSION
+from bench.models import (
     Linear,
     MemoryCurve,
     Polynomial,
@@ -21,7 +22,6 @@ from bench.hysteresis import (
     TwoStage,
     uniform_levels,
 )
-from bench.model_file import FORMAT, VERSION, ModelFile, load_model, parse_model
 from rigs.hybrid.design import Design
 from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel
 

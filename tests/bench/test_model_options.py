@@ -6,11 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.hysteresis import identifiable_models, timed_models
+from bench.identification import check_options, load_model, model_options
 from bench.identification.branches import turning_points
-from bench.identification.levels import quantile_levels
-from bench.identification.options import check_options, model_options
-from bench.model_file import load_model
+from bench.identification.fit.levels import quantile_levels
+from bench.models import identifiable_models, timed_models
 
 COLUMNS = ("--input", "voltage", "--output", "displacement")
 

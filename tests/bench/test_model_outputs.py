@@ -11,13 +11,20 @@ import pytest
 from cases import cases
 from matplotlib.figure import Figure
 
-from bench.errors import DataError
-from bench.results.data import read_columns
-from bench.results.model_card import sha256_of, write_card
-from bench.results.models import compare_models, identify_file
-from bench.results.prediction_figures import errors_text
-from bench.results.predictions import Predictions, Quantity
-from bench.results.report import draw_comparison, draw_identification, draw_predicted
+from bench.analysis import (
+    Predictions,
+    Quantity,
+    compare_models,
+    draw_comparison,
+    draw_identification,
+    draw_predicted,
+    errors_text,
+    identify_file,
+    read_columns,
+    write_card,
+)
+from bench.analysis.report.model_card import sha256_of
+from bench.base import DataError
 
 COLUMNS = ("--input", "voltage", "--output", "displacement")
 NAMES = {"input_column": "voltage", "output_column": "displacement"}

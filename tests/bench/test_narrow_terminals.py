@@ -9,10 +9,9 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
+from bench.base import Expectation, PlainConsole, print_plain, show_table
 from bench.devices import Signal
-from bench.printing import PlainConsole, print_plain, show_table
-from bench.remaining_time import Expectation
-from bench.terminal import ProgressDisplay
+from bench.run.terminal import ProgressDisplay
 
 SIGNALS = (Signal("supply_voltage", "V", ""), Signal("load_cell_force", "N", ""))
 LONG = Expectation(((5, 10.0), (100, 4000.0)), 4000.0, at_most=4000.0 * 24.0)
@@ -100,7 +99,7 @@ class TestTables:
     ids=["design", "rehearse"],
 )
 def test_commands_cut_nothing(bench, monkeypatch, columns, command, words):
-    from bench.cli.console import console
+    from bench.cli import console
 
     monkeypatch.setattr(console, "width", columns)
     code, out, _ = bench(*command)

@@ -8,10 +8,9 @@ from cases import cases
 from rich.console import Console
 from written_run import HOSTILE, META, write_run
 
-from bench.face import identify
-from bench.journal import add_model
-from bench.results.published import Published
-from bench.results.report import PAGE_NAME, report_run
+from bench.analysis import PAGE_NAME, Published, report_run
+from bench.api import identify
+from bench.record import add_model
 
 
 @pytest.fixture(scope="module")

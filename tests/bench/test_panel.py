@@ -10,20 +10,18 @@ from cases import cases
 from heater_protocols import stairs
 from rich.console import Console
 
-from bench.desk import Desk, HoldAll, Leave, Remark, Rest, SetPoint, Shown, Tare, parse_command
+from bench.base import ConfigurationError, DataError, Interrupts
 from bench.devices import Limits, Signal
-from bench.errors import ConfigurationError, DataError
-from bench.interlocks import Interlock
-from bench.interrupts import Interrupts
-from bench.journal import Record
+from bench.operator import Desk, HoldAll, Leave, Remark, Rest, SetPoint, Shown, Tare, parse_command
+from bench.panel import HandsOnRig, RunInProgress, carry_out_by_hand
 from bench.panel.margins import margin_of, sparkline
-from bench.panel.session import carry_out_by_hand
-from bench.panel.sources import HandsOnRig, RunInProgress
-from bench.runs import Run, carry_out
+from bench.record import Record
+from bench.rig import Interlock
+from bench.run import Run, carry_out
 
 pytest.importorskip("textual")
 
-from bench.panel.app import Panel
+from bench.panel import Panel
 
 SHOWN = Shown(
     "heater",

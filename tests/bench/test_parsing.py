@@ -9,8 +9,7 @@ import pytest
 from cases import cases
 from pydantic import Field, ValidationError
 
-from bench.checked_table import CheckedTable
-from bench.parsing import parse_json, parse_toml
+from bench.base import CheckedTable, parse_json, parse_toml
 
 DEEP = "[" * 100_000 + "]" * 100_000
 TOML, JSON = f"rig = {DEEP}\n", f'{{"kind": {DEEP}}}'
@@ -112,7 +111,7 @@ def test_json_and_toml_are_read_in_one_place():
                     continue
                 if used & readers:
                     found.add(path.relative_to(root).as_posix())
-    assert found == {"bench/parsing.py"}
+    assert found == {"bench/base/parsing.py"}
 
 
 @pytest.mark.parametrize(

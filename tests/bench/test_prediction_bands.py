@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.model_file import load_model
+from bench.identification import load_model
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "identification"))
 

@@ -4,32 +4,27 @@ import sys
 import numpy as np
 import pytest
 from cases import cases
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
-from bench.clock import VirtualClock
-from bench.control.loops import Playback
-from bench.errors import ConfigurationError
+from bench.base import ConfigurationError, VirtualClock
+from bench.base.registry import Entry
+from bench.control import Playback
+from bench.devices import Dwell, Settled, UntilSteady
 from bench.protocol import (
-    Dwell,
     FixedRate,
     Messages,
     Note,
     Phase,
     ProtocolParameters,
     Reading,
-    Settled,
     Step,
-    UntilSteady,
     find_protocol,
     packaged_protocols,
     parameter,
     plan,
     protocol,
 )
-from bench.registry import Entry
-from bench.rig import Rig
-from bench.rig_file import load_rig
+from bench.rig import Rig, load_rig
 
 
 class Parameters(ProtocolParameters):
@@ -316,8 +311,8 @@ class TestPlan:
         assert plan(define(idle), Nothing()).steps == 0
 
     def test_a_protocol_that_never_ends_is_refused(self, monkeypatch):
-        assert sys.modules["bench.protocol.plan"].LONGEST == 1_000_000
-        monkeypatch.setattr(sys.modules["bench.protocol.plan"], "LONGEST", 10_000)
+        assert sys.modules["bench.protocol.planning"].LONGEST == 1_000_000
+        monkeypatch.setattr(sys.modules["bench.protocol.planning"], "LONGEST", 10_000)
 
         def endless(parameters):
             while True:
@@ -328,7 +323,7 @@ class TestPlan:
 
     @pytest.mark.timeout(60)
     def test_a_protocol_that_talks_for_ever_is_refused(self, monkeypatch):
-        monkeypatch.setattr(sys.modules["bench.protocol.plan"], "LONGEST", 10_000)
+        monkeypatch.setattr(sys.modules["bench.protocol.planning"], "LONGEST", 10_000)
 
         def chatter(parameters):
             while True:
@@ -366,7 +361,8 @@ class TestPlan:
 
 class TestFiles:
     GOOD = """
-from bench.protocol import Dwell, Messages, ProtocolParameters, Step, parameter, protocol
+from bench.devices import Dwell
+from bench.protocol import Messages, ProtocolParameters, Step, parameter, protocol
 
 class Parameters(ProtocolParameters):
     target: float = parameter(60.0, unit="°C", low=0, high=90, help="where")
@@ -504,7 +500,7 @@ class TestPackaged:
             (package / f"{module}.py").write_text(TestFiles.GOOD, encoding="utf-8")
         monkeypatch.syspath_prepend(str(tmp_path))
         twins = Entry("protocols", "twins", "twin-package", "twin_protocols")
-        monkeypatch.setattr("bench.registry.entries", lambda _: {"twins": twins})
+        monkeypatch.setattr("bench.base.registry.entries", lambda _: {"twins": twins})
         with pytest.raises(ConfigurationError, match="two protocols are named soak: one of package twin-package"):
             packaged_protocols()
 
@@ -517,7 +513,7 @@ class TestPackaged:
         monkeypatch.syspath_prepend(str(tmp_path))
         broken = Entry("protocols", "broken", "a-package", "broken_protocols")
         gone = Entry("protocols", "gone", "b-package", "no_such_package")
-        monkeypatch.setattr("bench.registry.entries", lambda _: {"broken": broken, "gone": gone})
+        monkeypatch.setattr("bench.base.registry.entries", lambda _: {"broken": broken, "gone": gone})
         packaged = packaged_protocols()
         assert list(packaged.protocols) == ["soak"]
         assert packaged.packages == {"soak": "a-package"}
@@ -662,7 +658,7 @@ class TestFixedRate:
 
     @pytest.mark.timeout(60)
     def test_a_protocol_that_loops_for_ever_is_refused(self, monkeypatch):
-        monkeypatch.setattr(sys.modules["bench.protocol.plan"], "LONGEST", 10_000)
+        monkeypatch.setattr(sys.modules["bench.protocol.planning"], "LONGEST", 10_000)
 
         def endless(parameters):
             message = fast_loop()

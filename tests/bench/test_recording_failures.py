@@ -9,11 +9,10 @@ import pytest
 
 pytest.importorskip("rerun")
 
-from bench.dashboard import screenshot
+from bench.base import ConfigurationError
+from bench.dashboard import picture, screenshot
 from bench.dashboard._rerun_log import FILTER
-from bench.dashboard.recording import is_whole
-from bench.dashboard.screenshot import picture
-from bench.errors import ConfigurationError
+from bench.dashboard.rerun_recording import is_whole
 
 LIMITED = """
 import resource, sys
@@ -52,7 +51,7 @@ def test_the_log_of_rerun_is_left_alone_otherwise():
 
 
 def test_a_file_that_is_whole(tmp_path):
-    from bench.dashboard.recording import Recording
+    from bench.dashboard.rerun_recording import Recording
 
     recording = Recording("run", "a run", tmp_path / "run.rrd", None)
     recording.set_property("bench", {"rig": "none"})

@@ -6,9 +6,8 @@ import pytest
 from cases import cases
 
 import bench
-from bench.dashboard.from_journal import rebuild
-from bench.journal import Record
-from bench.journal.recovery import recover
+from bench.dashboard import rebuild
+from bench.record import Record, recover
 from rigs.muscles.identification import identify_muscle, read_resting, read_series
 
 FOLDER = Path(__file__).parents[2] / "recordings" / "reference"

@@ -8,14 +8,14 @@ from pathlib import Path
 import pytest
 from cases import cases
 
-from bench import registry
+from bench.base import ConfigurationError, registry
 from bench.cli import main
-from bench.errors import ConfigurationError
-from bench.rig_file import load_rig, packaged_rigs
+from bench.rig import load_rig, packaged_rigs
 
 HERE = Path(__file__).parent
 PROTOCOL = '''
-from bench.protocol import Dwell, ProtocolParameters, Step, parameter, protocol
+from bench.devices import Dwell
+from bench.protocol import ProtocolParameters, Step, parameter, protocol
 
 class Parameters(ProtocolParameters):
     count: int = parameter(1, unit="1", help="how often")

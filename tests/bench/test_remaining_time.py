@@ -3,7 +3,7 @@ import math
 import pytest
 from cases import cases
 
-from bench.remaining_time import Expectation, RemainingTime
+from bench.base import Expectation, RemainingTime
 
 TEN_STEPS = Expectation(tuple((i, 10.0 * i) for i in range(1, 11)), 100.0)
 

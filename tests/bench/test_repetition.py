@@ -14,23 +14,21 @@ from heater_laboratory import RIG
 from rerun.chunk import RrdReader
 from rich.console import Console
 
+from bench.analysis import compare_runs
+from bench.base import Interrupts
 from bench.cli import main
-from bench.hysteresis import Preisach, uniform_levels
-from bench.interrupts import Interrupts
-from bench.journal import FILE_NAME, Record
-from bench.journal.rows import checksum
-from bench.model_file import ModelFile
+from bench.identification import ModelFile
+from bench.models import Preisach, uniform_levels
 from bench.protocol import find_protocol
-from bench.repetition import repeat
-from bench.results.run_comparison import compare_runs
-from bench.resume import Resume, resume
-from bench.runs import Run
-from bench.runs import carry_out as carry_out_run
+from bench.record import FILE_NAME, Record
+from bench.record.rows import checksum
+from bench.run import Resume, Run, carry_out as carry_out_run, repeat, resume
 
 FAULTS = '[[fault]]\nat = 12\nfault = "tec.delay"\nvalues = { seconds = 0.05 }\nduration = 2\n'
 SCRIPT = """
 from beside_the_script import HOTTER
-from bench.protocol import Dwell, ProtocolParameters, Step, parameter, protocol
+from bench.devices import Dwell
+from bench.protocol import ProtocolParameters, Step, parameter, protocol
 
 class Parameters(ProtocolParameters):
     start: float = parameter(30.0, unit="°C", help="set-point")

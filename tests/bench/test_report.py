@@ -8,16 +8,13 @@ import pytest
 from cases import cases
 from rich.console import Console
 
-from bench.devices import Signal
-from bench.hysteresis import Polynomial
-from bench.journal import FILE_NAME, Journal, StepRecord, add_model
-from bench.model_file import ModelFile
+from bench.analysis import FOLLOW, REACH, READING, report_run
+from bench.base import fitting_prefix, format_numbers, with_unit
+from bench.devices import Settled, Signal
+from bench.identification import ModelFile
+from bench.models import Hammerstein, LinearPart, Polynomial
 from bench.protocol import TRACES
-from bench.results.report import report_run
-from bench.results.tracking import FOLLOW, REACH, READING
-from bench.settling import Settled
-from bench.timed import Hammerstein, LinearPart
-from bench.units import fitting_prefix, format_numbers, with_unit
+from bench.record import FILE_NAME, Journal, StepRecord, add_model
 
 META = {
     "run": "run",

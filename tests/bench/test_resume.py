@@ -15,16 +15,15 @@ from killing import distance, kill_after
 from rich.console import Console
 
 import bench
+from bench.base import AbortError, AgreementError, ConfigurationError, DataError
 from bench.cli import main
-from bench.engine import Engine
-from bench.errors import AbortError, AgreementError, ConfigurationError, DataError
-from bench.hysteresis import MemoryCurve
-from bench.journal import FILE_NAME, Journal, Record
-from bench.journal.recovery import RECOVERED_NAME
-from bench.locks import Holder, Locks
-from bench.past import Past
-from bench.past.corners import corners, turning_points
-from bench.resume import Resume, resume
+from bench.models import MemoryCurve
+from bench.record import FILE_NAME, RECOVERED_NAME, Journal, Record
+from bench.rig import Holder, Locks
+from bench.run import Resume, resume
+from bench.run.engine import Engine
+from bench.run.resumption.corners import corners, turning_points
+from bench.run.resumption.feeding import Past
 
 pytestmark = pytest.mark.usefixtures("warm_popen")
 
@@ -36,7 +35,7 @@ OSCILLATION = {
 
 
 LOOPS = """
-from bench.control.tracking import Trace
+from bench.control import Trace
 from bench.protocol import FixedRate, Messages, ProtocolParameters, protocol
 
 class P(ProtocolParameters):

@@ -2,14 +2,10 @@ import tomllib
 
 import pytest
 from heater_laboratory import CLOSED, RIG, HeaterLaboratory, HeaterTEC
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
-from bench.clock import VirtualClock
-from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
-from bench.layout import DashboardLayout
-from bench.rig import Rig
-from bench.rig_file import load_rig, packaged_rigs
+from bench.base import ConfigurationError, DeviceConnectionError, DeviceError, VirtualClock
+from bench.rig import DashboardLayout, Rig, load_rig, packaged_rigs
 
 SPOT = """
 [devices.spot]

@@ -6,9 +6,9 @@ from pathlib import Path
 import pytest
 from heater_laboratory import RIG
 
-from bench.errors import ConfigurationError
-from bench.journal import Record
-from bench.rig_file import load_rig
+from bench.base import ConfigurationError
+from bench.record import Record
+from bench.rig import load_rig
 
 TITLE = '[rig]\ntitle = "mine"\n'
 

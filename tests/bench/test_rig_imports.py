@@ -4,8 +4,8 @@ import sys
 
 import pytest
 
-from bench.errors import ConfigurationError
-from bench.rig_file import load_rig
+from bench.base import ConfigurationError
+from bench.rig import load_rig
 
 TRACE = "from pathlib import Path\nPath(__file__).with_suffix('.ran').touch()\n"
 

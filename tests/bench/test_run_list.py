@@ -12,14 +12,12 @@ from heater_laboratory import RIG
 from heater_protocols import stairs
 from rich.console import Console
 
+from bench.analysis import compare_runs
 from bench.cli.run_list import Status
-from bench.journal import FILE_NAME, Record
-from bench.locks import Holder, Locks
-from bench.protocol import Messages, Note, ProtocolParameters, parameter, protocol
-from bench.protocol.number_list import NumberList
-from bench.results.run_comparison import compare_runs
-from bench.run_record import Difference, run_name
-from bench.runs import Run, carry_out
+from bench.protocol import Messages, Note, NumberList, ProtocolParameters, parameter, protocol
+from bench.record import FILE_NAME, Difference, Record, run_name
+from bench.rig import Holder, Locks
+from bench.run import Run, carry_out
 
 
 @pytest.fixture(scope="module")

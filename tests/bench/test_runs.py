@@ -8,18 +8,15 @@ from heater_laboratory import CLOSED, HeaterLaboratory, HeaterTEC
 from heater_protocols import Stairs, settle, stairs
 from rich.console import Console
 
-from bench.devices import Signal
-from bench.dialogue import Dialogue
-from bench.errors import ConfigurationError, DeviceConnectionError
-from bench.journal import Event, Record, StepRecord, run_card
-from bench.protocol import Dwell, Step, find_protocol, protocol
-from bench.questions import AT_A_PROMPT, Question
-from bench.recorded_files import RIG_FILE_NAME
-from bench.remaining_time import Expectation
-from bench.rig_file import load_rig
-from bench.runs import Run, carry_out
-from bench.settling import Settled
-from bench.terminal import ProgressDisplay
+from bench.base import ConfigurationError, DeviceConnectionError, Expectation
+from bench.devices import Dwell, Settled, Signal
+from bench.operator import AT_A_PROMPT, Question
+from bench.protocol import Step, find_protocol, protocol
+from bench.record import RIG_FILE_NAME, Event, Record, StepRecord, run_card
+from bench.rig import load_rig
+from bench.run import Run, carry_out
+from bench.run.dialogue import Dialogue
+from bench.run.terminal import ProgressDisplay
 
 
 @pytest.fixture

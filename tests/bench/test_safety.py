@@ -1,7 +1,7 @@
 import pytest
 
-from bench.errors import DeviceError
-from bench.safety import SAFE, make_safe
+from bench.base import DeviceError
+from bench.rig import SAFE, make_safe
 
 
 class Stub:

@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.hysteresis import PrandtlIshlinskii
-from bench.identification import ramps
-from bench.model_file import load_model
-from bench.results.joined_files import read_files
+from bench.analysis import read_files
+from bench.identification import load_model, ramps
+from bench.models import PrandtlIshlinskii
 
 COLUMNS = ("--input", "voltage", "--output", "travel")
 # Few models keep this short; `all` is tested once.

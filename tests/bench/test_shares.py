@@ -6,10 +6,10 @@ import io
 import numpy as np
 from rich.console import Console
 
+from bench.analysis import read_columns
+from bench.base import say_share, shares_to
 from bench.cli.patience import PatienceDisplay
 from bench.identification import damped_oscillation, identify
-from bench.results.data import read_columns
-from bench.shares import say_share, shares_to
 
 
 def collected(work):

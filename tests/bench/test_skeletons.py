@@ -6,7 +6,7 @@ import sys
 import pytest
 
 from bench.cli import main
-from bench.skeletons import PARTS
+from bench.cli.skeletons import PARTS
 
 
 def new(*arguments):

@@ -5,15 +5,18 @@ from datetime import date
 import pytest
 from cases import cases
 
-from bench.clock import VirtualClock
-from bench.description import RigDescription
-from bench.devices import DeviceDescription, Identity, Limits, Signal
-from bench.errors import ConfigurationError
-from bench.interlocks import Interlock
-from bench.rig import Rig
-from bench.rig_file import SafetyTable, load_rig, packaged_rigs
-from bench.roles import PositionSensor, TECAmplifier
-from bench.start_checks import check_start, overdue_calibrations
+from bench.base import ConfigurationError, VirtualClock
+from bench.devices import DeviceDescription, Identity, Limits, PositionSensor, Signal, TECAmplifier
+from bench.rig import (
+    Interlock,
+    Rig,
+    RigDescription,
+    SafetyTable,
+    check_start,
+    load_rig,
+    overdue_calibrations,
+    packaged_rigs,
+)
 
 
 class Heater(TECAmplifier):

@@ -5,11 +5,11 @@ import json
 import numpy as np
 import pytest
 
-from bench.errors import ConfigurationError
-from bench.hysteresis import PrandtlIshlinskii, Preisach, identifiable_models, uniform_levels
-from bench.model_file import ModelFile, load_model
-from bench.results.models import compare_models, identify_file
-from bench.results.starting_state import digest, starting_state
+from bench.analysis import compare_models, identify_file, starting_state
+from bench.analysis.tables.starting_state import digest
+from bench.base import ConfigurationError
+from bench.identification import ModelFile, load_model
+from bench.models import PrandtlIshlinskii, Preisach, identifiable_models, uniform_levels
 
 COLUMNS = ("--input", "voltage", "--output", "displacement")
 LEVELS = uniform_levels(0.0, 10.0, 8)
@@ -150,8 +150,7 @@ def test_the_start_is_kept_and_can_be_chosen(bench, tmp_path, data):
 def test_figures_say_the_errors_of_the_text(monkeypatch, tmp_path, data):
     from matplotlib.figure import Figure
 
-    from bench.results.prediction_figures import errors_text
-    from bench.results.report import draw_identification
+    from bench.analysis import draw_identification, errors_text
 
     titles = []
     save = Figure.savefig

@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from written_run import META, SIGNALS
 
-from bench.campaigns.study_tables import over_seeds, write_study
-from bench.guardian.black_box import BlackBox
-from bench.journal import BLACK_BOX_NAME, FILE_NAME, Journal, StepRecord, add_model
-from bench.journal.models import models_beside
-from bench.model_file import load_model
-from bench.parsing import json_text
-from bench.results.data import write_csv
-from bench.settling import Settled
-from bench.studies import StudyResult
+from bench.analysis import write_csv
+from bench.base import json_text
+from bench.batch import StudyResult
+from bench.batch.campaign.study_tables import over_seeds, write_study
+from bench.devices import Settled
+from bench.identification import load_model
+from bench.record import BLACK_BOX_NAME, FILE_NAME, Journal, StepRecord, add_model
+from bench.record.model_files import models_beside
+from bench.run.guardian.black_box import BlackBox
 
 NAN, INFINITY = math.nan, math.inf
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from bench.errors import BenchError, ConfigurationError
-from bench.journal import Record
-from bench.studies import reproduce
+from bench.base import BenchError, ConfigurationError
+from bench.batch import reproduce
+from bench.record import Record
 
 sys.path.append(str(Path(__file__).parent))
 import small_study

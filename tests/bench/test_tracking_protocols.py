@@ -8,13 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.hysteresis import MemoryCurve, Preisach, ThermalExpansion, uniform_levels
-from bench.identification import identify
-from bench.identification.excitation import damped_oscillation
-from bench.journal import Record
-from bench.model_file import ModelFile, load_model
-from bench.results.tracking import following_result, target_results
-from bench.timed import Hammerstein, LinearPart
+from bench.analysis import following_result, target_results
+from bench.identification import ModelFile, damped_oscillation, identify, load_model
+from bench.models import Hammerstein, LinearPart, MemoryCurve, Preisach, ThermalExpansion, uniform_levels
+from bench.record import Record
 
 VO2 = ["--rig", "vo2", "--clock", "virtual"]
 

@@ -8,14 +8,11 @@ import numpy as np
 import pytest
 from cases import cases
 
-from bench.control.dynamics import ActuatorDynamics, IdentifiedDynamics, ResponseDynamics
-from bench.errors import DataError
-from bench.hysteresis import Preisach, uniform_levels
-from bench.model_file import ModelFile, parse_model
-from bench.transients import _kernels
-from bench.transients.actuator import at_rows
-from bench.transients.identification import identify_dynamics, identify_transients, noise_of
-from bench.transients.recording import Recording
+from bench.analysis import Recording, at_rows, identify_dynamics, identify_transients, noise_of
+from bench.base import DataError
+from bench.identification import ModelFile, parse_model
+from bench.models import ActuatorDynamics, IdentifiedDynamics, Preisach, ResponseDynamics, uniform_levels
+from bench.models.kernels import actuator_kernels as _kernels
 
 LEVELS = uniform_levels(0.0, 3.0, 10)
 MODEL = Preisach(LEVELS, np.linspace(0.2, 1.0, 55), 0.0, None, (0.0, 3.0))

@@ -7,16 +7,8 @@ import numpy as np
 import pytest
 from cases import cases
 
-from bench.cli import main
-from bench.control.dynamics import IdentifiedDynamics, ResponseDynamics
-from bench.controllers import ControllerSetup, controller_spec
-from bench.errors import AbortError, ConfigurationError
-from bench.hysteresis import Preisach, TwoStage, uniform_levels
-from bench.model_file import ModelFile
-from bench.protocol import find_protocol
-from bench.rig_file import load_rig
-from bench.tuning.runs import Task, TuningRuns, start_of
-from bench.tuning.search import (
+from bench.base import AbortError, ConfigurationError
+from bench.batch.tuning.search import (
     FACTOR,
     FAILED,
     MARGIN,
@@ -29,7 +21,14 @@ from bench.tuning.search import (
     put,
     search,
 )
-from bench.tuning_file import load_tuning, tuning_text
+from bench.batch.tuning.tuning_runs import Task, TuningRuns, start_of
+from bench.cli import main
+from bench.control import ControllerSetup, controller_spec, tuning_text
+from bench.control.tuning_file import load_tuning
+from bench.identification import ModelFile
+from bench.models import IdentifiedDynamics, Preisach, ResponseDynamics, TwoStage, uniform_levels
+from bench.protocol import find_protocol
+from bench.rig import load_rig
 
 FILM = Preisach(uniform_levels(30.0, 70.0, 4), np.ones(10), 20.0, None, (21.0, 84.0), "°C", "1/m")
 NUMBERS = {"wait": 8.0, "arrival": {"hold": 0.4}}

@@ -12,23 +12,21 @@ import pytest
 from cases import cases
 
 import bench
+from bench.analysis import Recording, identify_actuator
+from bench.base import ConfigurationError, DataError
 from bench.cli import main
-from bench.control.dynamics import ActuatorDynamics
-from bench.errors import ConfigurationError, DataError
-from bench.hysteresis import PrandtlIshlinskii, Preisach, uniform_levels
-from bench.journal import Record
-from bench.model_file import load_model
-from bench.rig_file import load_rig
-from bench.transients import _kernels
-from bench.transients.actuator import identify_actuator
-from bench.transients.recording import Recording
-from bench.twin.correction import identify_correction
-from bench.twin.disturbances import Noise, Part, evidence, identify_disturbances, mean_effects, noise_of
-from bench.twin.setpoints import identify_setpoints
-from bench.twin.specimen import Dynamics, Specimen, Unevenness, Wander
-from bench.twin.suitability import run_of_model
-from bench.twin.unevenness import identify_unevenness
-from bench.twin.write import write_twin
+from bench.identification import load_model
+from bench.models import ActuatorDynamics, PrandtlIshlinskii, Preisach, uniform_levels
+from bench.models.kernels import actuator_kernels as _kernels
+from bench.record import Record
+from bench.rig import load_rig
+from bench.specimen import Specimen, write_twin
+from bench.specimen.correction import identify_correction
+from bench.specimen.disturbances import Noise, Part, evidence, identify_disturbances, mean_effects, noise_of
+from bench.specimen.setpoints import identify_setpoints
+from bench.specimen.specimen import Dynamics, Unevenness, Wander
+from bench.specimen.suitability import run_of_model
+from bench.specimen.unevenness import identify_unevenness
 from sim_devices.twin_laboratory import SpecimenPlant
 
 pytestmark = pytest.mark.slow

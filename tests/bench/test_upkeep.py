@@ -10,8 +10,8 @@ from contextlib import ExitStack, contextmanager
 import pytest
 from cases import cases
 
-from bench.clock import Stopwatch
-from bench.upkeep.rescue import rescue_by_another_process
+from bench.base import Stopwatch
+from bench.rig import rescue_by_another_process
 from sim_devices.serving.process import serve
 
 pytestmark = pytest.mark.usefixtures("warm_popen")
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.usefixtures("warm_popen")
 CLIENT = """
 import sys
 from pathlib import Path
-from bench.upkeep.opening import opened
+from bench.rig import opened
 rig, file, *settings = sys.argv[1:]
 with opened(rig, {"devices.tec.watchdog": "300"} if rig in ("vo2", "hybrid") else {}, Path(file), "a run") as place:
     devices = {}

@@ -19,11 +19,10 @@ import rerun_cli
 from playwright.sync_api import Browser
 from rerun.chunk import RrdReader
 
+from bench.base import WallClock
 from bench.cli import main
-from bench.clock import WallClock
-from bench.dashboard.from_journal import JournalView
-from bench.dashboard.viewers import has_display, web_viewer
-from bench.journal import FILE_NAME, Record
+from bench.dashboard import JournalView, has_display, web_viewer
+from bench.record import FILE_NAME, Record
 
 BENCH = [sys.executable, "-P", "-u", "-m", "bench"]
 # As where nobody sits at the machine.

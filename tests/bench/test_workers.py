@@ -15,10 +15,8 @@ import pytest
 from cases import cases
 from rich.console import Console
 
-from bench.errors import AbortError, BenchError, DeviceError
-from bench.journal import Record
-from bench.workers import Workers, available_cores
-from bench.workers.display import TasksDisplay
+from bench.base import AbortError, BenchError, DeviceError, TasksDisplay, Workers, available_cores
+from bench.record import Record
 
 sys.path.append(str(Path(__file__).parent))
 import worker_tasks

@@ -27,16 +27,14 @@ import numpy as np
 from rich.console import Console
 
 import bench
-from bench.control.two_stage_inverse import TwoStageInverse
-from bench.errors import ConvergenceError, DataError
-from bench.journal import Record
-from bench.model_file import load_model
-from bench.results.tracking import TargetResults, target_results
-from bench.rig_file import load_rig
-from bench.studies import Campaign, reached_targets
-from bench.tuning.search import cost_of
-from bench.tuning.tune import tune
-from bench.workers import Workers
+from bench.analysis import TargetResults, target_results
+from bench.base import ConvergenceError, DataError, Workers
+from bench.batch import Campaign, reached_targets, tune
+from bench.batch.tuning.search import cost_of
+from bench.control import TwoStageInverse
+from bench.identification import load_model
+from bench.record import Record
+from bench.rig import load_rig
 from rigs.muscles.identification import (
     FORCE,
     LENGTH,

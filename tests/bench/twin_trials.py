@@ -24,9 +24,9 @@ from rich.console import Console
 from rich.table import Table
 
 import bench
-from bench.errors import ConvergenceError
-from bench.journal import Record
-from bench.twin.write import write_twin
+from bench.base import ConvergenceError
+from bench.record import Record
+from bench.specimen import write_twin
 
 MODELS: Mapping[str, Mapping[str, Any]] = {
     "vo2": {"model": "preisach-nonmonotonic", "plane": (30.0, 70.0)},

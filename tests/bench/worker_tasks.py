@@ -9,10 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.errors import DeviceError
+from bench.base import DeviceError, report, task_console
 from bench.protocol import find_protocol
-from bench.runs import Run, carry_out
-from bench.workers import report, task_console
+from bench.run import Run, carry_out
 
 _ordinals = itertools.count()
 

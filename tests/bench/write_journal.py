@@ -3,9 +3,8 @@
 import sys
 from pathlib import Path
 
-from bench.devices import Signal
-from bench.journal import Journal, StepRecord
-from bench.settling import Settled
+from bench.devices import Settled, Signal
+from bench.record import Journal, StepRecord
 
 journal = Journal(Path(sys.argv[1]), (Signal("a", "m", "a"), Signal("b", "m", "b")), {})
 step = 0

@@ -2,10 +2,8 @@
 
 import numpy as np
 
-from bench.devices import Signal
-from bench.journal import FILE_NAME, Event, Journal, StepRecord
-from bench.lateness import Lateness
-from bench.settling import Settled
+from bench.devices import Settled, Signal
+from bench.record import FILE_NAME, Event, Journal, Lateness, StepRecord
 
 HOSTILE = "<script>document.title='taken'</script><img src=x onerror=alert(1)>"
 STEPS = 4000

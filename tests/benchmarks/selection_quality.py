@@ -20,13 +20,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.hysteresis import identifiable_models
-from bench.identification.by_name import set_up_problem
-from bench.identification.evaluation import Candidate, Measurements
-from bench.identification.selection import Given, select
-from bench.results.selection import MOST_ROWS
-from bench.timed import identify_in_time
-from bench.timed.held_out import HeldOutInTime
+from bench.analysis.model_choice import MOST_ROWS
+from bench.identification import (
+    Candidate,
+    Given,
+    HeldOutInTime,
+    Measurements,
+    identify_in_time,
+    select,
+    set_up_problem,
+)
+from bench.models import identifiable_models
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "identification"))
 

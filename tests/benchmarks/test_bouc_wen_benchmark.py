@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 from scipy.signal import decimate
 
-from bench.timed import identify_in_time
+from bench.identification import identify_in_time
 
 pytestmark = pytest.mark.benchmark
 

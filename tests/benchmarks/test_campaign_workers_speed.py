@@ -5,10 +5,8 @@ import time
 
 import pytest
 
-from bench.campaigns.execution import WorkersExecutor, carry_out_tasks
-from bench.campaigns.expansion import expand
-from bench.campaigns.file import read_campaign
-from bench.workers import Workers, available_cores
+from bench.base import Workers, available_cores
+from bench.batch import WorkersExecutor, carry_out_tasks, expand, read_campaign
 
 CAMPAIGN = """
 [[runs]]

@@ -14,9 +14,8 @@ rr = pytest.importorskip("rerun")
 from bench.dashboard.entries import Entry, Tick  # noqa: E402
 from bench.dashboard.live import CHUNK_ROWS  # noqa: E402
 from bench.dashboard.writer import Writer  # noqa: E402
-from bench.devices import Signal  # noqa: E402
-from bench.journal import StepRecord  # noqa: E402
-from bench.settling import Settled  # noqa: E402
+from bench.devices import Settled, Signal  # noqa: E402
+from bench.record import StepRecord  # noqa: E402
 
 pytestmark = pytest.mark.benchmark
 

@@ -12,7 +12,7 @@ import warnings
 import pytest
 import serial
 
-from bench.clock import VirtualClock, WallClock
+from bench.base import VirtualClock, WallClock
 from drivers.dynamixel import DynamixelMX28
 from sim_devices import protocol_emulated
 from sim_devices.instruments.dynamixel import EmulatedMX28
@@ -24,7 +24,7 @@ pytestmark = pytest.mark.benchmark
 # The servo has a process of its own, so that no client competes with it for the interpreter.
 SERVO = """
 import math, os, sys, tty
-from bench.clock import WallClock
+from bench.base import WallClock
 from sim_devices.instruments.dynamixel import EmulatedMX28
 from sim_devices.wire.dynamixel2 import Dynamixel2Server
 from sim_devices.world import World

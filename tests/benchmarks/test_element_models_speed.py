@@ -5,8 +5,8 @@ import time
 import numpy as np
 import pytest
 
-from bench.hysteresis import BoucWen
 from bench.identification import identify
+from bench.models import BoucWen
 
 pytestmark = pytest.mark.benchmark
 

@@ -14,19 +14,14 @@ import numpy as np
 import pytest
 from pydantic import Field
 
-from bench import registry
-from bench.attachment import attach
-from bench.clock import VirtualClock
-from bench.devices import DriverSettings, Identity, Limits, Status
-from bench.engine import Engine
-from bench.guardian.remote import GuardedRig, RemoteStation
-from bench.interrupts import Interrupts
-from bench.journal import FILE_NAME, Journal
-from bench.protocol import Arrived, ProtocolParameters, Step, protocol
-from bench.rig import Look, Rig
-from bench.rig_file import LaboratorySettings, load_rig
-from bench.roles import TemperatureSensor, VoltageSupply
-from bench.station.local import LocalStation
+from bench.base import Interrupts, VirtualClock, registry
+from bench.devices import Arrived, DriverSettings, Identity, Limits, Status, TemperatureSensor, VoltageSupply
+from bench.protocol import ProtocolParameters, Step, protocol
+from bench.record import FILE_NAME, Journal
+from bench.rig import LaboratorySettings, Look, Rig, attach, load_rig
+from bench.run.engine import Engine
+from bench.run.guardian.remote import GuardedRig, RemoteStation
+from bench.run.station.local import LocalStation
 from sim_devices.serving.process import serve
 
 pytestmark = pytest.mark.benchmark

@@ -9,18 +9,16 @@ import numpy as np
 import pytest
 from numba import njit
 
-from bench.clock import VirtualClock
-from bench.control.notch_loop import NotchLoopParameters, notch
-from bench.control.tracking import Trace
-from bench.engine import Engine
-from bench.hysteresis import Polynomial, PrandtlIshlinskii
-from bench.interrupts import Interrupts
-from bench.journal import FILE_NAME, Journal, Record
+from bench.base import Interrupts, VirtualClock
+from bench.control import NotchLoopParameters, Trace
+from bench.control.notch_loop import notch
+from bench.models import Polynomial, PrandtlIshlinskii
 from bench.protocol import FixedRate, ProtocolParameters, protocol
-from bench.rig import Rig
-from bench.rig_file import load_rig
-from bench.runs import trace_signals
-from bench.station.local import LocalStation
+from bench.record import FILE_NAME, Journal, Record
+from bench.rig import Rig, load_rig
+from bench.run.context import trace_signals
+from bench.run.engine import Engine
+from bench.run.station.local import LocalStation
 from rigs.hybrid.control import make_fine
 from rigs.hybrid.design import Design
 from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel

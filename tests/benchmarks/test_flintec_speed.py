@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from pymodbus.client import ModbusSerialClient
 
-from bench.clock import Stopwatch, VirtualClock, WallClock
+from bench.base import Stopwatch, VirtualClock, WallClock
 from drivers.flintec_dad141 import FlintecDAD141
 from sim_devices import protocol_emulated
 from sim_devices.instruments.flintec_dad141 import EmulatedDAD141

@@ -6,9 +6,8 @@ from statistics import median
 
 import pytest
 
-from bench.clock import VirtualClock
-from bench.rig import Rig
-from bench.rig_file import load_rig
+from bench.base import VirtualClock
+from bench.rig import Rig, load_rig
 
 GLANCES = 100
 BATCHES = 15

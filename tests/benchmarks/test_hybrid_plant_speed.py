@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from bench.clock import Stopwatch
+from bench.base import Stopwatch
 from sim_devices.plants import _hybrid_kernels as kernels
 from sim_devices.plants.hybrid import HybridCantilever
 from sim_devices.plants.hybrid_parameters import HybridParameters

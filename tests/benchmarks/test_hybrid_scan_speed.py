@@ -7,9 +7,8 @@ import time
 
 import pytest
 
-from bench.clock import VirtualClock
-from bench.rig import Rig
-from bench.rig_file import load_rig
+from bench.base import VirtualClock
+from bench.rig import Rig, load_rig
 
 pytestmark = pytest.mark.benchmark
 

@@ -7,9 +7,8 @@ import pytest
 from scipy.optimize import brentq
 
 from bench.control.adaptation import Adapter
-from bench.hysteresis import PrandtlIshlinskii, Preisach, ThermalExpansion, uniform_levels
-from bench.hysteresis.inverse import PreisachInverse
 from bench.identification import damped_oscillation
+from bench.models import PrandtlIshlinskii, Preisach, PreisachInverse, ThermalExpansion, uniform_levels
 
 pytestmark = pytest.mark.benchmark
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from threadpoolctl import threadpool_limits
 
-from bench.hysteresis import Preisach, uniform_levels
 from bench.identification import fit
+from bench.models import Preisach, uniform_levels
 
 pytestmark = pytest.mark.benchmark
 
@@ -99,7 +99,7 @@ def test_fit(capsys):
 LONG = """
 import resource, sys, time
 import numpy as np
-from bench.hysteresis import Preisach, uniform_levels
+from bench.models import Preisach, uniform_levels
 from bench.identification import fit
 {problem}
 operator, inputs, outputs = problem(5)

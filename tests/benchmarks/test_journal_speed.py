@@ -11,10 +11,9 @@ from pathlib import Path
 
 import pytest
 
-from bench.devices import Signal
-from bench.journal import FILE_NAME, Journal, StepRecord
-from bench.journal.store import Store
-from bench.settling import Settled
+from bench.devices import Settled, Signal
+from bench.record import FILE_NAME, Journal, StepRecord
+from bench.record.store import Store
 
 pytestmark = pytest.mark.benchmark
 

@@ -6,9 +6,8 @@ from statistics import median
 import numpy as np
 import pytest
 
-from bench.clock import VirtualClock
-from bench.rig import Rig
-from bench.rig_file import load_rig
+from bench.base import VirtualClock
+from bench.rig import Rig, load_rig
 from drivers.labjack_t7.registers import AIN, TEST, LabJackT7, Span
 
 pytestmark = pytest.mark.benchmark

@@ -11,11 +11,10 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from bench.attachment import read_endpoints
-from bench.interrupts import Interrupts
-from bench.journal import Record
-from bench.lateness import lateness_lines
-from bench.runs import Run, carry_out
+from bench.base import Interrupts
+from bench.record import Record, lateness_lines
+from bench.rig import read_endpoints
+from bench.run import Run, carry_out
 from sim_devices.serving.process import serve
 
 sys.path.append(str(Path(__file__).parents[1] / "bench"))

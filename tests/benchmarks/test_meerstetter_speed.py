@@ -10,7 +10,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from bench.clock import VirtualClock
+from bench.base import VirtualClock
 from drivers.flintec_dad141 import FlintecDAD141
 from drivers.meerstetter import MeerstetterTEC
 from drivers.scpi import SCPISensor

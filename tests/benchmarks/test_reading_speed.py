@@ -7,7 +7,7 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from bench.results.data import read_columns
+from bench.analysis import read_columns
 
 ROWS = 1_000_000
 

@@ -10,7 +10,7 @@ import tty
 import can
 import pytest
 
-from bench.clock import Stopwatch, VirtualClock, WallClock
+from bench.base import Stopwatch, VirtualClock, WallClock
 from drivers.roboteq import RoboteqSupply
 from drivers.roboteq.supply import _VOLTS
 from sim_devices.instruments.roboteq import EmulatedRoboteq
@@ -23,7 +23,7 @@ BATCHES = 5
 
 SERVER = """
 import os, sys
-from bench.clock import WallClock
+from bench.base import WallClock
 from sim_devices.instruments.roboteq import EmulatedRoboteq
 from sim_devices.wire.canopen_slcan import CanopenSlcanServer
 from sim_devices.world import World

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 import pytest
 import serial
 
-from bench.clock import Stopwatch
+from bench.base import Stopwatch
 from sim_devices.serving.process import serve
 
 ROUND_TRIPS = 2000

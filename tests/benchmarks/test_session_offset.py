@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 import bench
-from bench.identification import identify, measure_errors
-from bench.identification.recalibration import recalibrate
+from bench.identification import identify, measure_errors, recalibrate
 
 pytestmark = pytest.mark.benchmark
 

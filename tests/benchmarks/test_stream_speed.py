@@ -5,7 +5,7 @@ import time
 import numpy as np
 import pytest
 
-from bench.hysteresis import PrandtlIshlinskii, Preisach, QuadraticTerm, TwoStage, uniform_levels
+from bench.models import PrandtlIshlinskii, Preisach, QuadraticTerm, TwoStage, uniform_levels
 
 pytestmark = pytest.mark.benchmark
 

@@ -7,10 +7,9 @@ from statistics import median
 import numpy as np
 import pytest
 
-from bench.hysteresis import Preisach, uniform_levels
-from bench.transients import _kernels
-from bench.transients.identification import identify_dynamics, identify_transients
-from bench.transients.recording import Recording
+from bench.analysis import Recording, identify_dynamics, identify_transients
+from bench.models import Preisach, uniform_levels
+from bench.models.kernels import actuator_kernels as _kernels
 
 pytestmark = pytest.mark.benchmark
 

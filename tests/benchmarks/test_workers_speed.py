@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.clock import Stopwatch
-from bench.workers import Workers, available_cores
+from bench.base import Stopwatch, Workers, available_cores
 
 sys.path.append(str(Path(__file__).parents[1] / "bench"))
 import worker_tasks

@@ -3,7 +3,7 @@
 import pytest
 from served import PATIENCE
 
-from bench.clock import Stopwatch, WallClock
+from bench.base import Stopwatch, WallClock
 
 canopen = pytest.importorskip("canopen")
 

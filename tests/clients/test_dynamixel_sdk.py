@@ -5,7 +5,7 @@ import warnings
 import pytest
 from served import PATIENCE
 
-from bench.clock import Stopwatch, WallClock
+from bench.base import Stopwatch, WallClock
 
 TORQUE_ENABLE, PROFILE_VELOCITY, GOAL_POSITION, PRESENT_POSITION, BUS_WATCHDOG = 64, 112, 116, 132, 98
 COUNT = 6.283185307179586 / 4096

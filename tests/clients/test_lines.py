@@ -7,7 +7,7 @@ import serial
 from dialects import Dynamixel, MalformedError, MeCom, ModbusRtu, SlcanCanopen
 from served import PATIENCE
 
-from bench.clock import Stopwatch
+from bench.base import Stopwatch
 
 LINES = {
     ("vo2", "tec"): MeCom(),

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from bench.clock import VirtualClock
+from bench.base import VirtualClock
 from bench.devices import Device
 from sim_devices.protocol_emulated import register, unregister
 from sim_devices.wire import WireServer
@@ -85,7 +85,7 @@ class OnABench:
 
     @pytest.fixture
     def clock(self, bench):
-        return bench.clock
+        return bench.base.clock
 
     @pytest.fixture
     def requests(self, bench):
@@ -109,7 +109,7 @@ class OnALine(OnABench):
 
     @pytest.fixture
     def mend(self, bench):
-        return lambda: register(bench.port.removeprefix("emulated://"), bench.server, bench.clock)
+        return lambda: register(bench.port.removeprefix("emulated://"), bench.server, bench.base.clock)
 
     @pytest.fixture
     def exchange(self, bench, another_server):
@@ -123,7 +123,7 @@ class OnALine(OnABench):
         def restart():
             bench.instrument.power_cycle()
             # The longest that an instrument takes to start.
-            bench.clock.sleep(0.5)
+            bench.base.clock.sleep(0.5)
 
         return restart
 

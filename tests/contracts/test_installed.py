@@ -20,8 +20,8 @@ MODULE = """
 import math
 
 from bench.devices import DriverSettings, Identity, Limits, Status
-from bench.roles import VoltageSupply
-from bench.rig_file import LaboratorySettings
+from bench.devices import VoltageSupply
+from bench.rig import LaboratorySettings
 
 
 class Nothing:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from each_case import each_case
 
-from bench.clock import VirtualClock
-from bench.contracts.faults import (
+from bench.base import DeviceConnectionError, DeviceError, DeviceRestartedError, VirtualClock
+from bench.contracts import (
     ActuatorLineLostContract,
     LineLostContract,
     RestartedActuatorContract,
@@ -16,8 +16,7 @@ from bench.contracts.faults import (
     SafeOverAFreshLineContract,
     WatchdogContract,
 )
-from bench.errors import DeviceConnectionError, DeviceError, DeviceRestartedError
-from bench.roles import TECMode
+from bench.devices import TECMode
 from drivers.labjack_t7 import T7HighVoltageSupply, T7PositionSensor, T7Switch
 from drivers.meerstetter import MeerstetterTEC
 from sim_devices.instruments.labjack_t7 import EmulatedT7

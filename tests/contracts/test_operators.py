@@ -5,9 +5,9 @@ from functools import cache
 import numpy as np
 import pytest
 
-from bench.contracts.operators import OperatorContract
-from bench.hysteresis import identifiable_models
+from bench.contracts import OperatorContract
 from bench.identification import identify
+from bench.models import identifiable_models
 
 # Nested loops; the output is that of two plays and a curve, so that no model fits it to the last digit.
 INPUTS = np.concatenate([np.linspace(a, b, 25) for a, b in ((0, 3), (3, 0.2), (0.2, 2.6), (2.6, 0.7), (0.7, 3))])

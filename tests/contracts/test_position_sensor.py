@@ -9,9 +9,8 @@ import pytest
 from each_case import each_case
 from emulated_bench import Bench, Given, OnABench, check_reproducible, tcp_port
 
-from bench.clock import VirtualClock
-from bench.contracts.roles import PositionSensorContract
-from bench.errors import DeviceError
+from bench.base import DeviceError, VirtualClock
+from bench.contracts import PositionSensorContract
 from drivers.labjack_t7 import T7PositionSensor
 from sim_devices.instruments.labjack_t7 import EmulatedT7
 from sim_devices.serving.modbus_tcp_server import ModbusTcpServer
@@ -173,12 +172,12 @@ def test_recovers_by_itself(bench, case):
 
 
 def test_a_measurement_takes_the_time_of_its_conversions(bench, readout):
-    begin = bench.clock.now()
+    begin = bench.base.clock.now()
     bench.device.measure()
-    assert bench.clock.now() - begin == pytest.approx(0.010 * len(CASES[readout].channels))
-    begin = bench.clock.now()
+    assert bench.base.clock.now() - begin == pytest.approx(0.010 * len(CASES[readout].channels))
+    begin = bench.base.clock.now()
     bench.device.glance()
-    assert bench.clock.now() == begin
+    assert bench.base.clock.now() == begin
 
 
 def test_a_measurement_is_the_mean_over_its_time(kind, stack):

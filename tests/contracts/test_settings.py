@@ -5,8 +5,8 @@ import math
 from each_case import each_case
 from pydantic import ValidationError
 
+from bench.base.registry import entries, load
 from bench.devices import DriverSettings
-from bench.registry import entries, load
 
 DRIVERS = sorted(name for name, entry in entries("devices").items() if entry.own)
 

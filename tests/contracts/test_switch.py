@@ -9,10 +9,9 @@ import pytest
 from each_case import each_case
 from emulated_bench import tcp_port
 
-from bench.clock import VirtualClock
-from bench.contracts.roles import SwitchContract
-from bench.errors import DeviceError
-from bench.roles import Switch
+from bench.base import DeviceError, VirtualClock
+from bench.contracts import SwitchContract
+from bench.devices import Switch
 from drivers.labjack_t7 import T7Switch
 from sim_devices.instruments.labjack_t7 import EmulatedT7
 from sim_devices.world import World

@@ -7,9 +7,8 @@ import pytest
 from each_case import each_case
 from emulated_bench import Bench, Given, OnABench, check_reproducible, tcp_port
 
-from bench.clock import VirtualClock
-from bench.contracts.roles import TemperatureSensorContract
-from bench.errors import DeviceError
+from bench.base import DeviceError, VirtualClock
+from bench.contracts import TemperatureSensorContract
 from drivers.labjack_t7 import T7Thermistor
 from sim_devices.instruments.labjack_t7 import EmulatedT7
 from sim_devices.serving.modbus_tcp_server import ModbusTcpServer
@@ -103,12 +102,12 @@ def test_outside_of_the_limits_is_an_error(bench, temperature):
 
 
 def test_a_measurement_takes_the_time_of_its_conversions(bench):
-    begin = bench.clock.now()
+    begin = bench.base.clock.now()
     bench.device.measure()
-    assert bench.clock.now() - begin == pytest.approx(0.020)
-    begin = bench.clock.now()
+    assert bench.base.clock.now() - begin == pytest.approx(0.020)
+    begin = bench.base.clock.now()
     bench.device.glance()
-    assert bench.clock.now() == begin
+    assert bench.base.clock.now() == begin
 
 
 def test_one_seed_gives_one_record(kind, stack):

@@ -12,9 +12,8 @@ from pathlib import Path
 import numpy as np
 
 import bench
-from bench.journal import Record
-from bench.results.models import identify_file
-from bench.results.tracking import target_results
+from bench.analysis import identify_file, target_results
+from bench.record import Record
 
 WIDER = ("major_width", "minor_width", "major_width_spread", "minor_width_spread")
 SPECIMENS = {

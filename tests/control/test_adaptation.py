@@ -5,12 +5,10 @@ import math
 import numpy as np
 import pytest
 from each_case import each_case
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from bench.control.adaptation import Adapter
-from bench.hysteresis import MemoryCurve, Preisach, QuadraticTerm, uniform_levels
-from bench.hysteresis.inverse import PreisachInverse
+from bench.models import MemoryCurve, Preisach, PreisachInverse, QuadraticTerm, uniform_levels
 
 
 def plant(order=20, seed=0, term=None, bias=0.3):

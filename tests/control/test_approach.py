@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from each_case import each_case
 
-from bench.control.approach import Approach
+from bench.control import Approach
 from sim_devices.plants.sma import SMAParameters, SMAWire
 
 TOLERANCE = 0.03

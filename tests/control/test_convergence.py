@@ -1,9 +1,9 @@
 import math
 
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
-from bench.control.convergence import MOST_SWINGS, LimitCycleWatch
+from bench.control import LimitCycleWatch
+from bench.control.convergence import MOST_SWINGS
 
 
 def cycles(setpoints, reference=1.0, low=0.0, high=3.0):

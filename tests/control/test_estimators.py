@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from each_case import each_case
 from filterpy.kalman import KalmanFilter
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
-from bench.control.estimators import DisturbanceEstimator
+from bench.control import DisturbanceEstimator
 
 variances = st.floats(1e-6, 1e6)
 

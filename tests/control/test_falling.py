@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from each_case import each_case
 
-from bench.control.dynamics import IdentifiedDynamics
-from bench.controllers import ControllerSetup, controller_names, make_controller
-from bench.hysteresis import Polynomial, Preisach, QuadraticTerm, Reach, uniform_levels
-from bench.model_file import ModelFile
+from bench.control import ControllerSetup, controller_names, make_controller
+from bench.identification import ModelFile
+from bench.models import IdentifiedDynamics, Polynomial, Preisach, QuadraticTerm, Reach, uniform_levels
 
 LIMITS = (0.0, 3.0)
 

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from each_case import each_case
 
-from bench.control.dynamics import ResponseDynamics, SeenInput
+from bench.control import Spans
 from bench.control.tracking import Arrival, ClosedLoopInverse, CorrectionParameters, OpenLoopInverse
-from bench.control.tuning import Spans
-from bench.hysteresis import Preisach, uniform_levels
+from bench.models import Preisach, ResponseDynamics, SeenInput, uniform_levels
 
 LAG = 5.0
 HEATED = ResponseDynamics(lag=LAG, power=2.0)

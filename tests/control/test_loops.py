@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from each_case import each_case
 
-from bench.control.dynamics import ActuatorDynamics, IdentifiedDynamics, ResponseDynamics
-from bench.control.loops import FollowReference, Playback, ReachTarget
-from bench.control.tracking import Command, Trace
+from bench.control import Command, FollowReference, Playback, ReachTarget, Trace
+from bench.models import ActuatorDynamics, IdentifiedDynamics, ResponseDynamics
 
 
 class Follower:

@@ -8,8 +8,7 @@ from each_case import each_case
 
 from bench.control.model_filters import DensityFilter, SessionFilter, model_filter
 from bench.control.tracking import ClosedLoopInverse, OpenLoopInverse
-from bench.hysteresis import Polynomial, PrandtlIshlinskii, Preisach, QuadraticTerm, uniform_levels
-from bench.hysteresis.transport import widened
+from bench.models import Polynomial, PrandtlIshlinskii, Preisach, QuadraticTerm, uniform_levels, widened
 
 NOISE = 0.5
 SPAN = 200.0

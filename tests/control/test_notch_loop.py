@@ -7,9 +7,10 @@ import pytest
 from each_case import each_case
 from scipy import signal
 
-from bench.control.notch_loop import NotchLoop, NotchLoopParameters, notch
-from bench.errors import ConvergenceError
-from bench.hysteresis import PrandtlIshlinskii
+from bench.base import ConvergenceError
+from bench.control import NotchLoop, NotchLoopParameters
+from bench.control.notch_loop import notch
+from bench.models import PrandtlIshlinskii
 from rigs.hybrid.model import PUBLISHED_DYNAMICS
 
 

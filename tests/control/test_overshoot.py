@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from bench.control import Spans
 from bench.control.overshoot import LEAST, Overshoot
 from bench.control.tracking import Arrival, ClosedLoopInverse, CorrectionParameters, OpenLoopInverse
-from bench.control.tuning import Spans
-from bench.hysteresis import Preisach, uniform_levels
+from bench.models import Preisach, uniform_levels
 
 LIMITS = (0.0, 100.0)
 MODEL = Preisach(uniform_levels(*LIMITS, 20), np.full(210, 0.01), 0.0, None, LIMITS)

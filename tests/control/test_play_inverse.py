@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from each_case import each_case
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
-from bench.control.play_inverse import PlayInverse
-from bench.hysteresis import DeadZones, PrandtlIshlinskii
+from bench.control import PlayInverse
+from bench.models import DeadZones, PrandtlIshlinskii
 
 MICRO, NANO = 1e-6, 1e-9
 

@@ -5,11 +5,18 @@ import math
 import numpy as np
 import pytest
 
-from bench.control.dynamics import ActuatorDynamics, IdentifiedDynamics, ResponseDynamics
+from bench.control import FollowReference
 from bench.control.following import ClosedLoopFollower
-from bench.control.loops import FollowReference, Foreseeing
+from bench.control.loops import Foreseeing
 from bench.control.predictive import PredictiveFollower
-from bench.hysteresis import PrandtlIshlinskii, Preisach, uniform_levels
+from bench.models import (
+    ActuatorDynamics,
+    IdentifiedDynamics,
+    PrandtlIshlinskii,
+    Preisach,
+    ResponseDynamics,
+    uniform_levels,
+)
 
 PERIOD = 0.5
 FINE = 50

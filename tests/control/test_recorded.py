@@ -12,30 +12,42 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.control.adaptation import Adapter
-from bench.control.approach import Approach
-from bench.control.baselines import IntegralControl, IntegralParameters, LookUp
-from bench.control.dynamics import ActuatorDynamics, IdentifiedDynamics, ResponseDynamics
-from bench.control.estimators import DisturbanceEstimator, DriftEstimator, agility_for
-from bench.control.following import ClosedLoopFollower, FollowingParameters, IntegralFollower, OpenLoopFollower
-from bench.control.latched import Latched, LatchParameters
-from bench.control.loops import FollowReference
-from bench.control.model_filters import model_filter
-from bench.control.notch_loop import NotchLoop, NotchLoopParameters
-from bench.control.predictive import PredictionParameters, PredictiveFollower
-from bench.control.references import (
+from bench.control import (
     AddedSine,
+    Approach,
     ApproachedReference,
+    DisturbanceEstimator,
+    DriftEstimator,
+    FollowReference,
+    NotchLoop,
+    NotchLoopParameters,
     SmoothMoves,
+    Spans,
+    Supervised,
+    agility_for,
     fastest_slope,
     modulated_sine,
     staircase,
     tracking_targets,
 )
-from bench.control.supervision import Supervised
+from bench.control.adaptation import Adapter
+from bench.control.baselines import IntegralControl, IntegralParameters, LookUp
+from bench.control.following import ClosedLoopFollower, FollowingParameters, IntegralFollower, OpenLoopFollower
+from bench.control.latched import Latched, LatchParameters
+from bench.control.model_filters import model_filter
+from bench.control.predictive import PredictionParameters, PredictiveFollower
 from bench.control.tracking import Arrival, ClosedLoopInverse, CorrectionParameters, OpenLoopInverse
-from bench.control.tuning import Spans
-from bench.hysteresis import Polynomial, PrandtlIshlinskii, Preisach, QuadraticTerm, Reach, uniform_levels
+from bench.models import (
+    ActuatorDynamics,
+    IdentifiedDynamics,
+    Polynomial,
+    PrandtlIshlinskii,
+    Preisach,
+    QuadraticTerm,
+    Reach,
+    ResponseDynamics,
+    uniform_levels,
+)
 
 RECORDED = Path(__file__).with_name("recorded.json")
 KEPT = 12

@@ -5,19 +5,10 @@ import math
 import numpy as np
 import pytest
 from each_case import each_case
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
-from bench.control.references import (
-    AddedSine,
-    SmoothMoves,
-    fastest_slope,
-    modulated_sine,
-    staircase,
-    tracking_targets,
-)
-from bench.hysteresis import Preisach, QuadraticTerm, uniform_levels
-from bench.hysteresis.inverse import PreisachInverse
+from bench.control import AddedSine, SmoothMoves, fastest_slope, modulated_sine, staircase, tracking_targets
+from bench.models import Preisach, PreisachInverse, QuadraticTerm, uniform_levels
 
 MICRO, NANO = 1e-6, 1e-9
 SPEED = 3 * MICRO

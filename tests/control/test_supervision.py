@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from each_case import each_case
 
+from bench.base import ConvergenceError
+from bench.control import Command, Spans, Supervised, SupervisedFollower, Trace
 from bench.control.following import ClosedLoopFollower, OpenLoopFollower
-from bench.control.supervision import SAMPLES, TARGETS, Supervised, SupervisedFollower
-from bench.control.tracking import ClosedLoopInverse, Command, CorrectionParameters, OpenLoopInverse, Trace
-from bench.control.tuning import Spans
-from bench.errors import ConvergenceError
-from bench.hysteresis import Preisach, Reach, uniform_levels
+from bench.control.supervision import SAMPLES, TARGETS
+from bench.control.tracking import ClosedLoopInverse, CorrectionParameters, OpenLoopInverse
+from bench.models import Preisach, Reach, uniform_levels
 
 LIMITS = (0.0, 1.0)
 MODEL = Preisach(uniform_levels(*LIMITS, 10), np.full(55, 2.0), 0.0, None, LIMITS)

@@ -8,17 +8,14 @@ from itertools import pairwise, product
 import numpy as np
 import pytest
 from each_case import each_case
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
+from bench.control import Spans, modulated_sine, tracking_targets, tuned, widened
 from bench.control.baselines import IntegralControl, IntegralParameters, LookUp
 from bench.control.following import ClosedLoopFollower, FollowingParameters, IntegralFollower, OpenLoopFollower
 from bench.control.latched import Latched, LatchParameters, reversible_slope, walk
-from bench.control.references import modulated_sine, tracking_targets
-from bench.control.tracking import Arrival, ClosedLoopInverse, CorrectionParameters, OpenLoopInverse, widened
-from bench.control.tuning import Spans, tuned
-from bench.hysteresis import MemoryCurve, Polynomial, Preisach, Reach, uniform_levels
-from bench.hysteresis.inverse import PreisachInverse
+from bench.control.tracking import Arrival, ClosedLoopInverse, CorrectionParameters, OpenLoopInverse
+from bench.models import MemoryCurve, Polynomial, Preisach, PreisachInverse, Reach, uniform_levels
 
 LOW, HIGH = 21.0, 84.0
 NARROW = (45.0, 66.0)

@@ -6,12 +6,10 @@ from functools import cache
 import numpy as np
 import pytest
 from each_case import each_case
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
-from bench.control import two_stage_inverse
-from bench.control.two_stage_inverse import TwoStageInverse
-from bench.hysteresis import (
+from bench.control import TwoStageInverse, two_stage_inverse
+from bench.models import (
     DeadZones,
     Linear,
     Polynomial,

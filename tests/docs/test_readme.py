@@ -8,7 +8,7 @@ import pytest
 from cases import cases
 from typer.main import get_command
 
-from bench.cli.app import app
+from bench.cli import app
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text()

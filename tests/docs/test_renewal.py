@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from bench.campaigns.file import axes, dotted, read_campaign
+from bench.batch import read_campaign
+from bench.batch.campaign.file import axes, dotted
 
 ROOT = Path(__file__).parents[2]
 ROBUSTNESS = read_campaign(ROOT / "examples" / "campaign-robustness.toml")

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.clock import VirtualClock
+from bench.base import VirtualClock
 from sim_devices.protocol_emulated import register, unregister
 
 # The line with faults, which the tests of several drivers share.

@@ -6,17 +6,13 @@ import struct
 import pytest
 from each_case import each_case
 from faulty_line import InPieces
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from refusals import blamed
 
-from bench.clock import VirtualClock
-from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, DeviceRestartedError
-from drivers.dynamixel import HARDWARE_ERRORS, STATUS_ERRORS, DynamixelDrum, DynamixelMX28
-from drivers.dynamixel import mx28 as driver
+from bench.base import ConfigurationError, DeviceConnectionError, DeviceError, DeviceRestartedError, VirtualClock
+from drivers.dynamixel import HARDWARE_ERRORS, STATUS_ERRORS, DynamixelDrum, DynamixelMX28, mx28 as driver
 from drivers.dynamixel.mx28 import MX28Settings
-from drivers.dynamixel.protocol2 import RefusedError, ServoLine, frame
-from drivers.dynamixel.protocol2 import crc as driver_crc
+from drivers.dynamixel.protocol2 import RefusedError, ServoLine, crc as driver_crc, frame
 from sim_devices.instruments.dynamixel_table import ITEMS
 from sim_devices.protocol_emulated import register, unregister
 from sim_devices.wire import WireServer

@@ -11,8 +11,7 @@ from contextlib import contextmanager
 import pytest
 from each_case import each_case
 
-from bench.clock import VirtualClock
-from bench.errors import DeviceError
+from bench.base import DeviceError, VirtualClock
 from drivers.dynamixel import DynamixelMX28
 from drivers.roboteq import RoboteqSupply
 from sim_devices.instruments.dynamixel import EmulatedMX28

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from faulty_line import KINDS, FaultyLine
 
-from bench.clock import VirtualClock
-from bench.errors import DeviceConnectionError
+from bench.base import DeviceConnectionError, VirtualClock
 from drivers.flintec_dad141 import FlintecDAD141
 from sim_devices import protocol_emulated
 from sim_devices.instruments.flintec_dad141 import EmulatedDAD141

@@ -9,21 +9,20 @@ from itertools import pairwise
 import pytest
 from each_case import each_case
 from faulty_line import InPieces
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from refusals import blamed
 
-from bench.clock import VirtualClock, WallClock
-from bench.errors import (
+from bench.base import (
     ConfigurationError,
     DeviceConnectionError,
     DeviceError,
     DeviceRestartedError,
+    VirtualClock,
+    WallClock,
     WatchdogError,
 )
-from bench.roles import TECMode
-from drivers.meerstetter import DEVICE_ERRORS, SERVER_ERRORS, MeerstetterTEC
-from drivers.meerstetter import tec as driver
+from bench.devices import TECMode
+from drivers.meerstetter import DEVICE_ERRORS, SERVER_ERRORS, MeerstetterTEC, tec as driver
 from drivers.meerstetter.mecom import Parameter, RefusedError, TECLine, decode, encode
 from sim_devices.instruments.meerstetter_table import PARAMETERS
 from sim_devices.protocol_emulated import register, unregister

@@ -8,12 +8,17 @@ import numpy as np
 import pytest
 from each_case import each_case
 
-from bench.clock import VirtualClock
-from bench.command_table import ActuatorTable
-from bench.contracts.devices import ActuatorContract
-from bench.contracts.faults import ActuatorLineLostContract, RestartedActuatorContract
-from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, DeviceRestartedError, LimitError
-from bench.rig_file import load_rig
+from bench.base import (
+    ConfigurationError,
+    DeviceConnectionError,
+    DeviceError,
+    DeviceRestartedError,
+    LimitError,
+    VirtualClock,
+)
+from bench.contracts import ActuatorContract, ActuatorLineLostContract, RestartedActuatorContract
+from bench.devices import ActuatorTable
+from bench.rig import load_rig
 from drivers.pymeasure import Adapter, InstrumentLine, SensorAdapter, parse_action
 from sim_devices.instruments.scpi import EmulatedTextInstrument, Meter
 from sim_devices.wire.text import TextServer

@@ -3,8 +3,8 @@
 import pytest
 from each_case import each_case
 
-from bench.command_table import QuantityTable, TargetTable
-from bench.errors import DeviceError, DeviceRestartedError
+from bench.base import DeviceError, DeviceRestartedError
+from bench.devices import QuantityTable, TargetTable
 from drivers.device import attempt, watchdog_field
 from drivers.quantities import arrival_of, check_ranges, check_read_back, identity_of, output_lost, signals_of
 

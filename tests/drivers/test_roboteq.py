@@ -8,14 +8,11 @@ import threading
 import pytest
 from each_case import each_case
 from faulty_line import InPieces
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from refusals import blamed
 
-from bench.clock import VirtualClock
-from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError, DeviceRestartedError
-from drivers.roboteq import ABORT_CODES, CHANNEL_FLAGS, FAULT_FLAGS, RoboteqSupply
-from drivers.roboteq import supply as driver
+from bench.base import ConfigurationError, DeviceConnectionError, DeviceError, DeviceRestartedError, VirtualClock
+from drivers.roboteq import ABORT_CODES, CHANNEL_FLAGS, FAULT_FLAGS, RoboteqSupply, supply as driver
 from drivers.roboteq.canopen import Entry, NodeLine
 from drivers.roboteq.process_data import ProcessData
 from drivers.roboteq.supply import _POWER, _VOLTS

@@ -7,13 +7,10 @@ from contextlib import ExitStack
 import numpy as np
 import pytest
 from each_case import each_case
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
-from bench.clock import VirtualClock
-from bench.contracts.devices import ActuatorContract
-from bench.contracts.faults import SilentInstrumentContract
-from bench.errors import ConfigurationError, DeviceConnectionError, DeviceError
+from bench.base import ConfigurationError, DeviceConnectionError, DeviceError, VirtualClock
+from bench.contracts import ActuatorContract, SilentInstrumentContract
 from drivers.scpi import SCPIActuator, SCPISensor, SCPIVoltageSupply
 from sim_devices import protocol_emulated
 from sim_devices.instruments.scpi import EmulatedTextInstrument, Meter

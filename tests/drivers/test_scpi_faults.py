@@ -7,8 +7,8 @@ import pytest
 from faulty_line import FaultyLine
 from test_scpi import Laboratory
 
-from bench.contracts.faults import ActuatorLineLostContract, RestartedActuatorContract, SafeOverAFreshLineContract
-from bench.errors import DeviceConnectionError, DeviceError, DeviceRestartedError
+from bench.base import DeviceConnectionError, DeviceError, DeviceRestartedError
+from bench.contracts import ActuatorLineLostContract, RestartedActuatorContract, SafeOverAFreshLineContract
 from drivers.scpi import SCPIActuator, SCPIVoltageSupply
 from sim_devices import protocol_emulated
 from sim_devices.wire.text import TextServer

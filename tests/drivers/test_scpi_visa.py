@@ -2,8 +2,7 @@
 
 import pytest
 
-from bench.clock import WallClock
-from bench.errors import DeviceConnectionError, DeviceError
+from bench.base import DeviceConnectionError, DeviceError, WallClock
 from drivers.scpi import SCPIActuator
 from drivers.scpi.transport import TextLineSettings, VisaTransport
 

@@ -2,9 +2,8 @@
 
 import pytest
 
-from bench.clock import VirtualClock
-from bench.rig import Rig
-from bench.rig_file import load_rig
+from bench.base import VirtualClock
+from bench.rig import Rig, load_rig
 
 
 @pytest.fixture

@@ -7,8 +7,7 @@ import tty
 
 import pytest
 
-from bench.clock import VirtualClock, slowness
-from bench.errors import DeviceConnectionError
+from bench.base import DeviceConnectionError, VirtualClock, slowness
 from drivers.serial_line import (
     MOST_STRAY,
     RESENDS,

@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from bench.errors import DeviceConnectionError, DeviceError, LimitError
+from bench.base import DeviceConnectionError, DeviceError, LimitError
 from drivers.twin import TwinActuator, TwinSensor
 from sim_devices.protocol_emulated import unregister
 from sim_devices.wire import WireServer

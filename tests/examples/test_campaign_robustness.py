@@ -5,11 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from bench.campaigns.execution import WorkersExecutor, carry_out_tasks
-from bench.campaigns.expansion import expand
-from bench.campaigns.file import axes, dotted, read_campaign
-from bench.campaigns.tasks import ModelTask, RunTask
-from bench.workers import Workers
+from bench.base import Workers
+from bench.batch import WorkersExecutor, carry_out_tasks, expand, read_campaign
+from bench.batch.campaign.file import axes, dotted
+from bench.batch.campaign.tasks import ModelTask, RunTask
 
 FILE = Path(__file__).parents[2] / "examples" / "campaign-robustness.toml"
 PLANT = "emulation.plant"

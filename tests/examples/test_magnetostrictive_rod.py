@@ -135,7 +135,7 @@ def test_its_devices_keep_their_contracts(python, device, least):
 
 RESTART = """
 import bench
-from bench.errors import DeviceRestartedError
+from bench.base import DeviceRestartedError
 with bench.open_rig("magnetostrictive-rod") as rig:
     coil, source = rig.devices["coil"], rig.laboratory.coil
     coil.set(1.5).wait()

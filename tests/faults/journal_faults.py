@@ -43,12 +43,11 @@ sys.path.insert(0, str(Path(__file__).parent))
 from matrix import HERE, RIGS, _safe
 from rich.console import Console
 
-from bench.errors import BenchError
-from bench.journal import FILE_NAME, Journal, Record
-from bench.journal.recovery import recover
-from bench.journal.store import Store
+from bench.base import BenchError
 from bench.protocol import find_protocol
-from bench.runs import Run, carry_out
+from bench.record import FILE_NAME, Journal, Record, recover
+from bench.record.store import Store
+from bench.run import Run, carry_out
 
 FAULTS = ("full", "crowded", "freed", "eio", "removed", "read-only", "locked", "page")
 MOUNTED = {"full", "crowded", "freed", "read-only"}

@@ -32,13 +32,12 @@ from pathlib import Path
 
 from rich.console import Console
 
-from bench.clock import VIRTUAL_EPOCH
-from bench.errors import BenchError
-from bench.journal import Record
+from bench.base import BenchError, Workers
+from bench.base.clock import VIRTUAL_EPOCH
 from bench.protocol import find_protocol
-from bench.rig_file import load_rig
-from bench.runs import Run, carry_out
-from bench.workers import Workers
+from bench.record import Record
+from bench.rig import load_rig
+from bench.run import Run, carry_out
 
 HERE = Path(__file__).parent
 RIGS = ("vo2", "sma", "hybrid")
@@ -115,7 +114,7 @@ class Cell:
 @cache
 def faults_of(rig):
     """Return the faults of a rig by name."""
-    from bench.clock import VirtualClock
+    from bench.base import VirtualClock
 
     file = load_rig(rig)
     return dict(file.laboratory(file.laboratory_settings, VirtualClock(), 0).faults)

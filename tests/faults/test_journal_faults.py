@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from bench.journal import Journal, Record, keeping
-from bench.journal.store import Store
+from bench.record import Journal, Record, keeping
+from bench.record.store import Store
 
 HERE = Path(__file__).parent
 

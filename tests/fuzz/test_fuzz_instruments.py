@@ -6,7 +6,7 @@ import pytest
 from dialects import MalformedError
 from fuzz_instruments import SMA, TARGETS, FailedError, fuzz, make, make_bench_supply, mutated
 
-from bench.clock import VirtualClock
+from bench.base import VirtualClock
 from rigs.hybrid.laboratory import HybridLaboratory
 from rigs.vo2.laboratory import VO2Laboratory
 from sim_devices.instruments.flintec_dad141 import EmulatedDAD141

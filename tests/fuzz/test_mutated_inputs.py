@@ -8,7 +8,7 @@ import pytest
 from mutated_inputs import all_kinds, try_input
 from mutations import mutated_bytes, mutated_document, mutated_lines, objections
 
-from bench.journal import Record
+from bench.record import Record
 
 FEW = 6
 """Inputs of each kind; tools/mutated_inputs.py tries thousands."""
@@ -73,7 +73,7 @@ def test_a_traceback_is_noticed(tmp_path, monkeypatch):
     def fail(*_, **__):
         raise RuntimeError("a defect")
 
-    monkeypatch.setattr("bench.results.imported.read_columns", fail)
+    monkeypatch.setattr("bench.analysis.tables.imported.read_columns", fail)
     assert any("a defect" in wrong for wrong in damaged("text", tmp_path))
 
 

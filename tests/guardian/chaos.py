@@ -18,17 +18,14 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from bench.attachment import ControlClient, attach, read_endpoints
-from bench.errors import BenchError, LimitError
-from bench.guardian import __main__ as program
-from bench.guardian import process, remote
-from bench.guardian.black_box import BlackBox
-from bench.guardian.channel import Channel
-from bench.guardian.lines import LineThreads
-from bench.guardian.process import Guardian
-from bench.rig import Look
-from bench.rig_file import load_rig
-from bench.station.core import State, StationCore
+from bench.base import BenchError, LimitError
+from bench.rig import ControlClient, Look, attach, load_rig, read_endpoints
+from bench.run.guardian import __main__ as program, process, remote
+from bench.run.guardian.black_box import BlackBox
+from bench.run.guardian.channel import Channel
+from bench.run.guardian.lines import LineThreads
+from bench.run.guardian.process import Guardian
+from bench.run.station.core import State, StationCore
 
 LEASE = 0.5
 LONGEST = 30.0

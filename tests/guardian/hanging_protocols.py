@@ -6,8 +6,8 @@ import os
 from collections.abc import Generator
 from pathlib import Path
 
-from bench.protocol import Dwell, Messages, Note, ProtocolParameters, Step, parameter, protocol
-from bench.protocol.vocabulary import Message, Reading
+from bench.devices import Dwell
+from bench.protocol import Message, Messages, Note, ProtocolParameters, Reading, Step, parameter, protocol
 
 
 class Parameters(ProtocolParameters):

@@ -27,7 +27,7 @@ from typing import Any
 
 from guarded_run import SETPOINTS, GuardedRun, find_guardian, hear_signals, on, start_busy
 
-from bench.rig_file import load_rig
+from bench.rig import load_rig
 from sim_devices.serving.process import EmulatedRig, serve
 
 SAFE_WITHIN = 0.1

@@ -7,12 +7,10 @@ import struct
 
 import pytest
 from cases import cases
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
-from bench import errors
-from bench.errors import BenchError, DeviceConnectionError, DeviceError
-from bench.guardian.channel import Channel, ChannelError, to_error, to_message
+from bench.base import BenchError, DeviceConnectionError, DeviceError, errors
+from bench.run.guardian.channel import Channel, ChannelError, to_error, to_message
 
 LONG = 60.0
 """Wall-clock time that a busy machine may take, s."""

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.clock import Stopwatch, WallClock
-from bench.journal import Record
+from bench.base import Stopwatch, WallClock
+from bench.record import Record
 
 pytestmark = pytest.mark.usefixtures("warm_popen")
 

@@ -13,17 +13,16 @@ from pathlib import Path
 import pytest
 from benches import IN_TIME, LONG, connected, is_alive, is_on, rescuer_of, seconds_until
 
-from bench.clock import VirtualClock
-from bench.errors import (
+from bench.base import (
     AbortError,
     ConfigurationError,
     DeviceConnectionError,
     GuardianError,
     InterlockError,
     LimitError,
+    VirtualClock,
 )
-from bench.rig import Look, Rig
-from bench.rig_file import load_rig
+from bench.rig import Look, Rig, load_rig
 
 pytestmark = [
     pytest.mark.usefixtures("warm_popen"),

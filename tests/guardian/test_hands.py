@@ -8,9 +8,8 @@ import sys
 import pytest
 from benches import is_on, seconds_until
 
-from bench.journal import Record
-from bench.locks import Holder, Locks
-from bench.rig_file import load_rig
+from bench.record import Record
+from bench.rig import Holder, Locks, load_rig
 
 pexpect = pytest.importorskip("pexpect")
 pytest.importorskip("textual")

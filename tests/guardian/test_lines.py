@@ -7,10 +7,9 @@ from itertools import count
 import pytest
 from cases import cases
 
-from bench.clock import VirtualClock, WallClock
+from bench.base import DeviceConnectionError, DeviceRestartedError, VirtualClock, WallClock
 from bench.devices import Device
-from bench.errors import DeviceConnectionError, DeviceRestartedError
-from bench.guardian.lines import BENCH, LOOK, SAFE, LineThreads
+from bench.run.guardian.lines import BENCH, LOOK, SAFE, LineThreads
 
 LONG = 60.0
 """Wall-clock time that a busy machine may take, s."""

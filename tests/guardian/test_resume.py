@@ -6,11 +6,10 @@ from benches import is_on, seconds_until
 from guarded_run import find_guardian
 from killing import kill_after
 
+from bench.base import DeviceError
 from bench.cli import main
-from bench.errors import DeviceError
-from bench.journal import BLACK_BOX_NAME, Record
-from bench.upkeep.opening import opened
-from bench.upkeep.recovery import clear_expired_watchdogs
+from bench.record import BLACK_BOX_NAME, Record
+from bench.rig import clear_expired_watchdogs, opened
 from sim_devices.serving.process import serve
 
 pytestmark = pytest.mark.usefixtures("warm_popen")

@@ -13,10 +13,10 @@ from benches import IN_TIME, LONG, check_at_once, connected, is_on, seconds_unti
 from guarded_run import SETPOINTS, GuardedRun, find_guardian
 from kill_safe import DEATH, PATIENCE, PROMISE
 
-from bench.errors import ConfigurationError
-from bench.journal import BLACK_BOX_NAME, Record, ending_of
-from bench.locks import is_in_use
-from bench.results.run_list import list_runs
+from bench.analysis import list_runs
+from bench.base import ConfigurationError
+from bench.record import BLACK_BOX_NAME, Record, ending_of
+from bench.rig import is_in_use
 from sim_devices.serving.process import serve
 
 pytestmark = [

@@ -9,23 +9,22 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from each_case import each_case
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from scipy.integrate import solve_ivp
 
-from bench.hysteresis import (
+from bench.models import (
     BoucWen,
     Duhem,
     GeneralizedPrandtlIshlinskii,
     KrasnoselskiiPokrovskii,
     MaxwellSlip,
     PrandtlIshlinskii,
+    Reach,
     operator_from_json,
 )
-from bench.hysteresis.branch_inverse import BranchInverse
-from bench.hysteresis.elements import ElementStream
-from bench.hysteresis.inverse import NumericalInverse
-from bench.hysteresis.reach import Reach
+from bench.models.inverses.branch_inverse import BranchInverse
+from bench.models.inverses.inverse import NumericalInverse
+from bench.models.operators.elements import ElementStream
 
 RANGE = (-2.0, 3.0)
 

@@ -5,19 +5,18 @@ import math
 import numpy as np
 import pytest
 from each_case import each_case
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
-from bench.hysteresis import (
+from bench.models import (
     MemoryCurve,
     PolynomialTerm,
     Preisach,
+    PreisachInverse,
     QuadraticTerm,
     Reach,
     ThermalExpansion,
     uniform_levels,
 )
-from bench.hysteresis.inverse import PreisachInverse
 
 LOW, HIGH = 21.0, 84.0
 

@@ -6,10 +6,9 @@ import math
 import numpy as np
 import pytest
 from each_case import each_case
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
-from bench.hysteresis import MemoryCurve
+from bench.models import MemoryCurve
 
 inputs = st.lists(st.integers(-20, 100).map(lambda n: n / 2), min_size=1, max_size=30)
 

@@ -7,7 +7,7 @@ import pytest
 from each_case import each_case
 from numpy.polynomial import chebyshev
 
-from bench.hysteresis import Polynomial
+from bench.models import Polynomial
 
 
 def make(seed=0, degree=6):

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from each_case import each_case
 
-from bench.hysteresis import PolynomialPlays, operator_from_json
 from bench.identification import identify
+from bench.models import PolynomialPlays, operator_from_json
 
 MODEL = PolynomialPlays([1.0, -0.4], [0.2, 0.5], [0.7, -0.3], (-1.0, 2.0), 0.25, "V", "mm")
 INPUTS = np.random.default_rng(0).uniform(-1.0, 2.0, 60)

@@ -6,10 +6,9 @@ import math
 import numpy as np
 import pytest
 from each_case import each_case
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
-from bench.hysteresis import DeadZones, PrandtlIshlinskii, operator_from_json
+from bench.models import DeadZones, PrandtlIshlinskii, operator_from_json
 
 volts = st.lists(st.floats(-40.0, 40.0), min_size=1, max_size=40)
 seeds = st.integers(0, 10_000)

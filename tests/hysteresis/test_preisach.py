@@ -9,10 +9,9 @@ from itertools import product
 import numpy as np
 import pytest
 from each_case import each_case
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
-from bench.hysteresis import (
+from bench.models import (
     MemoryCurve,
     PolynomialTerm,
     Preisach,
@@ -324,7 +323,7 @@ def test_wrong_input_is_named(make_it, message):
 
 def test_import_stays_light():
     code = (
-        "import sys, bench.hysteresis, bench.identification; "
+        "import sys, bench.models, bench.identification; "
         "print(sorted({'numba', 'scipy', 'threadpoolctl'} & sys.modules.keys()))"
     )
     result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 from each_case import each_case
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
-from bench.hysteresis import PolynomialTerm, Preisach, ThermalExpansion, reversible_from_json, uniform_levels
 from bench.identification import damped_oscillation, identify
+from bench.models import PolynomialTerm, Preisach, ThermalExpansion, reversible_from_json, uniform_levels
 
 
 def value(term, inputs):

@@ -9,10 +9,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from each_case import each_case
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
-from bench.hysteresis import (
+from bench.models import (
     DeadZones,
     Linear,
     MemoryCurve,

@@ -3,8 +3,7 @@
 import numpy as np
 import pytest
 
-from bench.hysteresis import Preisach, uniform_levels
-from bench.hysteresis.transport import transported, widened, widening
+from bench.models import Preisach, transported, uniform_levels, widened, widening
 
 
 def plane(levels, centre=6.0, width=2.0):

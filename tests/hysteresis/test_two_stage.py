@@ -7,10 +7,9 @@ import math
 import numpy as np
 import pytest
 from each_case import each_case
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
-from bench.hysteresis import (
+from bench.models import (
     Linear,
     Polynomial,
     PrandtlIshlinskii,

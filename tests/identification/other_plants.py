@@ -5,8 +5,7 @@ Quasi-static: the equations are integrated over the input, in steps of an eighth
 
 import numpy as np
 
-from bench.identification import ramps
-from bench.identification.excitation import damped_oscillation
+from bench.identification import damped_oscillation, ramps
 
 STEP = 0.04
 

@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 from other_plants import STEP, damped, first_order, measured, random_reversals
 
-from bench.identification import ramps
-from bench.identification.bands import Band, calibrate_band
-from bench.identification.by_name import set_up_problem
+from bench.identification import Band, calibrate_band, ramps, set_up_problem
 
 PREISACH = ("preisach", {"levels": 20, "plane": (-1.0, 1.0), "reversible": "linear"})
 PLAYS = ("prandtl-ishlinskii", {})

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
+from hypothesis import example, given, settings, strategies as st
 
-from bench.hysteresis import Preisach, QuadraticTerm, ThermalExpansion, uniform_levels
-from bench.identification import fit, least_squares
-from bench.identification.collapse import collapse
+from bench.identification import fit
+from bench.identification.fit import least_squares
+from bench.identification.fit.collapse import collapse
+from bench.models import Preisach, QuadraticTerm, ThermalExpansion, uniform_levels
 
 
 def problem(seed, term=None, order=8, samples=4000, digits=None):

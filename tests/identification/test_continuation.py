@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from each_case import each_case
 
-from bench.hysteresis import PrandtlIshlinskii, Preisach, QuadraticTerm, uniform_levels
-from bench.identification import assess, covering_sequence, identify, random_validation
-from bench.identification.continuation import Tail, continue_design
-from bench.identification.information import (
+from bench.identification import assess, continue_design, covering_sequence, identify, random_validation
+from bench.identification.design.continuation import Tail
+from bench.identification.design.information import (
     Scaling,
     covariance,
     log_determinant,
     mean_variance,
     random_reversals,
 )
+from bench.models import PrandtlIshlinskii, Preisach, QuadraticTerm, uniform_levels
 
 PLAYS = PrandtlIshlinskii([0.0, 0.1, 0.2], [0.0, 0.0, 0.0], input_range=(0.0, 1.0))
 

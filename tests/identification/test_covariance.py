@@ -7,9 +7,9 @@ import pytest
 from each_case import each_case
 from other_plants import damped, measured, random_reversals
 
-from bench.identification.by_name import set_up_problem
-from bench.identification.cell_layout import CellLayout
-from bench.identification.covariance import PredictionVariance, prediction_variance
+from bench.identification import set_up_problem
+from bench.identification.fit.cell_layout import CellLayout
+from bench.identification.fit.covariance import PredictionVariance, prediction_variance
 
 
 def problem_of(model, options, smoothing=0.0, weights=None, skip=0, seed=0):

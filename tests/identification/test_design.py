@@ -5,10 +5,8 @@ import math
 import numpy as np
 import pytest
 from each_case import each_case
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
-from bench.hysteresis import MemoryCurve, Preisach, QuadraticTerm, ThermalExpansion, uniform_levels
 from bench.identification import (
     assess,
     covering_sequence,
@@ -20,6 +18,7 @@ from bench.identification import (
     measure_errors,
     random_validation,
 )
+from bench.models import MemoryCurve, Preisach, QuadraticTerm, ThermalExpansion, uniform_levels
 from sim_devices.plants.vo2 import VO2Cantilever, VO2Parameters
 
 

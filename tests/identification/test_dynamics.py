@@ -8,7 +8,7 @@ from each_case import each_case
 from scipy import signal
 from scipy.linalg import expm
 
-from bench.identification.dynamics import ThirdOrder, identify_dynamics
+from bench.identification import ThirdOrder, identify_dynamics
 from rigs.hybrid.model import PUBLISHED_DYNAMICS
 
 # 40 V of a piezo cantilever, about 0.27 µm/V.

@@ -3,14 +3,8 @@
 import numpy as np
 import pytest
 
-from bench.hysteresis import (
-    BoucWen,
-    Duhem,
-    GeneralizedPrandtlIshlinskii,
-    KrasnoselskiiPokrovskii,
-    MaxwellSlip,
-)
 from bench.identification import identify
+from bench.models import BoucWen, Duhem, GeneralizedPrandtlIshlinskii, KrasnoselskiiPokrovskii, MaxwellSlip
 
 NOISE = 0.01
 ROWS = 1500

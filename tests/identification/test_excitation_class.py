@@ -7,7 +7,7 @@ import pytest
 from each_case import each_case
 from other_plants import cycles, damped, first_order, random_reversals
 
-from bench.identification.excitation_class import ExcitationClass
+from bench.identification.design.excitation_class import ExcitationClass
 
 CLASSES = {
     "damped oscillations": damped,

@@ -2,13 +2,12 @@
 
 import numpy as np
 from each_case import each_case
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from hysteretic_plants import through
 
 from bench.identification import ramps
 from bench.identification.branches import turning_points
-from bench.identification.folds import (
+from bench.identification.choose.folds import (
     REACHED,
     block_folds,
     correlated_rows,

@@ -5,14 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from bench.hysteresis import Preisach, QuadraticTerm, ThermalExpansion, identifiable_models, uniform_levels
-from bench.identification import (
-    damped_oscillation,
-    identify,
-    measure_errors,
-    ramps,
-    random_validation,
-)
+from bench.identification import damped_oscillation, identify, measure_errors, ramps, random_validation
+from bench.models import Preisach, QuadraticTerm, ThermalExpansion, identifiable_models, uniform_levels
 
 FILM = {"plane": (30.0, 70.0), "reference": 20.0, "input_unit": "°C", "output_unit": "1/m"}
 

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from each_case import each_case
 
-from bench.hysteresis import MemoryCurve, PrandtlIshlinskii, Preisach, QuadraticTerm, uniform_levels
 from bench.identification import identify, measure_errors, ramps
+from bench.models import MemoryCurve, PrandtlIshlinskii, Preisach, QuadraticTerm, uniform_levels
 
 
 def specimen(seed=0, order=8):

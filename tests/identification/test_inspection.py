@@ -7,9 +7,8 @@ import numpy as np
 import pytest
 from each_case import each_case
 
-from bench.hysteresis import MemoryCurve, PrandtlIshlinskii, Preisach, uniform_levels
-from bench.identification import check_data, cross_validate, fit, identify, ramps
-from bench.identification.by_name import set_up_problem
+from bench.identification import check_data, cross_validate, fit, identify, ramps, set_up_problem
+from bench.models import MemoryCurve, PrandtlIshlinskii, Preisach, uniform_levels
 
 
 def plane(order=4):
@@ -181,7 +180,7 @@ def test_plays_are_identified():
 
 
 def test_dead_zones_catch_saturation_and_asymmetry():
-    from bench.hysteresis import DeadZones
+    from bench.models import DeadZones
 
     operator = piezo(DeadZones([-2.0, 1.5, 3.0], [1.6, 1.0, 0.6, 0.3]))
     rng = np.random.default_rng(0)

@@ -5,14 +5,14 @@ import math
 import numpy as np
 import pytest
 from each_case import each_case
-from hypothesis import example, given, settings
-from hypothesis import strategies as st
+from hypothesis import example, given, settings, strategies as st
 from scipy.linalg.lapack import dpocon
 from scipy.optimize import lsq_linear, nnls
 
-from bench.hysteresis import Preisach, QuadraticTerm, Regressor, ThermalExpansion, uniform_levels
-from bench.identification import fit, fit_minimum_norm, least_squares, ramps
-from bench.identification.cholesky_factor import CholeskyFactor
+from bench.identification import fit, fit_minimum_norm, ramps
+from bench.identification.fit import least_squares
+from bench.identification.fit.cholesky_factor import CholeskyFactor
+from bench.models import Preisach, QuadraticTerm, Regressor, ThermalExpansion, uniform_levels
 
 
 def oscillation(count=25, step=0.05):

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from each_case import each_case
 
-from bench.hysteresis import MemoryCurve, Polynomial, PrandtlIshlinskii, Preisach, uniform_levels
 from bench.identification import compare, measure_errors
+from bench.models import MemoryCurve, Polynomial, PrandtlIshlinskii, Preisach, uniform_levels
 
 
 def models():

@@ -3,13 +3,11 @@
 import numpy as np
 import pytest
 from each_case import each_case
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from hysteretic_plants import random_reversals, through
 
-from bench.hysteresis import PrandtlIshlinskii, Preisach, uniform_levels
-from bench.identification import first_order_reversals
-from bench.identification.memory_tests import check_congruency, check_return_points
+from bench.identification import check_congruency, check_return_points, first_order_reversals
+from bench.models import PrandtlIshlinskii, Preisach, uniform_levels
 
 NOISE = np.random.default_rng(3).standard_normal(4000)
 LEVELS = uniform_levels(-1.0, 1.0, 12)

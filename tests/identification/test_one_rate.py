@@ -6,13 +6,10 @@ import numpy as np
 import pytest
 from hysteretic_plants import bouc_wen, duhem, jiles_atherton, random_reversals, settled, through
 
-from bench.hysteresis import identifiable_models
-from bench.identification.evaluation import Candidate, Measurements
-from bench.identification.near_best import simplest_near_best
-from bench.identification.selection import Given, select
-from bench.identification.time_stage import is_smooth_plane
-from bench.timed import LinearPart, identify_in_time
-from bench.timed.held_out import HeldOutInTime
+from bench.identification import Candidate, Given, HeldOutInTime, Measurements, identify_in_time, select
+from bench.identification.choose.near_best import simplest_near_best
+from bench.identification.choose.time_stage import is_smooth_plane
+from bench.models import LinearPart, identifiable_models
 
 STEP = 1.0 / 1500.0
 LAG = LinearPart(0.0, (1e-3, 0.0), np.empty(0), np.empty(0))

@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 from each_case import each_case
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
-from bench.hysteresis import (
+from bench.identification import cross_validate, identify, ramps
+from bench.identification.fit.orientation import possible_signs
+from bench.models import (
     DeadZones,
     ModelSpec,
     Polynomial,
@@ -16,8 +17,6 @@ from bench.hysteresis import (
     ThermalExpansion,
     uniform_levels,
 )
-from bench.identification import cross_validate, identify, ramps
-from bench.identification.orientation import possible_signs
 
 INPUTS = ramps([0.0, *(5.0 + 5.0 * (-1) ** n * (1.0 - n / 24) for n in range(24))], 0.11)
 

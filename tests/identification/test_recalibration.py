@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 from each_case import each_case
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from other_plants import random_reversals
 
-from bench.hysteresis import (
+from bench.identification import Recalibration, parse_kinds, recalibrate
+from bench.identification.recalibration import KINDS
+from bench.models import (
     DeadZones,
     Polynomial,
     PolynomialTerm,
@@ -18,7 +19,6 @@ from bench.hysteresis import (
     TwoStage,
     uniform_levels,
 )
-from bench.identification.recalibration import KINDS, Recalibration, parse_kinds, recalibrate
 
 DENSITY = np.random.default_rng(0).uniform(0.2, 1.0, 55)
 PREISACH = Preisach(

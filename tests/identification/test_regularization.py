@@ -2,15 +2,13 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from hysteretic_plants import PLANTS, settled
-from hysteretic_plants import butterfly as butterfly_of_duhem
+from hypothesis import given, settings, strategies as st
+from hysteretic_plants import PLANTS, butterfly as butterfly_of_duhem, settled
 from scipy.optimize import lsq_linear
 
-from bench.hysteresis import Preisach, uniform_levels
 from bench.identification import choose_regularization, cross_validate, fit, fit_minimum_norm, identify, ramps
-from bench.identification.cell_layout import CellLayout
+from bench.identification.fit.cell_layout import CellLayout
+from bench.models import Preisach, uniform_levels
 
 OTHER_PLANTS = PLANTS | {"butterfly": butterfly_of_duhem}
 

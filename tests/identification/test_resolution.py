@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 from each_case import each_case
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
-from bench.hysteresis import Preisach, QuadraticTerm, uniform_levels
-from bench.identification import fit, fit_minimum_norm
-from bench.identification.resolution import resolve
+from bench.identification import fit, fit_minimum_norm, resolve
+from bench.models import Preisach, QuadraticTerm, uniform_levels
 
 
 def problem(seed, order, samples, term=None):

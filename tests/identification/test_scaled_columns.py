@@ -4,9 +4,9 @@ import numpy as np
 from each_case import each_case
 from scipy.sparse import csr_array
 
-from bench.hysteresis import Preisach, QuadraticTerm, uniform_levels
-from bench.hysteresis._kernels import by_column
-from bench.identification.scaled_columns import ScaledColumns
+from bench.identification.fit.scaled_columns import ScaledColumns
+from bench.models import Preisach, QuadraticTerm, uniform_levels
+from bench.models.kernels.memory_kernels import by_column
 
 
 @each_case("penalised", [False, True])

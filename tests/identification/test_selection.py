@@ -6,10 +6,18 @@ import numpy as np
 import pytest
 from hysteretic_plants import bouc_wen, butterfly, duhem, jiles_atherton, random_reversals, settled, through
 
-from bench.hysteresis import ModelSpec, Polynomial, PrandtlIshlinskii, Preisach, models, uniform_levels
-from bench.identification.by_name import set_up_problem
-from bench.identification.evaluation import Candidate, Evaluation, Measurements, evaluate
-from bench.identification.near_best import (
+from bench.identification import (
+    Candidate,
+    Evaluation,
+    Given,
+    HeldOutInTime,
+    Measurements,
+    identify_in_time,
+    select,
+    set_up_problem,
+)
+from bench.identification.choose.evaluation import evaluate
+from bench.identification.choose.near_best import (
     best_memory,
     best_of_few_rows,
     best_of_one_kind,
@@ -17,9 +25,15 @@ from bench.identification.near_best import (
     is_within_one_standard_error,
     simplest_near_best,
 )
-from bench.identification.selection import Given, select
-from bench.timed import LinearPart, identify_in_time
-from bench.timed.held_out import HeldOutInTime
+from bench.models import (
+    LinearPart,
+    ModelSpec,
+    Polynomial,
+    PrandtlIshlinskii,
+    Preisach,
+    registered_models as models,
+    uniform_levels,
+)
 
 INPUTS = random_reversals(np.random.default_rng(1), 400, 30)
 NAMES = ("polynomial", "polynomial-plays", "prandtl-ishlinskii")

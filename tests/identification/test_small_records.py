@@ -6,11 +6,10 @@ import numpy as np
 import pytest
 from hysteretic_plants import PLANTS, butterfly, duhem, random_reversals, settled, through
 
-from bench.hysteresis import identifiable_models
-from bench.identification import identify
-from bench.identification.evaluation import Candidate, Measurements, akaike, corrected
-from bench.identification.near_best import best_of_few_rows, simplest_near_best
-from bench.identification.selection import Given, select
+from bench.identification import Candidate, Given, Measurements, identify, select
+from bench.identification.choose.evaluation import akaike, corrected
+from bench.identification.choose.near_best import best_of_few_rows, simplest_near_best
+from bench.models import identifiable_models
 
 MOST = 1.5
 ALL = PLANTS | {"butterfly": butterfly}

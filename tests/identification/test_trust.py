@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from each_case import each_case
 
-from bench.hysteresis import PrandtlIshlinskii, Preisach, QuadraticTerm, uniform_levels
 from bench.identification import cross_validate, identify, ramps
+from bench.models import PrandtlIshlinskii, Preisach, QuadraticTerm, uniform_levels
 
 TURNS = [0.0, *(5.0 + 5.0 * (-1) ** n * (1.0 - n / 24) for n in range(24))]
 INPUTS = ramps(TURNS, 0.05)

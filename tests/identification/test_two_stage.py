@@ -5,7 +5,6 @@ import pytest
 from each_case import each_case
 from scipy.optimize import nnls
 
-from bench.hysteresis import Linear, PrandtlIshlinskii, Preisach, Summed, TwoStage, uniform_levels
 from bench.identification import (
     Series,
     identify_linear,
@@ -15,8 +14,9 @@ from bench.identification import (
     predict_series,
     voltage_steps,
 )
-from bench.identification.cell_layout import CellLayout, PlanesBeside
-from bench.identification.two_stage import _beside, _chained
+from bench.identification.fit.cell_layout import CellLayout, PlanesBeside
+from bench.identification.fit.two_stage_fit import _beside, _chained
+from bench.models import Linear, PrandtlIshlinskii, Preisach, Summed, TwoStage, uniform_levels
 
 LOADS = (0.98, 2.94, 4.90, 6.86, 8.82)
 HELD = (0.0, 0.6, 1.2, 1.8, 2.4, 3.0)

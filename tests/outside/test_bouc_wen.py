@@ -9,12 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench import registry
-from bench.controllers import ControllerSetup, make_controller
-from bench.errors import DataError
-from bench.hysteresis import Preisach, QuadraticTerm, Reach, operator_from_json, uniform_levels
-from bench.identification import damped_oscillation, identify
-from bench.model_file import ModelFile, load_model
+from bench.base import DataError, registry
+from bench.control import ControllerSetup, make_controller
+from bench.identification import ModelFile, damped_oscillation, identify, load_model
+from bench.models import Preisach, QuadraticTerm, Reach, operator_from_json, uniform_levels
 
 PACKAGE = Path(__file__).parent / "boucwen_package"
 TRUE = {"rho": 1.2, "sigma": 1.6, "n": 1.8}

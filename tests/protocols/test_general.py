@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from cases import cases
 
-from bench.hysteresis import Preisach, uniform_levels
-from bench.journal import Record
-from bench.model_file import ModelFile
-from bench.results.tracking import target_results
-from bench.rig_file import load_rig
+from bench.analysis import target_results
+from bench.identification import ModelFile
+from bench.models import Preisach, uniform_levels
+from bench.record import Record
+from bench.rig import load_rig
 
 
 @dataclass(frozen=True)

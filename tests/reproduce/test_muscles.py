@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import bench
-from bench.journal import Record
-from bench.results.tracking import target_results
+from bench.analysis import target_results
+from bench.record import Record
 from rigs.muscles.identification import FORCE, LENGTH, MODELS, SAMPLE
 
 MUSCLES = ("mckibben", "coiled_polymer")

@@ -4,11 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from bench.identification import measure_errors
-from bench.identification.two_stage import measure_series
-from bench.journal import Record
-from bench.model_file import load_model
-from bench.results.tracking import target_results
+from bench.analysis import target_results
+from bench.identification import load_model, measure_errors, measure_series
+from bench.record import Record
 from rigs.muscles.identification import FORCE, LENGTH, MODELS, SAMPLE, errors_json, read_resting, read_series
 
 CONTROLLERS = ("open_loop_inverse", "proportional_integral", "closed_loop_inverse")

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from bench.cli import main
-from bench.journal import Record
-from bench.model_file import load_model
+from bench.identification import load_model
+from bench.record import Record
 
 MODELS = ("nonmonotonic", "signed", "polynomial")
 

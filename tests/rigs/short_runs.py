@@ -5,10 +5,10 @@ import io
 import pytest
 from rich.console import Console
 
-from bench.errors import ConfigurationError
+from bench.base import ConfigurationError
 from bench.protocol import Note, Phase, Reading, find_protocol
-from bench.rig_file import load_rig
-from bench.runs import Run, carry_out
+from bench.rig import load_rig
+from bench.run import Run, carry_out
 
 
 def record_run(folder, protocol, rig, settings, overrides=None):

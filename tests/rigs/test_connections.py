@@ -5,9 +5,8 @@ from contextlib import ExitStack
 
 import pytest
 
-from bench.clock import VirtualClock
-from bench.rig import Rig
-from bench.rig_file import load_rig
+from bench.base import VirtualClock
+from bench.rig import Rig, load_rig
 from drivers.labjack_t7.device import T7Device
 from rigs.hybrid.laboratory import HybridLaboratory
 from rigs.muscles.laboratory import SMALaboratory

@@ -5,10 +5,8 @@ import math
 import pytest
 from cases import cases
 
-from bench.clock import VirtualClock
-from bench.interlocks import InterlockWatch
-from bench.rig import Rig
-from bench.rig_file import load_rig, packaged_rigs
+from bench.base import VirtualClock
+from bench.rig import InterlockWatch, Rig, load_rig, packaged_rigs
 
 RIGS = sorted(name for name in packaged_rigs() if "hardware" not in name)
 LOOKS = 5.0  # Hz

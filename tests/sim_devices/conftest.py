@@ -1,6 +1,6 @@
 import pytest
 
-from bench.clock import VirtualClock
+from bench.base import VirtualClock
 
 
 @pytest.fixture

@@ -9,11 +9,9 @@ import numpy as np
 import pytest
 import serial
 from each_case import each_case
-from hypothesis import example, given
-from hypothesis import strategies as st
+from hypothesis import example, given, strategies as st
 
-from bench.clock import VirtualClock
-from bench.errors import DeviceConnectionError, DeviceError
+from bench.base import DeviceConnectionError, DeviceError, VirtualClock
 from sim_devices.instruments.dynamixel import (
     FULL_LOAD_HEATING,
     HEATING_TIME,

@@ -6,13 +6,10 @@ import math
 import pytest
 import serial
 from each_case import each_case
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
-from bench.clock import VirtualClock
-from bench.errors import ConfigurationError
-from bench.faults import ScheduledFault, read_schedule
-from bench.rig_file import load_rig
+from bench.base import ConfigurationError, VirtualClock
+from bench.rig import ScheduledFault, load_rig, read_schedule
 from sim_devices.wire import WireServer
 from sim_devices.wire.modbus_tcp import FramingError
 

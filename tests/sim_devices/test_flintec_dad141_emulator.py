@@ -7,10 +7,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from each_case import each_case
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
-from bench.clock import VirtualClock, WallClock
+from bench.base import VirtualClock, WallClock
 from sim_devices.instruments.flintec_dad141 import (
     CUTOFF_HZ,
     EmulatedDAD141,

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from each_case import each_case
 
-from bench.clock import VirtualClock
+from bench.base import VirtualClock
 from sim_devices.transducers.imperfect import Characteristic, ImperfectSensor, SensorErrors, imperfect, shown
 from sim_devices.world import World
 

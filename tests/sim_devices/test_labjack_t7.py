@@ -10,10 +10,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 from each_case import each_case
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
-from bench.clock import VirtualClock
+from bench.base import VirtualClock
 from sim_devices.instruments.labjack_t7 import CONVERSIONS, DAC_STEP, RAIL, EmulatedT7
 from sim_devices.plants import _voltage_course_kernels as course_kernels
 from sim_devices.serving.modbus_tcp_server import ModbusTcpServer

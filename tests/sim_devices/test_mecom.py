@@ -4,10 +4,9 @@ import struct
 from binascii import crc_hqx
 
 import pytest
-from hypothesis import example, given
-from hypothesis import strategies as st
+from hypothesis import example, given, strategies as st
 
-from bench.clock import VirtualClock
+from bench.base import VirtualClock
 from sim_devices.instruments.meerstetter_table import PARAMETERS, DeviceStatus
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC
 from sim_devices.wire.mecom import LONGEST_FRAME, MeComServer

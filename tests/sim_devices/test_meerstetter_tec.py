@@ -5,9 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from bench.clock import VirtualClock
-from bench.errors import DeviceConnectionError, DeviceError
-from bench.roles import TECMode
+from bench.base import DeviceConnectionError, DeviceError, VirtualClock
+from bench.devices import TECMode
 from sim_devices.instruments.emulated import RequestRefusedError
 from sim_devices.instruments.meerstetter_table import PARAMETERS, DeviceStatus, ServerError
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC

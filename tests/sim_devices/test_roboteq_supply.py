@@ -10,11 +10,9 @@ import tty
 
 import numpy as np
 import pytest
-from hypothesis import example, given
-from hypothesis import strategies as st
+from hypothesis import example, given, strategies as st
 
-from bench.clock import VirtualClock, WallClock
-from bench.errors import DeviceConnectionError, DeviceError
+from bench.base import DeviceConnectionError, DeviceError, VirtualClock, WallClock
 from drivers.roboteq import RoboteqSupply
 from sim_devices.instruments.emulated import RequestRefusedError
 from sim_devices.instruments.roboteq import EmulatedRoboteq

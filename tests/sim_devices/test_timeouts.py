@@ -3,8 +3,7 @@
 import pytest
 
 import bench
-from bench.clock import Stopwatch
-from bench.errors import DeviceError
+from bench.base import DeviceError, Stopwatch
 from sim_devices import protocol_emulated
 from sim_devices.wire import TcpServer
 

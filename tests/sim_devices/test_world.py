@@ -2,10 +2,9 @@ import math
 import threading
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
-from bench.clock import VirtualClock
+from bench.base import VirtualClock
 from sim_devices.world import World
 
 

@@ -8,10 +8,9 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "bench"))
 
 from heater_laboratory import RIG
 
-from bench.clock import VirtualClock
-from bench.rig import Rig
-from bench.rig_file import load_rig
-from bench.station.local import LocalStation
+from bench.base import VirtualClock
+from bench.rig import Rig, load_rig
+from bench.run.station.local import LocalStation
 
 
 @pytest.fixture

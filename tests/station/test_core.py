@@ -4,13 +4,12 @@ import math
 
 import pytest
 from cases import cases
-from hypothesis import settings
-from hypothesis import strategies as st
+from hypothesis import settings, strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from bench.errors import DeviceError, GuardianError, InterlockError
-from bench.interlocks import Interlock, InterlockWatch, Level
-from bench.station.core import State, StationCore
+from bench.base import DeviceError, GuardianError, InterlockError
+from bench.rig import Interlock, InterlockWatch, Level
+from bench.run.station.core import State, StationCore
 
 INTERVAL = 0.2
 SECONDS = 2.0

@@ -2,8 +2,7 @@
 
 import pytest
 
-from bench.clock import VirtualClock
-from bench.errors import (
+from bench.base import (
     AbortError,
     ConfigurationError,
     DeviceConnectionError,
@@ -12,11 +11,11 @@ from bench.errors import (
     GuardianError,
     InterlockError,
     LimitError,
+    VirtualClock,
 )
-from bench.rig import Look, Rig
-from bench.rig_file import load_rig
-from bench.station.local import LocalStation
-from bench.station.reconnection import lines_of, longest_away
+from bench.rig import Look, Rig, load_rig
+from bench.run.station.local import LocalStation
+from bench.run.station.reconnection import lines_of, longest_away
 
 
 class Later(VirtualClock):

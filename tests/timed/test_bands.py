@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from each_case import each_case
 
-from bench.identification.bands import Band
-from bench.identification.excitation_class import ExcitationClass
-from bench.timed import Hammerstein, LinearPart, RateDependentPlays, identify_in_time
-from bench.timed.bands import calibrate_band_in_time
+from bench.identification import Band, calibrate_band_in_time, identify_in_time
+from bench.identification.design.excitation_class import ExcitationClass
+from bench.models import Hammerstein, LinearPart, RateDependentPlays
 
 COLUMNS = ("--time", "time", "--input", "voltage", "--output", "displacement")
 STEP = 0.01

@@ -6,11 +6,24 @@ import numpy as np
 import pytest
 from each_case import each_case
 
-from bench.hysteresis import BoucWen, PrandtlIshlinskii, Preisach, uniform_levels
-from bench.identification import identify, measure_errors, ramps
-from bench.identification.evaluation import Candidate, Measurements
-from bench.timed import Hammerstein, LinearPart, identify_in_time, logarithmic_creep
-from bench.timed.held_out import HeldOutInTime
+from bench.identification import (
+    Candidate,
+    HeldOutInTime,
+    Measurements,
+    identify,
+    identify_in_time,
+    measure_errors,
+    ramps,
+)
+from bench.models import (
+    BoucWen,
+    Hammerstein,
+    LinearPart,
+    PrandtlIshlinskii,
+    Preisach,
+    logarithmic_creep,
+    uniform_levels,
+)
 
 CREEP = logarithmic_creep(0.05, 0.02, 2.0)
 

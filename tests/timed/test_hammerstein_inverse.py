@@ -6,11 +6,18 @@ import numpy as np
 import pytest
 from each_case import each_case
 
-from bench.errors import ConfigurationError
-from bench.hysteresis import PrandtlIshlinskii, Preisach, uniform_levels
-from bench.model_file import ModelFile
-from bench.results.inverted import invert_targets
-from bench.timed import BoucWenOscillator, Hammerstein, LinearPart, logarithmic_creep
+from bench.analysis import invert_targets
+from bench.base import ConfigurationError
+from bench.identification import ModelFile
+from bench.models import (
+    BoucWenOscillator,
+    Hammerstein,
+    LinearPart,
+    PrandtlIshlinskii,
+    Preisach,
+    logarithmic_creep,
+    uniform_levels,
+)
 
 TIMES, STRENGTHS = logarithmic_creep(0.05, 0.02, 2.0)
 CREEP = {"creep_times": TIMES, "creep_strengths": STRENGTHS}

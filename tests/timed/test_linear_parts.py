@@ -5,7 +5,7 @@ import pytest
 from each_case import each_case
 from scipy.integrate import solve_ivp
 
-from bench.timed import FilterState, LinearPart, logarithmic_creep
+from bench.models import FilterState, LinearPart, logarithmic_creep
 
 LAGS = {
     "none": (0.0, 0.0),

@@ -8,7 +8,8 @@ import pytest
 from each_case import each_case
 from scipy.integrate import solve_ivp
 
-from bench.timed import BoucWenOscillator, identify_in_time
+from bench.identification import identify_in_time
+from bench.models import BoucWenOscillator
 
 # Noël and Schoukens 2016, in N and mm.
 PUBLISHED = BoucWenOscillator(0.002, 0.01, 50.0, 50.0, 0.8, -1.1, 0.05, (-100.0, 100.0))

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
 
-from bench.hysteresis import PrandtlIshlinskii, Preisach, QuadraticTerm, uniform_levels
-from bench.timed import PreisachOscillator, identify_in_time
+from bench.identification import identify_in_time
+from bench.models import PrandtlIshlinskii, Preisach, PreisachOscillator, QuadraticTerm, uniform_levels
 
 RATE = 750.0
 

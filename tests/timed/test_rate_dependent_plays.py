@@ -5,17 +5,20 @@ import json
 import numpy as np
 import pytest
 from each_case import each_case
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
-from bench.hysteresis import PrandtlIshlinskii
-from bench.identification import identify, measure_errors
-from bench.identification.evaluation import Candidate, Measurements
-from bench.model_file import ModelFile
-from bench.results.inverted import invert_targets
-from bench.timed import PlaysState, RateDependentPlays, identify_in_time
-from bench.timed.held_out import HeldOutInTime
-from bench.timed.rate_dependent_plays_fit import PlaysSearch
+from bench.analysis import invert_targets
+from bench.identification import (
+    Candidate,
+    HeldOutInTime,
+    Measurements,
+    ModelFile,
+    identify,
+    identify_in_time,
+    measure_errors,
+)
+from bench.identification.timed.rate_dependent_plays_fit import PlaysSearch
+from bench.models import PlaysState, PrandtlIshlinskii, RateDependentPlays
 
 seeds = st.integers(0, 10**6)
 

@@ -6,9 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.errors import ConfigurationError
-from bench.hysteresis import Preisach, uniform_levels
-from bench.timed import BoucWenOscillator, Hammerstein, LinearPart, RateDependentPlays
+from bench.base import ConfigurationError
+from bench.models import BoucWenOscillator, Hammerstein, LinearPart, Preisach, RateDependentPlays, uniform_levels
 
 COLUMNS = ("--time", "time", "--input", "drive", "--output", "response")
 

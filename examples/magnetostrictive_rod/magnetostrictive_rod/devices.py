@@ -4,10 +4,8 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from bench.clock import Clock
-from bench.devices import Identity, Limits, Signal, Status
-from bench.errors import DeviceConnectionError, DeviceError, DeviceRestartedError
-from bench.roles import GeneralActuator, GeneralSensor
+from bench.base import Clock, DeviceConnectionError, DeviceError, DeviceRestartedError
+from bench.devices import GeneralActuator, GeneralSensor, Identity, Limits, Signal, Status
 from drivers.device import LineDevice
 from drivers.serial_line import SerialSettings, lost_line, open_port
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from pydantic import Field
 
-from bench.clock import Clock
-from bench.rig_file import LaboratorySettings
+from bench.base import Clock
+from bench.rig import LaboratorySettings
 from magnetostrictive_rod.instruments import EmulatedCoilSource, EmulatedStrainBridge
 from magnetostrictive_rod.plant import MagnetostrictiveRod, RodParameters
 from sim_devices.laboratory import EmulatedLaboratory, TrueValue

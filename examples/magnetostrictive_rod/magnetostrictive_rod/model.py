@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bench.hysteresis import ModelSpec, Operator, Regressor, Shape
+from bench.models import ModelSpec, Operator, Regressor, Shape
 
 Floats = NDArray[np.float64]
 State = tuple[float, ...]

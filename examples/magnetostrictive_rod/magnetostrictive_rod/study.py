@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from bench.results.models import errors_json, identify_file
-from bench.runs import RunResult
-from bench.studies import Campaign, ResultTable, Study, StudyResult, reached_targets
-from bench.workers import Pending
+from bench.analysis import errors_json, identify_file
+from bench.base import Pending
+from bench.batch import Campaign, ResultTable, Study, StudyResult, reached_targets
+from bench.run import RunResult
 
 MODELS: Mapping[str, Mapping[str, Any]] = {
     "quadratic-play": {},

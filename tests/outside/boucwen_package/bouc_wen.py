@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import ArrayLike, NDArray
 
-from bench.hysteresis import ModelSpec, Operator, Shape
+from bench.models import ModelSpec, Operator, Shape
 
 # Greatest change of z within one step of integration.
 _STEP = 0.02

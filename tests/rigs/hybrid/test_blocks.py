@@ -3,19 +3,14 @@
 import numpy as np
 import pytest
 
-from bench.clock import VirtualClock
-from bench.control.loops import Playback
-from bench.control.notch_loop import NotchLoop
-from bench.control.tracking import Trace
-from bench.engine import Engine
-from bench.errors import ConfigurationError, DeviceError, LimitError
-from bench.interrupts import Interrupts
-from bench.journal import FILE_NAME, Journal, Record
+from bench.base import ConfigurationError, DeviceError, Interrupts, LimitError, VirtualClock
+from bench.control import NotchLoop, Playback, Trace
 from bench.protocol import FixedRate, ProtocolParameters, find_protocol, protocol
-from bench.rig import Rig
-from bench.rig_file import load_rig
-from bench.runs import trace_signals
-from bench.station.local import LocalStation
+from bench.record import FILE_NAME, Journal, Record
+from bench.rig import Rig, load_rig
+from bench.run.context import trace_signals
+from bench.run.engine import Engine
+from bench.run.station.local import LocalStation
 
 RATE = 20e3
 DEFLECTION = "displacement_position"

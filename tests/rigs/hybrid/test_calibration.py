@@ -5,10 +5,9 @@ from pathlib import Path
 
 from cases import cases
 
-from bench.clock import VirtualClock
+from bench.base import VirtualClock
 from bench.protocol import find_protocol
-from bench.rig import Rig
-from bench.rig_file import load_rig
+from bench.rig import Rig, load_rig
 
 ERRORS = {"nonlinearity": "5e-4", "gain_error": "2e-3", "offset": "3e-7", "latency": "0.02"}
 SENSOR = {f"emulation.displacement_sensor.{key}": value for key, value in ERRORS.items()}

@@ -9,11 +9,10 @@ import pytest
 from cases import cases
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
-from bench.control.notch_loop import NotchLoopParameters
-from bench.control.references import AddedSine, SmoothMoves, staircase
-from bench.errors import ConfigurationError, ConvergenceError
-from bench.identification.dynamics import identify_dynamics
-from bench.rig_file import load_rig
+from bench.base import ConfigurationError, ConvergenceError
+from bench.control import AddedSine, NotchLoopParameters, SmoothMoves, staircase
+from bench.identification import identify_dynamics
+from bench.rig import load_rig
 from rigs.hybrid.control import (
     HybridController,
     MidRangingParameters,

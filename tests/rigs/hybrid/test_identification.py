@@ -7,9 +7,9 @@ import pytest
 from cases import cases
 from short_runs import record_run
 
-from bench.errors import DataError
-from bench.hysteresis import PrandtlIshlinskii
-from bench.journal import FILE_NAME, Record, Table
+from bench.base import DataError
+from bench.models import PrandtlIshlinskii
+from bench.record import FILE_NAME, Record, Table
 from rigs.hybrid.identification import (
     BASE,
     CURRENT,

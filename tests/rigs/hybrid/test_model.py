@@ -7,13 +7,12 @@ from functools import cache
 import numpy as np
 import pytest
 from cases import cases
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from scipy import signal
 from scipy.integrate import solve_ivp
 
-from bench.hysteresis import Polynomial, PrandtlIshlinskii
-from bench.identification.dynamics import ThirdOrder
+from bench.identification import ThirdOrder
+from bench.models import Polynomial, PrandtlIshlinskii
 from rigs.hybrid.design import Design
 from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel, choose_order, identify_pi, identify_polynomial
 from rigs.hybrid.network import NODES

@@ -13,16 +13,13 @@ from cases import cases
 from rich.console import Console
 from short_runs import all_messages
 
-from bench.clock import VirtualClock
-from bench.engine import check_before_moving
-from bench.errors import ConfigurationError, ConvergenceError, DataError
-from bench.hysteresis import Polynomial, PrandtlIshlinskii
-from bench.journal import Record
-from bench.model_file import ModelFile
+from bench.base import ConfigurationError, ConvergenceError, DataError, VirtualClock
+from bench.identification import ModelFile
+from bench.models import Polynomial, PrandtlIshlinskii
 from bench.protocol import Caution, FixedRate, Step, find_protocol, plan
-from bench.rig import Rig
-from bench.rig_file import load_rig
-from bench.runs import Run, carry_out
+from bench.record import Record
+from bench.rig import Rig, load_rig
+from bench.run import Run, carry_out, check_before_moving
 from protocols.hybrid.control import APPROACH, REST, moves_of
 from rigs.hybrid.control import HybridController, OpenLoopHybrid, ThermalFeedback
 from rigs.hybrid.design import Design

@@ -3,9 +3,8 @@
 import pytest
 from cases import cases
 
-from bench.clock import VirtualClock
-from bench.rig import Rig
-from bench.rig_file import load_rig
+from bench.base import VirtualClock
+from bench.rig import Rig, load_rig
 
 SIGNALS = ("displacement_position", "base_temperature", "tip_temperature")
 
@@ -21,7 +20,7 @@ def readings(*, scanned, then=None, **emulation):
         bench.devices["tec"].set(0.1)
         found = []
         for k in range(400):
-            bench.clock.sleep(0.0137)
+            bench.base.clock.sleep(0.0137)
             bench.devices["piezo"].set(10.0 * (k % 7) - 30.0)
             if k == 200 and then is not None:
                 then(laboratory)

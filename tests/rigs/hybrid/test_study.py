@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.journal import Record
-from bench.model_file import load_model
+from bench.identification import load_model
+from bench.record import Record
 from rigs.hybrid.evaluation import displacement_characteristic, tracked
 from rigs.hybrid.identification import CURRENT, DEFLECTION, VOLTAGE, WITNESS, read_loop
 from rigs.hybrid.study import CONTROLLERS, RESONANCES

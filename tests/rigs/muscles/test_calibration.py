@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from cases import cases
 
-from bench.calibration import Calibration
+from bench.rig import Calibration
 
 ERRORS = {"gain_error": 0.01, "offset": 5e-4, "nonlinearity": 0.0}
 

@@ -4,9 +4,9 @@ import csv
 
 import pytest
 
-from bench.campaigns.tasks import MODEL_NAME
+from bench.batch.campaign.tasks import MODEL_NAME
 from bench.cli import main
-from bench.model_file import load_model
+from bench.identification import load_model
 
 # The runs and the identification take some 20 s.
 pytestmark = [pytest.mark.seeds, pytest.mark.usefixtures("warm_popen")]

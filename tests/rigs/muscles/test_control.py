@@ -6,17 +6,12 @@ from dataclasses import MISSING, fields, replace
 import numpy as np
 import pytest
 from cases import cases
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
-from bench.control.dynamics import IdentifiedDynamics, ResponseDynamics
-from bench.control.loops import ReachTarget
-from bench.control.two_stage_inverse import TwoStageInverse
-from bench.controllers import ControllerSetup
-from bench.errors import ConfigurationError, DataError
-from bench.hysteresis import Preisach, Reach, TwoStage, uniform_levels
-from bench.identification import Series, identify_two_stage, voltage_steps
-from bench.model_file import ModelFile
+from bench.base import ConfigurationError, DataError
+from bench.control import ControllerSetup, ReachTarget, TwoStageInverse
+from bench.identification import ModelFile, Series, identify_two_stage, voltage_steps
+from bench.models import IdentifiedDynamics, Preisach, Reach, ResponseDynamics, TwoStage, uniform_levels
 from rigs.muscles.control import (
     FORCE_OPEN_LOOP,
     LENGTH_CLOSED_LOOP,

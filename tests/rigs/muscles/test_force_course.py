@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from bench.clock import VirtualClock
+from bench.base import VirtualClock
 from rigs.muscles.laboratory import (
     LOAD,
     STAGE,

@@ -8,11 +8,10 @@ import pytest
 from cases import cases
 from short_runs import record_run
 
-from bench.errors import DataError
-from bench.hysteresis import Linear, PrandtlIshlinskii, Preisach, Summed, TwoStage
-from bench.identification.two_stage import measure_series, predict_series
-from bench.journal import FILE_NAME, Record
-from bench.model_file import load_model
+from bench.base import DataError
+from bench.identification import load_model, measure_series, predict_series
+from bench.models import Linear, PrandtlIshlinskii, Preisach, Summed, TwoStage
+from bench.record import FILE_NAME, Record
 from protocols.muscles.force_voltage import scaled_steps
 from rigs.muscles.identification import (
     FORCE,

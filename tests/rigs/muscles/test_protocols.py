@@ -9,17 +9,14 @@ import pytest
 from cases import cases
 from short_runs import all_messages
 
+from bench.analysis import target_results
+from bench.base import ConfigurationError, DataError, VirtualClock
 from bench.cli import main
-from bench.clock import VirtualClock
-from bench.control.dynamics import IdentifiedDynamics, ResponseDynamics
-from bench.errors import ConfigurationError, DataError
-from bench.hysteresis import Linear, Preisach, Summed, TwoStage, uniform_levels
-from bench.journal import Record
-from bench.model_file import ModelFile
+from bench.identification import ModelFile
+from bench.models import IdentifiedDynamics, Linear, Preisach, ResponseDynamics, Summed, TwoStage, uniform_levels
 from bench.protocol import Control, Phase, Prompt, Step, find_protocol, plan
-from bench.results.tracking import target_results
-from bench.rig import Rig
-from bench.rig_file import load_rig
+from bench.record import Record
+from bench.rig import Rig, load_rig
 from protocols.muscles.force_voltage import scaled_steps
 from rigs.muscles.identification import FORCE, LENGTH, SAMPLE
 

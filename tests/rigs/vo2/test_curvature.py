@@ -3,11 +3,10 @@ import math
 import numpy as np
 import pytest
 from cases import cases
-from hypothesis import assume, given
-from hypothesis import strategies as st
+from hypothesis import assume, given, strategies as st
 from pydantic import ValidationError
 
-from bench.errors import DeviceError
+from bench.base import DeviceError
 from rigs.vo2.curvature import CantileverCurvature, curvature_to_deflection, deflection_to_curvature
 
 LENGTH = 300e-6

@@ -6,14 +6,13 @@ from functools import cached_property
 import numpy as np
 import pytest
 from each_case import each_case
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from plant_outputs import snapshot
 from scipy.integrate import solve_ivp
 from scipy.signal import TransferFunction, lsim
 
-from bench.clock import VirtualClock
-from bench.roles import TECMode
+from bench.base import VirtualClock
+from bench.devices import TECMode
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC
 from sim_devices.plants import _hybrid_kernels as kernels
 from sim_devices.plants.hybrid import HybridCantilever

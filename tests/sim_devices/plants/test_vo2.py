@@ -5,8 +5,7 @@ import time
 import numpy as np
 import pytest
 from each_case import each_case
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from plant_outputs import snapshot
 
 from sim_devices.plants import _vo2_kernels as kernels

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import serial
 
-from bench.clock import Stopwatch
+from bench.base import Stopwatch
 from sim_devices.serving.process import serve
 
 LONG = 60.0

@@ -7,8 +7,8 @@ import sys
 import numpy as np
 import pytest
 
-from bench.attachment import ControlClient
-from bench.results.run_folder import RunFolder
+from bench.analysis import RunFolder
+from bench.rig import ControlClient
 
 pytestmark = pytest.mark.usefixtures("warm_popen")
 

@@ -115,7 +115,7 @@ def test_raw_bytes_on_tcp_have_one_client_at_a_time(emulate, opened, connect):
 
 
 def test_bytes_take_the_time_of_the_line_on_request(emulate, opened):
-    from bench.clock import Stopwatch
+    from bench.base import Stopwatch
 
     with emulate("vo2", "--baud-time") as (_, endpoints):
         line = opened(endpoints["instruments"]["tec"]["port"], baudrate=1200)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from bench.attachment import ControlClient
+from bench.rig import ControlClient
 
 pytestmark = pytest.mark.usefixtures("warm_popen")
 
@@ -139,7 +139,7 @@ def test_a_port_in_use_is_one_message(bench):
 
 def test_a_laboratory_without_lines_is_refused(bench, tmp_path):
     (tmp_path / "without_lines.py").write_text(
-        "from bench.rig_file import LaboratorySettings\n"
+        "from bench.rig.file import LaboratorySettings\n"
         "class Laboratory:\n"
         "    Settings = LaboratorySettings\n"
         "    def open(self): ...\n"

@@ -7,8 +7,8 @@ from contextlib import suppress
 import pytest
 from each_case import each_case
 
-from bench.attachment import AttachedClock, ControlClient
-from bench.errors import ConfigurationError, DeviceConnectionError
+from bench.base import ConfigurationError, DeviceConnectionError
+from bench.rig import AttachedClock, ControlClient
 from sim_devices.serving.clock import LONGEST_STEP, ServedClock, make_served_clock
 from sim_devices.serving.process import serve
 from sim_devices.serving.requests import REQUESTS, parse_request

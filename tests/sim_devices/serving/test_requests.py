@@ -3,7 +3,7 @@
 import pytest
 from each_case import each_case
 
-from bench.errors import ConfigurationError
+from bench.base import ConfigurationError
 from sim_devices.serving.requests import parse_request
 
 

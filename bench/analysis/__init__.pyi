@@ -1,0 +1,172 @@
+from .band_columns import (
+    BandedPrediction as BandedPrediction,
+    invert_band as invert_band,
+)
+from .designs import (
+    assess_designs as assess_designs,
+    continue_file as continue_file,
+    write_sequence as write_sequence,
+)
+from .examined import (
+    Examined as Examined,
+    examine as examine,
+)
+from .export.run_export import (
+    export_run as export_run,
+)
+from .figures.canvas import (
+    check_matplotlib as check_matplotlib,
+)
+from .figures.fits import (
+    plot_errors as plot_errors,
+    plot_fit as plot_fit,
+    plot_sequence_and_errors as plot_sequence_and_errors,
+)
+from .figures.panels import (
+    Curve as Curve,
+    plot_panels as plot_panels,
+)
+from .figures.planes import (
+    plot_densities as plot_densities,
+)
+from .figures.targets import (
+    plot_tracking as plot_tracking,
+)
+from .inverted import (
+    NEAR as NEAR,
+    TOO_EARLY as TOO_EARLY,
+    InvertedTargets as InvertedTargets,
+    invert_targets as invert_targets,
+)
+from .model_choice import (
+    ALL as ALL,
+    SelectedModel as SelectedModel,
+    TestedModel as TestedModel,
+    evaluate_on_test as evaluate_on_test,
+    named_models as named_models,
+    select_model as select_model,
+)
+from .model_service import (
+    IdentifiedFile as IdentifiedFile,
+    certificate_lines as certificate_lines,
+    check_template as check_template,
+    check_unit as check_unit,
+    compare_models as compare_models,
+    errors_json as errors_json,
+    identify_file as identify_file,
+    option_names as option_names,
+    outside_of_range as outside_of_range,
+    predict as predict,
+    transients_of as transients_of,
+)
+from .models_of_several_runs import (
+    WholeIdentification as WholeIdentification,
+    whole_identification as whole_identification,
+    whole_models as whole_models,
+)
+from .prediction_figures import (
+    errors_text as errors_text,
+)
+from .predictions import (
+    Predictions as Predictions,
+    Quantity as Quantity,
+)
+from .report.model_card import (
+    write_card as write_card,
+)
+from .report.page.comparison_page import (
+    comparison_page as comparison_page,
+)
+from .report.page.render import (
+    write_page as write_page,
+)
+from .report.published import (
+    Published as Published,
+)
+from .report.run_report import (
+    PAGE_NAME as PAGE_NAME,
+    draw_comparison as draw_comparison,
+    draw_identification as draw_identification,
+    draw_predicted as draw_predicted,
+    report_run as report_run,
+)
+from .run_comparison import (
+    RunComparison as RunComparison,
+    compare_runs as compare_runs,
+)
+from .run_folder import (
+    RunFolder as RunFolder,
+)
+from .run_list import (
+    ListedRun as ListedRun,
+    list_runs as list_runs,
+    select_runs as select_runs,
+)
+from .sensor_calibrations import (
+    calibrate_run as calibrate_run,
+)
+from .session_recalibration import (
+    Session as Session,
+    session_rows as session_rows,
+)
+from .tables.data import (
+    FEWEST_ROWS as FEWEST_ROWS,
+    read_columns as read_columns,
+    write_csv as write_csv,
+)
+from .tables.imported import (
+    import_file as import_file,
+)
+from .tables.joined_files import (
+    is_rows as is_rows,
+    parse_rows as parse_rows,
+    read_files as read_files,
+)
+from .tables.reading.options import (
+    ReadingOptions as ReadingOptions,
+)
+from .tables.starting_state import (
+    starting_state as starting_state,
+)
+from .tables.times import (
+    NO_TIMES as NO_TIMES,
+    choose_times as choose_times,
+    find_times as find_times,
+    foreign_drift as foreign_drift,
+    named_times as named_times,
+    read_times as read_times,
+    time_quantity as time_quantity,
+)
+from .tracking_errors import (
+    FOLLOW as FOLLOW,
+    REACH as REACH,
+    READING as READING,
+    FollowingResult as FollowingResult,
+    TargetResults as TargetResults,
+    following_result as following_result,
+    results_json as results_json,
+    target_results as target_results,
+)
+from .transients.actuator import (
+    MEDIAN_OF_DIFFERENCES as MEDIAN_OF_DIFFERENCES,
+    IdentifiedActuator as IdentifiedActuator,
+    at_rows as at_rows,
+    grid_step as grid_step,
+    identify_actuator as identify_actuator,
+    latency as latency,
+)
+from .transients.recorded_transients import (
+    Recording as Recording,
+    recording_of as recording_of,
+)
+from .transients.response import (
+    SimulatedDrive as SimulatedDrive,
+    identify_lag as identify_lag,
+    late_parts as late_parts,
+)
+from .transients.transient_dynamics import (
+    identify_dynamics as identify_dynamics,
+    identify_transients as identify_transients,
+    noise_of as noise_of,
+    read_transients as read_transients,
+)

@@ -1,0 +1,217 @@
+"""A model's inverse for a sequence of targets: the columns that `bench invert` writes."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from bench.analysis.predictions import check_finite
+from bench.analysis.tables.starting_state import starting_state
+from bench.analysis.tables.times import bind_times
+from bench.base import ConfigurationError, DataError
+from bench.identification import ModelFile
+from bench.models import Policy, Reach, TimedSequence
+
+Floats = npt.NDArray[np.float64]
+
+# Part of the span of all outputs and targets within which a target over time counts as met.
+_TOLERANCE = 1e-9
+# Part of a time step within which two times are the same.
+_SAME_TIME = 1e-9
+# Part of the span of the set-points from which on their alternation is worth a warning.
+_ALTERNATION = 1e-2
+
+
+@dataclass(frozen=True)
+class InvertedTargets:
+    """Set-points that bring a model's output to one target after another.
+
+    Attributes
+    ----------
+    targets : ndarray, shape (N,)
+        Output units.
+    setpoints : ndarray, shape (N,)
+        Input units.
+    passing : ndarray, shape (N,)
+        Set-point to pass before it, where the target is met only after saturation; nan where there is none.
+    predicted : ndarray, shape (N,)
+        Output of the model at `setpoints`, output units.
+    flags : tuple of str
+        By target: `met`, `too high` or `too low`. What is not met is clamped to the nearest reachable value. Of a
+        model with a delay also `too early`, before any set-point has an effect, and `near`, met but for targets
+        between the rows.
+    times : ndarray, shape (N,), or None
+        s, of a model with time. Its targets are met without passing another set-point, or not at all.
+    delay : float
+        Of a model with time, s.
+    held : int
+        Number of last set-points without an effect on any target, which repeat the one before.
+    """
+
+    targets: Floats
+    setpoints: Floats
+    passing: Floats
+    predicted: Floats
+    flags: tuple[str, ...]
+    times: Floats | None = None
+    delay: float = 0.0
+    held: int = 0
+
+    def warnings(self) -> list[str]:
+        """Return what a person should know of set-points over time: targets that are not met, and ringing."""
+        if self.times is None:
+            return []
+        found = []
+        missed = [row for row, flag in enumerate(self.flags, 1) if flag not in (Reach.MET.value, NEAR, TOO_EARLY)]
+        if self.held:
+            found += self._of_delay()
+        if missed:
+            found.append(
+                f"{len(missed)} of {len(self.flags)} targets cannot be met (first: row {missed[0]}, "
+                f"{self.flags[missed[0] - 1]}); their set-points are clamped"
+            )
+        ringing = self._ringing()
+        if ringing.size:
+            found.append(
+                f"the set-points alternate from row to row where the targets do not in {ringing.size} of "
+                f"{len(self.flags)} rows (first: row {ringing[0]}): the steps are short beside the response of the "
+                "model; take longer steps, or targets without kinks"
+            )
+        return found
+
+    def _of_delay(self) -> list[str]:
+        found = [
+            f"a set-point has an effect after {self.delay:.4g} s: on the first {self.flags.count(TOO_EARLY)} targets "
+            f"none has any, and the last {self.held} set-points, which reach no target, repeat the one before"
+        ]
+        near = np.array([flag == NEAR for flag in self.flags])
+        if near.any():
+            errors, span = np.abs(self.predicted - self.targets)[near], float(np.ptp(self.targets))
+            found.append(
+                f"the delay of {self.delay:.4g} s is no multiple of the time steps: between the rows the targets are "
+                f"straight lines, and {near.sum()} rows err by up to {errors.max():.3g} "
+                f"({100.0 * errors.max() / span:.2g} % of their span); with steps that divide the delay it is exact"
+            )
+        return found
+
+    def _ringing(self) -> npt.NDArray[np.int64]:
+        """Return the rows, from 1, at which set-points turn for the second time in a row and targets do not."""
+        moves, wanted = np.diff(self.setpoints), np.diff(self.targets)
+        far = np.abs(moves) > _ALTERNATION * np.ptp(self.setpoints)
+        turns = (moves[:-1] * moves[1:] < 0.0) & far[:-1] & far[1:] & (wanted[:-1] * wanted[1:] >= 0.0)
+        return np.flatnonzero(turns[:-1] & turns[1:]) + 3
+
+
+NEAR, TOO_EARLY = "near", "too early"
+"""Flags of targets behind a delay; see `InvertedTargets`."""
+
+
+def invert_targets(
+    model: ModelFile,
+    targets: Floats,
+    *,
+    policy: Policy = "nearest",
+    initial: str | None = None,
+    continue_memory: bool = False,
+    times: Floats | None = None,
+) -> InvertedTargets:
+    """Invert a model for a sequence of targets.
+
+    Parameters
+    ----------
+    model : ModelFile
+        Any model of one input: Preisach and Prandtl-Ishlinskii models are inverted exactly with their memory, a
+        polynomial by its look-up table, others numerically. Of the models with time those that `TimedModel.follow`
+        inverts.
+    targets : ndarray, shape (N,)
+        Output units, finite.
+    policy : {"nearest", "paper"}
+        Which answer is taken where there are several.
+    initial, continue_memory
+        The state before the first target, as for `starting_state`.
+    times : ndarray, shape (N,), or None
+        s, for a model with time.
+
+    Raises
+    ------
+    DataError
+        If it is a model of several inputs, or a set-point or an output is not finite.
+    ConfigurationError
+        If a model with time has no times or another one has, or it has no inverse at these times.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        found = _inverted(model, targets, policy, initial, times, continue_memory=continue_memory)
+    units = model.response.input_unit, model.response.output_unit
+    check_finite(model.name, "set-point", found.setpoints, units[0], targets, "target", units[1])
+    check_finite(model.name, "output", found.predicted, units[1], found.setpoints, "set-point", units[0])
+    return found
+
+
+def _inverted(
+    model: ModelFile,
+    targets: Floats,
+    policy: Policy,
+    initial: str | None,
+    times: Floats | None,
+    *,
+    continue_memory: bool,
+) -> InvertedTargets:
+    state = starting_state(model, initial=initial, continue_memory=continue_memory).state
+    bound = bind_times(model, times)
+    if isinstance(bound, TimedSequence):
+        try:
+            return _invert_in_time(bound, targets, state, policy)
+        except ValueError as error:
+            raise ConfigurationError(f"model {model.name} cannot be inverted: {error}") from None
+    if times is not None:
+        raise ConfigurationError(f"--time: {model.name} is a model without time")
+    try:
+        found = bound.inverse(policy).follow(targets, state)
+    except (ValueError, ArithmeticError) as error:
+        raise DataError(f"model {model.name} cannot be inverted: {error}") from None
+    flags = tuple(_flags(found.met, targets, found.outputs))
+    return InvertedTargets(targets, found.setpoints, found.saturating, found.outputs, flags)
+
+
+def _invert_in_time(bound: TimedSequence, targets: Floats, state: Any, policy: Policy) -> InvertedTargets:  # noqa: ANN401 - the model's own
+    """Return the set-points of a model with time; raises ValueError if it has no inverse, or none at these times."""
+    times, delay = bound.times, bound.model.delay
+    same = _SAME_TIME * float(np.median(np.diff(times)))
+    # A set-point is for the target that its effect meets, a delay later.
+    effective = int(np.count_nonzero(times + delay <= times[-1] + same))
+    if effective < 2:
+        raise ValueError(f"its delay of {delay:.4g} s is as long as the {np.ptp(times):.4g} s of the targets")
+    prompt, before = bound.model.ahead(state)
+    wanted = np.interp(times[:effective] + delay, times, targets)
+    found = prompt.follow(times[:effective], wanted, before, policy)
+    reached = _are_equal(prompt.evaluate(times[:effective], found, before), wanted)
+    setpoints = np.append(found, np.full(times.size - effective, found[-1]))
+    predicted = bound.evaluate(setpoints, state)
+    flags = _flags(_are_equal(predicted, targets), targets, predicted)
+    if delay:
+        # Each target is between the effects of two set-points, or at that of one.
+        after = np.searchsorted(times, times - delay - same)
+        for row, last in enumerate(after.tolist()):
+            if times[row] < times[0] + delay - same:
+                flags[row] = TOO_EARLY
+            elif flags[row] != Reach.MET.value and reached[max(last - 1, 0) : last + 1].all():
+                flags[row] = NEAR
+    held = times.size - effective
+    return InvertedTargets(
+        targets, setpoints, np.full(times.size, np.nan), predicted, tuple(flags), times, delay, held
+    )
+
+
+def _are_equal(outputs: Floats, targets: Floats) -> npt.NDArray[np.bool_]:
+    both = np.concatenate([targets, outputs])
+    return np.asarray(np.abs(outputs - targets) <= _TOLERANCE * (np.ptp(both) or abs(both[0])))
+
+
+def _flags(met: npt.NDArray[np.bool_], targets: Floats, outputs: Floats) -> list[str]:
+    return [
+        (Reach.MET if at else Reach.TOO_HIGH if target > output else Reach.TOO_LOW).value
+        for at, target, output in zip(met.tolist(), targets.tolist(), outputs.tolist(), strict=True)
+    ]

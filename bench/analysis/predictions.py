@@ -1,0 +1,132 @@
+"""A model beside measurements, row by row: the columns that `bench predict` and `bench compare` write."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import numpy.typing as npt
+
+from bench.analysis.band_columns import BandedPrediction
+from bench.base import DataError, header_with_unit
+from bench.identification import Errors, measure_errors
+
+Floats = npt.NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A column of measurements.
+
+    Attributes
+    ----------
+    name : str
+        As it was asked for; a unit at the end, as in `force [N]`, is that of the quantity.
+    unit : str
+        Empty if unknown.
+    values : ndarray, shape (N,)
+        In that unit.
+    """
+
+    name: str
+    unit: str
+    values: Floats
+
+    @property
+    def header(self) -> str:
+        """The head of the column, with the unit."""
+        return header_with_unit(self.title, self.unit)
+
+    @property
+    def title(self) -> str:
+        """The name without the unit."""
+        return self.name.removesuffix(f"[{self.unit}]").rstrip() if self.unit else self.name
+
+
+def check_finite(
+    model: str, what: str, values: Floats, unit: str, given: Floats, of_given: str, unit_given: str
+) -> None:
+    """Check that what a model gave for N rows, shape (N,), is finite.
+
+    Raises DataError otherwise: names the model, the first wrong row (from 1), and what it was given there.
+    """
+    wrong = np.flatnonzero(~np.isfinite(values))
+    if wrong.size:
+        row = int(wrong[0])
+        value, at = f"{values[row]:g} {unit}".rstrip(), f"{given[row]:g} {unit_given}".rstrip()
+        raise DataError(
+            f"model {model}: its {what} is {value} in row {row + 1}, where the {of_given} is {at}, and not finite in "
+            f"{wrong.size} of {values.size} rows: its numbers overflow; check its coefficients, and that the input "
+            "is in the range that it was identified for"
+        )
+
+
+@dataclass(frozen=True)
+class Predictions:
+    """Outputs of models for one sequence of inputs, beside what was measured.
+
+    Raises DataError if a model has an output that is not finite.
+
+    Attributes
+    ----------
+    input : Quantity
+        The inputs.
+    unit : str
+        Unit of the output; empty if unknown.
+    predicted : mapping of str to ndarray
+        Outputs by the name of the model, shape (N,) each.
+    measured : Quantity or None
+        The measured outputs, where there are some.
+    time : Quantity or None
+        When each row was taken, where it is known.
+    skip : int
+        First rows, which drive the memory but count in no error.
+    bands : mapping of str to BandedPrediction
+        Prediction bands of those models that have one.
+    """
+
+    input: Quantity
+    unit: str
+    predicted: Mapping[str, Floats]
+    measured: Quantity | None = None
+    time: Quantity | None = None
+    skip: int = 0
+    bands: Mapping[str, BandedPrediction] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Raise DataError if an output is not finite."""
+        for name, values in self.predicted.items():
+            check_finite(name, "output", values, self.unit, self.input.values, "input", self.input.unit)
+
+    def residuals(self) -> dict[str, Floats]:
+        """Return measured minus predicted output by model, shape (N,) each; none without measurements."""
+        if self.measured is None:
+            return {}
+        return {name: self.measured.values - values for name, values in self.predicted.items()}
+
+    def errors(self) -> dict[str, Errors]:
+        """Return the errors over the rows after `skip` by model; none without measurements."""
+        if self.measured is None:
+            return {}
+        measured = self.measured.values[self.skip :]
+        return {name: measure_errors(measured, values[self.skip :]) for name, values in self.predicted.items()}
+
+    def table(self) -> list[tuple[str, Floats]]:
+        """Return the columns of a file with their heads: time, input, measured; predicted and residual; bands.
+
+        The model is named in the heads if there are several.
+        """
+        columns = [(each.header, each.values) for each in (self.time, self.input) if each is not None]
+        if self.measured is not None:
+            columns.append((header_with_unit("measured", self.unit), self.measured.values))
+        residuals = self.residuals()
+        for name, values in self.predicted.items():
+            prefix = f"{name} " if len(self.predicted) > 1 else ""
+            columns.append((header_with_unit(f"{prefix}predicted", self.unit), values))
+            if name in residuals:
+                columns.append((header_with_unit(f"{prefix}residual", self.unit), residuals[name]))
+        for name, band in self.bands.items():
+            prefix = f"{name} " if len(self.predicted) > 1 else ""
+            columns += [(f"{prefix}{head}", values) for head, values in band.columns(self.predicted[name])]
+        return columns

@@ -1,0 +1,255 @@
+"""The model card: what a person must know of an identified model before using it, as a Markdown page."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+import os
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from bench.analysis.model_service import IdentifiedFile, certificate_lines
+from bench.analysis.predictions import Predictions, Quantity
+from bench.base import DataError
+from bench.identification import Errors
+from bench.models import MemoryCurve, Operator, TimedModel
+from bench.record import Record
+
+Floats = npt.NDArray[np.float64]
+
+# Models in the table of those that were compared; all are in the model file.
+_SHOWN = 10
+
+
+def write_card(
+    path: Path, found: IdentifiedFile, data: Path, *, command: str, model: Path | None, figures: Sequence[Path]
+) -> None:
+    """Write the card of a model as Markdown, UTF-8.
+
+    Parameters
+    ----------
+    path : Path
+        The file to write; figures are linked relative to its folder.
+    found : IdentifiedFile
+        The model and the fit behind it.
+    data : Path
+        File or run that it was identified from.
+    command : str
+        Command line that identifies it again.
+    model : Path or None
+        The model file, if one was written.
+    figures : sequence of Path
+        Figures of the fit, if some were drawn.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be written, or the data not read again.
+    """
+    text = model_card(
+        found,
+        data.name,
+        sha256_of(data),
+        command=command,
+        model="" if model is None else model.name,
+        figures=[Path(os.path.relpath(each, path.parent)).as_posix() for each in figures],
+    )
+    try:
+        path.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise DataError(f"model card {path} cannot be written: {error.strerror}") from None
+
+
+def sha256_of(data: Path) -> str:
+    """Return the SHA-256 digest of a file of measurements, or of the journal of a run, in hexadecimal.
+
+    Raises DataError if it cannot be read.
+    """
+    if data.is_dir():
+        with Record(data) as record:
+            data = record.path
+    try:
+        with data.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise DataError(f"{data} cannot be read: {error.strerror}") from None
+
+
+def model_card(
+    found: IdentifiedFile, source: str, digest: str, *, command: str, model: str = "", figures: Iterable[str] = ()
+) -> str:
+    """Return the card of an identified model as Markdown.
+
+    Parameters
+    ----------
+    found : IdentifiedFile
+        The model and the fit behind it.
+    source, digest : str
+        Name of the data, and their SHA-256 digest.
+    command : str
+        Command line that identifies the model again.
+    model : str
+        Name of the model file; empty if there is none.
+    figures : iterable of str
+        Links to figures.
+    """
+    rows = found.predictions()
+    measured = Quantity(found.file.provenance["output"], rows.unit, found.outputs)
+    sections = {
+        "Data": _table(("", ""), _data(found, rows, measured, source, digest)),
+        "Errors": _table(("error", measured.unit or "output units", "% of the range"), _errors(found)),
+        "Certificate": _table(("", ""), certificate_lines(found)),
+        "Limits of validity": _table(("", ""), _limits(found, rows.input, rows.time)),
+    }
+    if (band := found.band) is not None:
+        held_out = f"{band.band.held_out:.4g} {band.unit}".rstrip()
+        sections["Prediction band"] = _table(
+            ("", ""), [*band.rows(), ("RMS error of the rows, each left out of the fit", held_out)]
+        )
+    if (selection := found.file.provenance.get("selection")) is not None:
+        unit = selection["unit"] or "output units"
+        heads = ("model", f"held out, {unit}", "±", "% of the range", f"other cycles, {unit}", "free", "")
+        sections["Models compared"] = _table(heads, _compared(selection["table"]))
+    if found.trials is not None:
+        sections["Selection"] = _fenced(found.trials.table())
+    if found.warnings:
+        sections["Warnings"] = "\n".join(f"- {warning}" for warning in found.warnings)
+    sections["Reproduce"] = _fenced(command) + f"\n\nactuator-bench {importlib.metadata.version('actuator-bench')}."
+    if links := list(figures):
+        sections["Figures"] = "\n".join(f"![{Path(link).stem}](<{link}>)" for link in links)
+    unit = f" in {rows.unit}" if rows.unit else ""
+    head = f"# Model {found.file.name}\n\n{measured.title}{unit} from {rows.input.title}, identified from {source}"
+    parts = [f"{head}{f', in the file {model}' if model else ''}."]
+    parts += [f"## {title}\n\n{text}" for title, text in sections.items()]
+    return "\n\n".join(parts) + "\n"
+
+
+def _data(
+    found: IdentifiedFile, rows: Predictions, outputs: Quantity, source: str, digest: str
+) -> list[tuple[str, str]]:
+    skip = found.identification.skip
+    first = f", of which the first {skip} drive the memory and count in no error" if skip else ""
+    return [
+        ("source", source),
+        ("SHA-256", digest),
+        *([("layout", found.assumptions)] if found.assumptions else []),
+        ("rows", f"{found.inputs.size}{first}"),
+        *([] if rows.time is None else [("sampling rate", _sampling(rows.time))]),
+        ("input", _extent(rows.input)),
+        ("output", _extent(outputs)),
+    ]
+
+
+def _extent(quantity: Quantity) -> str:
+    return f"{quantity.title}, {_between(quantity.values.min(), quantity.values.max(), quantity.unit)}"
+
+
+def _between(low: float, high: float, unit: str) -> str:
+    return f"{low:.6g} to {high:.6g}{f' {unit}' if unit else ', unit unknown'}"
+
+
+def _errors(found: IdentifiedFile) -> list[tuple[str, str, str]]:
+    errors: Errors = found.identification.errors
+    return [
+        ("largest", f"{errors.maximum:.4g}", f"{errors.maximum_percent:.2f}"),
+        ("RMS", f"{errors.rms:.4g}", f"{errors.rms_percent:.2f}"),
+        ("mean absolute", f"{errors.average:.4g}", f"{errors.average_percent:.2f}"),
+        ("range of the output", f"{errors.span:.4g}", "100.00"),
+    ]
+
+
+def _compared(table: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
+    """Return the models that were compared to the end, the best first, at most ten beside the chosen one."""
+    whole = [row for row in table if row["note"] in ("", "chosen", "least error")]
+    shown = [*whole[:_SHOWN], *(row for row in whole[_SHOWN:] if row["note"] == "chosen")]
+    return [
+        (
+            f"{row['model']} {row['options']}".strip(),
+            *(
+                "" if row[name] is None else f"{row[name]:.{digits}g}"
+                for name, digits in (("held_out_rms", 3), ("held_out_spread", 1), ("held_out_percent", 3))
+            ),
+            "" if row["units_rms"] is None else f"{row['units_rms']:.3g}",
+            f"{row['free']:.0f}",
+            row["note"],
+        )
+        for row in shown
+    ]
+
+
+def _limits(found: IdentifiedFile, inputs: Quantity, time: Quantity | None) -> list[tuple[str, str]]:
+    operator = found.file.response
+    # Swings between reversals say which class of inputs the errors hold for.
+    moved = inputs.values[np.append(True, np.diff(inputs.values) != 0.0)]
+    turns = np.flatnonzero(np.diff(np.sign(np.diff(moved)))) + 1
+    swings = np.abs(np.diff(moved[np.concatenate([[0], turns, [moved.size - 1]])]))
+    unit = f" {inputs.unit}" if inputs.unit else ""
+    excitation = (
+        f"{turns.size} reversals, swings of {swings.min():.4g} to {swings.max():.4g}{unit}, "
+        f"median {np.median(swings):.4g}{unit}; the errors hold for inputs of this class"
+    )
+    return [
+        ("input", f"{_between(*operator.input_range, operator.input_unit)}; beyond it the model extrapolates"),
+        ("excitation", excitation),
+        ("rate", _rate(inputs, time)),
+        ("memory before the first row", _memory(found)),
+    ]
+
+
+def _rate(inputs: Quantity, time: Quantity | None) -> str:
+    if time is None:
+        return "no time was read; the errors hold at the rate of these data"
+    speeds = np.abs(np.diff(inputs.values) / np.diff(time.values))
+    speeds = speeds[speeds > 0.0]
+    unit = f"{inputs.unit or 'input units'}/{time.unit}"
+    return f"{speeds.min():.4g} to {speeds.max():.4g} {unit}, median {np.median(speeds):.4g}; the errors hold there"
+
+
+def _sampling(time: Quantity) -> str:
+    steps = np.diff(time.values)
+    low, middle, high = steps.min(), np.median(steps), steps.max()
+    uneven = f"; uneven steps of {low:.4g} to {high:.4g} {time.unit}" if high - low > 1e-3 * middle else ""
+    return f"{1.0 / middle:.4g} Hz over {time.values[-1] - time.values[0]:.4g} {time.unit}{uneven}"
+
+
+def _memory(found: IdentifiedFile) -> str:
+    operator, state = found.file.response, found.identification.initial_state
+    text = _memory_text(operator, state)
+    how = found.file.provenance.get("initial")
+    if how == "skip":
+        return f"unknown; taken as {text}, and the rows that it reaches are left out"
+    return f"estimated: {text}" if how == "estimate" else text
+
+
+def _memory_text(operator: Operator[Any] | TimedModel[Any], state: Any) -> str:  # noqa: ANN401 - each has its own
+    if isinstance(operator, TimedModel):
+        return str(operator.state_to_json(state))
+    if operator.memoryless:
+        return "none: the output depends on the present input alone"
+    for direction, name in ((-1, "negative saturation"), (1, "positive saturation")):
+        if state == operator.saturated_state(direction):
+            return name
+    if state is None or state == operator.initial_state():
+        return "the initial state of the model"
+    if isinstance(state, MemoryCurve):
+        before = "negative" if state.saturation < 0 else "positive"
+        extrema = ", ".join(f"{value:.6g}" for value in state.extrema)
+        return f"{before} saturation{f', then {extrema}' if extrema else ''}, then {state.input:.6g}"
+    return f"{operator.state_to_json(state)}"
+
+
+def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+    lines = [head, ["---", *["---:" if len(head) > 2 else "---"] * (len(head) - 1)], *rows]
+    return "\n".join(f"| {' | '.join(_cell(cell) for cell in line)} |" for line in lines)
+
+
+def _cell(text: str) -> str:
+    return text.replace("|", "\\|").replace("\n", " ")
+
+
+def _fenced(text: str) -> str:
+    return f"```\n{text.strip(chr(10))}\n```"

@@ -1,0 +1,206 @@
+"""The parts of a run's page about models: loops, residuals, bands, densities, coefficients."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from bench.analysis.figures.fits import plot_fit
+from bench.analysis.figures.planes import plot_coverage, plot_densities
+from bench.analysis.models_on_run import ModelOnRun
+from bench.analysis.prediction_figures import errors_text
+from bench.analysis.report.page.elements import PageFigure, PageSection, PageTable, PageText
+from bench.analysis.report.page.svg import inlined
+from bench.base import fitting_prefix, with_unit
+from bench.identification import CoefficientUncertainties, ModelFile, coefficient_uncertainties
+from bench.models import MemoryCurve, TimedModel
+
+Floats = npt.NDArray[np.float64]
+
+_FEW_COEFFICIENTS = 30
+"""So many coefficients are listed one by one without being asked for."""
+
+
+def models_section(models: Sequence[ModelOnRun], times: Floats, scratch: Path) -> PageSection:
+    """Return loops and residuals of models, their errors, bands and coefficients.
+
+    Parameters
+    ----------
+    models : sequence of ModelOnRun
+        At least one.
+    times : ndarray, shape (N,)
+        Laboratory time of each reading, s.
+    scratch : Path
+        Folder for files that are not kept.
+    """
+    parts: list[PageFigure | PageTable | PageText] = [_errors_table(models)]
+    skip = models[0].skip
+    if skip:
+        parts.append(PageText(f"Readings 1 to {skip} drive the memory of the models and count in no error."))
+    for i, group in enumerate(_by_signals(models)):
+        parts += _fits(group, times, scratch, i)
+    parts += [part for model in models for part in _bands(model)]
+    for i, model in enumerate(models):
+        has_time = isinstance(model.file.model, TimedModel)
+        parts += _details_in_time(model, scratch, i) if has_time else _details(model, scratch, i)
+    return PageSection("Loops and models", parts)
+
+
+def given_section(files: Sequence[tuple[str, ModelFile]], scratch: Path) -> PageSection:
+    """Return the models that a run was given, by the parameter that names each, with their densities."""
+    rows = []
+    figures = []
+    for i, (parameter, file) in enumerate(files):
+        source = file.provenance.get("source") or ", ".join(file.provenance.get("sources", ()))
+        band = "none" if file.band is None else f"{100.0 * file.band.level:g} %, {file.band.calibrated_on.kind}"
+        rows.append((parameter, file.name, file.model.kind, str(source), band))
+        for k, density in enumerate(file.model.densities()):
+            path = scratch / f"given-{i}-{k}.svg"
+            plot_densities(path, [density])
+            caption = f"Density of {file.name} {density.title}".rstrip()
+            figures.append(PageFigure(inlined(path, caption), f"{caption}, as the run was given it."))
+    heads = ("parameter", "model", "kind", "identified from", "prediction band")
+    return PageSection("Models that the run was given", (PageTable(heads, rows), *figures))
+
+
+def _errors_table(models: Sequence[ModelOnRun]) -> PageTable:
+    rows = []
+    for model in models:
+        errors = model.errors
+        numbers = (errors.maximum, errors.rms, errors.average)
+        factor, unit = fitting_prefix(model.unit, *numbers, least=0.1)
+        cells = [f"{factor * number:.4g}" for number in numbers]
+        rows.append(
+            (model.file.name, model.file.model.kind, *cells, "" if unit == "1" else unit, f"{errors.rms_percent:.2f}")
+        )
+    heads = ("model", "kind", "max", "RMS", "mean absolute", "unit", "RMS / % of range")
+    return PageTable(heads, rows, title="errors on this run", numbers_from=2)
+
+
+def _by_signals(models: Sequence[ModelOnRun]) -> list[list[ModelOnRun]]:
+    groups: dict[tuple[str, str], list[ModelOnRun]] = {}
+    for model in models:
+        groups.setdefault((model.inputs.name, model.measured.name), []).append(model)
+    return list(groups.values())
+
+
+def _fits(models: Sequence[ModelOnRun], times: Floats, scratch: Path, number: int) -> Iterator[PageFigure]:
+    first = models[0]
+    names = [model.file.name for model in models]
+    titles = {model.file.name: f"{model.file.name}: {errors_text(model.errors, model.unit)}" for model in models}
+    factor, unit = fitting_prefix(first.unit, float(np.abs(first.measured.values).max(initial=0.0)))
+    input_factor, input_unit = fitting_prefix(first.inputs.unit, float(np.abs(first.inputs.values).max(initial=0.0)))
+    for kind, horizontal, label in (
+        ("loops", input_factor * first.inputs.values, with_unit(first.inputs.title, input_unit)),
+        ("time", times / 3600.0, "laboratory time / h"),
+    ):
+        path = scratch / f"{kind}-{number}.svg"
+        plot_fit(
+            path,
+            horizontal,
+            factor * first.measured.values,
+            {model.file.name: factor * model.predicted for model in models},
+            horizontal_label=label,
+            output_label=with_unit(first.measured.title, unit),
+            error_label=with_unit("residual", unit),
+            titles=titles,
+            skip=first.skip,
+            bands={
+                model.file.name: (model.band.label, factor * model.band.half_widths)
+                for model in models
+                if model.band is not None
+            },
+        )
+        over = first.inputs.title if kind == "loops" else "time"
+        caption = (
+            f"{first.measured.title} over {over}: measured (points) and {', '.join(names)} (lines); below, what each "
+            "leaves, on one scale."
+        )
+        if any(model.band is not None for model in models):
+            caption += " Shaded: prediction bands."
+        yield PageFigure(inlined(path, caption), caption)
+
+
+def _bands(model: ModelOnRun) -> Iterator[PageTable | PageText]:
+    if model.band is None:
+        return
+    covered = model.band.coverage(model.residuals[model.skip :])
+    rows = [*model.band.rows(), ("covers of the readings", f"{100.0 * covered:.1f} %")]
+    yield PageTable(("", ""), rows, title=f"prediction band of {model.file.name}")
+    if warning := model.band.warning():
+        yield PageText(f"Warning: {warning}")
+
+
+def _details(model: ModelOnRun, scratch: Path, number: int) -> Iterator[PageFigure | PageTable | PageText]:
+    operator, name = model.file.operator, model.file.name
+    inputs = model.inputs.values
+    found = coefficient_uncertainties(operator, inputs, model.residuals, model.state, model.skip)
+    coverage = operator.coverage(inputs, model.state)
+    cells = 0 if coverage is None else coverage.swept.size
+    for i, density in enumerate(operator.densities()):
+        path = scratch / f"density-{number}-{i}.svg"
+        sigma = found.sigmas[:cells] if found.sigmas is not None and _is_one_plane(model, cells) else None
+        plot_densities(path, [density], None if coverage is None else coverage.swept, uncertainties=sigma)
+        caption = f"Density of {name}"
+        if coverage is not None:
+            caption += f"; {coverage.summary()} by this run"
+        if sigma is not None:
+            caption += "; beside it its standard uncertainty"
+        yield PageFigure(inlined(path, caption), f"{caption}.")
+        if coverage is not None and isinstance(memory := model.file.memory, MemoryCurve):
+            path = scratch / f"coverage-{number}-{i}.svg"
+            plot_coverage(path, density, coverage.swept, memory)
+            caption = f"What this run swept of the plane of {name}, and the memory at the end of the model's data"
+            yield PageFigure(inlined(path, caption), f"{caption}.")
+    yield _coefficients(model, found, cells)
+
+
+def _details_in_time(model: ModelOnRun, scratch: Path, number: int) -> Iterator[PageFigure | PageTable]:
+    for i, density in enumerate(model.file.model.densities()):
+        path = scratch / f"density-{number}-{i}.svg"
+        plot_densities(path, [density])
+        caption = f"Density of {model.file.name}"
+        yield PageFigure(inlined(path, caption), f"{caption}.")
+    rows = [(name, f"{value:.6g}", unit) for name, (value, unit) in model.file.model.parameters().items()]
+    heads = ("parameter", "value", "unit")
+    yield PageTable(heads, rows, title=f"parameters of {model.file.name}", numbers_from=1)
+
+
+def _coefficients(model: ModelOnRun, found: CoefficientUncertainties, cells: int) -> PageTable:
+    operator = model.file.operator
+    values = operator.coefficients
+    rows = [("bias", f"{operator.bias:.6g}", "")]
+    for k, value in enumerate(values.tolist()):
+        if k < cells and value == 0.0:
+            continue
+        sigma = "–" if found.sigmas is None or not np.isfinite(found.sigmas[k]) else f"{found.sigmas[k]:.2g}"
+        rows.append((_coefficient_name(model, k, cells), f"{value:.6g}", sigma))
+    shape = operator.shape_parameters()
+    rows += [(name, f"{value:.6g}", "") for name, value in zip(shape.names, shape.values, strict=True)]
+    zeros = int(np.count_nonzero(values[:cells] == 0.0))
+    note = f"{found.text}. {zeros} cells with zero density are left out." if zeros else f"{found.text}."
+    return PageTable(
+        ("coefficient", "value", "σ"),
+        rows,
+        title=f"coefficients of {model.file.name}",
+        note=note,
+        folded=len(rows) > _FEW_COEFFICIENTS,
+        numbers_from=1,
+    )
+
+
+def _is_one_plane(model: ModelOnRun, cells: int) -> bool:
+    """Return whether the first coefficients of a model are the cells of its only density."""
+    densities = model.file.operator.densities()
+    return len(densities) == 1 and cells == np.tril_indices(len(densities[0].values))[0].size
+
+
+def _coefficient_name(model: ModelOnRun, k: int, cells: int) -> str:
+    if k < cells and _is_one_plane(model, cells):
+        levels = model.file.operator.densities()[0].levels
+        i, j = (int(index[k]) for index in np.tril_indices(levels.size - 1))
+        return f"density at β {levels[j]:g} to {levels[j + 1]:g}, α {levels[i]:g} to {levels[i + 1]:g}"
+    return f"reversible part, coefficient {k - cells}" if cells else f"coefficient {k}"

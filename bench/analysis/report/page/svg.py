@@ -1,0 +1,78 @@
+"""Figures as parts of a page: SVG without what a page does not need."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+from bench.base import DataError
+
+_ROOT = re.compile(r"<svg\b[^>]*>.*</svg>", re.DOTALL)
+_NEEDLESS = re.compile(r"<!--.*?-->|<metadata>.*?</metadata>|<style\b.*?</style>", re.DOTALL)
+_GROUP_NAMES = re.compile(r'(?<=<g) id="[^"]+"')
+_NUMBERS = re.compile(r"-?\d+\.\d+")
+_PATHS = re.compile(r'(?<= d=")[^"]+')
+_MARKS = re.compile(r"(?:\s*<use [^>]*/>){2,}")
+_MARK = re.compile(r'<use xlink:href="#(?P<mark>[^"]+)" x="(?P<x>[^"]+)" y="(?P<y>[^"]+)" style="(?P<style>[^"]*)"/>')
+_DOTS = re.compile(r'<path id="(?P<mark>[^"]+)" d="M ?0 (?P<radius>[\d.]+) ?\s*C[^"]*"(?: style="[^"]*")?/>')
+_FILL = re.compile(r"fill: (#[0-9a-f]{6})(?:; fill-opacity: ([\d.]+))?")
+_FEW_MARKS = 20
+"""Marks that stay as they are, such as those of an axis."""
+
+
+def inlined(path: Path, description: str) -> str:
+    """Return the content of an SVG file that matplotlib drew, as an element of a page.
+
+    Coordinates keep a hundredth of a point, and the dots of a curve become one path. The identifiers that stay are
+    those of clips and marks, which differ from figure to figure.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    description : str
+        What it shows, for those who do not see it; plain text.
+
+    Raises
+    ------
+    DataError
+        If it cannot be read or is no such file.
+    """
+    from markupsafe import escape
+
+    try:
+        found = _ROOT.search(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise DataError(f"{path} cannot be read: {error.strerror}") from None
+    if found is None:
+        raise DataError(f"{path} is not an SVG figure")
+    text = _GROUP_NAMES.sub("", _NEEDLESS.sub("", found[0]))
+    radii = {each["mark"]: float(each["radius"]) for each in _DOTS.finditer(text)}
+    text = _MARKS.sub(lambda marks: _one_path(marks[0], radii), _PATHS.sub(_short_path, text))
+    text = re.sub(r">\s+<", "><", text)
+    return text.replace("<svg ", f'<svg role="img" aria-label="{escape(description)}" ', 1)
+
+
+def _short_path(path: re.Match[str]) -> str:
+    return re.sub(r"\s*([A-Za-z])\s*", r"\1", _NUMBERS.sub(lambda number: _short(number[0]), path[0]))
+
+
+def _short(number: str) -> str:
+    return f"{float(number):.2f}".rstrip("0").rstrip(".")
+
+
+def _one_path(marks: str, radii: dict[str, float]) -> str:
+    """Return many dots of one curve as the round ends of lines without length."""
+    parts = list(_MARK.finditer(marks))
+    kinds = {(each["mark"], each["style"]) for each in parts}
+    if len(parts) < _FEW_MARKS or len(kinds) != 1:
+        return marks
+    mark, style = kinds.pop()
+    fill = _FILL.search(style)
+    if mark not in radii or fill is None:
+        return marks
+    dots = "".join(f"M{float(each['x']):.1f} {float(each['y']):.1f}h0" for each in parts)
+    opacity = f"; stroke-opacity: {fill[2]}" if fill[2] else ""
+    width = _short(f"{2.0 * radii[mark]}")
+    drawn = f"fill: none; stroke: {fill[1]}; stroke-width: {width}; stroke-linecap: round{opacity}"
+    return f'<path d="{dots}" style="{drawn}"/>'

@@ -1,0 +1,272 @@
+"""Tables, figures and the page of a run, made from its journal."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table as Columns
+
+from bench.analysis.export.run_export import make_folder
+from bench.analysis.figures.canvas import check_matplotlib
+from bench.analysis.figures.fits import plot_errors, plot_loops
+from bench.analysis.figures.panels import plot_signals
+from bench.analysis.figures.planes import plot_coverage, plot_densities
+from bench.analysis.model_service import ComparedModels, IdentifiedFile, errors_json
+from bench.analysis.models_on_run import ModelOnRun, apply_models, models_of
+from bench.analysis.prediction_figures import draw_predictions
+from bench.analysis.predictions import Predictions
+from bench.analysis.report.page.render import write_page
+from bench.analysis.report.page.run_page import run_page
+from bench.analysis.report.page.run_parts import watched_pairs
+from bench.analysis.report.published import Published
+from bench.analysis.report.telemetry_summary import TelemetrySummary, summarize, wider
+from bench.analysis.tracking_errors import results_json
+from bench.base import format_numbers, print_plain, with_unit
+from bench.devices import Signal
+from bench.identification import ModelFile, models_among
+from bench.models import MemoryCurve
+from bench.record import Record, Table, expected_steps, lateness_lines, run_card
+
+PAGE_NAME = "report.html"
+"""Usual file name of the page of a run."""
+
+
+def report_run(
+    run: Path,
+    models: Sequence[ModelFile],
+    out: Path | None,
+    console: Console,
+    *,
+    page: Path | None = None,
+    figure_format: str = "png",
+    published: Sequence[Published] = (),
+) -> dict[str, Any]:
+    """Print a run's tables, draw its figures, write its page, and compare models on it; return the same for programs.
+
+    Parameters
+    ----------
+    run : Path
+        Folder or journal of the run.
+    models : sequence of ModelFile
+        Models to compare, besides those that were identified from the run.
+    out : Path or None
+        Folder of the figures; `report` beside the journal if None.
+    console : Console
+        Console to print on.
+    page : Path or None
+        HTML file to write; none if None.
+    figure_format : {"png", "pdf", "svg"}
+        Format of the figures.
+    published : sequence of Published
+        Numbers of papers, for the page.
+
+    Raises
+    ------
+    DataError
+        If the run or a model cannot be read.
+    MissingExtraError
+        If matplotlib or jinja2 is not installed.
+    """
+    # A Markdown parser is dear to import, and each study imports this module.
+    from rich.markdown import Markdown
+
+    check_matplotlib()
+    with Record(run) as record:
+        folder = make_folder(out or record.path.parent / "report")
+        console.print(Markdown(run_card(record.meta)))
+        steps = record.steps()
+        if remark := record.remark():
+            print_plain(console, remark)
+        _print_status(record, len(steps), console)
+        summary = summarize(record, watched_pairs(record))
+        extremes = _extremes(record, steps, summary)
+        _print_extremes(record, extremes, console)
+        _print_events(record, console)
+        for line in lateness_lines(record.meta.get("lateness", {})):
+            print_plain(console, line)
+        figures = _draw_run(record, steps, folder, figure_format)
+        compared = [*models_of(record), *_given_with_band(record), *models]
+        applied = apply_models(record, steps, compared) if len(steps) else []
+        comparison = {
+            each.file.name: {**errors_json(each.errors), "unit": each.unit, "skipped": each.skip} for each in applied
+        }
+        more = _draw_errors(applied, folder, figure_format)
+        controlled = str(record.meta.get("controls", ""))
+        control = results_json(record, controlled) if controlled else {}
+        _print_control(control, record, controlled, console)
+        _print_comparison(comparison, applied, record, console)
+        found = {"extremes": extremes, "models": comparison, **control}
+        if page is not None:
+            write_page(page, run_page(record, steps, summary, applied, found, published))
+    for path in [*figures, *more]:
+        print_plain(console, f"figure: {path}")
+    if page is not None:
+        print_plain(console, f"page: {page}")
+    return {
+        "run": record.meta["run"],
+        "status": record.status,
+        "reason": record.reason,
+        "steps": len(steps),
+        "laboratory_seconds": record.meta.get("finished"),
+        "safe_state": record.safe_state,
+        "extremes": extremes,
+        "models": comparison,
+        "lateness": record.meta.get("lateness", {}),
+        **control,
+        "figures": [str(path) for path in [*figures, *more]],
+        "page": None if page is None else str(page),
+    }
+
+
+def draw_comparison(result: ComparedModels, out: Path) -> list[Path]:
+    """Draw the residuals of compared models, their outputs and loops; return the files."""
+    folder = make_folder(out)
+    path = folder / "residuals.png"
+    plot_errors(
+        path,
+        result.predictions.residuals(),
+        error_label=with_unit("error", result.unit),
+        skip=result.skip,
+    )
+    return [path, *draw_predictions(result.predictions, folder, "models")]
+
+
+def draw_predicted(found: Predictions, out: Path) -> list[Path]:
+    """Draw the outputs of one model; return the files."""
+    return draw_predictions(found, make_folder(out), next(iter(found.predicted)))
+
+
+def draw_identification(found: IdentifiedFile, out: Path) -> list[Path]:
+    """Draw loops, errors and density of an identified model; return the files."""
+    folder = make_folder(out)
+    operator = found.file.response
+    name = found.file.name
+    paths = draw_predictions(found.predictions(), folder, name)
+    for density in operator.densities():
+        paths.append(folder / f"{name}-density.png")
+        # What the samples of the fit swept; the coverage is that of all.
+        swept = found.identification.certificate.swept[: found.coverage.swept.size] if found.coverage else None
+        plot_densities(paths[-1], [density], swept)
+        if found.coverage is not None and isinstance(found.file.memory, MemoryCurve):
+            paths.append(folder / f"{name}-coverage.png")
+            swept = found.coverage.swept
+            resolution = found.resolution.diagonal[: swept.size] if found.resolution else None
+            plot_coverage(paths[-1], density, swept, found.file.memory, resolution)
+    return paths
+
+
+def _print_status(record: Record, steps: int, console: Console) -> None:
+    style = {"completed": "green", "unfinished": "yellow"}.get(record.status, "red")
+    expected = expected_steps(record.meta)
+    of = f" of {expected}" if expected is not None else ""
+    console.print(f"[{style}]{record.status}[/] after {steps}{of} steps", highlight=False)
+    if record.reason:
+        console.print(f"  {record.reason}", highlight=False, markup=False)
+    for device, state in record.safe_state.items():
+        console.print(f"  {device}: {state}", highlight=False, markup=False)
+
+
+def _extremes(record: Record, steps: Table, summary: TelemetrySummary) -> dict[str, dict[str, Any]]:
+    extremes: dict[str, dict[str, Any]] = {}
+    for signal in record.signals:
+        low, high = wider(summary.extremes[signal.name], steps[signal.name])
+        extremes[signal.name] = {"low": low, "high": high, "unit": signal.unit}
+    return extremes
+
+
+def _print_extremes(record: Record, extremes: Mapping[str, Mapping[str, Any]], console: Console) -> None:
+    table = Columns(
+        "signal", "lowest", "highest", "unit", title="signals, readings and telemetry", title_justify="left"
+    )
+    for signal in record.signals:
+        entry = extremes[signal.name]
+        table.add_row(signal.name, *format_numbers([entry["low"], entry["high"]], signal.unit, signal.precision))
+    console.print(table)
+
+
+def _print_events(record: Record, console: Console) -> None:
+    for event in record.events():
+        if event.level != "INFO" or event.kind == "note":
+            console.print(f"{event.t:10.1f} s  {event.kind}: {event.text}", highlight=False, markup=False)
+
+
+def _draw_run(record: Record, steps: Table, folder: Path, figure_format: str) -> list[Path]:
+    if len(steps) == 0:
+        return []
+    names = [signal.name for signal in record.signals if np.any(np.isfinite(steps[signal.name]))]
+    labels = [with_unit(name, record.unit(name)).replace(" / ", "\n/ ") for name in names]
+    paths = [folder / f"signals.{figure_format}"]
+    plot_signals(paths[0], steps["finished"] / 3600.0, {name: steps[name] for name in names}, labels)
+    layout = record.meta.get("dashboard")
+    if layout:
+        paths.append(folder / f"loop.{figure_format}")
+        plot_loops(
+            paths[1],
+            steps[layout["input"]],
+            steps[layout["output"]],
+            None,
+            input_label=with_unit(layout["input"], record.unit(layout["input"])),
+            output_label=with_unit(layout["output"], record.unit(layout["output"])),
+        )
+    return paths
+
+
+def _given_with_band(record: Record) -> list[ModelFile]:
+    """Return the models that a run was given which have a prediction band, for the signals of the run."""
+    names = {signal.name for signal in record.signals}
+    return [
+        file
+        for file in models_among(record.files(), str(record.path)).values()
+        if file.band is not None and {file.provenance.get("input"), file.provenance.get("output")} <= names
+    ]
+
+
+def _draw_errors(models: Sequence[ModelOnRun], folder: Path, figure_format: str) -> list[Path]:
+    if not models:
+        return []
+    path = folder / f"errors.{figure_format}"
+    residuals = {each.file.name: each.residuals for each in models}
+    plot_errors(
+        path,
+        residuals,
+        error_label=with_unit("error", models[0].unit),
+        skip=models[0].skip,
+        bands={each.file.name: (each.band.label, each.band.half_widths) for each in models if each.band is not None},
+    )
+    return [path]
+
+
+def _print_comparison(
+    comparison: Mapping[str, Mapping[str, Any]], models: Sequence[ModelOnRun], record: Record, console: Console
+) -> None:
+    if not comparison:
+        return
+    table = Columns(
+        "model", "max", "RMS", "unit", "RMS / % of range", title="models on this run", title_justify="left"
+    )
+    outputs = {each.file.name: each.measured.name for each in models}
+    for name, entry in comparison.items():
+        cells = format_numbers([entry["max"], entry["rms"]], entry["unit"], _precision(record, outputs[name]))
+        table.add_row(name, *cells, f"{entry['rms_percent']:.2f}")
+    console.print(table)
+
+
+def _print_control(
+    results: Mapping[str, Mapping[str, float]], record: Record, controlled: str, console: Console
+) -> None:
+    for name, entry in results.items():
+        keys = [key for key in ("max", "rms", "median") if key in entry]
+        errors = [entry[key] for key in keys]
+        *numbers, unit = format_numbers(errors, record.unit(controlled), _precision(record, controlled))
+        parts = [f"error {key} {number} {unit}".rstrip() for key, number in zip(keys, numbers, strict=True)]
+        if "seconds_per_target" in entry:
+            parts.append(f"{entry['seconds_per_target']:.1f} s a target")
+        console.print(f"{name}: {', '.join(parts)}", highlight=False)
+
+
+def _precision(record: Record, name: str) -> int:
+    return next((signal.precision for signal in record.signals if signal.name == name), Signal.precision)

@@ -1,0 +1,161 @@
+"""Two runs side by side: what differs in what they were given, and how far their signals are apart."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from bench.analysis.run_list import main_result
+from bench.analysis.tracking_errors import results_json
+from bench.protocol import PARAMETER
+from bench.record import Difference, Record, Table, differences
+
+_OF_THE_WALL_CLOCK = ("clock", "observer", "suspended", "notify", "pause", "resume", "remark", PARAMETER)
+"""Kinds of events that say how fast a machine was, and when an operator did something."""
+
+
+@dataclass(frozen=True)
+class SignalDifference:
+    """How far a signal of the second run is from that of the first, over the readings of equal steps.
+
+    Attributes
+    ----------
+    rms, maximum : float
+        Of the absolute difference, in the unit of the signal.
+    step : int
+        Step of the greatest difference.
+    unit : str
+        Unit of the signal in the first run.
+    """
+
+    rms: float
+    maximum: float
+    step: int
+    unit: str
+
+
+@dataclass(frozen=True)
+class Outcomes:
+    """How a run ended, for a table.
+
+    Attributes
+    ----------
+    run, status, reason : str
+        Its name, and how it ended.
+    steps : int
+        Finished steps.
+    seconds : float or None
+        Laboratory time, s; None of a run that has not ended.
+    result : str
+        Main result, as its protocol noted it.
+    errors : mapping
+        Errors of a run under control, as `bench.analysis.tracking_errors.results_json` gives them.
+    """
+
+    run: str
+    status: str
+    reason: str
+    steps: int
+    seconds: float | None
+    result: str
+    errors: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class RunComparison:
+    """What tells two runs apart.
+
+    Attributes
+    ----------
+    differences : tuple of Difference
+        Parameters, content of the rig, identities, versions and files that are not the same.
+    outcomes : (Outcomes, Outcomes)
+        How each ended.
+    common_steps : int
+        Number of steps that both have, by their numbers.
+    signals : mapping of str to SignalDifference
+        By the signals that both have, over these steps.
+    equal : mapping of str to bool
+        Whether `steps`, `telemetry` and `events` are equal to the last bit; events without those of the wall clock.
+    """
+
+    differences: tuple[Difference, ...]
+    outcomes: tuple[Outcomes, Outcomes]
+    common_steps: int
+    signals: Mapping[str, SignalDifference]
+    equal: Mapping[str, bool]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it for programs."""
+        return asdict(self)
+
+
+def compare_runs(first: Record, second: Record) -> RunComparison:
+    """Compare two runs, finished or not.
+
+    Raises DataError if a journal is damaged.
+    """
+    tables = first.steps(), second.steps()
+    common, ours, theirs = np.intersect1d(tables[0]["step"], tables[1]["step"], return_indices=True)
+    signals: dict[str, SignalDifference] = {}
+    for signal in first.signals:
+        if signal.name in tables[1].columns:
+            apart = np.abs(tables[1][signal.name][theirs] - tables[0][signal.name][ours])
+            if np.any(np.isfinite(apart)):
+                worst = int(np.nanargmax(apart))
+                rms = float(np.sqrt(np.nanmean(apart**2)))
+                signals[signal.name] = SignalDifference(rms, float(apart[worst]), int(common[worst]), signal.unit)
+    return RunComparison(
+        tuple(differences(first.meta, second.meta)) + _files(first, second),
+        (_outcomes(first, len(tables[0])), _outcomes(second, len(tables[1]))),
+        len(common),
+        signals,
+        {
+            "steps": _steps(first) == _steps(second) and _equal(*tables),
+            "telemetry": _equal(first.telemetry(), second.telemetry()),
+            "events": _events(first) == _events(second),
+        },
+    )
+
+
+def _files(first: Record, second: Record) -> tuple[Difference, ...]:
+    sums = [
+        {name: f"sha256 {hashlib.sha256(content).hexdigest()[:12]}" for name, content in record.files().items()}
+        for record in (first, second)
+    ]
+    return tuple(
+        Difference(f"files.{name}", sums[0].get(name), sums[1].get(name))
+        for name in {**sums[0], **sums[1]}
+        if sums[0].get(name) != sums[1].get(name)
+    )
+
+
+def _outcomes(record: Record, steps: int) -> Outcomes:
+    controlled = str(record.meta.get("controls", ""))
+    return Outcomes(
+        str(record.meta["run"]),
+        record.status,
+        record.reason,
+        steps,
+        record.meta.get("finished"),
+        main_result(record),
+        dict(results_json(record, controlled)) if controlled else {},
+    )
+
+
+def _steps(record: Record) -> list[tuple[Any, ...]]:
+    return [(step.phase, step.label, step.settled, dict(step.setpoints)) for step in record.step_records()]
+
+
+def _equal(first: Table, second: Table) -> bool:
+    return first.columns.keys() == second.columns.keys() and all(
+        np.array_equal(column, second[name], equal_nan=True) for name, column in first.columns.items()
+    )
+
+
+def _events(record: Record) -> list[Any]:
+    return [event for event in record.events() if event.kind not in _OF_THE_WALL_CLOCK]

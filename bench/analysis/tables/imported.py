@@ -1,0 +1,174 @@
+"""A run made of measurements of another program, so that reports, comparisons and models take it as their own."""
+
+from __future__ import annotations
+
+import hashlib
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from bench.analysis.tables.data import read_columns
+from bench.analysis.tables.reading.heads import split_unit
+from bench.analysis.tables.reading.options import ReadingOptions
+from bench.analysis.tables.times import find_times, read_times
+from bench.base import ConfigurationError, DataError, redacted_command, wall_time
+from bench.devices import Settled, Signal
+from bench.record import FILE_NAME, Event, Journal, StepRecord, current_user, make_folder, version_of
+
+Floats = npt.NDArray[np.float64]
+
+PROTOCOL = "imported"
+"""What an imported run has in the place of a protocol."""
+
+
+@dataclass(frozen=True)
+class ImportedRun:
+    """What was imported.
+
+    Attributes
+    ----------
+    folder : Path
+        The folder of the run.
+    rows : int
+        Number of readings.
+    assumptions : str
+        What was assumed about the layout of the file and about times.
+    """
+
+    folder: Path
+    rows: int
+    assumptions: str
+
+
+def import_file(
+    path: Path,
+    *,
+    input_column: str,
+    output_column: str,
+    others: Sequence[str] = (),
+    time_column: str | None = None,
+    title: str = "",
+    out: Path = Path("recordings"),
+    reading: ReadingOptions | None = None,
+) -> ImportedRun:
+    """Make a run of a file of measurements: each row is a reading.
+
+    Parameters
+    ----------
+    path : Path
+        A file that `read_columns` reads.
+    input_column, output_column : str
+        Columns of the input and the output of the specimen, by name or by number from 1.
+    others : sequence of str
+        Further columns.
+    time_column : str, optional
+        Column of times; if not given, one that by its name holds times. Without one, rows are 1 s apart.
+    title : str
+        Of the rig, for heads; the name of the file if empty.
+    out : Path
+        Where the folder of the run is made.
+    reading : ReadingOptions, optional
+        What is known of the layout of the file.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be read, is a run already, or times do not increase: names row and column.
+    ConfigurationError
+        If a column is asked for twice, or two signals have one name.
+    """
+    if path.is_dir() or path.suffix == ".sqlite":
+        raise DataError(f"{path} is a run already")
+    wanted = [input_column, output_column, *others]
+    if len(set(wanted)) < len(wanted):
+        raise ConfigurationError(f"columns {', '.join(wanted)}: one of them is asked for twice")
+    time_column = time_column or _times(path, reading)
+    columns = read_columns(path, [*wanted, *([time_column] if time_column else [])], options=reading)
+    rows = len(columns.values[input_column])
+    times = np.arange(1.0, rows + 1.0) if time_column is None else read_times(columns, time_column)
+    signals = [_signal(name, columns.units[name]) for name in wanted]
+    assumptions = [columns.assumptions, *(["rows are 1 s apart"] if time_column is None else [])]
+    folder = make_folder(out, f"{_word(path.stem)}-{PROTOCOL}")
+    meta = _metadata(path, folder.name, title, signals, dict(zip(("input", "output"), wanted, strict=False)), times)
+    # A file that is still there needs no row to be durable before the next.
+    journal = Journal(folder / FILE_NAME, signals, meta, {path.name: path.read_bytes()}, flushed=False)
+    values = np.column_stack([columns.values[name] for name in wanted])
+    journal.event(Event(0.0, "INFO", "phase", f"imported from {path.name}"))
+    for text in filter(None, assumptions):
+        journal.event(Event(0.0, "INFO", "note", text))
+    elapsed = times - times[0]
+    steps = np.diff(elapsed, prepend=elapsed[0]).tolist()
+    for i, (t, lasted, row) in enumerate(zip(elapsed.tolist(), steps, values.tolist(), strict=True)):
+        journal.step(StepRecord(i, t - lasted, t, PROTOCOL, "", Settled.UNRECORDED, {}, tuple(row)))
+    journal.finish(status="completed", reason="", finished=float(elapsed[-1]), safe_state={})
+    journal.close()
+    return ImportedRun(folder, rows, ", ".join(filter(None, assumptions)))
+
+
+def _times(path: Path, reading: ReadingOptions | None) -> str | None:
+    """Return the column of times, None if there is none of one record."""
+    try:
+        return find_times(path, reading)
+    except DataError:
+        return None
+
+
+def _signal(column: str, unit: str) -> Signal:
+    name = split_unit(column)[0]
+    return Signal(f"column_{name}" if name.isdecimal() else name, unit or "1", "imported", 6)
+
+
+def _word(text: str) -> str:
+    return "".join(sign if sign.isalnum() else "-" for sign in text)[:48].strip("-") or "file"
+
+
+def _metadata(
+    path: Path, run: str, title: str, signals: Sequence[Signal], ends: Mapping[str, str], times: Floats
+) -> dict[str, Any]:
+    content = path.read_bytes()
+    span = {signal.name: signal for signal in signals}
+    driven, response = list(span)[:2]
+    measured = datetime.fromtimestamp(path.stat().st_mtime, UTC)
+    now = wall_time().isoformat()
+    return {
+        "run": run,
+        "rig": path.stem,
+        "rig_title": title or path.name,
+        "rig_file": "",
+        "rig_content": {},
+        "protocol": PROTOCOL,
+        "protocol_summary": f"Imported from {path.name}",
+        "parameters": {
+            "source": str(path),
+            "sha256": hashlib.sha256(content).hexdigest(),
+            **{f"{end}_column": column for end, column in ends.items()},
+        },
+        "changed": {},
+        "overrides": {},
+        "controls": "",
+        "slots": {
+            "drive": {"device": "", "signal": driven},
+            "response": {"device": "", "signal": response},
+        },
+        "plan": {"steps": times.size, "seconds": float(times[-1] - times[0]), "at_most": None, "complete": True},
+        "seed": None,
+        "clock": "wall",
+        # Nothing better is known of when it was measured.
+        "epoch": measured.isoformat(),
+        "devices": {},
+        "limits": {},
+        "calibration": {},
+        "dashboard": None,
+        "rehearsal": None,
+        "operator": current_user(),
+        "command": redacted_command(sys.argv),
+        "packages": {"actuator-bench": version_of("actuator-bench")},
+        "git": "",
+        "host": {"started": now},
+    }

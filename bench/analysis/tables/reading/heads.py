@@ -1,0 +1,161 @@
+"""Heads of columns: names, units, and the column that is meant."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from bench.base import DataError
+
+_SYMBOL = (
+    r"(?:[yzafpnµμumcdhkMGTP]?(?:m|g|s|A|K|mol|cd|V|N|W|J|Pa|Hz|Ω|Ω|[Oo]hm|C|F|T|H|bar|eV|Oe|G|Wb|S|rad|l|L|strain)"
+    r"|°C|ºC|°F|°|º|deg|degC|deg_?C|celsius|rpm|min|h|%|‰|psi|lbf|inch|in|mil|counts?|sec|volts?|a\.u\.|arb\. ?u\.)"
+)
+_FACTOR = rf"{_SYMBOL}(?:\^?[-−]?[1-9]|[²³]|⁻[¹²³])?"
+_UNIT = rf"(?:1|{_FACTOR})(?:\s?[/*·⋅.]\s?\(?{_FACTOR}\)?|\s{_FACTOR})*|1|-"
+_SPELLINGS = {"degC": "°C", "deg_C": "°C", "ºC": "°C", "celsius": "°C", "º": "°", "sec": "s"}
+
+
+class NoColumnError(DataError):
+    """A column that a table does not have."""
+
+
+@dataclass(frozen=True)
+class Head:
+    """Head of a column.
+
+    Attributes
+    ----------
+    text : str
+        As it stands in the file.
+    name, unit : str
+        Its parts; the unit is empty where there is none.
+    """
+
+    text: str
+    name: str
+    unit: str
+
+
+@cache
+def _unit_pattern() -> re.Pattern[str]:
+    # At its first use, as it takes 20 ms to compile.
+    return re.compile(_UNIT)
+
+
+def is_unit(text: str) -> bool:
+    """Return whether a text is a unit, such as `V`, `µm` or `m/s²`; a plain `1` or `-` counts."""
+    return _unit_pattern().fullmatch(text.strip()) is not None
+
+
+def split_unit(head: str) -> tuple[str, str]:
+    """Return name and unit of a head such as `force [N]`, `force (N)` or `force / N`; the unit may be empty.
+
+    What stands in brackets after a blank is a unit; elsewhere only what is known to be one.
+    """
+    head = head.strip()
+    for opening, closing in ("[]", "()"):
+        name, bracket, rest = head.rpartition(opening)
+        if not (bracket and rest.endswith(closing) and name.strip()):
+            continue
+        unit = rest[:-1].strip()
+        if (opening == "[" and name.endswith(" ")) or is_unit(unit):
+            # As in U / (V).
+            return name.rstrip().removesuffix(" /").rstrip(), _spelled(unit)
+    for place in (match.start() for match in re.finditer("/", head)):
+        name, unit = head[:place].rstrip(), head[place + 1 :].strip()
+        # In `speed m/s` the part before the solidus is a unit too.
+        words = name.split()
+        if words and is_unit(unit) and (len(words) == 1 or not is_unit(words[-1])):
+            return name, _spelled(unit)
+    return head, ""
+
+
+def make_heads(texts: Sequence[str], units: Sequence[str] = ()) -> tuple[Head, ...]:
+    """Return heads from their texts and those of a unit row, if there is one.
+
+    A unit after an underscore, as in `voltage_V`, is taken only if every head has one and one of them has more than
+    one letter: `x_m` alone may mean anything.
+    """
+    if units:
+        padded = [*units, *[""] * len(texts)]
+        return tuple(
+            Head(text.strip(), text.strip(), bare_unit(unit)) for text, unit in zip(texts, padded, strict=False)
+        )
+    heads = tuple(Head(text.strip(), *split_unit(text)) for text in texts)
+    filled = [head for head in heads if head.text]
+    ends = [head.text.rpartition("_") for head in filled]
+    if (
+        len(filled) > 1
+        and not any(head.unit for head in filled)
+        and all(name and is_unit(unit) and unit.isalpha() for name, _, unit in ends)
+        and any(len(unit) > 1 for _, _, unit in ends)
+    ):
+        return tuple(
+            Head(head.text, head.text.rpartition("_")[0], _spelled(head.text.rpartition("_")[2])) for head in heads
+        )
+    return heads
+
+
+def bare_unit(text: str) -> str:
+    """Return a unit of a unit row without its brackets; a dash is no unit."""
+    text = text.strip()
+    if text[:1] + text[-1:] in ("[]", "()"):
+        text = text[1:-1].strip()
+    return "" if text in ("-", "") else _spelled(text)
+
+
+def find_place(path: Path, heads: Sequence[Head], columns: int, name: str) -> int:
+    """Return the index of the column that a name or a number from 1 means.
+
+    Parameters
+    ----------
+    path : Path
+        The file, for messages.
+    heads : sequence of Head
+        Heads, none where the table has no header.
+    columns : int
+        Number of columns.
+    name : str
+        Head, head without its unit, or number.
+
+    Raises
+    ------
+    NoColumnError
+        If there is no such column.
+    DataError
+        If there are several.
+    """
+    wanted = _folded(name.strip())
+    exact = [i for i, head in enumerate(heads) if _folded(head.text) == wanted]
+    places = exact or [i for i, head in enumerate(heads) if _folded(head.name) == wanted]
+    if len(places) == 1:
+        return places[0]
+    if len(places) > 1:
+        numbers = " or ".join(str(place + 1) for place in places)
+        raise DataError(
+            f"{path}: has {len(places)} columns {name!r}; name one with its unit, as in the header, or by its "
+            f"number: {numbers}"
+        )
+    if name.isdecimal() and 1 <= int(name) <= columns:
+        return int(name) - 1
+    if not heads:
+        raise NoColumnError(
+            f"{path}: has no column {name!r}, as it has no header line; name columns by number, 1 to {columns}"
+        )
+    known = ", ".join(head.text for head in heads if head.text)
+    raise NoColumnError(f"{path}: has no column {name!r}; it has: {known} (or a number, 1 to {columns})")
+
+
+def _spelled(unit: str) -> str:
+    unit = unit.replace("μ", "µ").replace("Ω", "Ω")
+    unit = _SPELLINGS.get(unit, unit)
+    # An instrument that has no µ writes u.
+    return re.sub(r"\bu(?=(?:m|A|V|s|N|W|F|H|strain)\b)", "µ", unit)
+
+
+def _folded(text: str) -> str:
+    return text.replace("μ", "µ").replace("º", "°")

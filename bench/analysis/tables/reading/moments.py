@@ -1,0 +1,64 @@
+"""Cells with a date and a time of day, or a time alone: seconds."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Collection, Sequence
+from datetime import UTC, datetime
+
+import numpy as np
+import numpy.typing as npt
+
+from bench.base import DataError
+
+Floats = npt.NDArray[np.float64]
+
+_CLOCK = re.compile(r"(\d+):([0-5]\d):([0-5]\d(?:[.,]\d+)?)")
+"""Hours, which may be more than 24, minutes and seconds."""
+
+
+def seconds_of(cell: str) -> float | None:
+    """Return a date with a time of day (ISO 8601) or hours, minutes and seconds in s; None if it is neither.
+
+    Dates count from 1970 in universal time; those without a zone are taken as such.
+    """
+    cell = cell.strip().strip('"')
+    if ":" not in cell:
+        return None
+    if found := _CLOCK.fullmatch(cell):
+        hours, minutes, seconds = found.groups()
+        return 3600.0 * int(hours) + 60.0 * int(minutes) + float(seconds.replace(",", "."))
+    try:
+        moment = datetime.fromisoformat(cell)
+    except ValueError:
+        return None
+    return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+
+
+def moment_in(where: str, cell: str) -> float:
+    """Return the seconds in a cell; raises DataError with the place if it has no date and time."""
+    found = seconds_of(cell)
+    if found is None:
+        raise DataError(f"{where}: {cell[:40]!r} is no date and time, as those above are")
+    return found
+
+
+def with_moments(cells: Sequence[str], places: Collection[int]) -> frozenset[int]:
+    """Return those of some columns that have a date and time in a row of cells."""
+    return frozenset(place for place in places if place < len(cells) and seconds_of(cells[place].strip()) is not None)
+
+
+def since_first(
+    values: Sequence[Floats], units: Sequence[str], names: Sequence[str], are_moments: Sequence[bool]
+) -> tuple[list[Floats], list[str], list[str]]:
+    """Return columns, shape (N,) each, with those of dates and times in s since the first row; units, and notes."""
+    pairs = list(zip(values, are_moments, strict=True))
+    return (
+        [column - column[:1] if is_moment else column for column, is_moment in pairs],
+        ["s" if is_moment else unit for unit, is_moment in zip(units, are_moments, strict=True)],
+        [
+            f"{name}: dates and times, in s since the first row"
+            for name, is_moment in zip(names, are_moments, strict=True)
+            if is_moment
+        ],
+    )

@@ -1,0 +1,53 @@
+"""What every reader of a file gives, and the number that a cell must be."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from bench.analysis.tables.reading.layout import is_number
+from bench.base import DataError
+
+NO_ROW_LEFT_OUT = "no option leaves out a row"
+"""Begins the remedy for a cell that is not a finite number."""
+
+OTHER_COLUMN = "; most rows have no number in this column: choose another"
+"""Remedy for a cell of a column that is not one of numbers."""
+
+
+@dataclass(frozen=True)
+class ReadColumns:
+    """Columns that were read.
+
+    Attributes
+    ----------
+    values : list of ndarray
+        In the order in which they were asked for, shape (rows,) each, finite.
+    units : list of str
+        Likewise; empty where the file does not say.
+    notes : tuple of str
+        What was assumed about the file.
+    """
+
+    values: list[npt.NDArray[np.float64]]
+    units: list[str]
+    notes: tuple[str, ...]
+
+
+def finite_number(where: str, cell: str, decimal: str = ".", remedy: str = "") -> float:
+    """Return the number in a cell.
+
+    Raises DataError with the place and a remedy, if there is none or it is not finite.
+    """
+    if not cell:
+        raise DataError(f"{where}: is empty; expected a number{remedy}")
+    if not is_number(cell, decimal):
+        shown = cell if len(cell) < 40 else f"{cell[:40]}…"
+        raise DataError(f"{where}: {shown!r} is not a number{remedy}")
+    value = float((cell.replace(",", ".") if decimal == "," else cell).upper().replace("D", "E"))
+    if not math.isfinite(value):
+        raise DataError(f"{where}: {cell[:40]} is not a finite number{remedy}")
+    return value

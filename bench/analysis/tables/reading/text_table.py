@@ -1,0 +1,305 @@
+"""Columns of a table of text: numpy reads them at once; what it cannot read is looked at cell by cell."""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import re
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from bench.analysis.tables.reading.formats import check_format
+from bench.analysis.tables.reading.heads import NoColumnError, find_place
+from bench.analysis.tables.reading.layout import (
+    D_EXPONENTS,
+    Layout,
+    closes_its_quotes,
+    count_lines,
+    find_layout,
+    header_only,
+    is_comment,
+    is_number,
+    split_rows,
+)
+from bench.analysis.tables.reading.moments import moment_in, since_first, with_moments
+from bench.analysis.tables.reading.options import ReadingOptions
+from bench.analysis.tables.reading.remedies import cell_remedy, is_cut_off, missing_column
+from bench.analysis.tables.reading.summary_rows import is_label, text_note
+from bench.analysis.tables.reading.table import ReadColumns, finite_number
+from bench.analysis.tables.reading.tables import Ending, count_tables, find_end, note_rest, read_sample, walk_tables
+from bench.analysis.tables.reading.text import TextFile, open_text
+from bench.base import ConfigurationError, DataError
+
+Floats = npt.NDArray[np.float64]
+
+_LETTER = re.compile(r"[^\x00-@E\[-`e{-\x7f]")
+"""A letter but for that of an exponent."""
+
+_D_EXPONENT = re.compile(r"(\d*\.\d*)[dD](?=[+-]?\d)")
+
+
+class _BreakError(Exception):
+    """Lines that may not be of the table."""
+
+
+def read_text(path: Path, names: Sequence[str], options: ReadingOptions) -> ReadColumns:
+    """Read columns of a text file.
+
+    Parameters
+    ----------
+    path : Path
+        The file, perhaps compressed by gzip.
+    names : sequence of str
+        Columns by head, head without its unit, or number from 1.
+    options : ReadingOptions
+        What is known of its layout.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be read, is ambiguous, or a cell is not a finite number: names line and option.
+    ConfigurationError
+        If `options.table` is not a number.
+    """
+    if options.table is not None and not options.table.isdecimal():
+        raise ConfigurationError(f"--table {options.table!r}: the tables of a text file have numbers, from 1")
+    file = open_text(path, options.encoding)
+    try:
+        return _read(file, names, options)
+    except csv.Error as error:
+        raise DataError(f"{path} cannot be read as a table: {error}") from None
+
+
+def _read(file: TextFile, names: Sequence[str], options: ReadingOptions) -> ReadColumns:
+    lines = read_sample(file, options.skip_lines)
+    check_format(file.path, lines)
+    layout = _choose(file, options, lines)
+    places = _find_places(file, names, options, layout, lines)
+    body = _Body(file, layout, names, places)
+    after: tuple[str, ...] = ()
+    try:
+        values = body.at_once()
+    except (_BreakError, DataError, ValueError):
+        body.ending = find_end(file, layout, places)
+        after = note_rest(file, options, layout, body.ending)
+        try:
+            values = body.at_once()
+        except (_BreakError, DataError, ValueError):
+            values = body.cell_by_cell()
+    if not all(np.isfinite(column).all() for column in values):
+        values = body.cell_by_cell()
+    encoding = file.encoding.removesuffix("-sig")
+    comments = layout.comments + body.comments
+    notes = (
+        *(["gzip"] if file.compressed else []),
+        *([encoding.upper() if encoding.startswith("utf") else encoding] if encoding != "utf-8" else []),
+        *([f"table {int(options.table)}"] if options.table else []),
+        *layout.notes,
+        *([count_lines(comments, "of comment")] if comments else []),
+        *(text_note(body.ending.within) if body.ending else []),
+        *after,
+    )
+    units = [layout.heads[place].unit if place < len(layout.heads) else "" for place in places]
+    values, units, remarks = since_first(values, units, names, [place in body.moments for place in places])
+    return ReadColumns(values, units, (*notes, *remarks))
+
+
+def _choose(file: TextFile, options: ReadingOptions, lines: Sequence[str]) -> Layout:
+    """Return the layout of the table that is chosen.
+
+    Raises DataError if there is no such table.
+    """
+    start, table = options.skip_lines, int(options.table or 1)
+    if options.table is None:
+        layout = find_layout(file.path, lines, options, start)
+    else:
+        layouts = list(itertools.islice(walk_tables(file, options), table))
+        if len(layouts) < table > 1:
+            raise DataError(f"{file.path}: --table {table}: it has {count_tables(max(len(layouts), 1))}")
+        layout = layouts[-1] if layouts else None
+    layout = layout or header_only(lines, options, start)
+    if layout is None and is_cut_off(lines):
+        raise DataError(
+            f"{file.path}: has neither a header nor numbers in {len(lines)} lines from line {start + 1}; leave out "
+            "the lines above the table with --skip-lines"
+        )
+    if layout is None:
+        raise DataError(f"{file.path}: is empty; expected a header line with column names, or numbers")
+    return layout
+
+
+def _find_places(
+    file: TextFile, names: Sequence[str], options: ReadingOptions, layout: Layout, lines: Sequence[str]
+) -> list[int]:
+    """Return the indices of the columns that are asked for.
+
+    Raises DataError that says what may help if there is no such column.
+    """
+    places: list[int] = []
+    for name in names:
+        try:
+            places.append(
+                find_place(file.path, layout.heads, layout.columns, name)
+                if _fits(layout)
+                else _place_by_number(file, layout, name)
+            )
+        except NoColumnError as error:
+            raise missing_column(error, name, file, options, layout, lines) from None
+    return places
+
+
+class _Body:
+    """The data of a table.
+
+    Attributes
+    ----------
+    ending : Ending or None
+        End of the table; None as long as it was not looked for.
+    comments : int
+        Number of lines of comment within it.
+    moments : frozenset of int
+        Indices of the columns that have dates and times, by their first row.
+    """
+
+    def __init__(self, file: TextFile, layout: Layout, names: Sequence[str], places: Sequence[int]) -> None:
+        self._file, self._layout, self._names, self._places = file, layout, names, places
+        self._width = max(layout.columns, len(layout.heads))
+        self.ending: Ending | None = None
+        self.comments = 0
+        self.moments: frozenset[int] = frozenset()
+
+    def at_once(self) -> list[Floats]:
+        """Return the columns by numpy's reader, shape (rows,) each.
+
+        Raises ValueError, DataError or _BreakError if cells are not all numbers, or moments.
+        """
+        layout = self._layout
+        if layout.decimal == layout.delimiter:
+            raise ValueError("cells are in quotes")
+        lines = self._lines()
+        first = next(lines, None)
+        if first is None:
+            return [np.empty(0) for _ in self._places]
+        wanted = sorted(set(self._places))
+        row = next(split_rows([first], layout.delimiter), None)
+        self.moments = with_moments(row.cells, wanted) if row is not None else frozenset()
+        array = np.loadtxt(
+            itertools.chain([first], lines),
+            delimiter=None if layout.delimiter == " " else layout.delimiter,
+            usecols=wanted,
+            comments=None,
+            quotechar='"',
+            ndmin=2,
+            converters={place: partial(moment_in, "") for place in self.moments} or None,
+        )
+        return [np.ascontiguousarray(array[:, wanted.index(place)]) for place in self._places]
+
+    def cell_by_cell(self) -> list[Floats]:
+        """Return the columns by looking at each cell.
+
+        Raises DataError that names the first that is not a finite number.
+        """
+        layout, path = self._layout, self._file.path
+        values: list[list[float]] = [[] for _ in self._places]
+        lines = self._closed(self._file.lines(layout.start, self._end()))
+        for number, row in enumerate(split_rows(lines, layout.delimiter, layout.start), start=1):
+            if any(is_number(cell, layout.decimal) for cell in row.cells[self._width :]):
+                raise DataError(
+                    f"{path}: line {row.line}, row {number}: has {len(row.cells)} cells; the table has {self._width} "
+                    "columns, so that its numbers may stand in the wrong ones; remove what is too much"
+                )
+            if number == 1:
+                self.moments = with_moments(row.cells, self._places)
+            for name, place, column in zip(self._names, self._places, values, strict=True):
+                cell = row.cells[place].strip() if place < len(row.cells) else ""
+                where = f"{path}: line {row.line}, row {number}, column {name}"
+                column.append(self._number(where, cell, place, row.line, first=not column))
+        return [np.array(column, dtype=np.float64) for column in values]
+
+    def _number(self, where: str, cell: str, place: int, line: int, *, first: bool) -> float:
+        if place in self.moments:
+            return moment_in(where, cell)
+        try:
+            return finite_number(where, cell, self._layout.decimal)
+        except DataError as error:
+            raise DataError(f"{error}{cell_remedy(cell, self._layout, place, line, first=first)}") from None
+
+    def _end(self) -> int | None:
+        return None if self.ending is None else self.ending.end
+
+    def _lines(self) -> Iterator[str]:
+        """Yield the lines of data as numpy reads numbers.
+
+        Raises _BreakError where what follows may not be of the table.
+        """
+        marks, comma = self._layout.marks, self._layout.decimal == ","
+        exponents = D_EXPONENTS in self._layout.notes
+        self.comments = blank = 0
+        for line in self._closed(self._file.lines(self._layout.start, self._end())):
+            if line.isspace():
+                blank += 1
+                continue
+            if is_comment(line, marks):
+                if blank:
+                    raise _BreakError
+                self.comments += 1
+                continue
+            if blank > 1:
+                raise _BreakError
+            blank = 0
+            if self.ending is None and _LETTER.search(line) and self._has_label(line):
+                raise _BreakError
+            if self._is_longer(line):
+                raise ValueError("more cells than columns")
+            if comma:
+                # A point within numbers of decimal comma is none; it may not become one.
+                line = line.replace(".", "?").replace(",", ".")
+            yield _D_EXPONENT.sub(r"\1E", line) if exponents else line
+
+    def _is_longer(self, line: str) -> bool:
+        """Return whether a line may have more cells than the table has columns."""
+        delimiter = self._layout.delimiter
+        if delimiter == " ":
+            return len(line.split()) > self._width
+        return (
+            line.count(delimiter) >= self._width
+            and len(line.rstrip(f"{delimiter} \r\n\t").split(delimiter)) > self._width
+        )
+
+    def _closed(self, lines: Iterator[str]) -> Iterator[str]:
+        """Yield lines of data; raise DataError for a quote that opens a cell and does not close it in its line."""
+        layout = self._layout
+        for number, line in enumerate(lines, start=layout.start + 1):
+            if not closes_its_quotes(line, layout.delimiter) and not is_comment(line, layout.marks):
+                raise DataError(
+                    f"{self._file.path}: line {number}: a quotation mark opens a cell and does not close it before "
+                    "the next delimiter or the end of the line; remove it, or close it"
+                )
+            yield line
+
+    def _has_label(self, line: str) -> bool:
+        """Return whether a line may have a label in a column of numbers, dates or times."""
+        cells = line.split(None if self._layout.delimiter == " " else self._layout.delimiter)
+        for place in self._layout.figures:
+            # Most cells begin with a digit.
+            if place < len(cells) and not cells[place][:1].isdigit() and is_label(cells[place], self._layout.decimal):
+                return True
+        return False
+
+
+def _fits(layout: Layout) -> bool:
+    return bool(layout.heads) or "no header" in layout.notes
+
+
+def _place_by_number(file: TextFile, layout: Layout, name: str) -> int:
+    if name.isdecimal() and 1 <= int(name) <= layout.columns:
+        return int(name) - 1
+    raise NoColumnError(
+        f"{file.path}: line {layout.start}: the header does not fit the {layout.columns} columns below it, so "
+        f"there is no column {name!r}; name columns by number, 1 to {layout.columns}, or say --delimiter, --decimal "
+        "or --skip-lines"
+    )

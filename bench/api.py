@@ -1,0 +1,315 @@
+"""The bench for scripts and notebooks: the functions that `import bench` offers.
+
+>>> import bench
+>>> with bench.open_rig("vo2") as rig:  # on its virtual clock, as it is emulated
+...     status = rig.devices["tec"].set(40.0)
+...     status.wait()
+...     print(round(rig.measure()["tec_temperature"]))
+40
+
+Leaving the block brings every device into its safe state before its line is closed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+from rich.console import Console
+
+from bench.analysis import (
+    PAGE_NAME,
+    IdentifiedFile,
+    InvertedTargets,
+    ReadingOptions,
+    RunFolder,
+    identify_file,
+    invert_targets,
+    predict as predict_file,
+    report_run,
+)
+from bench.base import BenchError, DeviceError, VirtualClock, wall_time
+from bench.batch import published_of
+from bench.identification import ModelFile, load_model
+from bench.protocol import ProtocolDefinition, find_protocol
+from bench.rig import SAFE, Rig, clock_for, load_rig
+from bench.run import Run, carry_out
+
+Model: TypeAlias = IdentifiedFile | ModelFile | Path | str
+"""What a model may be given as: the result of `identify` or `load`, or a model file."""
+
+
+def open_rig(
+    rig: str | Path, *, seed: int = 0, clock: str | None = None, overrides: Mapping[str, str] | None = None
+) -> Rig:
+    """Connect a rig.
+
+    Parameters
+    ----------
+    rig : str or Path
+        Name of an installed rig, or path of a rig file.
+    seed : int
+        Seed of all that is random in an emulated laboratory.
+    clock : str, optional
+        `wall`, `virtual` or `xN`; if not given, `virtual` where all instruments are emulated in this process,
+        else `wall`. There `wall` and `xN` slow down when the process is late, rather than run ahead of it.
+    overrides : mapping of str to str, optional
+        Values of the rig file to replace, by dotted key.
+
+    Returns
+    -------
+    Rig
+        A context manager: leaving it makes every device safe, then closes its line.
+
+    Raises
+    ------
+    ConfigurationError
+        If the rig file is wrong.
+    DeviceError
+        If a device cannot be connected; nothing has moved.
+    """
+    file = load_rig(str(rig), overrides)
+    passing = clock_for(file, clock or ("virtual" if file.in_process else "wall"))
+    if isinstance(passing, VirtualClock):
+        # Time stamps that stand beside those of another program, such as bluesky's, count from today.
+        passing.go_on(wall_time(), 0.0)
+    return Rig(file, passing, seed)
+
+
+def run(
+    protocol: str | ProtocolDefinition,
+    rig: str | Path,
+    *,
+    out: str | Path = "recordings",
+    seed: int = 0,
+    clock: str | None = None,
+    overrides: Mapping[str, str] | None = None,
+    live: bool = False,
+    recording: bool = False,
+    progress: bool = False,
+    **parameters: Any,  # noqa: ANN401 - each protocol names and types its own
+) -> RunFolder:
+    """Carry out a protocol on a rig, record it, make every device safe, and return what was recorded.
+
+    Parameters
+    ----------
+    protocol : str or ProtocolDefinition
+        Name, `path/to/file.py[:NAME]`, or the protocol itself.
+    rig : str or Path
+        Name of an installed rig, or path of a rig file.
+    out : str or Path
+        Where the folder of the run is made.
+    seed, clock, overrides
+        As for `open_rig`.
+    live : bool
+        Whether to serve the live view on the loopback interface.
+    recording : bool
+        Whether to write the recording for the viewer while the run goes on.
+    progress : bool
+        Whether to print the progress.
+    **parameters
+        Parameters of the protocol; the others have the rig's defaults or its own.
+
+    Raises
+    ------
+    BenchError
+        If anything is wrong before the start, the run does not complete, or the safe state is not confirmed; what
+        was recorded is kept, and the error names its folder.
+
+    Examples
+    --------
+    >>> folder = getfixture("tmp_path")
+    >>> found = run("creep", "vo2", out=folder, hot=70.0, cool=50.0, duration=8.0)
+    >>> found.status, len(found.readings)
+    ('completed', 35)
+    >>> round(float(found.readings["tec_temperature"].max()))
+    70
+    """
+    definition = find_protocol(protocol) if isinstance(protocol, str) else protocol
+    file = load_rig(str(rig), overrides)
+    result = carry_out(
+        Run(
+            protocol=definition,
+            settings=parameters,
+            rig=str(rig),
+            folder=Path(out),
+            overrides=overrides or {},
+            seed=seed,
+            clock=clock or ("virtual" if file.in_process else "wall"),
+            live=live,
+            recording=recording,
+        ),
+        Console(quiet=not progress),
+    )
+    outcome = result.outcome
+    unsafe = ", ".join(name for name, state in outcome.safe_state.items() if state != SAFE)
+    error = outcome.error or (DeviceError(unsafe, "NOT in its safe state") if unsafe else None)
+    if error is not None:
+        error.add_note(f"recorded in {result.folder}" + (f"; NOT in its safe state: {unsafe}" if unsafe else ""))
+        raise error
+    return RunFolder(result.folder)
+
+
+def identify(
+    source: RunFolder | str | Path,
+    model: str,
+    *,
+    input: str | None = None,  # noqa: A002 - the word of the command line
+    output: str | None = None,
+    **options: Any,  # noqa: ANN401 - each model names and types its own
+) -> IdentifiedFile:
+    """Identify a model from a run or a file of measurements.
+
+    Parameters
+    ----------
+    source : RunFolder, str or Path
+        A run, or a table of measurements: text, .gz, .mat, .xlsx or .parquet.
+    model : str
+        Name of a registered model.
+    input, output : str, optional
+        Columns, by name or by number from 1; of a run, the reading of its slot `drive` and the signal of its slot
+        `response` if not given.
+    **options
+        As in `bench.analysis.identify_file`: `smoothing`, `skip`, `cross_validated`, `initial`, `orientation`,
+        `time_column` for a model with time, and the options of the model; and those of `ReadingOptions` where the
+        layout of a file is not found from it: `delimiter`, `decimal`, `encoding`, `skip_lines`, `table`.
+
+    Raises
+    ------
+    DataError
+        If the measurements cannot be used.
+    ConfigurationError
+        If there is no such model, or an option does not belong to it.
+
+    Examples
+    --------
+    >>> folder = getfixture("tmp_path")
+    >>> measured = run("damped-oscillation", "vo2", out=folder, increment=3.0, half_cycles=8)
+    >>> model = identify(measured, "preisach-nonmonotonic", levels=8, plane=(30.0, 70.0))
+    >>> model.identification.errors.rms_percent < 5.0
+    True
+    >>> curvature = predict(model, [21.0, 60.0, 66.0, 62.0])
+    >>> curvature.shape
+    (4,)
+    >>> invert(model, [500.0, 900.0]).flags
+    ('met', 'met')
+    """
+    folder = source.folder if isinstance(source, RunFolder) else Path(source)
+    if folder.is_dir():
+        recorded = RunFolder(folder)
+        input, output = input or recorded.signal_of("drive"), output or recorded.signal_of("response")  # noqa: A001
+    if input is None or output is None:
+        raise BenchError(f"{folder}: name the columns: input=..., output=...")
+    reading = ReadingOptions(
+        **{field.name: options.pop(field.name) for field in fields(ReadingOptions) if field.name in options}
+    )
+    return identify_file(folder, input_column=input, output_column=output, model=model, reading=reading, **options)
+
+
+def predict(
+    model: Model,
+    inputs: npt.ArrayLike,
+    *,
+    times: npt.ArrayLike | None = None,
+    initial: str | None = None,
+    continue_memory: bool = False,
+) -> npt.NDArray[np.float64]:
+    """Return the outputs of a model for a sequence of inputs, shape (N,), in its units.
+
+    Parameters
+    ----------
+    model : IdentifiedFile, ModelFile, Path or str
+        The model.
+    inputs : array_like, shape (N,)
+        Inputs in the unit of the model.
+    times : array_like, shape (N,), optional
+        s, strictly increasing, for a model with time.
+    initial : {"file", "negative", "positive"}, optional
+        The memory before the first input: that at the start of the model's own data (if not given), or saturation at
+        the low or the high end of the operating range.
+    continue_memory : bool
+        Whether to start from the memory at the end of the model's own data instead.
+
+    Raises
+    ------
+    DataError
+        If a model file cannot be read.
+    ConfigurationError
+        If a model with time has no times.
+    """
+    values = np.asarray(inputs, dtype=np.float64)
+    moments = None if times is None else np.asarray(times, dtype=np.float64)
+    return predict_file(_model(model), values, initial=initial, continue_memory=continue_memory, times=moments)
+
+
+def invert(
+    model: Model,
+    targets: npt.ArrayLike,
+    *,
+    times: npt.ArrayLike | None = None,
+    initial: str | None = None,
+    continue_memory: bool = False,
+) -> InvertedTargets:
+    """Return the set-points that bring a model's output to one target after another; see `InvertedTargets`.
+
+    Parameters
+    ----------
+    model, times, initial, continue_memory
+        As for `predict`.
+    targets : array_like, shape (N,)
+        Targets in the unit of the model's output.
+
+    Raises
+    ------
+    DataError
+        If a model file cannot be read, or the model has several inputs.
+    ConfigurationError
+        If a model with time has no times or another one has, or it has no inverse at these times.
+    """
+    values = np.asarray(targets, dtype=np.float64)
+    moments = None if times is None else np.asarray(times, dtype=np.float64)
+    return invert_targets(_model(model), values, initial=initial, continue_memory=continue_memory, times=moments)
+
+
+def load(path: str | Path) -> RunFolder | ModelFile:
+    """Return a run (a folder or its journal) or a model (a `.json` file).
+
+    Raises DataError if it is neither, or cannot be read.
+    """
+    if Path(path).suffix == ".json":
+        return load_model(Path(path))
+    found = RunFolder(Path(path))
+    # Reads the journal, so that a wrong path is found here.
+    _ = found.status
+    return found
+
+
+def report(source: RunFolder | str | Path, models: Sequence[Model] = ()) -> dict[str, Any]:
+    """Print tables of a run, draw its figures and write its page `report.html`; return the same for programs.
+
+    Parameters
+    ----------
+    source : RunFolder, str or Path
+        The run.
+    models : sequence of IdentifiedFile, ModelFile, Path or str
+        Models to try on it, beside those that were identified from it.
+
+    Raises
+    ------
+    DataError
+        If the run or a model cannot be read.
+    """
+    folder = source.folder if isinstance(source, RunFolder) else Path(source)
+    published = published_of(folder)
+    page = (folder if folder.is_dir() else folder.parent) / PAGE_NAME
+    return report_run(folder, [_model(model) for model in models], None, Console(), page=page, published=published)
+
+
+def _model(model: Model) -> ModelFile:
+    if isinstance(model, IdentifiedFile):
+        return model.file
+    return model if isinstance(model, ModelFile) else load_model(Path(model))

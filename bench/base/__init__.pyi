@@ -1,0 +1,122 @@
+from . import (
+    checks as checks,
+    errors as errors,
+    registry as registry,
+)
+from .checked_table import (
+    CheckedTable as CheckedTable,
+)
+from .checks import (
+    Floats as Floats,
+)
+from .clock import (
+    Clock as Clock,
+    Pace as Pace,
+    PacedClock as PacedClock,
+    ScaledClock as ScaledClock,
+    Stopwatch as Stopwatch,
+    VirtualClock as VirtualClock,
+    WallClock as WallClock,
+    make_clock as make_clock,
+    slowness as slowness,
+    wall_time as wall_time,
+)
+from .compilation_display import (
+    CompilationDisplay as CompilationDisplay,
+    compile_kernels as compile_kernels,
+)
+from .compiled import (
+    Cube as Cube,
+    Fixed as Fixed,
+    IntegerTable as IntegerTable,
+    Table as Table,
+    inlined as inlined,
+    inner as inner,
+    kernel as kernel,
+    kernels_of as kernels_of,
+    reordered as reordered,
+)
+from .configuration_errors import (
+    problems as problems,
+)
+from .deferred import (
+    DeferredModule as DeferredModule,
+)
+from .errors import (
+    AbortError as AbortError,
+    AgreementError as AgreementError,
+    BenchError as BenchError,
+    ConfigurationError as ConfigurationError,
+    ConvergenceError as ConvergenceError,
+    DataError as DataError,
+    DeviceConnectionError as DeviceConnectionError,
+    DeviceError as DeviceError,
+    DeviceRestartedError as DeviceRestartedError,
+    GuardianError as GuardianError,
+    IncompleteRecordWarning as IncompleteRecordWarning,
+    InterlockError as InterlockError,
+    LimitError as LimitError,
+    RecordError as RecordError,
+    SettleTimeoutError as SettleTimeoutError,
+    WatchdogError as WatchdogError,
+)
+from .extras import (
+    MissingExtraError as MissingExtraError,
+    check_extra as check_extra,
+    needed_for as needed_for,
+)
+from .interrupts import (
+    ENDING as ENDING,
+    STACKS as STACKS,
+    Interrupts as Interrupts,
+    say_at_once as say_at_once,
+)
+from .parsing import (
+    comma_remark as comma_remark,
+    end_of_json as end_of_json,
+    json_text as json_text,
+    parse_json as parse_json,
+    parse_toml as parse_toml,
+    write_json_file as write_json_file,
+)
+from .printing import (
+    PlainConsole as PlainConsole,
+    print_plain as print_plain,
+    show_table as show_table,
+)
+from .redaction import (
+    OPTION as OPTION,
+    redacted as redacted,
+    redacted_command as redacted_command,
+)
+from .remaining_time import (
+    Expectation as Expectation,
+    RemainingTime as RemainingTime,
+)
+from .shares import (
+    say_share as say_share,
+    shares_to as shares_to,
+)
+from .units import (
+    check_unit as check_unit,
+    fitting_prefix as fitting_prefix,
+    format_duration as format_duration,
+    format_numbers as format_numbers,
+    header_with_unit as header_with_unit,
+    per_square as per_square,
+    quantity as quantity,
+    unit_registry as unit_registry,
+    with_unit as with_unit,
+)
+from .workers.display import (
+    TasksDisplay as TasksDisplay,
+)
+from .workers.pool import (
+    Pending as Pending,
+    Workers as Workers,
+    available_cores as available_cores,
+)
+from .workers.task import (
+    report as report,
+    task_console as task_console,
+)

@@ -1,0 +1,185 @@
+"""Carrying out the tasks of a campaign: not those that were done before, and each once what it needs is there."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Protocol
+
+from bench.base import BenchError, ConfigurationError, Pending, Workers
+from bench.batch.campaign.tasks import DONE_NAME, SHOWN_DIGITS, UNFINISHED, Done, Task
+from bench.rig import Holder, Locks
+
+FILE_NAME = "campaign.toml"
+"""Copy of the campaign file in the folder of the campaign."""
+
+
+class Executor(Protocol):
+    """Carries tasks out, many at a time."""
+
+    def submit(self, task: Task) -> None:
+        """Have a task carried out; all that it needs is in the folder of the campaign."""
+
+    def next_done(self) -> tuple[Task, Done]:
+        """Wait for a task that was submitted, and return it with what it left; its folder is there by then."""
+
+
+class WorkersExecutor:
+    """Carries tasks out in the worker processes of this machine.
+
+    Parameters
+    ----------
+    workers : Workers
+        That are at work.
+    campaign : Path
+        Folder of the campaign.
+    """
+
+    def __init__(self, workers: Workers, campaign: Path) -> None:
+        self._workers = workers
+        self._campaign = campaign
+        self._pending: dict[Pending[Done], Task] = {}
+
+    def submit(self, task: Task) -> None:
+        """Have a task carried out."""
+        self._pending[self._workers.submit_as(task.name, task.carry_out, self._campaign)] = task
+
+    def next_done(self) -> tuple[Task, Done]:
+        """Wait for a task."""
+        pending = next(iter(self._workers.as_completed(self._pending)))
+        task = self._pending.pop(pending)
+        return task, settled(task, pending.error, None if pending.error else pending.result())
+
+
+def settled(task: Task, error: BaseException | None, done: Done | None) -> Done:
+    """Return what a task left, also where it has raised."""
+    if done is not None:
+        return done
+    if isinstance(error, BenchError):
+        return Done(task.identity, "refused", str(error))
+    return Done(task.identity, "crashed", f"{type(error).__name__}: {error}")
+
+
+def opened_folder(campaign: Path, text: str, locks: Locks) -> None:
+    """Make the folder of a campaign ready, for one process at a time; what others left unfinished is removed.
+
+    Raises ConfigurationError if another campaign is at work in it, or it cannot be written.
+    """
+    try:
+        campaign.mkdir(parents=True, exist_ok=True)
+        locks.take_folder(campaign)
+        shutil.rmtree(campaign / UNFINISHED, ignore_errors=True)
+        (campaign / FILE_NAME).write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise ConfigurationError(f"the folder of the campaign cannot be made: {error}") from None
+
+
+def holder(campaign: Path) -> Holder:
+    """Return who holds the folder of a campaign, for others."""
+    return Holder.of_this_process("emulated", f"a campaign in {campaign.resolve()}")
+
+
+@dataclass(frozen=True)
+class Before:
+    """What earlier starts have left.
+
+    Attributes
+    ----------
+    done : dict of str to Done
+        By name of the task.
+    places : dict of str to str
+        By name of a task the one that it had then: what differs among the runs was something else.
+    lost : dict of str to tuple of str
+        By name of a task that has to be done again the files that have gone from its folder.
+    """
+
+    done: dict[str, Done]
+    places: dict[str, str]
+    lost: dict[str, tuple[str, ...]] = field(default_factory=dict)
+
+    def put_in_place(self, campaign: Path) -> list[str]:
+        """Rename the folders of tasks that have another name now, and of those that are not whole.
+
+        Returns
+        -------
+        list of str
+            A line for each task that is done again as its folder is not whole.
+        """
+        lines = []
+        for name, files in self.lost.items():
+            aside = _aside(campaign / name)
+            (campaign / name).replace(aside)
+            what = "was not whole" if name in self.done else "is done again"
+            lines.append(
+                f"{name} {what}, as {' and '.join(files)} is gone; what was left is in {aside.name} beside it"
+            )
+        for name, former in self.places.items():
+            (campaign / name).parent.mkdir(parents=True, exist_ok=True)
+            (campaign / former).replace(campaign / name)
+        return lines
+
+
+def _aside(folder: Path) -> Path:
+    """Return a name beside a folder that nothing has yet, and that is not the name of a task."""
+    names = (f"{folder.name}.incomplete{suffix}" for suffix in ("", *(f"-{i}" for i in range(2, 1000))))
+    return next(each for name in names if not (each := folder.with_name(name)).exists())
+
+
+def done_before(tasks: Mapping[str, Task], campaign: Path) -> Before:
+    """Return what earlier starts have left of tasks in the folder of a campaign."""
+    found = {name: task.done_in(campaign / name) for name, task in tasks.items()}
+    done = {name: each for name, each in found.items() if each is not None}
+    missing = {task.identity[:SHOWN_DIGITS]: task for name, task in tasks.items() if name not in done}
+    places: dict[str, str] = {}
+    for file in campaign.glob(f"*/*/{DONE_NAME}") if missing else ():
+        former = file.parent.relative_to(campaign).as_posix()
+        task = missing.get(former[-SHOWN_DIGITS:])
+        if task is None or former in tasks or task.name in done:
+            continue
+        if (left := task.done_in(file.parent)) is not None:
+            done[task.name], places[task.name] = left, former
+    lost = {name: files for name, task in tasks.items() if (files := task.lost_in(campaign / name))}
+    return Before({name: done[name] for name in tasks if name in done}, places, lost)
+
+
+def carry_out_tasks(tasks: Mapping[str, Task], before: Mapping[str, Done], executor: Executor) -> dict[str, Done]:
+    """Carry out all tasks that were not done before; return what each has left, by name, in the order of `tasks`.
+
+    A task whose needs could not be carried out is refused.
+    """
+    done: dict[str, Done] = dict(before)
+    missing = {name: {need for need in task.needs if need not in done} for name, task in tasks.items()}
+    users: dict[str, list[str]] = {}
+    for name, needs in missing.items():
+        for need in needs:
+            users.setdefault(need, []).append(name)
+    ready = [name for name, needs in missing.items() if name not in done and not needs]
+    going = 0
+    while ready or going:
+        for name in ready:
+            executor.submit(tasks[name])
+        going += len(ready)
+        task, result = executor.next_done()
+        going -= 1
+        ready = []
+        finished = [(task.name, result)]
+        while finished:
+            name, result = finished.pop()
+            done[name] = result
+            for user in users.get(name, ()):
+                missing[user].discard(name)
+                if user in done:
+                    continue
+                if not result.carried_out:
+                    reason = f"needs {name}, which was not carried out: {result.reason}"
+                    finished.append((user, Done(tasks[user].identity, "refused", reason)))
+                elif not missing[user]:
+                    ready.append(user)
+    return {name: done[name] for name in tasks}
+
+
+def all_carried_out(done: Sequence[Done]) -> bool:
+    """Return whether all that was asked for was carried out; a run that has failed was."""
+    return all(each.carried_out for each in done)

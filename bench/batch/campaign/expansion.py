@@ -1,0 +1,583 @@
+"""From a campaign file to its tasks, everything checked: rigs, protocols, each set of parameters, limits, faults."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeGuard
+
+import numpy as np
+
+from bench.analysis import WholeIdentification, check_template, option_names, whole_identification, whole_models
+from bench.base import BenchError, ConfigurationError, registry
+from bench.batch.campaign.file import (
+    REFERENCE,
+    CampaignFile,
+    ComparisonsTable,
+    ModelsTable,
+    RunsTable,
+    as_override,
+    axes,
+    dotted,
+)
+from bench.batch.campaign.known_rig import KnownRig
+from bench.batch.campaign.sources import PROGRAMS, code_digest, digest, file_digest
+from bench.batch.campaign.tasks import (
+    SHOWN_DIGITS,
+    ComparisonTask,
+    ModelTask,
+    RunTask,
+    StudyTask,
+    Task,
+    identification_options,
+)
+from bench.batch.study import Study
+from bench.models import find_model, identifiable_models
+from bench.protocol import Plan, ProtocolDefinition, find_protocol, plan
+from bench.rig import RigFile
+from bench.run import check_before_moving
+
+_LONGEST_NAME = 120
+_UNSAFE = re.compile(r"[^A-Za-z0-9_.=+,-]+")
+
+Axis = Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What a campaign will take, by the plans of its runs.
+
+    Attributes
+    ----------
+    laboratory_seconds : float
+        Of the runs whose plan is known, s.
+    wall_seconds : float
+        The same on one core of this machine, s.
+    unknown : int
+        Number of tasks that are in neither: studies, identifications, and runs that need a model of the campaign.
+    """
+
+    laboratory_seconds: float = 0.0
+    wall_seconds: float = 0.0
+    unknown: int = 0
+
+
+@dataclass(frozen=True)
+class Expansion:
+    """The tasks of a campaign file.
+
+    Attributes
+    ----------
+    tasks : mapping of str to Task
+        By name; those that others need come before them.
+    varying : mapping of str to tuple of str
+        By the name of a table of runs, what differs among its runs, in the order in which it is shown.
+    plans : mapping of str to (float, float)
+        By the name of a task its planned laboratory time and that on the wall clock, s; those that are known.
+    units : mapping of (str, str) to str
+        Unit of a parameter, by the table of runs and its name.
+    kernels : tuple of str
+        Packages whose kernels the tasks take, but for those of laboratories, which are compiled by now.
+    """
+
+    tasks: Mapping[str, Task]
+    varying: Mapping[str, tuple[str, ...]]
+    plans: Mapping[str, tuple[float, float]]
+    units: Mapping[tuple[str, str], str]
+    kernels: tuple[str, ...]
+
+    def estimate(self, names: Sequence[str]) -> Estimate:
+        """Return what these tasks will take."""
+        known = [self.plans[name] for name in names if name in self.plans]
+        return Estimate(sum(lab for lab, _ in known), sum(wall for _, wall in known), len(names) - len(known))
+
+
+def expand(file: CampaignFile) -> Expansion:
+    """Return the tasks of a campaign file; nothing is carried out, nothing is written.
+
+    Raises ConfigurationError if something in it is wrong: names file, table, key, and what is allowed.
+    """
+    return _Expander(file).expansion()
+
+
+class _Expander:
+    """Carries what was looked up already: a thousand runs of ten rigs connect ten."""
+
+    def __init__(self, file: CampaignFile) -> None:
+        self._file = file
+        self._rigs: dict[tuple[str, str], KnownRig] = {}
+        self._faults: set[tuple[str, str]] = set()
+        self._protocols: dict[str, tuple[ProtocolDefinition, str]] = {}
+        self._plans: dict[str, Plan | None] = {}
+        self._digests: dict[str, str] = {}
+        self._tasks: dict[str, Task] = {}
+        self._runs: dict[str, list[RunTask]] = {}
+        self._models: dict[str, dict[tuple[str, int], list[ModelTask]]] = {}
+        self._several: dict[str, bool] = {}
+        self._rig_of: dict[str, KnownRig] = {}
+        self._definition_of: dict[str, ProtocolDefinition] = {}
+        self._found_plans: dict[str, tuple[float, float]] = {}
+        self._varying: dict[str, tuple[str, ...]] = {}
+        self._units: dict[tuple[str, str], str] = {}
+        self._kernels = ["bench.models", "bench.identification"]
+
+    def expansion(self) -> Expansion:
+        """Return all tasks, those of runs in an order in which their models come before them."""
+        file = self._file
+        self._check_number()
+        for number, models in enumerate(file.models):
+            self._check_models(number, models)
+        # A table of models comes after its runs, and before those that use it.
+        waiting = list(file.models)
+        for number, table in enumerate(file.runs):
+            self._add_runs(number, table)
+            for models in [each for each in waiting if self._runs.keys() >= set(each.runs)]:
+                self._add_models(file.where("models", file.models.index(models)), models)
+                waiting.remove(models)
+        for number, comparisons in enumerate(file.comparisons):
+            self._add_comparisons(file.where("comparisons", number), comparisons)
+        for number, study in enumerate(file.studies):
+            self._add_studies(number, study)
+        if len(self._tasks) > 2 * file.most_runs:
+            raise ConfigurationError(
+                f"{file.path}: {len(self._tasks)} runs, models and studies; expected at most twice most_runs = "
+                f"{file.most_runs}"
+            )
+        return Expansion(self._tasks, self._varying, self._found_plans, self._units, tuple(self._kernels))
+
+    def _check_number(self) -> None:
+        """Check the number of runs before any list of them is made."""
+        total = 0
+        for number, table in enumerate(self._file.runs):
+            grid = [*axes(table.parameters).values(), *axes(dotted(table.overrides)).values()]
+            lengths = [len(table.protocol), len(table.rigs), len(table.seeds), len(table.faults), *map(len, grid)]
+            total += math.prod(lengths)
+            if total > self._file.most_runs:
+                raise ConfigurationError(
+                    f"{self._file.where('runs', number)}: {' × '.join(map(str, lengths))} runs make {total} with "
+                    f"those before; most_runs = {self._file.most_runs} are allowed"
+                )
+
+    def _check_models(self, number: int, table: ModelsTable) -> None:
+        where = self._file.where("models", number)
+        known = {runs.label: runs for runs in self._file.runs}
+        for name in table.runs:
+            if name not in known:
+                raise ConfigurationError(
+                    f"{where}: runs = {name!r}: there is no table of runs of this name; there are: "
+                    f"{', '.join(known) or 'none'}"
+                )
+            seeds = known[name].seeds
+            if table.seed is not None and table.seed not in seeds:
+                raise ConfigurationError(
+                    f"{where}: seed = {table.seed}: {name} has no run with this seed; it has: "
+                    f"{', '.join(map(str, seeds))}"
+                )
+        allowed: tuple[str, ...] = ()
+        if whole_identification(table.model) is None:
+            try:
+                find_model(table.model)
+            except ValueError:
+                raise ConfigurationError(
+                    f"{where}: model = {table.model!r}: there is no such model; there are: "
+                    f"{', '.join((*identifiable_models(), *whole_models()))}"
+                ) from None
+            if len(table.runs) > 1:
+                raise ConfigurationError(
+                    f"{where}: runs: a model {table.model} is identified from one run; expected one table"
+                )
+            allowed = option_names(table.model)
+        for key in table.options:
+            if key not in allowed:
+                raise ConfigurationError(
+                    f"{where}.{key}: there is no such key; allowed are: {', '.join(allowed) or 'none'}"
+                )
+
+    def _add_runs(self, number: int, table: RunsTable) -> None:
+        where = self._file.where("runs", number)
+        parameters, overrides = axes(table.parameters), axes(dotted(table.overrides))
+        for kind, grid in (("parameters", parameters), ("overrides", overrides)):
+            for key, values in grid.items():
+                if not values:
+                    raise ConfigurationError(f"{where}: {kind}.{key} = []: expected at least one value")
+        models = {key: self._references(where, key, values) for key, values in parameters.items()}
+        models = {key: names for key, names in models.items() if names}
+        self._runs[table.label] = []
+        varying = {
+            "protocol": len(table.protocol) > 1,
+            "rig": len(table.rigs) > 1,
+            **{key: len(values) > 1 for key, values in {**parameters, **overrides}.items()},
+            **{key: True for key, names in models.items() if len(names) > 1 or self._several[names[0]]},
+            "faults": len(table.faults) > 1,
+            "seed": len(table.seeds) > 1,
+        }
+        self._varying[table.label] = tuple(key for key, varies in varying.items() if varies)
+        for protocol, rig in itertools.product(table.protocol, table.rigs):
+            for replaced in _grid(overrides):
+                known = self._rig(where, rig, {key: as_override(value) for key, value in replaced.items()})
+                for faults in filter(None, table.faults):
+                    self._check_faults(where, known, faults)
+                for chosen in _grid(parameters):
+                    self._add_run_of(where, table, protocol, rig, known, replaced, chosen, models)
+
+    def _references(self, where: str, key: str, values: Sequence[Any]) -> list[str]:
+        """Return the tables of models to which the values of a parameter refer."""
+        names = [value[1:] for value in values if isinstance(value, str) and value.startswith(REFERENCE)]
+        for name in names:
+            if name not in self._models:
+                known = ", ".join(REFERENCE + each for each in self._models) or "none"
+                raise ConfigurationError(
+                    f"{where}: parameters.{key} = '{REFERENCE}{name}': there is no such table of models of runs that "
+                    f"come before; there are: {known}"
+                )
+        return names
+
+    def _add_run_of(
+        self,
+        where: str,
+        table: RunsTable,
+        protocol: str,
+        rig: str,
+        known: KnownRig,
+        replaced: Axis,
+        chosen: Axis,
+        models: Mapping[str, Sequence[str]],
+    ) -> None:
+        """Add the runs of one point of the grid: its faults, seeds, and the models of each."""
+        definition, source = self._protocol(where, protocol)
+        given = {
+            key: self._file.beside(value) if key in definition.file_parameters and _is_path(value) else value
+            for key, value in chosen.items()
+        }
+        referred = {key: str(given.pop(key))[1:] for key in models if str(given[key]).startswith(REFERENCE)}
+        planned, resolved, inputs = self._planned(where, definition, source, known, given, referred)
+        for key in chosen:
+            self._units.setdefault((table.label, key), _unit(definition, known.file, key))
+        for faults, seed in itertools.product(table.faults, table.seeds):
+            for sources in self._sources(where, referred, rig, seed):
+                used = {key: task.name for key, task in sources.items()}
+                path = self._file.beside(faults)
+                identity = digest(
+                    {
+                        "code": code_digest(),
+                        "rig": known.digest,
+                        "protocol": [definition.name, source],
+                        "parameters": resolved,
+                        "models": {key: task.identity for key, task in sources.items()},
+                        "inputs": {key: self._digest(each) for key, each in inputs.items()},
+                        "seed": seed + table.seed_offset,
+                        "faults": self._digest(path) if path else "",
+                        "interlock_rate": table.interlock_rate,
+                    }
+                )
+                labels = {key: task.label for key, task in sources.items()}
+                values = {
+                    "protocol": Path(protocol).name,
+                    "rig": known.file.name,
+                    **{key: _shown(value) for key, value in {**chosen, **replaced}.items()},
+                    **labels,
+                    "faults": Path(faults).stem or "none",
+                    "seed": seed,
+                }
+                task = RunTask(
+                    name=_name(table.label, values, self._varying[table.label], identity),
+                    identity=identity,
+                    table=table.label,
+                    protocol=self._file.beside(protocol) if ".py" in protocol else protocol,
+                    rig=self._file.beside(rig) if rig.endswith(".toml") else rig,
+                    seed=seed,
+                    seed_offset=table.seed_offset,
+                    parameters=given,
+                    models=used,
+                    overrides={key: as_override(value) for key, value in replaced.items()},
+                    faults=path,
+                    interlock_rate=table.interlock_rate,
+                    inputs=tuple(inputs.values()),
+                    model_labels=labels,
+                )
+                self._add(task)
+                self._runs[table.label].append(task)
+                self._rig_of[task.name] = known
+                self._definition_of[task.name] = definition
+                if planned is not None and planned.complete:
+                    self._found_plans[task.name] = (planned.seconds, planned.seconds * known.pace)
+
+    def _sources(
+        self, where: str, referred: Mapping[str, str], rig: str, seed: int
+    ) -> Iterator[Mapping[str, ModelTask]]:
+        """Yield the models that a run takes, one set a run: those of its rig and seed."""
+        tables = {table.name: table for table in self._file.models}
+        found: dict[str, list[ModelTask]] = {}
+        for key, name in referred.items():
+            wanted = seed if tables[name].seed is None else tables[name].seed
+            found[key] = self._models[name].get((rig, wanted or 0), [])
+            if not found[key]:
+                raise ConfigurationError(
+                    f"{where}: parameters.{key} = '{REFERENCE}{name}': {', '.join(tables[name].runs)} has no run on "
+                    f"{rig} with seed {wanted}; expected the same rigs and seeds there, or `seed` in the table of "
+                    "models"
+                )
+        for chosen in itertools.product(*found.values()):
+            yield dict(zip(found, chosen, strict=True))
+
+    def _add_models(self, where: str, table: ModelsTable) -> None:
+        self._models[table.name] = {}
+        runs = [
+            (self._rig_as_given(label, run), run)
+            for label in table.runs
+            for run in self._runs[label]
+            if table.seed in (None, run.seed)
+        ]
+        if (whole := whole_identification(table.model)) is not None:
+            self._several[table.name] = False
+            for key in dict.fromkeys((rig, run.seed) for rig, run in runs):
+                together = [run for rig, run in runs if (rig, run.seed) == key]
+                self._check_whole(where, whole, *key, together)
+                self._add_model(table, key, together, f"{Path(key[0]).stem}-seed={key[1]}", table.name)
+            return
+        (table_of_runs,) = table.runs
+        varying = [key for key in self._varying[table_of_runs] if key not in ("rig", "seed")]
+        self._several[table.name] = bool(varying)
+        for rig, run in runs:
+            self._check_identification(where, table, run)
+            label = " ".join([table.name, *(f"{key}={_setting(run, key)}" for key in varying)])
+            self._add_model(table, (rig, run.seed), [run], run.name.rpartition("/")[2].rpartition("-")[0], label)
+
+    def _add_model(
+        self, table: ModelsTable, key: tuple[str, int], runs: Sequence[RunTask], base: str, label: str
+    ) -> None:
+        """Add the identification of a model of a rig and seed from runs."""
+        identity = digest(
+            {"runs": [run.identity for run in runs], **table.model_dump(exclude={"name", "runs", "seed"})}
+        )
+        task = ModelTask(
+            name=f"{table.name}/{base}{'-' * bool(base)}{identity[:SHOWN_DIGITS]}",
+            identity=identity,
+            table=table.name,
+            sources=tuple(run.name for run in runs),
+            model=table.model,
+            input=table.input,
+            output=table.output,
+            options=table.options,
+            label=label,
+        )
+        self._add(task)
+        self._models[table.name].setdefault(key, []).append(task)
+
+    def _check_whole(
+        self, where: str, whole: WholeIdentification, rig: str, seed: int, runs: Sequence[RunTask]
+    ) -> None:
+        """Check that a model of several runs gets one of each protocol that it needs."""
+        found = [self._definition_of[run.name].name for run in runs]
+        if sorted(found) != sorted(whole.protocols):
+            raise ConfigurationError(
+                f"{where}: runs: expected one run each of {', '.join(whole.protocols)} on a rig and seed; on {rig} "
+                f"with seed {seed} there are: {', '.join(found)}"
+            )
+
+    def _check_identification(self, where: str, table: ModelsTable, run: RunTask) -> None:
+        """Check columns and options of an identification from a run."""
+        known = self._rig_of[run.name]
+        slots = known.description.slots(self._definition_of[run.name])
+        columns = {"input": (table.input, "drive"), "output": (table.output, "response")}
+        for key, (column, slot) in columns.items():
+            if not column and slot not in slots:
+                raise ConfigurationError(f"{where}: {key} is missing, as {run.protocol} has no slot {slot!r}")
+            if column and column not in known.description.by_name:
+                signals = ", ".join(known.description.by_name)
+                raise ConfigurationError(
+                    f"{where}: {key} = {column!r}: there is no such signal; there are: {signals}"
+                )
+        drive = known.file.roles.get("drive")
+        if table.input or drive is None or drive.range is None:
+            return
+        try:
+            options = identification_options(table.options)
+            for levels in options.pop("levels_to_try", (None,)):
+                own = options if levels is None else {**options, "levels": levels}
+                check_template(table.model, np.linspace(*drive.range, 100), own)
+        except ValueError as error:
+            raise ConfigurationError(f"{where}: {error} (rig {known.file.name})") from None
+
+    def _add_comparisons(self, where: str, table: ComparisonsTable) -> None:
+        for key, names, known in (
+            ("runs", (table.runs,), self._runs),
+            ("models", table.models, self._models),
+        ):
+            for name in names:
+                if name not in known:
+                    raise ConfigurationError(
+                        f"{where}: {key} = {name!r}: there is no table of {key} of this name; there are: "
+                        f"{', '.join(known) or 'none'}"
+                    )
+        tables = {models.name: models for models in self._file.models}
+        columns = {(tables[name].input, tables[name].output) for name in table.models}
+        if len(columns) > 1:
+            raise ConfigurationError(f"{where}: models: their columns differ; expected one input and one output")
+        ((input_column, output_column),) = columns
+        for run in self._runs[table.runs]:
+            rig = self._rig_as_given(table.runs, run)
+            found: dict[str, ModelTask] = {}
+            for name in table.models:
+                wanted = run.seed if tables[name].seed is None else tables[name].seed
+                for task in self._models[name].get((rig, wanted or 0), []):
+                    found[task.label] = task
+                if not any(task.table == name for task in found.values()):
+                    raise ConfigurationError(
+                        f"{where}: models = {name!r}: {', '.join(tables[name].runs)} has no run on {rig} with seed "
+                        f"{wanted}; expected the same rigs and seeds there, or `seed` in the table of models"
+                    )
+            content = table.model_dump(exclude={"name", "runs", "models"})
+            identity = digest({"run": run.identity, **content, "models": {k: t.identity for k, t in found.items()}})
+            base = run.name.rpartition("/")[2].rpartition("-")[0]
+            self._add(
+                ComparisonTask(
+                    name=f"{table.name}/{base}{'-' * bool(base)}{identity[:SHOWN_DIGITS]}",
+                    identity=identity,
+                    table=table.name,
+                    source=run.name,
+                    models={label: task.name for label, task in found.items()},
+                    input=input_column,
+                    output=output_column,
+                    recalibrate=table.recalibrate,
+                    recalibrate_rows=table.recalibrate_rows,
+                )
+            )
+
+    def _rig_as_given(self, label: str, run: RunTask) -> str:
+        table = next(each for each in self._file.runs if each.label == label)
+        return next(rig for rig in table.rigs if run.rig in (rig, self._file.beside(rig)))
+
+    def _add_studies(self, number: int, table: Any) -> None:  # noqa: ANN401 - a StudiesTable
+        where = self._file.where("studies", number)
+        try:
+            study: Study = registry.load("studies", table.name)
+        except ConfigurationError as error:
+            raise ConfigurationError(f"{where}: name = {table.name!r}: {error}") from None
+        for rig, seed in itertools.product(table.rigs, table.seeds):
+            given = self._file.beside(rig) if rig.endswith(".toml") else rig
+            if rig and study.rig is None:
+                raise ConfigurationError(f"{where}: rigs = {rig!r}: the study runs on several rigs of its own")
+            used = rig or study.rig
+            known = self._rig(where, used, {}).digest if used else ""
+            identity = digest({"code": code_digest(), "study": table.name, "rig": known, "seed": seed})
+            self._kernels += study.all_kernels
+            values = {"rig": Path(rig).stem, "seed": seed}
+            varying = ["rig"] * (len(table.rigs) > 1) + ["seed"]
+            self._add(StudyTask(_name(table.name, values, varying, identity), identity, table.name, given, seed))
+
+    def _add(self, task: Task) -> None:
+        if task.name in self._tasks:
+            raise ConfigurationError(f"{self._file.path}: {task.name}: two runs are the same; give each value once")
+        self._tasks[task.name] = task
+
+    def _protocol(self, where: str, name: str) -> tuple[ProtocolDefinition, str]:
+        """Return a protocol, and the hash of its file."""
+        if name not in self._protocols:
+            path = self._file.beside(name) if ".py" in name else name
+            try:
+                definition = find_protocol(path)
+            except ConfigurationError as error:
+                raise ConfigurationError(f"{where}: protocol = {name!r}: {error}") from None
+            source = file_digest(Path(path.partition(".py")[0] + ".py"), PROGRAMS) if ".py" in name else ""
+            self._protocols[name] = definition, source
+        return self._protocols[name]
+
+    def _rig(self, where: str, name: str, overrides: Mapping[str, str]) -> KnownRig:
+        key = name, digest(overrides)
+        if key not in self._rigs:
+            try:
+                path = self._file.beside(name) if name.endswith(".toml") else name
+                self._rigs[key] = KnownRig.look_at(path, overrides)
+            except BenchError as error:
+                with_overrides = f" with overrides {dict(overrides)}" if overrides else ""
+                raise ConfigurationError(f"{where}: rigs = {name!r}{with_overrides}: {error}") from None
+        return self._rigs[key]
+
+    def _check_faults(self, where: str, known: KnownRig, faults: str) -> None:
+        key = known.digest, faults
+        if key in self._faults:
+            return
+        try:
+            known.check_faults(Path(self._file.beside(faults)))
+        except ConfigurationError as error:
+            raise ConfigurationError(f"{where}: faults = {faults!r}, rig {known.file.name}: {error}") from None
+        self._faults.add(key)
+
+    def _planned(
+        self,
+        where: str,
+        definition: ProtocolDefinition,
+        source: str,
+        known: KnownRig,
+        given: Mapping[str, Any],
+        referred: Mapping[str, str],
+    ) -> tuple[Plan | None, Mapping[str, Any], Mapping[str, str]]:
+        """Check parameters on a rig; return the plan if there is one, the parameters, and the files among them."""
+        file = known.file
+        try:
+            # The path of a model that does not exist yet is a text like any other.
+            parameters = definition.parse(
+                {**given, **dict.fromkeys(referred, "")},
+                file.roles,
+                file.protocols.get(definition.name),
+                path=file.path,
+            )
+            files = {name: path for name, path in definition.files(parameters).items() if name not in referred}
+            # Of a file its content counts, not its place.
+            left_out = {*files, *referred}
+            resolved = {
+                key: value for key, value in parameters.model_dump(mode="json").items() if key not in left_out
+            }
+            key = digest([definition.name, source, known.digest, resolved, files, *referred])
+            if key not in self._plans:
+                slots = known.description.slots(definition)
+                known.description.check_needs(definition.name, definition.names)
+                expected = None if referred else plan(definition, parameters, slots)
+                if expected is not None:
+                    check_before_moving(known.description, definition, expected)
+                self._plans[key] = expected
+        except BenchError as error:
+            of = f" (rig {file.name}{''.join(f', {key} = {value}' for key, value in given.items())})"
+            raise ConfigurationError(f"{where}: parameters{of}: {error}") from None
+        return self._plans[key], resolved, files
+
+    def _digest(self, path: str) -> str:
+        if path not in self._digests:
+            self._digests[path] = file_digest(Path(path))
+        return self._digests[path]
+
+
+def _is_path(value: object) -> TypeGuard[str]:
+    return isinstance(value, str) and not value.startswith(REFERENCE)
+
+
+def _grid(values: Mapping[str, Sequence[Any]]) -> Iterator[dict[str, Any]]:
+    for chosen in itertools.product(*values.values()):
+        yield dict(zip(values, chosen, strict=True))
+
+
+def _unit(definition: ProtocolDefinition, file: RigFile, key: str) -> str:
+    entries = definition.help(file.roles, file.protocols.get(definition.name))
+    return next((entry.unit for entry in entries if entry.name == key), "")
+
+
+def _shown(value: object) -> str:
+    return Path(value).stem if isinstance(value, str) and "/" in value else str(value)
+
+
+def _setting(run: RunTask, key: str) -> str:
+    """Return what a run has on an axis, as it is shown."""
+    own = {"protocol": run.protocol, "faults": run.faults or "none"}
+    return _shown({**own, **run.overrides, **run.parameters, **run.model_labels}[key])
+
+
+def _name(table: str, values: Mapping[str, Any], varying: Sequence[str], identity: str) -> str:
+    """Return the folder of a task: what differs within its table, and the first digits of its identity."""
+    parts = [str(values[key]) if key in ("protocol", "rig") else f"{key}={values[key]}" for key in varying]
+    text = _UNSAFE.sub("_", "-".join(parts))[:_LONGEST_NAME]
+    return f"{table}/{text}{'-' * bool(text)}{identity[:SHOWN_DIGITS]}"

@@ -1,0 +1,308 @@
+"""The results of a campaign: a table of its runs, medians and worst over seeds, CSV and Parquet."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from bench.analysis import write_csv
+from bench.base import MissingExtraError, header_with_unit, needed_for, print_plain
+from bench.batch.campaign.expansion import Expansion
+from bench.batch.campaign.tasks import ComparisonTask, Done, ModelTask, RunTask, StudyTask
+
+Cell: TypeAlias = float | int | str | None
+
+MOST_ROWS = 40
+"""Rows of a table that are printed; files have all of them."""
+_NOT_GROUPED = ("steps", "laboratory_time", "wall_time")
+_NOT_SHOWN = ("steps", "wall_time", "folder", "table")
+MEDIAN, WORST, SPREAD = "median", "worst", "spread"
+_PLAIN = ("", "1")
+ERRORS = ("max", "rms")
+"""What a comparison gives of each model."""
+
+
+@dataclass(frozen=True)
+class ResultsTable:
+    """Columns of equal length; `None` where a row has no value.
+
+    Attributes
+    ----------
+    columns : mapping of (str, str) to list
+        Cells by name and unit.
+    """
+
+    columns: Mapping[tuple[str, str], Sequence[Cell]]
+
+    @classmethod
+    def of(cls, rows: Sequence[Mapping[tuple[str, str], Cell]]) -> ResultsTable:
+        """Make a table of rows, each a mapping of (name, unit) to a cell."""
+        keys = dict.fromkeys(key for row in rows for key in row)
+        return cls({key: [row.get(key) for row in rows] for key in keys})
+
+    @property
+    def heads(self) -> list[str]:
+        """The heads of the columns, units in brackets."""
+        return [header_with_unit(name, "" if unit in _PLAIN else unit) for name, unit in self.columns]
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values()), ()))
+
+    def write_csv(self, path: Path) -> None:
+        """Write it as CSV; raises DataError if that fails."""
+        write_csv(
+            path, self.heads, [["" if cell is None else cell for cell in each] for each in self.columns.values()]
+        )
+
+    def write_parquet(self, path: Path) -> None:
+        """Write it as Parquet, with the unit of each column in its metadata; raises MissingExtraError."""
+        with needed_for("a Parquet file", "report"):
+            import pyarrow as pa
+            import pyarrow.parquet as pq
+
+        fields, arrays = [], []
+        for head, ((_, unit), cells) in zip(self.heads, self.columns.items(), strict=True):
+            kinds = {type(cell) for cell in cells if cell is not None}
+            kind = pa.int64() if kinds <= {int} else pa.float64() if kinds <= {int, float} else pa.string()
+            values = cells if kinds <= {int, float} else [None if cell is None else str(cell) for cell in cells]
+            fields.append(pa.field(head, kind, metadata={"unit": unit}))
+            arrays.append(pa.array(values, kind))
+        pq.write_table(pa.Table.from_arrays(arrays, schema=pa.schema(fields)), path)
+
+    def print(self, title: str, console: Console, most: int = MOST_ROWS) -> None:
+        """Print its first rows."""
+        table = Table(title=title, title_justify="left")
+        for (_, cells), head in zip(self.columns.items(), self.heads, strict=True):
+            numeric = all(isinstance(cell, (int, float)) or cell is None for cell in cells)
+            # Units stand in brackets, which are no markup; a head breaks between words.
+            table.add_column(Text(head.replace("_", " ")), justify="right" if numeric else "left", overflow="fold")
+        for row in list(zip(*self.columns.values(), strict=True))[:most]:
+            table.add_row(*(Text(shown(cell)) for cell in row))
+        console.print(table)
+        if len(self) > most:
+            console.print(f"… and {len(self) - most} rows more", highlight=False)
+
+
+def shown(cell: Cell) -> str:
+    """Return a cell for people."""
+    if cell is None:
+        return "–"
+    return f"{cell:.4g}" if isinstance(cell, float) else str(cell)
+
+
+def runs_table(expansion: Expansion, done: Mapping[str, Done], table: str) -> ResultsTable:
+    """Return the runs of one table of a campaign file: what varies, how each ended, and its results."""
+    models: dict[str, list[ModelTask]] = {}
+    for task in expansion.tasks.values():
+        if isinstance(task, ModelTask):
+            models.setdefault(task.sources[0], []).append(task)
+    rows: list[dict[tuple[str, str], Cell]] = []
+    for task in expansion.tasks.values():
+        if not isinstance(task, RunTask) or task.table != table:
+            continue
+        found = done[task.name]
+        row: dict[tuple[str, str], Cell] = {("table", ""): table, ("protocol", ""): Path(task.protocol).name}
+        row[("rig", "")] = Path(task.rig).stem
+        for key in expansion.varying[table]:
+            if key not in ("protocol", "rig", "seed", "faults"):
+                row[(key, expansion.units.get((table, key), ""))] = _setting(task, key)
+        row |= {("faults", ""): Path(task.faults).stem, ("seed", ""): task.seed}
+        row |= {("status", ""): found.status, ("reason", ""): found.reason}
+        row |= {(name, unit): value for name, (value, unit) in found.results.items()}
+        for model in models.get(task.name, ()):
+            if model.name in done:
+                row |= {
+                    (f"{model.table}_{name}", unit): value for name, (value, unit) in done[model.name].results.items()
+                }
+        row[("folder", "")] = task.name
+        rows.append(row)
+    return ResultsTable.of(rows)
+
+
+def over_seeds(table: ResultsTable, varying: Sequence[str]) -> ResultsTable:
+    """Return median, worst (the greatest) and spread of each result over the seeds of a table of runs.
+
+    A parameter that is a seed as well, such as `sequence_seed`, counts as one.
+    """
+    keys = [key for key in table.columns if key[0] in varying and not key[0].endswith("seed")]
+    names = [key[0] for key in table.columns]
+    results = [
+        key
+        for key in list(table.columns)[names.index("reason") + 1 :]
+        if key[0] not in (*_NOT_GROUPED, "folder") and _is_numeric(table.columns[key])
+    ]
+    groups: dict[tuple[Cell, ...], list[int]] = {}
+    for i in range(len(table)):
+        groups.setdefault(tuple(table.columns[key][i] for key in keys), []).append(i)
+    rows: list[dict[tuple[str, str], Cell]] = []
+    for group, members in groups.items():
+        row: dict[tuple[str, str], Cell] = {("table", ""): table.columns[("table", "")][members[0]]}
+        row |= dict(zip(keys, group, strict=True))
+        row[("runs", "")] = len(members)
+        row[("completed", "")] = sum(table.columns[("status", "")][i] == "completed" for i in members)
+        for name, unit in results:
+            row |= _statistics(name, unit, (table.columns[(name, unit)][i] for i in members))
+        rows.append(row)
+    return ResultsTable.of(rows)
+
+
+def comparisons_table(expansion: Expansion, done: Mapping[str, Done]) -> ResultsTable:
+    """Return the errors of each model on each run that it was compared on, a row each."""
+    rows: list[dict[tuple[str, str], Cell]] = []
+    for task in expansion.tasks.values():
+        if not isinstance(task, ComparisonTask) or not (found := done[task.name].results):
+            continue
+        for model in task.models:
+            row: dict[tuple[str, str], Cell] = {("comparison", ""): task.table, ("model", ""): model}
+            row |= {("run", ""): task.source}
+            for what in ERRORS:
+                value, unit = found[f"{model}_{what}"]
+                row[(what, unit)] = value
+            rows.append(row)
+    return ResultsTable.of(rows)
+
+
+def over_runs(comparisons: ResultsTable) -> ResultsTable:
+    """Return median, worst and spread of the errors of each model over the runs of a `comparisons_table`."""
+    groups: dict[tuple[Cell, Cell], list[int]] = {}
+    heads = zip(comparisons.columns[("comparison", "")], comparisons.columns[("model", "")], strict=True)
+    for i, key in enumerate(heads):
+        groups.setdefault(key, []).append(i)
+    rows: list[dict[tuple[str, str], Cell]] = []
+    for (comparison, model), members in groups.items():
+        row: dict[tuple[str, str], Cell] = {("comparison", ""): comparison, ("model", ""): model}
+        row[("runs", "")] = len(members)
+        for name, unit in comparisons.columns:
+            if name in ERRORS:
+                row |= _statistics(name, unit, (comparisons.columns[(name, unit)][i] for i in members))
+        rows.append(row)
+    return ResultsTable.of(rows)
+
+
+def shown_columns(table: ResultsTable, varying: Sequence[str]) -> ResultsTable:
+    """Return the columns of a table of runs that people look at: what varies, and results."""
+    alike = [name for name in ("protocol", "rig", "faults", "seed") if name not in varying]
+    columns = {
+        key: cells
+        for key, cells in table.columns.items()
+        if key[0] not in (*_NOT_SHOWN, *alike) and (key[0] != "reason" or any(cells))
+    }
+    return ResultsTable(columns)
+
+
+def in_one_cell(summary: ResultsTable) -> ResultsTable:
+    """Return a table of `over_seeds` with median and worst in one cell, for people."""
+    columns: dict[tuple[str, str], Sequence[Cell]] = {}
+    for (name, unit), cells in summary.columns.items():
+        result, _, which = name.rpartition(" ")
+        if which == MEDIAN:
+            worst = summary.columns[(f"{result} {WORST}", unit)]
+            columns[(result, unit)] = [f"{shown(a)} / {shown(b)}" for a, b in zip(cells, worst, strict=True)]
+        elif which not in (WORST, SPREAD) and name != "table":
+            columns[(name, unit)] = cells
+    return ResultsTable(columns)
+
+
+def studies_of(expansion: Expansion, done: Mapping[str, Done]) -> dict[str, list[str]]:
+    """Return the names of the tasks of each study that were completed, by study and rig."""
+    found: dict[str, list[str]] = {}
+    for task in expansion.tasks.values():
+        if isinstance(task, StudyTask) and done[task.name].status == "completed":
+            found.setdefault(" on ".join(filter(None, (task.study, Path(task.rig).stem))), []).append(task.name)
+    return found
+
+
+def studies_table(expansion: Expansion, done: Mapping[str, Done]) -> ResultsTable:
+    """Return each number of each study over its seeds: median, worst (of the greatest magnitude), and spread."""
+    found: dict[tuple[str, str, str], list[float]] = {}
+    for task in expansion.tasks.values():
+        if isinstance(task, StudyTask):
+            for name, (value, _) in done[task.name].results.items():
+                found.setdefault((task.study, Path(task.rig).stem, name), []).append(value)
+    rows: list[dict[tuple[str, str], Cell]] = []
+    for (study, rig, name), values in found.items():
+        rows.append(
+            {
+                ("study", ""): study,
+                ("rig", ""): rig,
+                ("number", ""): name,
+                ("seeds", ""): len(values),
+                ("median", ""): statistics.median(values),
+                ("worst", ""): max(values, key=abs),
+                ("spread", ""): max(values) - min(values),
+            }
+        )
+    return ResultsTable.of(rows)
+
+
+def study_values(expansion: Expansion, done: Mapping[str, Done]) -> ResultsTable:
+    """Return each number of each study and seed, a row each."""
+    rows: list[dict[tuple[str, str], Cell]] = [
+        {
+            ("study", ""): task.study,
+            ("rig", ""): Path(task.rig).stem,
+            ("seed", ""): task.seed,
+            ("status", ""): done[task.name].status,
+            ("number", ""): name,
+            ("value", ""): value,
+        }
+        for task in expansion.tasks.values()
+        if isinstance(task, StudyTask)
+        for name, (value, _) in done[task.name].results.items()
+    ]
+    return ResultsTable.of(rows)
+
+
+def write_tables(tables: Mapping[str, ResultsTable], folder: Path, console: Console) -> list[Path]:
+    """Write tables as CSV and Parquet files by their name; without pyarrow as CSV only, which is said once."""
+    paths = []
+    for name, table in tables.items():
+        paths.append(folder / f"{name}.csv")
+        table.write_csv(paths[-1])
+    try:
+        for name, table in tables.items():
+            table.write_parquet(folder / f"{name}.parquet")
+            paths.append(folder / f"{name}.parquet")
+    except MissingExtraError as error:
+        print_plain(console, f"no Parquet files: {error}")
+    return paths
+
+
+def together(tables: Iterable[ResultsTable]) -> ResultsTable:
+    """Return the rows of several tables in one; what varies in one of them is empty in the others."""
+    rows = [{key: cells[i] for key, cells in table.columns.items()} for table in tables for i in range(len(table))]
+    return ResultsTable.of(rows)
+
+
+def _statistics(name: str, unit: str, cells: Iterable[Cell]) -> dict[tuple[str, str], Cell]:
+    """Return median, worst (the greatest) and spread of cells as columns; None where there is no number."""
+    values = _numbers(cells)
+    return {
+        (f"{name} {MEDIAN}", unit): statistics.median(values) if values else None,
+        (f"{name} {WORST}", unit): max(values) if values else None,
+        (f"{name} {SPREAD}", unit): max(values) - min(values) if values else None,
+    }
+
+
+def _setting(task: RunTask, key: str) -> Cell:
+    value: Any
+    if key in task.models:
+        return task.model_labels[key]
+    value = task.parameters.get(key, task.overrides.get(key))
+    return value if isinstance(value, (int, float, str)) and not isinstance(value, bool) else str(value)
+
+
+def _is_numeric(cells: Sequence[Cell]) -> bool:
+    return all(isinstance(cell, (int, float)) or cell is None for cell in cells)
+
+
+def _numbers(cells: Iterable[Cell]) -> list[float]:
+    return [float(cell) for cell in cells if isinstance(cell, (int, float)) and math.isfinite(cell)]

@@ -1,0 +1,65 @@
+"""What a campaign reads beside its own file: programs, rig files, faults, data; their hashes, and their content."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import json
+from collections.abc import Collection
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from bench.base import ConfigurationError, registry
+from bench.record import version_of
+
+PROGRAMS = (".py",)
+PROGRAMS_AND_RIGS = (".py", ".toml")
+"""Suffixes of the files beside a rig file or a protocol file that it may import or extend."""
+_LIBRARIES = ("llvmlite", "numba", "numpy", "pydantic", "pymodbus", "scipy", "simpleeval")
+"""Whose versions may change a number."""
+
+
+def digest(content: object) -> str:
+    """Return the hash of what JSON can hold."""
+    text = json.dumps(content, sort_keys=True, ensure_ascii=False, default=str)
+    return hashlib.sha256(text.encode("utf-8", "backslashreplace")).hexdigest()
+
+
+@cache
+def code_digest() -> str:
+    """Return the hash of the programs: the bench, the packages that register parts, the versions of libraries."""
+    tops = {"bench"} | {
+        entry.reference.partition(":")[0].partition(".")[0]
+        for group in registry.GROUPS
+        for entry in registry.entries(group).values()
+    }
+    found: dict[str, Any] = {name: version_of(name) for name in _LIBRARIES}
+    for top in sorted(tops):
+        spec = importlib.util.find_spec(top)
+        places = [*(spec.submodule_search_locations or filter(None, [spec.origin]))] if spec else []
+        for place in map(Path, places):
+            files = sorted(place.rglob("*")) if place.is_dir() else [place]
+            found |= {
+                f"{top}/{file.relative_to(place).as_posix()}": hashlib.sha256(file.read_bytes()).hexdigest()
+                for file in files
+                if file.suffix in PROGRAMS_AND_RIGS and file.is_file()
+            }
+    return digest(found)
+
+
+def content_of(path: Path, beside: Collection[str] = ()) -> dict[str, bytes]:
+    """Return the content of a file by its name, and of those beside it with one of these suffixes.
+
+    Raises ConfigurationError if it cannot be read.
+    """
+    try:
+        others = (file for file in sorted(path.parent.iterdir()) if file.suffix in beside and file.is_file())
+        return {file.name: file.read_bytes() for file in (path, *others)}
+    except OSError as error:
+        raise ConfigurationError(f"{path} cannot be read: {error.strerror}") from None
+
+
+def file_digest(path: Path, beside: Collection[str] = ()) -> str:
+    """Return the hash of `content_of` these; raises as that."""
+    return digest({name: hashlib.sha256(content).hexdigest() for name, content in content_of(path, beside).items()})

@@ -1,0 +1,497 @@
+"""The tasks of a campaign: runs, identifications and studies, each carried out by itself in a folder of its own."""
+
+from __future__ import annotations
+
+import math
+import shutil
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any, TypeAlias
+
+from rich.console import Console
+
+from bench.analysis import RunFolder, Session, compare_models, identify_file, results_json, whole_identification
+from bench.base import AbortError, BenchError, DataError, Workers, parse_json, registry, write_json_file
+from bench.batch.campaign.sources import PROGRAMS, PROGRAMS_AND_RIGS, digest
+from bench.batch.campaign.study_tables import FILE_NAME as STUDY_NAME, write_study
+from bench.batch.study import Campaign, Study
+from bench.protocol import find_protocol
+from bench.record import FILE_NAME as JOURNAL_NAME, Record
+from bench.run import Run, carry_out
+
+DONE_NAME = "campaign.json"
+"""In the folder of each task that is done: what it was, and its results."""
+SHOWN_DIGITS = 8
+"""Digits of its identity at the end of the name of a task."""
+MODEL_NAME = "model.json"
+"""In the folder of an identification."""
+UNFINISHED = "unfinished"
+"""Folder of a campaign in which tasks are carried out; what died there is removed at the next start."""
+
+Results: TypeAlias = Mapping[str, tuple[float, str]]
+"""Value and unit by name; 1 for a plain number."""
+
+
+@dataclass(frozen=True)
+class Done:
+    """What a task left behind.
+
+    Attributes
+    ----------
+    identity : str
+        That of the task.
+    status : str
+        `completed`, or how a run ended: `failed`, `unsafe` if the safe state was not confirmed; `refused` if it could
+        not start, `crashed` if it ended by a defect of a program.
+    reason : str
+        Why, and what the run warned of; empty where it was completed without a warning.
+    results : mapping of str to (float, str)
+        Value and unit by name.
+    """
+
+    identity: str
+    status: str
+    reason: str = ""
+    results: Results = field(default_factory=dict)
+
+    @property
+    def carried_out(self) -> bool:
+        """Whether it has a result, if only that a run has failed; else the next start tries it again."""
+        return self.status not in ("refused", "crashed")
+
+
+@dataclass(frozen=True)
+class Task(ABC):
+    """One task.
+
+    Attributes
+    ----------
+    name : str
+        Its folder, relative to that of the campaign; the last part ends in the first digits of its identity.
+    identity : str
+        Hash of all that determines its results.
+    """
+
+    name: str
+    identity: str
+
+    @property
+    def scratch(self) -> str:
+        """Name of the folder in which it is carried out, its own even where another task has the same identity."""
+        return digest(self.name)[:32]
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """The names of the tasks that come before it."""
+        return ()
+
+    @property
+    def files(self) -> Mapping[Path, Sequence[str]]:
+        """The files that it reads, with the suffixes of those beside each that it may read as well."""
+        return {}
+
+    @property
+    def leaves(self) -> tuple[str, ...]:
+        """The files in its folder that its results are in, for people and for other tasks."""
+        return ()
+
+    def moved(self, places: Mapping[str, str]) -> Task:  # noqa: ARG002 - of a task without files
+        """Return the same task with its files in other places, by their old path."""
+        return self
+
+    def carry_out(self, campaign: Path) -> Done:
+        """Carry it out in the folder of a campaign, and leave its folder there, whole or not at all.
+
+        Errors of the bench become a status, as they are a result of this task alone; that the operator ends it does
+        not.
+        """
+        scratch = campaign / UNFINISHED / self.scratch
+        shutil.rmtree(scratch, ignore_errors=True)
+        scratch.mkdir(parents=True)
+        try:
+            made, done = self._work(campaign, scratch)
+        except AbortError:
+            # The operator ends the campaign; the next start does this task again.
+            raise
+        except BenchError as error:
+            return Done(self.identity, "refused", f"{error}{self._way_on(campaign, str(error))}")
+        content = {"task": self.describe(), **asdict(done)}
+        write_json_file(made / DONE_NAME, content)
+        target = campaign / self.name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        # Nothing is there but what this very task has left when it was done twice, as by a worker thought dead.
+        shutil.rmtree(target, ignore_errors=True)
+        made.replace(target)
+        shutil.rmtree(scratch, ignore_errors=True)
+        return done
+
+    def done_in(self, folder: Path) -> Done | None:
+        """Return what this task has left in a folder, or None if it is not the folder of this task, or not whole."""
+        found = self._said_in(folder)
+        return found if found is not None and not self._missing(folder) else None
+
+    def lost_in(self, folder: Path) -> tuple[str, ...]:
+        """Return the files that this task has left in a folder and that are not there any more."""
+        return self._missing(folder) if self._said_in(folder) is not None else ()
+
+    def _missing(self, folder: Path) -> tuple[str, ...]:
+        return tuple(name for name in self.leaves if not (folder / name).is_file())
+
+    def _way_on(self, campaign: Path, reason: str) -> str:
+        """Return how to go on if the reason why it was refused is what another task has left."""
+        wrong = next((name for name in self.needs if str(campaign / name) in reason), None)
+        return f"; remove {wrong} from the campaign, and the next start makes it anew" if wrong else ""
+
+    def _said_in(self, folder: Path) -> Done | None:
+        try:
+            content = parse_json((folder / DONE_NAME).read_text(encoding="utf-8"))
+            results = {
+                name: (math.nan if value is None else value, unit)
+                for name, (value, unit) in content["results"].items()
+            }
+            found = Done(content["identity"], content["status"], content["reason"], results)
+        except (OSError, ValueError, KeyError, TypeError):
+            return None
+        return found if found.identity == self.identity and found.carried_out else None
+
+    @abstractmethod
+    def describe(self) -> dict[str, Any]:
+        """Return what it is, for programs."""
+
+    @abstractmethod
+    def _work(self, campaign: Path, scratch: Path) -> tuple[Path, Done]:
+        """Do it below `scratch`; return the folder that it has made there."""
+
+
+@dataclass(frozen=True)
+class RunTask(Task):
+    """A run on an emulated rig, on the virtual clock.
+
+    Attributes
+    ----------
+    table : str
+        Name of the table that asks for it.
+    protocol, rig : str
+        As `bench run` takes them.
+    seed : int
+        As the file has it; the laboratory's is `seed_offset` more.
+    parameters : mapping
+        Parameters that were set, without models of the campaign.
+    models : mapping of str to str
+        Name of the task by the parameter that takes its model file.
+    overrides : mapping of str to str
+        Values of the rig file by dotted key.
+    faults : str
+        File of faults; empty for none.
+    interlock_rate : float, optional
+        As for `bench run`.
+    inputs : tuple of str
+        Files that its parameters name.
+    model_labels : mapping of str to str
+        What tells the models apart, by the parameter, for people.
+    """
+
+    table: str
+    protocol: str
+    rig: str
+    seed: int
+    seed_offset: int = 0
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    models: Mapping[str, str] = field(default_factory=dict)
+    overrides: Mapping[str, str] = field(default_factory=dict)
+    faults: str = ""
+    interlock_rate: float | None = None
+    inputs: tuple[str, ...] = ()
+    model_labels: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """The identifications of its models."""
+        return tuple(self.models.values())
+
+    @property
+    def leaves(self) -> tuple[str, ...]:
+        """The journal."""
+        return (JOURNAL_NAME,)
+
+    @property
+    def files(self) -> Mapping[Path, Sequence[str]]:
+        """The files that its parameters name, the faults, the rig file and the protocol file."""
+        found: dict[Path, Sequence[str]] = {Path(name): () for name in (*self.inputs, self.faults) if name}
+        if self.rig.endswith(".toml"):
+            found[Path(self.rig)] = PROGRAMS_AND_RIGS
+        if ".py" in self.protocol:
+            found[Path(self.protocol.partition(".py")[0] + ".py")] = PROGRAMS
+        return found
+
+    def moved(self, places: Mapping[str, str]) -> Task:
+        """Return the same run with its files in other places."""
+        file, suffix, name = self.protocol.partition(".py")
+        return replace(
+            self,
+            protocol=places.get(file + suffix, file + suffix) + name,
+            rig=places.get(self.rig, self.rig),
+            faults=places.get(self.faults, self.faults),
+            parameters={
+                key: places.get(value, value) if isinstance(value, str) else value
+                for key, value in self.parameters.items()
+            },
+        )
+
+    def run(self, campaign: Path, folder: Path) -> Run:
+        """Return the run that it carries out; its record goes below `folder`."""
+        models = {key: str(campaign / name / MODEL_NAME) for key, name in self.models.items()}
+        return Run(
+            protocol=find_protocol(self.protocol),
+            settings={**self.parameters, **models},
+            rig=self.rig,
+            folder=folder,
+            overrides=self.overrides,
+            seed=self.seed + self.seed_offset,
+            clock="virtual",
+            recording=False,
+            interlock_rate=self.interlock_rate,
+            faults=Path(self.faults) if self.faults else None,
+        )
+
+    def describe(self) -> dict[str, Any]:
+        """Return what it is, for programs."""
+        return {"kind": "run", **_own_fields(self)}
+
+    def _work(self, campaign: Path, scratch: Path) -> tuple[Path, Done]:
+        result = carry_out(self.run(campaign, scratch), Console(quiet=True))
+        outcome = result.outcome
+        if isinstance(outcome.error, AbortError):
+            raise outcome.error
+        if outcome.error is not None and not isinstance(outcome.error, BenchError):
+            # A defect of a protocol or of the bench, not a result.
+            return result.folder, Done(self.identity, "crashed", outcome.reason)
+        results = {
+            "steps": (outcome.steps, "1"),
+            "laboratory_time": (outcome.laboratory_seconds, "s"),
+            "wall_time": (result.wall_seconds, "s"),
+            **run_results(result.folder),
+        }
+        unsafe = "" if outcome.is_safe else f"NOT in the safe state: {dict(outcome.safe_state)}"
+        reason = "; ".join(filter(None, (outcome.reason, unsafe, *warnings_of(result.folder))))
+        return result.folder, Done(self.identity, outcome.status if outcome.is_safe else "unsafe", reason, results)
+
+
+@dataclass(frozen=True)
+class ModelTask(Task):
+    """The identification of a model from a run, or from several together.
+
+    Attributes
+    ----------
+    table : str
+        Name of the table that asks for it.
+    sources : tuple of str
+        Names of the tasks of the runs; several for a model that needs them.
+    model : str
+        Name of a registered model.
+    input, output : str
+        Columns; empty for the signals of the slots `drive` and `response`.
+    options : mapping
+        Options of the identification, as `bench.analysis.model_service.identify_file` takes them.
+    label : str
+        What tells it from the others of its rig and seed.
+    """
+
+    table: str
+    sources: tuple[str, ...]
+    model: str
+    input: str = ""
+    output: str = ""
+    options: Mapping[str, Any] = field(default_factory=dict)
+    label: str = ""
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """The runs."""
+        return self.sources
+
+    @property
+    def leaves(self) -> tuple[str, ...]:
+        """The model."""
+        return (MODEL_NAME,)
+
+    def describe(self) -> dict[str, Any]:
+        """Return what it is, for programs."""
+        return {
+            "kind": "model",
+            "table": self.table,
+            "sources": self.sources,
+            "model": self.model,
+            "options": self.options,
+        }
+
+    def _work(self, campaign: Path, scratch: Path) -> tuple[Path, Done]:
+        made = scratch / "made"
+        made.mkdir()
+        runs = [completed_run(campaign, name) for name in self.sources]
+        whole = whole_identification(self.model)
+        if whole is not None:
+            whole.identify({str(run.meta["protocol"]): run.folder for run in runs}).save(made / MODEL_NAME)
+            return made, Done(self.identity, "completed")
+        (source,) = runs
+        found = identify_file(
+            source.folder,
+            input_column=self.input or source.signal_of("drive"),
+            output_column=self.output or source.signal_of("response"),
+            model=self.model,
+            **identification_options(self.options),
+        )
+        found.file.save(made / MODEL_NAME)
+        summary, unit = found.summary(), found.file.operator.output_unit or "1"
+        units = {"max": unit, "rms": unit, "rms_percent": "%"}
+        results = {name: (float(summary[name]), unit) for name, unit in units.items()}
+        return made, Done(self.identity, "completed", "", results)
+
+
+@dataclass(frozen=True)
+class ComparisonTask(Task):
+    """The errors of models on a run.
+
+    Attributes
+    ----------
+    table : str
+        Name of the table that asks for it.
+    source : str
+        Name of the run's task.
+    models : mapping of str to str
+        Name of each identification's task by that of its table.
+    input, output : str
+        Columns; empty for the signals of the slots `drive` and `response`.
+    recalibrate : str
+        What is estimated of the session first, with commas; empty for nothing.
+    recalibrate_rows : int, optional
+        First rows for that; they do not count in the errors.
+    """
+
+    table: str
+    source: str
+    models: Mapping[str, str]
+    input: str = ""
+    output: str = ""
+    recalibrate: str = ""
+    recalibrate_rows: int | None = None
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """The run and the identifications."""
+        return (self.source, *self.models.values())
+
+    def describe(self) -> dict[str, Any]:
+        """Return what it is, for programs."""
+        return {"kind": "comparison", **_own_fields(self)}
+
+    def _work(self, campaign: Path, scratch: Path) -> tuple[Path, Done]:
+        source = completed_run(campaign, self.source)
+        session = Session.parse(self.recalibrate or None, self.recalibrate_rows)
+        results: dict[str, tuple[float, str]] = {}
+        for name, task in self.models.items():
+            found = compare_models(
+                [campaign / task / MODEL_NAME],
+                source.folder,
+                self.input or source.signal_of("drive"),
+                self.output or source.signal_of("response"),
+                session=session,
+            )
+            (compared,) = found.comparisons
+            errors = found.recalibrated(compared) or found.comparisons[compared].raw
+            unit = found.unit or "1"
+            results |= {f"{name}_max": (errors.maximum, unit), f"{name}_rms": (errors.rms, unit)}
+        made = scratch / "made"
+        made.mkdir()
+        return made, Done(self.identity, "completed", "", results)
+
+
+@dataclass(frozen=True)
+class StudyTask(Task):
+    """A study with one seed.
+
+    Attributes
+    ----------
+    study : str
+        Name of a registered study.
+    rig : str
+        Another rig than the study's own; empty for that.
+    seed : int
+        From which the seeds of its runs come.
+    """
+
+    study: str
+    rig: str
+    seed: int
+
+    @property
+    def leaves(self) -> tuple[str, ...]:
+        """Values and tables."""
+        return (STUDY_NAME,)
+
+    def describe(self) -> dict[str, Any]:
+        """Return what it is, for programs."""
+        return {"kind": "study", "study": self.study, "rig": self.rig, "seed": self.seed}
+
+    def _work(self, campaign: Path, scratch: Path) -> tuple[Path, Done]:
+        del campaign
+        study: Study = registry.load("studies", self.study)
+        made = scratch / "made"
+        # The cores are shared by the tasks of the campaign.
+        with Workers(1) as workers:
+            found = study.carry_out(Campaign(self.rig or study.rig or "", made, self.seed, False, workers))
+        write_study(found, made)
+        return made, Done(self.identity, "completed", "", dict(flat_numbers(found.values)))
+
+
+def completed_run(campaign: Path, name: str) -> RunFolder:
+    """Return the run of a task; raises DataError if it was not completed."""
+    run = RunFolder(campaign / name)
+    if run.status != "completed":
+        raise DataError(f"the run {name} was not completed")
+    return run
+
+
+def _own_fields(task: RunTask | ComparisonTask) -> dict[str, Any]:
+    """Return the fields of a task but those that all tasks have."""
+    return {key: value for key, value in asdict(task).items() if key not in ("name", "identity")}
+
+
+def identification_options(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return options from a file as `identify_file` takes them: ranges are pairs, of several levels one is chosen."""
+    found = {key: tuple(value) if isinstance(value, list) else value for key, value in options.items()}
+    if isinstance(levels := found.get("levels"), tuple):
+        del found["levels"]
+        found |= {"levels_to_try": levels, "cross_validated": True}
+    return found
+
+
+def run_results(folder: Path) -> dict[str, tuple[float, str]]:
+    """Return what a run that controls a signal has reached: value and unit by name, such as `tracking_rms`."""
+    with Record(folder) as record:
+        controlled = str(record.meta.get("controls", ""))
+        found = results_json(record, controlled) if controlled else {}
+        unit = record.unit(controlled) if controlled else "1"
+    return {
+        f"{kind}_{name}": (float(value), "s" if name.startswith("seconds") else unit)
+        for kind, values in found.items()
+        for name, value in values.items()
+    }
+
+
+def warnings_of(folder: Path) -> list[str]:
+    """Return the warnings that the protocol of a run noted."""
+    with Record(folder) as record:
+        return [event.text for event in record.events() if event.kind == "note" and event.level == "WARN"]
+
+
+def flat_numbers(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, tuple[float, str]]]:
+    """Yield each number of the values of a study by its dotted name; what is no number is left out."""
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            yield from flat_numbers(value, f"{prefix}{key}.")
+        elif isinstance(value, (int, float)) and not isinstance(value, bool):
+            # Units are in the names, or the study's own tables say them.
+            yield f"{prefix}{key}", (float(value), "")

@@ -1,0 +1,17 @@
+from .application import (
+    app as app,
+    main as main,
+)
+from .catalogue import (
+    Catalogue as Catalogue,
+)
+from .command_support import (
+    STANDARD_OUTPUT as STANDARD_OUTPUT,
+    JsonOption as JsonOption,
+    console as console,
+    parse_assignments as parse_assignments,
+    parse_numbers as parse_numbers,
+    print_rows as print_rows,
+    warn as warn,
+    write_json as write_json,
+)

@@ -1,0 +1,304 @@
+"""`bench identify --model all`: the options of the comparison of models, its table, and errors on test rows."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from bench.analysis import ReadingOptions
+from bench.base import ConfigurationError, print_plain
+from bench.cli.command_support import check_outputs, console, print_rows
+from bench.cli.data_options import offer_options
+from bench.cli.model_options import ModelOptions
+
+if TYPE_CHECKING:
+    from bench.analysis import IdentifiedFile, SelectedModel, TestedModel
+    from bench.identification import Candidate
+
+# Rows of the printed table; all are in the file.
+_SHOWN = 10
+
+
+@dataclass(frozen=True)
+class Comparing:
+    """What the command line says of the comparison of models.
+
+    Attributes
+    ----------
+    train : slice or None
+        Rows that are fitted.
+    test : str or None
+        Rows or a file on which the model is tested.
+    table_out : Path or None
+        File for the table.
+    """
+
+    train: slice | None = None
+    test: str | None = None
+    table_out: Path | None = None
+
+    @property
+    def test_files(self) -> tuple[Path, ...]:
+        """The file on which the model is tested; none if there is none, or rows are given."""
+        from bench.analysis import is_rows
+
+        return () if self.test is None or is_rows(self.test) else (Path(self.test),)
+
+
+def _comparing(
+    train: Annotated[
+        str | None,
+        typer.Option(
+            metavar="START:STOP", help="Rows to fit, from 0, without STOP; the others still drive the memory."
+        ),
+    ] = None,
+    test: Annotated[
+        str | None,
+        typer.Option(
+            metavar="START:STOP|FILE", help="Rows, or another file, on which the errors of the model are stated."
+        ),
+    ] = None,
+    table_out: Annotated[
+        Path | None, typer.Option(metavar="FILE.csv", help="File for the table of the models that were compared.")
+    ] = None,
+) -> Comparing:
+    """Return what the command line says of the comparison of models; its signature is that of the options."""
+    from bench.analysis import parse_rows
+
+    if table_out is not None:
+        check_outputs(out=table_out)
+    return Comparing(parse_rows("--train", train) if train is not None else None, test, table_out)
+
+
+offer_comparing = offer_options(_comparing, "comparing")
+"""Offer a command's users the options of the comparison of models, in place of its parameter `comparing`."""
+
+
+def is_comparison(model: str) -> bool:
+    """Return whether several models are asked for: `all`, or names with commas between them."""
+    from bench.analysis import ALL
+
+    return model == ALL or "," in model
+
+
+def choose_model(
+    files: Sequence[Path],
+    columns: tuple[str, str],
+    model: str,
+    options: ModelOptions,
+    settings: dict[str, Any],
+    comparing: Comparing,
+    *,
+    skip: int,
+    time_column: str | None,
+    is_time_asked: bool,
+    reading: ReadingOptions,
+) -> SelectedModel:
+    """Compare models on measurements, and print the table.
+
+    Parameters
+    ----------
+    files, columns, skip, time_column, reading
+        The measurements.
+    is_time_asked : bool
+        Whether the column of times was asked for, not found.
+    model : str
+        `all`, or names with commas between them.
+    options : ModelOptions
+        Options of models that are given.
+    settings : dict
+        `smoothing`, `ridge`, `initial` and `orientation` as given.
+    comparing : Comparing
+        The options of the comparison.
+
+    Raises
+    ------
+    ConfigurationError
+        If an option is for one model, or none can be fitted.
+    """
+    from bench.analysis import named_models, select_model
+    from bench.identification import Given
+
+    if settings["ridge"] is not None:
+        raise ConfigurationError("--ridge goes with one --model NAME")
+    if options.levels_to_try:
+        raise ConfigurationError("--levels: give one number, or none, to compare models; or one --model")
+    orientation = settings["orientation"]
+    given = Given(
+        options.values,
+        initial=settings["initial"],
+        orientation=None if orientation == "auto" else orientation,
+        smoothing=settings["smoothing"],
+        is_time_asked=is_time_asked,
+    )
+    found = select_model(
+        files,
+        input_column=columns[0],
+        output_column=columns[1],
+        models=named_models(model),
+        given=given,
+        console=console,
+        skip=skip,
+        train=comparing.train,
+        time_column=time_column,
+        reading=reading,
+    )
+    _print_table(found)
+    if time_column is not None and not is_time_asked:
+        _print_line(_on_found_times(found, time_column))
+    if comparing.table_out is not None:
+        found.save(comparing.table_out)
+        print_plain(console, f"table: {comparing.table_out}")
+    return found
+
+
+def _print_table(found: SelectedModel) -> None:
+    """Print the best models, a line each; cells are never cut off."""
+    selection = found.selection
+    unit = found.unit or "units"
+    heads = [
+        ("", "", "deg. of", "training", "held out", "", "% of", "other", "CPU"),
+        ("", "model", "freedom", unit, unit, "±", "range", f"cycles, {unit}", "s"),
+    ]
+    shown = list(selection.evaluations[:_SHOWN])
+    shown += [each for each in (selection.chosen,) if each not in shown]
+    rows = [
+        (
+            "*" if each is selection.chosen else "+" if each is selection.best else "",
+            _describe(each.candidate),
+            f"{each.free:.0f}",
+            f"{each.training:.3g}",
+            f"{each.rms:.3g}",
+            f"{each.spread:.1g}",
+            f"{100.0 * each.rms / selection.span:.2f}",
+            f"{each.units_rms:.3g}" if each.units else "-",
+            f"{each.seconds:.1f}",
+        )
+        for each in shown
+    ]
+    widths = [max(map(len, column)) for column in zip(*heads, *rows, strict=True)]
+    _print_line("models by their RMS error on what was left out of the fit")
+    for row in (*heads, *rows):
+        # Marks and names begin a column, numbers end it.
+        cells = [
+            text.ljust(width) if place < 2 else text.rjust(width)
+            for place, (text, width) in enumerate(zip(row, widths, strict=True))
+        ]
+        _print_line(f"{cells[0]} {'  '.join(cells[1:])}".rstrip())
+    more = len(selection.evaluations) - len(shown)
+    _print_line(
+        "* chosen; + least error of those that may be, if that is another"
+        + (f"; {more} more were worse or given up" if more > 0 else "")
+    )
+    _print_line(
+        f"held out: contiguous blocks of the {selection.rows} rows compared, with gaps of {selection.gap}; "
+        "other cycles: whole kinds of cycles left out"
+    )
+    if (
+        selection.has_times
+        and selection.is_time_asked
+        and not any(each.candidate.static for each in selection.evaluations)
+    ):
+        _print_line("with time: no lag, resonance, delay, creep or drift behind the best operators is worth it")
+
+
+def find_common_times(
+    files: Sequence[Path], tests: Sequence[Path], columns: tuple[str, str], model: str, reading: ReadingOptions
+) -> str | None:
+    """Return the column of times that nobody named, where a model with time may use it.
+
+    None of several files, as times are those of one record, and if it is one of the model's own or missing from a
+    file for tests. What is in the way of comparing models with time is printed.
+    """
+    from bench.analysis import find_times, named_times
+    from bench.base import DataError
+    from bench.models import timed_models
+
+    if len(files) > 1 or not (is_comparison(model) or model in timed_models()):
+        return None
+    if not is_comparison(model):
+        return named_times(files[0], reading)
+    try:
+        name = find_times(files[0], reading)
+    except DataError as error:
+        print_plain(console, f"{error}: time is left out")
+        return None
+    if name in columns:
+        return None
+    for test in tests:
+        if name is not None and named_times(test, reading, name) != name:
+            print_plain(console, f"{test.name} has no column {name}: time is left out")
+            return None
+    return name
+
+
+def _on_found_times(found: SelectedModel, name: str) -> str:
+    """Return what became of a column of times that nobody asked for."""
+    selection = found.selection
+    if not selection.has_times:
+        return (
+            f"column {name} holds times, of too few or too many rows to be tried unasked: --time {name} compares "
+            "models with time all the same"
+        )
+    if found.is_timed:
+        return (
+            f"column {name} holds times: the chosen model takes time, as it errs at least 1.2 times less than what "
+            "would be chosen without. --time none leaves time out"
+        )
+    return (
+        f"column {name} holds times: no model with time errs 1.2 times less than the chosen one. "
+        f"--time {name} compares them as equals"
+    )
+
+
+def _print_line(text: str) -> None:
+    console.print(text, highlight=False, markup=False, soft_wrap=True)
+
+
+def _describe(one: Candidate) -> str:
+    """Return a model with its settings in short: those that differ from none."""
+    own = dict(one.options)
+    parts = [own.pop("static") + " with " + own.pop("dynamics") if "static" in own else one.model]
+    parts += [value if isinstance(value, str) else f"{name} {value}" for name, value in own.items() if value]
+    parts.append(one.orientation if one.orientation == "falling" else "")
+    parts.append(f"start {one.initial}" if one.initial else "")
+    parts.append(f"smooth {one.smoothing:g}" if one.smoothing else "")
+    return ", ".join(part for part in parts if part and part != "none")
+
+
+def check_test(path: Path, columns: tuple[str, str], time_column: str | None, reading: ReadingOptions) -> None:
+    """Check that a file for tests can be read, before anything is fitted.
+
+    Raises DataError if it cannot.
+    """
+    from bench.analysis import FEWEST_ROWS, read_files
+
+    names = (*columns, *([time_column] if time_column else ()))
+    read_files([path], names, at_least=FEWEST_ROWS, options=reading)
+
+
+def print_test(
+    found: IdentifiedFile, comparing: Comparing, columns: tuple[str, str], reading: ReadingOptions
+) -> TestedModel | None:
+    """Print the errors of a model on the test rows, if there are any, and return them."""
+    from bench.analysis import evaluate_on_test
+
+    if comparing.test is None:
+        return None
+    tested = evaluate_on_test(found, comparing.test, columns, reading)
+    unit = found.file.response.output_unit
+    raw, rezeroed = tested.comparison.raw, tested.comparison.rezeroed
+    skipped = f", first {tested.skip} rows left out" if tested.skip else ""
+    print_rows(
+        f"on {tested.source}{skipped}",
+        (
+            ("largest error", f"{raw.maximum:.4g} {unit} ({raw.maximum_percent:.2f} % of the range)"),
+            ("RMS error", f"{raw.rms:.4g} {unit} ({raw.rms_percent:.2f} % of the range)"),
+            ("re-zeroed RMS error", f"{rezeroed.rms:.4g} {unit} (offset {tested.comparison.offset:+.4g})"),
+        ),
+    )
+    return tested

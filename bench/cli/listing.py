@@ -1,0 +1,103 @@
+"""What `bench list` shows, remembered until a file of a package that registers a part changes.
+
+To say it anew, every rig, protocol, model and driver is imported: half a second of CPU.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.util
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from bench.base import json_text, parse_json, registry
+
+
+def listing() -> dict[str, Any]:
+    """Return the installed catalogue, as `bench.cli.catalogue.Catalogue.to_json`.
+
+    It is remembered in the user's folder for caches, unless something could not be loaded.
+    """
+    state = _state()
+    file = _file_of_this_environment()
+    with suppress(OSError, ValueError):
+        remembered = parse_json(file.read_text(encoding="utf-8"))
+        if isinstance(remembered, dict) and remembered.get("state") == state:
+            found: dict[str, Any] = remembered["catalogue"]
+            return found
+    from bench.cli.catalogue import Catalogue
+
+    found = Catalogue.of_installed().to_json()
+    if not found["problems"]:
+        # Where nothing can be remembered, it is said anew each time.
+        with suppress(OSError):
+            file.parent.mkdir(parents=True, exist_ok=True)
+            made = file.with_name(f"{file.name}.{os.getpid()}")
+            made.write_text(json_text({"state": state, "catalogue": found}), encoding="utf-8")
+            made.replace(file)
+    return found
+
+
+def _file_of_this_environment() -> Path:
+    # Another environment has another listing, which shall not take the place of this one's.
+    return _folder() / f"catalogue-{hashlib.sha256(sys.prefix.encode()).hexdigest()[:12]}.json"
+
+
+def _folder() -> Path:
+    if sys.platform == "win32":
+        base = os.environ.get("LOCALAPPDATA") or Path("~/AppData/Local").expanduser()
+    else:
+        base = os.environ.get("XDG_CACHE_HOME") or Path("~/.cache").expanduser()
+    return Path(base) / "actuator-bench"
+
+
+def _state() -> str:
+    """Return a digest of what is registered, the installed packages, and the files that are imported for it."""
+    digest = hashlib.sha256()
+    for text in (sys.version, *_places(), *_files()):
+        digest.update(text.encode("utf-8", "surrogateescape") + b"\0")
+    return digest.hexdigest()
+
+
+def _places() -> Iterator[str]:
+    """Yield the folders that packages are imported from; installing and removing one changes their times."""
+    for folder in sys.path:
+        with suppress(OSError):
+            yield f"{folder} {Path(folder).stat().st_mtime_ns}"
+
+
+def _files() -> Iterator[str]:
+    """Yield the entries, and the files of the packages that they name."""
+    packages = {"bench"}
+    for group in registry.GROUPS:
+        for entry in registry.entries(group).values():
+            yield f"{group} {entry.name} {entry.package} {entry.reference}"
+            packages.add(entry.reference.partition(":")[0].partition(".")[0])
+    for package in sorted(packages):
+        with suppress(ImportError, ValueError):
+            spec = importlib.util.find_spec(package)
+            if spec is None:
+                continue
+            if spec.origin:
+                yield from _file(spec.origin)
+            for folder in spec.submodule_search_locations or ():
+                yield from _below(folder)
+
+
+def _below(folder: str) -> Iterator[str]:
+    with suppress(OSError), os.scandir(folder) as entries:
+        for entry in sorted(entries, key=lambda entry: entry.name):
+            if entry.name.endswith((".py", ".toml")):
+                yield from _file(entry.path)
+            elif entry.name != "__pycache__" and entry.is_dir():
+                yield from _below(entry.path)
+
+
+def _file(path: str) -> Iterator[str]:
+    with suppress(OSError):
+        found = Path(path).stat()
+        yield f"{path} {found.st_mtime_ns} {found.st_size}"

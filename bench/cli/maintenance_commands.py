@@ -1,0 +1,198 @@
+"""The commands that look after the instruments of a rig: safe, recover, doctor."""
+
+from __future__ import annotations
+
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from bench.base import AbortError, ConfigurationError, DeviceError, show_table
+from bench.cli.command_support import JsonOption, console, parse_assignments, show_compilation, warn, write_json
+
+app = typer.Typer()
+
+UNSAFE_EXIT_CODE = 7
+
+RigArgument = Annotated[str, typer.Argument(metavar="RIG", help="A packaged rig, or a rig file: path/to/rig.toml.")]
+OverrideOption = Annotated[
+    list[str] | None,
+    typer.Option("--override", metavar="KEY=VALUE", help="Replace a value of the rig file; repeatable."),
+]
+AttachOption = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="Endpoints file of `bench emulate --json`: use the instruments served there."),
+]
+
+
+@app.command()
+def safe(
+    rig: RigArgument,
+    force: Annotated[
+        bool, typer.Option("--force", help="Go on although another process holds the rig; says who it is.")
+    ] = False,
+    limit: Annotated[
+        float | None, typer.Option(metavar="SECONDS", min=0.0, help="Give up after so long; without it, never.")
+    ] = None,
+    attach: AttachOption = None,
+    overrides: OverrideOption = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Bring every device of a rig into its safe state, whatever state the instruments are in.
+
+    For when a run has died, or an instrument reports an error. The lines are tried in parallel. A device that does
+    not confirm its safe state is named at once, with what to unplug, and tried again each second until it does, also
+    one whose port is not there. Ctrl-C and every signal that would end the process end it; a script sets `--limit`.
+    Nothing is configured, and errors stay (see `bench recover`). A run that goes on holds its lines: end it, or use
+    `--force`; a serial line that is open elsewhere may still be refused then.
+
+    Exit codes: 0 every output is off; 2 the rig file is wrong, or the rig is in use; 7 at least one device had not
+    confirmed its safe state when the command was ended, or at the limit.
+    """
+    from bench.base import Interrupts
+    from bench.rig import UNANSWERED, opened, rescue
+
+    replaced = parse_assignments("--override", overrides or [])
+    with opened(rig, replaced, attach, "bench safe", warn if force else None) as place, Interrupts() as interrupts:
+
+        def is_ended() -> bool:
+            return interrupts.pause_requested or interrupts.abort_requested()
+
+        said: dict[str, str] = {}
+        for seconds, found in rescue(place, is_ended, math.inf if limit is None else limit):
+            unsafe = {each.device: each for each in found if not each.is_safe}
+            for name, each in unsafe.items():
+                if each.state not in (UNANSWERED, said.get(name)):
+                    said[name] = each.state
+                    warn(f"{name}: NOT CONFIRMED: {each.state}; {each.advice}")
+            if unsafe and seconds >= 1.0:
+                warn(f"not confirmed after {seconds:.0f} s: {', '.join(unsafe)}; trying again, Ctrl-C ends")
+    table = Table("device", "state", "what to do", box=None, padding=(0, 2))
+    for each in found:
+        style = "green" if each.is_safe else "bold red"
+        state = each.state if each.is_safe else f"NOT CONFIRMED: {each.state}"
+        table.add_row(escape(each.device), f"[{style}]{escape(state)}[/]", escape(each.advice))
+    show_table(console, table)
+    write_json(json_file, {each.device: {"state": each.state, "is_safe": each.is_safe} for each in found})
+    if not all(each.is_safe for each in found):
+        sys.exit(UNSAFE_EXIT_CODE)
+
+
+@app.command()
+@show_compilation()
+def recover(
+    rig: RigArgument,
+    device: Annotated[str | None, typer.Argument(help="Only this device; without it all that are in error.")] = None,
+    yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
+    attach: AttachOption = None,
+    overrides: OverrideOption = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Clear the errors that a watchdog or a protection left in the instruments of a rig.
+
+    First every device is connected, its output switched off, and its error shown with what it means. Remove the cause
+    before you confirm: clearing restarts the instrument or releases its emergency stop. A servo loses its number of
+    turns. Every output is off at the end.
+
+    Exit codes: 0 every device is ready; 2 the rig file is wrong or does not fit an instrument, or the rig is in use;
+    4 a device is still in error, or cannot be reached; 130 not confirmed.
+    """
+    from bench.rig import Condition, look, opened, recover as recover_device
+
+    with opened(rig, parse_assignments("--override", overrides or []), attach, "bench recover") as place:
+        entries = place.only(device)
+        found: dict[str, Condition] = {entry.name: look(place, entry) for entry in entries}
+        _print_conditions(list(found.values()))
+        wanted = [entry for entry in entries if (at := found[entry.name]).state == "in error" and at.can_recover]
+        if wanted:
+            names = ", ".join(entry.name for entry in wanted)
+            if not yes and not (sys.stdin is not None and sys.stdin.isatty()):
+                raise ConfigurationError(f"clearing the errors of {names} needs --yes where no operator can answer")
+            question = f"Is the cause removed? Clear the errors of {names}"
+            if not yes and not typer.confirm(question, err=console.stderr):
+                raise AbortError("nothing was cleared")
+            found |= {entry.name: recover_device(place, entry) for entry in wanted}
+            console.print()
+            _print_conditions([found[entry.name] for entry in wanted])
+    write_json(json_file, {name: {"state": each.state, "meaning": each.meaning} for name, each in found.items()})
+    for each in found.values():
+        if each.state == "refused":
+            raise ConfigurationError(f"{each.device}: {each.meaning}")
+        if each.state != "ready":
+            raise DeviceError(each.device, f"is {each.state}: {each.meaning}")
+
+
+def _print_conditions(conditions: Sequence[object]) -> None:
+    from bench.rig import Condition
+
+    table = Table("device", "state", "what it is, or what it reports", box=None, padding=(0, 2))
+    for each in conditions:
+        assert isinstance(each, Condition)
+        style = "green" if each.state == "ready" else "bold red"
+        table.add_row(escape(each.device), f"[{style}]{each.state}[/]", escape(each.meaning))
+    show_table(console, table)
+
+
+@app.command()
+@show_compilation()
+def doctor(
+    rig: RigArgument,
+    exercise: Annotated[
+        bool,
+        typer.Option(
+            "--exercise", help="Move each actuator that a role gives a rest: to a set-point beside it, and back."
+        ),
+    ] = False,
+    attach: AttachOption = None,
+    overrides: OverrideOption = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Check the instruments of a rig, and the rig file against them, before a run.
+
+    Opens every line; identifies instruments and firmware; compares limits, ranges, watchdogs and interlocks; measures
+    noise, and the time of a reading beside telemetry and watchdogs. Outputs are switched off; nothing moves without
+    `--exercise`. An emulated rig is checked in process.
+
+    Exit codes: 0 all is well; 1 something should be mended; 2 the rig file is wrong, or the rig is in use; 4 a device
+    cannot be connected, is in error or fails to read; 7 at least one device did not confirm its safe state at the
+    end. The highest counts.
+    """
+    from bench.base import Interrupts
+    from bench.rig import check_up, opened
+
+    def keep_on() -> None:
+        if interrupts.pause_requested or interrupts.abort_requested():
+            raise AbortError("the check-up was ended; every device was brought into its safe state")
+
+    replaced = parse_assignments("--override", overrides or [])
+    with Interrupts() as interrupts, opened(rig, replaced, attach, "bench doctor") as place:
+        place.clock.interrupted = lambda: interrupts.pause_requested or interrupts.abort_requested()
+        checks = check_up(place, exercise, keep_on)
+        name = place.file.name
+    table = Table("device", "what", "found", "what to do", box=None, padding=(0, 2))
+    for check in checks:
+        if check.identity:
+            table.add_row(f"[bold]{escape(check.device)}[/]", "instrument", escape(check.identity), "")
+        for finding in check.findings:
+            style = "yellow" if finding.advice else "default"
+            device, text, advice = map(escape, (check.device or f"rig {name}", finding.text, finding.advice))
+            table.add_row(f"[bold]{device}[/]", escape(finding.subject), f"[{style}]{text}[/]", advice)
+    show_table(console, table)
+    code = 0
+    if any(finding.advice for check in checks for finding in check.findings):
+        code = 1
+    if any(check.failed for check in checks):
+        code = DeviceError.exit_code
+    if any(check.unsafe for check in checks):
+        code = UNSAFE_EXIT_CODE
+    count = sum(bool(finding.advice) for check in checks for finding in check.findings)
+    console.print(f"{count} to look at" if count else "all is well", highlight=False)
+    write_json(json_file, {"rig": name, "exit_code": code, "devices": [asdict(check) for check in checks]})
+    if code:
+        sys.exit(code)

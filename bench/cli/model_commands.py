@@ -1,0 +1,475 @@
+"""The commands that identify and apply models."""
+
+from __future__ import annotations
+
+from enum import Enum
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import typer
+
+from bench.analysis import ReadingOptions
+from bench.base import ConfigurationError, print_plain
+from bench.cli.band_options import BandOption, RecalibrateOption, RecalibrateRowsOption, print_band, print_examined
+from bench.cli.choice_options import (
+    Comparing,
+    check_test,
+    choose_model,
+    find_common_times,
+    is_comparison,
+    offer_comparing,
+    print_test,
+)
+from bench.cli.command_support import (
+    JsonOption,
+    check_outputs,
+    console,
+    print_rows,
+    show_compilation,
+    warn,
+    write_json,
+)
+from bench.cli.data_options import layout_options, print_assumptions
+from bench.cli.model_options import ModelOptions, offer_model_options
+from bench.cli.patience import show_patience
+from bench.cli.written import print_figures, write_fit, write_rows
+
+app = typer.Typer()
+
+
+DataArgument = Annotated[
+    Path,
+    typer.Argument(
+        metavar="FILE", help="Table of measurements (text, .gz, .mat, .xlsx, .parquet), or the folder of a run."
+    ),
+]
+ModelArgument = Annotated[Path, typer.Argument(metavar="model.json", help="A model file.")]
+ContinueMemory = Annotated[
+    bool,
+    typer.Option(
+        "--continue-memory", help="Start from the memory at the end of the model's data, not at their start."
+    ),
+]
+InitialOption = Annotated[
+    str | None,
+    typer.Option(
+        "--initial",
+        metavar="KIND",
+        help="Memory at the first row: file (that at the start of the model's data; if not given), negative or "
+        "positive saturation, or unknown: skip the rows that it could reach.",
+    ),
+]
+
+
+TimeColumn = Annotated[
+    str | None,
+    typer.Option(
+        "--time",
+        metavar="COLUMN",
+        help="Column of times, for a model with time; if not given, that of its data, or one named time or t.",
+    ),
+]
+
+
+@app.command("identify")
+@offer_comparing
+@offer_model_options
+@layout_options
+@show_compilation()
+def identify_(
+    context: typer.Context,
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FILE...",
+            help="Tables of measurements (text, .gz, .mat, .xlsx, .parquet), or folders of runs; one model of all.",
+        ),
+    ],
+    input_column: Annotated[str, typer.Option("--input", metavar="COLUMN", help="Input column.")],
+    output_column: Annotated[str, typer.Option("--output", metavar="COLUMN", help="Output column.")],
+    model: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME[,NAME...]|all",
+            help="Model to fit; `bench list` shows the names. Of several, or all, the one that predicts best what is "
+            "left out of its fit.",
+        ),
+    ] = "all",
+    smoothing: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            help="Weight of the roughness penalty on the density; if not given, 0, and by cross-validation for "
+            "signed densities.",
+        ),
+    ] = None,
+    ridge: Annotated[
+        float | None,
+        typer.Option(min=0.0, help="Weight of the penalty on the size of the density; if not given, as --smoothing."),
+    ] = None,
+    skip: Annotated[
+        int,
+        typer.Option(min=0, metavar="ROWS", help="First rows, which drive the memory but are left out of the fit."),
+    ] = 0,
+    initial: Annotated[
+        str | None,
+        typer.Option(
+            metavar="KIND",
+            help="Memory at the first row: negative or positive saturation, or unknown: skip the rows that it could "
+            "reach, or estimate it.",
+        ),
+    ] = None,
+    time_column: Annotated[
+        str | None,
+        typer.Option(
+            "--time",
+            metavar="COLUMN|none",
+            help="Column of times: models with time take part in the comparison. If not given, one named time or t, "
+            "by which a model is chosen only if it errs 1.2 times less; none leaves time out.",
+        ),
+    ] = None,
+    static: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Operator within a model with time, such as preisach (hammerstein)."),
+    ] = None,
+    dynamics: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LIST",
+            help="What follows the operator: lag, resonance, delay, creep, kelvin-voigt, drift, fading-drift, or "
+            "none; chosen by the data if not given (hammerstein).",
+        ),
+    ] = None,
+    orientation: Annotated[
+        str,
+        typer.Option(
+            metavar="KIND",
+            help="Whether the output rises or falls with the input: auto (what fits better), rising, falling.",
+        ),
+    ] = "auto",
+    weights_column: Annotated[
+        str | None,
+        typer.Option("--weights", metavar="COLUMN", help="Column of the weight of each row in the fit, ≥ 0."),
+    ] = None,
+    cross_validate: Annotated[
+        bool, typer.Option("--cross-validate", help="Choose the smoothing by cross-validation, and show the table.")
+    ] = False,
+    band: BandOption = False,
+    out: Annotated[Path | None, typer.Option(metavar="model.json", help="Model file to write.")] = None,
+    card: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.md", help="Model card to write: data, errors, limits of validity, command line."),
+    ] = None,
+    figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for figures.")] = None,
+    json_file: JsonOption = None,
+    *,
+    reading: ReadingOptions,
+    options: ModelOptions,
+    comparing: Comparing,
+) -> None:
+    """Identify a hysteresis model from measurements, and say how good it is.
+
+    Columns are named as in the header; a unit at the end, as in `force [N]`, may be left out and goes into the
+    model. A number, such as `--input 1`, chooses a column by its place. The layout of a file is found from it and
+    printed; `--delimiter`, `--decimal`, `--encoding`, `--skip-lines` and `--table` set it. Of a run, the readings of
+    its steps are taken: `bench identify RUN --input voltage --output displacement --model preisach --out model.json`;
+    `--table telemetry` takes those within its steps, as of a fast loop.
+    """
+    from bench.analysis import NO_TIMES, certificate_lines, identify_file
+
+    check_outputs(out=out, card=card, figures=figures, json_file=json_file, read=[*files, *comparing.test_files])
+    names = ", ".join(file.name for file in files)
+    columns = (input_column, output_column)
+    if input_column == output_column:
+        raise ConfigurationError(f"--input and --output are the same column, {input_column}; a model needs two")
+    is_time_asked = time_column is not None
+    if not is_time_asked:
+        time_column = find_common_times(files, comparing.test_files, columns, model, reading)
+    elif time_column == NO_TIMES:
+        time_column = None
+    if comparing.test_files:
+        check_test(comparing.test_files[0], columns, time_column, reading)
+    settings: dict[str, Any] = {
+        "smoothing": smoothing,
+        "ridge": ridge,
+        "initial": initial,
+        "orientation": orientation,
+        "skip": skip,
+    }
+    selected = None
+    if is_comparison(model):
+        if cross_validate or weights_column:
+            raise ConfigurationError("--cross-validate and --weights go with one --model NAME")
+        if static is not None or dynamics is not None:
+            raise ConfigurationError("--static and --dynamics go with --model hammerstein")
+        selected = choose_model(
+            files,
+            columns,
+            model,
+            options,
+            settings,
+            comparing,
+            skip=skip,
+            time_column=time_column,
+            is_time_asked=is_time_asked,
+            reading=reading,
+        )
+        model, settings = selected.model, settings | selected.settings()
+        time_column = time_column if selected.is_timed else None
+    elif comparing.table_out is not None:
+        raise ConfigurationError("--table-out goes with --model all, or several models")
+    else:
+        settings |= {**options.values, "static": static, "dynamics": dynamics}
+    with show_patience(f"reading and fitting {names}"):
+        found = identify_file(
+            files,
+            input_column=input_column,
+            output_column=output_column,
+            model=model,
+            time_column=time_column,
+            cross_validated=cross_validate,
+            weights_column=weights_column,
+            levels_to_try=options.levels_to_try,
+            train=comparing.train,
+            band=band,
+            reading=reading,
+            **settings,
+        )
+    if selected is not None:
+        found = selected.record_in(found)
+    # Before anything is printed: a terminal that fails must not cost the fit.
+    if out is not None:
+        found.file.save(out)
+    print_assumptions(names, found.assumptions)
+    if found.trials is not None:
+        console.print(f"cross-validation, errors in {found.file.response.output_unit or 'output units'}:")
+        console.print(found.trials.table(), highlight=False, markup=False)
+    for warning in found.warnings:
+        warn(warning)
+    print_rows(f"{model} from {names}", certificate_lines(found))
+    if found.band is not None:
+        print_band(found.band)
+    if out is not None:
+        print_plain(console, f"model: {out}")
+    tested = print_test(found, comparing, columns, reading)
+    write_fit(found, files[0], context=context, out=out, card=card, figures=figures)
+    more = {"test": tested.to_json()} if tested else {}
+    more |= {"selection": selected.to_json()} if selected else {}
+    write_json(json_file, found.summary() | more)
+
+
+@app.command("predict")
+@layout_options
+@show_compilation()
+def predict_(
+    model_path: ModelArgument,
+    file: DataArgument,
+    input_column: Annotated[str, typer.Option("--input", metavar="COLUMN", help="Input column.")],
+    out: Annotated[Path, typer.Option(metavar="FILE.csv", help="File for input and prediction.")],
+    output_column: Annotated[
+        str | None, typer.Option("--output", metavar="COLUMN", help="Measured output, to compare with.")
+    ] = None,
+    time_column: TimeColumn = None,
+    skip: Annotated[
+        int | None,
+        typer.Option(
+            min=0,
+            metavar="ROWS",
+            help="First rows, which drive the memory but are left out of the errors; on the model's own data those "
+            "that its identification left out.",
+        ),
+    ] = None,
+    initial: InitialOption = None,
+    continue_memory: ContinueMemory = False,
+    recalibrate: RecalibrateOption = None,
+    recalibrate_rows: RecalibrateRowsOption = None,
+    figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for figures.")] = None,
+    json_file: JsonOption = None,
+    *,
+    reading: ReadingOptions,
+) -> None:
+    """Apply a model to a column of inputs, row by row.
+
+    Writes a CSV file with the input column and `predicted`; with `--time` the time before them, with `--output` also
+    `measured` and `residual` (measured minus predicted), and if the model has a prediction band `predicted lower` and
+    `predicted upper`. Heads have the units. The model starts from the memory that it had at the start of its own
+    data, so that on these data the errors are those of `bench identify`. With `--recalibrate` the predictions are
+    those for the session of the measured output.
+    """
+    from bench.analysis import (
+        Predictions,
+        Quantity,
+        Session,
+        check_unit,
+        choose_times,
+        errors_json,
+        examine,
+        foreign_drift,
+        outside_of_range,
+        read_columns,
+        read_times,
+        starting_state,
+        time_quantity,
+    )
+    from bench.identification import load_model
+
+    check_outputs(out=out, figures=figures, json_file=json_file, read=(model_path, file))
+    session = Session.parse(recalibrate, recalibrate_rows)
+    model = load_model(model_path)
+    time_column = choose_times(model, file, time_column, reading)
+    with show_patience(f"reading {file.name}"):
+        names = [name for name in (input_column, output_column, time_column) if name]
+        columns = read_columns(file, names, options=reading)
+    print_assumptions(file.name, columns.assumptions)
+    inputs = columns.values[input_column]
+    check_unit(model.response.input_unit, columns.units[input_column], input_column)
+    if output_column:
+        check_unit(model.response.output_unit, columns.units[output_column], output_column)
+    if warning := outside_of_range(model, inputs):
+        warn(warning)
+    if session is None and (warning := foreign_drift(model, inputs)):
+        warn(warning)
+    start = starting_state(model, inputs, initial=initial, skip=skip, continue_memory=continue_memory)
+    measured = columns.values[output_column] if output_column else None
+    times = read_times(columns, time_column) if time_column else None
+    found = examine(model, inputs, measured, state=start.state, session=session, skip=start.skip, times=times)
+    unit = model.response.output_unit
+    rows = Predictions(
+        Quantity(input_column, columns.units[input_column] or model.response.input_unit, inputs),
+        unit,
+        {model.name: found.predicted},
+        Quantity(output_column, unit, columns.values[output_column]) if output_column else None,
+        time_quantity(times),
+        skip=found.first,
+        bands={model.name: found.band} if found.band else {},
+    )
+    result: dict[str, Any] = {"model": model.name, "samples": int(inputs.size), "out": str(out), **found.to_json()}
+    print_examined(found)
+    if output_column:
+        errors = rows.errors()[model.name]
+        result |= {**errors_json(errors), "skipped": found.first}
+        print_rows(
+            f"{model.name} on {file.name}",
+            (
+                ("samples", f"{inputs.size - found.first} (skipped: {found.first})"),
+                ("largest error", f"{errors.maximum:.4g} {unit} ({errors.maximum_percent:.2f} % of the range)"),
+                ("RMS error", f"{errors.rms:.4g} {unit} ({errors.rms_percent:.2f} % of the range)"),
+            ),
+        )
+    write_rows(out, rows)
+    if figures is not None:
+        from bench.analysis import draw_predicted
+
+        print_figures(draw_predicted(rows, figures))
+    write_json(json_file, result)
+
+
+class PolicyOption(Enum):
+    """Which answer of an inverse is taken."""
+
+    NEAREST: Literal["nearest"] = "nearest"  # type: ignore[misc]  # so that its value is of a literal type
+    PAPER: Literal["paper"] = "paper"  # type: ignore[misc]
+
+
+@app.command()
+@layout_options
+@show_compilation()
+def invert(
+    model_path: ModelArgument,
+    file: Annotated[
+        Path, typer.Argument(metavar="TARGETS.csv", help="Table of targets (text, .gz, .mat, .xlsx, .parquet).")
+    ],
+    column: Annotated[str, typer.Option("--column", metavar="NAME", help="Column with the targets.")],
+    out: Annotated[Path, typer.Option(metavar="FILE.csv", help="File for the set-points.")] = Path("setpoints.csv"),
+    time_column: TimeColumn = None,
+    policy: Annotated[
+        PolicyOption,
+        typer.Option(help="Choice among several solutions: nearest, or the paper's direction rule."),
+    ] = PolicyOption.NEAREST,
+    initial: InitialOption = None,
+    continue_memory: ContinueMemory = False,
+    json_file: JsonOption = None,
+    *,
+    reading: ReadingOptions,
+) -> None:
+    """Compute the set-points that bring a model's output to one target after another.
+
+    Writes a CSV file, a row a target: `target`, `passing` (a set-point to pass before, where the target is met
+    only after saturation), `setpoint`, `predicted` (the model's output there) and `flag` (`met`, `too high` or
+    `too low`; what cannot be met is clamped to the nearest reachable value). If the model has a prediction band, also
+    its ends for the set-point, by the local slope, and for the output there. Of models with time `hammerstein`
+    and `rate-dependent-plays` are inverted, at the times of the targets (`--time`); `time` is the first column then.
+    Behind a delay set-points are for the targets that come so much later, and flags also `near` (met but for
+    targets between the rows) and `too early` (before any set-point has an effect).
+    """
+    from bench.analysis import (
+        NEAR,
+        TOO_EARLY,
+        check_unit,
+        choose_times,
+        invert_band,
+        invert_targets,
+        read_columns,
+        read_times,
+        starting_state,
+        write_csv,
+    )
+    from bench.base import header_with_unit
+    from bench.identification import load_model
+
+    check_outputs(out=out, json_file=json_file, read=(model_path, file))
+    model = load_model(model_path)
+    time_column = choose_times(model, file, time_column, reading)
+    with show_patience(f"reading {file.name}"):
+        columns = read_columns(file, [name for name in (column, time_column) if name], options=reading)
+    print_assumptions(file.name, columns.assumptions)
+    units = (model.response.input_unit, model.response.output_unit)
+    check_unit(units[1], columns.units[column], column)
+    found = invert_targets(
+        model,
+        columns.values[column],
+        policy=policy.value,
+        initial=initial,
+        continue_memory=continue_memory,
+        times=read_times(columns, time_column) if time_column else None,
+    )
+    for warning in found.warnings():
+        warn(warning)
+    start = starting_state(model, initial=initial, continue_memory=continue_memory)
+    banded = invert_band(model, found.setpoints, found.passing, start.state, found.times)
+    bands = banded.columns(found.setpoints, found.predicted, units[0]) if banded else []
+    passing = ["" if value != value else value for value in found.passing.tolist()]
+    written: list[tuple[str, Any]] = [
+        *([] if found.times is None else [(header_with_unit("time", "s"), found.times)]),
+        (header_with_unit("target", units[1]), found.targets),
+        (header_with_unit("passing", units[0]), passing),
+        (header_with_unit("setpoint", units[0]), found.setpoints),
+        (header_with_unit("predicted", units[1]), found.predicted),
+        ("flag", list(found.flags)),
+        *bands,
+    ]
+    write_csv(out, [head for head, _ in written], [values for _, values in written])
+    if banded is not None:
+        print_band(banded.outputs)
+    kinds = ("met", "too high", "too low", *((NEAR, TOO_EARLY) if found.delay else ()))
+    counts = {flag: found.flags.count(flag) for flag in kinds}
+    two = sum(value != "" for value in passing)
+    console.print(
+        f"{len(found.flags)} targets: {', '.join(f'{count} {flag}' for flag, count in counts.items())}; "
+        f"{two} by way of saturation: {out}",
+        highlight=False,
+        soft_wrap=True,
+    )
+    met = [abs(p - t) for p, t, f in zip(found.predicted, found.targets, found.flags, strict=True) if f == "met"]
+    write_json(
+        json_file,
+        {
+            "model": model.name,
+            "targets": len(found.flags),
+            **{flag.replace(" ", "_"): count for flag, count in counts.items()},
+            "through_saturation": two,
+            "largest_residual": float(max(met)) if met else None,
+            "out": str(out),
+            **({"band": banded.outputs.to_json()} if banded else {}),
+        },
+    )

@@ -1,0 +1,307 @@
+"""The commands that list parts and run protocols."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from bench.base import BenchError, ConfigurationError, print_plain, show_table
+from bench.cli.command_support import (
+    JsonOption,
+    LiveOption,
+    NotifyOption,
+    SettingsOption,
+    check_outputs,
+    console,
+    error_console,
+    parse_assignments,
+    print_error,
+    print_table,
+    show_compilation,
+    warn,
+    write_json,
+)
+from bench.cli.model_options import inverse_of, options_json, print_model, print_models
+from bench.cli.rehearse_command import show_rehearsal
+
+if TYPE_CHECKING:
+    from bench.run import RunResult
+
+app = typer.Typer()
+
+UNSAFE_EXIT_CODE = 7
+
+
+@app.command("list")
+def list_(
+    name: Annotated[
+        str | None,
+        typer.Argument(
+            help="A rig, a protocol or a model to show in full, or `models` for all their options; without it, names."
+        ),
+    ] = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Show what there is: rigs with the protocols that fit them, models, controllers, studies; or one of these.
+
+    A protocol is shown with its parameters, a rig with its file: `bench list RIG > desk.toml` gives you a copy to
+    fill in. What comes from another package bears its name; an entry that cannot be loaded is named and left out.
+    """
+    if name is None:
+        from bench.cli.listing import listing
+
+        listed = listing()
+        _print_listing(listed)
+        write_json(json_file, listed)
+        return
+
+    from bench.cli.catalogue import Catalogue
+    from bench.models import identifiable_models, timed_models
+
+    catalogue = Catalogue.of_installed()
+    if name in catalogue.rigs:
+        # Plain, so that it can be redirected into a file.
+        typer.echo(catalogue.rigs[name].text, nl=False, err=console.stderr)
+        write_json(json_file, {"name": name, "text": catalogue.rigs[name].text})
+    elif name in catalogue.protocols:
+        definition = catalogue.protocols[name]
+        print_protocol(definition)
+        write_json(json_file, {"name": name, "parameters": [vars(entry) for entry in definition.help()]})
+    elif name == "models":
+        specs = identifiable_models() | timed_models()
+        print_models(specs)
+        write_json(json_file, {each: _model_json(spec) for each, spec in specs.items()})
+    elif name in (specs := identifiable_models() | timed_models()):
+        print_model(specs[name])
+        write_json(json_file, {"name": name, **_model_json(specs[name])})
+    elif name in (others := {**catalogue.studies, **catalogue.controllers}):
+        console.print(others[name], highlight=False)
+        write_json(json_file, {"name": name, "summary": others[name]})
+    else:
+        known = ", ".join([*catalogue.rigs, *catalogue.protocols, *specs, *others])
+        raise ConfigurationError(
+            f"there is no rig, protocol, model, controller or study {name!r}; there are: {known}"
+        )
+
+
+def _model_json(spec: Any) -> dict[str, Any]:  # noqa: ANN401 - a ModelSpec, not imported at start
+    return {"summary": spec.summary, "inverse": inverse_of(spec), "options": options_json(spec)}
+
+
+def _print_listing(listed: Mapping[str, Any]) -> None:
+    def titles(group: str) -> dict[str, str]:
+        packages = {name: f" \\[{package}]" for name, package in listed["packages"].items()}
+        return {name: text + packages.get(name, "") for name, text in listed[group].items()}
+
+    alike: dict[tuple[str, ...], dict[str, str]] = {}
+    for rig, title in titles("rigs").items():
+        alike.setdefault(tuple(listed["fitting"][rig]), {})[rig] = title
+    for protocols, rigs in alike.items():
+        print_table("rigs", rigs)
+        names = ", ".join(name + "*" * (name in listed["take_a_model"]) for name in protocols) or "none"
+        console.print(f"    [dim]protocols (*: takes a model file):[/] {names}\n", highlight=False)
+    for group in ("protocols", "models", "controllers"):
+        print_table(group, titles(group))
+    print_table("studies, for `bench reproduce`", titles("studies"))
+    for problem in listed["problems"]:
+        warn(f"left out: {problem}")
+
+
+@app.command(add_help_option=False)
+def run(
+    context: typer.Context,
+    protocol: Annotated[
+        str | None, typer.Argument(help="Name of a protocol, or a file of your own: path/to/file.py[:NAME].")
+    ] = None,
+    rig: Annotated[
+        str | None,
+        typer.Option("--rig", metavar="RIG", help="Name of a packaged rig, or a rig file: path/to/rig.toml."),
+    ] = None,
+    settings: SettingsOption = None,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--override",
+            metavar="KEY=VALUE",
+            help="Replace a value of the rig file, such as devices.NAME.port=/dev/ttyUSB1; may come several times.",
+        ),
+    ] = None,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers of an emulated laboratory.")] = 0,
+    clock: Annotated[
+        str,
+        typer.Option(
+            help="wall; on emulated rigs also virtual (as fast as possible) or xN (N times as fast as the wall "
+            "clock). There a process that cannot keep up slows the laboratory down, so that no emulated watchdog "
+            "trips because the machine is busy; the factor reached is recorded, and printed if it is below 90 % of N."
+        ),
+    ] = "wall",
+    attach: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Endpoints file of `bench emulate --json`: use the instruments served there, on their clock.",
+        ),
+    ] = None,
+    faults: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE",
+            help="Faults of the emulated laboratory from a file (.toml, .jsonl): at = seconds of laboratory time "
+            "from the start of the run, or rate an hour with a seed; fault, values, duration. "
+            "docs/reference/emulate.md lists them.",
+        ),
+    ] = None,
+    interlock_rate: Annotated[
+        float | None,
+        typer.Option(
+            metavar="HZ",
+            min=0.01,
+            max=50.0,
+            help="Look at the interlocks of an emulated rig so often in a laboratory second, beside each reading; on "
+            "hardware the rig file says it ([safety] rate, 5 Hz).",
+        ),
+    ] = None,
+    rehearse: Annotated[
+        bool,
+        typer.Option(
+            "--rehearse/--no-rehearse",
+            help="Rehearse the run on the emulated twin of the rig first, and refuse it if it would not complete; on "
+            "the virtual clock it is not rehearsed.",
+        ),
+    ] = True,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Only say what the run would do and touch, as `bench rehearse` does.")
+    ] = False,
+    notify: NotifyOption = None,
+    out: Annotated[Path, typer.Option(metavar="DIR", help="Parent of the run's folder.")] = Path("recordings"),
+    live: LiveOption = False,
+    json_file: JsonOption = None,
+    help_: Annotated[
+        bool,
+        typer.Option(
+            "--help",
+            help="Show this message; after PROTOCOL also its parameters, and with --rig their defaults there.",
+        ),
+    ] = False,
+) -> None:
+    """Carry a protocol out on a rig, record it, and leave every device in its safe state.
+
+    The run is rehearsed on the rig's emulated twin before anything moves. Ctrl-C pauses at the next
+    step and asks; Ctrl-C again ends at once; so does every signal that would end a process, such as
+    SIGTERM, SIGHUP and SIGUSR1. However the run ends, every device is brought into its safe state,
+    and what was recorded so far is kept.
+    """
+    from bench.protocol import find_protocol
+
+    if help_ or protocol is None:
+        console.print(context.get_help(), highlight=False)
+        if protocol is not None:
+            print_protocol(find_protocol(protocol), rig)
+        return
+    if rig is None:
+        raise ConfigurationError("--rig is missing; `bench list` shows the installed rigs")
+    if attach is not None and (clock != "wall" or seed):
+        raise ConfigurationError("--attach: clock and seed are the server's; leave --clock and --seed out")
+    check_outputs(
+        json_file=json_file, folder=None if dry_run else out, read=[Path(rig)] if rig.endswith(".toml") else []
+    )
+    definition = find_protocol(protocol)
+    given = parse_assignments("--set", settings or [])
+
+    from bench.base import Interrupts
+    from bench.run import Run, carry_out, say_what_ctrl_c_does
+
+    asked = Run(
+        protocol=definition,
+        settings=given,
+        rig=rig,
+        overrides=parse_assignments("--override", overrides or []),
+        seed=seed,
+        clock=clock,
+        folder=out,
+        live=live,
+        attach=attach,
+        interlock_rate=interlock_rate,
+        faults=faults,
+        rehearse=rehearse,
+        notify=tuple(notify or ()),
+    )
+    if dry_run:
+        if not rehearse:
+            raise ConfigurationError("--dry-run is a rehearsal; leave --no-rehearse out")
+        show_rehearsal(asked, json_file)
+        return
+    # Until the result is printed: a terminal that hangs must not keep the process from being ended.
+    with Interrupts(say_what_ctrl_c_does) as interrupts:
+        with show_compilation():
+            result = carry_out(asked, console, interrupts)
+        print_result(result, json_file)
+
+
+def print_result(result: RunResult, json_file: Path | None, more: Mapping[str, Any] | None = None) -> None:
+    """Print how a run ended, write it with `more` for programs, and exit with the code of what ended it."""
+    from bench.rig import SAFE
+
+    outcome, ratio = result.outcome, result.time_ratio
+    # Of a run that was resumed, this process has seen the end only.
+    end = "" if outcome.own_seconds >= outcome.laboratory_seconds else f", the last {outcome.own_seconds:.0f} s of it"
+    console.print(
+        f"{outcome.status}: {outcome.steps} steps, {outcome.laboratory_seconds:.0f} s of laboratory time{end} in "
+        f"{result.wall_seconds:.1f} s" + (f" ({ratio:.0f} times as fast)" if ratio >= 2 else ""),
+        highlight=False,
+    )
+    if outcome.pace is not None and not outcome.pace.is_reached:
+        console.print(f"clock: {outcome.pace}", highlight=False)
+    print_plain(console, f"record: {result.folder}")
+    write_json(
+        json_file,
+        {
+            "folder": str(result.folder),
+            "status": outcome.status,
+            "reason": outcome.reason,
+            "steps": outcome.steps,
+            "laboratory_seconds": outcome.laboratory_seconds,
+            "wall_seconds": result.wall_seconds,
+            "safe_state": dict(outcome.safe_state),
+            "is_safe": outcome.is_safe,
+            **(more or {}),
+        },
+    )
+    for name, state in outcome.safe_state.items():
+        if state != SAFE:
+            error_console.print(
+                "[bold red]error:[/]",
+                escape(f"{name} is NOT in its safe state: {state}"),
+                highlight=False,
+                soft_wrap=True,
+            )
+    if outcome.error is not None:
+        if not isinstance(outcome.error, BenchError):
+            raise outcome.error
+        print_error(outcome.error)
+    # What is not safe matters more than what ended the run.
+    if not outcome.is_safe:
+        sys.exit(UNSAFE_EXIT_CODE)
+    if isinstance(outcome.error, BenchError):
+        sys.exit(outcome.error.exit_code)
+
+
+def print_protocol(definition: Any, rig: str | None = None) -> None:  # noqa: ANN401 - a ProtocolDefinition
+    """Print a protocol's help: what it does and what can be set; with a rig, its defaults and units."""
+    from rich.markdown import Markdown
+
+    from bench.rig import load_rig
+
+    file = load_rig(rig) if rig is not None else None
+    console.print(Markdown(f"**{definition.name}**: {definition.description}"))
+    console.print()
+    table = Table("--set", "default", "unit", "allowed", "what it does", title="parameters", title_justify="left")
+    for entry in definition.help(file.roles, file.protocols.get(definition.name)) if file else definition.help():
+        table.add_row(entry.name, entry.default, entry.unit, entry.allowed, entry.text)
+    show_table(console, table)

@@ -1,0 +1,1 @@
+"""Excitations and the design of experiments."""

@@ -1,0 +1,1 @@
+"""Constrained least squares and what belongs to one fit."""

@@ -1,0 +1,410 @@
+"""The search for the parameters of what follows an operator: variable projection from several starts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+from typing import Literal, NamedTuple
+
+import numpy as np
+
+from bench.base import Floats
+from bench.identification.by_name import FitProblem
+from bench.identification.fit.least_squares import Fit, fit, fit_minimum_norm
+from bench.identification.timed.parsimony import deviations_of, moving
+from bench.models import LinearPart, Regressor, logarithmic_creep
+
+EVALUATIONS = 40
+"""Evaluations of a search."""
+
+FREE = 30
+"""Principal columns of the operator in a first search."""
+
+# Rounds of search and constrained fit, and the relative gain of the cost at which they end.
+_ROUNDS, _GAIN = 6, 1e-7
+_STARTS = 3
+# Principal columns in the grid that a search starts from.
+_COARSE = 6
+_STEP = 1e-5
+
+
+@dataclass(frozen=True)
+class _Parameter:
+    """A nonlinear parameter: its name, the values to start from, and bounds."""
+
+    name: str
+    starts: tuple[float, ...]
+    low: float
+    high: float
+
+
+@dataclass(frozen=True, eq=False)
+class Search:
+    """Everything but the elements: the measured sequence, and the operator's columns.
+
+    Attributes
+    ----------
+    times : ndarray, shape (N,)
+        s.
+    static : FitProblem
+        The problem of the operator alone.
+    columns : ndarray, shape (N, K)
+        Its regressor.
+    roots : ndarray, shape (N,)
+        Square roots of the weights, 0 for rows left out.
+    signs : tuple
+        Signs of the operator's coefficients that are tried.
+    smoothing : float
+        Weight of the roughness penalty on the density of the operator, see `fit`.
+    longest_period : float
+        Of a resonance, s.
+    elapsed : ndarray, shape (N,)
+        Since the first row, s.
+    principal : ndarray, shape (N, r)
+        Principal columns of the regressor.
+    step : float
+        Median step of time, s.
+    """
+
+    times: Floats
+    static: FitProblem
+    columns: Floats
+    roots: Floats
+    signs: tuple[Literal[1, -1], ...]
+    smoothing: float = 0.0
+    longest_period: float = math.inf
+    elapsed: Floats = field(init=False)
+    principal: Floats = field(init=False)
+    step: float = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "elapsed", self.times - self.times[0])
+        object.__setattr__(self, "step", float(np.median(np.diff(self.times))))
+        centred = self.columns - self.columns.mean(axis=0)
+        strengths, directions = np.linalg.eigh(centred.T @ centred)
+        kept = strengths > 1e-10 * strengths[-1]
+        object.__setattr__(self, "principal", np.ascontiguousarray(self.columns @ directions[:, kept][:, ::-1]))
+
+    @property
+    def span(self) -> float:
+        """Length of the record, s."""
+        return float(self.elapsed[-1])
+
+    @property
+    def creep_span(self) -> tuple[float, float]:
+        """Shortest and longest retardation time, s."""
+        return 10.0 * self.step, self.span
+
+    def parameters(self, elements: Sequence[str]) -> list[_Parameter]:
+        """Return the nonlinear parameters of elements: logarithms of times and damping, delay in steps."""
+        shortest, longest, found = math.log(self.step), math.log(self.span), []
+        decades = max(1, round(math.log10(self.creep_span[1] / self.creep_span[0])))
+        for element in elements:
+            if element == "lag":
+                starts = tuple(np.linspace(shortest - 1.0, longest - 1.0, 12))
+                found.append(_Parameter("lag", starts, shortest - math.log(100.0), longest + 1.0))
+            elif element == "resonance":
+                low = math.log(2.0 * math.pi) - min(longest, math.log(self.longest_period))
+                high = math.log(20.0 * math.pi) - shortest
+                top = math.log(math.pi) - shortest
+                starts = (*np.linspace(max(low, top - 6.0), max(low, top), 13), high - 0.5)
+                found.append(_Parameter("frequency", starts, low, high))
+                found.append(_Parameter("damping", tuple(map(math.log, (0.03, 0.3, 1.0))), math.log(1e-3), 3.4))
+            elif element == "delay":
+                most = min(0.25 * self.span / self.step, 200.0)
+                found.append(_Parameter("delay", (0.3, 1.5, min(6.0, most)), 0.0, most))
+            elif element == "creep":
+                found.append(_Parameter("creep", (0.02,), 0.0, 3.0))
+            elif element == "kelvin-voigt":
+                found += [_Parameter(f"creep {k}", (0.02,), 0.0, 3.0) for k in range(decades)]
+            elif element == "fading-drift":
+                found.append(_Parameter("drift", (longest - 1.0,), longest - 4.6, longest + 2.3))
+        return found
+
+    def linear(self, parameters: Sequence[_Parameter], values: Floats) -> tuple[LinearPart, float]:
+        """Return the linear part and the time constant of the drift, s."""
+        x = {parameter.name: float(value) for parameter, value in zip(parameters, values, strict=True)}
+        lag = (math.exp(x["lag"]), 0.0) if "lag" in x else (0.0, 0.0)
+        if "frequency" in x:
+            lag = (2.0 * math.exp(x["damping"] - x["frequency"]), math.exp(-2.0 * x["frequency"]))
+        times, strengths = np.empty(0), np.empty(0)
+        if "creep" in x:
+            times, strengths = logarithmic_creep(x["creep"], *self.creep_span)
+        elif elements := [x[name] for name in x if name.startswith("creep ")]:
+            strengths = np.array(elements)
+            shortest, longest = self.creep_span
+            times = shortest * (longest / shortest) ** ((np.arange(strengths.size) + 0.5) / strengths.size)
+        part = LinearPart(self.step * x.get("delay", 0.0), lag, times, strengths)
+        return part, math.exp(x["drift"]) if "drift" in x else 0.0
+
+    def drifts(self, elements: Sequence[str], time: float) -> Floats:
+        """Return the columns of the drift, shape (N, 0) or (N, 1)."""
+        if not {"drift", "fading-drift"} & set(elements):
+            return np.empty((self.times.size, 0))
+        shape = self.elapsed if time == 0.0 else -np.expm1(-self.elapsed / time)
+        return shape[:, None]
+
+    def responses(self, elements: Sequence[str], values: Floats) -> tuple[Floats, Floats]:
+        """Return the filtered columns of the operator, shape (N, K), and those of the drift for given parameters."""
+        part, time = self.linear(self.parameters(elements), values)
+        return part.respond(self.times, self.columns)[0], self.drifts(elements, time)
+
+    def fit(self, elements: Sequence[str], values: Floats) -> Fit:
+        """Return the coefficients of operator and drift for given parameters, of the sign that fits better."""
+        columns, drifts = self.responses(elements, values)
+        fits = [self.fit_columns(columns, drifts, self.static.weights, sign) for sign in self.signs]
+        return min(fits, key=lambda each: self.cost(elements, values, each)) if len(fits) > 1 else fits[0]
+
+    def fit_columns(
+        self,
+        columns: Floats,
+        drifts: Floats,
+        weights: Floats,
+        sign: Literal[1, -1],
+        smoothing: float | None = None,
+    ) -> Fit:
+        """Return the coefficients of filtered columns and drift, with those of the operator of one sign."""
+        problem = self.static
+        smoothing = self.smoothing if smoothing is None else smoothing
+        columns = moving(columns, weights, problem.skip)
+        cells, constrained = problem.regressor.base.size, problem.spec.constrained
+        turn = sign if constrained else 1
+        regressor = Regressor.of_cells(
+            turn * columns[:, :cells], np.column_stack([turn * columns[:, cells:], drifts])
+        )
+        if not constrained and not smoothing:
+            return fit_minimum_norm(regressor, problem.outputs, weights=weights, skip=problem.skip)
+        found = fit(
+            regressor,
+            problem.outputs,
+            nonnegative=constrained
+            & np.append(problem.template.nonnegative(), np.zeros(drifts.shape[1], dtype=bool)),
+            weights=weights,
+            skip=problem.skip,
+            smoothing=smoothing,
+        )
+        turned = found.coefficients.copy()
+        turned[: columns.shape[1]] *= turn
+        return replace(found, coefficients=turned)
+
+    def cost(self, elements: Sequence[str], values: Floats, found: Fit) -> float:
+        """Return the weighted sum of squares of a fit."""
+        part, time = self.linear(self.parameters(elements), values)
+        count = self.columns.shape[1]
+        response = part.respond(self.times, (self.columns @ found.coefficients[:count])[:, None])[0][:, 0]
+        drift = self.drifts(elements, time) @ found.coefficients[count:]
+        return float(np.sum((self.roots * (self.static.outputs - found.bias - response - drift)) ** 2))
+
+    def sign(self, found: Fit) -> Literal[1, -1]:
+        """Return the sign of the operator's coefficients that are constrained."""
+        signed = found.coefficients[: self.columns.shape[1]][self.static.template.nonnegative()]
+        return -1 if (signed < 0.0).any() else 1
+
+    def basis(self, found: Fit) -> Floats:
+        """Return the operator's columns over which the search projects, shape (N, r)."""
+        if self.smoothing:
+            # All cells are free then, and together they would take what follows the operator for hysteresis.
+            signal = self.columns @ found.coefficients[: self.columns.shape[1]]
+            return np.column_stack([signal, self.principal[:, :FREE]])
+        if self.static.spec.constrained:
+            used = found.coefficients[: self.columns.shape[1]] != 0.0
+            return self.columns[:, used]
+        return self.principal[:, :100]
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Elements with their parameters and the fit."""
+
+    elements: tuple[str, ...]
+    values: Floats
+    fit: Fit
+    cost: float
+    deviations: Floats
+
+
+class _Point(NamedTuple):
+    """Projection at given parameters."""
+
+    key: bytes
+    columns: Floats
+    inverse: Floats
+    weights: Floats
+    rest: Floats
+
+
+class _Projection:
+    """Residuals and Jacobian of variable projection over given columns."""
+
+    def __init__(self, search: Search, elements: Sequence[str], basis: Floats) -> None:
+        self._search, self._elements, self._basis = search, elements, basis
+        self._parameters = search.parameters(elements)
+        self._at: _Point | None = None
+        self._creep: dict[float, list[Floats]] = {}
+
+    def _respond(self, part: LinearPart) -> Floats:
+        """Return the filtered basis; responses of the creep, whose times stay, are kept for the last delay."""
+        times, basis = self._search.times, self._basis
+        strengths = part.creep_strengths
+        if not strengths.size:
+            return part.respond(times, basis)[0]
+        if part.delay not in self._creep:
+            # Logarithmic creep has one strength for all.
+            shared = [name for name in (p.name for p in self._parameters) if name == "creep"]
+            banks = [np.full(strengths.size, 1.0)] if shared else list(np.eye(strengths.size))
+            fast = replace(part, creep_strengths=np.zeros(strengths.size)).respond(times, basis)[0]
+            self._creep = {
+                part.delay: [replace(part, creep_strengths=bank).respond(times, basis)[0] - fast for bank in banks]
+            }
+        result = replace(part, creep_times=np.empty(0), creep_strengths=np.empty(0)).respond(times, basis)[0]
+        for strength, bank in zip(strengths, self._creep[part.delay], strict=False):
+            result += strength * bank
+        return result
+
+    def _solve(self, values: Floats) -> _Point:
+        key = values.tobytes()
+        if self._at is None or self._at.key != key:
+            search = self._search
+            part, time = search.linear(self._parameters, values)
+            columns = np.column_stack([
+                self._respond(part),
+                search.drifts(self._elements, time),
+                np.ones(search.times.size),
+            ])  # fmt: skip
+            columns *= search.roots[:, None]
+            norms = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+            columns /= norms
+            gram = columns.T @ columns
+            # The search only leads to where the constrained fit is then exact.
+            gram.flat[:: gram.shape[0] + 1] += 1e-12
+            inverse = np.linalg.inv(np.linalg.cholesky(gram))
+            target = search.roots * search.static.outputs
+            shares = inverse.T @ (inverse @ (columns.T @ target))
+            self._at = _Point(key, columns, inverse, shares / norms, target - columns @ shares)
+        return self._at
+
+    def residuals(self, values: Floats) -> Floats:
+        return self._solve(values).rest
+
+    def jacobian(self, values: Floats) -> Floats:
+        at, search = self._solve(values), self._search
+        count = self._basis.shape[1]
+        signal = (self._basis @ at.weights[:count])[:, None]
+
+        def model(x: Floats) -> Floats:
+            part, time = search.linear(self._parameters, x)
+            drift = search.drifts(self._elements, time)
+            return search.roots * (part.respond(search.times, signal)[0][:, 0] + drift @ at.weights[count:-1])
+
+        slopes = []
+        for k, parameter in enumerate(self._parameters):
+            ends = [values.copy(), values.copy()]
+            ends[0][k] = max(values[k] - _STEP, parameter.low)
+            ends[1][k] = min(values[k] + _STEP, parameter.high)
+            slopes.append((model(ends[1]) - model(ends[0])) / (ends[1][k] - ends[0][k]))
+        slope = np.column_stack(slopes)
+        return np.asarray(at.columns @ (at.inverse.T @ (at.inverse @ (at.columns.T @ slope))) - slope)
+
+
+def find_best(search: Search, elements: tuple[str, ...], before: Found | None = None, rounds: int = _ROUNDS) -> Found:
+    """Return the parameters of elements that fit best, found from several starts; `before` is a smaller model."""
+    parameters = search.parameters(elements)
+    if not parameters:
+        found = search.fit(elements, np.empty(0))
+        return Found(elements, np.empty(0), found, search.cost(elements, np.empty(0), found), np.empty(0))
+    first = find_best(search, ()) if before is None else before
+    trials = [
+        replace(
+            trial, fit=(refit := search.fit(elements, trial.values)), cost=search.cost(elements, trial.values, refit)
+        )
+        for trial in search_ends(search, elements, first, search.principal[:, :FREE])
+    ]
+    best = min(trials, key=lambda trial: trial.cost)
+    values, deviations, found, cost = best.values, best.deviations, best.fit, best.cost
+    for _ in range(rounds):
+        moved, wider, _ = _search(search, elements, parameters, values, search.basis(found))
+        refit = search.fit(elements, moved)
+        lower = search.cost(elements, moved, refit)
+        gained = cost - lower
+        if gained > 0.0:
+            values, deviations, found, cost = moved, wider, refit, lower
+        if not gained > _GAIN * cost:
+            break
+    return Found(elements, values, found, cost, deviations)
+
+
+def search_ends(
+    search: Search,
+    elements: tuple[str, ...],
+    before: Found,
+    basis: Floats,
+    starts: int = _STARTS,
+    evaluations: int = EVALUATIONS,
+) -> list[Found]:
+    """Return the ends of searches over the coefficients of a basis, with their costs and the smaller model's fit."""
+    parameters = search.parameters(elements)
+    if not parameters:
+        none = np.empty(0)
+        cost = float(np.sum(_Projection(search, elements, basis).residuals(none) ** 2))
+        return [Found(elements, none, before.fit, cost, none)]
+    names = [p.name for p in search.parameters(before.elements)]
+    known = dict(zip(names, before.values.tolist(), strict=True))
+    found = []
+    for start in _starts(search, elements, parameters, known, before.fit)[:starts]:
+        values, deviations, cost = _search(search, elements, parameters, start, basis, evaluations)
+        found.append(Found(elements, values, before.fit, cost, deviations))
+    return found
+
+
+def _starts(
+    search: Search, elements: Sequence[str], parameters: Sequence[_Parameter], known: dict[str, float], before: Fit
+) -> list[Floats]:
+    """Return the best few of a grid, judged with the fit of the smaller model and the principal columns."""
+    grids = [(known[p.name],) if p.name in known else p.starts for p in parameters]
+    signal = search.columns @ before.coefficients[: search.columns.shape[1]]
+    basis = np.column_stack([signal, search.principal[:, :_COARSE]])
+    projection = _Projection(search, elements, basis)
+    grid = [np.array(values) for values in product(*grids)]
+    costs = [float(np.sum(projection.residuals(values) ** 2)) for values in grid]
+    order = np.argsort(costs, kind="stable")
+    chosen: list[Floats] = []
+    for place in order.tolist():
+        # Neighbours end in the same minimum.
+        if all(np.abs(grid[place] - other).max() > 1.0 for other in chosen):
+            chosen.append(grid[place])
+        if len(chosen) == _STARTS:
+            break
+    return chosen
+
+
+def _search(
+    search: Search,
+    elements: Sequence[str],
+    parameters: Sequence[_Parameter],
+    start: Floats,
+    basis: Floats,
+    evaluations: int = EVALUATIONS,
+) -> tuple[Floats, Floats, float]:
+    """Return the parameters at the end of a search, their standard deviations, and the cost."""
+    from scipy.optimize import least_squares
+
+    projection = _Projection(search, elements, basis)
+    low, high = (np.array([getattr(p, name) for p in parameters]) for name in ("low", "high"))
+    residuals: Callable[[Floats], Floats] = projection.residuals
+    end = least_squares(
+        residuals,
+        np.clip(start, low, high),
+        jac=projection.jacobian,
+        bounds=(low, high),
+        x_scale="jac",
+        ftol=1e-9,
+        xtol=1e-9,
+        gtol=1e-9,
+        max_nfev=evaluations,
+    )
+    values = np.asarray(end.x)
+    freedom = max(search.times.size - basis.shape[1] - values.size - 1, 1)
+    deviations = deviations_of(np.asarray(end.jac), 2.0 * end.cost / freedom)
+    return values, deviations, 2.0 * float(end.cost)

@@ -1,0 +1,311 @@
+"""Fit of rate-dependent plays: weights and time constants at once.
+
+For given time constants the weights are a constrained least-squares problem over plays of each threshold without and
+with each time constant. The time constants follow by variable projection (Golub and Pereyra, Inverse Problems 19(2),
+R1-R26, 2003), one more as long as it is worth it. Several spread over the rates of the record stand for hysteresis
+that widens with the logarithm of the rate, as where thermal activation lets it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Annotated, cast
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from bench.base import Floats
+from bench.identification.by_name import FitProblem, Identification, Initial, set_up_problem
+from bench.identification.choose.trust import judge_fit
+from bench.identification.fit.cell_layout import CellLayout
+from bench.identification.fit.least_squares import Fit, fit_cells, one_thread
+from bench.identification.fit.orientation import NAMES, Orientation
+from bench.identification.measures import measure_errors
+from bench.identification.options import OptionHelp
+from bench.identification.timed.parsimony import check_size, deviations_of, is_worth, moving
+from bench.models import PlaysState, PrandtlIshlinskii, RateDependentPlays, Regressor, check_sequence
+
+# Most time constants that are tried if nobody says how many, and the first values of another one.
+_MOST, _GRID = 3, 9
+# Shortest time constant, in time steps.
+_SHORTEST = 0.1
+# Evaluations of a search, and the relative change of cost and logarithms at which it ends.
+_EVALUATIONS, _TOLERANCE = 12, 1e-6
+# Relative step of its differences.
+_STEP = 1e-5
+# Part of the sum of squares of the outputs that is left by rounding alone.
+_ROUNDED = 1e-24
+# Standard deviation of the logarithm of a time constant from which on the data do not determine it.
+_UNKNOWN = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """Time constants with the fit.
+
+    Attributes
+    ----------
+    lags : ndarray, shape (J,)
+        s.
+    fit : Fit
+        Weights of the plays without time constant, then of those of each; of the sign of the problem's orientation.
+    cost : float
+        Weighted sum of squares.
+    deviations : ndarray, shape (J,)
+        Standard deviations of the logarithms of the time constants.
+    """
+
+    lags: Floats
+    fit: Fit
+    cost: float
+    deviations: Floats
+
+
+@dataclass(frozen=True, eq=False)
+class PlaysSearch:
+    """The measured sequence, and the problem of plays that do not depend on the rate.
+
+    Attributes
+    ----------
+    times : ndarray, shape (N,)
+        s.
+    static : FitProblem
+        That of a Prandtl-Ishlinskii operator of the same thresholds.
+    """
+
+    times: Floats
+    static: FitProblem
+
+    @classmethod
+    def of(
+        cls,
+        times: Floats,
+        inputs: Floats,
+        outputs: Floats,
+        weights: ArrayLike | None,
+        skip: int,
+        initial: Initial | None,
+        orientation: Orientation,
+        **options: object,
+    ) -> PlaysSearch:
+        """Return the search for a measured sequence; arguments and errors as `identify_rate_dependent_plays`."""
+        static = set_up_problem(
+            "prandtl-ishlinskii", inputs, outputs, weights, skip, 0.0, initial, options, orientation=orientation
+        )
+        check_size(times.size, (1 + _MOST) * static.template.coefficients.size, "plays")
+        return cls(times, static)
+
+    @property
+    def template(self) -> PrandtlIshlinskii:
+        """The operator that does not depend on the rate."""
+        return cast("PrandtlIshlinskii", self.static.template)
+
+    def model(self, lags: Floats, found: Fit | None = None) -> RateDependentPlays:
+        """Return the model of given time constants, with the weights of a fit or all 0."""
+        template = self.template
+        count = template.thresholds.size
+        return RateDependentPlays(
+            np.tile(template.thresholds, 1 + lags.size),
+            np.append(0.0, lags).repeat(count),
+            np.zeros((1 + lags.size) * count) if found is None else found.coefficients,
+            template.input_range,
+            0.0 if found is None else found.bias,
+            template.origin,
+            template.input_unit,
+            template.output_unit,
+        )
+
+    def state(self, lags: Floats) -> PlaysState:
+        """Return the state before the first sample."""
+        return PlaysState(tuple(self.template.origin + play for play in self.static.state) * (1 + lags.size))
+
+    def columns(self, lags: Floats) -> Floats:
+        """Return the plays sample by sample, shape (N, (1 + J) n)."""
+        return self.model(lags).columns(self.times, self.static.inputs, self.state(lags))
+
+    def fit_columns(self, columns: Floats, weights: Floats | None = None) -> Fit:
+        """Return the weights of the plays for the problem's weights of samples, or others."""
+        problem = self.static
+        w = problem.weights if weights is None else weights
+        # Plays stand still most of the time: as cells, without a place in a plane, they are quickly fitted.
+        cells = problem.orientation * moving(columns, w, problem.skip)
+        count = cells.shape[1]
+        regressor = Regressor.of_cells(cells, np.empty((cells.shape[0], 0)))
+        layout = CellLayout(0, np.arange(count), np.zeros(count, dtype=np.int64))
+        found = fit_cells(layout, regressor, problem.outputs, weights=w, skip=problem.skip)
+        return replace(found, coefficients=problem.orientation * found.coefficients)
+
+    def at(self, lags: Floats) -> tuple[Fit, Floats]:
+        """Return the fit for given time constants, and its weighted residuals, shape (N - skip,)."""
+        columns = self.columns(lags)
+        found = self.fit_columns(columns)
+        return found, self._weighted(self.static.outputs - found.bias - columns @ found.coefficients)
+
+    def slopes(self, lags: Floats, found: Fit) -> Floats:
+        """Return the derivatives of the residuals by the logarithms of the time constants, shape (N - skip, J).
+
+        In the form of Kaufman: without what the free weights can take over.
+        """
+        count = self.template.thresholds.size
+        state = PlaysState(self.state(lags).plays[:count])
+
+        def output(place: int, lag: float) -> Floats:
+            weights = found.coefficients[(1 + place) * count : (2 + place) * count]
+            plays = replace(self.model(np.empty(0)), time_constants=np.full(count, lag), weights=weights, bias=0.0)
+            return plays.evaluate(self.times, self.static.inputs, state)
+
+        change = np.column_stack([
+            self._weighted(output(k, lag * (1.0 + _STEP)) - output(k, lag * (1.0 - _STEP))) / (2.0 * _STEP)
+            for k, lag in enumerate(lags.tolist())
+        ])  # fmt: skip
+        free = self.columns(lags)[:, found.coefficients != 0.0]
+        basis = np.linalg.qr(self._weighted(np.column_stack([free, np.ones(self.times.size)])))[0]
+        return np.asarray(basis @ (basis.T @ change) - change)
+
+    def _weighted(self, values: Floats) -> Floats:
+        """Return rows that count times the roots of their weights; shape (N, ...) becomes (N - skip, ...)."""
+        roots = np.sqrt(self.static.weights[self.static.skip :])
+        return (roots * values[self.static.skip :].T).T
+
+    @property
+    def bounds(self) -> tuple[float, float]:
+        """Logarithms of the shortest and the longest time constant in s."""
+        step = float(np.median(np.diff(self.times)))
+        return math.log(_SHORTEST * step), math.log(float(np.ptp(self.times)))
+
+    def search(self, start: Floats) -> Found:
+        """Return the end of a search from time constants."""
+        from scipy.optimize import least_squares
+
+        low, high = self.bounds
+        fits: dict[bytes, Fit] = {}
+
+        def residuals(values: Floats) -> Floats:
+            fits[values.tobytes()], rest = self.at(np.exp(values))
+            return rest
+
+        def jacobian(values: Floats) -> Floats:
+            return self.slopes(np.exp(values), fits[values.tobytes()])
+
+        end = least_squares(
+            residuals,
+            np.clip(np.log(start), low, high),
+            jac=jacobian,
+            bounds=(low, high),
+            ftol=_TOLERANCE,
+            xtol=_TOLERANCE,
+            gtol=_TOLERANCE,
+            max_nfev=_EVALUATIONS,
+        )
+        lags = np.sort(np.exp(end.x))
+        found, rest = self.at(lags)
+        cost = float(rest @ rest)
+        freedom = max(rest.size - found.certificate.passive - lags.size - 1, 1)
+        deviations = deviations_of(np.asarray(end.jac), cost / freedom)[np.argsort(end.x)]
+        return Found(lags, found, cost, deviations)
+
+    def more(self, before: Found) -> Found:
+        """Return the best fit with one time constant more."""
+        low, high = self.bounds
+        grid = np.exp(np.linspace(low, high, _GRID + 2)[1:-1])
+        starts = [np.append(before.lags, lag) for lag in grid]
+        costs = [float(np.sum(self.at(start)[1] ** 2)) for start in starts]
+        return self.search(starts[int(np.argmin(costs))])
+
+    def choose(self, count: int | None = None) -> Found:
+        """Return the fit with as many time constants as are worth it, or a given number of them."""
+        none = np.empty(0)
+        fitted, rest = self.at(none)
+        found = Found(none, fitted, float(rest @ rest), none)
+        counted = self.static.weights[self.static.skip :]
+        used = max(int(np.count_nonzero(counted)), 1)
+        exact = _ROUNDED * float(counted @ self.static.outputs[self.static.skip :] ** 2)
+        while found.lags.size < (_MOST if count is None else count):
+            if count is None and found.cost <= exact:
+                break
+            more = self.more(found)
+            added = 1 + max(more.fit.certificate.passive - found.fit.certificate.passive, 0)
+            if count is None and not is_worth(found.cost, more.cost, added, used):
+                break
+            found = more
+        return found
+
+
+def identify_rate_dependent_plays(
+    times: ArrayLike,
+    inputs: ArrayLike,
+    outputs: ArrayLike,
+    *,
+    weights: ArrayLike | None = None,
+    skip: int = 0,
+    initial: Initial | None = None,
+    orientation: Orientation = "auto",
+    plays: Annotated[int, OptionHelp("number of thresholds, i maximum / plays, i from 0")] = 15,
+    maximum: Annotated[
+        float | None, OptionHelp("end of the thresholds, input units", "half the range of the inputs")
+    ] = None,
+    origin: Annotated[float, OptionHelp("input of the relaxed state, input units")] = 0.0,
+    time_constants: Annotated[
+        int | None, OptionHelp("number of time constants, up to 3", "as many as are worth it")
+    ] = None,
+    input_unit: str = "",
+    output_unit: str = "",
+) -> Identification[RateDependentPlays]:
+    """Return the rate-dependent plays that fit a measured sequence best in the least-squares sense.
+
+    Parameters
+    ----------
+    times : array_like, shape (N,)
+        s, strictly increasing.
+    inputs, outputs : array_like, shape (N,)
+        The measured sequence.
+    weights, skip, initial, orientation
+        As `identify`.
+    plays : int
+        Number of thresholds; there is a play of each without a time constant and with each.
+    maximum : float or None
+        End of the thresholds, input units; half the range of the inputs if None.
+    origin : float
+        Where the plays stand at first, input units.
+    time_constants : int or None
+        Their number, 0 to 3. None adds one after the other as long as it lowers the RMS error by 0.5 %, and more than
+        its parameters would by chance.
+    input_unit, output_unit : str
+        Units, for labels.
+
+    Raises
+    ------
+    ValueError
+        If an option is wrong or the data are unfit.
+    """
+    moments, sequence, measured = check_sequence(times, inputs=inputs, outputs=outputs)
+    if time_constants is not None and time_constants not in range(_MOST + 1):
+        raise ValueError(f"time_constants: expected 0 to {_MOST}, got {time_constants!r}")
+    options = {"plays": plays, "maximum": maximum, "origin": origin}
+    units = {"input_unit": input_unit, "output_unit": output_unit}
+    search = PlaysSearch.of(moments, sequence, measured, weights, skip, initial, orientation, **options, **units)
+    with one_thread():
+        found = search.choose(time_constants)
+    warnings = list(search.static.warnings())
+    if not (found.deviations < _UNKNOWN).all():
+        warnings.append(
+            "the data do not determine every time constant; give fewer (--option time_constants=NUMBER), or data "
+            "with faster and slower inputs"
+        )
+    model, state, first = search.model(found.lags, found.fit), search.state(found.lags), search.static.skip
+    predicted = model.evaluate(moments, sequence, state)
+    residuals = measured - predicted
+    warnings += judge_fit(search.static, found.fit, residuals, initial=initial, smoothing=0.0)
+    return Identification(
+        model_name=model.kind,
+        model=model,
+        residuals=residuals,
+        errors=measure_errors(measured[first:], predicted[first:]),
+        uncertainties=found.fit.uncertainties,
+        certificate=found.fit.certificate,
+        skip=first,
+        initial_state=state,
+        warnings=tuple(warnings),
+        orientation=NAMES[search.static.orientation],
+    )

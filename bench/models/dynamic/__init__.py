@@ -1,0 +1,1 @@
+"""Models with time: operators in a chain with delay, lag and creep, and equations of motion."""

@@ -1,0 +1,226 @@
+"""Compiled loops over the elements of an operator. Imported on first use only, because numba is slow to load."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.base import inlined, inner, kernel
+
+Floats = NDArray[np.float64]
+
+# Error of one step of integration, as part of the scale of the internal variable.
+_TOLERANCE = 1e-13
+# Rate of the internal variable below which it has come to rest.
+_REST = 1e-13
+# The internal variable is kept below this multiple of its scale: where it stiffens it would grow without end.
+_LIMIT = 1e6
+
+
+@kernel
+def generalized_plays(lower: Floats, upper: Floats, thresholds: Floats, state: Floats) -> Floats:
+    """Step plays between two drives; return their states sample by sample. `state` is changed."""
+    result = np.empty((lower.size, state.size))
+    for t in range(lower.size):
+        for i in range(state.size):
+            state[i] = max(lower[t] - thresholds[i], min(upper[t] + thresholds[i], state[i]))
+            result[t, i] = state[i]
+    return result
+
+
+@kernel
+def stops(inputs: Floats, present: float, limits: Floats, state: Floats) -> Floats:
+    """Step stops through `inputs`; return their states sample by sample. `state` is changed."""
+    result = np.empty((inputs.size, state.size))
+    for t in range(inputs.size):
+        move = inputs[t] - present
+        for i in range(state.size):
+            state[i] = max(-limits[i], min(limits[i], state[i] + move))
+            result[t, i] = state[i]
+        present = inputs[t]
+    return result
+
+
+@kernel
+def ramps(inputs: Floats, rising: Floats, falling: Floats, width: float, state: Floats) -> Floats:
+    """Step Krasnosel'skii-Pokrovskii kernels through `inputs`; return their states. `state` is changed.
+
+    A kernel is lifted along the ramp from -1 at `rising` to 1 a width later, and lowered along that from -1 at
+    `falling` to 1 a width later.
+    """
+    result = np.empty((inputs.size, state.size))
+    for t in range(inputs.size):
+        for k in range(state.size):
+            low = max(-1.0, min(1.0, 2.0 * (inputs[t] - rising[k]) / width - 1.0))
+            high = max(-1.0, min(1.0, 2.0 * (inputs[t] - falling[k]) / width - 1.0))
+            state[k] = max(low, min(high, state[k]))
+            result[t, k] = state[k]
+    return result
+
+
+@inlined
+def _grown(rate: float, path: float) -> float:
+    """Return (exp(rate path) - 1) / rate."""
+    if abs(rate * path) < 1e-8:
+        return path * (1.0 + 0.5 * rate * path)
+    return math.expm1(rate * path) / rate
+
+
+@inner
+def _exponential(z: float, path: float, loading: float, unloading: float) -> float:
+    """Return z, counted along the move, after a path with dz/dx = 1 - c |z|: the exact solution."""
+    if z < 0.0:
+        whole = 1.0 + unloading * z
+        crossing = math.inf
+        if whole > 0.0:
+            argument = unloading * z
+            crossing = -z if abs(argument) < 1e-8 else -math.log1p(argument) / unloading
+            if abs(argument) < 1e-8:
+                crossing = -z * (1.0 - 0.5 * argument)
+        if path <= crossing:
+            return z * math.exp(unloading * path) + _grown(unloading, path)
+        path -= crossing
+        z = 0.0
+    return z * math.exp(-loading * path) + _grown(-loading, path)
+
+
+@inlined
+def _slope(z: float, loading: float, unloading: float, exponent: float) -> float:
+    slope: float = 1.0 - (loading if z > 0.0 else unloading) * abs(z) ** exponent
+    return slope
+
+
+@inner
+def _integrated(z: float, path: float, loading: float, unloading: float, exponent: float) -> float:
+    """Return z, counted along the move, after a path with dz/dx = 1 - c |z|^n: Dormand and Prince, order 5(4)."""
+    x, h = 0.0, min(path, 0.05)
+    while x < path:
+        k1 = _slope(z, loading, unloading, exponent)
+        if abs(k1) < _REST or z > _LIMIT:
+            return z
+        h = min(h, path - x)
+        k2 = _slope(z + h * 0.2 * k1, loading, unloading, exponent)
+        k3 = _slope(z + h * (3.0 / 40.0 * k1 + 9.0 / 40.0 * k2), loading, unloading, exponent)
+        k4 = _slope(z + h * (44.0 / 45.0 * k1 - 56.0 / 15.0 * k2 + 32.0 / 9.0 * k3), loading, unloading, exponent)
+        k5 = _slope(
+            z + h * (19372.0 / 6561.0 * k1 - 25360.0 / 2187.0 * k2 + 64448.0 / 6561.0 * k3 - 212.0 / 729.0 * k4),
+            loading,
+            unloading,
+            exponent,
+        )
+        k6 = _slope(
+            z
+            + h
+            * (
+                9017.0 / 3168.0 * k1
+                - 355.0 / 33.0 * k2
+                + 46732.0 / 5247.0 * k3
+                + 49.0 / 176.0 * k4
+                - 5103.0 / 18656.0 * k5
+            ),
+            loading,
+            unloading,
+            exponent,
+        )
+        after = z + h * (
+            35.0 / 384.0 * k1 + 500.0 / 1113.0 * k3 + 125.0 / 192.0 * k4 - 2187.0 / 6784.0 * k5 + 11.0 / 84.0 * k6
+        )
+        k7 = _slope(after, loading, unloading, exponent)
+        error = h * abs(
+            71.0 / 57600.0 * k1
+            - 71.0 / 16695.0 * k3
+            + 71.0 / 1920.0 * k4
+            - 17253.0 / 339200.0 * k5
+            + 22.0 / 525.0 * k6
+            - 1.0 / 40.0 * k7
+        )
+        allowed = _TOLERANCE * max(1.0, abs(z))
+        if not math.isfinite(error):
+            h *= 0.1
+            continue
+        # A step that no longer moves x is taken as it is.
+        if error <= allowed or h <= 1e-9 * path:
+            x, z = x + h, after
+        h *= min(5.0, max(0.2, 0.9 * (allowed / max(error, 1e-300)) ** 0.2))
+    return z
+
+
+@kernel
+def bouc_wen(inputs: Floats, present: float, z: float, beta: float, gamma: float, exponent: float) -> Floats:
+    """Return z after each input, where dz/du = 1 - |z|^n (beta sgn(z du) + gamma)."""
+    result = np.empty(inputs.size)
+    loading, unloading = beta + gamma, gamma - beta
+    for t in range(inputs.size):
+        move = inputs[t] - present
+        if move != 0.0:
+            sign = 1.0 if move > 0.0 else -1.0
+            if exponent == 1.0:
+                z = sign * _exponential(sign * z, abs(move), loading, unloading)
+            else:
+                z = sign * _integrated(sign * z, abs(move), loading, unloading, exponent)
+            z = max(-_LIMIT, min(_LIMIT, z))
+        present = inputs[t]
+        result[t] = z
+    return result
+
+
+# Nodes and weights of Gauss and Legendre on [0, 1], exact to degree 15.
+_NODES = (
+    0.019855071751231884,
+    0.10166676129318664,
+    0.2372337950418355,
+    0.4082826787521751,
+    0.5917173212478249,
+    0.7627662049581645,
+    0.8983332387068134,
+    0.9801449282487681,
+)
+_WEIGHTS = (
+    0.05061426814518813,
+    0.11119051722668724,
+    0.15685332293894363,
+    0.18134189168918100,
+    0.18134189168918100,
+    0.15685332293894363,
+    0.11119051722668724,
+    0.05061426814518813,
+)
+
+
+@kernel
+def duhem(inputs: Floats, present: float, rate: float, degree: int, state: Floats) -> Floats:
+    """Step the elements of a Duhem operator through `inputs`; return their states. `state` is changed.
+
+    The first `degree` elements follow T_1 ... T_degree of the input, dw/d|x| = rate (T - w), and the others take
+    T_0 ... T_(degree - 1) up, dv/dx = T - rate sgn(dx) v.
+    """
+    result = np.empty((inputs.size, 2 * degree))
+    chebyshev = np.empty(degree + 1)
+    total = np.empty(2 * degree)
+    for t in range(inputs.size):
+        move = inputs[t] - present
+        count = math.ceil(abs(move) * max(rate, 1.0) / 0.5)
+        step = move / max(count, 1)
+        for part in range(count):
+            start = present + part * step
+            for k in range(2 * degree):
+                total[k] = 0.0
+            for n in range(8):
+                x = start + _NODES[n] * step
+                left = _WEIGHTS[n] * math.exp(-rate * abs(step) * (1.0 - _NODES[n]))
+                chebyshev[0] = 1.0
+                chebyshev[1] = x
+                for k in range(2, degree + 1):
+                    chebyshev[k] = 2.0 * x * chebyshev[k - 1] - chebyshev[k - 2]
+                for k in range(degree):
+                    total[k] += left * rate * abs(step) * chebyshev[k + 1]
+                    total[degree + k] += left * step * chebyshev[k]
+            decay = math.exp(-rate * abs(step))
+            for k in range(2 * degree):
+                state[k] = state[k] * decay + total[k]
+        present = inputs[t]
+        for k in range(2 * degree):
+            result[t, k] = state[k]
+    return result

@@ -1,0 +1,133 @@
+"""A polynomial and a few plays, of either sign: the least model with memory, for few samples."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import ClassVar, TypeAlias
+
+import numpy as np
+from numpy.polynomial import chebyshev
+from numpy.typing import ArrayLike, NDArray
+
+from bench.base import Floats, checks as _checks
+from bench.models.operator import Operator
+from bench.models.regressor import Regressor
+
+State: TypeAlias = tuple[float, ...]
+"""The input, then the output of each play."""
+
+
+@dataclass(frozen=True, eq=False)
+class PolynomialPlays(Operator[State]):
+    """A Chebyshev series of the input and weighted plays.
+
+    Parameters
+    ----------
+    series : array_like, shape (degree,)
+        Coefficients of T1 to Tn on the range mapped to [-1, 1], output units.
+    thresholds : array_like, shape (n,)
+        Half-widths of the plays, > 0, increasing, input units.
+    weights : array_like, shape (n,)
+        Weights of the plays, output units per input unit.
+    input_range : tuple of float
+        The range mapped to [-1, 1], input units.
+    bias : float
+        Constant part, output units.
+    input_unit, output_unit : str
+        Units, for labels.
+
+    Raises
+    ------
+    ValueError
+        If series or plays are empty or not finite, lengths differ, or thresholds or the range do not increase.
+    """
+
+    kind: ClassVar[str] = "polynomial-plays"
+    series: Floats
+    thresholds: Floats
+    weights: Floats
+    input_range: tuple[float, float]
+    bias: float = 0.0
+    input_unit: str = ""
+    output_unit: str = ""
+
+    def __post_init__(self) -> None:
+        thresholds = _checks.increasing("thresholds", self.thresholds, least=1)
+        if thresholds[0] <= 0.0:
+            raise ValueError(f"thresholds: expected positive values, got {thresholds[0]}")
+        weights = _checks.samples("weights", self.weights)
+        if weights.size != thresholds.size:
+            raise ValueError(f"weights: expected {thresholds.size} values, one for each play, got {weights.size}")
+        low, high = _checks.increasing("input_range", self.input_range).tolist()
+        object.__setattr__(self, "series", _checks.frozen(_checks.samples("series", self.series)))
+        object.__setattr__(self, "thresholds", _checks.frozen(thresholds))
+        object.__setattr__(self, "weights", _checks.frozen(weights))
+        object.__setattr__(self, "input_range", (low, high))
+        object.__setattr__(self, "bias", _checks.number("bias", self.bias))
+
+    @property
+    def coefficients(self) -> Floats:
+        """Weights of the plays, then coefficients of T1 to Tn, shape (n + degree,)."""
+        return np.concatenate([self.weights, self.series])
+
+    def with_coefficients(self, coefficients: ArrayLike, bias: float) -> PolynomialPlays:
+        """Return the same operator with other coefficients, shape (n + degree,), and bias."""
+        values = _checks.samples("coefficients", coefficients)
+        plays = self.weights.size
+        if values.size != plays + self.series.size:
+            raise ValueError(f"coefficients: expected {plays + self.series.size} values, got {values.size}")
+        return replace(self, weights=values[:plays], series=values[plays:], bias=bias)
+
+    def initial_state(self) -> State:
+        """Return the state of negative saturation."""
+        return self.saturated_state(-1)
+
+    def saturated_state(self, direction: int, value: float | None = None) -> State:
+        """Return the state at the low (-1) or high (1) end, or at a value, entered from far beyond the other end.
+
+        Raises ValueError if `direction` is neither -1 nor 1.
+        """
+        _, end = self._ends(direction)
+        at = end if value is None else value
+        return (at, *(at - direction * self.thresholds).tolist())
+
+    def present_input(self, state: State) -> float:
+        """Return the input of a state."""
+        return state[0]
+
+    def _plays(self, sequence: Floats, state: State | None) -> Floats:
+        from bench.models.kernels import memory_kernels as _kernels
+
+        before = np.array((self.initial_state() if state is None else state)[1:], dtype=np.float64)
+        if before.size != self.thresholds.size:
+            raise ValueError(f"state: expected {self.thresholds.size} plays after the input, got {before.size}")
+        return np.asarray(_kernels.plays(sequence, self.thresholds, before))
+
+    def regressor(self, inputs: ArrayLike, state: State | None = None) -> Regressor:
+        """Return the columns of the plays and of T1 to Tn."""
+        sequence = _checks.samples("inputs", inputs)
+        low, high = self.input_range
+        mapped = (2.0 * sequence - (low + high)) / (high - low)
+        terms = chebyshev.chebvander(mapped, self.series.size)[:, 1:]
+        return Regressor.of_columns(np.column_stack([self._plays(sequence, state), terms]))
+
+    def evaluate(self, inputs: ArrayLike, state: State | None = None) -> Floats:
+        """Return the outputs of a sequence, shape (N,), from `state` (default: negative saturation)."""
+        return self.bias + self.regressor(inputs, state).extra @ self.coefficients
+
+    def advance(self, state: State, inputs: ArrayLike) -> State:
+        """Return the state after a sequence of inputs, shape (N,)."""
+        sequence = _checks.samples("inputs", inputs)
+        return (float(sequence[-1]), *self._plays(sequence, state)[-1].tolist())
+
+    def step(self, state: State, value: float) -> tuple[State, float]:
+        """Return state and output after the input moved monotonically to `value`."""
+        if not math.isfinite(value):
+            raise ValueError(f"value: expected a finite number, got {value}")
+        after = self.advance(state, [value])
+        return after, float(self.evaluate([value], state)[0])
+
+    def nonnegative(self) -> NDArray[np.bool_]:
+        """Return False for each coefficient: their signs are free."""
+        return np.zeros(self.coefficients.size, dtype=bool)

@@ -1,0 +1,1 @@
+"""Operators and inverses with a memory of their own, one sample at a time."""

@@ -1,0 +1,71 @@
+"""The page about a run for people."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from bench.base import format_duration
+
+
+def run_card(meta: Mapping[str, Any]) -> str:
+    """Return a run's metadata as a Markdown page, for the dashboard and the report.
+
+    `missing_rows` in the metadata, a text, says what its record lacks.
+    """
+    lines = [
+        f"# {meta['rig_title']}",
+        "",
+        f"**{meta['protocol']}** on **{meta['rig']}**: {meta['protocol_summary']}",
+        "",
+    ]
+    lines += ["| | |", "|---|---|"]
+    rows = {
+        **({"incomplete": meta["missing_rows"]} if "missing_rows" in meta else {}),
+        "run": meta["run"],
+        "operator": meta["operator"],
+        "started": f"{meta['epoch']} ({meta['clock']} clock)",
+        **_expected(meta),
+        "seed": meta["seed"],
+        **{f"device {name}": identity for name, identity in meta["devices"].items()},
+        **{f"parameter {name}": value for name, value in meta["parameters"].items()},
+        "git": meta["git"],
+    }
+    lines += [f"| {key} | {value} |" for key, value in rows.items()]
+    return "\n".join(lines)
+
+
+def _expected(meta: Mapping[str, Any]) -> dict[str, str]:
+    """Return the rows about what was expected of the run: its rehearsal if there was one, else its plan."""
+    rehearsal, planned = meta.get("rehearsal"), meta["plan"]
+    if rehearsal is None:
+        if planned.get("complete", True):
+            return {"planned": f"{planned['steps']} steps, {_between(planned['seconds'], planned.get('at_most'))}"}
+        known = f"{planned['steps']} steps, {format_duration(planned['seconds'])}"
+        return {"planned": f"unknown, as readings decide; {known} up to the first that does"}
+    length = f"{rehearsal['steps']} steps, {format_duration(rehearsal['seconds'])}"
+    if (most := rehearsal["at_most"]) is not None:
+        length += f", at most {format_duration(most)}"
+    margins = [
+        f"{name} {each['margin']:.3g} {each['unit']}"
+        for name, each in rehearsal["extremes"].items()
+        if each["margin"] is not None
+    ]
+    rows = {f"rehearsed on {rehearsal['twin']}": length}
+    if margins:
+        rows["least margins"] = ", ".join(margins)
+    return rows
+
+
+def _between(seconds: float, most: float | None) -> str:
+    """Return a time that lies between two bounds."""
+    least = format_duration(seconds)
+    return least if most is None or most - seconds < 1.0 else f"{least} to {format_duration(most)}"
+
+
+def expected_steps(meta: Mapping[str, Any]) -> int | None:
+    """Return how many steps a run was expected to have; None where that was not known before it."""
+    if (rehearsal := meta.get("rehearsal")) is not None:
+        return int(rehearsal["steps"])
+    planned = meta["plan"]
+    return int(planned["steps"]) if planned.get("complete", True) else None

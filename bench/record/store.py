@@ -1,0 +1,132 @@
+"""The SQLite file of a journal: its settings, writing rows, and whether they are all there."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import closing, suppress
+from pathlib import Path
+
+from bench.record.rows import TABLES, Entry, entry, table_definitions
+
+_LOG_PAGES = 64
+"""Pages after which the write-ahead log is folded in and overwritten, of a journal whose commits wait for the disk.
+
+A commit that makes the log longer waits for the file system's record of its size as well. After 64 pages, some 16
+steps, the log does not grow any more (https://sqlite.org/wal.html).
+"""
+
+
+class Store:
+    """Writes rows into the SQLite file; every method raises `sqlite3.Error`, and none waits for another program.
+
+    Parameters
+    ----------
+    path : Path
+        The file; it is created if there is none.
+    wait : float
+        Wall-clock time for which it waits for other programs until `wait_for_others` says otherwise, s.
+    flushed : bool
+        Whether each commit waits for the disk.
+    """
+
+    def __init__(self, path: Path, wait: float = 0.0, *, flushed: bool = True) -> None:
+        self.path = path
+        self._settings = (
+            ("synchronous=FULL", f"wal_autocheckpoint={_LOG_PAGES}") if flushed else ("synchronous=NORMAL",)
+        )
+        self._connect(wait)
+        made = path.stat()
+        self._file = made.st_dev, made.st_ino
+
+    def _connect(self, wait: float = 0.0) -> None:
+        # One thread at a time, see `Keeper`.
+        self._db = sqlite3.connect(self.path, timeout=wait, isolation_level=None, check_same_thread=False)
+        self._db.execute("PRAGMA journal_mode=WAL")
+        for setting in self._settings:
+            self._db.execute(f"PRAGMA {setting}")
+
+    def create(self, signals: Sequence[str], entries: Iterable[Entry]) -> None:
+        """Make the tables, with their first rows."""
+        self._db.execute("BEGIN IMMEDIATE")
+        for statement in table_definitions(signals):
+            self._db.execute(statement)
+        self._insert(entries)
+        self._db.execute("COMMIT")
+
+    def write(self, entries: Sequence[Entry]) -> None:
+        """Commit rows, all or none."""
+        if len(entries) == 1 and len(entries[0].rows) == 1:
+            self._insert(entries)
+            return
+        self._db.execute("BEGIN IMMEDIATE")
+        try:
+            self._insert(entries)
+            self._db.execute("COMMIT")
+        except sqlite3.Error:
+            # SQLite itself may have done so.
+            with suppress(sqlite3.Error):
+                self._db.execute("ROLLBACK")
+            raise
+
+    def forget(self, keys: Iterable[str]) -> None:
+        """Remove entries of the metadata."""
+        self._db.executemany("DELETE FROM meta WHERE key = ?", [(key,) for key in keys])
+
+    def _insert(self, entries: Iterable[Entry]) -> None:
+        for each in entries:
+            marks = ", ".join("?" * (len(each.row) + (each.table != "files")))
+            # A row that comes a second time, from the second file, is the same.
+            statement = f"INSERT OR REPLACE INTO {each.table} VALUES ({marks})"  # noqa: S608 - own names
+            self._db.executemany(statement, each.columns())
+
+    def wait_for_others(self, seconds: float) -> None:
+        """Wait for other programs from now on, each time for so long at most, s of wall-clock time."""
+        self._db.execute(f"PRAGMA busy_timeout={round(1e3 * seconds)}")
+
+    def reconnect(self) -> None:
+        """Open the file anew, as after a failure of the disk."""
+        with suppress(sqlite3.Error):
+            self._db.close()
+        self._connect()
+
+    def fold_in(self) -> None:
+        """Bring what is committed from the companion file into the file itself, as far as nobody reads there."""
+        self._db.execute("PRAGMA wal_checkpoint(PASSIVE)").fetchall()
+
+    def loss(self) -> str:
+        """Return how the file is no longer where it was made, or nothing; SQLite goes on with one that is removed."""
+        try:
+            found = self.path.stat()
+        except OSError:
+            return "removed"
+        return "" if (found.st_dev, found.st_ino) == self._file else "replaced"
+
+    def problem(self, counts: Mapping[str, int]) -> str:
+        """Return what is wrong with the file, by SQLite's own check and the number of rows by table; or nothing."""
+        # What is in the file, not what this connection remembers of it.
+        with closing(sqlite3.connect(self.path, isolation_level=None)) as db:
+            found = db.execute("PRAGMA quick_check(1)").fetchone()[0]
+            if found != "ok":
+                return str(found)
+            for table, count in counts.items():
+                (rows,) = db.execute(f"SELECT count(*) FROM {table}").fetchone()  # noqa: S608 - own names
+                if rows != count:
+                    return f"table {table} has {rows} rows of {count}"
+        return ""
+
+    def entries(self) -> list[Entry]:
+        """Return every row, also of a file that has been removed."""
+        return [
+            entry(table, row if table == "files" else row[:-1])
+            for table in TABLES
+            for row in self._db.execute(f"SELECT * FROM {table}").fetchall()  # noqa: S608 - own names
+        ]
+
+    def close(self) -> None:
+        """Close the file, as one that can be read where nothing can be written."""
+        # Out of WAL mode, as a reader of a WAL file leaves companions beside it; while one reads, it cannot be.
+        with suppress(sqlite3.Error):
+            self._db.execute("PRAGMA busy_timeout=0")
+            self._db.execute("PRAGMA journal_mode=DELETE")
+        self._db.close()

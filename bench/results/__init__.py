@@ -1,1 +1,0 @@
-"""Data, models, figures and reports made from the records of runs."""

@@ -1,0 +1,341 @@
+"""A check-up of a rig: what the instruments say of themselves beside what the rig file says of them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import date
+from functools import partial
+
+from bench.base import BenchError, Clock, DeviceConnectionError, DeviceError, wall_time
+from bench.devices import Actuator, Device, DeviceDescription, DriverSettings, Finding, Limits, Status
+from bench.rig.file import RigFile
+from bench.rig.maintenance.opening import Workplace
+from bench.rig.maintenance.safe_state import SAFE, make_safe
+from bench.rig.slots import RoleTable, reading_of
+from bench.rig.start_checks import SHARE_OF_WATCHDOG
+
+GLANCES, MEASUREMENTS = 20, 5
+"""How many of each are taken for noise and time."""
+
+_MUCH_NOISE = 3.0
+"""Noise beyond what is typical, as a factor."""
+_STEP = 0.01
+"""Set-point of an exercise from the rest, as a part of the range, where the role has no increment."""
+_PATIENCE = 20.0
+"""Laboratory time (s) that an exercise gives a set-point to arrive."""
+_NEAR = 0.1
+"""Distance from the set-point that counts as having arrived, as a part of the way."""
+_LOOK = 0.1
+_SIGNIFICANT = 3.0
+"""Change of a reading that is beyond its noise, as a factor."""
+
+
+@dataclass(frozen=True)
+class DeviceCheck:
+    """What was found of one device, or of the rig as a whole.
+
+    Attributes
+    ----------
+    device : str
+        Name of the device; empty for the rig.
+    identity : str
+        Which instrument it is; empty if it did not say.
+    findings : tuple of Finding
+        All of them, those without an advice as well.
+    failed : bool
+        Whether it could not be connected, or a reading failed.
+    unsafe : bool
+        Whether its safe state could not be confirmed at the end.
+    """
+
+    device: str
+    identity: str
+    findings: tuple[Finding, ...]
+    failed: bool = False
+    unsafe: bool = False
+
+
+def check_up(place: Workplace, exercise: bool, keep_on: Callable[[], None]) -> list[DeviceCheck]:
+    """Connect every device, look at all that it says, and leave it in its safe state.
+
+    Parameters
+    ----------
+    place : Workplace
+        The lines of the rig.
+    exercise : bool
+        Whether to move each actuator that a role gives a rest.
+    keep_on : callable
+        Is called between two steps; what it raises ends the check-up, in the safe state.
+
+    Returns
+    -------
+    list of DeviceCheck
+        One a device in the order of the rig file, and one of the rig as a whole.
+    """
+    today = wall_time().astimezone().date()
+    found = {entry.name: _calibration(entry.settings, today) for entry in place.entries}
+    identities: dict[str, str] = {}
+    failed: set[str] = set()
+    devices: dict[str, Device] = {}
+    unsafe: set[str] = set()
+    whole: list[Finding] = []
+
+    def of(name: str, check: Callable[[], Iterable[Finding]]) -> None:
+        keep_on()
+        try:
+            found[name].extend(check())
+        except DeviceError as error:
+            failed.add(name)
+            found[name].append(_failure(name, error))
+
+    try:
+        for entry in place.entries:
+            keep_on()
+            try:
+                device = entry.driver.connect(entry.name, entry.settings, place.clock)
+            except BenchError as error:
+                failed.add(entry.name)
+                found[entry.name].append(_failure(entry.name, error))
+                continue
+            devices[entry.name] = device
+            identities[entry.name] = str(device.identity)
+            place.take_instrument(device)
+        ticks: dict[str, float] = {}
+        for name, device in devices.items():
+            of(name, device.self_check)
+            of(name, partial(_readings, device, place, ticks))
+            if isinstance(device, Actuator):
+                of(name, partial(_limits, device, place.file.roles))
+                of(name, partial(_watchdog, device, place.file))
+        whole = _times(place.file, devices, ticks)
+        if exercise:
+            for name, role in _exercised(place.file.roles, devices).items():
+                if name not in failed:
+                    of(name, partial(_exercise, devices, name, role, place.clock, keep_on))
+    finally:
+        for name, state in make_safe(devices.values()).items():
+            if state != SAFE:
+                unsafe.add(name)
+                found[name].append(Finding("safe state", state, f"unplug what {name} drives, or its power supply"))
+        for device in devices.values():
+            # A line that is gone cannot be closed either.
+            with suppress(Exception):
+                device.close()
+    checks = [
+        DeviceCheck(name, identities.get(name, ""), tuple(findings), name in failed, name in unsafe)
+        for name, findings in found.items()
+    ]
+    return [*checks, DeviceCheck("", "", tuple(whole))]
+
+
+def _calibration(settings: DriverSettings, today: date) -> list[Finding]:
+    """Say when a device was calibrated, and whether it is due again."""
+    day, due = settings.calibrated, settings.calibration_due
+    parts = [*([f"of {day}"] if day else []), *([f"due on {due}"] if due else [])]
+    if not parts:
+        return []
+    if due is not None and due <= today:
+        parts.append(f"{(today - due).days} days ago")
+        return [Finding("calibration", ", ".join(parts), "calibrate it, then set calibrated and calibration_due")]
+    return [Finding("calibration", ", ".join(parts))]
+
+
+def _failure(name: str, error: BenchError) -> Finding:
+    text = str(error).removeprefix(f"{name}: ")
+    if isinstance(error, DeviceConnectionError):
+        return Finding("connection", text, "see that it is on and connected as the rig file says")
+    if isinstance(error, DeviceError):
+        return Finding("error", text, "do as it says; `bench recover` clears an error that the instrument keeps")
+    return Finding("rig file", text, "correct the rig file")
+
+
+def _readings(device: Device, place: Workplace, ticks: dict[str, float]) -> list[Finding]:
+    """Say what a device reads, how much that varies, and how long it takes; its `glance` joins `ticks`, s."""
+    glances, glance_time = _repeat(device.glance, GLANCES, place.clock)
+    measurements, measure_time = _repeat(device.measure, MEASUREMENTS, place.clock)
+    ticks[device.name] = glance_time
+    findings = []
+    for signal in device.signals:
+        quick = [values[signal.name] for values in glances]
+        slow = [values[signal.name] for values in measurements]
+        value, noise = math.fsum(slow) / len(slow), deviation(quick)
+        text = (
+            f"{value:.6g} {signal.unit}, noise {noise:.2g} (of {GLANCES} quick readings), "
+            f"{deviation(slow):.2g} (of {MEASUREMENTS} measurements)"
+        )
+        typical, advice = _typical_noise(signal.name, place.file.roles, {device.name: device}), ""
+        if typical is not None:
+            text += f"; typical {typical:.2g}"
+            if noise > _MUCH_NOISE * typical:
+                advice = "look for a loose cable, a ground loop, or a load that is not at rest"
+        for lock in place.file.interlocks:
+            if lock.signal == signal.name and not lock.minus and not lock.low <= value <= lock.high:
+                text += f"; outside of its interlock, {lock.low:g} to {lock.high:g} {signal.unit}"
+                advice = "bring it into the range of its interlock before a run"
+        findings.append(Finding(signal.name, text, advice))
+    text = f"{1e3 * glance_time:.3g} ms a quick reading, {1e3 * measure_time:.3g} ms a measurement"
+    advice = ""
+    if device.watchdog and measure_time > SHARE_OF_WATCHDOG * device.watchdog:
+        text += f", {measure_time / device.watchdog:.0%} of its watchdog of {device.watchdog:g} s"
+        advice = "take fewer samples in a measurement, or lengthen the watchdog"
+    return [*findings, Finding("time", text, advice)]
+
+
+def _repeat(read: Callable[[], dict[str, float]], times: int, clock: Clock) -> tuple[list[dict[str, float]], float]:
+    """Return readings, and the longest time that one took, s."""
+    readings, longest = [], 0.0
+    for _ in range(times):
+        begin = clock.now()
+        readings.append(read())
+        longest = max(longest, clock.now() - begin)
+    return readings, longest
+
+
+def deviation(values: list[float]) -> float:
+    """Return the standard deviation of values; 0 of one."""
+    mean = math.fsum(values) / len(values)
+    return math.sqrt(math.fsum((value - mean) ** 2 for value in values) / max(1, len(values) - 1))
+
+
+def _typical_noise(signal: str, roles: Mapping[str, RoleTable], devices: Mapping[str, Device]) -> float | None:
+    """Return what the rig file says that a signal varies by; None if it says nothing."""
+    for role in roles.values():
+        if role.reset is None or role.reset.noise is None:
+            continue
+        watched = role.reset.signal or role.signal or role.reading
+        if not watched and role.device in devices:
+            watched = _reading(role, devices)
+        if watched == signal:
+            return role.reset.noise
+    return None
+
+
+def _reading(role: RoleTable, devices: Mapping[str, Device]) -> str:
+    """Return the signal of a role whose device, if it has one, is connected."""
+    known = {role.device: DeviceDescription.of(devices[role.device])} if role.device else {}
+    return reading_of(role, known)
+
+
+def _limits(device: Actuator, roles: Mapping[str, RoleTable]) -> list[Finding]:
+    """Compare the ranges of the roles with the limits of the device."""
+    findings = [Finding("limits", str(device.limits))]
+    for name, role in roles.items():
+        if role.device != device.name:
+            continue
+        values = {"range": role.range or (), "rest": () if role.rest is None else (role.rest,)}
+        for key, each in values.items():
+            beyond = [f"{value:g}" for value in each if value not in device.limits]
+            if beyond:
+                findings.append(
+                    Finding(
+                        "limits",
+                        f"roles.{name}.{key}: {' and '.join(beyond)} beyond {device.limits}",
+                        f"correct roles.{name}.{key}, or the limits in devices.{device.name}",
+                    )
+                )
+    return findings
+
+
+def _watchdog(device: Actuator, file: RigFile) -> list[Finding]:
+    """Judge the watchdog that the driver declares."""
+    watchdog, period = device.watchdog, file.telemetry.period
+    if watchdog is None:
+        if not device.heats:
+            return [Finding("watchdog", "none")]
+        return [Finding("watchdog", "none, and its output heats", f"set the key watchdog of devices.{device.name}")]
+    text = f"{watchdog:g} s"
+    if period > SHARE_OF_WATCHDOG * watchdog:
+        return [
+            Finding(
+                "watchdog",
+                f"{text}, with {period:g} s between two readings (telemetry.period)",
+                f"let telemetry.period be {SHARE_OF_WATCHDOG * watchdog:g} s at most, or lengthen the watchdog",
+            )
+        ]
+    return [Finding("watchdog", text)]
+
+
+def _times(file: RigFile, devices: Mapping[str, Device], ticks: Mapping[str, float]) -> list[Finding]:
+    """Compare the time of one reading of all devices with the telemetry and the shortest watchdog."""
+    total, period = math.fsum(ticks.values()), file.telemetry.period
+    watchdogs = [device.watchdog for device in devices.values() if device.watchdog]
+    shortest = min(watchdogs, default=math.inf)
+    text = f"{1e3 * total:.3g} ms a quick reading of all devices, every {period:g} s"
+    if total > period:
+        return [Finding("time", text, "lengthen telemetry.period, or read faster (speed of the lines, samples)")]
+    if total > SHARE_OF_WATCHDOG * shortest:
+        return [Finding("time", f"{text}; the shortest watchdog is {shortest:g} s", "lengthen the watchdog")]
+    return [Finding("time", text)]
+
+
+def _exercised(roles: Mapping[str, RoleTable], devices: Mapping[str, Device]) -> dict[str, RoleTable]:
+    """Return the actuators that have a rest, each with its role."""
+    return {
+        role.device: role
+        for role in roles.values()
+        if role.rest is not None and isinstance(devices.get(role.device), Actuator)
+    }
+
+
+def exercise_setpoint(role: RoleTable, limits: Limits) -> float:
+    """Return a set-point near the rest of a role, within its range and the limits of its device.
+
+    Parameters
+    ----------
+    role : RoleTable
+        A role with a rest.
+    limits : Limits
+        Of its device.
+    """
+    assert role.rest is not None
+    low, high = role.range or (limits.low, limits.high)
+    low, high = max(low, limits.low), min(high, limits.high)
+    step = role.increment or _STEP * (high - low)
+    above = role.rest + step
+    return min(max(above if above <= high else role.rest - step, low), high)
+
+
+def _exercise(
+    devices: Mapping[str, Device], name: str, role: RoleTable, clock: Clock, keep_on: Callable[[], None]
+) -> list[Finding]:
+    """Set an actuator near its rest, see that its reading follows, and make it safe again."""
+    device = devices[name]
+    assert isinstance(device, Actuator)
+    signal = _reading(role, devices)
+    source = next((each for each in devices.values() if signal in (s.name for s in each.signals)), None)
+    if source is None:
+        return [Finding("exercise", f"{signal} cannot be read, so {name} was not moved", "connect its device")]
+    quick, _ = _repeat(source.glance, GLANCES, clock)
+    noise = deviation([values[signal] for values in quick])
+    begin, target = quick[-1][signal], exercise_setpoint(role, device.limits)
+    near = max(_SIGNIFICANT * noise, _NEAR * abs(target - begin))
+    start, value = clock.now(), begin
+    try:
+        status = device.set(target)
+        while abs(value - target) > near and clock.now() - start < _PATIENCE and not _has_failed(status):
+            keep_on()
+            clock.sleep(_LOOK)
+            # Also what feeds a watchdog.
+            device.glance()
+            value = source.glance()[signal]
+        problem = status.exception()
+    finally:
+        device.safe()
+    text = (
+        f"{signal} went from {begin:.6g} to {value:.6g} within {clock.now() - start:.2g} s of setting "
+        f"{target:g} {device.limits.unit}"
+    )
+    if problem is not None:
+        return [Finding("exercise", f"{text}: {problem}", "see that the output is connected and not blocked")]
+    moved, way = value - begin, target - begin
+    if abs(way) <= near or (moved * way > 0 and abs(moved) > _SIGNIFICANT * noise):
+        return [Finding("exercise", text)]
+    advice = "see that the output is connected, and the sensor on it"
+    return [Finding("exercise", f"{text}, so it does not follow", advice)]
+
+
+def _has_failed(status: Status) -> bool:
+    return status.update() and not status.success

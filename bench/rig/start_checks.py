@@ -1,0 +1,153 @@
+"""Checks of a connected rig before anything moves: watchdogs, interlocks, and how often instruments are asked.
+
+Nothing here touches a device.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+from datetime import date
+
+from bench.base import ConfigurationError
+from bench.devices import Actuator, DeviceDescription
+from bench.rig.description import RigDescription
+from bench.rig.file import RigFile
+from bench.rig.interlocks.config import SETPOINT, Interlock, Level
+
+SHARE_OF_WATCHDOG = 0.4
+"""Longest silence of the host on purpose, as a share of the shortest watchdog: one late answer may double it."""
+
+
+def check_start(
+    rig: RigDescription, *, interval: float, interval_key: str, measurements: Mapping[str, float] | None = None
+) -> tuple[str, ...]:
+    """Check that a rig can be left to itself.
+
+    Parameters
+    ----------
+    rig : RigDescription
+        What was found when it was connected.
+    interval : float
+        Longest time between two requests to each instrument, s: the telemetry period, or that between two looks at
+        the interlocks, where these feed the watchdogs.
+    interval_key : str
+        Key of the rig file from which the interval comes, for messages.
+    measurements : mapping of str to float, optional
+        Longest time of one measurement by name of device, s, where it is known.
+
+    Returns
+    -------
+    tuple of str
+        Warnings: what is accepted only since an operator is present (`safety.unattended = false`).
+
+    Raises
+    ------
+    ConfigurationError
+        If the instruments are asked less often than their watchdogs need, a device that heats has no watchdog or no
+        interlock, or an interlock does not fit its signals; one line each.
+    """
+    file = rig.file
+    wrong = [*_wrong_intervals(rig, interval, interval_key, measurements or {})]
+    for i, interlock in enumerate(file.interlocks):
+        wrong.extend(f"interlocks.{i}.{problem}" for problem in _wrong_interlock(interlock, rig))
+    unguarded = [*_unguarded(rig)]
+    if file.safety.unattended:
+        wrong.extend(f"{problem}, or safety.unattended = false if an operator is present" for problem in unguarded)
+    if wrong:
+        raise ConfigurationError("\n".join(f"{file.path}: {problem}" for problem in wrong))
+    return tuple(f"{file.path}: {problem}; accepted, as safety.unattended = false" for problem in unguarded)
+
+
+def overdue_calibrations(file: RigFile, today: date) -> tuple[str, ...]:
+    """Return a warning for each device of a rig file whose calibration is due on a day or before it."""
+    return tuple(
+        f"{file.path}: devices.{entry.name}: its calibration was due on {due}; calibrate it, then set calibrated and "
+        "calibration_due"
+        for entry in file.devices
+        if (due := entry.settings.calibration_due) is not None and due <= today
+    )
+
+
+def _wrong_intervals(
+    rig: RigDescription, interval: float, interval_key: str, measurements: Mapping[str, float]
+) -> Iterable[str]:
+    guarded = [(device.watchdog, device.name) for device in rig.devices.values() if device.watchdog]
+    if not guarded:
+        return
+    watchdog, name = min(guarded)
+    allowed = SHARE_OF_WATCHDOG * watchdog
+    why = (
+        f"{name} goes to its safe state after {watchdog:g} s of silence; {allowed:g} s, {SHARE_OF_WATCHDOG:g} of its "
+        "watchdog, is allowed at most"
+    )
+    # Products of rounded numbers: 0.4 * 5 s are 2 s.
+    if interval > allowed * (1.0 + 1e-9):
+        yield f"{interval_key}: instruments are asked each {interval:g} s only, but {why}"
+    for device, longest in measurements.items():
+        if longest > allowed * (1.0 + 1e-9):
+            yield f"devices.{device}: a measurement takes {longest:.3g} s, but {why}"
+
+
+def _wrong_interlock(interlock: Interlock, rig: RigDescription) -> Iterable[str]:
+    units = {name: signal.unit for name, signal in rig.by_name.items()}
+    for key, signal in (("signal", interlock.signal), ("minus", interlock.minus)):
+        if signal and signal not in units:
+            yield f"{key} = {signal!r}: there is no such signal; there are: {', '.join(units)}"
+    unit, other = units.get(interlock.signal), units.get(interlock.minus)
+    if interlock.minus and unit is not None and other is not None and unit != other:
+        yield f"minus = {interlock.minus!r}: it is in {other} and {interlock.signal} in {unit}; expected one unit"
+    meant = {unit, "K"} if interlock.minus and unit == "°C" else {unit}
+    if interlock.unit and unit is not None and interlock.unit not in meant:
+        yield f"unit = {interlock.unit!r}: {interlock.label} is in {' or '.join(sorted(map(str, meant)))}"
+    limits = rig.limits
+    if interlock.setpoint and interlock.setpoint not in limits:
+        yield (
+            f"setpoint = {interlock.setpoint!r}: there is no such device that takes a set-point; "
+            f"there are: {', '.join(limits) or 'none'}"
+        )
+    moving = limits.get(interlock.setpoint)
+    if interlock.stuck is not None and moving is not None and interlock.stuck.moved > moving.high - moving.low:
+        yield f"stuck.moved = {interlock.stuck.moved:g}: {interlock.setpoint} takes {moving}, so that it never acts"
+    device = interlock.signal.removesuffix(SETPOINT)
+    if device == interlock.signal or device not in limits or interlock.minus:
+        return
+    for key, limit in (("low", interlock.low), ("high", interlock.high)):
+        if math.isfinite(limit) and limit not in limits[device]:
+            yield f"{key} = {limit:g}: {device} takes {limits[device]}, so that it never acts"
+
+
+def _unguarded(rig: RigDescription) -> Iterable[str]:
+    ending = [each for each in rig.file.interlocks if each.level in (Level.SAFE, Level.HOLD) and each.limits_values]
+    for device in rig.devices.values():
+        if not _heats(device):
+            continue
+        if not device.watchdog:
+            yield (
+                f"devices.{device.name}: it heats and has no watchdog, so that it goes on when its host is gone; "
+                "expected a watchdog"
+            )
+        measured = {signal.name for signal in device.signals}
+        if not any(
+            each.setpoint == device.name or measured & _origins(rig, (each.signal, each.minus)) for each in ending
+        ):
+            yield (
+                f"devices.{device.name}: it heats, and no interlock of level safe or hold limits it; expected one on "
+                f"{', '.join(sorted(measured))} or a signal derived from them, or with setpoint = {device.name!r}"
+            )
+
+
+def _heats(device: DeviceDescription) -> bool:
+    return issubclass(device.kind, Actuator) and device.kind.heats
+
+
+def _origins(rig: RigDescription, names: Iterable[str]) -> set[str]:
+    """Return signals, and all those that the derived ones among them come from."""
+    found: set[str] = set()
+    waiting = [*names]
+    while waiting:
+        name = waiting.pop()
+        if name not in found:
+            found.add(name)
+            waiting.extend(rig.file.derived[name].sources if name in rig.file.derived else ())
+    return found

@@ -1,0 +1,190 @@
+"""Makes a rig safe when its guardian has died or hangs: `python -m bench.run.guardian.rescuer`.
+
+A guardian starts it before it opens a line, so that it has loaded what it needs by the time that it is needed. It
+opens no line as long as the guardian's signs of life come through a pipe, its standard input.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import signal
+import subprocess
+import sys
+import threading
+from contextlib import suppress
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from bench.base import ENDING, BenchError, parse_json
+from bench.rig import SAFE, Rescued, load_rig, opened, rescue
+from bench.run.guardian.parent import SIGKILL, ParentProcess
+from bench.run.guardian.start import start_module
+
+SILENCE = 3.0
+"""Silence of a guardian after which it counts as dead, s; it gives a sign of life twice a second."""
+
+TRY_FOR = 600.0
+"""Time for which a device that is not safe is tried again, s."""
+
+_SLICE = 0.25
+"""Longest single wait for a sign of life, s."""
+
+_INTERVAL = 0.25
+"""Shortest time between two signs of life, s."""
+
+_REPORT_AFTER = 3.0
+"""Time after which it is reported what has become of each device so far, s."""
+
+_DIES = 1.0
+"""Time within which a process that was killed has ended, s."""
+
+_ALIVE, _RELEASED = b".", b"!"
+
+
+class Rescuer:
+    """A rescuer, as its guardian sees it.
+
+    Parameters
+    ----------
+    content : mapping
+        `rig`, `overrides` and `attach` as for `opened`, and `report`, the path of the file in
+        which it says that it is ready, and later what has become of each device.
+    """
+
+    def __init__(self, content: dict[str, Any]) -> None:
+        self._process = start_module("bench.run.guardian.rescuer", stdin=subprocess.PIPE)
+        assert self._process.stdin is not None
+        self._pipe = self._process.stdin.fileno()
+        self._last = float("-inf")
+        self._write(json.dumps({**content, "guardian": os.getpid()}).encode() + b"\n")
+        if sys.platform != "win32":
+            os.set_blocking(self._pipe, False)
+
+    def live(self, now: float) -> None:
+        """Give a sign of life at a time of the guardian's clock, s."""
+        if now - self._last >= _INTERVAL:
+            self._last = now
+            self._write(_ALIVE)
+
+    def release(self) -> None:
+        """Let it end without an action, as nothing is left to be made safe."""
+        self._write(_RELEASED)
+        assert self._process.stdin is not None
+        with suppress(OSError):
+            self._process.stdin.close()
+        # It ends by itself.
+        self._process.returncode = 0
+
+    def _write(self, content: bytes) -> None:
+        # One that does not read or has died must not hinder the guardian; the bench makes up for it.
+        with suppress(OSError):
+            os.write(self._pipe, content)
+
+
+@dataclass(frozen=True)
+class Report:
+    """The file in which a rescuer says how far it is.
+
+    Attributes
+    ----------
+    path : Path
+        Where it is.
+    """
+
+    path: Path
+
+    def is_ready(self) -> bool:
+        """Return whether a rescuer is ready, or has been needed already."""
+        return self.path.exists()
+
+    def states(self) -> dict[str, str]:
+        """Return by device `safe`, or what went wrong; empty as long as that is not known."""
+        with suppress(OSError, ValueError):
+            content = parse_json(self.path.read_text(encoding="utf-8"))
+            return {str(name): str(state) for name, state in content["devices"].items()}
+        return {}
+
+    def write(self, states: dict[str, str]) -> None:
+        """Write the states of devices down, empty while they are not known; a bench that has left reads no more."""
+        new = self.path.with_suffix(".new")
+        with suppress(OSError):
+            new.write_text(json.dumps({"process": os.getpid(), "devices": states}), encoding="utf-8")
+            new.replace(self.path)
+
+
+def is_needed(signs: queue.SimpleQueue[bytes]) -> bool:
+    """Wait until the guardian is gone or has been silent for too long, or releases this process.
+
+    Of a wait without a sign of life only its nominal time counts: while this process itself got no processor, or the
+    machine was suspended, the guardian may not have got one either.
+
+    Parameters
+    ----------
+    signs : queue.SimpleQueue of bytes
+        What the guardian has written; empty at its end.
+    """
+    silent, has_begun = 0.0, False
+    while silent < SILENCE:
+        try:
+            sign = signs.get(timeout=_SLICE)
+        except queue.Empty:
+            # Before its first sign it opens lines, which may take long.
+            silent += _SLICE if has_begun else 0.0
+            continue
+        if not sign or _RELEASED in sign:
+            return not sign
+        silent, has_begun = 0.0, True
+    return True
+
+
+def main() -> int:
+    """Wait until this process is needed, and make the devices of the rig safe then."""
+    # It ends with its guardian only.
+    for number in (*ENDING, signal.SIGINT):
+        signal.signal(number, signal.SIG_IGN)
+    content = parse_json(sys.stdin.buffer.readline())
+    guardian = ParentProcess(content["guardian"])
+    report = Report(Path(content["report"]))
+    # The drivers as well: nothing has to be loaded any more when it counts.
+    names = [entry.name for entry in load_rig(content["rig"], content["overrides"]).devices]
+    signs: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    threading.Thread(target=_read, args=(signs,), daemon=True).start()
+    report.write({})
+    if not is_needed(signs):
+        return 0
+    # A stopped guardian keeps its lines and locks.
+    guardian.send(SIGKILL)
+    guardian.await_end(_DIES)
+    attach = None if content["attach"] is None else Path(content["attach"])
+    try:
+        with opened(
+            content["rig"], content["overrides"], attach, "making safe without its guardian", _go_on
+        ) as place:
+            for seconds, found in rescue(place, limit=TRY_FOR):
+                if seconds >= _REPORT_AFTER or all(each.is_safe for each in found):
+                    report.write({each.device: _state(each) for each in found})
+    except BenchError as error:
+        report.write(dict.fromkeys(names, str(error)))
+    return 0
+
+
+def _read(signs: queue.SimpleQueue[bytes]) -> None:
+    # From the buffer, which may have taken in more than the first line.
+    while sign := sys.stdin.buffer.read1(4096):
+        signs.put(sign)
+    signs.put(b"")
+
+
+def _go_on(_: str) -> None:
+    """Take no notice of a lock: the devices have to be made safe whoever holds it."""
+
+
+def _state(found: Rescued) -> str:
+    return SAFE if found.is_safe else found.state
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,253 @@
+"""Messages to people who are not at the bench: when a run pauses, asks, warns, trips or ends.
+
+A target is a command, the address of a mailbox, or that of a webhook::
+
+    --notify "notify-send bench"          # a program, with the facts in its environment and as JSON on its input
+    --notify mailto:operator@lab.example  # by the SMTP server that BENCH_SMTP_HOST names
+    --notify https://hooks.lab.example/7  # JSON, posted
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import queue
+import shlex
+import shutil
+import smtplib
+import ssl
+import subprocess
+import threading
+import urllib.parse
+import urllib.request
+from collections.abc import Callable, Mapping, Sequence
+from email.message import EmailMessage
+from functools import partial
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from bench.base import OPTION, ConfigurationError, json_text, redacted, wall_time
+from bench.record import Event, StepRecord
+
+_OCCASIONS = {"pause": "pause", "prompt": "prompt", "warning": "warning", "interlock": "trip", "end": "end"}
+"""Kinds of events that are told, and what the occasion is called."""
+
+WITHIN = 30.0
+"""Wall-clock time that one message may take, s."""
+
+_AT_THE_END = 10.0
+"""Longest wait at the end of a run until all messages are sent, s."""
+
+_MOST = 20
+"""Messages that wait at most."""
+
+_SMTP = {
+    "BENCH_SMTP_HOST": "server",
+    "BENCH_SMTP_PORT": "its port; 587 if not given, 465 speaks TLS from the start",
+    "BENCH_SMTP_USER": "user, if it asks for one",
+    "BENCH_SMTP_PASSWORD": "password",
+    "BENCH_SMTP_FROM": "sender; bench@HOST if not given",
+    "BENCH_SMTP_TLS": "`no` for a server of the laboratory without encryption",
+}
+"""Variables of the environment that say how mail is sent."""
+
+Facts = Mapping[str, Any]
+Send = Callable[[Facts], None]
+
+
+def sender(target: str) -> Send:
+    """Return what sends facts to a target; it raises OSError, or another error of the library, if that fails.
+
+    Raises ConfigurationError if the target is none: no such program, no mail server.
+    """
+    if target.lower().startswith(("http://", "https://")):
+        return partial(_post, target)
+    if target.lower().startswith("mailto:"):
+        address = target[len("mailto:") :]
+        if "@" not in address:
+            raise ConfigurationError(f"{OPTION} {target}: expected mailto:NAME@DOMAIN")
+        if not os.environ.get("BENCH_SMTP_HOST"):
+            known = "; ".join(f"{name}: {text}" for name, text in _SMTP.items())
+            raise ConfigurationError(f"{OPTION} {target}: BENCH_SMTP_HOST is not set ({known})")
+        return partial(_mail, address)
+    # On Windows a backslash is part of a path.
+    words = [word.strip('"') for word in shlex.split(target, posix=False)] if os.name == "nt" else shlex.split(target)
+    program = shutil.which(words[0]) if words else None
+    if program is None:
+        raise ConfigurationError(
+            f"{OPTION} {redacted(target)!r}: there is no such program; expected a command, mailto:ADDRESS or https://ADDRESS"
+        )
+    return partial(_call, [program, *words[1:]])
+
+
+def _call(command: Sequence[str], facts: Facts) -> None:
+    said = {f"BENCH_{name.upper()}": str(value) for name, value in facts.items() if not isinstance(value, dict)}
+    done = subprocess.run(  # noqa: S603 - the operator's own command
+        command,
+        input=json_text(facts).encode(),
+        env={**os.environ, **said},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        timeout=WITHIN,
+        check=False,
+        # Ctrl-C at the terminal is meant for the run.
+        start_new_session=os.name != "nt",
+        creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
+    )
+    if done.returncode:
+        lines = done.stderr.decode(errors="replace").strip().splitlines()
+        raise OSError(f"exit code {done.returncode}{f': {lines[-1]}' if lines else ''}")
+
+
+def _post(url: str, facts: Facts) -> None:
+    body = json_text(facts).encode()
+    request = urllib.request.Request(  # noqa: S310 - http and https only, see `sender`
+        url, body, {"Content-Type": "application/json", "User-Agent": "actuator-bench"}
+    )
+    with urllib.request.urlopen(request, timeout=WITHIN):  # noqa: S310
+        pass
+
+
+def _mail(address: str, facts: Facts) -> None:
+    settings = {name: os.environ.get(name, "") for name in _SMTP}
+    host, port = settings["BENCH_SMTP_HOST"], int(settings["BENCH_SMTP_PORT"] or 587)
+    message = EmailMessage()
+    message["From"] = settings["BENCH_SMTP_FROM"] or f"bench@{platform.node() or 'localhost'}"
+    message["To"] = address
+    message["Subject"] = " ".join(f"[bench] {facts['event']}: {facts['protocol']} on {facts['rig']}".split())
+    lines = [str(facts["text"]), "", *(f"{name}: {value}" for name, value in facts.items() if name != "text")]
+    message.set_content("\n".join(lines))
+    encrypted = settings["BENCH_SMTP_TLS"].lower() != "no"
+    context = ssl.create_default_context()
+    connection = (
+        smtplib.SMTP_SSL(host, port, timeout=WITHIN, context=context)
+        if encrypted and port == 465
+        else smtplib.SMTP(host, port, timeout=WITHIN)
+    )
+    with connection as server:
+        if encrypted and port != 465:
+            server.starttls(context=context)
+        if settings["BENCH_SMTP_USER"]:
+            server.login(settings["BENCH_SMTP_USER"], settings["BENCH_SMTP_PASSWORD"])
+        server.send_message(message)
+
+
+class Notifier:
+    """Sends messages about a run; an `Observer` of the engine, whose thread waits for none of them.
+
+    Use it as a context manager. What fails is returned by `take_notices`, for the record.
+
+    Parameters
+    ----------
+    targets : sequence of str
+        Commands, `mailto:` and `https://` addresses.
+    signals : sequence of str
+        Names of the signals, in the order of the engine's values.
+
+    Raises
+    ------
+    ConfigurationError
+        If a target is none.
+    """
+
+    def __init__(self, targets: Sequence[str], signals: Sequence[str] = ()) -> None:
+        self._senders = {target: sender(target) for target in targets}
+        self.signals = tuple(signals)
+        self.facts: dict[str, Any] = {}
+        """What is said of the run in each message: run, rig, protocol, …"""
+        self.is_told: Callable[[], bool] = lambda: False
+        """Whether another process has told already that the run has failed; nobody is told twice."""
+        self._values: Sequence[float] = ()
+        self._waiting: queue.Queue[Facts | None] = queue.Queue(_MOST)
+        self._notices: list[str] = []
+        self._reason = ""
+        self._is_finished = False
+        self._thread = threading.Thread(target=self._work, name="notifier", daemon=True)
+
+    def start(self) -> None:
+        """Begin to send; what has happened before is sent as well."""
+        self._thread.start()
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.finish()
+
+    def telemetry(self, t: float, step: int, values: Sequence[float]) -> None:  # noqa: ARG002 - as of all
+        """Note the newest readings."""
+        self._values = values
+
+    def step(self, record: StepRecord) -> None:
+        """Note the newest readings."""
+        self._values = record.values
+
+    def event(self, event: Event) -> None:
+        """Send a message, if it is an occasion for one."""
+        if event.level == "ERROR":
+            self._reason = event.text
+        occasion = _OCCASIONS.get(event.kind)
+        if occasion is None or (event.level == "INFO" and occasion not in ("prompt", "end")):
+            return
+        if occasion == "trip" and event.level != "ERROR":
+            occasion = "warning"  # of an interlock that does not end the run
+        if occasion == "end" and event.level != "INFO" and self.is_told():
+            return
+        values = dict(zip(self.signals, self._values, strict=False))
+        facts = {
+            "event": occasion,
+            "text": f"{event.text}: {self._reason}" if occasion == "end" and self._reason else event.text,
+            "level": event.level,
+            "t": event.t,
+            "time": wall_time().isoformat(timespec="seconds"),
+            "host": platform.node(),
+            **self.facts,
+            "values": {name: value for name, value in values.items() if value == value},
+        }
+        try:
+            self._waiting.put_nowait(facts)
+        except queue.Full:
+            self._notices.append(f"{occasion} was not sent: {_MOST} messages wait already")
+
+    def take_notices(self) -> list[str]:
+        """Return what has failed since the last call."""
+        taken, self._notices = self._notices, []
+        return taken
+
+    def finish(self, longest: float = _AT_THE_END) -> None:
+        """Wait until all messages are sent, for so many seconds at most."""
+        if self._is_finished:
+            return
+        self._is_finished = True
+        try:
+            self._waiting.put(None, timeout=longest)
+            self._thread.join(longest)
+        except queue.Full:
+            pass
+        if self._thread.is_alive():
+            self._notices.append(f"messages were not sent within {longest:g} s after the end")
+
+    def _work(self) -> None:
+        while (facts := self._waiting.get()) is not None:
+            for target, send in self._senders.items():
+                try:
+                    send(facts)
+                except subprocess.TimeoutExpired:
+                    # What this error says names all arguments.
+                    self._fail(target, facts, f"it took longer than {WITHIN:g} s")
+                # Whatever a library raises: the run goes on.
+                except Exception as error:
+                    self._fail(target, facts, str(error))
+
+    def _fail(self, target: str, facts: Facts, why: str) -> None:
+        shown = redacted(target)
+        self._notices.append(f"{shown} was not told of the {facts['event']}: {why.replace(target, shown)}")
+
+
+def facts_of(meta: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """Return what each message says of a run."""
+    return {"run": str(folder.resolve()), "rig": meta["rig"], "protocol": meta["protocol"]}

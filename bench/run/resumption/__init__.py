@@ -1,0 +1,1 @@
+"""Taking up a run that died, and repeating one from its record."""

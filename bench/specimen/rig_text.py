@@ -1,0 +1,224 @@
+"""The rig file of a twin, as text."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from bench.rig import RigFile
+from bench.specimen.identify import IdentifiedTwin, inexact, measured_signals, model_json
+from bench.specimen.specimen import Wander
+
+_FASTEST_LINE = 100_000_000
+"""Speed of the emulated lines, Bd: their time is part of that of a reading."""
+
+
+def rig_text(twin: IdentifiedTwin, file: RigFile, rig: str, out: Path) -> str:
+    """Return the rig file of a twin.
+
+    Parameters
+    ----------
+    twin : IdentifiedTwin
+        What was identified.
+    file : RigFile
+        The rig that it is a twin of.
+    rig : str
+        How that was named: a packaged rig, or a path.
+    out : Path
+        Where the text will stand.
+    """
+    lines = [
+        f"# A twin of the present specimen on the rig {file.name}, made by `bench twin` from the runs",
+        *(f"#   {recording.path.name}" for recording in twin.recordings),
+        "# Its slots, derived signals, interlocks, parameters of protocols and telemetry are those of that rig. Its",
+        "# devices have the same names, signals, units and limits, but are emulated: the drive follows its",
+        "# set-points, and the response follows the drive as was identified. Other signals stand at the level that",
+        "# was measured, with the noise that was measured, or follow the set-point of their device at once.",
+        "",
+        f"extends = {_value(_base(rig, out))}",
+        f"without = {_value(_left_out(file))}",
+        "",
+        "[rig]",
+        f"title = {_value(f'{file.rig.title}: twin')}",
+        "",
+        *_devices(twin, file),
+        *_emulation(twin, file),
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _left_out(file: RigFile) -> list[str]:
+    """Return the keys of the rig that its twin does not have."""
+    named = ["rig.twin"] if "twin" in file.content["rig"] else []
+    return [key for key in ("devices", "emulation") if key in file.content] + named
+
+
+def _base(rig: str, out: Path) -> str:
+    """Return the rig as `extends` names it in the file of the twin."""
+    if not rig.endswith(".toml"):
+        return rig
+    path = Path(rig).resolve()
+    try:
+        return Path(os.path.relpath(path, out.resolve().parent)).as_posix()
+    # On Windows there is no way from one drive to another.
+    except ValueError:
+        return path.as_posix()
+
+
+def _devices(twin: IdentifiedTwin, file: RigFile) -> Iterator[str]:
+    first, time = twin.recordings[0], twin.reading_time
+    signals = {signal.name: signal for signal in first.signals}
+    limits = twin.setpoint_limits
+    drive = file.roles["drive"].device
+    for device, measured in measured_signals(first, file).items():
+        setpoint = signals.get(f"{device}_setpoint")
+        keys: dict[str, Any] = {
+            "driver": "twin-sensor" if setpoint is None else "twin-actuator",
+            "port": f"emulated://{device}",
+            "baudrate": _FASTEST_LINE,
+        }
+        if time is not None:
+            # What each device takes of the time is not on record: equal parts.
+            count = len(file.devices)
+            keys |= {"reading_time": round(time.reading / count, 6), "quick_time": round(time.quick / count, 6)}
+        if time is not None and device == drive:
+            keys["setpoint_time"] = round(time.setpoint, 5)
+        yield from _table(f"devices.{device}", keys)
+        for signal in measured:
+            described = {"name": signal.name, "unit": signal.unit, "description": signal.description}
+            yield from _table(f"[devices.{device}.signals]", described | {"precision": signal.precision})
+        if setpoint is not None:
+            low, high = limits[device]
+            described = {"name": setpoint.name, "unit": setpoint.unit, "description": setpoint.description}
+            tolerance = {}
+            if device == drive:
+                noise = twin.noise[0]
+                tolerance["tolerance"] = max(6.0 * noise.quick, 2.0 * noise.resolution, 1e-3 * (high - low))
+            yield from _table(
+                f"devices.{device}.setpoint",
+                described | {"precision": setpoint.precision, "limits": [low, high]} | tolerance,
+            )
+
+
+def _emulation(twin: IdentifiedTwin, file: RigFile) -> Iterator[str]:
+    first, actuator, response = twin.recordings[0], twin.actuator.dynamics, twin.response.dynamics
+    units = {signal.name: signal.unit for signal in first.signals}
+    drive, output = units[first.drive], units[first.response]
+    yield from _comments(twin)
+    yield from _table(
+        "emulation",
+        {
+            "laboratory": "twin",
+            "step": _grid(twin),
+            "session_offset": twin.offset,
+            "tasks": _tasks(file, twin),
+        },
+        tail=[
+            f"model = '{model_json(twin.model)}'",
+            *([] if twin.response.correction is None else [f"correction = '{model_json(twin.response.correction)}'"]),
+        ],
+    )
+    yield from _table(
+        "emulation.drive",
+        {
+            "device": file.roles["drive"].device,
+            "signal": first.drive,
+            "rest": float(first.driven[0]),
+            "delay": _delay(twin, file),
+            "frequency": actuator.frequency,
+            "damping": actuator.damping,
+            **({"rate": actuator.rate} if math.isfinite(actuator.rate) else {}),
+            "gain": actuator.gain,
+            "offset": actuator.offset,
+        },
+        {"rest": drive, "delay": "s", "frequency": "rad/s", "rate": f"{drive}/s".replace("°C", "K"), "offset": drive},
+    )
+    if twin.setpoints.resolution:
+        yield from _table("emulation.setpoints", inexact(twin.setpoints), {"resolution": drive})
+    yield from _table(
+        "emulation.response",
+        {
+            "signal": twin.source,
+            "lag": response.lag,
+            "power": response.power,
+            "gain": response.gain,
+            "shares": list(response.shares),
+            "times": list(response.times),
+            **({"conversion": [list(pair) for pair in twin.conversion]} if twin.conversion else {}),
+        },
+        {"lag": "s", "times": "s"},
+    )
+    for name, wander, unit in (("wander", twin.wander, drive.replace("°C", "K")), ("drift", twin.drift, output)):
+        yield from _wander(name, wander, unit)
+    unit = drive.replace("°C", "K")
+    uneven = {"deviation": twin.unevenness.deviation, "length": twin.unevenness.length}
+    yield from _table("emulation.unevenness", uneven, {"deviation": unit, "length": unit})
+    for name, table in twin.signals.items():
+        yield from _table(f"emulation.signals.{name}", table)
+
+
+def _delay(twin: IdentifiedTwin, file: RigFile) -> float:
+    """Return the delay of the drive, s, without what the lines of the twin take by themselves.
+
+    What was identified counts from when a set-point was about to be sent until all devices had been read.
+    """
+    delay, time = twin.actuator.dynamics.delay, twin.reading_time
+    if time is not None:
+        names = [each.name for each in file.devices]
+        read_later = len(names) - 1 - names.index(file.roles["drive"].device)
+        delay -= time.setpoint + time.quick * read_later / len(names)
+    return max(delay, 0.0)
+
+
+def _comments(twin: IdentifiedTwin) -> Iterator[str]:
+    yield "# What was identified:"
+    yield from (f"#   {name.strip()}: {text}" for name, text in twin.identified())
+
+
+def _grid(twin: IdentifiedTwin) -> float:
+    from bench.analysis import grid_step
+
+    return grid_step(twin.actuator.dynamics)
+
+
+def _tasks(file: RigFile, twin: IdentifiedTwin) -> dict[str, str]:
+    """Return what a prompt may ask for: the slots of what is set by hand, as the runs have it."""
+    return {
+        table.task or name: table.signal
+        for name, table in file.roles.items()
+        if table.signal in twin.signals and table.signal != twin.source
+    }
+
+
+def _wander(name: str, wander: Wander, unit: str) -> Iterator[str]:
+    yield from _table(
+        f"emulation.{name}", {"deviation": wander.deviation, "time": wander.time}, {"deviation": unit, "time": "s"}
+    )
+
+
+def _table(
+    name: str, keys: Mapping[str, Any], units: Mapping[str, str] | None = None, tail: Sequence[str] = ()
+) -> Iterator[str]:
+    yield f"[{name}]"
+    for key, value in keys.items():
+        text = f"{key} = {_value(value)}"
+        unit = (units or {}).get(key, "")
+        yield f"{text:<36}# {unit}" if unit else text
+    yield from tail
+    yield ""
+
+
+def _value(value: Any) -> str:  # noqa: ANN401 - any of TOML
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False)
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, list):
+        return f"[{', '.join(map(_value, value))}]"
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{json.dumps(key)} = {_value(each)}" for key, each in value.items()) + " }"
+    return repr(value)
