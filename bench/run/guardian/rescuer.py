@@ -6,6 +6,7 @@ opens no line as long as the guardian's signs of life come through a pipe, its s
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import queue
@@ -16,7 +17,7 @@ import threading
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from bench.base import ENDING, BenchError, parse_json
 from bench.rig import SAFE, Rescued, load_rig, opened, rescue
@@ -173,7 +174,8 @@ def main() -> int:
 
 def _read(signs: queue.SimpleQueue[bytes]) -> None:
     # From the buffer, which may have taken in more than the first line.
-    while sign := sys.stdin.buffer.read1(4096):
+    signs_of_life = cast("io.BufferedReader", sys.stdin.buffer)
+    while sign := signs_of_life.read1(4096):
         signs.put(sign)
     signs.put(b"")
 
