@@ -165,5 +165,5 @@ $(SETUP): $(DEMO)
 
 # Once, beside the second half of the installation; afterwards `bench reproduce` compiles what has changed.
 $(KERNELS): $(BASE)
-	@$(BIN)/python -P -c "from rich.console import Console; from bench.studies import prepare; prepare('vo2', Console())"
+	@$(BIN)/python -P -c "from rich.console import Console; from bench.batch import prepare; prepare('vo2', Console())"
 	touch $@

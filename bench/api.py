@@ -34,10 +34,10 @@ from bench.analysis import (
 )
 from bench.base import BenchError, DeviceError, VirtualClock, wall_time
 from bench.batch import published_of
+from bench.execution import Run, carry_out
 from bench.identification import ModelFile, load_model
 from bench.protocol import ProtocolDefinition, find_protocol
 from bench.rig import SAFE, Rig, clock_for, load_rig
-from bench.run import Run, carry_out
 
 Model: TypeAlias = IdentifiedFile | ModelFile | Path | str
 """What a model may be given as: the result of `identify` or `load`, or a model file."""

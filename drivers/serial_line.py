@@ -20,7 +20,7 @@ RESENDS = 2
 
 _SHARE_OF_WATCHDOG = 0.6
 """Share of the time of an instrument's watchdog that a request and its repetitions may take together on a busy
-computer; as long as its line may be lost (`bench.run.station.reconnection`)."""
+computer; as long as its line may be lost (`bench.execution.station.reconnection`)."""
 
 _LONGEST_WITHOUT_WATCHDOG = 1.0
 """Longest wait for an answer on a busy computer, s, of an instrument that has no watchdog."""

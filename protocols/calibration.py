@@ -2,9 +2,19 @@
 
 from __future__ import annotations
 
-from bench.devices import Dwell, Signal
-from bench.protocol import Messages, NumberList, Phase, ProtocolParameters, Step, parameter, protocol
-from bench.rig import Slot, Slots
+from bench.devices import Signal
+from bench.protocol import (
+    Dwell,
+    Messages,
+    NumberList,
+    Phase,
+    ProtocolParameters,
+    Slot,
+    Slots,
+    Step,
+    parameter,
+    protocol,
+)
 from protocols.preparation import prompt_for
 
 

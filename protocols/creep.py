@@ -6,9 +6,21 @@ import math
 from collections.abc import Sequence
 from functools import partial
 
-from bench.devices import Actuator, Dwell, Signal
-from bench.protocol import Messages, Phase, Step, Summary, Views, from_slot, parameter, protocol, unit_of
-from bench.rig import Slot, Slots
+from bench.devices import Actuator, Signal
+from bench.protocol import (
+    Dwell,
+    Messages,
+    Phase,
+    Slot,
+    Slots,
+    Step,
+    Summary,
+    Views,
+    from_slot,
+    parameter,
+    protocol,
+    unit_of,
+)
 from protocols.preparation import LOAD, LoadedParameters, hang_load
 
 _DRIVE = unit_of("drive")

@@ -6,10 +6,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from bench.devices import Dwell
 from bench.identification import excitation
-from bench.protocol import Messages, Phase, Step, from_slot, parameter, protocol
-from bench.rig import Slots
+from bench.protocol import Dwell, Messages, Phase, Slots, Step, from_slot, parameter, protocol
 from protocols.preparation import (
     DRIVE,
     DRIVE_AND_RESPONSE,

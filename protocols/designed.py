@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from bench.devices import Dwell
 from bench.identification import covering_sequence, sequences as design
 from bench.models import uniform_levels
-from bench.protocol import Messages, Phase, Step, from_slot, parameter, protocol
-from bench.rig import Slots
+from bench.protocol import Dwell, Messages, Phase, Slots, Step, from_slot, parameter, protocol
 from protocols.preparation import DRIVE, DRIVE_AND_RESPONSE, LOAD, LOOP, SweepParameters, check_order, reset
 
 

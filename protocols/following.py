@@ -18,8 +18,7 @@ from bench.control import (
     make_supervised,
     modulated_sine,
 )
-from bench.protocol import Caution, Control, Messages, Phase, from_slot, parameter, protocol, unit_of
-from bench.rig import Slots
+from bench.protocol import Caution, Control, Messages, Phase, Slots, from_slot, parameter, protocol, unit_of
 from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LOOP, check_order, load_checked_model
 from protocols.session import SessionParameters, begin_session, keep_adapted, session_kinds
 

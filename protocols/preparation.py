@@ -6,23 +6,25 @@ from collections.abc import Generator, Mapping
 from typing import TypeAlias, TypeVar
 
 from bench.control import Tuning, load_model_for, saturated_below
-from bench.devices import Actuator, Dwell, Signal
+from bench.devices import Actuator, Signal
 from bench.identification import ModelFile
 from bench.protocol import (
     LONGEST,
+    Dwell,
     Message,
     Note,
     Phase,
     Prompt,
     ProtocolParameters,
     Reading,
+    Slot,
+    Slots,
     Step,
     Views,
     from_slot,
     parameter,
     unit_of,
 )
-from bench.rig import Slot, Slots
 
 DRIVE_AND_RESPONSE: Mapping[str, type[Actuator] | type[Signal]] = {"drive": Actuator, "response": Signal}
 """What a characterization needs of a rig."""

@@ -8,9 +8,7 @@ import numpy as np
 
 from bench.analysis import read_columns
 from bench.base import DataError
-from bench.devices import Dwell
-from bench.protocol import Messages, Phase, Step, parameter, protocol
-from bench.rig import Slot, Slots
+from bench.protocol import Dwell, Messages, Phase, Slot, Slots, Step, parameter, protocol
 from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LOOP, SweepParameters, check_order, reset
 
 _LONGEST_DWELL = 86400.0

@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from bench.control import ADAPTATIONS, AdaptationName, time_to_rest
-from bench.devices import Dwell
 from bench.identification import Kind, ModelFile, parse_kinds, ramps, recalibrate
-from bench.protocol import Caution, KeptModel, Note, Phase, Reading, Step, from_slot, parameter
-from bench.rig import RoleTable, Slots
+from bench.protocol import Caution, Dwell, KeptModel, Note, Phase, Reading, Slots, Step, from_slot, parameter
+from bench.rig import RoleTable
 from protocols.preparation import ControlledParameters, Part, reset, reset_unknown_memory
 
 SESSION = "session"

@@ -16,10 +16,21 @@ from bench.control import (
     make_supervised,
     tracking_targets,
 )
-from bench.devices import Dwell
 from bench.models import Policy
-from bench.protocol import Caution, Control, Messages, Note, Phase, Step, from_slot, parameter, protocol, unit_of
-from bench.rig import Slots
+from bench.protocol import (
+    Caution,
+    Control,
+    Dwell,
+    Messages,
+    Note,
+    Phase,
+    Slots,
+    Step,
+    from_slot,
+    parameter,
+    protocol,
+    unit_of,
+)
 from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LOOP, check_order, load_checked_model
 from protocols.session import SessionParameters, begin_session, keep_adapted, session_kinds
 

@@ -38,11 +38,11 @@ WHERE_LINES_ARE_OPENED = {
     "bench/batch/campaign/known_rig.py",
     "bench/contracts/on_a_rig.py",
     "bench/api.py",
-    "bench/run/guardian/__main__.py",
-    "bench/run/guardian/process.py",
-    "bench/run/rehearsal.py",
-    "bench/run/context.py",
-    "bench/run/station/local.py",
+    "bench/execution/guardian/__main__.py",
+    "bench/execution/guardian/process.py",
+    "bench/execution/rehearsal.py",
+    "bench/execution/context.py",
+    "bench/execution/station/local.py",
 }
 """The guardian, and what has a rig in this process; a rig alone connects devices."""
 

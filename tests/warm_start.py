@@ -40,10 +40,10 @@ LIBRARIES = (
     "scipy.special",
     "sqlite3",
     "typer.main",
-    "bench.controllers",
+    "bench.control.catalogue",
     "bench.dashboard",
     "bench.analysis.report.run_report",
-    "bench.run.run",
+    "bench.execution.run",
 )
 
 

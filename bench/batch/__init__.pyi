@@ -46,6 +46,7 @@ from .study import (
     ResultTable as ResultTable,
     Study as Study,
     StudyResult as StudyResult,
+    prepare as prepare,
     published_of as published_of,
     reached_targets as reached_targets,
     reproduce as reproduce,

@@ -35,8 +35,8 @@ from bench.record import Record, add_model
 
 if TYPE_CHECKING:
     from bench.base import Pending, Workers
+    from bench.execution import RunResult
     from bench.identification import ModelFile
-    from bench.run import RunResult
 
 P = ParamSpec("P")
 
@@ -48,7 +48,7 @@ _KERNELS = (
     "bench.identification.kernels.factor_kernels",
 )
 """Kernels of the identification of a Preisach operator, which every study takes."""
-_OF_RUNS = "bench.base.compilation_display", "bench.run.run"
+_OF_RUNS = "bench.base.compilation_display", "bench.execution.run"
 """Modules that every run takes."""
 _OF_RESULTS = "matplotlib.figure", "bench.dashboard"
 """Modules that figures and recordings take."""
@@ -197,7 +197,7 @@ def _carry_out(
     """Carry one run of a campaign out."""
     # Here, as they take a while to load and `bench list` reads the studies' names.
     from bench.base import CompilationDisplay, task_console
-    from bench.run import Run, carry_out
+    from bench.execution import Run, carry_out
 
     console = task_console()
     with CompilationDisplay(console, console):

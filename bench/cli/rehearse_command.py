@@ -22,7 +22,7 @@ from bench.cli.command_support import (
 )
 
 if TYPE_CHECKING:
-    from bench.run import Extremes, Rehearsal, Run
+    from bench.execution import Extremes, Rehearsal, Run
 
 app = typer.Typer()
 
@@ -52,8 +52,8 @@ def rehearse(
     names (`[rig] twin`) or extends. A rig without a twin is connected, to know its limits, and the set-points are
     checked as far as no reading decides.
     """
+    from bench.execution import Run
     from bench.protocol import find_protocol
-    from bench.run import Run
 
     asked = Run(
         protocol=find_protocol(protocol),
@@ -69,7 +69,7 @@ def rehearse(
 def show_rehearsal(run: Run, json_file: Path | None) -> None:
     """Print what a run would do and touch; raises ConfigurationError if it would not complete."""
     from bench.base import Interrupts
-    from bench.run import foresee, say_what_ctrl_c_does
+    from bench.execution import foresee, say_what_ctrl_c_does
 
     with Interrupts(say_what_ctrl_c_does) as interrupts, show_compilation():
         rehearsal = foresee(run, console, interrupts)

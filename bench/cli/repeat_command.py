@@ -52,8 +52,8 @@ def repeat(
     """
     from bench.analysis import compare_runs
     from bench.base import Interrupts
+    from bench.execution import repeat as carry_out_again, say_what_ctrl_c_does
     from bench.record import Record
-    from bench.run import repeat as carry_out_again, say_what_ctrl_c_does
 
     check_outputs(json_file=json_file, folder=out, read=[run])
     with Interrupts(say_what_ctrl_c_does) as interrupts:

@@ -59,7 +59,7 @@ def resume(
     Exit codes: those of `bench run`; 9 the specimen is not as the record left it, and every device is safe.
     """
     from bench.base import Interrupts, say_at_once
-    from bench.run import Resume, resume as resume_run
+    from bench.execution import Resume, resume as resume_run
 
     check_outputs(json_file=json_file, read=[run])
     asked = Resume(

@@ -31,7 +31,7 @@ from bench.cli.model_options import inverse_of, options_json, print_model, print
 from bench.cli.rehearse_command import show_rehearsal
 
 if TYPE_CHECKING:
-    from bench.run import RunResult
+    from bench.execution import RunResult
 
 app = typer.Typer()
 
@@ -215,7 +215,7 @@ def run(
     given = parse_assignments("--set", settings or [])
 
     from bench.base import Interrupts
-    from bench.run import Run, carry_out, say_what_ctrl_c_does
+    from bench.execution import Run, carry_out, say_what_ctrl_c_does
 
     asked = Run(
         protocol=definition,

@@ -9,9 +9,9 @@ from pathlib import Path
 from rich.console import Console
 
 from bench.base import Interrupts
+from bench.execution import Run, RunResult, carry_out
 from bench.operator import Desk
 from bench.protocol import ByHand, Messages, ProtocolDefinition, ProtocolParameters, protocol
-from bench.run import Run, RunResult, carry_out
 
 
 class _Log(io.StringIO):
@@ -52,7 +52,7 @@ def carry_out_by_hand(
 ) -> RunResult:
     """Connect a rig, carry the commands of a desk out, and leave every device in its safe state.
 
-    Raises what `bench.run.run.carry_out` does before anything moves.
+    Raises what `bench.execution.run.carry_out` does before anything moves.
     """
     run = Run(
         protocol=protocol_of(desk),

@@ -29,8 +29,17 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from bench.control import BlockController, ControlTask, DelayedController, SampledController
-from bench.devices import Arrived, Dwell, Settle, Settled, Signal, UntilSteady, durations
+from bench.devices import (
+    Arrived as Arrived,
+    Dwell as Dwell,
+    Settle as Settle,
+    Settled as Settled,
+    Signal,
+    UntilSteady as UntilSteady,
+    durations,
+)
 from bench.operator import Desk
+from bench.rig import Slot as Slot, Slots as Slots
 
 
 class Message(ABC):

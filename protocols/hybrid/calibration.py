@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 
 from bench.control import Playback
-from bench.protocol import FixedRate, Messages, Phase, ProtocolParameters, parameter, protocol
-from bench.rig import Slots
+from bench.protocol import FixedRate, Messages, Phase, ProtocolParameters, Slots, parameter, protocol
 from protocols.hybrid import THERMAL, WITNESS
 
 

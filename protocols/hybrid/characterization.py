@@ -13,20 +13,21 @@ from collections.abc import Callable
 import numpy as np
 
 from bench.control import Playback
-from bench.devices import Dwell
 from bench.protocol import (
+    Dwell,
     FixedRate,
     Messages,
     NumberList,
     Phase,
     ProtocolParameters,
+    Slots,
     Step,
     Views,
     from_slot,
     parameter,
     protocol,
 )
-from bench.rig import RoleTable, Slots
+from bench.rig import RoleTable
 from protocols.hybrid import BOTH_LOOPS, FINE, FINE_OVER_TIME, HEATING, SENSORS, THERMAL
 
 

@@ -16,11 +16,11 @@ from bench.protocol import (
     NumberList,
     Phase,
     ProtocolParameters,
+    Slots,
     from_slot,
     parameter,
     protocol,
 )
-from bench.rig import Slots
 from protocols.hybrid import BOTH_LOOPS, FINE, FINE_OVER_TIME, SENSORS, THERMAL, WITNESS
 from protocols.preparation import check_order
 

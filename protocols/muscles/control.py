@@ -18,23 +18,23 @@ from bench.control import (
     controller_names,
     make_supervised,
 )
-from bench.devices import Dwell
 from bench.identification import ModelFile, load_model
 from bench.models import TwoStage, TwoStageState
 from bench.protocol import (
     Caution,
     Control,
+    Dwell,
     Messages,
     Note,
     Phase,
     ProtocolParameters,
+    Slots,
     Step,
     Views,
     from_slot,
     parameter,
     protocol,
 )
-from bench.rig import Slots
 from protocols.muscles.parts import (
     LENGTH_LOOPS,
     ON_STAGE,

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from bench.identification import voltage_steps
-from bench.protocol import Messages, Phase, Views, parameter, protocol
-from bench.rig import Slots
+from bench.protocol import Messages, Phase, Slots, Views, parameter, protocol
 from protocols.muscles.parts import ON_STAGE, StageParameters, prepare_on_stage, sample_voltages
 
 

@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bench.devices import Dwell
-from bench.protocol import Messages, NumberList, Phase, Step, Views, from_slot, parameter, protocol
-from bench.rig import Slots
+from bench.protocol import Dwell, Messages, NumberList, Phase, Slots, Step, Views, from_slot, parameter, protocol
 from protocols.muscles.parts import (
     ON_STAGE,
     SAMPLE,

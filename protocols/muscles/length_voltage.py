@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from bench.protocol import Messages, NumberList, Phase, parameter, protocol
-from bench.rig import Slots
+from bench.protocol import Messages, NumberList, Phase, Slots, parameter, protocol
 from protocols.muscles.force_voltage import scaled_steps
 from protocols.muscles.parts import (
     LENGTH_LOOPS,

@@ -15,21 +15,23 @@ from typing import Any
 import numpy as np
 
 from bench.control import Approach
-from bench.devices import Actuator, Dwell, Signal
+from bench.devices import Actuator, Signal
 from bench.protocol import (
     Control,
+    Dwell,
     NumberList,
     Phase,
     Prompt,
     ProtocolParameters,
     Reading,
+    Slots,
     Step,
     Views,
     from_slot,
     parameter,
     unit_of,
 )
-from bench.rig import RoleTable, Slots
+from bench.rig import RoleTable
 from protocols.preparation import DRIVE_AND_RESPONSE, SETTLE_LOAD, Part, prompt_for
 
 SAMPLE = "sample"

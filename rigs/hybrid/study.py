@@ -50,8 +50,8 @@ from rigs.hybrid.model import PUBLISHED_DYNAMICS
 
 if TYPE_CHECKING:
     from bench.base import Pending
+    from bench.execution import RunResult
     from bench.rig import Calibration
-    from bench.run import RunResult
 
 Floats = npt.NDArray[np.float64]
 

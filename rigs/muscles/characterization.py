@@ -33,7 +33,7 @@ from rigs.muscles.identification import (
 
 if TYPE_CHECKING:
     from bench.base import Pending
-    from bench.run import RunResult
+    from bench.execution import RunResult
 
 Floats = npt.NDArray[np.float64]
 

@@ -41,7 +41,7 @@ from rigs.vo2.curvature import CantileverCurvature, curvature_to_deflection, def
 
 if TYPE_CHECKING:
     from bench.base import Pending
-    from bench.run import RunResult
+    from bench.execution import RunResult
 
 Floats = npt.NDArray[np.float64]
 

@@ -1,8 +1,7 @@
 """Protocols that go on by what they read."""
 
-from bench.devices import Actuator, Dwell, Signal
-from bench.protocol import Messages, Note, Phase, ProtocolParameters, Step, parameter, protocol
-from bench.rig import Slots
+from bench.devices import Actuator, Signal
+from bench.protocol import Dwell, Messages, Note, Phase, ProtocolParameters, Slots, Step, parameter, protocol
 
 NEEDS = {"drive": Actuator, "response": Signal}
 

@@ -1,7 +1,6 @@
 """Protocols for the heater."""
 
-from bench.devices import Dwell, UntilSteady
-from bench.protocol import Messages, Note, Phase, ProtocolParameters, Step, parameter, protocol
+from bench.protocol import Dwell, Messages, Note, Phase, ProtocolParameters, Step, UntilSteady, parameter, protocol
 
 
 class Stairs(ProtocolParameters):

@@ -5,8 +5,8 @@ from pathlib import Path
 
 from rich.console import Console
 
+from bench.execution import Run, carry_out
 from bench.protocol import find_protocol
-from bench.run import Run, carry_out
 
 
 def main() -> int:

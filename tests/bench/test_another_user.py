@@ -177,7 +177,7 @@ def test_what_is_planted_for_a_second_file_is_neither_followed_nor_believed(shar
             "remark": remark,
             "added": added,
             "problems": problems,
-            "read": [len(read_mirror(Path(p))) for p in places],
+            "read": [len(list(read_mirror(Path(p)))) for p in places],
         }
 
     as_user(THEM, forge)

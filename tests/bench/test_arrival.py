@@ -5,12 +5,11 @@ from cases import cases
 
 from bench.base import DeviceError, Interrupts, SettleTimeoutError, VirtualClock
 from bench.dashboard.timeline import _NOT_SETTLED, Timeline
-from bench.devices import Arrived, Dwell, Settled, UntilSteady
-from bench.protocol import Prompt, ProtocolParameters, Step, plan, protocol
+from bench.execution.engine import Engine
+from bench.execution.station.local import LocalStation
+from bench.protocol import Arrived, Dwell, Prompt, ProtocolParameters, Settled, Step, UntilSteady, plan, protocol
 from bench.record import FILE_NAME, Journal, Record
 from bench.rig import Rig, load_rig
-from bench.run.engine import Engine
-from bench.run.station.local import LocalStation
 
 
 class Nothing(ProtocolParameters):

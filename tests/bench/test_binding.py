@@ -6,8 +6,8 @@ from heater_laboratory import CLOSED
 
 from bench.base import ConfigurationError, VirtualClock
 from bench.cli import main
-from bench.devices import Dwell, Servo, Signal, TECAmplifier, UntilSteady
-from bench.protocol import ProtocolParameters, Step, find_protocol, from_slot, parameter, protocol
+from bench.devices import Servo, Signal, TECAmplifier
+from bench.protocol import Dwell, ProtocolParameters, Step, UntilSteady, find_protocol, from_slot, parameter, protocol
 from bench.rig import Rig, RoleTable, load_rig
 
 ROLES = """

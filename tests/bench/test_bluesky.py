@@ -8,9 +8,9 @@ from heater_protocols import stairs
 from bench.api import open_rig
 from bench.base import DeviceError, LimitError, VirtualClock
 from bench.base.clock import VIRTUAL_EPOCH
+from bench.execution import check_before_moving
 from bench.protocol import plan
 from bench.rig import Rig, load_rig
-from bench.run import check_before_moving
 
 bluesky = pytest.importorskip("bluesky")
 plans = pytest.importorskip("bluesky.plans")

@@ -33,9 +33,9 @@ from bench.batch.campaign.study_tables import OverSeeds, over_seeds
 from bench.batch.campaign.tasks import DONE_NAME
 from bench.cli import main
 from bench.cli.campaign_command import SayingExecutor
+from bench.execution import carry_out
 from bench.record import Record
 from bench.rig import Holder, Locks
-from bench.run import carry_out
 
 pytestmark = pytest.mark.usefixtures("warm_popen")
 

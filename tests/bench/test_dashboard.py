@@ -19,7 +19,7 @@ from rerun.experimental import ViewerClient
 from bench.base import ConfigurationError, DataError, Stopwatch, WallClock
 from bench.dashboard import Dashboard, picture, rebuild
 from bench.dashboard.live import QUEUED_TICKS
-from bench.devices import Settled, Signal
+from bench.devices import Signal
 from bench.identification import ModelFile
 from bench.models import (
     Density,
@@ -33,7 +33,7 @@ from bench.models import (
     TwoStage,
     uniform_levels,
 )
-from bench.protocol import TRACES
+from bench.protocol import TRACES, Settled
 from bench.record import FILE_NAME, Event, Journal, Lateness, Record, StepRecord, add_model
 from bench.record.rows import Entry
 from bench.rig import DashboardLayout, XYPlot

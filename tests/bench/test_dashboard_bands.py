@@ -11,9 +11,9 @@ from bench.analysis import identify_file, invert_band
 from bench.analysis.band_columns import predict_band
 from bench.dashboard.entries import End, Tick
 from bench.dashboard.writer import Writer
-from bench.devices import Settled, Signal
+from bench.devices import Signal
 from bench.identification import ModelFile, identify, set_up_problem
-from bench.protocol import TRACES
+from bench.protocol import TRACES, Settled
 from bench.record import StepRecord
 from bench.rig import DashboardLayout
 

@@ -11,8 +11,8 @@ pytest.importorskip("rerun")
 
 from bench.dashboard.controlled_run import ControlPlots, Errors
 from bench.dashboard.entries import Entry, Tick, Ticks, in_parts, merged, portions, single, size
-from bench.devices import Settled, Signal
-from bench.protocol import TRACES
+from bench.devices import Signal
+from bench.protocol import TRACES, Settled
 from bench.record import Event, StepRecord
 
 SIGNALS = (Signal("input", "V", "input"), Signal("output", "m", "output"), *TRACES)

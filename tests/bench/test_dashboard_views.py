@@ -13,10 +13,10 @@ from bench.dashboard.controlled_run import ControlPlots, Errors
 from bench.dashboard.drawing import Frame
 from bench.dashboard.entries import End, Tick, in_parts
 from bench.dashboard.writer import Writer
-from bench.devices import Settled, Signal
-from bench.protocol import LATENESS, TRACES, Views, find_protocol
+from bench.devices import Signal
+from bench.protocol import LATENESS, TRACES, Settled, Slot, Views, find_protocol
 from bench.record import Event, Lateness, StepRecord
-from bench.rig import DashboardLayout, RoleTable, Slot
+from bench.rig import DashboardLayout, RoleTable
 
 SIGNALS = (
     Signal("tec_setpoint", "°C", "temperature set-point", 3),

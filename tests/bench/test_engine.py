@@ -24,28 +24,29 @@ from bench.base import (
     WallClock,
 )
 from bench.control import Command, Trace
-from bench.devices import Dwell, UntilSteady
+from bench.execution import check_before_moving
+from bench.execution.engine import Engine
+from bench.execution.resumption.feeding import Past, feed
+from bench.execution.station.local import LocalStation
 from bench.operator import ABORT, RESUME
 from bench.protocol import (
     PARAMETER,
     TRACES,
     Control,
+    Dwell,
     Note,
     ParameterChange,
     Phase,
     Prompt,
     ProtocolParameters,
     Step,
+    UntilSteady,
     plan,
     protocol,
 )
 from bench.record import FILE_NAME, Journal, Record
 from bench.record.store import Store
 from bench.rig import Rig, load_rig
-from bench.run import check_before_moving
-from bench.run.engine import Engine
-from bench.run.resumption.feeding import Past, feed
-from bench.run.station.local import LocalStation
 
 
 class Nothing(ProtocolParameters):

@@ -20,14 +20,24 @@ from bench.base import (
     WallClock,
 )
 from bench.control import Playback, Trace
-from bench.devices import Dwell, Settled
-from bench.protocol import LATENESS, TRACES, FixedRate, ProtocolParameters, Step, find_protocol, plan, protocol
+from bench.execution import check_before_moving
+from bench.execution.context import trace_signals
+from bench.execution.engine import Engine
+from bench.execution.station.local import LocalStation
+from bench.protocol import (
+    LATENESS,
+    TRACES,
+    Dwell,
+    FixedRate,
+    ProtocolParameters,
+    Settled,
+    Step,
+    find_protocol,
+    plan,
+    protocol,
+)
 from bench.record import FILE_NAME, Journal, Record
 from bench.rig import Rig, load_rig
-from bench.run import check_before_moving
-from bench.run.context import trace_signals
-from bench.run.engine import Engine
-from bench.run.station.local import LocalStation
 
 PERIOD = 0.5
 """Of the telemetry of the heater's rig, s."""
@@ -169,7 +179,7 @@ def slow_down(bench, device, seconds):
     read, numbers = device.glance, itertools.count()
 
     def glance():
-        bench.base.clock.sleep(seconds.get(next(numbers), 0.0) if isinstance(seconds, dict) else seconds)
+        bench.clock.sleep(seconds.get(next(numbers), 0.0) if isinstance(seconds, dict) else seconds)
         return read()
 
     device.glance = glance

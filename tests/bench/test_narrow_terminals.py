@@ -11,7 +11,7 @@ from rich.text import Text
 
 from bench.base import Expectation, PlainConsole, print_plain, show_table
 from bench.devices import Signal
-from bench.run.terminal import ProgressDisplay
+from bench.execution.terminal import ProgressDisplay
 
 SIGNALS = (Signal("supply_voltage", "V", ""), Signal("load_cell_force", "N", ""))
 LONG = Expectation(((5, 10.0), (100, 4000.0)), 4000.0, at_most=4000.0 * 24.0)

@@ -9,9 +9,9 @@ from heater_protocols import stairs
 from rich.console import Console
 
 from bench.base import ConfigurationError
+from bench.execution import Run, carry_out
+from bench.execution.notify import Notifier, sender
 from bench.record import Event, Record
-from bench.run import Run, carry_out
-from bench.run.notify import Notifier, sender
 
 FACTS = {
     "event": "trip",
@@ -184,7 +184,7 @@ class TestNotifier:
 
     def test_nothing_waits_for_one_that_hangs(self, monkeypatch):
         free = threading.Event()
-        monkeypatch.setattr("bench.run.notify.sender", lambda _: lambda _: free.wait(60))
+        monkeypatch.setattr("bench.execution.notify.sender", lambda _: lambda _: free.wait(60))
         with Notifier(["slow"]) as notifier:
             for _ in range(40):
                 notifier.event(Event(0.0, "WARN", "pause", "paused"))

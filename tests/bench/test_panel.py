@@ -12,12 +12,12 @@ from rich.console import Console
 
 from bench.base import ConfigurationError, DataError, Interrupts
 from bench.devices import Limits, Signal
+from bench.execution import Run, carry_out
 from bench.operator import Desk, HoldAll, Leave, Remark, Rest, SetPoint, Shown, Tare, parse_command
 from bench.panel import HandsOnRig, RunInProgress, carry_out_by_hand
 from bench.panel.margins import margin_of, sparkline
 from bench.record import Record
 from bench.rig import Interlock
-from bench.run import Run, carry_out
 
 pytest.importorskip("textual")
 

@@ -9,15 +9,17 @@ from hypothesis import given, strategies as st
 from bench.base import ConfigurationError, VirtualClock
 from bench.base.registry import Entry
 from bench.control import Playback
-from bench.devices import Dwell, Settled, UntilSteady
 from bench.protocol import (
+    Dwell,
     FixedRate,
     Messages,
     Note,
     Phase,
     ProtocolParameters,
     Reading,
+    Settled,
     Step,
+    UntilSteady,
     find_protocol,
     packaged_protocols,
     parameter,
@@ -361,7 +363,7 @@ class TestPlan:
 
 class TestFiles:
     GOOD = """
-from bench.devices import Dwell
+from bench.protocol import Dwell
 from bench.protocol import Messages, ProtocolParameters, Step, parameter, protocol
 
 class Parameters(ProtocolParameters):

@@ -8,8 +8,8 @@ from following_supplies import rig_of, supplies
 from rich.console import Console
 
 from bench.cli import main
+from bench.execution import Run, carry_out
 from bench.record import Record
-from bench.run import Run, carry_out
 from sim_devices.serving.process import serve
 
 pytestmark = pytest.mark.usefixtures("warm_popen")

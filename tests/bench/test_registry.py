@@ -14,7 +14,7 @@ from bench.rig import load_rig, packaged_rigs
 
 HERE = Path(__file__).parent
 PROTOCOL = '''
-from bench.devices import Dwell
+from bench.protocol import Dwell
 from bench.protocol import ProtocolParameters, Step, parameter, protocol
 
 class Parameters(ProtocolParameters):

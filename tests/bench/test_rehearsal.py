@@ -18,14 +18,13 @@ from heater_protocols import stairs
 from rich.console import Console
 
 from bench.base import AbortError, ConfigurationError, VirtualClock
-from bench.devices import Dwell
+from bench.execution import Rehearsal, Run, carry_out, foresee
+from bench.execution.rehearsal import rehearse
 from bench.identification import ModelFile
 from bench.models import Preisach, ThermalExpansion, uniform_levels
-from bench.protocol import Step, Summary, find_protocol, plan, protocol
+from bench.protocol import Dwell, Step, Summary, find_protocol, plan, protocol
 from bench.record import FILE_NAME, Record, run_card
 from bench.rig import Rig, load_rig, twin_of
-from bench.run import Rehearsal, Run, carry_out, foresee
-from bench.run.rehearsal import rehearse
 
 GOALS = {"vo2": {"goal": 900.0, "low": 30.0, "high": 80.0}, "sma": {"goal": -1.2e-3, "low": 0.0, "high": 3.0}}
 
@@ -161,7 +160,7 @@ class TestRehearsal:
 
     @pytest.mark.parametrize(("name", "limit"), [("LONGEST", 50), ("LONGEST_DAYS", 0.01)])
     def test_a_protocol_that_waits_for_ever_is_refused(self, make, console, monkeypatch, name, limit):
-        monkeypatch.setattr(f"bench.run.rehearsal.{name}", limit)
+        monkeypatch.setattr(f"bench.execution.rehearsal.{name}", limit)
         run = make(definition=wait_for_ever, settings=GOALS["vo2"], rig="vo2")
         with pytest.raises(ConfigurationError, match=r"wait-for-ever does not end in its rehearsal on vo2, within"):
             foresee(run, console)
@@ -425,8 +424,8 @@ class TestCommand:
 
     @pytest.mark.parametrize("terminal", [False, True])
     def test_a_long_rehearsal_is_seen(self, make, monkeypatch, terminal):
-        monkeypatch.setattr("bench.run.terminal._UNSEEN", 0.0)
-        monkeypatch.setattr("bench.run.terminal._REFRESH", 0.0)
+        monkeypatch.setattr("bench.execution.terminal._UNSEEN", 0.0)
+        monkeypatch.setattr("bench.execution.terminal._REFRESH", 0.0)
         console = Console(file=io.StringIO(), width=200, force_terminal=terminal)
         foresee(make(), console)
         shown = console.file.getvalue()

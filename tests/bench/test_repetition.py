@@ -17,17 +17,17 @@ from rich.console import Console
 from bench.analysis import compare_runs
 from bench.base import Interrupts
 from bench.cli import main
+from bench.execution import Resume, Run, carry_out as carry_out_run, repeat, resume
 from bench.identification import ModelFile
 from bench.models import Preisach, uniform_levels
 from bench.protocol import find_protocol
 from bench.record import FILE_NAME, Record
 from bench.record.rows import checksum
-from bench.run import Resume, Run, carry_out as carry_out_run, repeat, resume
 
 FAULTS = '[[fault]]\nat = 12\nfault = "tec.delay"\nvalues = { seconds = 0.05 }\nduration = 2\n'
 SCRIPT = """
 from beside_the_script import HOTTER
-from bench.devices import Dwell
+from bench.protocol import Dwell
 from bench.protocol import ProtocolParameters, Step, parameter, protocol
 
 class Parameters(ProtocolParameters):

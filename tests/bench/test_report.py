@@ -10,10 +10,10 @@ from rich.console import Console
 
 from bench.analysis import FOLLOW, REACH, READING, report_run
 from bench.base import fitting_prefix, format_numbers, with_unit
-from bench.devices import Settled, Signal
+from bench.devices import Signal
 from bench.identification import ModelFile
 from bench.models import Hammerstein, LinearPart, Polynomial
-from bench.protocol import TRACES
+from bench.protocol import TRACES, Settled
 from bench.record import FILE_NAME, Journal, StepRecord, add_model
 
 META = {

@@ -17,13 +17,13 @@ from rich.console import Console
 import bench
 from bench.base import AbortError, AgreementError, ConfigurationError, DataError
 from bench.cli import main
+from bench.execution import Resume, resume
+from bench.execution.engine import Engine
+from bench.execution.resumption.corners import corners, turning_points
+from bench.execution.resumption.feeding import Past
 from bench.models import MemoryCurve
 from bench.record import FILE_NAME, RECOVERED_NAME, Journal, Record
 from bench.rig import Holder, Locks
-from bench.run import Resume, resume
-from bench.run.engine import Engine
-from bench.run.resumption.corners import corners, turning_points
-from bench.run.resumption.feeding import Past
 
 pytestmark = pytest.mark.usefixtures("warm_popen")
 

@@ -14,10 +14,10 @@ from rich.console import Console
 
 from bench.analysis import compare_runs
 from bench.cli.run_list import Status
+from bench.execution import Run, carry_out
 from bench.protocol import Messages, Note, NumberList, ProtocolParameters, parameter, protocol
 from bench.record import FILE_NAME, Difference, Record, run_name
 from bench.rig import Holder, Locks
-from bench.run import Run, carry_out
 
 
 @pytest.fixture(scope="module")

@@ -11,10 +11,9 @@ from heater_protocols import stairs
 from rich.console import Console
 
 from bench.base import ConfigurationError, RecordError
-from bench.devices import Dwell
-from bench.protocol import Messages, ProtocolParameters, Step, parameter, protocol
+from bench.execution import Run, carry_out
+from bench.protocol import Dwell, Messages, ProtocolParameters, Step, parameter, protocol
 from bench.record import FILE_NAME, RIG_FILE_NAME, NewFolder, Record, make_folder
-from bench.run import Run, carry_out
 
 
 @pytest.fixture
@@ -62,7 +61,7 @@ def test_a_start_that_fails_behind_the_journal_leaves_no_folder(asked, tmp_path,
     def fail(*_):
         raise ConfigurationError("no display")
 
-    monkeypatch.setattr("bench.run.context.ProgressDisplay", fail)
+    monkeypatch.setattr("bench.execution.context.ProgressDisplay", fail)
     with pytest.raises(ConfigurationError, match="no display"):
         carry_out(asked, silent())
     assert not (tmp_path / "runs").exists()

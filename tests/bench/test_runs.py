@@ -9,14 +9,14 @@ from heater_protocols import Stairs, settle, stairs
 from rich.console import Console
 
 from bench.base import ConfigurationError, DeviceConnectionError, Expectation
-from bench.devices import Dwell, Settled, Signal
+from bench.devices import Signal
+from bench.execution import Run, carry_out
+from bench.execution.dialogue import Dialogue
+from bench.execution.terminal import ProgressDisplay
 from bench.operator import AT_A_PROMPT, Question
-from bench.protocol import Step, find_protocol, protocol
+from bench.protocol import Dwell, Settled, Step, find_protocol, protocol
 from bench.record import RIG_FILE_NAME, Event, Record, StepRecord, run_card
 from bench.rig import load_rig
-from bench.run import Run, carry_out
-from bench.run.dialogue import Dialogue
-from bench.run.terminal import ProgressDisplay
 
 
 @pytest.fixture

@@ -12,10 +12,10 @@ from bench.base import json_text
 from bench.batch import StudyResult
 from bench.batch.campaign.study_tables import over_seeds, write_study
 from bench.devices import Settled
+from bench.execution.guardian.black_box import BlackBox
 from bench.identification import load_model
 from bench.record import BLACK_BOX_NAME, FILE_NAME, Journal, StepRecord, add_model
 from bench.record.model_files import models_beside
-from bench.run.guardian.black_box import BlackBox
 
 NAN, INFINITY = math.nan, math.inf
 

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from bench.base import DeviceError, report, task_console
+from bench.execution import Run, carry_out
 from bench.protocol import find_protocol
-from bench.run import Run, carry_out
 
 _ordinals = itertools.count()
 

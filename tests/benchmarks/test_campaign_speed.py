@@ -9,10 +9,10 @@ import pytest
 CAMPAIGN = """
 import json, resource, sys
 from pathlib import Path
-import bench.cli, bench.run, bench.dashboard, bench.identification, drivers.labjack_t7, drivers.meerstetter
+import bench.cli, bench.execution, bench.dashboard, bench.identification, drivers.labjack_t7, drivers.meerstetter
 import numba, rigs.vo2.laboratory
 from bench.protocol import find_protocol
-from bench.run import Run, carry_out
+from bench.execution import Run, carry_out
 from rich.console import Console
 
 def megabytes():

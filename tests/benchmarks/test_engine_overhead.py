@@ -15,13 +15,13 @@ import pytest
 from pydantic import Field
 
 from bench.base import Interrupts, VirtualClock, registry
-from bench.devices import Arrived, DriverSettings, Identity, Limits, Status, TemperatureSensor, VoltageSupply
-from bench.protocol import ProtocolParameters, Step, protocol
+from bench.devices import DriverSettings, Identity, Limits, Status, TemperatureSensor, VoltageSupply
+from bench.execution.engine import Engine
+from bench.execution.guardian.remote import GuardedRig, RemoteStation
+from bench.execution.station.local import LocalStation
+from bench.protocol import Arrived, ProtocolParameters, Step, protocol
 from bench.record import FILE_NAME, Journal
 from bench.rig import LaboratorySettings, Look, Rig, attach, load_rig
-from bench.run.engine import Engine
-from bench.run.guardian.remote import GuardedRig, RemoteStation
-from bench.run.station.local import LocalStation
 from sim_devices.serving.process import serve
 
 pytestmark = pytest.mark.benchmark

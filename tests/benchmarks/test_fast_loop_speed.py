@@ -12,13 +12,13 @@ from numba import njit
 from bench.base import Interrupts, VirtualClock
 from bench.control import NotchLoopParameters, Trace
 from bench.control.notch_loop import notch
+from bench.execution.context import trace_signals
+from bench.execution.engine import Engine
+from bench.execution.station.local import LocalStation
 from bench.models import Polynomial, PrandtlIshlinskii
 from bench.protocol import FixedRate, ProtocolParameters, protocol
 from bench.record import FILE_NAME, Journal, Record
 from bench.rig import Rig, load_rig
-from bench.run.context import trace_signals
-from bench.run.engine import Engine
-from bench.run.station.local import LocalStation
 from rigs.hybrid.control import make_fine
 from rigs.hybrid.design import Design
 from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from bench.execution import Run, carry_out
 from bench.identification import ModelFile
 from bench.models import Polynomial, PrandtlIshlinskii
 from bench.protocol import find_protocol
-from bench.run import Run, carry_out
 from rigs.hybrid.design import Design
 from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel
 

@@ -12,9 +12,9 @@ import pytest
 from rich.console import Console
 
 from bench.base import Interrupts
+from bench.execution import Run, carry_out
 from bench.record import Record, lateness_lines
 from bench.rig import read_endpoints
-from bench.run import Run, carry_out
 from sim_devices.serving.process import serve
 
 sys.path.append(str(Path(__file__).parents[1] / "bench"))

@@ -6,8 +6,8 @@ import pytest
 from sim_devices.serving.process import serve
 
 # What these clients share, and the protocols that the fuzzer knows.
-for folder in ("clients", "fuzz"):
-    sys.path.insert(0, str(Path(__file__).parents[1] / folder))
+for folder in ("tests/clients", "tools"):
+    sys.path.insert(0, str(Path(__file__).parents[2] / folder))
 
 
 @pytest.fixture(scope="package")

@@ -85,7 +85,7 @@ class OnABench:
 
     @pytest.fixture
     def clock(self, bench):
-        return bench.base.clock
+        return bench.clock
 
     @pytest.fixture
     def requests(self, bench):
@@ -109,7 +109,7 @@ class OnALine(OnABench):
 
     @pytest.fixture
     def mend(self, bench):
-        return lambda: register(bench.port.removeprefix("emulated://"), bench.server, bench.base.clock)
+        return lambda: register(bench.port.removeprefix("emulated://"), bench.server, bench.clock)
 
     @pytest.fixture
     def exchange(self, bench, another_server):
@@ -123,7 +123,7 @@ class OnALine(OnABench):
         def restart():
             bench.instrument.power_cycle()
             # The longest that an instrument takes to start.
-            bench.base.clock.sleep(0.5)
+            bench.clock.sleep(0.5)
 
         return restart
 

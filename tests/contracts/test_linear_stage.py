@@ -117,14 +117,14 @@ def test_arrives_and_holds(kind, stack, goal):
     assert not status.update()
     assert bench.device.force_enabled
     assert bench.device.setpoint == goal
-    bench.base.clock.sleep(0.6)
+    bench.clock.sleep(0.6)
     assert bench.device.measure()["stage_velocity"] == pytest.approx(
         math.copysign(VELOCITY, goal), abs=VELOCITY_UNIT * RADIUS
     )
     status.wait()
     assert status.success
     for _ in range(3):
-        bench.base.clock.sleep(2.0)
+        bench.clock.sleep(2.0)
         values = bench.device.glance()
         assert values["stage_position"] == pytest.approx(goal, abs=0.51 * RESOLUTION)
         assert values["stage_velocity"] == 0.0
@@ -134,10 +134,10 @@ def test_arrives_and_holds(kind, stack, goal):
 
 def test_plant_sees_where_the_wire_is_going(bench):
     bench.device.set(0.05)
-    bench.base.clock.sleep(1.0)
+    bench.clock.sleep(1.0)
     before, ahead = bench.where(), bench.drum.position_after(1.0)
     assert ahead == pytest.approx(before + VELOCITY, abs=1e-6)
-    bench.base.clock.sleep(1.0)
+    bench.clock.sleep(1.0)
     assert bench.where() == pytest.approx(ahead, abs=1e-6)
 
 
@@ -145,12 +145,12 @@ def test_stop_holds_the_position_of_the_moment(bench):
     bench.device.stop()
     assert not bench.device.force_enabled
     status = bench.device.set(0.1)
-    bench.base.clock.sleep(2.0)
+    bench.clock.sleep(2.0)
     bench.device.stop()
     held = bench.device.setpoint
     assert VELOCITY < held < 2.1 * VELOCITY
     for _ in range(3):
-        bench.base.clock.sleep(1.0)
+        bench.clock.sleep(1.0)
         assert bench.device.measure()["stage_position"] == pytest.approx(held, abs=0.02 * RADIUS)
     assert bench.device.force_enabled
     with pytest.raises(DeviceError, match=r"stage: .*replaced"):
@@ -163,7 +163,7 @@ def never_moved(bench):
 
 def moves(bench):
     bench.device.set(0.1)
-    bench.base.clock.sleep(1.0)
+    bench.clock.sleep(1.0)
 
 
 def stands(bench):
@@ -172,7 +172,7 @@ def stands(bench):
 
 def watchdog_expired(bench):
     bench.device.set(0.1)
-    bench.base.clock.sleep(60.0)
+    bench.clock.sleep(60.0)
 
 
 def error_with_force_on(bench):
@@ -193,7 +193,7 @@ def test_safe_from_any_state_and_again_changes_nothing(kind, stack, state):
     assert not bench.device.force_enabled
     where = bench.where()
     bench.device.safe()
-    bench.base.clock.sleep(10.0)
+    bench.clock.sleep(10.0)
     assert bench.where() == where
     assert not bench.device.force_enabled
 
@@ -213,7 +213,7 @@ def test_every_call_tells_of_a_hardware_error(bench):
 def test_silence_of_the_host_stops_the_stage(bench):
     status = bench.device.set(0.15)
     bench.device.glance()
-    bench.base.clock.sleep(3600.0)
+    bench.clock.sleep(3600.0)
     assert bench.where() == pytest.approx(VELOCITY * WATCHDOG, abs=0.3 * RADIUS)
     for call in (bench.device.measure, bench.device.glance, lambda: bench.device.set(0.0), status.wait):
         with pytest.raises(DeviceError, match=r"stage: .*bus watchdog"):
@@ -231,7 +231,7 @@ class OnADrumLine(OnATorque, OnALine, OnADrum):
     @pytest.fixture
     def another_server(self, bench):
         plant = Wall()
-        return Dynamixel2Server([EmulatedMX28("another", World(plant, bench.base.clock), plant)])
+        return Dynamixel2Server([EmulatedMX28("another", World(plant, bench.clock), plant)])
 
     @pytest.fixture
     def truth(self, bench):

@@ -105,7 +105,7 @@ class TestLineLost(OnABench, LineLostContract):
         def mend():
             bench.instrument.plug_in()
             unregister(bench.port)
-            register(bench.port.removeprefix("emulated://"), ModbusRtuServer(bench.instrument), bench.base.clock)
+            register(bench.port.removeprefix("emulated://"), ModbusRtuServer(bench.instrument), bench.clock)
 
         return mend
 
@@ -170,17 +170,17 @@ def test_tare_makes_the_present_force_zero(bench):
 def test_tare_waits_until_the_signal_is_still(bench):
     bench.device.measure()
     bench.plant.value = 10.0
-    bench.base.clock.sleep(0.05)
+    bench.clock.sleep(0.05)
     bench.device.tare()  # the filter has not settled yet: without waiting, a part of the 10 N would remain
     assert force(bench.device.measure()) == pytest.approx(0.0, abs=2e-3)
 
 
 def test_tare_of_a_moving_load_is_refused(bench):
     bench.plant.rate = 0.5
-    begin = bench.base.clock.now()
+    begin = bench.clock.now()
     with pytest.raises(DeviceError, match=r"^load: .*still"):
         bench.device.tare()
-    assert bench.base.clock.now() - begin == pytest.approx(10.0, abs=0.3)
+    assert bench.clock.now() - begin == pytest.approx(10.0, abs=0.3)
     bench.plant.rate = 0.0
     bench.put(8.0)
     assert force(bench.device.measure()) == pytest.approx(8.0, abs=1.5e-3)
@@ -221,19 +221,19 @@ def test_safe_and_stop_change_nothing(bench):
 
 
 def test_a_measurement_spaces_its_readings_by_the_filter(bench):
-    begin = bench.base.clock.now()
+    begin = bench.clock.now()
     bench.device.measure()
-    assert bench.base.clock.now() - begin == pytest.approx(4 * reading_interval(3), abs=0.01)
-    begin = bench.base.clock.now()
+    assert bench.clock.now() - begin == pytest.approx(4 * reading_interval(3), abs=0.01)
+    begin = bench.clock.now()
     bench.device.glance()
-    assert bench.base.clock.now() - begin < 0.01
+    assert bench.clock.now() - begin < 0.01
 
 
 def test_a_measurement_is_the_mean_over_its_time(bench):
     bench.put(0.0)
     bench.device.glance()
     bench.plant.rate = 1.0
-    bench.base.clock.sleep(2.0)
+    bench.clock.sleep(2.0)
     # Readings over 0.5 s, 0.25 s on the mean; both lags hold them back by 25.6 ms each.
     assert force(bench.device.measure()) == pytest.approx(2.0 + 0.25 - 2 * 0.0256, abs=8e-3)
 
@@ -242,7 +242,7 @@ def test_a_force_that_nobody_watched_arriving_is_seen_settled(bench):
     bench.put(0.0)
     bench.device.glance()
     bench.plant.value = 20.0
-    bench.base.clock.sleep(3600.0)
+    bench.clock.sleep(3600.0)
     assert force(bench.device.glance()) == pytest.approx(20.0, abs=2e-3)
     bench.device.tare()
     assert force(bench.device.glance()) == pytest.approx(0.0, abs=2e-3)
@@ -279,9 +279,9 @@ def test_noise_of_a_measurement_is_that_of_the_mean(kind, stack):
     means, single = [], []
     for _ in range(400):
         means.append(force(bench.device.measure()))
-        bench.base.clock.sleep(0.2)
+        bench.clock.sleep(0.2)
         single.append(force(bench.device.glance()))
-        bench.base.clock.sleep(0.2)
+        bench.clock.sleep(0.2)
     assert np.std(single) == pytest.approx(10 * NOISE, rel=0.12)
     # Neighbouring readings are correlated by 4 %.
     assert np.std(means) == pytest.approx(10 * NOISE * math.sqrt((1 + 0.08) / 5), rel=0.12)

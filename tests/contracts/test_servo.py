@@ -124,7 +124,7 @@ class TestSilence(OnAShaft, SilentInstrumentContract):
 @each_case("goal", [3.5, 0.0, 2.5 * TURN, -1.5 * TURN])
 def test_arrives_and_holds(kind, stack, goal):
     bench = connected(kind, stack)
-    start = bench.base.clock.now()
+    start = bench.clock.now()
     status = bench.device.set(goal)
     assert not status.update()
     assert bench.device.torque_enabled
@@ -136,9 +136,9 @@ def test_arrives_and_holds(kind, stack, goal):
         expected = distance / VELOCITY + VELOCITY / ACCELERATION
     else:
         expected = 2.0 * math.sqrt(distance / ACCELERATION)
-    assert bench.base.clock.now() - start == pytest.approx(expected, abs=0.15)
+    assert bench.clock.now() - start == pytest.approx(expected, abs=0.15)
     for _ in range(5):
-        bench.base.clock.sleep(2.0)
+        bench.clock.sleep(2.0)
         values = bench.device.glance()
         assert values["servo_position"] == pytest.approx(goal, abs=0.5 * COUNT + 1e-9)
         assert values["servo_velocity"] == 0.0
@@ -154,7 +154,7 @@ def test_where_it_stands_already_it_has_arrived_at_once(bench):
 def test_velocity_on_the_way_is_that_of_the_profile(bench):
     for goal, sign in ((9.0, 1), (-3.0, -1)):
         status = bench.device.set(goal)
-        bench.base.clock.sleep(1.0)
+        bench.clock.sleep(1.0)
         values = bench.device.measure()
         assert values["servo_velocity"] == pytest.approx(sign * VELOCITY, abs=VELOCITY_UNIT)
         status.wait()
@@ -170,7 +170,7 @@ def test_plant_sees_the_way_in_small_steps(bench):
 
 def test_new_goal_on_the_way_turns_round_without_a_jump(bench):
     first = bench.device.set(9.0)
-    bench.base.clock.sleep(1.5)
+    bench.clock.sleep(1.5)
     bench.device.set(2.0).wait()
     assert bench.device.measure()["servo_position"] == pytest.approx(2.0, abs=COUNT)
     with pytest.raises(DeviceError, match="replaced"):
@@ -181,12 +181,12 @@ def test_new_goal_on_the_way_turns_round_without_a_jump(bench):
 
 def test_stop_holds_the_angle_of_the_moment(bench):
     status = bench.device.set(9.0)
-    bench.base.clock.sleep(2.0)
+    bench.clock.sleep(2.0)
     bench.device.stop()
     held = bench.device.setpoint
     assert math.pi + 1.0 < held < math.pi + 2.1
     for _ in range(3):
-        bench.base.clock.sleep(1.0)
+        bench.clock.sleep(1.0)
         assert bench.device.measure()["servo_position"] == pytest.approx(held, abs=0.02)
     assert bench.device.torque_enabled
     with pytest.raises(DeviceError, match="replaced"):
@@ -195,12 +195,12 @@ def test_stop_holds_the_angle_of_the_moment(bench):
 
 def test_safe_switches_the_torque_off_and_again_changes_nothing(bench):
     bench.device.set(9.0)
-    bench.base.clock.sleep(1.0)
+    bench.clock.sleep(1.0)
     bench.device.safe()
     assert not bench.device.torque_enabled
     where = bench.where()
     bench.device.safe()
-    bench.base.clock.sleep(10.0)
+    bench.clock.sleep(10.0)
     assert bench.where() == where
     assert not bench.device.torque_enabled
     assert bench.device.measure()["servo_velocity"] == 0.0
@@ -208,7 +208,7 @@ def test_safe_switches_the_torque_off_and_again_changes_nothing(bench):
 
 def test_no_jump_to_the_goal_of_before(bench):
     status = bench.device.set(9.0)
-    bench.base.clock.sleep(1.0)
+    bench.clock.sleep(1.0)
     bench.device.safe()
     with pytest.raises(DeviceError, match="torque was switched off"):
         status.wait()
@@ -249,8 +249,8 @@ def test_every_call_tells_of_a_hardware_error_and_safe_succeeds(kind, stack, err
 def test_silence_of_the_host_stops_the_shaft_at_that_instant(bench):
     status = bench.device.set(15.0)
     bench.device.glance()
-    last_request = bench.base.clock.now()
-    bench.base.clock.sleep(3600.0)
+    last_request = bench.clock.now()
+    bench.clock.sleep(3600.0)
     assert bench.where() == pytest.approx(math.pi + VELOCITY * WATCHDOG, abs=0.3)
     held = bench.where()
     seen = [instant for instant, position in bench.plant.seen if position != held]
@@ -271,7 +271,7 @@ def test_silence_of_the_host_stops_the_shaft_at_that_instant(bench):
 def test_ticks_of_two_seconds_keep_it_going(bench):
     bench.device.set(9.0)
     for _ in range(100):
-        bench.base.clock.sleep(2.0)
+        bench.clock.sleep(2.0)
         bench.device.glance()
     assert bench.device.torque_enabled
     assert bench.instrument.read_item(98) == 125
@@ -313,7 +313,7 @@ def test_torque_that_goes_off_lets_the_weight_fall(loaded):
 class OnAServoLine(OnATorque, OnALine, OnAShaft):
     @pytest.fixture
     def another_server(self, bench):
-        return Dynamixel2Server([EmulatedMX28("another", World(Pendulum(), bench.base.clock))])
+        return Dynamixel2Server([EmulatedMX28("another", World(Pendulum(), bench.clock))])
 
     @pytest.fixture
     def truth(self, bench):
@@ -343,7 +343,7 @@ class TestSafeOverAFreshLine(OnAServoLine, SafeOverAFreshLineContract):
 def test_position_one_turn_off_is_never_reported(bench):
     bench.device.set(math.pi + 2 * TURN).wait()
     bench.instrument.power_cycle()
-    bench.base.clock.sleep(0.5)
+    bench.clock.sleep(0.5)
     for call in (bench.device.measure, bench.device.glance, lambda: bench.device.set(8.0)):
         with pytest.raises(DeviceRestartedError, match=r"servo: the servo has restarted: .*zero_counts"):
             call()
@@ -353,11 +353,11 @@ def test_position_one_turn_off_is_never_reported(bench):
 @over_the_wire
 def test_motion_during_which_it_restarts_does_not_arrive_one_turn_off(bench):
     status = bench.device.set(1.0)
-    bench.base.clock.sleep(1.0)
+    bench.clock.sleep(1.0)
     bench.device.set(1.0 + 2 * TURN)
-    bench.base.clock.sleep(8.0)
+    bench.clock.sleep(8.0)
     bench.instrument.power_cycle()
-    bench.base.clock.sleep(0.5)
+    bench.clock.sleep(0.5)
     with pytest.raises(DeviceRestartedError):
         bench.device.glance()
     with pytest.raises(DeviceError):
@@ -437,7 +437,7 @@ def test_error_of_before_is_refused_and_recovered(bench):
 def test_host_that_died_leaves_a_servo_that_the_next_one_takes_over(bench):
     bench.device.set(15.0)
     bench.device.close()
-    bench.base.clock.sleep(60.0)
+    bench.clock.sleep(60.0)
     assert bench.instrument.read_item(98) == -1
     device = bench.connect()
     assert not device.torque_enabled
@@ -448,11 +448,11 @@ def test_host_that_died_leaves_a_servo_that_the_next_one_takes_over(bench):
 
 @over_the_wire
 def test_watchdog_is_idle_while_the_torque_is_off(bench):
-    bench.base.clock.sleep(100.0)
+    bench.clock.sleep(100.0)
     bench.device.measure()
     bench.device.set(5.0).wait()
     bench.device.safe()
-    bench.base.clock.sleep(100.0)
+    bench.clock.sleep(100.0)
     bench.device.measure()
     bench.device.set(4.0).wait()
 
@@ -462,7 +462,7 @@ def test_zero_and_direction(bench):
     device = bench.connect(zero_counts=2048, direction=-1, position_limits=(-3.0, 3.0))
     assert device.measure()["servo_position"] == 0.0
     status = device.set(1.0)
-    bench.base.clock.sleep(0.6)
+    bench.clock.sleep(0.6)
     assert device.measure()["servo_velocity"] == pytest.approx(VELOCITY, abs=VELOCITY_UNIT)
     status.wait()
     assert bench.where() == pytest.approx(math.pi - 1.0, abs=COUNT)

@@ -120,17 +120,17 @@ def test_temperature_arrives_and_holds(bench):
     assert status.success
     assert bench.device.measure()["tec_temperature"] == pytest.approx(45.0, abs=0.15)
     for _ in range(10):
-        bench.base.clock.sleep(2.0)
+        bench.clock.sleep(2.0)
         assert bench.device.glance()["tec_temperature"] == pytest.approx(45.0, abs=0.15)
 
 
 def test_every_new_target_is_a_new_arrival(bench):
     bench.device.set(45.0).wait()
-    start = bench.base.clock.now()
+    start = bench.clock.now()
     status = bench.device.set(46.0)
     assert not status.update()
     status.wait()
-    assert bench.base.clock.now() - start > 1.0
+    assert bench.clock.now() - start > 1.0
 
 
 def test_currents_of_both_signs_flow_and_have_limits(bench):
@@ -140,7 +140,7 @@ def test_currents_of_both_signs_flow_and_have_limits(bench):
     before = device.measure()["tec_temperature"]
     for current in (0.5, -0.5):
         assert device.set(current).success
-        bench.base.clock.sleep(3.0)
+        bench.clock.sleep(3.0)
         values = device.measure()
         assert values["tec_current"] == pytest.approx(current, abs=2e-3)
         if current > 0:
@@ -176,11 +176,11 @@ def test_old_current_does_not_come_back_with_the_mode(bench):
 
 def test_stop_holds_the_temperature_of_the_moment(bench):
     bench.device.set(80.0)
-    bench.base.clock.sleep(1.0)
+    bench.clock.sleep(1.0)
     bench.device.stop()
     held = bench.device.setpoint
     assert 25.0 < held < 75.0
-    bench.base.clock.sleep(3.0)
+    bench.clock.sleep(3.0)
     assert bench.device.measure()["tec_temperature"] == pytest.approx(held, abs=2.0)
     assert bench.device.output_enabled
 
@@ -199,7 +199,7 @@ def test_safe_releases_the_plate(bench):
     assert bench.plant.commands[-1][1] == "release"
     commands = len(bench.plant.commands)
     bench.device.safe()
-    bench.base.clock.sleep(1.0)
+    bench.clock.sleep(1.0)
     assert len(bench.plant.commands) == commands
     assert bench.device.measure()["tec_current"] == pytest.approx(0.0, abs=5e-3)
     bench.device.set(50.0).wait()
@@ -235,8 +235,8 @@ def test_protection_of_the_device_ends_the_heating(bench):
 def test_silence_of_the_host_switches_the_output_off_at_that_instant(bench, kind):
     bench.device.set(60.0)
     bench.device.glance()
-    last_request = bench.base.clock.now()
-    bench.base.clock.sleep(3600.0)
+    last_request = bench.clock.now()
+    bench.clock.sleep(3600.0)
     assert bench.instrument.status is DeviceStatus.ERROR
     instant, command, _ = bench.plant.commands[-1]
     assert command == "release"
@@ -251,7 +251,7 @@ def test_silence_of_the_host_switches_the_output_off_at_that_instant(bench, kind
 def test_ticks_of_two_seconds_keep_the_output_on(bench):
     bench.device.set(60.0)
     for _ in range(100):
-        bench.base.clock.sleep(2.0)
+        bench.clock.sleep(2.0)
         bench.device.glance()
     assert bench.device.output_enabled
 
@@ -272,14 +272,14 @@ class TestSpoiltAnswer(Spoilt, OnAPlate, SpoiltAnswerContract):
 
 @over_the_wire
 def test_output_is_off_and_the_watchdog_idle_after_connecting_and_after_safe(bench):
-    bench.base.clock.sleep(100.0)
+    bench.clock.sleep(100.0)
     bench.device.measure()
     bench.device.set(45.0).wait()
     bench.device.safe()
-    bench.base.clock.sleep(100.0)
+    bench.clock.sleep(100.0)
     bench.device.measure()
     bench.device.close()
-    bench.base.clock.sleep(100.0)
+    bench.clock.sleep(100.0)
     bench.connect().close()
 
 
@@ -297,9 +297,9 @@ def test_nothing_is_worn_out(bench):
 def test_closing_while_the_output_is_on_leaves_it_to_the_watchdog(bench):
     bench.device.set(60.0)
     bench.device.close()
-    bench.base.clock.sleep(WATCHDOG - 0.1)
+    bench.clock.sleep(WATCHDOG - 0.1)
     assert bench.instrument.status is DeviceStatus.RUN
-    bench.base.clock.sleep(0.2)
+    bench.clock.sleep(0.2)
     assert bench.instrument.status is DeviceStatus.ERROR
 
 

@@ -8,7 +8,13 @@ import pkgutil
 import pytest
 
 PACKAGES = ("bench.control", "bench.record", "drivers")
-CHANGING = {"bench.control.approach.Approach", "bench.control.predictive._Lag", "drivers.dynamixel.mx28._Standstill"}
+CHANGING = {
+    "bench.control.approach.Approach",
+    "bench.control.predictive._Lag",
+    "bench.record.lateness.Lateness",
+    "bench.record.recovery._Left",
+    "drivers.dynamixel.mx28._Standstill",
+}
 """What is no value but a state."""
 BY_IDENTITY = {
     "bench.control.adaptation.Adapter",
@@ -22,7 +28,7 @@ BY_IDENTITY = {
 @pytest.fixture(scope="module")
 def values():
     """The data classes of the packages, by their full names."""
-    names = ["bench.run.engine"]
+    names = ["bench.execution.engine"]
     for package in map(importlib.import_module, PACKAGES):
         names += [found.name for found in pkgutil.walk_packages(package.__path__, f"{package.__name__}.")]
     found = {}

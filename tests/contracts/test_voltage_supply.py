@@ -286,7 +286,7 @@ def test_current_is_that_of_a_capacitor(bench):
     bench.device.set(0.0)
     bench.settle()
     bench.device.set(40.0)
-    bench.base.clock.sleep(0.1e-3)
+    bench.clock.sleep(0.1e-3)
     # 20 nF by a lag of 0.2 ms, half a time constant later.
     expected = 20e-9 * 40.0 / 0.2e-3 * math.exp(-0.5)
     assert bench.device.glance()["supply_current"] == pytest.approx(expected, abs=bench.facts.current_within)
@@ -348,7 +348,7 @@ def test_safe_goes_to_zero_and_again_changes_nothing(bench):
 def test_safe_after_the_watchdog_has_expired(bench):
     bench.device.set(6.0)
     bench.settle()
-    bench.base.clock.sleep(10.0)
+    bench.clock.sleep(10.0)
     applied = len(bench.plant.applied)
     bench.device.safe()
     assert falls_to_zero([volts for _, volts in bench.plant.applied[applied:]])
@@ -376,7 +376,7 @@ def test_every_call_tells_of_a_fault_and_safe_succeeds(kind, output, stack, faul
 @pytest.mark.parametrize("call", ["measure", "glance", "read", "set"])
 def test_an_amplifier_that_went_off_is_told_once(bench, call):
     bench.device.set(6.0)
-    bench.base.clock.sleep(0.1)
+    bench.clock.sleep(0.1)
     bench.amplifier.trip()
     with pytest.raises(DeviceError, match=r"^supply: the amplifier went off by itself, while .* protection"):
         bench.device.set(7.0) if call == "set" else getattr(bench.device, call)()
@@ -402,8 +402,8 @@ def test_an_amplifier_is_clipped_and_the_monitor_says_so(bench):
 def test_silence_of_the_host_drops_the_output_at_that_instant(bench):
     bench.device.set(6.0)
     bench.device.glance()
-    last_command = bench.base.clock.now()
-    bench.base.clock.sleep(3600.0)
+    last_command = bench.clock.now()
+    bench.clock.sleep(3600.0)
     bench.instrument.world.advance()
     instant, volts = bench.plant.applied[-1]
     assert volts == 0.0
@@ -415,7 +415,7 @@ def test_silence_of_the_host_drops_the_output_at_that_instant(bench):
 def test_reading_after_too_long_a_silence_raises_and_resumes_nothing(bench, pause):
     bench.device.set(6.0)
     bench.settle()
-    bench.base.clock.sleep(pause)
+    bench.clock.sleep(pause)
     applied = len(bench.plant.applied)
     with pytest.raises(DeviceError, match=r"supply: .*watchdog"):
         bench.device.measure()
@@ -430,7 +430,7 @@ def test_reading_after_too_long_a_silence_raises_and_resumes_nothing(bench, paus
 def test_set_point_after_a_silence_does_not_resume_the_voltage_of_before(bench, kind, pause):
     bench.device.set(12.0)
     bench.settle()
-    bench.base.clock.sleep(pause)
+    bench.clock.sleep(pause)
     bench.instrument.world.advance()
     applied = len(bench.plant.applied)
     if kind in LINEAR:
@@ -447,7 +447,7 @@ def test_set_point_after_a_silence_does_not_resume_the_voltage_of_before(bench, 
 def test_device_that_comes_back_resumes_nothing(bench):
     bench.device.set(6.0)
     bench.instrument.unplug()
-    bench.base.clock.sleep(5.0)
+    bench.clock.sleep(5.0)
     bench.instrument.world.advance()
     bench.instrument.plug_in()
     applied = len(bench.plant.applied)
@@ -477,7 +477,7 @@ class OnASupplyLine(OnALine):
     @pytest.fixture
     def another_server(self, bench):
         load = Resistor()
-        world = load.world = World(load, bench.base.clock)
+        world = load.world = World(load, bench.clock)
         return CanopenSlcanServer(EmulatedRoboteq("another", world, load))
 
     @pytest.fixture
@@ -523,7 +523,7 @@ def test_command_of_another_host_is_an_error_of_the_next_reading(bench):
 @over_the_wire
 def test_rescue_of_a_voltage_that_a_dead_host_left(bench):
     bench.device.set(6.0).wait()
-    RoboteqSupply.rescue("supply", bench.device._settings, bench.base.clock)
+    RoboteqSupply.rescue("supply", bench.device._settings, bench.clock)
     assert bench.plant.voltage == 0.0
 
 
@@ -543,7 +543,7 @@ def test_spoilt_answer_is_asked_for_again(bench, output, fault):
 @over_the_wire
 def test_command_that_was_lost_until_the_watchdog_expired_does_not_resume(bench, output):
     bench.device.set(12.0)
-    bench.base.clock.sleep(0.95)
+    bench.clock.sleep(0.95)
     bench.server.lose_next = b"t601823002001"
     bench.device.set(3.0)
     assert bench.server.lose_next == b""
@@ -572,7 +572,7 @@ def test_power_that_was_dropped_never_comes_back(calls):
             before = len(load.applied)
             with suppress(DeviceError):
                 if call == "sleep":
-                    bench.base.clock.sleep(value)
+                    bench.clock.sleep(value)
                 elif call in ("connect", "recover"):
                     supply.close()
                     supply = bench.connect(getattr(RoboteqSupply, call))
@@ -596,7 +596,7 @@ def test_other_channel_that_someone_drove_is_not_resumed(bench):
     bench.instrument.write_object(0x2000, 700, 2)
     bench.device.set(6.0)
     assert bench.instrument.read_object(0x2101, 2) == 700
-    bench.base.clock.sleep(2.0)
+    bench.clock.sleep(2.0)
     commands = [request[13:] for request in bench.requests if request.startswith(b"t601823002002")]
     assert commands == [b"00000000\r"]
     bench.device.set(3.0)
@@ -617,7 +617,7 @@ def test_output_is_zero_after_connecting_to_a_device_that_drives(bench):
 def test_connecting_after_a_silence_resumes_nothing(bench):
     bench.device.set(6.0)
     bench.device.close()
-    bench.base.clock.sleep(10.0)
+    bench.clock.sleep(10.0)
     bench.instrument.world.advance()
     applied = len(bench.plant.applied)
     bench.connect().close()
@@ -628,9 +628,9 @@ def test_connecting_after_a_silence_resumes_nothing(bench):
 def test_closing_while_the_output_is_on_leaves_it_to_the_watchdog(bench):
     bench.device.set(6.0)
     bench.device.close()
-    bench.base.clock.sleep(WATCHDOG - 0.1)
+    bench.clock.sleep(WATCHDOG - 0.1)
     assert bench.instrument.power > 0
-    bench.base.clock.sleep(0.2)
+    bench.clock.sleep(0.2)
     assert bench.instrument.power == 0
 
 

@@ -185,13 +185,13 @@ def test_one_request_a_reading(bench):
 def test_after_a_pause_the_filter_is_looked_at_once_and_costs_a_measurement_no_time(bench):
     cell = bench.cell(samples=3)
     for pause, looks in ((0.29, 0), (0.31, 1), (2.0, 1)):
-        bench.base.clock.sleep(pause)
+        bench.clock.sleep(pause)
         bench.tap.sent.clear()
-        begin = bench.base.clock.now()
+        begin = bench.clock.now()
         cell.measure()
         assert sum(frame in LOOK_AT_FILTER for frame in bench.tap.sent) == looks
         assert len(bench.tap.sent) == 3 + looks
-        assert bench.base.clock.now() - begin == pytest.approx(0.25 + 23 * 10 / 115200)
+        assert bench.clock.now() - begin == pytest.approx(0.25 + 23 * 10 / 115200)
 
 
 def test_a_look_at_the_filter_leaves_the_noise_as_it_was():
@@ -200,12 +200,12 @@ def test_a_look_at_the_filter_leaves_the_noise_as_it_was():
         bench = Bench(noise=0.1)
         record = []
         for _ in range(10):
-            bench.base.clock.sleep(0.1)
+            bench.clock.sleep(0.1)
             record += bench.instrument.read_registers(0x3500, 5)
             for _ in range(looks):
-                bench.base.clock.sleep(0.01)
+                bench.clock.sleep(0.01)
                 assert bench.instrument.read_registers(0x2106, 2) == [0, 3]
-            bench.base.clock.sleep(0.05 - 0.01 * looks)
+            bench.clock.sleep(0.05 - 0.01 * looks)
         records.append(record)
         protocol_emulated.unregister("load")
     assert records[0] == records[1]
@@ -236,9 +236,9 @@ def test_the_pause_between_frames(bench, settings, pause):
             with pytest.raises(DeviceError, match="illegal data address"):
                 cell.glance()
             bench.bank.alter = lambda _, words: words
-        begin = bench.base.clock.now()
+        begin = bench.clock.now()
         cell.glance()
-        assert bench.base.clock.now() - begin == pytest.approx(pause + wire)
+        assert bench.clock.now() - begin == pytest.approx(pause + wire)
 
 
 @each_case(
@@ -247,16 +247,16 @@ def test_the_pause_between_frames(bench, settings, pause):
 )
 def test_the_interval_of_a_measurement(bench, settings, interval):
     cell = bench.cell(samples=4, **settings)
-    begin = bench.base.clock.now()
+    begin = bench.clock.now()
     cell.measure()
-    assert bench.base.clock.now() - begin == pytest.approx(3 * interval, abs=0.01)
+    assert bench.clock.now() - begin == pytest.approx(3 * interval, abs=0.01)
 
 
 def test_no_interval_is_as_fast_as_the_line(bench):
     cell = bench.cell(samples=4, interval=0.0)
-    begin = bench.base.clock.now()
+    begin = bench.clock.now()
     cell.measure()
-    assert bench.base.clock.now() - begin < 0.02
+    assert bench.clock.now() - begin < 0.02
 
 
 # Other lines
@@ -386,7 +386,7 @@ def test_any_decimal_point_agrees(decimals, force):
 def test_a_load_that_moves_does_not_make_a_wrong_device(bench):
     bench.put(10.0)
     bench.instrument._force = lambda: 10.0 + 8.0 * math.sin(30 * bench.world.time)
-    bench.base.clock.sleep(1.0)
+    bench.clock.sleep(1.0)
     for _ in range(20):
         bench.cell().close()
 
@@ -420,12 +420,12 @@ def test_a_setting_that_is_not_taken_is_noticed(bench):
 
 
 def test_another_address_is_silent(bench):
-    begin = bench.base.clock.now()
+    begin = bench.clock.now()
     with pytest.raises(
         DeviceConnectionError, match=r"no good reply within 0\.2 s at emulated://load, address 2, after 3"
     ):
         bench.cell(address=2)
-    assert bench.base.clock.now() - begin == pytest.approx(0.7, abs=0.01)  # three requests, and two short silences
+    assert bench.clock.now() - begin == pytest.approx(0.7, abs=0.01)  # three requests, and two short silences
 
 
 # Bad lines
@@ -630,10 +630,10 @@ def test_a_command_without_effect_is_noticed(bench, action, message):
 def test_taring_does_not_wait_for_ever(bench):
     cell = bench.cell(still_timeout=0.5)
     bench.instrument._force = lambda: math.sin(10 * bench.world.time)
-    begin = bench.base.clock.now()
+    begin = bench.clock.now()
     with pytest.raises(DeviceError, match=r"not still within 0\.5 s"):
         cell.tare()
-    assert bench.base.clock.now() - begin == pytest.approx(0.5, abs=0.1)
+    assert bench.clock.now() - begin == pytest.approx(0.5, abs=0.1)
 
 
 def test_a_converter_that_stands_still(bench):
@@ -641,21 +641,21 @@ def test_a_converter_that_stands_still(bench):
     bench.instrument.power_cycle()
     cell = bench.cell(stale_after=10.0, samples=1)
     bench.instrument.frozen = True
-    begin = bench.base.clock.now()
+    begin = bench.clock.now()
 
     def watch() -> None:
         for _ in range(100):
-            bench.base.clock.sleep(1.0)
+            bench.clock.sleep(1.0)
             cell.glance()
 
     stale = r"readings are stale: the converter has stood at -?\d+ for 1\d"
     with pytest.raises(DeviceError, match=stale):
         watch()
-    assert 20.0 <= bench.base.clock.now() - begin <= 23.0
+    assert 20.0 <= bench.clock.now() - begin <= 23.0
     with pytest.raises(DeviceError, match=stale):
         cell.glance()
     bench.instrument.frozen = False
-    bench.base.clock.sleep(1.0)
+    bench.clock.sleep(1.0)
     cell.glance()
 
 
@@ -666,7 +666,7 @@ def test_a_quiet_load_is_not_stale(bench):
     bench.put(5.0)
     readings = []
     for _ in range(50):
-        bench.base.clock.sleep(1.0)
+        bench.clock.sleep(1.0)
         readings.append(cell.glance()["load_force"])
     assert set(readings) == {5.0}
 
@@ -675,7 +675,7 @@ def test_watching_for_stale_readings_can_be_left_out(bench):
     cell = bench.cell(stale_after=0.0)
     bench.instrument.frozen = True
     for _ in range(5):
-        bench.base.clock.sleep(1e5)
+        bench.clock.sleep(1e5)
         cell.glance()
 
 
@@ -748,7 +748,7 @@ def test_after_a_lost_reply_a_request_like_no_other_brings_the_line_into_step(be
     for _ in range(5):
         times, lose = [], Once(lambda _: b"")
         bench.tap.sent.clear()
-        bench.tap.alter = lambda reply, times=times, lose=lose: times.append(bench.base.clock.now()) or lose(reply)
+        bench.tap.alter = lambda reply, times=times, lose=lose: times.append(bench.clock.now()) or lose(reply)
         cell.glance()
         block, echo, again, look = bench.tap.sent
         assert again == block
@@ -771,7 +771,7 @@ def test_a_line_that_was_lost_is_not_asked(bench):
         cell.glance()
     with pytest.raises(DeviceConnectionError, match="was lost; open it again"):
         cell.self_check()
-    protocol_emulated.register("load", bench.tap, bench.base.clock)
+    protocol_emulated.register("load", bench.tap, bench.clock)
     cell.glance()
 
 
@@ -791,9 +791,9 @@ def test_own_check_reads_the_filter_and_looks_at_the_converter(bench):
     bench.instrument.power_cycle()
     cell = bench.cell()
     bench.tap.sent.clear()
-    begin = bench.base.clock.now()
+    begin = bench.clock.now()
     filtered, converter = cell.self_check()
-    assert bench.base.clock.now() - begin == pytest.approx(5 * 0.05, abs=0.03)
+    assert bench.clock.now() - begin == pytest.approx(5 * 0.05, abs=0.03)
     assert (filtered.text, filtered.advice) == ("3 in the instrument", "")
     assert converter.text.endswith("in 5 readings")
     assert converter.advice == ""

@@ -515,7 +515,7 @@ def test_one_sample_needs_no_burst(bench):
     sensor = bench.sensor(samples=1)
     assert bench.t7.read_value(9000) == 0
     assert sensor.measure()["psd_position"] == pytest.approx(10e-6, abs=1e-8)
-    assert bench.base.clock.now() == 0.0
+    assert bench.clock.now() == 0.0
 
 
 @each_case("channels", [(0, 1), (1, 0), (5, 2)])
@@ -553,7 +553,7 @@ def test_a_setting_that_is_not_taken_is_noticed(bench):
         ModbusTcpServer(Altered(bench.t7, alter)) as server,
         pytest.raises(DeviceError, match="AIN0_RESOLUTION_INDEX reads back 5 after 4"),
     ):
-        T7PositionSensor.connect("psd", Settings(port=server.address), bench.base.clock)
+        T7PositionSensor.connect("psd", Settings(port=server.address), bench.clock)
 
 
 # Wrong devices
@@ -577,7 +577,7 @@ def test_a_wrong_device_is_refused(bench, alter, message):
         ModbusTcpServer(Altered(bench.t7, alter)) as server,
         pytest.raises(DeviceConnectionError, match=message) as raised,
     ):
-        T7PositionSensor.connect("psd", Settings(port=server.address), bench.base.clock)
+        T7PositionSensor.connect("psd", Settings(port=server.address), bench.clock)
     assert server.address in str(raised.value)
     assert bench.t7.flash_writes == bench.t7.read_value(2850) == 0
 
@@ -590,7 +590,7 @@ def test_a_device_without_test_registers_is_refused(bench):
         ModbusTcpServer(Altered(bench.t7, refuse)) as server,
         pytest.raises(DeviceConnectionError, match=r"is not a LabJack T-series.*exception 2"),
     ):
-        T7PositionSensor.connect("psd", Settings(port=server.address), bench.base.clock)
+        T7PositionSensor.connect("psd", Settings(port=server.address), bench.clock)
 
 
 # Broken lines
@@ -618,9 +618,9 @@ def test_a_silent_host_costs_one_timeout():
 def test_a_lost_connection_is_masked_and_counted(bench):
     bench.wire()
     lost = ModbusTcpInstrument(bench.t7)
-    address = register("t7-lost", lost, bench.base.clock)
-    supply = T7HighVoltageSupply.connect("hv", SupplySettings(port=address, line=5), bench.base.clock)
-    psd = T7PositionSensor.connect("psd", Settings(port=address, channels=(3,)), bench.base.clock)
+    address = register("t7-lost", lost, bench.clock)
+    supply = T7HighVoltageSupply.connect("hv", SupplySettings(port=address, line=5), bench.clock)
+    psd = T7PositionSensor.connect("psd", Settings(port=address, channels=(3,)), bench.clock)
     calls = psd.measure, psd.glance, supply.measure, supply.glance, lambda: supply.set(10.0), lambda: supply.set(5.0)
     for count, call in enumerate(calls, 1):
         lost.end_connections()
@@ -643,14 +643,14 @@ class TestUseByAnother:
     def test_one_that_answers_keeps_its_instrument(self, bench, monkeypatch):
         fan = bench.switch(line=6)
         with monkeypatch.context() as patch:
-            sleep = bench.base.clock.sleep
+            sleep = bench.clock.sleep
 
             def go_on(seconds):
                 sleep(seconds)
-                if bench.base.clock.now() > 2.0:
+                if bench.clock.now() > 2.0:
                     fan.glance()
 
-            patch.setattr(bench.base.clock, "sleep", go_on)
+            patch.setattr(bench.clock, "sleep", go_on)
             with pytest.raises(DeviceError, match="in use by another program, on this or another computer"):
                 self.another(bench, monkeypatch)
         fan.set(1.0)
@@ -658,9 +658,9 @@ class TestUseByAnother:
 
     def test_one_that_died_is_not_waited_for_for_long(self, bench, monkeypatch):
         fan = bench.switch(line=6)
-        before = bench.base.clock.now()
+        before = bench.clock.now()
         self.another(bench, monkeypatch).measure()
-        assert 2.0 < bench.base.clock.now() - before < 10.0
+        assert 2.0 < bench.clock.now() - before < 10.0
         with pytest.raises(DeviceError, match="another program has taken the LabJack T7"):
             fan.glance()
 
@@ -670,9 +670,9 @@ class TestUseByAnother:
         # The other device uses it still.
         psd.measure()
         psd.close()
-        before = bench.base.clock.now()
+        before = bench.clock.now()
         self.another(bench, monkeypatch)
-        assert bench.base.clock.now() - before < 1.0
+        assert bench.clock.now() - before < 1.0
 
 
 def test_another_program_that_takes_the_instrument_is_told(bench):
@@ -758,7 +758,7 @@ def test_an_invalid_conversion_is_no_reading(bench, words):
         return words if address == 7600 else actual
 
     with ModbusTcpServer(Altered(bench.t7, alter)) as server:
-        sensor = T7PositionSensor.connect("psd", Settings(port=server.address), bench.base.clock)
+        sensor = T7PositionSensor.connect("psd", Settings(port=server.address), bench.clock)
         with pytest.raises(DeviceError, match="no valid conversion"):
             sensor.measure()
         sensor.close()
@@ -771,7 +771,7 @@ def test_a_failure_in_the_instrument_is_passed_on(bench):
         return words
 
     with ModbusTcpServer(Altered(bench.t7, alter)) as server:
-        sensor = T7PositionSensor.connect("psd", Settings(port=server.address), bench.base.clock)
+        sensor = T7PositionSensor.connect("psd", Settings(port=server.address), bench.clock)
         with pytest.raises(DeviceError, match=r"exception 4.*reading register 7000"):
             sensor.measure()
         sensor.close()
@@ -831,7 +831,7 @@ def recorded_supply(bench) -> Iterator[tuple[T7HighVoltageSupply, Recorded]]:
     recorded = Recorded(bench.t7)
     with ModbusTcpServer(recorded) as server:
         yield (
-            T7HighVoltageSupply.connect("hv", SupplySettings(port=server.address, line=5), bench.base.clock),
+            T7HighVoltageSupply.connect("hv", SupplySettings(port=server.address, line=5), bench.clock),
             recorded,
         )
 
@@ -851,12 +851,12 @@ def test_requests_of_a_high_voltage_supply(bench):
         assert asked(lambda: supply.set(11.0)) == [send]
         assert asked(supply.glance) == [look, OWNER]
         assert asked(supply.measure) == [("read", 7000, 6), ("read", 7300, 6), ("read", 7600, 6), OWNER]
-        bench.base.clock.sleep(0.099)
+        bench.clock.sleep(0.099)
         assert asked(lambda: supply.set(12.0)) == [send]
-        bench.base.clock.sleep(0.001)
+        bench.clock.sleep(0.001)
         assert asked(lambda: supply.set(13.0)) == [look, OWNER, send]
         assert asked(lambda: supply.set(0.1)) == [send]
-        bench.base.clock.sleep(0.05)
+        bench.clock.sleep(0.05)
         assert asked(supply.safe) == [send, *enable[:-1], look]
         supply.close()
 
@@ -867,7 +867,7 @@ def test_a_loop_that_looks_sends_in_one_request(bench):
         supply.set(0.0)
         recorded.requests.clear()
         for step in range(200):
-            bench.base.clock.sleep(0.01)
+            bench.clock.sleep(0.01)
             supply.glance()
             supply.set(0.1 * step)
         assert len([entry for entry in recorded.requests if entry != OWNER]) == 400
@@ -878,7 +878,7 @@ def test_connect_switches_off_and_guards_the_enable_line(bench):
     amplifier = bench.wire()
     bench.t7.write_value(30000, 2.0)
     bench.t7.write_value(2005, 1)
-    bench.base.clock.sleep(1.0)
+    bench.clock.sleep(1.0)
     bench.world.advance()
     assert amplifier.voltage == pytest.approx(40.0, abs=0.02)
     supply = bench.supply(watchdog=2)
@@ -907,7 +907,7 @@ def test_an_amplifier_may_take_its_time_to_go_on(bench, looks):
     answers = iter([0.0] * looks)
     bench.t7._sources[2] = lambda: next(answers, 5.0)
     supply.set(10.0)
-    assert bench.base.clock.now() == pytest.approx(0.01 * looks)
+    assert bench.clock.now() == pytest.approx(0.01 * looks)
     assert bench.t7.tdac_volts(0) == pytest.approx(0.5, abs=1e-3)
 
 
@@ -970,7 +970,7 @@ def test_an_output_may_take_its_time_to_discharge(bench):
     answers = iter([1.8, 1.0, 0.5, 0.1])
     bench.t7._sources[0] = lambda: next(answers, 0.0)
     supply.safe()
-    assert bench.base.clock.now() == pytest.approx(0.04)
+    assert bench.clock.now() == pytest.approx(0.04)
 
 
 WENT_OFF = r"^hv: the amplifier went off by itself, while DIO5, its enable line, "
@@ -1010,13 +1010,13 @@ def test_safe_tries_everything_and_tells_the_first_failure(bench, refused):
 
     instrument = Refusing(bench.t7, lambda _, words: words)
     with ModbusTcpServer(instrument) as server:
-        supply = T7HighVoltageSupply.connect("hv", SupplySettings(port=server.address, line=5), bench.base.clock)
+        supply = T7HighVoltageSupply.connect("hv", SupplySettings(port=server.address, line=5), bench.clock)
         supply.set(30.0)
-        bench.base.clock.sleep(0.1)
+        bench.clock.sleep(0.1)
         instrument.refusing = True
         with pytest.raises(DeviceError, match=rf"hv: Modbus exception 4 .* register {refused}"):
             supply.safe()
-        bench.base.clock.sleep(0.1)
+        bench.clock.sleep(0.1)
         bench.world.advance()
         assert amplifier.voltage == pytest.approx(0.0, abs=1e-6)
         assert supply.setpoint == 0.0
@@ -1033,7 +1033,7 @@ def test_closing_a_high_voltage_supply(bench):
     supply.set(30.0)
     supply.close()
     assert bench.t7.dio_level(5)
-    bench.base.clock.sleep(2.0)
+    bench.clock.sleep(2.0)
     bench.world.advance()
     assert not bench.t7.dio_level(5)
 
@@ -1074,7 +1074,7 @@ def test_a_watchdog_that_is_set_up_already_is_not_written(bench):
     bench.switch().set(1.0)  # as after a host that died, which is asked first
     recorded = Recorded(bench.t7)
     with ModbusTcpServer(recorded) as server:
-        switch = T7Switch.connect("fan", SwitchSettings(port=server.address, line=5), bench.base.clock)
+        switch = T7Switch.connect("fan", SwitchSettings(port=server.address, line=5), bench.clock)
         assert [address for kind, address, _ in recorded.requests if kind == "write"] == [OWNER[1], OWNER[1], 2005]
         switch.close()
 
@@ -1095,7 +1095,7 @@ def test_a_watchdog_is_off_while_its_settings_change_and_each_is_written_by_itse
     bench.switch(line=5, watchdog=7)
     recorded = Recorded(bench.t7)
     with ModbusTcpServer(recorded) as server:
-        switch = T7Switch.connect("fan", SwitchSettings(port=server.address, line=5, watchdog=9), bench.base.clock)
+        switch = T7Switch.connect("fan", SwitchSettings(port=server.address, line=5, watchdog=9), bench.clock)
         writes = [entry for entry in recorded.requests if entry[0] == "write" and entry[1] >= 61600]
         assert writes == [("write", 61600, 2), ("write", 61604, 2), ("write", 61600, 2)]
         switch.close()
@@ -1127,7 +1127,7 @@ def test_a_setting_of_the_watchdog_that_is_not_taken_leaves_it_running_for_other
         ModbusTcpServer(Altered(bench.t7, alter)) as server,
         pytest.raises(DeviceError, match="fan: WATCHDOG_DIO_INHIBIT_DEFAULT reads back 0 after 8"),
     ):
-        T7Switch.connect("fan", SwitchSettings(port=server.address, line=5), bench.base.clock)
+        T7Switch.connect("fan", SwitchSettings(port=server.address, line=5), bench.clock)
     assert bench.guarded() & 0b10
     assert bench.t7.deadline() < math.inf
 
@@ -1139,7 +1139,7 @@ def test_closing_the_last_switch_that_is_off_disables_the_watchdog(bench):
     pump.close()
     assert bench.t7.read_value(61600) == 0
     assert bench.guarded() == 0
-    bench.base.clock.sleep(100.0)
+    bench.clock.sleep(100.0)
     bench.t7.world.advance()
     assert not bench.t7.dio_level(5)
     assert not bench.t7.dio_level(6)
@@ -1150,7 +1150,7 @@ def test_closing_a_switch_keeps_the_watchdog_of_an_analog_output(bench):
         bench.t7.write_value(address, value)
     bench.t7.write_value(1000, 3.0)
     bench.switch(line=5, watchdog=60).close()
-    bench.base.clock.sleep(4.0)
+    bench.clock.sleep(4.0)
     bench.t7.world.advance()
     assert bench.t7.dac_volts(0) == 0.0
 
@@ -1159,7 +1159,7 @@ def test_the_message_of_the_watchdog_has_its_time(bench):
     switch = bench.switch(watchdog=60)
     bench.switch(line=6, watchdog=4)
     switch.set(1.0)
-    bench.base.clock.sleep(4.0)
+    bench.clock.sleep(4.0)
     with pytest.raises(DeviceError, match=r"fan: DIO5 is off .* no host communicated with it for 4 s"):
         switch.glance()
 
@@ -1172,7 +1172,7 @@ def test_a_line_that_does_not_go_off_is_told(bench, active_high, stuck):
     with ModbusTcpServer(Altered(bench.t7, alter)) as server:
         settings = SwitchSettings(port=server.address, line=5, active_high=active_high)
         with pytest.raises(DeviceError, match="fan: DIO5 is on right after it was switched off; check the wiring"):
-            T7Switch.connect("fan", settings, bench.base.clock)
+            T7Switch.connect("fan", settings, bench.clock)
 
 
 def test_a_line_that_does_not_go_on_is_told(bench):
@@ -1180,7 +1180,7 @@ def test_a_line_that_does_not_go_on_is_told(bench):
         return [words[0], words[1] & ~(1 << 5)] if address == 2800 else words
 
     with ModbusTcpServer(Altered(bench.t7, alter)) as server:
-        switch = T7Switch.connect("fan", SwitchSettings(port=server.address, line=5), bench.base.clock)
+        switch = T7Switch.connect("fan", SwitchSettings(port=server.address, line=5), bench.clock)
         with pytest.raises(DeviceError, match="fan: DIO5 is off right after it was switched on; check the wiring"):
             switch.set(1.0)
         switch.close()
@@ -1210,7 +1210,7 @@ def test_an_output_that_is_not_guarded_stays(bench):
     t7 = LabJackT7("fan", bench.server.address, 1.0)
     output = DigitalOutput("fan", t7, 9, active_high=True)
     output.switch(True)
-    bench.base.clock.sleep(1e4)
+    bench.clock.sleep(1e4)
     assert output.is_on
     before = bench.t7.read_registers(61630, 8)
     output.unguard()
@@ -1374,19 +1374,19 @@ def in_process(bench) -> Iterator[str]:
     """Return the address of the T7 in this process; its amplifier is wired, and AIN3 follows its voltage."""
     amplifier = bench.wire()
     bench.t7._sources[3] = lambda: amplifier.voltage / 10.0
-    address = register("t7-in-process", ModbusTcpInstrument(bench.t7), bench.base.clock)
+    address = register("t7-in-process", ModbusTcpInstrument(bench.t7), bench.clock)
     yield address
     for device in bench.devices:
         device.close()
-    bench.devices.device.clear()
+    bench.devices.clear()
     unregister("t7-in-process")
 
 
 def connected(bench, address, kind, **settings):
     device = kind.connect(
-        {T7HighVoltageSupply: "hv"}.get(kind, "psd"), kind.Settings(port=address, **settings), bench.base.clock
+        {T7HighVoltageSupply: "hv"}.get(kind, "psd"), kind.Settings(port=address, **settings), bench.clock
     )
-    bench.devices.device.append(device)
+    bench.devices.append(device)
     return device
 
 
@@ -1397,13 +1397,13 @@ def test_a_block_is_what_single_samples_are(bench, in_process):
     )
     supply.set(0.0)
     setpoints = np.linspace(-40.0, 40.0, 120)
-    begin = bench.base.clock.now()
+    begin = bench.clock.now()
     found = supply.play(setpoints, 1e-3, sensor)
     assert found.shape == (120, 1)
     # A sample is read before its set-point is sent, the amplifier lags by less than a period.
     np.testing.assert_allclose(found[2:, 0], setpoints[1:-1] / 10.0, atol=0.05)
     assert supply.setpoint == 40.0
-    assert 0.119 <= bench.base.clock.now() - begin <= 0.121
+    assert 0.119 <= bench.clock.now() - begin <= 0.121
     assert bench.t7.tdac_volts(0) == pytest.approx(2.0, abs=2e-3)
 
 
@@ -1445,7 +1445,7 @@ def test_a_block_looks_at_the_status_from_time_to_time(bench, in_process):
     supply.set(0.0)
     bench.t7._sources[2] = lambda: 0.0
     supply.play(np.zeros(2), 1e-3, sensor)
-    bench.base.clock.sleep(0.1)
+    bench.clock.sleep(0.1)
     with pytest.raises(DeviceError, match="went off by itself"):
         supply.play(np.zeros(2), 1e-3, sensor)
 
@@ -1524,11 +1524,11 @@ class Spoiling(ModbusTcpInstrument):
 def spoiling(bench) -> Iterator[Spoiling]:
     bench.wire()
     spoiling = Spoiling(bench.t7)
-    register("t7-spoiling", spoiling, bench.base.clock)
+    register("t7-spoiling", spoiling, bench.clock)
     yield spoiling
     for device in bench.devices:
         device.close()
-    bench.devices.device.clear()
+    bench.devices.clear()
     unregister("t7-spoiling")
 
 

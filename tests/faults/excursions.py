@@ -1,7 +1,6 @@
 """A short excursion of every actuator of a rig, with readings all along."""
 
-from bench.devices import Dwell
-from bench.protocol import ProtocolParameters, Step, protocol
+from bench.protocol import Dwell, ProtocolParameters, Step, protocol
 
 COUNT, DWELL = 16, 2.0
 

@@ -44,10 +44,10 @@ from matrix import HERE, RIGS, _safe
 from rich.console import Console
 
 from bench.base import BenchError
+from bench.execution import Run, carry_out
 from bench.protocol import find_protocol
 from bench.record import FILE_NAME, Journal, Record, recover
 from bench.record.store import Store
-from bench.run import Run, carry_out
 
 FAULTS = ("full", "crowded", "freed", "eio", "removed", "read-only", "locked", "page")
 MOUNTED = {"full", "crowded", "freed", "read-only"}

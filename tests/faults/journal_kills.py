@@ -21,10 +21,10 @@ from pathlib import Path
 
 from rich.console import Console
 
-import bench.run.run
+import bench.execution.context
+from bench.execution import Run, carry_out
 from bench.protocol import find_protocol
 from bench.record import Journal, Record
-from bench.run import Run, carry_out
 
 HERE = Path(__file__).parent
 RIGS = ("vo2", "sma", "hybrid")
@@ -85,7 +85,7 @@ def _run(rig, clock, folder, writer):
             super().event(event)
             os.write(writer, b"e")
 
-    bench.run.run.Journal = Telling
+    bench.execution.context.Journal = Telling
     run = Run(
         protocol=find_protocol(f"{HERE / 'excursions.py'}:excursion-{rig}"), settings={}, seed=0, clock=clock,
         rig=rig, folder=folder, recording=False,

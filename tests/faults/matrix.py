@@ -34,10 +34,10 @@ from rich.console import Console
 
 from bench.base import BenchError, Workers
 from bench.base.clock import VIRTUAL_EPOCH
+from bench.execution import Run, carry_out
 from bench.protocol import find_protocol
 from bench.record import Record
 from bench.rig import load_rig
-from bench.run import Run, carry_out
 
 HERE = Path(__file__).parent
 RIGS = ("vo2", "sma", "hybrid")

@@ -10,8 +10,8 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
+from bench.execution.guardian.remote import GuardedRig, RemoteStation
 from bench.rig import attach, load_rig
-from bench.run.guardian.remote import GuardedRig, RemoteStation
 from sim_devices.serving.process import EmulatedRig
 
 LONG = 60.0
@@ -65,7 +65,7 @@ def rescuer_of(guardian: int) -> int:
 
 def _is_rescuer(process: int) -> bool:
     with suppress(OSError):
-        return b"bench.run.guardian.rescuer" in (Path("/proc") / str(process) / "cmdline").read_bytes()
+        return b"bench.execution.guardian.rescuer" in (Path("/proc") / str(process) / "cmdline").read_bytes()
     return False
 
 

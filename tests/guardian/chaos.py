@@ -19,13 +19,13 @@ from contextlib import suppress
 from pathlib import Path
 
 from bench.base import BenchError, LimitError
+from bench.execution.guardian import __main__ as program, process, remote
+from bench.execution.guardian.black_box import BlackBox
+from bench.execution.guardian.channel import Channel
+from bench.execution.guardian.lines import LineThreads
+from bench.execution.guardian.process import Guardian
+from bench.execution.station.core import State, StationCore
 from bench.rig import ControlClient, Look, attach, load_rig, read_endpoints
-from bench.run.guardian import __main__ as program, process, remote
-from bench.run.guardian.black_box import BlackBox
-from bench.run.guardian.channel import Channel
-from bench.run.guardian.lines import LineThreads
-from bench.run.guardian.process import Guardian
-from bench.run.station.core import State, StationCore
 
 LEASE = 0.5
 LONGEST = 30.0

@@ -11,8 +11,8 @@ import sys
 import time
 from pathlib import Path
 
+from bench.execution.guardian.remote import GuardedRig, RemoteStation
 from bench.rig import attach, load_rig
-from bench.run.guardian.remote import GuardedRig, RemoteStation
 
 endpoints = Path(sys.argv[1])
 guarded = GuardedRig(load_rig("vo2"), "vo2", {}, endpoints, 0, "a test")

@@ -199,7 +199,7 @@ def find_guardian(process: int) -> int:
     """Return the guardian that a bench has started."""
     for child in children(process):
         with suppress(OSError):
-            if b"bench.run.guardian" in (Path("/proc") / str(child) / "cmdline").read_bytes():
+            if b"bench.execution.guardian" in (Path("/proc") / str(child) / "cmdline").read_bytes():
                 return child
     raise AssertionError("the bench has no guardian")
 

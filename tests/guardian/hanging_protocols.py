@@ -6,8 +6,7 @@ import os
 from collections.abc import Generator
 from pathlib import Path
 
-from bench.devices import Dwell
-from bench.protocol import Message, Messages, Note, ProtocolParameters, Reading, Step, parameter, protocol
+from bench.protocol import Dwell, Message, Messages, Note, ProtocolParameters, Reading, Step, parameter, protocol
 
 
 class Parameters(ProtocolParameters):

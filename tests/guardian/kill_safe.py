@@ -26,8 +26,8 @@ from dataclasses import dataclass
 
 from guarded_run import SETPOINTS, GuardedRun, hear_signals, outputs_on, start_busy
 
+from bench.execution.guardian.rescuer import SILENCE
 from bench.rig import load_rig
-from bench.run.guardian.rescuer import SILENCE
 from sim_devices.serving.process import EmulatedRig, serve
 
 DEATH, PROMISE, PATIENCE = 0.2, 5.0, 4.0

@@ -10,7 +10,7 @@ from cases import cases
 from hypothesis import given, settings, strategies as st
 
 from bench.base import BenchError, DeviceConnectionError, DeviceError, errors
-from bench.run.guardian.channel import Channel, ChannelError, to_error, to_message
+from bench.execution.guardian.channel import Channel, ChannelError, to_error, to_message
 
 LONG = 60.0
 """Wall-clock time that a busy machine may take, s."""

@@ -9,8 +9,8 @@ import pytest
 from benches import IN_TIME, LONG
 from chaos import LEASE, METHODS
 
+from bench.execution.guardian.channel import LONGEST_ANSWER
 from bench.rig import load_rig
-from bench.run.guardian.channel import LONGEST_ANSWER
 
 RECONNECT = load_rig("vo2").safety.reconnect
 

@@ -13,7 +13,7 @@ def test_a_guardian_of_hardware_loads_nothing_heavy(rig):
     """It has to start fast, stay small, and do no computing beside its lines."""
     code = (
         "import sys\n"
-        "import bench.run.guardian.__main__\n"
+        "import bench.execution.guardian.__main__\n"
         "from bench.rig.file import load_rig\n"
         f"load_rig({rig!r})\n"
         f"print(*sorted(set({HEAVY!r}) & set(sys.modules)))\n"

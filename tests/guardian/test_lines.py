@@ -9,7 +9,7 @@ from cases import cases
 
 from bench.base import DeviceConnectionError, DeviceRestartedError, VirtualClock, WallClock
 from bench.devices import Device
-from bench.run.guardian.lines import BENCH, LOOK, SAFE, LineThreads
+from bench.execution.guardian.lines import BENCH, LOOK, SAFE, LineThreads
 
 LONG = 60.0
 """Wall-clock time that a busy machine may take, s."""

@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from bench.run.guardian.rescuer import SILENCE, is_needed
+from bench.execution.guardian.rescuer import SILENCE, is_needed
 
 
 class Signs:
@@ -56,7 +56,7 @@ def test_one_that_is_released_before_it_is_ready_does_nothing(tmp_path):
     """As by a guardian that is refused the rig: what it writes comes at once."""
     report = tmp_path / "report.json"
     content = {"rig": "vo2", "overrides": {}, "attach": None, "report": str(report), "guardian": 1}
-    command = [sys.executable, "-P", "-m", "bench.run.guardian.rescuer"]
+    command = [sys.executable, "-P", "-m", "bench.execution.guardian.rescuer"]
     done = subprocess.run(command, input=json.dumps(content).encode() + b"\n.!", check=False)
     assert done.returncode == 0
     assert json.loads(report.read_text())["devices"] == {}

@@ -6,9 +6,9 @@ import pytest
 from rich.console import Console
 
 from bench.base import ConfigurationError
+from bench.execution import Run, carry_out
 from bench.protocol import Note, Phase, Reading, find_protocol
 from bench.rig import load_rig
-from bench.run import Run, carry_out
 
 
 def record_run(folder, protocol, rig, settings, overrides=None):

@@ -9,8 +9,8 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "bench"))
 from heater_laboratory import RIG
 
 from bench.base import VirtualClock
+from bench.execution.station.local import LocalStation
 from bench.rig import Rig, load_rig
-from bench.run.station.local import LocalStation
 
 
 @pytest.fixture

@@ -8,8 +8,8 @@ from hypothesis import settings, strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from bench.base import DeviceError, GuardianError, InterlockError
+from bench.execution.station.core import State, StationCore
 from bench.rig import Interlock, InterlockWatch, Level
-from bench.run.station.core import State, StationCore
 
 INTERVAL = 0.2
 SECONDS = 2.0

@@ -13,9 +13,9 @@ from bench.base import (
     LimitError,
     VirtualClock,
 )
+from bench.execution.station.local import LocalStation
+from bench.execution.station.reconnection import lines_of, longest_away
 from bench.rig import Look, Rig, load_rig
-from bench.run.station.local import LocalStation
-from bench.run.station.reconnection import lines_of, longest_away
 
 
 class Later(VirtualClock):

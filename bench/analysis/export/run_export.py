@@ -14,8 +14,8 @@ from bench.analysis.export.bluesky_documents import write_documents
 from bench.analysis.export.typed_tables import TypedTable, metadata_of, typed_tables
 from bench.analysis.tables.data import write_blocks
 from bench.base import ConfigurationError, DataError, json_text, needed_for, write_json_file
+from bench.execution import RECORDING_NAME
 from bench.record import Record
-from bench.run import RECORDING_NAME
 
 FORMATS = ("csv", "parquet", "bluesky", "rrd", "png")
 """What a run can be exported to."""

@@ -36,10 +36,10 @@ from bench.batch.campaign.tasks import (
     identification_options,
 )
 from bench.batch.study import Study
+from bench.execution import check_before_moving
 from bench.models import find_model, identifiable_models
 from bench.protocol import Plan, ProtocolDefinition, find_protocol, plan
 from bench.rig import RigFile
-from bench.run import check_before_moving
 
 _LONGEST_NAME = 120
 _UNSAFE = re.compile(r"[^A-Za-z0-9_.=+,-]+")

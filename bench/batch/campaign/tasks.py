@@ -17,9 +17,9 @@ from bench.base import AbortError, BenchError, DataError, Workers, parse_json, r
 from bench.batch.campaign.sources import PROGRAMS, PROGRAMS_AND_RIGS, digest
 from bench.batch.campaign.study_tables import FILE_NAME as STUDY_NAME, write_study
 from bench.batch.study import Campaign, Study
+from bench.execution import Run, carry_out
 from bench.protocol import find_protocol
 from bench.record import FILE_NAME as JOURNAL_NAME, Record
-from bench.run import Run, carry_out
 
 DONE_NAME = "campaign.json"
 """In the folder of each task that is done: what it was, and its results."""

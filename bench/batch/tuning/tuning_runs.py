@@ -22,7 +22,7 @@ from bench.rig import load_rig
 
 if TYPE_CHECKING:
     from bench.base import Pending, Workers
-    from bench.run import RunResult
+    from bench.execution import RunResult
 
 _AS_IDENTIFIED = "as-identified"
 _TARGETS = "target"

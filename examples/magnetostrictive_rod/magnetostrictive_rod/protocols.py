@@ -4,9 +4,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from bench.devices import Actuator, Dwell, Signal
-from bench.protocol import Messages, Note, Phase, ProtocolParameters, Step, from_slot, parameter, protocol, unit_of
-from bench.rig import Slots
+from bench.devices import Actuator, Signal
+from bench.protocol import (
+    Dwell,
+    Messages,
+    Note,
+    Phase,
+    ProtocolParameters,
+    Slots,
+    Step,
+    from_slot,
+    parameter,
+    protocol,
+    unit_of,
+)
 
 
 class Parameters(ProtocolParameters):

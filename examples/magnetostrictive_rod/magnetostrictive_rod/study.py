@@ -8,7 +8,7 @@ from typing import Any
 from bench.analysis import errors_json, identify_file
 from bench.base import Pending
 from bench.batch import Campaign, ResultTable, Study, StudyResult, reached_targets
-from bench.run import RunResult
+from bench.execution import RunResult
 
 MODELS: Mapping[str, Mapping[str, Any]] = {
     "quadratic-play": {},

@@ -5,12 +5,12 @@ import pytest
 
 from bench.base import ConfigurationError, DeviceError, Interrupts, LimitError, VirtualClock
 from bench.control import NotchLoop, Playback, Trace
+from bench.execution.context import trace_signals
+from bench.execution.engine import Engine
+from bench.execution.station.local import LocalStation
 from bench.protocol import FixedRate, ProtocolParameters, find_protocol, protocol
 from bench.record import FILE_NAME, Journal, Record
 from bench.rig import Rig, load_rig
-from bench.run.context import trace_signals
-from bench.run.engine import Engine
-from bench.run.station.local import LocalStation
 
 RATE = 20e3
 DEFLECTION = "displacement_position"

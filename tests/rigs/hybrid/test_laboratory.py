@@ -50,7 +50,7 @@ def look(rig, until):
 class TestWitnessed:
     def drive(self, name, seed=3):
         with rig(name, seed, sensors="ideal") as bench:
-            bench.base.clock.sleep_until(1.0)
+            bench.clock.sleep_until(1.0)
             bench.devices["tec"].set(0.08)
             bench.devices["piezo"].set(20.0)
             look(bench, 40.0)
@@ -104,9 +104,9 @@ class TestNoise:
             for device, times in (("tec", tec), ("displacement", displacement)):
                 for _ in range(times):
                     bench.devices[device].glance()
-            bench.base.clock.sleep_until(3.0)
+            bench.clock.sleep_until(3.0)
             seen = [bench.devices[device].glance() for device in ("displacement", "base", "tip", "piezo")]
-            bench.base.clock.sleep_until(4.0)
+            bench.clock.sleep_until(4.0)
             plant = bench.laboratory.plant
             truth = plant.deflection, plant.base_temperature, plant.tip_temperature, plant.ambient_temperature
             return seen, bench.devices["tec"].glance(), truth
@@ -159,12 +159,12 @@ class TestAmplifier:
             lab, piezo = bench.laboratory, bench.devices["piezo"]
             for value in (25.0, -40.0, 40.0):
                 piezo.set(value)
-                bench.base.clock.sleep(0.01)
+                bench.clock.sleep(0.01)
                 assert piezo.glance()["piezo_voltage"] == pytest.approx(value, abs=0.3)
                 assert lab.plant.piezo_voltage == pytest.approx(value, rel=5e-3)
                 assert lab.t7.dio_level(ENABLE_LINE, pulled_down=True)
             piezo.safe()
-            bench.base.clock.sleep(0.01)
+            bench.clock.sleep(0.01)
             lab.world.advance()
             assert lab.plant.piezo_voltage == 0.0
             assert lab.t7.tdac_volts(0) == 0.0
@@ -174,7 +174,7 @@ class TestAmplifier:
     def test_a_silent_host_lets_the_line_fall(self, name):
         with rig(name) as bench:
             bench.devices["piezo"].set(30.0)
-            start = bench.base.clock.now()
+            start = bench.clock.now()
             wait(bench.laboratory, start + 0.9 * WATCHDOG)
             assert bench.laboratory.plant.piezo_voltage == pytest.approx(30.0, rel=5e-3)
             wait(bench.laboratory, start + 1.1 * WATCHDOG)
@@ -191,11 +191,11 @@ class TestCooler:
         with rig(name) as bench:
             with pytest.raises(LimitError, match=r"tec: set-point .* A is outside of -0.15 to 0.15 A"):
                 bench.devices["tec"].set(current)
-            bench.base.clock.sleep(1.0)
+            bench.clock.sleep(1.0)
             assert bench.glance()["tec_current"] == pytest.approx(0.0, abs=5e-3)
             assert bench.laboratory.plant.current == 0.0
             bench.devices["tec"].set(0.15)
-            bench.base.clock.sleep(1.0)
+            bench.clock.sleep(1.0)
             bench.glance()
             assert bench.laboratory.plant.current == pytest.approx(0.15)
 
@@ -279,8 +279,8 @@ class TestFaults:
             bench.devices["piezo"].set(10.0)
             look(bench, 7.9)
             bench.glance()
-            bench.base.clock.sleep_until(8.1)
-            for name, each in bench.devices.device.items():
+            bench.clock.sleep_until(8.1)
+            for name, each in bench.devices.items():
                 if name != device:
                     each.glance()
             with pytest.raises(DeviceError, match=words):
@@ -340,7 +340,7 @@ class TestOpening:
             second.devices["piezo"].set(20.0)
             second.devices["tec"].set(0.05)
             for bench in (first, second):
-                bench.base.clock.sleep_until(1.0)
+                bench.clock.sleep_until(1.0)
             assert first.glance()["piezo_voltage"] == pytest.approx(0.0, abs=0.3)
             assert second.glance()["piezo_voltage"] == pytest.approx(20.0, abs=0.3)
             assert first.laboratory.plant.current == 0.0
@@ -395,7 +395,7 @@ class TestWitness:
             bench.devices["piezo"].set(20.0)
             errors = []
             for k in range(1, 101):
-                bench.base.clock.sleep_until(0.5 * k)
+                bench.clock.sleep_until(0.5 * k)
                 bench.devices["tec"].glance()  # feeds its watchdog
                 seen = witness.glance()
                 assert seen == witness.measure() == {"witness_position": plant.deflection}

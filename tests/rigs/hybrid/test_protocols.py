@@ -14,12 +14,12 @@ from rich.console import Console
 from short_runs import all_messages
 
 from bench.base import ConfigurationError, ConvergenceError, DataError, VirtualClock
+from bench.execution import Run, carry_out, check_before_moving
 from bench.identification import ModelFile
 from bench.models import Polynomial, PrandtlIshlinskii
 from bench.protocol import Caution, FixedRate, Step, find_protocol, plan
 from bench.record import Record
 from bench.rig import Rig, load_rig
-from bench.run import Run, carry_out, check_before_moving
 from protocols.hybrid.control import APPROACH, REST, moves_of
 from rigs.hybrid.control import HybridController, OpenLoopHybrid, ThermalFeedback
 from rigs.hybrid.design import Design

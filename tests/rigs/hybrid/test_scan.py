@@ -20,7 +20,7 @@ def readings(*, scanned, then=None, **emulation):
         bench.devices["tec"].set(0.1)
         found = []
         for k in range(400):
-            bench.base.clock.sleep(0.0137)
+            bench.clock.sleep(0.0137)
             bench.devices["piezo"].set(10.0 * (k % 7) - 30.0)
             if k == 200 and then is not None:
                 then(laboratory)

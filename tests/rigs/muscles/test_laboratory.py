@@ -181,7 +181,7 @@ class TestOperator:
     def test_hangs_a_load_and_fastens_the_end(self, name):
         with rig(name) as bench:
             bench.laboratory.operate(LOAD, 2.0)
-            bench.base.clock.sleep(5.0)
+            bench.clock.sleep(5.0)
             hung = bench.measure()
             assert hung["load_cell_force"] == pytest.approx(2.0, abs=0.1)
             bench.laboratory.operate(STAGE, 0.0)
@@ -222,8 +222,8 @@ class TestFaults:
     def test_one_device_tells_of_it_after_its_time(self, fault, device, words):
         with closing(rig(fault=fault, fault_time=20.0)) as bench:
             look(bench, 15.0)
-            bench.base.clock.sleep_until(25.0)
-            for name, other in bench.devices.device.items():
+            bench.clock.sleep_until(25.0)
+            for name, other in bench.devices.items():
                 if name != device:
                     other.glance()
             with pytest.raises(DeviceError, match=words) as caught:
@@ -298,7 +298,7 @@ class TestPorts:
             first.laboratory.operate(LOAD, 2.0)
             second.devices["supply"].set(1.0)
             for bench in (first, second):
-                bench.base.clock.sleep_until(5.0)
+                bench.clock.sleep_until(5.0)
             ours, theirs = first.glance(), second.glance()
             assert ours["load_cell_force"] == pytest.approx(2.0, abs=0.5)
             assert theirs["load_cell_force"] == pytest.approx(0.0, abs=0.5)
@@ -312,9 +312,9 @@ class TestNoise:
             bench.laboratory.operate(LOAD, 2.0)
             for _ in range(asked_of_the_cell):
                 bench.devices["load_cell"].measure()
-            bench.base.clock.sleep_until(10.0)
+            bench.clock.sleep_until(10.0)
             position = bench.devices["wire_end"].measure()["wire_end_position"]
-            bench.base.clock.sleep_until(12.0)
+            bench.clock.sleep_until(12.0)
             return position, bench.devices["supply"].measure(), bench.devices["load_cell"].measure()
 
     def test_the_same_seed_gives_the_same_readings(self):

@@ -11,11 +11,11 @@ from typing import Any, Protocol
 from bench.base import AbortError, ConfigurationError, Interrupts
 from bench.control import Trace
 from bench.devices import Settled, Signal
+from bench.execution.station.interface import Station
 from bench.operator import ABORT, AT_A_PAUSE, NOBODY, NOTE, OFF, RESUME, SET, STEP, Question
 from bench.protocol import LATENESS, PARAMETER, TRACES, ParameterChange, Reading
 from bench.record import Event, Lateness, StepRecord
 from bench.rig import Look
-from bench.run.station.interface import Station
 
 TRACE_NAMES = tuple(signal.name for signal in TRACES)
 _TRACE_AND_LATENESS = (*TRACE_NAMES, LATENESS.name)

@@ -1,4 +1,4 @@
-"""Makes a rig safe when its guardian has died or hangs: `python -m bench.run.guardian.rescuer`.
+"""Makes a rig safe when its guardian has died or hangs: `python -m bench.execution.guardian.rescuer`.
 
 A guardian starts it before it opens a line, so that it has loaded what it needs by the time that it is needed. It
 opens no line as long as the guardian's signs of life come through a pipe, its standard input.
@@ -20,9 +20,9 @@ from pathlib import Path
 from typing import Any, cast
 
 from bench.base import ENDING, BenchError, parse_json
+from bench.execution.guardian.parent import SIGKILL, ParentProcess
+from bench.execution.guardian.start import start_module
 from bench.rig import SAFE, Rescued, load_rig, opened, rescue
-from bench.run.guardian.parent import SIGKILL, ParentProcess
-from bench.run.guardian.start import start_module
 
 SILENCE = 3.0
 """Silence of a guardian after which it counts as dead, s; it gives a sign of life twice a second."""
@@ -56,7 +56,7 @@ class Rescuer:
     """
 
     def __init__(self, content: dict[str, Any]) -> None:
-        self._process = start_module("bench.run.guardian.rescuer", stdin=subprocess.PIPE)
+        self._process = start_module("bench.execution.guardian.rescuer", stdin=subprocess.PIPE)
         assert self._process.stdin is not None
         self._pipe = self._process.stdin.fileno()
         self._last = float("-inf")

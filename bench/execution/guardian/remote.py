@@ -18,11 +18,11 @@ import numpy as np
 
 from bench.base import STACKS, AbortError, BenchError, Clock, GuardianError, Stopwatch, WallClock
 from bench.devices import DeviceDescription, Floats, Identity, Limits, Signal
+from bench.execution.guardian.channel import LONGEST_ANSWER, ChannelError, Message, to_error
+from bench.execution.guardian.rescuer import SILENCE, Report
+from bench.execution.guardian.start import start_guardian
+from bench.execution.station.interface import Arrivals, News, Station
 from bench.rig import Look, RigDescription, RigFile, rescue_by_another_process
-from bench.run.guardian.channel import LONGEST_ANSWER, ChannelError, Message, to_error
-from bench.run.guardian.rescuer import SILENCE, Report
-from bench.run.guardian.start import start_guardian
-from bench.run.station.interface import Arrivals, News, Station
 
 _OPENING = 120.0
 """Longest wait until all devices are connected, s."""
@@ -175,7 +175,7 @@ class RemoteStation(Station):
         folder : Path
             The folder.
         targets : sequence of str
-            Who is told; see `bench.run.notify`.
+            Who is told; see `bench.execution.notify`.
         facts : mapping of str to str
             What is said of the run in each message.
         epoch : str, optional

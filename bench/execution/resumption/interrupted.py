@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from bench.base import Clock, ConfigurationError, wall_time
+from bench.execution.resumption.feeding import Past, feed
+from bench.execution.resumption.repriming import RESUMED, Resumption
 from bench.protocol import LATENESS, TRACES, ProtocolDefinition, ProtocolParameters
 from bench.record import Event, Journal
 from bench.rig import RigDescription, Slots
-from bench.run.resumption.feeding import Past, feed
-from bench.run.resumption.repriming import RESUMED, Resumption
 
 _DESCRIBED = ("operator", "command", "packages", "git", "host", "devices", "rig_content", "protocol_source")
 """What is kept of each process that takes a run up."""

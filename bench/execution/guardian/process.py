@@ -28,17 +28,17 @@ import numpy as np
 
 from bench.base import ENDING, STACKS, BenchError, Clock, ConfigurationError, DeviceError, GuardianError, WallClock
 from bench.devices import Status
+from bench.execution.guardian.black_box import BlackBox
+from bench.execution.guardian.channel import LONGEST_ANSWER, STILL_AT_IT, Channel, ChannelError, Message, to_message
+from bench.execution.guardian.lines import BENCH, LOOK, SAFE, LineThreads, Result
+from bench.execution.guardian.parent import SIGKILL, ParentProcess
+from bench.execution.guardian.rescuer import TRY_FOR, Rescuer
+from bench.execution.notify import WITHIN, Notifier
+from bench.execution.station.core import StationCore
+from bench.execution.station.interface import News, masked, news_of
+from bench.execution.station.reconnection import TRIES, lines_of, longest_away
 from bench.record import BEGIN, END, FAILED, Event
 from bench.rig import SAFE as IS_SAFE, AttachedClock, InterlockWatch, Look, Rig
-from bench.run.guardian.black_box import BlackBox
-from bench.run.guardian.channel import LONGEST_ANSWER, STILL_AT_IT, Channel, ChannelError, Message, to_message
-from bench.run.guardian.lines import BENCH, LOOK, SAFE, LineThreads, Result
-from bench.run.guardian.parent import SIGKILL, ParentProcess
-from bench.run.guardian.rescuer import TRY_FOR, Rescuer
-from bench.run.notify import WITHIN, Notifier
-from bench.run.station.core import StationCore
-from bench.run.station.interface import News, masked, news_of
-from bench.run.station.reconnection import TRIES, lines_of, longest_away
 
 _SAFE_WITHIN = 3.0
 """Time for the safe state of all devices, s; those that have not answered then are reported as unsafe."""

@@ -14,6 +14,8 @@ import numpy as np
 from bench.base import BenchError, ConfigurationError
 from bench.control import Playback
 from bench.devices import Dwell, Settle
+from bench.execution.resumption.corners import corners, turning_points
+from bench.execution.run_at_hand import NOT_AT_WORK
 from bench.protocol import (
     PROMPT,
     Control,
@@ -31,8 +33,6 @@ from bench.protocol import (
 )
 from bench.record import Record, StepRecord, Table
 from bench.rig import Slots
-from bench.run.resumption.corners import corners, turning_points
-from bench.run.run_at_hand import NOT_AT_WORK
 
 _LEAST_TURN = 0.01
 """Smallest turn under a controller that counts as a corner, as a share of what the actuator went through."""

@@ -10,10 +10,10 @@ from typing import NoReturn, TypeVar
 
 from bench.base import ConfigurationError, DeviceConnectionError, DeviceError
 from bench.devices import Floats, Status
+from bench.execution.station.core import StationCore
+from bench.execution.station.interface import Arrivals, News, Station, masked, news_of
+from bench.execution.station.reconnection import TRIES, longest_away, reconnect
 from bench.rig import Finding, InterlockWatch, Look, Rig, make_safe, raise_if_unsafe
-from bench.run.station.core import StationCore
-from bench.run.station.interface import Arrivals, News, Station, masked, news_of
-from bench.run.station.reconnection import TRIES, longest_away, reconnect
 
 _T = TypeVar("_T")
 

@@ -9,12 +9,12 @@ from pathlib import Path
 from rich.console import Console
 
 from bench.base import Interrupts, Stopwatch, say_at_once
+from bench.execution.context import Run, RunContext, _clock, _connected, _leave, _read, _rehearsed
+from bench.execution.engine import Outcome, check_before_moving
+from bench.execution.rehearsal import Rehearsal
+from bench.execution.resumption.interrupted import Interrupted
 from bench.protocol import plan
 from bench.rig import read_schedule
-from bench.run.context import Run, RunContext, _clock, _connected, _leave, _read, _rehearsed
-from bench.run.engine import Outcome, check_before_moving
-from bench.run.rehearsal import Rehearsal
-from bench.run.resumption.interrupted import Interrupted
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ def carry_out(
     interrupts : Interrupts, optional
         At work already, and for longer than the run; without them the run has its own.
     again : Interrupted, optional
-        The run that died and is taken up; see `bench.run.resume`.
+        The run that died and is taken up; see `bench.execution.resume`.
 
     Raises
     ------

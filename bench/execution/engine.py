@@ -30,6 +30,10 @@ from bench.base import (
 )
 from bench.control import Command, DriftEstimator, LimitCycleWatch, agility_for
 from bench.devices import Arrived, Dwell, Settle, Settled, UntilSteady
+from bench.execution import fixed_rate, manual as by_hand
+from bench.execution.resumption.repriming import Resumption, reprime
+from bench.execution.run_at_hand import NOT_AT_WORK, Notices, Observer, RunAtHand, RunRecord, traced
+from bench.execution.station.interface import Station
 from bench.operator import AT_A_PROMPT, NOBODY, RESUME, Question
 from bench.protocol import (
     EXPECTED,
@@ -54,10 +58,6 @@ from bench.protocol import (
 )
 from bench.record import Lateness
 from bench.rig import SAFE, Look, RigDescription
-from bench.run import fixed_rate, manual as by_hand
-from bench.run.resumption.repriming import Resumption, reprime
-from bench.run.run_at_hand import NOT_AT_WORK, Notices, Observer, RunAtHand, RunRecord, traced
-from bench.run.station.interface import Station
 
 
 @dataclass(frozen=True)

@@ -28,6 +28,17 @@ from bench.base import (
     wall_time,
 )
 from bench.devices import Signal
+from bench.execution.detached_observer import DetachedObserver
+from bench.execution.dialogue import Dialogue
+from bench.execution.engine import Engine, Outcome, check_before_moving
+from bench.execution.guardian.remote import STACKS_NAME, GuardedRig, RemoteStation
+from bench.execution.notify import Notifier, facts_of
+from bench.execution.rehearsal import Rehearsal, rehearse
+from bench.execution.resumption.interrupted import Interrupted
+from bench.execution.resumption.repriming import Resumption
+from bench.execution.station.interface import Station
+from bench.execution.station.local import LocalStation
+from bench.execution.terminal import ProgressDisplay, RehearsalDisplay
 from bench.identification import models_among
 from bench.operator import Question, RunMailbox
 from bench.protocol import LATENESS, TRACES, ParameterChange, Plan, ProtocolDefinition, ProtocolParameters, plan
@@ -63,17 +74,6 @@ from bench.rig import (
     schedule_faults,
     twin_of,
 )
-from bench.run.detached_observer import DetachedObserver
-from bench.run.dialogue import Dialogue
-from bench.run.engine import Engine, Outcome, check_before_moving
-from bench.run.guardian.remote import STACKS_NAME, GuardedRig, RemoteStation
-from bench.run.notify import Notifier, facts_of
-from bench.run.rehearsal import Rehearsal, rehearse
-from bench.run.resumption.interrupted import Interrupted
-from bench.run.resumption.repriming import Resumption
-from bench.run.station.interface import Station
-from bench.run.station.local import LocalStation
-from bench.run.terminal import ProgressDisplay, RehearsalDisplay
 
 if TYPE_CHECKING:
     from bench.dashboard import Dashboard
@@ -124,7 +124,7 @@ class Run:
         is not, as it would take as long itself.
     notify : tuple of str
         Who is sent messages at a pause, a prompt, a warning, a trip and the end, also that of a bench which hung or
-        died; see `bench.run.notify`.
+        died; see `bench.execution.notify`.
     changes : tuple of ParameterChange
         Parameters that are changed on the way, as in the run that is repeated.
     """

@@ -12,7 +12,7 @@ from typing import Any
 
 from bench.base import Clock, DeviceConnectionError
 from bench.devices import Device
-from bench.run.station.reconnection import reconnect
+from bench.execution.station.reconnection import reconnect
 
 SAFE, BENCH, LOOK = range(3)
 """Priorities of calls that wait for their line: the safe state, requests of the bench, looks at the interlocks."""

@@ -13,13 +13,13 @@ from typing import Any
 from rich.console import Console
 
 from bench.base import ConfigurationError, Interrupts, print_plain
+from bench.execution.context import RECORDING_NAME, Run
+from bench.execution.resumption.feeding import Past
+from bench.execution.resumption.interrupted import Interrupted
+from bench.execution.resumption.repetition import recorded_protocol
+from bench.execution.run import RunResult, carry_out
 from bench.record import FILE_NAME, Original, Record, take_in, unpack
 from bench.rig import Holder, Locks, clear_expired_watchdogs, load_rig, opened, rig_of_content
-from bench.run.context import RECORDING_NAME, Run
-from bench.run.resumption.feeding import Past
-from bench.run.resumption.interrupted import Interrupted
-from bench.run.resumption.repetition import recorded_protocol
-from bench.run.run import RunResult, carry_out
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -43,7 +43,7 @@ class Resume:
     live : bool
         Whether to serve the live view on the loopback interface.
     notify : tuple of str
-        Who is sent messages; see `bench.run.notify`.
+        Who is sent messages; see `bench.execution.notify`.
     """
 
     folder: Path

@@ -10,9 +10,9 @@ import numpy as np
 
 from bench.base import AgreementError, format_numbers
 from bench.devices import Settle, Signal
+from bench.execution.resumption.feeding import Fed
+from bench.execution.run_at_hand import RunAtHand
 from bench.rig import Look
-from bench.run.resumption.feeding import Fed
-from bench.run.run_at_hand import RunAtHand
 
 RESUMED = "resumed"
 """Kind of the events of a process that takes a run up."""

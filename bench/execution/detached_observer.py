@@ -9,8 +9,8 @@ from contextlib import AbstractContextManager
 from types import TracebackType
 from typing import Protocol, Self
 
+from bench.execution.run_at_hand import Observer
 from bench.record import Event, StepRecord
-from bench.run.run_at_hand import Observer
 
 _INTERVAL = 0.1
 """Wall-clock time between two notifications, s."""

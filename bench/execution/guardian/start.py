@@ -11,12 +11,12 @@ from collections.abc import Sequence
 from typing import BinaryIO
 
 from bench.base import GuardianError
-from bench.run.guardian.channel import Channel
+from bench.execution.guardian.channel import Channel
 
 _START = 30.0
 """Longest wait for a guardian to connect, s, where a descriptor cannot be inherited."""
 
-_GUARDIAN = "bench.run.guardian"
+_GUARDIAN = "bench.execution.guardian"
 
 _WINDOWS = sys.platform == "win32"
 

@@ -11,8 +11,8 @@ from functools import partial
 from rich.console import Console
 
 from bench.base import Stopwatch, format_duration, print_plain
+from bench.execution.terminal import ProgressDisplay
 from bench.operator import ABORT, AT_A_PROMPT, MEANINGS, NOBODY, RESUME, STEP, Question, RunMailbox
-from bench.run.terminal import ProgressDisplay
 
 _INTERVAL = 0.1
 """Wall-clock time between two looks for an answer, s."""

@@ -13,13 +13,13 @@ from typing import Any, Self
 
 from bench.base import AbortError, ConfigurationError, DataError, Interrupts, VirtualClock
 from bench.devices import Signal
+from bench.execution.engine import Engine, Outcome, check_before_moving
+from bench.execution.run_at_hand import Observer
+from bench.execution.station.local import LocalStation
 from bench.operator import ABORT, RESUME, Question
 from bench.protocol import LATENESS, LONGEST, TRACES, Plan, ProtocolDefinition, ProtocolParameters, plan
 from bench.record import Event, StepRecord
 from bench.rig import SETPOINT, Interlock, Rig, RigDescription, RigFile
-from bench.run.engine import Engine, Outcome, check_before_moving
-from bench.run.run_at_hand import Observer
-from bench.run.station.local import LocalStation
 
 LONGEST_DAYS = 30.0
 """Longest rehearsal, days of laboratory time: a protocol that waits for a reading which never comes ends there."""

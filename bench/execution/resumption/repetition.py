@@ -12,11 +12,11 @@ from typing import Any
 from rich.console import Console
 
 from bench.base import ConfigurationError, DataError, Interrupts
+from bench.execution.context import Run
+from bench.execution.run import RunResult, carry_out
 from bench.protocol import ParameterChange, ProtocolDefinition, digest_of, find_protocol
 from bench.record import PROTOCOL_NAME, Original, Record, unpack
 from bench.rig import RigFile, rig_of_content
-from bench.run.context import Run
-from bench.run.run import RunResult, carry_out
 
 
 @dataclass(frozen=True)

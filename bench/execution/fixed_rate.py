@@ -10,10 +10,10 @@ import numpy as np
 from bench.base import ConfigurationError, LimitError
 from bench.control import BlockController, Floats, SampledController
 from bench.devices import Settled
+from bench.execution.run_at_hand import NOT_AT_WORK, RunAtHand, row_of, traced
 from bench.protocol import LATENESS, FixedRate, Reading
 from bench.record import Lateness
 from bench.rig import Look
-from bench.run.run_at_hand import NOT_AT_WORK, RunAtHand, row_of, traced
 
 _PERIODS_OF_GRACE = 5
 """Periods of a loop beyond the next sample by which the station expects to hear from it."""

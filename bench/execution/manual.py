@@ -7,10 +7,10 @@ from collections.abc import Mapping
 
 from bench.base import ConfigurationError, LimitError
 from bench.devices import Settled
+from bench.execution.run_at_hand import RunAtHand
 from bench.operator import Command, Desk, HoldAll, Leave, Remark, Rest, SetPoint, Shown, Tare
 from bench.protocol import ByHand, Reading
 from bench.rig import Look
-from bench.run.run_at_hand import RunAtHand
 
 _PERIOD = 0.5
 """Longest time between two looks for a command, s."""

@@ -1,4 +1,4 @@
-"""The process: `python -m bench.run.guardian`, started by the bench with one end of the channel."""
+"""The process: `python -m bench.execution.guardian`, started by the bench with one end of the channel."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from bench.base import Clock, Stopwatch, WallClock
+from bench.execution.guardian.channel import Channel, ChannelError, Message, to_message
+from bench.execution.guardian.process import Guardian
+from bench.execution.guardian.rescuer import Rescuer
+from bench.execution.guardian.start import inherited
 from bench.rig import SAFE, Holder, Locks, Rig, attach, load_rig, make_safe, port_of
-from bench.run.guardian.channel import Channel, ChannelError, Message, to_message
-from bench.run.guardian.process import Guardian
-from bench.run.guardian.rescuer import Rescuer
-from bench.run.guardian.start import inherited
 
 _PATIENCE = 60.0
 """Time for the first message, s."""
