@@ -14,7 +14,7 @@ COLLECTED := $(VENV)/.collected
 WORKERS ?= $(shell expr $$(getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2) + 1)
 # More of them for pytest, such as --no-skips.
 OPTIONS ?=
-PYTEST := $(BIN)/python -m pytest --ignore tests/benchmarks --numprocesses $(WORKERS) --dist worksteal $(OPTIONS)
+PYTEST := $(BIN)/python -m pytest --numprocesses $(WORKERS) --dist worksteal $(OPTIONS)
 # Two at once: the kernels are compiled, and then mypy runs, beside what waits for the network and the disk.
 MAKEFLAGS += --jobs=2
 # Without files of byte code each worker and each process of the tests compiles every module again.
@@ -84,7 +84,7 @@ all-tests: kernels $(COLLECTED)
 
 # Side-by-side speed comparisons; run them on an idle machine.
 benchmark: $(SETUP)
-	$(BIN)/python -m pytest -m benchmark -s tests/benchmarks
+	$(BIN)/python -m pytest -m benchmark -s tools/benchmarks
 
 # The documents as a site, in docs/_build/html: reference from the code, links checked; no network is needed.
 docs: $(SETUP)
@@ -95,15 +95,15 @@ docs: $(SETUP)
 # coverage is installed for these alone: numba loads it where it finds it, 75 ms for each command.
 mutants: $(SETUP)
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check --constraint constraints.txt coverage
-	$(BIN)/python tests/mutants.py --sample 300
+	$(BIN)/python tools/mutants.py --sample 300
 
 # 50 virtual runs beside 16 busy processes, compared to the last bit, and a run at x100 beside them.
 busy: $(SETUP)
-	$(BIN)/python tests/bench/busy_machine.py --trial runs clock --runs 50 --busy 16
+	$(BIN)/python tools/busy_machine.py --trial runs clock --runs 50 --busy 16
 
 # A study of the lowest priority beside four busy processes, without compiled kernels, compared with the same alone.
 busy-study: $(SETUP)
-	$(BIN)/python tests/bench/busy_machine.py --trial study --study hybrid
+	$(BIN)/python tools/busy_machine.py --trial study --study hybrid
 
 # The studies with the seeds 0 to 9: median, worst and spread of each number.
 studies: $(SETUP)
@@ -111,37 +111,37 @@ studies: $(SETUP)
 
 # Each fault of each rig with five seeds, and a table of what passed.
 fault-matrix: $(SETUP)
-	$(BIN)/python tests/faults/matrix.py
+	$(BIN)/python tools/matrix.py
 
 # Disks that are full, fail or are slow, journals that are locked, removed or overwritten, on each rig.
 journal-faults: $(SETUP)
-	$(BIN)/python tests/faults/journal_faults.py
+	$(BIN)/python tools/journal_faults.py
 
 # Benches killed at random moments on each rig: no step that was acknowledged is lost.
 journal-kills: $(SETUP)
-	$(BIN)/python tests/faults/journal_kills.py --times 200
+	$(BIN)/python tools/journal_kills.py --times 200
 
 # Benches and guardians killed, stopped or hanging, and lines cut, on each rig: when every output is off, read in the
 # instruments.
 kill-safe: $(SETUP)
-	$(BIN)/python tests/guardian/kill_safe.py --times 10
+	$(BIN)/python tools/kill_safe.py --times 10
 
 # The time from when each interlock of each rig has to act until every output is off, likewise.
 interlock-times: $(SETUP)
-	$(BIN)/python tests/guardian/interlock_times.py --times 5
+	$(BIN)/python tools/interlock_times.py --times 5
 
 # A run killed ten times and 40 runs killed once, by SIGKILL at random moments, resumed and compared with uninterrupted
 # ones.
 resume-trials: $(SETUP)
-	$(BIN)/python tests/bench/resume_trials.py
+	$(BIN)/python tools/resume_trials.py
 
 # Tracking runs on twins, beside those on the plants that they were identified from: durations and errors.
 twin-trials: $(SETUP)
-	$(BIN)/python tests/bench/twin_trials.py
+	$(BIN)/python tools/twin_trials.py
 
 # The dashboard of every protocol on every emulated rig, dark and light, with those of README.md; fails on an empty view.
 pictures: $(SETUP)
-	$(BIN)/python -P tests/pictures.py --out recordings/pictures --docs
+	$(BIN)/python -P tools/pictures.py --out recordings/pictures --docs
 
 clean:
 	rm -rf $(VENV) .mypy_cache .pytest_cache .ruff_cache .hypothesis .import_linter_cache

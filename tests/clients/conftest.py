@@ -5,9 +5,8 @@ import pytest
 
 from sim_devices.serving.process import serve
 
-# What these clients share, and the protocols that the fuzzer knows.
-for folder in ("tests/clients", "tools"):
-    sys.path.insert(0, str(Path(__file__).parents[2] / folder))
+# What these clients share.
+sys.path.insert(0, str(Path(__file__).parent))
 
 
 @pytest.fixture(scope="package")

@@ -1,12 +1,4 @@
-import sys
-from pathlib import Path
-
 import pytest
-
-# The trials and protocols of the scripts in this folder.
-sys.path.insert(0, str(Path(__file__).parent))
-# What kills runs.
-sys.path.append(str(Path(__file__).parents[1] / "bench"))
 
 from sim_devices.serving.process import serve
 

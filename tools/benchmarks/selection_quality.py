@@ -32,7 +32,7 @@ from bench.identification import (
 )
 from bench.models import identifiable_models
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "identification"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "identification"))
 
 from hysteretic_plants import PLANTS, butterfly, damped, random_reversals, settled, through
 

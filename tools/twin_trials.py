@@ -1,6 +1,6 @@
 """Trials of twins: tracking runs on a twin, beside those on the emulated plant that it was identified from.
 
-    python tests/bench/twin_trials.py [--rig vo2 ...] [--specimens 0 1 2] [--sessions 24] [--out FOLDER]
+    python tools/twin_trials.py [--rig vo2 ...] [--specimens 0 1 2] [--sessions 24] [--out FOLDER]
 
 The plants of the packaged rigs are built differently from any twin. Each specimen is characterized once (creep,
 damped-oscillation, random-validation), in sessions of its own; the second run identifies the model of the controller,

@@ -1,6 +1,6 @@
 """Let every method of the guardian fail once, and read in the instrument whether its output goes off.
 
-    python tests/guardian/chaos.py ENDPOINTS [METHOD]...
+    python tools/chaos.py ENDPOINTS [METHOD]...
 
 prints a line of JSON for each: whether it failed, when the output was off, and what the bench was told.
 """

@@ -1,6 +1,6 @@
 """Trials of emulated runs on a busy machine; each ends with a line that says whether it passed.
 
-    python tests/bench/busy_machine.py [--trial runs|clock|study ...] [--busy 16] [--runs 50]
+    python tools/busy_machine.py [--trial runs|clock|study ...] [--busy 16] [--runs 50]
 
 - `runs`: virtual runs beside busy processes, whose records have to be equal to the last bit.
 - `clock`: a run at a scaled clock beside them, which has to complete; shows the factor that it reached.

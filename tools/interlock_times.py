@@ -1,6 +1,6 @@
 """Let a signal cross its limit, and read in the instruments when every output is off.
 
-    python tests/guardian/interlock_times.py [--rig RIG]... [--case TEXT]... [--times N] [--busy N]
+    python tools/interlock_times.py [--rig RIG]... [--case TEXT]... [--times N] [--busy N]
 
 prints a table: for each interlock of each rig, while the protocol holds and while it computes, how often every output
 was off in time, and the median and longest time from when the interlock had to act until then. That is the instant at

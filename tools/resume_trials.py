@@ -1,6 +1,6 @@
 """Trials of resuming: runs that are killed at random moments, resumed, and compared with uninterrupted ones.
 
-    python tests/bench/resume_trials.py [--trials 40] [--kills 10] [--seed 0]
+    python tools/resume_trials.py [--trials 40] [--kills 10] [--seed 0]
 
 First one run of vo2 that is killed many times in a row, then single kills on every rig. Each run has to have the
 steps of the uninterrupted one, and coefficients of a model within one standard uncertainty of it: RMS, in σ of the

@@ -1,6 +1,6 @@
 """Open loop on a cantilever that changed after its model was identified, with and without adaptation: a table.
 
-Run as a script, some minutes: `.venv/bin/python tests/control/adaptation_trials.py [SESSIONS]`. It prints the RMS
+Run as a script, some minutes: `.venv/bin/python tools/adaptation_trials.py [SESSIONS]`. It prints the RMS
 error of targets 1 to 60 and 61 to 120, median and worst over the sessions (5 if not given), for
 docs/reference/adaptation.md.
 """

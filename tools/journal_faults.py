@@ -1,6 +1,6 @@
 """The journal's faults on each rig: what is left of the record, and whether the rig is safe.
 
-    python tests/faults/journal_faults.py [--rig RIG] [--fault WORD] [--clock xN] [--processes N] [--json FILE]
+    python tools/journal_faults.py [--rig RIG] [--fault WORD] [--clock xN] [--processes N] [--json FILE]
 
 full      the disk is full from step 5 on (a small tmpfs that is filled)
 crowded   likewise, and the folder for temporary files is on it

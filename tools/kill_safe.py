@@ -1,6 +1,6 @@
 """Kill, stop and hang a bench or its guardian, and cut the lines: when every output is off, read in the instruments.
 
-    python tests/guardian/kill_safe.py [--rig RIG]... [--trial NAME]... [--times N] [--busy N]
+    python tools/kill_safe.py [--rig RIG]... [--trial NAME]... [--times N] [--busy N]
 
 prints a table: for each rig and trial, how often every output became safe within its declared time, and the median
 and longest time it took. The instruments are served by `bench emulate` in another process, and the bench runs as on

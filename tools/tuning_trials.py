@@ -1,6 +1,6 @@
 """Trials of `bench tune` on the packaged rigs: controllers with constants by hand, today's numbers and tuned ones.
 
-    python tests/bench/tuning_trials.py [--case mckibben/length-control ...] [--sessions 5] [--out FOLDER]
+    python tools/tuning_trials.py [--case mckibben/length-control ...] [--sessions 5] [--out FOLDER]
 
 Each rig is characterized once. Each controller is tuned for the model, and brings its output to its targets in
 sessions whose noise and targets the tuning has not seen: with the constants by hand (`by_hand`), with the numbers of

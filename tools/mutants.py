@@ -4,8 +4,8 @@ One operator, number or call of a module is changed at a time, and those tests a
 A mutant that no test notices is a gap in the tests, or an equivalent program. Compiled kernels are left out, as
 numba's cache does not see the change; they are compared with brute-force oracles.
 
-    python tests/mutants.py --sample 200          # a sample over all modules
-    python tests/mutants.py bench/control/tracking.py
+    python tools/mutants.py --sample 200          # a sample over all modules
+    python tools/mutants.py bench/control/tracking.py
 
 Those of a line that is executed when the module is loaded, such as a constant, may be killed by any test that
 executes a line of the module or has its name, and by the tests of all settings and values. A mutant counts as

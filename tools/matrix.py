@@ -1,6 +1,6 @@
 """The fault matrix: each fault of each rig, with several seeds, in process on the virtual clock.
 
-    python tests/faults/matrix.py [--rig RIG] [--fault WORD] [--seeds N] [--processes N] [--json FILE]
+    python tools/matrix.py [--rig RIG] [--fault WORD] [--seeds N] [--processes N] [--json FILE]
 
 Each run is judged by the emulated instruments and the plant, not by what the drivers or the journal say of them:
 

@@ -1,6 +1,6 @@
 """Kill runs at random moments on each rig: no step and no event that the journal has acknowledged is lost.
 
-    python tests/faults/journal_kills.py [--rig RIG] [--times N] [--seed N]
+    python tools/journal_kills.py [--rig RIG] [--times N] [--seed N]
 
 Each run is in process, by turns on the virtual clock, where the control thread writes the journal, and on a paced
 one, where a thread of its own does. It is killed by SIGKILL up to 30 ms after a random step was acknowledged. POSIX,
