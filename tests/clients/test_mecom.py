@@ -1,7 +1,7 @@
 """A MeCom client that was written from the specification alone, on the served TEC controller."""
 
 import pytest
-from each_case import each_case
+from cases import cases
 from mecom_client import MeComClient, checksum
 
 READY, RUN, ERROR = 1, 2, 3
@@ -48,7 +48,7 @@ def tec(connect, vo2):
     switch_off()
 
 
-@each_case("vector", VECTORS)
+@cases("vector", VECTORS)
 def test_the_client_agrees_with_the_frames_of_the_maker(vector):
     assert f"{checksum(vector[:-4].encode('ascii')):04X}" == vector[-4:]
 

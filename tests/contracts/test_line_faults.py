@@ -5,7 +5,7 @@ from typing import ClassVar
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 
 from bench.base import DeviceConnectionError, DeviceError, DeviceRestartedError, VirtualClock
 from bench.contracts import (
@@ -347,7 +347,7 @@ class RestartingCooler(Cooler):
         return RestartingServer(instrument)
 
 
-@each_case("number", range(1, 8))
+@cases("number", range(1, 8))
 def test_a_restart_while_the_output_goes_on_is_found(stack, number):
     laboratory = RestartingCooler(stack)
     laboratory.server.left = number

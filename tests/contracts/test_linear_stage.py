@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 import pytest
-from each_case import each_case
+from cases import cases
 from emulated_bench import Bench, OnABench, OnALine, OnAServo, OnATorque, over_the_wire, serial_port
 
 from bench.base import DeviceConnectionError, DeviceError, VirtualClock
@@ -110,7 +110,7 @@ class TestSilence(OnADrum, SilentInstrumentContract):
             status.wait()
 
 
-@each_case("goal", [0.01, -0.02, 2.5 * TURN, -1.5 * TURN])
+@cases("goal", [0.01, -0.02, 2.5 * TURN, -1.5 * TURN])
 def test_arrives_and_holds(kind, stack, goal):
     bench = connected(kind, stack)
     status = bench.device.set(goal)
@@ -185,7 +185,7 @@ def error_with_force_off(bench):
     bench.instrument.trip(HardwareError.OVERLOAD)
 
 
-@each_case("state", [never_moved, moves, stands, watchdog_expired, error_with_force_on, error_with_force_off])
+@cases("state", [never_moved, moves, stands, watchdog_expired, error_with_force_on, error_with_force_off])
 def test_safe_from_any_state_and_again_changes_nothing(kind, stack, state):
     bench = connected(kind, stack)
     state(bench)
@@ -289,7 +289,7 @@ def test_shaft_that_was_turned_a_whole_turn_is_off_by_a_circumference_after_a_re
     assert bench.drum.position == pytest.approx(TURN, abs=RESOLUTION)
 
 
-@each_case(("radius", "direction"), [(0.0, 1), (-1.0, 1), (math.nan, 1), (math.inf, 1), (0.01, 0)])
+@cases(("radius", "direction"), [(0.0, 1), (-1.0, 1), (math.nan, 1), (math.inf, 1), (0.01, 0)])
 def test_drum_that_makes_no_sense(radius, direction):
     plant = Wall()
     servo = EmulatedMX28("stage", World(plant, VirtualClock()))
@@ -297,9 +297,9 @@ def test_drum_that_makes_no_sense(radius, direction):
         EmulatedDrum(servo, radius, direction=direction)
 
 
-@each_case("radius", [0.001, 0.007, 0.012, 0.033, 0.1])
-@each_case("zero_counts", [0, 1, 1000, -12345])
-@each_case("direction", [1, -1])
+@cases("radius", [0.001, 0.007, 0.012, 0.033, 0.1])
+@cases("zero_counts", [0, 1, 1000, -12345])
+@cases("direction", [1, -1])
 def test_rounding_keeps_no_limit_of_the_drum_from_being_reached(radius, zero_counts, direction):
     servo = EmulatedMX28("stage", World(Wall(), VirtualClock()))
     drum = EmulatedDrum(servo, radius, zero_counts=zero_counts, direction=direction)

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from emulated_bench import Bench, Given, OnABench, check_reproducible, over_the_wire, serial_port
 
 from bench.base import DeviceError, VirtualClock
@@ -133,14 +133,14 @@ def force(reading: dict[str, float]) -> float:
     return reading["load_force"]
 
 
-@each_case("newtons", [-59.9, -0.5, 0.0, 12.345, 59.9])
+@cases("newtons", [-59.9, -0.5, 0.0, 12.345, 59.9])
 def test_measures_the_force(bench, newtons):
     bench.put(newtons)
     assert force(bench.device.measure()) == pytest.approx(newtons, abs=1.5e-3)
     assert force(bench.device.glance()) == pytest.approx(newtons, abs=2e-3)
 
 
-@each_case(("newtons_per_unit", "zero_newtons"), [(9.80665, 0.0), (-2.0, 3.0), (0.5, -10.0)])
+@cases(("newtons_per_unit", "zero_newtons"), [(9.80665, 0.0), (-2.0, 3.0), (0.5, -10.0)])
 def test_calibration(kind, newtons_per_unit, zero_newtons, stack):
     calibration = {"newtons_per_unit": newtons_per_unit, "zero_newtons": zero_newtons}
     bench = connected(kind, stack, **calibration, noise=5e-5, decimals=4)
@@ -186,7 +186,7 @@ def test_tare_of_a_moving_load_is_refused(bench):
     assert force(bench.device.measure()) == pytest.approx(8.0, abs=1.5e-3)
 
 
-@each_case(("newtons", "side"), [(60.1, "over"), (-60.1, "under"), (1e9, "over"), (-1e9, "under")])
+@cases(("newtons", "side"), [(60.1, "over"), (-60.1, "under"), (1e9, "over"), (-1e9, "under")])
 def test_out_of_range_is_an_error_and_not_a_number(bench, newtons, side):
     bench.put(newtons)
     for take in (bench.device.measure, bench.device.glance, bench.device.read):

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from emulated_bench import Bench, Given, OnABench, check_reproducible, tcp_port
 
 from bench.base import DeviceError, VirtualClock
@@ -217,7 +217,7 @@ def test_noise_of_a_measurement_is_that_of_the_mean(kind, stack):
     assert abs(np.mean(means)) < 4 * 50e-9 / math.sqrt(5000)
 
 
-@each_case("position", [-1e-3, -200e-6, 200e-6, 1e-3])
+@cases("position", [-1e-3, -200e-6, 200e-6, 1e-3])
 def test_a_displacement_beyond_the_reach_is_never_a_position(kind, position, stack):
     bench = connected(kind, "displacement", stack)
     bench.plant.value = position
@@ -235,7 +235,7 @@ def test_supply_of_a_ratiometric_sensor_does_not_matter_within_its_range(kind, s
         assert np.mean(means) == pytest.approx(5e-3, abs=8e-6)
 
 
-@each_case("volts", [0.0, 4.45, 5.55, 9.0])
+@cases("volts", [0.0, 4.45, 5.55, 9.0])
 def test_a_failed_supply_is_named(kind, volts, stack):
     bench = connected(kind, "ratiometric", stack)
     bench.transducer.supply_volts = volts
@@ -244,7 +244,7 @@ def test_a_failed_supply_is_named(kind, volts, stack):
             take()
 
 
-@each_case("position", [-1.0, -ZERO - 1e-3, 0.035 - ZERO + 1e-3, 1.0])
+@cases("position", [-1.0, -ZERO - 1e-3, 0.035 - ZERO + 1e-3, 1.0])
 def test_a_magnet_beyond_the_stroke_is_never_a_position(kind, position, stack):
     bench = connected(kind, "ratiometric", stack)
     bench.plant.value = position

@@ -5,7 +5,7 @@ import math
 import sys
 
 import pytest
-from each_case import each_case
+from cases import cases
 from emulated_bench import Bench, OnABench, OnALine, OnAServo, OnATorque, Spoilt, over_the_wire, serial_port
 
 from bench.base import DeviceConnectionError, DeviceError, DeviceRestartedError, VirtualClock, WallClock
@@ -121,7 +121,7 @@ class TestSilence(OnAShaft, SilentInstrumentContract):
             status.wait()
 
 
-@each_case("goal", [3.5, 0.0, 2.5 * TURN, -1.5 * TURN])
+@cases("goal", [3.5, 0.0, 2.5 * TURN, -1.5 * TURN])
 def test_arrives_and_holds(kind, stack, goal):
     bench = connected(kind, stack)
     start = bench.clock.now()
@@ -218,7 +218,7 @@ def test_no_jump_to_the_goal_of_before(bench):
     assert max(position for _, position in bench.plant.seen) <= where + COUNT
 
 
-@each_case(
+@cases(
     ("error", "text"),
     [
         (HardwareError.INPUT_VOLTAGE, r"0x01 \(input voltage"),
@@ -365,7 +365,7 @@ def test_motion_during_which_it_restarts_does_not_arrive_one_turn_off(bench):
 
 
 @over_the_wire
-@each_case(
+@cases(
     ("address", "value", "text"),
     [(116, 100, "goal was changed to .* by another host"), (64, 0, "torque was switched")],
 )

@@ -2,7 +2,7 @@
 
 import math
 
-from each_case import each_case
+from cases import cases
 from pydantic import ValidationError
 
 from bench.base.registry import entries, load
@@ -28,7 +28,7 @@ def is_refused(settings, key, value):
     return False
 
 
-@each_case("driver", DRIVERS)
+@cases("driver", DRIVERS)
 def test_each_key_is_described_and_takes_its_default_and_no_number_that_is_none(driver):
     for settings in tables(load("devices", driver).Settings):
         assert is_refused(settings, "no_such_key", 1)

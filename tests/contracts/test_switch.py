@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from emulated_bench import tcp_port
 
 from bench.base import DeviceError, VirtualClock
@@ -101,7 +101,7 @@ class TestContract(SwitchContract):
         return lambda: len(lab.t7.requests)
 
 
-@each_case("line", [0, 7, 22])
+@cases("line", [0, 7, 22])
 def test_off_at_first(lab, line):
     fan = lab.connect(line)
     assert not lab.on(line)
@@ -149,7 +149,7 @@ def switch_on_from_elsewhere(lab: Laboratory, fan: Switch) -> None:
     lab.t7.write_value(2003, lab.active_high)
 
 
-@each_case("bring", [None, bring_on, bring_off, run_out, make_an_input, switch_on_from_elsewhere])
+@cases("bring", [None, bring_on, bring_off, run_out, make_an_input, switch_on_from_elsewhere])
 def test_safe_is_off_from_any_state(fan, lab, bring):
     if bring is not None:
         bring(lab, fan)

@@ -5,7 +5,7 @@ from itertools import dropwhile
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from emulated_bench import Bench, OnABench, Spoilt, over_the_wire, serial_port
 
 from bench.base import DeviceError, VirtualClock
@@ -205,7 +205,7 @@ def test_safe_releases_the_plate(bench):
     bench.device.set(50.0).wait()
 
 
-@each_case("number", [11, 30, 60, 100, 108, 134, 137, 138, 139, 143, 176, 182, 183])
+@cases("number", [11, 30, 60, 100, 108, 134, 137, 138, 139, 143, 176, 182, 183])
 def test_every_call_tells_of_an_error_and_safe_succeeds(kind, stack, number):
     bench = connected(kind, stack)
     status = bench.device.set(60.0)

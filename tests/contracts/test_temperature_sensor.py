@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from emulated_bench import Bench, Given, OnABench, check_reproducible, tcp_port
 
 from bench.base import DeviceError, VirtualClock
@@ -57,7 +57,7 @@ class TestContract(OnABench, TemperatureSensorContract):
         return "LabJack T7, serial number 470012345, firmware 1.0300"
 
 
-@each_case("temperature", TEMPERATURES)
+@cases("temperature", TEMPERATURES)
 def test_measures_the_temperature(bench, temperature):
     bench.plant.value = temperature
     # The noise of the thermistor, and up to 60 mK of the converter where the divider is steep.
@@ -73,7 +73,7 @@ def test_excitation_does_not_matter_within_its_range(bench):
         assert np.mean(means) == pytest.approx(30.0, abs=0.01)
 
 
-@each_case("fault", ["open", "shorted"])
+@cases("fault", ["open", "shorted"])
 def test_a_broken_thermistor_is_named_and_recovers_by_itself(bench, fault):
     setattr(bench.thermistor, fault, True)
     for take in bench.takes() * 10:
@@ -83,7 +83,7 @@ def test_a_broken_thermistor_is_named_and_recovers_by_itself(bench, fault):
     assert bench.device.measure()["base_temperature"] == pytest.approx(22.0, abs=0.1)
 
 
-@each_case("volts", [0.0, 1.9, 3.1, 20.0])
+@cases("volts", [0.0, 1.9, 3.1, 20.0])
 def test_a_failed_excitation_is_an_error_and_not_a_number(bench, volts):
     bench.thermistor.excitation_volts = volts
     for take in bench.takes():
@@ -93,7 +93,7 @@ def test_a_failed_excitation_is_an_error_and_not_a_number(bench, volts):
             take()
 
 
-@each_case("temperature", [-45.0, 130.0])
+@cases("temperature", [-45.0, 130.0])
 def test_outside_of_the_limits_is_an_error(bench, temperature):
     bench.plant.value = temperature
     for take in bench.takes():

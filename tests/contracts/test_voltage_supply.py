@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from emulated_bench import Bench, OnABench, OnALine, serial_port, tcp_port
 from hypothesis import given, strategies as st
 
@@ -305,7 +305,7 @@ def test_held_for_long_by_looking_at_it(bench):
 
 
 @pwm
-@each_case("battery", [15.0, 30.0])
+@cases("battery", [15.0, 30.0])
 def test_voltage_follows_a_supply_that_changes(bench, output, battery):
     bench.instrument.battery_voltage = 24.0
     bench.device.set(6.0)
@@ -356,7 +356,7 @@ def test_safe_after_the_watchdog_has_expired(bench):
 
 
 @pwm
-@each_case("fault", [*Fault, *ChannelFlag])
+@cases("fault", [*Fault, *ChannelFlag])
 def test_every_call_tells_of_a_fault_and_safe_succeeds(kind, output, stack, fault):
     bench = switching("driver" in kind, output, stack)
     text = fault.name.replace("_", ".")

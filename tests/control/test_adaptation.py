@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from hypothesis import given, strategies as st
 
 from bench.control.adaptation import Adapter
@@ -125,8 +125,8 @@ def reference(count=4000):
     return 0.3 + 0.6 * np.sin(2 * np.pi * t / 200) * (0.7 + 0.3 * np.sin(2 * np.pi * t / 1370))
 
 
-@each_case("seed", range(2))
-@each_case(("noise", "ratio"), [(0.0, 0.15), (0.002, 0.2)])
+@cases("seed", range(2))
+@cases(("noise", "ratio"), [(0.0, 0.15), (0.002, 0.2)])
 def test_adaptation_follows_a_drifting_gain(seed, noise, ratio):
     truth, targets = plant(seed=seed), reference()
     drift = np.linspace(1.0, 1.05, targets.size)
@@ -154,7 +154,7 @@ def test_density_stays_bounded_under_noise():
     assert np.std(after.model.evaluate(fresh) - truth.evaluate(fresh)) < 0.03
 
 
-@each_case(
+@cases(
     ("make", "message"),
     [
         (lambda: Adapter(Preisach([0.0, 1.0], [-1.0])), "model: expected a density >= 0"),

@@ -2,7 +2,7 @@ import itertools
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 
 from bench.control import Approach
 from sim_devices.plants.sma import SMAParameters, SMAWire
@@ -97,7 +97,7 @@ class TestLoop:
         assert not command.done
         assert command.wait == 0.5
 
-    @each_case(("output", "met"), [(1.02, True), (1.25, True), (0.75, True), (1.25 + 1e-9, False)])
+    @cases(("output", "met"), [(1.02, True), (1.25, True), (0.75, True), (1.25 + 1e-9, False)])
     def test_what_is_met_is_not_moved(self, output, met):
         command = approach(1.0, tolerance=0.25).begin(0.0, 0.7e-3, output)
         assert command.done is met
@@ -109,7 +109,7 @@ class TestLoop:
         loop.update(0.5, first.setpoint, 0.4)
         assert loop.begin(10.0, 0.0, 0.0) == first
 
-    @each_case("seed", range(5))
+    @cases("seed", range(5))
     def test_never_leaves_its_step_limit_whatever_is_measured(self, seed):
         rng = np.random.default_rng(seed)
         loop = approach(5.0, largest_step=0.1e-3)
@@ -132,7 +132,7 @@ class TestLoop:
         assert t == 12.0
         assert {command.setpoint for command in commands} == {0.0}
 
-    @each_case(
+    @cases(
         ("arguments", "words"),
         [
             ({"slopes": (0.0, 1e3)}, "slopes: expected two positive numbers"),

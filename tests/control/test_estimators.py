@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from filterpy.kalman import KalmanFilter
 from hypothesis import given, strategies as st
 
@@ -65,7 +65,7 @@ class TestMissingReadings:
             assert estimator.uncertainty == pytest.approx(math.sqrt(before**2 + 4.0 * n), rel=1e-9)
         assert estimator.update(20.0) > 19.0
 
-    @each_case("value", [math.nan, math.inf, -math.inf])
+    @cases("value", [math.nan, math.inf, -math.inf])
     def test_a_nan_is_refused_and_leaves_no_trace(self, value):
         estimator = DisturbanceEstimator(walk_variance=4.0, reading_variance=1.0)
         estimator.update(10.0)
@@ -99,13 +99,13 @@ class TestStability:
         errors = self.errors(q, 2.0 * part / self.gain(q))
         assert errors[-1] < errors[0] * max(abs(1.0 - 2.0 * part), 0.05) ** 100 + 1e-6
 
-    @each_case("q", [0.1, 3.0, 30.0])
+    @cases("q", [0.1, 3.0, 30.0])
     def test_beyond_the_bound_it_grows(self, q):
         assert self.errors(q, 2.1 / self.gain(q))[-1] > 1e3
         assert self.errors(q, -0.1 / self.gain(q))[-1] > 1e3
 
 
-@each_case("wrong", [0.0, -1.0, math.nan, math.inf])
+@cases("wrong", [0.0, -1.0, math.nan, math.inf])
 def test_variances_are_positive(wrong):
     with pytest.raises(ValueError, match="positive"):
         DisturbanceEstimator(walk_variance=wrong, reading_variance=1.0)

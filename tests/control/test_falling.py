@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 
 from bench.control import ControllerSetup, controller_names, make_controller
 from bench.identification import ModelFile
@@ -34,7 +34,7 @@ def reach(controller, plant, sign, targets):
     return np.array(rows)
 
 
-@each_case("name", controller_names("target"))
+@cases("name", controller_names("target"))
 def test_targets_are_reached_as_with_the_opposite_output(name):
     found = {}
     low, high = actuator(1).output_range()
@@ -51,7 +51,7 @@ def test_targets_are_reached_as_with_the_opposite_output(name):
         assert found[-1][-1, 1] == pytest.approx(targets[-1], abs=0.01 * (high - low))
 
 
-@each_case("name", controller_names("follow"))
+@cases("name", controller_names("follow"))
 def test_a_reference_is_followed_as_with_the_opposite_output(name):
     found = {}
     low, high = actuator(1).output_range()

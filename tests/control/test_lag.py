@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 
 from bench.control import Spans
 from bench.control.tracking import Arrival, ClosedLoopInverse, CorrectionParameters, OpenLoopInverse
@@ -77,7 +77,7 @@ def test_a_closed_loop_that_knows_the_lag_converges_where_one_without_chases_wha
     assert chased > swings
 
 
-@each_case("power", [1.0, 2.0])
+@cases("power", [1.0, 2.0])
 def test_the_seen_input_is_the_exact_response_to_a_drive_that_is_held(power):
     seen = SeenInput(ResponseDynamics(lag=LAG, power=power))
     assert seen.take(0.0, 1.0) == pytest.approx(1.0)

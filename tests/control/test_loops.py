@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 
 from bench.control import Command, FollowReference, Playback, ReachTarget, Trace
 from bench.models import ActuatorDynamics, IdentifiedDynamics, ResponseDynamics
@@ -27,7 +27,7 @@ class Follower:
         return reference
 
 
-@each_case(("period", "duration"), [(0.0, 1.0), (1.0, 0.0), (-1.0, 1.0), (math.nan, 1.0), (1.0, math.nan)])
+@cases(("period", "duration"), [(0.0, 1.0), (1.0, 0.0), (-1.0, 1.0), (math.nan, 1.0), (1.0, math.nan)])
 def test_times_that_make_no_sense(period, duration):
     with pytest.raises(ValueError, match="period, duration: expected positive numbers of s"):
         FollowReference(Follower(), abs, period, duration)
@@ -87,7 +87,7 @@ def test_playback():
     assert out.tolist() == [[2.0, 1.0], [4.0, 1.0]]
 
 
-@each_case(
+@cases(
     ("make", "words"),
     [
         (

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 
 from bench.control.model_filters import DensityFilter, SessionFilter, model_filter
 from bench.control.tracking import ClosedLoopInverse, OpenLoopInverse
@@ -231,7 +231,7 @@ def test_a_density_that_falls_stays_without_positive_values(identified):
     assert (adaptation.model.density <= 0.0).all()
 
 
-@each_case(
+@cases(
     ("name", "operator", "words"),
     [
         ("session", Polynomial([0.0, 1.0], (0.0, 1.0)), "memory"),

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from scipy import signal
 
 from bench.base import ConvergenceError
@@ -47,7 +47,7 @@ def test_notch_takes_the_resonance_out_of_the_step():
     assert np.abs(with_notch[200:] - 1.0).max() < 0.005
 
 
-@each_case(
+@cases(
     ("make", "message"),
     [
         (lambda: notch(7e4, 2e4, 0.0), "frequency: expected rad/s between"),
@@ -98,7 +98,7 @@ def test_a_delay_that_makes_it_overshoot_ends_it():
         follow(5.0, delay=40)
 
 
-@each_case(
+@cases(
     ("height", "beyond", "samples", "ends"),
     [
         (5.0, 0.051, 11, True),

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from hypothesis import given, strategies as st
 
 from bench.control import PlayInverse
@@ -45,7 +45,7 @@ def test_inverse_by_samples_does_not_drift():
     assert voltages == pytest.approx(operator.inverse_operator().evaluate(wanted + operator.bias), abs=1e-9)
 
 
-@each_case(
+@cases(
     ("make", "message"),
     [
         (lambda: PlayInverse(plays(), 0.0), "stroke: expected a positive"),

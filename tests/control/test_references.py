@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from hypothesis import given, strategies as st
 
 from bench.control import AddedSine, SmoothMoves, fastest_slope, modulated_sine, staircase, tracking_targets
@@ -55,7 +55,7 @@ class TestSine:
         assert peaks.max() > 1450.0
         assert peaks.min() < 1200.0
 
-    @each_case(
+    @cases(
         ("arguments", "match"),
         [
             (([0.0], 1.0, 0.0, 60.0), "low, high"),
@@ -152,7 +152,7 @@ def test_staircase_and_sine():
     assert abs(sine(0.01) - stairs(0.01)) < 1e-3 * NANO
 
 
-@each_case(
+@cases(
     ("make", "message"),
     [
         (lambda: SmoothMoves([0.0], SPEED), "positions: expected at least 2"),

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 
 from bench.base import ConvergenceError
 from bench.control import Command, Spans, Supervised, SupervisedFollower, Trace
@@ -110,7 +110,7 @@ def judged(error, disturbance, fallback=None):
     return controller
 
 
-@each_case(
+@cases(
     ("disturbance", "said"),
     [
         (0.02, r"error but for the greatest is 0\.1 RMS, 10 % of the range, and that of its model alone.* 0\.02;"),
@@ -122,7 +122,7 @@ def test_errors_beyond_three_percent_over_several_targets_end_the_run(disturbanc
         judged(0.1, disturbance)
 
 
-@each_case(("error", "notice"), [(0.003, ""), (0.015, "1.5 % of the range")])
+@cases(("error", "notice"), [(0.003, ""), (0.015, "1.5 % of the range")])
 def test_an_error_that_is_left_is_said_once(error, notice):
     controller = judged(error, 0.02)
     found = controller.take_notice()
@@ -151,7 +151,7 @@ def missing(errors, disturbance=0.02, **options):
     return controller
 
 
-@each_case("options", [{}, {"holds": 0.03}])
+@cases("options", [{}, {"holds": 0.03}])
 def test_one_missed_target_of_five_is_warned_of_and_two_end_the_run(options):
     controller = missing([0.0, 0.3, 0.0, 0.0, 0.0, 0.0, 0.3, 0.0, 0.0, 0.0], **options)
     assert "error is 0.134 RMS" in controller.take_notice()
@@ -166,7 +166,7 @@ def verdict(error, disturbance, **options):
         return "the end"
 
 
-@each_case(
+@cases(
     ("disturbance", "options", "borne", "warned_of", "the_end"),
     [
         (0.0, {}, 0.003, 0.014, 0.05),
@@ -199,7 +199,7 @@ def test_targets_that_cannot_be_met_do_not_count():
     assert controller.take_notice() == "the target 0.1 cannot be met within the limits: missed by 10 % of the range"
 
 
-@each_case(("error", "options"), [(0.01, {}), (0.1, {"holds": 0.03})])
+@cases(("error", "options"), [(0.01, {}), (0.1, {"holds": 0.03})])
 def test_a_target_that_is_nearly_met_or_by_an_open_loop_is_not_named(error, options):
     inner = Contrary()
     inner.reach = Reach.TOO_LOW
@@ -214,7 +214,7 @@ def test_the_warning_of_an_open_loop_says_so():
     assert notice.startswith("the open loop errs: over 5 targets")
 
 
-@each_case(("gain", "offset"), [(1.0, 0.0), (1.0, 0.05), (1.3, 0.0), (0.7, 0.0)])
+@cases(("gain", "offset"), [(1.0, 0.0), (1.0, 0.05), (1.3, 0.0), (0.7, 0.0)])
 def test_a_controller_that_converges_is_left_alone(gain, offset):
     controller, specimen = Supervised(closed_loop(), LIMITS, HIGH - LOW), Specimen(gain, offset)
     errors = [specimen.reach(controller, gain * target + offset) for target in TARGETS_WITHIN]
@@ -280,7 +280,7 @@ def supervised_follower(inner, *, holds=math.nan, fallback=None):
     return SupervisedFollower(inner, LIMITS, HIGH - LOW, fallback, holds=holds * (HIGH - LOW))
 
 
-@each_case("offset", [0.0, 0.05])
+@cases("offset", [0.0, 0.05])
 def test_a_follower_that_follows_is_left_alone(offset):
     span = HIGH - LOW
     controller = supervised_follower(ClosedLoopFollower(MODEL.inverse()))
@@ -344,7 +344,7 @@ def verdict_of_samples(error, disturbance, samples=SAMPLES, **options):
     return "warned of" if controller.take_notice() else "borne"
 
 
-@each_case(
+@cases(
     ("disturbance", "options", "borne", "warned_of", "the_end"),
     [
         (0.0, {}, 0.003, 0.014, 0.05),

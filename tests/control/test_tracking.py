@@ -7,7 +7,7 @@ from itertools import pairwise, product
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from hypothesis import given, settings, strategies as st
 
 from bench.control import Spans, modulated_sine, tracking_targets, tuned, widened
@@ -635,7 +635,7 @@ class TestTuning:
 
     spans = Spans(63.0, 1900.0)
 
-    @each_case(
+    @cases(
         "scaled",
         [
             *(each.scaled for each in (CorrectionParameters, FollowingParameters, Arrival)),
@@ -663,7 +663,7 @@ class TestTuning:
         changed = tuned(CORRECTION, {"close_enough": 2, "arrival": {"tolerance": 0.5}})
         assert changed == replace(CORRECTION, close_enough=2, arrival=replace(CORRECTION.arrival, tolerance=0.5))
 
-    @each_case(
+    @cases(
         ("options", "words"),
         [
             ({"closenough": 1.0}, "closenough: there is no such number; there are: close_enough"),

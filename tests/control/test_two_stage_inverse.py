@@ -5,7 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from hypothesis import given, settings, strategies as st
 
 from bench.control import TwoStageInverse, two_stage_inverse
@@ -96,7 +96,7 @@ def reachable_forces(model, state, argument):
     return tuple(model.first.step(state.first, voltage)[1] + argument for voltage in ends)
 
 
-@each_case("kinds", KINDS)
+@cases("kinds", KINDS)
 def test_random_states_at_a_known_force(kinds):
     rng = np.random.default_rng(1)
     met = 0
@@ -119,7 +119,7 @@ def test_random_states_at_a_known_force(kinds):
     assert met > COUNTS[kinds] // 2
 
 
-@each_case("kinds", KINDS)
+@cases("kinds", KINDS)
 def test_random_states_between_fixed_ends(kinds):
     rng = np.random.default_rng(2)
     met = 0
@@ -277,7 +277,7 @@ def signed():
     return Preisach(uniform_levels(0.0, 3.0, 2), [1.0, -0.5, 1.0])
 
 
-@each_case(
+@cases(
     ("make", "message"),
     [
         (

@@ -4,7 +4,7 @@ import math
 import struct
 
 import pytest
-from each_case import each_case
+from cases import cases
 from faulty_line import InPieces
 from hypothesis import given, strategies as st
 from refusals import blamed
@@ -156,7 +156,7 @@ def servo(script, clock):
 # Packets.
 
 
-@each_case(
+@cases(
     ("instruction", "parameters", "sent"),
     [
         (0x01, "", "FFFFFD00 01 0300 01 194E"),
@@ -201,7 +201,7 @@ EXCHANGES = """
 """
 
 
-@each_case("exchange", EXCHANGES.strip().splitlines())
+@cases("exchange", EXCHANGES.strip().splitlines())
 def test_published_exchanges(script, clock, exchange):
     servo_id, instruction, *data, error, content = (field.strip("-") for field in exchange.split())
     parameters, sent, replied, content = map(bytes.fromhex, (*data, content))
@@ -263,7 +263,7 @@ def test_eeprom_that_does_not_take_a_value(script, clock):
         connect(clock)
 
 
-@each_case("level", [0, 1])
+@cases("level", [0, 1])
 def test_servo_that_does_not_answer_everything_is_made_to(script, clock, level):
     script.values[68] = level
     servo = connect(clock)
@@ -307,7 +307,7 @@ def test_settings_beyond_the_limits_of_the_servo_are_told_by_their_key(script, c
     assert script.orders() == []
 
 
-@each_case("port", ["emulated://nobody", "/dev/no-such-port", "nonsense://x"])
+@cases("port", ["emulated://nobody", "/dev/no-such-port", "nonsense://x"])
 def test_port_that_cannot_be_opened(script, clock, port):
     with pytest.raises(DeviceConnectionError, match=f"servo: cannot open {port}"):
         connect(clock, port=port)
@@ -319,7 +319,7 @@ def test_servo_that_never_answered(script, clock):
         connect(clock, id=7)
 
 
-@each_case(
+@cases(
     ("key", "changes"),
     [
         ("position_limits", {"position_limits": (1.0, 1.0)}),
@@ -359,7 +359,7 @@ def test_zero_and_direction(script, clock):
     assert all(data[4] == 9 for data in script.received)
 
 
-@each_case("bit", range(8))
+@cases("bit", range(8))
 def test_every_hardware_error_is_told_with_advice(script, servo, bit):
     script.values[70] = 1 << bit
     text, advice = HARDWARE_ERRORS.get(bit, ("unknown to this driver", "look it up in the manual of the servo"))
@@ -379,7 +379,7 @@ def test_alert_whose_cause_has_gone(script, servo):
         servo.measure()
 
 
-@each_case("code", sorted(STATUS_ERRORS))
+@cases("code", sorted(STATUS_ERRORS))
 def test_every_refusal_is_told(script, servo, code):
     script.refusals[3, 116] = code
     if code == 3:
@@ -631,9 +631,9 @@ def connect_drum(clock, **changes):
     return drum
 
 
-@each_case("direction", [1, -1])
-@each_case("zero_counts", [0, 1200, -70_000])
-@each_case("metres", [0.0, 0.012, -0.0213, 0.036, -0.036])
+@cases("direction", [1, -1])
+@cases("zero_counts", [0, 1200, -70_000])
+@cases("metres", [0.0, 0.012, -0.0213, 0.036, -0.036])
 def test_metres_to_counts_and_back(script, clock, direction, zero_counts, metres):
     drum = connect_drum(clock, direction=direction, zero_counts=zero_counts)
     drum.set(metres)
@@ -680,7 +680,7 @@ def test_every_position_within_the_limits_arrives_as_it_was_asked_for(radius, lo
         unregister("drum-servo")
 
 
-@each_case(
+@cases(
     "changes",
     [
         {"stage_limits": (0.0, 20.0)},
@@ -744,7 +744,7 @@ def test_stop_of_the_drum_takes_where_it_stands(script, clock):
 # A line that is not good.
 
 
-@each_case(
+@cases(
     "damaged",
     [
         b"",
@@ -772,7 +772,7 @@ def test_a_damaged_answer_costs_a_resend(script, servo, damaged):
     assert servo.torque_enabled is False
 
 
-@each_case(
+@cases(
     "before",
     [
         lambda sent, _right: sent,
@@ -1067,9 +1067,9 @@ def test_reboot_on_the_way_to_the_safe_state_takes_a_second(script, servo, clock
     assert 0.9 < max(after) < 2.1
 
 
-@each_case("noise", [b"", b"no\xff\xff\xfd"])
-@each_case("place", range(20))
-@each_case("kind", ["value", "acknowledge"])
+@cases("noise", [b"", b"no\xff\xff\xfd"])
+@cases("place", range(20))
+@cases("kind", ["value", "acknowledge"])
 def test_an_answer_in_pieces_is_put_together_and_costs_no_more_than_its_pause(clock, place, kind, noise):
     script = Script()
     answered = script.right_answer
@@ -1088,7 +1088,7 @@ def test_an_answer_in_pieces_is_put_together_and_costs_no_more_than_its_pause(cl
         unregister("pieces-servo")
 
 
-@each_case(("head", "requests"), [("0200", 1), ("0101", 1), ("0000", 1), ("ffff", 1), ("0300", 2), ("0001", 2)])
+@cases(("head", "requests"), [("0200", 1), ("0101", 1), ("0000", 1), ("ffff", 1), ("0300", 2), ("0001", 2)])
 def test_heads_that_are_none_are_passed_over(script, servo, clock, head, requests):
     # Lengths are 3 to 256 bytes; what seems to have one of them is waited for, and is damaged.
     script.received.clear()

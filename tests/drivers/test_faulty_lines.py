@@ -9,7 +9,7 @@ from collections import Counter
 from contextlib import contextmanager
 
 import pytest
-from each_case import each_case
+from cases import cases
 
 from bench.base import DeviceError, VirtualClock
 from drivers.dynamixel import DynamixelMX28
@@ -194,8 +194,8 @@ def count_servo(faults, share, seed=0, calls=CALLS):
     return counts
 
 
-@each_case("faults", FAULTS.values())
-@each_case("count", [count_supply, count_servo])
+@cases("faults", FAULTS.values())
+@cases("count", [count_supply, count_servo])
 def test_no_answer_is_taken_for_what_it_is_not(count, faults):
     counts = count(faults, 0.35)
     assert counts["wrong"] == 0

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from hypothesis import HealthCheck, given, settings, strategies as st
 from refusals import blamed
 
@@ -211,7 +211,7 @@ def test_a_look_at_the_filter_leaves_the_noise_as_it_was():
     assert records[0] == records[1]
 
 
-@each_case(
+@cases(
     ("settings", "pause"),
     [
         ({}, 1.75e-3),
@@ -241,7 +241,7 @@ def test_the_pause_between_frames(bench, settings, pause):
         assert bench.clock.now() - begin == pytest.approx(pause + wire)
 
 
-@each_case(
+@cases(
     ("settings", "interval"),
     [({}, 0.125), ({"filter": 7}, 1.0), ({"filter": 0}, 0.5 / 17), ({"interval": 0.05}, 0.05)],
 )
@@ -330,7 +330,7 @@ def only(register: int, words: list[int]) -> Callable[[int, list[int]], list[int
     return lambda address, actual: words if address == register else actual
 
 
-@each_case(
+@cases(
     ("alter", "message"),
     [
         (lambda _, words: words[::-1], "words of a value in swapped order"),
@@ -363,15 +363,15 @@ def test_a_device_without_these_registers_is_refused(bench):
         bench.cell()
 
 
-@each_case("number", [1410, 0x1410, 1411])
+@cases("number", [1410, 0x1410, 1411])
 def test_identities_that_are_accepted(bench, number):
     bench.bank.alter = only(0x202C, [0, number])
     known = {} if number != 1411 else {"device_ids": (1411,)}
     bench.cell(**known).glance()
 
 
-@each_case("decimals", range(6))
-@each_case("force", [-7.5, 0.0, 0.02, 8.25])
+@cases("decimals", range(6))
+@cases("force", [-7.5, 0.0, 0.02, 8.25])
 def test_any_decimal_point_agrees(decimals, force):
     bench = Bench(decimals=decimals, weight_limits=(-9.0, 9.0))
     try:
@@ -398,7 +398,7 @@ def test_a_noisy_cell_does_not_make_a_wrong_device():
         protocol_emulated.unregister("load")
 
 
-@each_case("tracking", [1, 100])
+@cases("tracking", [1, 100])
 def test_zero_tracking_is_refused_and_nothing_is_changed(tracking):
     bench = Bench(zero_tracking=tracking)
     try:
@@ -473,7 +473,7 @@ class Once:
 OTHERS = sealed("05 03 0A 00 00 00 00 00 00 00 00 00 00")
 
 
-@each_case(
+@cases(
     "damage",
     [
         lambda _: b"",
@@ -538,7 +538,7 @@ def test_a_failure_in_the_instrument_is_passed_on(bench):
 # Bad readings
 
 
-@each_case(("bits", "side"), [(0x0001, "under"), (0x0002, "over"), (0x0033, "over")])
+@cases(("bits", "side"), [(0x0001, "under"), (0x0002, "over"), (0x0033, "over")])
 def test_range_bits(bench, bits, side):
     cell = bench.cell()
     bench.bank.alter = only(0x3500, [0x4140, 0, 0x4140, 0, bits])
@@ -549,8 +549,8 @@ def test_range_bits(bench, bits, side):
             take()
 
 
-@each_case("position", [0, 2])
-@each_case("value", [math.nan, math.inf, -math.inf])
+@cases("position", [0, 2])
+@cases("value", [math.nan, math.inf, -math.inf])
 def test_a_weight_that_is_no_number(bench, position, value):
     cell = bench.cell()
     words = [0, 0, 0, 0, 0x10]
@@ -606,7 +606,7 @@ def test_another_tare_of_somebody_else_is_noticed(bench):
     assert cell.glance()["load_force"] == pytest.approx(1.5)
 
 
-@each_case("weight", [1e-3, 0.123, 59.999, -59.999])
+@cases("weight", [1e-3, 0.123, 59.999, -59.999])
 def test_a_tare_is_the_same_whatever_the_digits_of_the_weights(bench, weight):
     cell = bench.cell()
     bench.put(weight)
@@ -703,7 +703,7 @@ def test_any_reply_is_a_reading_or_an_error(bench, reply, whole, head):
     assert math.isfinite(force)
 
 
-@each_case("function", [*range(8), 15, 16, 22, 23, 43, 0x80, 0x83, 0x84, 0x90, 0xFF])
+@cases("function", [*range(8), 15, 16, 22, 23, 43, 0x80, 0x83, 0x84, 0x90, 0xFF])
 def test_a_reply_of_another_form_is_an_error(bench, function):
     for length in (0, 1, 2, 3, 4, 5, 9, 10, 12):
         cell = bench.cell()

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from refusals import blamed
 
 from bench.base import DeviceConnectionError, DeviceError, LimitError, VirtualClock
@@ -187,7 +187,7 @@ class Recorded(Altered):
 # Settings
 
 
-@each_case(
+@cases(
     ("given", "kept"),
     [
         ("tcp://192.168.1.207:502", "tcp://192.168.1.207:502"),
@@ -206,7 +206,7 @@ CURRENTS = {"readout": "currents", "channels": (0, 1)}
 BEYOND_A_VOLT = {"steinhart_hart": (5e-3, -1e-5, 1e-5), "reference_ohms": 1.0, "temperature_limits": (-100.0, 0.0)}
 
 
-@each_case(
+@cases(
     ("settings", "key", "wrong"),
     [
         *((Settings, "port", {"port": port}) for port in ("serial:///dev/ttyUSB0", "host:0", "host:65536", "")),
@@ -276,7 +276,7 @@ def test_limits_may_be_the_whole_stroke():
         assert made.position_limits == limits
 
 
-@each_case(
+@cases(
     ("right", "rest"),
     [
         ({}, 0.0),
@@ -455,7 +455,7 @@ def test_byte_vectors_of_dac1():
     assert len(server.received) == len(exchanges)
 
 
-@each_case(
+@cases(
     ("use", "words"),
     [
         (lambda t7: t7.write(AIN, 1.0), "AIN# can only be read"),
@@ -518,7 +518,7 @@ def test_one_sample_needs_no_burst(bench):
     assert bench.clock.now() == 0.0
 
 
-@each_case("channels", [(0, 1), (1, 0), (5, 2)])
+@cases("channels", [(0, 1), (1, 0), (5, 2)])
 def test_currents_on_any_two_inputs(bench, channels):
     first, second = channels
     bench.volts[first], bench.volts[second] = 3.0, 5.0
@@ -559,7 +559,7 @@ def test_a_setting_that_is_not_taken_is_noticed(bench):
 # Wrong devices
 
 
-@each_case(
+@cases(
     ("alter", "message"),
     [
         (lambda _, words: words[::-1], "swapped order"),
@@ -707,7 +707,7 @@ def test_a_host_that_hangs_up_in_the_middle():
 # Bad signals
 
 
-@each_case("volts", [10.0, -10.0, 10.4, -20.0, 30.0])
+@cases("volts", [10.0, -10.0, 10.4, -20.0, 30.0])
 def test_over_range(bench, volts):
     sensor = bench.sensor(position_limits=(-1.0, 1.0))
     bench.volts[0] = volts
@@ -752,7 +752,7 @@ def test_darkness_does_not_divide_by_zero(bench):
         sensor.measure()
 
 
-@each_case("words", [[0xC61C, 0x3C00], [0x7FC0, 0x0000], [0x7F80, 0x0000]])
+@cases("words", [[0xC61C, 0x3C00], [0x7FC0, 0x0000], [0x7F80, 0x0000]])
 def test_an_invalid_conversion_is_no_reading(bench, words):
     def alter(address: int, actual: list[int]) -> list[int]:
         return words if address == 7600 else actual
@@ -802,7 +802,7 @@ def test_the_mean_of_a_ratiometric_sensor_is_the_ratio_of_the_means(bench):
 # A thermistor
 
 
-@each_case(
+@cases(
     ("ohms", "celsius"),
     # The table of a thermistor of 10 kΩ at 25 °C with these coefficients, in steps of 1 Ω or 0.1 %.
     [(32650.0, 0.0), (10000.0, 25.0), (3603.0, 50.0), (678.3, 100.0)],
@@ -1459,7 +1459,7 @@ def test_a_clipped_sample_of_a_block_is_told(bench, in_process):
         supply.play(np.zeros(4), 1e-3, sensor)
 
 
-@each_case(
+@cases(
     ("period", "can"),
     [
         (1e-6, True),
@@ -1536,7 +1536,7 @@ def with_byte(place: int, value: int) -> Callable[[bytes], bytes]:
     return lambda answer: answer[:place] + bytes((value,)) + answer[place + 1 :]
 
 
-@each_case("place", [0, 1, 2, 3, 5, 6, 7, 8])
+@cases("place", [0, 1, 2, 3, 5, 6, 7, 8])
 def test_an_answer_that_belongs_to_nothing_is_asked_for_again(bench, spoiling, place):
     address = "emulated://t7-spoiling"
     supply = connected(bench, address, T7HighVoltageSupply, line=5)

@@ -7,7 +7,7 @@ from binascii import crc_hqx
 from itertools import pairwise
 
 import pytest
-from each_case import each_case
+from cases import cases
 from faulty_line import InPieces
 from hypothesis import given, strategies as st
 from refusals import blamed
@@ -160,7 +160,7 @@ def test_over_a_pseudo_terminal(pseudo_terminal):
         tec.close()
 
 
-@each_case(
+@cases(
     ("sequence", "request_text", "digits", "sent", "replied", "content"),
     [
         # Meerstetter 5136AL, chapter 5, captured with a TEC-1089.
@@ -202,7 +202,7 @@ def test_answers_of_the_maker_at_address_1(script):
         line.ask("?VR04D201", 8)
 
 
-@each_case(
+@cases(
     ("sequence", "request_text", "sent"),
     [
         # Sent to real devices at address 2 by programs that work (Arduino and Go); the answers are not published.
@@ -414,7 +414,7 @@ def test_stop_holds_the_present_temperature(script, tec):
     assert tec.setpoint == 15.0
 
 
-@each_case("number", sorted(DEVICE_ERRORS))
+@cases("number", sorted(DEVICE_ERRORS))
 def test_every_error_of_the_device_is_told_with_advice(script, tec, number):
     script.values |= {104: 3, 105: number, 106: 1, 107: 1000}
     text, advice = DEVICE_ERRORS[number]
@@ -430,7 +430,7 @@ def test_error_that_the_driver_does_not_know(script, tec):
         tec.glance()
 
 
-@each_case("code", sorted(SERVER_ERRORS))
+@cases("code", sorted(SERVER_ERRORS))
 def test_every_server_error_is_told(script, tec, code):
     script.refusals["VSC35C"] = code
     with pytest.raises(DeviceError) as caught:
@@ -451,7 +451,7 @@ def test_refused_reading(script, tec):
         tec.stop()
 
 
-@each_case(("state", "title"), [(0, "init"), (4, "bootloader"), (5, "reset pending")])
+@cases(("state", "title"), [(0, "init"), (4, "bootloader"), (5, "reset pending")])
 def test_no_reading_of_a_device_that_is_not_ready(script, tec, state, title):
     script.values[104] = state
     with pytest.raises(DeviceError, match=rf"not ready \(device status {state}, {title}\)"):
@@ -476,7 +476,7 @@ def test_value_that_is_no_hex_number(script, tec):
         _ = tec.output_enabled
 
 
-@each_case(
+@cases(
     "damaged",
     [
         b"",
@@ -557,7 +557,7 @@ def test_silence_names_port_and_address_and_takes_its_time(script, tec, clock):
     assert clock.now() - before == pytest.approx(0.6, abs=0.05)
 
 
-@each_case("port", ["emulated://nobody", "/dev/no-such-port", "nonsense://x"])
+@cases("port", ["emulated://nobody", "/dev/no-such-port", "nonsense://x"])
 def test_port_that_cannot_be_opened(script, clock, port):
     with pytest.raises(DeviceConnectionError, match=f"tec: cannot open {port}"):
         connect(clock, port=port)
@@ -1029,8 +1029,8 @@ def test_another_line_goes_on_counting(script, tec):
     assert tec.repeats == 1
 
 
-@each_case("place", range(21))
-@each_case("kind", ["value", "acknowledge", "refusal"])
+@cases("place", range(21))
+@cases("kind", ["value", "acknowledge", "refusal"])
 def test_an_answer_in_pieces_is_put_together_and_costs_no_more_than_its_pause(clock, place, kind):
     script = Script()
     script.refusals["?VR03E9"] = 5

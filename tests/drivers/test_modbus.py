@@ -2,7 +2,7 @@
 
 import pytest
 import serial
-from each_case import each_case
+from cases import cases
 from faulty_line import InPieces
 
 from drivers.modbus import (
@@ -96,7 +96,7 @@ def test_values_in_registers():
     assert swapped(known[::-1], lambda _: False) == ""
 
 
-@each_case(
+@cases(
     ("head", "length"),
     [("0103 0A", 15), ("0104 02", 7), ("0110 20", 8), ("0106 20", 8), ("0183 02", 5), ("014C 09", 5), ("0105 09", 5)],
 )

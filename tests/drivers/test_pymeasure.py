@@ -6,7 +6,7 @@ from importlib.util import find_spec
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 
 from bench.base import (
     ConfigurationError,
@@ -84,7 +84,7 @@ def test_what_is_sent_is_what_pymeasure_expects():
         assert math.isnan(supply.setpoint)
 
 
-@each_case(
+@cases(
     ("exchange", "text"),
     [
         ([(":MEAS:VOLT?", "OL")], "voltage is 'OL', expected a number"),
@@ -131,7 +131,7 @@ def test_closing_shuts_the_instrument_down_unless_told_otherwise():
         on_protocol(instrument, table={**TABLE, "shutdown": False}).close()
 
 
-@each_case("text", ["output_enabled", "a.b = c", "f(x)", "f(); g()", "_x = 1", "f(*[1])", "import os", "="])
+@cases("text", ["output_enabled", "a.b = c", "f(x)", "f(); g()", "_x = 1", "f(*[1])", "import os", "="])
 def test_an_action_is_a_call_or_an_assignment_of_literals(text):
     with pytest.raises(ValueError, match="expected a call such as"):
         parse_action(text)

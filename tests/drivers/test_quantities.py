@@ -1,7 +1,7 @@
 """Signals, ranges, read-back and arrival of instruments that the rig file describes."""
 
 import pytest
-from each_case import each_case
+from cases import cases
 
 from bench.base import DeviceError, DeviceRestartedError
 from bench.devices import QuantityTable, TargetTable
@@ -69,7 +69,7 @@ def test_arrival_is_within_the_tolerance_and_asked_for_in_steps(clock):
     assert arrival_of("supply", clock, target(), 5.0, dict).done
 
 
-@each_case(
+@cases(
     ("answer", "fields"),
     [
         ("ACME,PSU-1,42,2.0", ("ACME", "PSU-1", "42", "2.0")),

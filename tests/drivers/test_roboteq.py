@@ -6,7 +6,7 @@ import math
 import threading
 
 import pytest
-from each_case import each_case
+from cases import cases
 from faulty_line import InPieces
 from hypothesis import given, strategies as st
 from refusals import blamed
@@ -206,7 +206,7 @@ def test_channel_that_is_not_there(script, connect):
     assert script.orders() == [(0x2000, 3, 0)]
 
 
-@each_case(
+@cases(
     ("name", "model"),
     [
         (b"Roboteq SDC2160", "SDC2160"),
@@ -292,7 +292,7 @@ def test_heartbeat_of_the_device_is_made_frequent_enough(script, connect, millis
     assert [value for index, _, value in script.orders() if index == 0x1017] == ([] if written is None else [written])
 
 
-@each_case(
+@cases(
     ("output", "battery", "volts", "command"),
     [
         ("average", 240, 0.0, 0),
@@ -449,7 +449,7 @@ def test_waiting_for_a_ramp_feeds_the_watchdog(script, connect, clock):
     assert len(script.orders()) > 25
 
 
-@each_case("bit", list(FAULT_FLAGS))
+@cases("bit", list(FAULT_FLAGS))
 def test_every_fault_is_told_with_advice(script, supply, bit):
     script.objects[0x2112, 0] = (bit, 2)
     text, advice = FAULT_FLAGS[bit]
@@ -460,7 +460,7 @@ def test_every_fault_is_told_with_advice(script, supply, bit):
     assert script.orders() == []
 
 
-@each_case("bit", list(CHANNEL_FLAGS))
+@cases("bit", list(CHANNEL_FLAGS))
 def test_every_flag_of_the_channel_is_told_with_advice(script, supply, bit):
     script.objects[0x2122, 1] = (bit, 2)
     text, advice = CHANNEL_FLAGS[bit]
@@ -477,7 +477,7 @@ def test_several_faults_and_unknown_ones(script, supply):
         assert part in str(caught.value)
 
 
-@each_case("code", [*ABORT_CODES, 0x12345678])
+@cases("code", [*ABORT_CODES, 0x12345678])
 def test_every_abort_code_is_told(script, supply, code):
     text = ABORT_CODES.get(code, "abort code 0x12345678")
     script.aborts[0x210D, 2] = code
@@ -493,7 +493,7 @@ def test_every_abort_code_is_told(script, supply, code):
 GOOD = bytes.fromhex("4B0D2102F0000000")
 
 
-@each_case(
+@cases(
     "spoilt",
     [
         b"",
@@ -556,7 +556,7 @@ def test_answers_to_a_request_that_was_sent_again_are_waited_for(script, supply,
     assert clock.now() - before < 0.01
 
 
-@each_case(
+@cases(
     "ends", [(b"\r", b"\r"), (b"\n", b"\r"), (b"\r\n", b"\r\n"), (b"\n", b"\n"), (b"", b"\r"), (b"z\r\n", b"\n\r")]
 )
 def test_acknowledgements_and_line_ends_of_all_adapters(script, supply, ends):
@@ -586,7 +586,7 @@ def test_negative_readings(script, supply):
     assert supply.measure() == {"supply_voltage": -12.0, "supply_current": -1.5}
 
 
-@each_case("answer", ["410D210204000000", "600D210200000000"])
+@cases("answer", ["410D210204000000", "600D210200000000"])
 def test_answers_that_are_no_number(script, supply, answer):
     script.instead = [None, line(0x581, bytes.fromhex(answer))]
     with pytest.raises(DeviceError, match=r"answered .* for its battery voltage \(object 0x210D:2\)"):
@@ -728,7 +728,7 @@ def test_damaged_digit_is_no_reading(script, supply):
         assert supply.measure() == {"supply_voltage": 0.0, "supply_current": 1.2}
 
 
-@each_case("port", ["emulated://nobody", "/dev/no-such-port", "nonsense://x"])
+@cases("port", ["emulated://nobody", "/dev/no-such-port", "nonsense://x"])
 def test_port_that_cannot_be_opened(script, connect, port):
     with pytest.raises(DeviceConnectionError, match=f"supply: cannot open {port}"):
         connect(port=port)
@@ -839,7 +839,7 @@ def test_several_threads_wait_for_each_other(script, supply):
     assert failures == []
 
 
-@each_case(
+@cases(
     ("key", "changes"),
     [
         ("port", {"port": "/dev/ttyUSB0@9600"}),
@@ -999,7 +999,7 @@ def test_flags_and_abort_codes_are_those_of_the_standard():
 # Reading and writing objects.
 
 
-@each_case(
+@cases(
     ("command", "data", "text"),
     [
         (0x43, b"v1.2", "v1.2"),
@@ -1019,7 +1019,7 @@ def test_expedited_text(script, connect, command, data, text):
     assert connect().identity.firmware == text
 
 
-@each_case(
+@cases(
     ("command", "data", "value"),
     [
         (0x43, "F0000000", 240),
@@ -1036,7 +1036,7 @@ def test_numbers_of_every_size(script, supply, command, data, value):
     assert supply._line.read(_VOLTS, 2) == value
 
 
-@each_case("command", [0x41, 0x45, 0x60, 0x20, 0x00])
+@cases("command", [0x41, 0x45, 0x60, 0x20, 0x00])
 def test_answers_with_other_commands_are_no_numbers(script, supply, command):
     script.instead = [line(0x581, bytes((command,)) + bytes.fromhex("0D2102F0000000"))]
     with pytest.raises(DeviceError, match=f"answered {command:02x} 0d 21 02"):
@@ -1069,7 +1069,7 @@ def test_time_stamps_of_the_adapter_are_passed_over(script, supply, connect, clo
     supply.measure()
 
 
-@each_case(("identifier", "heard"), [(0x700, ""), (0x780, ""), (0x6FF, ""), (0x702, "2"), (0x77F, "2, 127")])
+@cases(("identifier", "heard"), [(0x700, ""), (0x780, ""), (0x6FF, ""), (0x702, "2"), (0x77F, "2, 127")])
 def test_nodes_whose_heartbeats_are_heard(script, supply, identifier, heard):
     script.instead = [line(identifier, b"\x05")] * 3
     with pytest.raises(DeviceConnectionError) as caught:
@@ -1085,7 +1085,7 @@ def test_heartbeat_of_another_length_is_none(script, supply):
     assert "heard" not in str(caught.value)
 
 
-@each_case("place", range(26))
+@cases("place", range(26))
 def test_an_answer_in_pieces_is_put_together_and_costs_no_more_than_its_pause(clock, place):
     script = Script()
     register("pieces-supply", InPieces(script, clock, place, 0.02), clock)
@@ -1341,7 +1341,7 @@ def damaged(number, place=5):
     return spoil
 
 
-@each_case(("number", "place"), [(0, 5), (2, 9), (1, 5), (3, 12), (1, 14), (3, 13)])
+@cases(("number", "place"), [(0, 5), (2, 9), (1, 5), (3, 12), (1, 14), (3, 13)])
 def test_damaged_process_data_are_asked_for_again(controller, synchronous, number, place):
     synchronous.set(6.0)
     controller.synchronized = 0
@@ -1352,7 +1352,7 @@ def test_damaged_process_data_are_asked_for_again(controller, synchronous, numbe
     assert synchronous.repeats == before + 1
 
 
-@each_case("left_out", range(4))
+@cases("left_out", range(4))
 def test_process_data_that_are_not_whole_are_asked_for_again(controller, synchronous, clock, left_out):
     controller.synchronized = 0
     controller.spoilt = [lambda sent: sent[:left_out] + sent[left_out + 1 :]]

@@ -6,7 +6,7 @@ from contextlib import ExitStack
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from hypothesis import given, settings, strategies as st
 
 from bench.base import ConfigurationError, DeviceConnectionError, DeviceError, VirtualClock
@@ -334,7 +334,7 @@ def test_a_sensor_has_no_set_point(stack):
     assert not hasattr(device, "set")
 
 
-@each_case(
+@cases(
     ("changes", "text"),
     [
         ({"signals": {"voltage": {"query": "V?", "unit": "V"}}}, "signals voltage in V and current in A"),
@@ -657,7 +657,7 @@ def test_an_answer_without_an_end_is_none(stack, length):
     assert device.glance() == {"supply_voltage": 5.0 if length <= 1024 else 7.0}
 
 
-@each_case(
+@cases(
     ("port", "right"),
     [
         ("tcp://host:1", True),

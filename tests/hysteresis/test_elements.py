@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from hypothesis import given, settings, strategies as st
 from scipy.integrate import solve_ivp
 
@@ -148,7 +148,7 @@ class TestEachOperator:
         assert operator.evaluate(found.setpoints, state)[-1] == found.outputs[-1]
         assert found.state == pytest.approx(operator.advance(state, found.setpoints), abs=1e-12)
 
-    @each_case("operator", OPERATORS)
+    @cases("operator", OPERATORS)
     def test_what_cannot_be_reached_is_clamped_and_said(self, operator):
         low, high = operator.output_range()
         state = operator.initial_state()
@@ -157,7 +157,7 @@ class TestEachOperator:
             assert found.reach is reach
             assert RANGE[0] <= found.setpoints[-1] <= RANGE[1]
 
-    @each_case("operator", OPERATORS)
+    @cases("operator", OPERATORS)
     def test_wrong_numbers_are_refused(self, operator):
         state = operator.initial_state()
         with pytest.raises(ValueError, match="value: expected a finite number"):
@@ -167,7 +167,7 @@ class TestEachOperator:
         with pytest.raises(ValueError, match="coefficients: expected"):
             operator.with_coefficients([1.0] * 50, 0.0)
 
-    @each_case("operator", OPERATORS)
+    @cases("operator", OPERATORS)
     def test_saturation_does_not_depend_on_the_past(self, operator):
         for direction in (-1, 1):
             saturated = operator.saturated_state(direction)
@@ -181,7 +181,7 @@ class TestEachOperator:
 
 
 class TestAgainstDifferentialEquations:
-    @each_case(("exponent", "beta", "gamma"), [(1.0, 1.5, 0.5), (1.0, 0.4, -1.1), (1.7, 4.0, 2.0), (3.0, 30.0, 10.0)])
+    @cases(("exponent", "beta", "gamma"), [(1.0, 1.5, 0.5), (1.0, 0.4, -1.1), (1.7, 4.0, 2.0), (3.0, 30.0, 10.0)])
     def test_bouc_wen(self, exponent, beta, gamma):
         operator = bouc_wen(exponent, beta, gamma)
         inputs, z, outputs = [1.7, -1.2, 0.8, -2.0, 3.0, 0.1, 0.2], 0.0, []
@@ -273,7 +273,7 @@ class TestAgainstTheirDefinitions:
 
 
 class TestTheExactInverse:
-    @each_case("make", [maxwell_slip, generalized])
+    @cases("make", [maxwell_slip, generalized])
     def test_serves_operators_that_rise_or_fall(self, make):
         for sign in (1.0, -1.0):
             assert isinstance(make(sign).inverse(), BranchInverse)
@@ -301,7 +301,7 @@ class TestTheExactInverse:
         assert (found.setpoints, found.reach) == ((1.0,), Reach.MET)
 
 
-@each_case(
+@cases(
     ("make", "words"),
     [
         (lambda: BoucWen(beta=-1.0), "beta: expected a number >= 0"),

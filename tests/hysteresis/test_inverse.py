@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from hypothesis import given, settings, strategies as st
 
 from bench.models import (
@@ -133,8 +133,8 @@ def test_paper_policy_goes_towards_the_target(seed, outside):
         assert found.setpoints[0] == pytest.approx(expected, abs=1e-6)
 
 
-@each_case("policy", ["nearest", "paper"])
-@each_case("order", [1, 3, 20])
+@cases("policy", ["nearest", "paper"])
+@cases("order", [1, 3, 20])
 def test_unreachable_targets_are_clamped_and_flagged(order, policy):
     operator = film(order, zeros=0.0)
     inverse = PreisachInverse(operator, policy)
@@ -267,7 +267,7 @@ def test_tracks_what_forward_evaluation_made():
     assert following.state == operator.initial_state().advance(path)
 
 
-@each_case(
+@cases(
     ("make", "message"),
     [
         (lambda: PreisachInverse(plain(), "fast"), "policy: expected 'nearest' or 'paper'"),

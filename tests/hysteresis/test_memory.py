@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from hypothesis import given, strategies as st
 
 from bench.models import MemoryCurve
@@ -125,7 +125,7 @@ def test_description_tells_branch_and_reversals():
     assert "on a major branch" in driven([5.0]).describe()
 
 
-@each_case(
+@cases(
     ("make", "message"),
     [
         (lambda: MemoryCurve((1.0, 5.0), 3.0), "extrema"),

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from numpy.polynomial import chebyshev
 
 from bench.models import Polynomial
@@ -25,7 +25,7 @@ def test_evaluates_its_series():
     assert p.step(p.initial_state(), u[7]) == (None, pytest.approx(expected[7]))
 
 
-@each_case("seed", range(10))
+@cases("seed", range(10))
 def test_output_range_is_that_of_a_dense_scan(seed):
     p = make(seed)
     y = p.evaluate(np.linspace(21.0, 84.0, 20001))
@@ -41,7 +41,7 @@ def test_output_range_of_a_line():
     assert Polynomial([0.0, 0.0], (0.0, 1.0), 1.0).output_range() == (1.0, 1.0)
 
 
-@each_case(
+@cases(
     ("make_it", "message"),
     [
         (lambda: Polynomial([], (0.0, 1.0)), "series"),

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 
 from bench.identification import identify
 from bench.models import PolynomialPlays, operator_from_json
@@ -48,7 +48,7 @@ def test_it_is_identified_and_inverted():
     np.testing.assert_allclose(rising.evaluate(answers.setpoints), targets, atol=1e-6)
 
 
-@each_case(
+@cases(
     ("change", "message"),
     [
         ({"thresholds": [0.0, 0.5]}, "thresholds: expected positive"),

@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from hypothesis import given, strategies as st
 
 from bench.models import DeadZones, PrandtlIshlinskii, operator_from_json
@@ -149,7 +149,7 @@ def test_dead_zones():
     np.testing.assert_allclose(one_sided([-1.0, 0.0, 1.0, 3.0, 5.0]), [-2.0, 0.0, 2.0, 4.0, 5.0])
 
 
-@each_case(
+@cases(
     ("make", "message"),
     [
         (lambda: PrandtlIshlinskii([1.0, 2.0], [1.0, 1.0]), "thresholds: expected the first to be 0"),

@@ -8,7 +8,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from hypothesis import given, settings, strategies as st
 
 from bench.models import (
@@ -67,7 +67,7 @@ histories = st.lists(st.floats(22.0, 83.0), min_size=1, max_size=25)
 seeds = st.integers(0, 50)
 
 
-@each_case("term", TERMS)
+@cases("term", TERMS)
 def test_equals_320000_relays(term):
     operator = make(term=term)
     rng = np.random.default_rng(1)
@@ -145,7 +145,7 @@ def test_nonnegative_density_is_monotone(history, then, seed):
     assert (np.diff(falling) <= 1e-9).all()
 
 
-@each_case("term", TERMS)
+@cases("term", TERMS)
 def test_output_falls_as_steeply_as_it_is_bounded_to(term):
     operator, flat = make(term=term, signed=False), make(term=term, signed=False, zeros=1.0)
     inputs = np.linspace(21.0, 84.0, 20_001)
@@ -205,9 +205,9 @@ def test_output_equals_the_paper_at_saturation():
     assert operator.evaluate([30.0, 70.0]) == pytest.approx([-20.0, 1830.4], abs=1e-9)
 
 
-@each_case("signed", [True, False])
-@each_case("term", ["none", "quadratic", "thermal"])
-@each_case("order", [3, 7])
+@cases("signed", [True, False])
+@cases("term", ["none", "quadratic", "thermal"])
+@cases("order", [3, 7])
 def test_output_range_bounds_and_is_reached(order, term, signed):
     operator = make(order, seed=order, term=term, signed=signed, uniform=order == 3)
     low, high = operator.output_range()
@@ -227,7 +227,7 @@ def test_output_range_bounds_and_is_reached(order, term, signed):
     assert high - (0.02 if signed else 1e-6) * span <= greatest <= high + 1e-9 * span
 
 
-@each_case("seed", range(8))
+@cases("seed", range(8))
 def test_output_range_of_a_nonnegative_density_is_that_of_the_major_branches(seed):
     operator = make(seed=seed, term="thermal", signed=False, uniform=bool(seed % 2))
     values = []
@@ -286,7 +286,7 @@ def test_density_matrix_and_areas():
     assert operator.cell_areas().sum() == pytest.approx(0.5 * 40.0**2)
 
 
-@each_case(
+@cases(
     ("make_it", "message"),
     [
         (lambda: Preisach([0, 1, 1], np.zeros(3)), "levels: expected strictly increasing"),

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from hypothesis import given, strategies as st
 
 from bench.identification import damped_oscillation, identify
@@ -57,7 +57,7 @@ def test_it_is_identified_beside_a_density():
     assert worse.errors.rms > 100 * found.errors.rms
 
 
-@each_case(
+@cases(
     ("arguments", "word"),
     [
         (((), 0.0, 1.0), "series"),
@@ -71,7 +71,7 @@ def test_wrong_arguments_are_named(arguments, word):
         PolynomialTerm(*arguments)
 
 
-@each_case(
+@cases(
     ("numbers", "word"),
     [
         ((1.0, 2.0, 30.0, 30.0, 20.0), "low: expected a value below high = 30"),
@@ -86,7 +86,7 @@ def test_wrong_numbers_of_a_thermal_expansion_are_named(numbers, word):
         ThermalExpansion(*numbers)
 
 
-@each_case("coefficients", [[1.0], [1.0, 2.0, 3.0]])
+@cases("coefficients", [[1.0], [1.0, 2.0, 3.0]])
 def test_a_thermal_expansion_has_two_coefficients(coefficients):
     with pytest.raises(ValueError, match="expected k0 and k1"):
         ThermalExpansion(1.0, 2.0, 30.0, 70.0, 20.0).with_coefficients(coefficients)

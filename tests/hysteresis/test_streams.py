@@ -8,7 +8,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from hypothesis import given, settings, strategies as st
 
 from bench.models import (
@@ -193,7 +193,7 @@ def test_a_two_stage_stream_moves_as_its_model_between_fixed_ends():
     assert stream.state == state
 
 
-@each_case("kind", ["polynomial", "summed", "linear"])
+@cases("kind", ["polynomial", "summed", "linear"])
 def test_every_other_model_has_a_stream(kind):
     rng = np.random.default_rng(3)
     inputs, forces = walk(rng, 50), walk(rng, 50)
@@ -211,8 +211,8 @@ def test_every_other_model_has_a_stream(kind):
     assert stream.state == model.advance(inputs, forces)
 
 
-@each_case("value", [math.nan, math.inf, -math.inf])
-@each_case("make", [preisach, plays])
+@cases("value", [math.nan, math.inf, -math.inf])
+@cases("make", [preisach, plays])
 def test_what_is_not_finite_is_refused_without_a_move(make, value):
     stream = make(np.random.default_rng(5)).stream()
     output = stream.step(0.7)
@@ -228,7 +228,7 @@ def test_what_is_not_finite_is_refused_without_a_move(make, value):
     assert inverse.state == before
 
 
-@each_case("inputs", [(math.nan, 0.1), (0.1, math.inf)])
+@cases("inputs", [(math.nan, 0.1), (0.1, math.inf)])
 def test_a_two_stage_stream_refuses_before_either_stage_moves(inputs):
     rng = np.random.default_rng(6)
     stream = TwoStage(preisach(rng, term=None), preisach(rng, low=-3.0, high=2.0)).stream()
@@ -349,7 +349,7 @@ def test_the_state_of_a_stream_is_a_value():
     assert operator.state_from_json(operator.state_to_json(stream.state)) == stream.state
 
 
-@each_case("copied", [copy.copy, copy.deepcopy, lambda stream: pickle.loads(pickle.dumps(stream))])
+@cases("copied", [copy.copy, copy.deepcopy, lambda stream: pickle.loads(pickle.dumps(stream))])
 def test_a_copy_of_a_stream_has_a_memory_of_its_own(copied):
     rng = np.random.default_rng(14)
     operator, relaxed = preisach(rng, 6, term=None), plays(rng)

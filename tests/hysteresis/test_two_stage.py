@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from hypothesis import given, settings, strategies as st
 
 from bench.models import (
@@ -164,7 +164,7 @@ def test_length_rises_with_force_and_falls_with_voltage(seed, kinds):
     assert (np.diff(model.evaluate(voltages, np.full(60, state.force), state)) <= 1e-12).all()
 
 
-@each_case("kinds", KINDS)
+@cases("kinds", KINDS)
 def test_nothing_depends_on_how_finely_a_move_is_sampled(kinds):
     model = wire(3, *kinds)
     start = model.advance([2.0, 0.7], [3.0, 5.0])
@@ -225,7 +225,7 @@ def test_linear_is_a_two_stage_model_with_a_line():
     assert (model.voltage_unit, model.force_unit, model.length_unit) == ("V", "N", "mm")
 
 
-@each_case(
+@cases(
     "model",
     [
         *(wire(2, *kinds) for kinds in KINDS),
@@ -252,7 +252,7 @@ def line(units):
     return Polynomial([1.0], (0.0, 1.0), 0.0, *units)
 
 
-@each_case(
+@cases(
     ("make", "message"),
     [
         (lambda: TwoStage(line(("V", "N")), line(("kg", "mm"))), "second: expected the unit 'N', got 'kg'"),

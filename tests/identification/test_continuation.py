@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 
 from bench.identification import assess, continue_design, covering_sequence, identify, random_validation
 from bench.identification.design.continuation import Tail
@@ -68,7 +68,7 @@ class TestInformation:
 
 
 class TestContinuation:
-    @each_case("operator", [plane(4), PrandtlIshlinskii([0.0, 0.1, 0.2], [0.0, 0.0, 0.0], input_range=(0.0, 1.0))])
+    @cases("operator", [plane(4), PrandtlIshlinskii([0.0, 0.1, 0.2], [0.0, 0.0, 0.0], input_range=(0.0, 1.0))])
     def test_each_tail_is_the_best_of_all(self, operator):
         data = covering_sequence(uniform_levels(0.0, 1.0, 2))
         found = continue_design(operator, data, seconds=60.0, dwell=1.0, noise=0.05)
@@ -120,7 +120,7 @@ class TestContinuation:
         found = continue_design(plane(60), covering_sequence(uniform_levels(0.0, 1.0, 10)), seconds=60.0, dwell=1.0)
         assert found.tails[0].step == pytest.approx(1.0 / 30.0)
 
-    @each_case(
+    @cases(
         ("options", "message"),
         [
             ({"seconds": 0.0, "dwell": 1.0}, "seconds"),

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from other_plants import damped, measured, random_reversals
 
 from bench.identification import set_up_problem
@@ -48,13 +48,13 @@ def dense_variance(problem, found, smoothing, ridge, inputs):
     return np.sqrt(variance), rho, freedom, variance * inflation * np.einsum("ij,jk,ik->i", b, posterior, b)
 
 
-@each_case(("model", "options", "smoothing", "ridge"), [
+@cases(("model", "options", "smoothing", "ridge"), [
     ("preisach", {"levels": 8, "plane": (-1.0, 1.0), "reversible": "linear"}, 0.0, 0.0),
     ("preisach", {"levels": 8, "plane": (-1.0, 1.0)}, 0.1, 0.0),
     ("preisach-signed", {"levels": 8, "plane": (-1.0, 1.0)}, 0.01, 0.1),
     ("prandtl-ishlinskii", {"plays": 8}, 0.0, 0.0),
 ])  # fmt: skip
-@each_case("skip", [0, 40])
+@cases("skip", [0, 40])
 def test_it_is_the_dense_one(model, options, smoothing, ridge, skip):
     weights = np.random.default_rng(1).uniform(0.5, 2.0, problem_of(model, options).inputs.size)
     problem = problem_of(model, options, smoothing, weights, skip)
@@ -94,7 +94,7 @@ def test_no_samples_to_spare():
         prediction_variance(problem, problem.fit(0.0), 0.0)
 
 
-@each_case(("key", "value", "words"), [
+@cases(("key", "value", "words"), [
     ("residual", -1.0, "expected a residual"),
     ("constant", "x", "constant: expected a number"),
     ("columns", [3, 1], "as many finite means and factors as columns"),

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from hypothesis import given, strategies as st
 
 from bench.identification import (
@@ -60,8 +60,8 @@ def test_first_order_reversals_measure_every_pair_of_levels(seed, order, per_cel
     assert inputs[0] == inputs[-1] == operator.levels[-1]
 
 
-@each_case("design", [covering_sequence, first_order_reversals])
-@each_case("term", [QuadraticTerm(0.0), QuadraticTerm(0.0, 0.0), ThermalExpansion(0.0, 0.0, 30.0, 70.0, 20.0)])
+@cases("design", [covering_sequence, first_order_reversals])
+@cases("term", [QuadraticTerm(0.0), QuadraticTerm(0.0, 0.0), ThermalExpansion(0.0, 0.0, 30.0, 70.0, 20.0)])
 def test_reversible_part_is_determined_too(design, term):
     operator = plane(uniform_levels(30.0, 70.0, 10), term, (21.0, 84.0))
     inputs = design(operator.levels, (21.0, 84.0), per_cell=2)
@@ -112,7 +112,7 @@ def measure(setpoints, seed):
     return readings + 0.37 * rng.standard_normal(setpoints.size)
 
 
-@each_case("seed", range(3))
+@cases("seed", range(3))
 def test_design_reaches_the_oscillation_in_half_the_time_on_the_film(seed):
     span = (21.0, 84.0)
     oscillation = damped_oscillation(21.0, 84.0, 54.0, 36, 0.35)
@@ -136,7 +136,7 @@ def test_design_reaches_the_oscillation_in_half_the_time_on_the_film(seed):
     assert designed <= usual < 10.0
 
 
-@each_case(
+@cases(
     ("make", "message"),
     [
         (lambda: covering_sequence([1.0, 0.0]), "levels: expected strictly"),

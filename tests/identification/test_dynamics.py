@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from scipy import signal
 from scipy.linalg import expm
 
@@ -57,7 +57,7 @@ def test_published_step():
     assert (unit.final, unit.overshoot) == (1.0, pytest.approx(found.overshoot))
 
 
-@each_case("band", [0.02, 0.1])
+@cases("band", [0.02, 0.1])
 def test_step_measures_equal_those_of_a_fine_grid(band):
     times = np.arange(0.0, 0.3, 1e-6)
     response = PUBLISHED_DYNAMICS.step_response(times) / PUBLISHED_DYNAMICS.gain
@@ -86,7 +86,7 @@ def test_frequency_response():
     assert abs(unit.response([809.0])[0]) == pytest.approx(math.sqrt(0.5), rel=0.01)
 
 
-@each_case("numerator", [(0.0, 0.0), (1e-4, 0.0), (-1e-4, 0.0), (2e-4, 1e-8), (1e-4, -1e-8)])
+@cases("numerator", [(0.0, 0.0), (1e-4, 0.0), (-1e-4, 0.0), (2e-4, 1e-8), (1e-4, -1e-8)])
 def test_zeros_of_any_kind(numerator):
     model = ThirdOrder(0.7, 800.0, 3000.0, 0.1, numerator)
     zeros, poles = model.zeros, model.poles
@@ -104,7 +104,7 @@ def test_zeros_of_any_kind(numerator):
     assert model.step_response(times) == pytest.approx(response, abs=1e-9)
 
 
-@each_case("dt", [1e-7, 5e-5, 1e-3, 1.0])
+@cases("dt", [1e-7, 5e-5, 1e-3, 1.0])
 def test_held_step_is_the_step_response_at_the_samples(dt):
     found = PUBLISHED_DYNAMICS.simulate(np.ones(500), dt)
     assert found == pytest.approx(PUBLISHED_DYNAMICS.step_response(dt * np.arange(500)), abs=1e-12)
@@ -127,8 +127,8 @@ def test_simulation_of_held_inputs_is_exact():
     assert PUBLISHED_DYNAMICS.simulate(inputs, dt) == pytest.approx(expected, abs=1e-9)
 
 
-@each_case("rate", [5e3, 1e4, 2e4])
-@each_case("seed", range(4))
+@cases("rate", [5e3, 1e4, 2e4])
+@cases("seed", range(4))
 def test_poles_from_a_noisy_step(rate, seed):
     found = identify_dynamics(*measured(PIEZO, rate, seed=seed, delay=0.3 * seed / rate))
     for name in ("real_pole", "frequency", "damping"):
@@ -149,7 +149,7 @@ def test_poles_from_a_noisy_step(rate, seed):
     assert step.settling_time == pytest.approx(0.157, abs=0.002)
 
 
-@each_case("change", [-0.03, 0.03])
+@cases("change", [-0.03, 0.03])
 def test_exact_step_gives_the_exact_system(change):
     truth = ThirdOrder(-1.5, 900.0, PIEZO.frequency * (1.0 + change), 0.02, (5e-5, 2e-9))
     found = identify_dynamics(*measured(truth, 2e4, noise=0.0, delay=2.37e-4, offset=-0.4))
@@ -201,7 +201,7 @@ FLAT = np.zeros(100)
 STEP = np.repeat([0.0, 1.0], 50)
 
 
-@each_case(
+@cases(
     ("make", "message"),
     [
         (lambda: ThirdOrder(0.0, 1.0, 1.0, 0.1), "gain: expected a number other than 0"),

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from other_plants import cycles, damped, first_order, random_reversals
 
 from bench.identification.design.excitation_class import ExcitationClass
@@ -17,7 +17,7 @@ CLASSES = {
 }
 
 
-@each_case("name", CLASSES)
+@cases("name", CLASSES)
 def test_each_is_known_by_name_and_holds_for_its_own_class_only(name):
     for seed in range(5):
         rng = np.random.default_rng(seed)
@@ -51,7 +51,7 @@ def test_noise_of_the_input_is_no_reversal():
     assert not plain.departures(inputs + 0.003 * rng.normal(size=inputs.size))
 
 
-@each_case(("change", "words"), [
+@cases(("change", "words"), [
     (lambda u: 1.2 * u, "it spans -1.2 to 1.2, not -1 to 1"),
     (lambda u: 0.4 * u, "its swings are distributed otherwise"),
     (lambda u: 0.5 * u + 0.5, "reversals are distributed otherwise"),

@@ -1,7 +1,7 @@
 """Folds of a measured sequence: gaps are respected, no residual is in two parts, units are left out whole."""
 
 import numpy as np
-from each_case import each_case
+from cases import cases
 from hypothesis import given, settings, strategies as st
 from hysteretic_plants import through
 
@@ -156,6 +156,6 @@ def test_the_gap_is_where_residuals_are_no_longer_correlated():
     assert correlated_rows(np.ones(50), 10) == 0
 
 
-@each_case("least", [0.0, 0.5])
+@cases("least", [0.0, 0.5])
 def test_a_constant_input_has_no_turns_between_its_ends(least):
     assert turning_points(np.ones(5), least).tolist() == [0, 4]

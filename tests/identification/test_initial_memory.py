@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 
 from bench.identification import identify, measure_errors, ramps
 from bench.models import MemoryCurve, PrandtlIshlinskii, Preisach, QuadraticTerm, uniform_levels
@@ -24,7 +24,7 @@ def wandering(seed=0, start=0.05):
 HISTORIES = ([-1.0, 0.8, -0.7, 0.5, -0.3], [1.0, -0.9, 0.6, -0.2], [-1.0, 1.0, -0.25], [-1.0, 0.35])
 
 
-@each_case("history", HISTORIES)
+@cases("history", HISTORIES)
 def test_estimate_finds_the_start(history):
     operator, inputs = specimen(), wandering()
     start = MemoryCurve.from_negative_saturation(-1.0).advance(history)
@@ -77,8 +77,8 @@ def test_saturation_at_either_end_is_taken_as_told():
     assert identify("preisach", inputs, outputs, levels=8).initial_state.saturation == -1
 
 
-@each_case("history", HISTORIES)
-@each_case("plane", [(-1.0, 1.0), (-2.0, 0.5), (-0.5, 3.0), (-4.0, 4.0)])
+@cases("history", HISTORIES)
+@cases("plane", [(-1.0, 1.0), (-2.0, 0.5), (-0.5, 3.0), (-4.0, 4.0)])
 def test_skip_leaves_out_just_what_depends_on_the_start(history, plane):
     rng = np.random.default_rng(2)
     operator = Preisach(uniform_levels(*plane, 10), rng.random(55))
@@ -112,7 +112,7 @@ def test_plays_start_where_told():
     assert found.skip > 0
 
 
-@each_case(
+@cases(
     ("name", "options", "message"),
     [
         ("preisach", {"initial": "unknown"}, "initial: expected 'negative'"),

@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 
 from bench.identification import check_data, cross_validate, fit, identify, ramps, set_up_problem
 from bench.models import MemoryCurve, PrandtlIshlinskii, Preisach, uniform_levels
@@ -43,7 +43,7 @@ def test_unobtrusive_data_raise_no_warning():
     assert check_data(inputs, inputs**3, plane=(-1.0, 1.0)) == []
 
 
-@each_case(
+@cases(
     ("inputs", "outputs", "options", "message"),
     [
         ([0.0, 0.0, 0.0, 1.0, 0.0], [0.0, 0.2, 0.1, 1.0, 0.5], {}, "2 of 5 inputs repeat .* up to 0.2 "),
@@ -130,7 +130,7 @@ def test_cross_validation_of_models_without_smoothing():
     assert rms["preisach"] < rms["polynomial"]
 
 
-@each_case(
+@cases(
     ("options", "message"),
     [
         ({"smoothing": ()}, "smoothing: expected at least one"),
@@ -199,7 +199,7 @@ def test_dead_zones_catch_saturation_and_asymmetry():
     np.testing.assert_allclose(back, fresh, atol=1e-9)
 
 
-@each_case(
+@cases(
     ("options", "message"),
     [
         ({"plays": 0}, "plays: expected at least 1"),

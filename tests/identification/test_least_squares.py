@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from hypothesis import example, given, settings, strategies as st
 from scipy.linalg.lapack import dpocon
 from scipy.optimize import lsq_linear, nnls
@@ -62,7 +62,7 @@ def kkt(matrix, outputs, found, nonnegative, weights=None):
     return np.where(held, np.maximum(g, 0.0), np.abs(g)).max()
 
 
-@each_case("seed", range(5))
+@cases("seed", range(5))
 def test_equals_dense_nnls(seed):
     operator, inputs, outputs = problem(seed=seed)
     regressor = operator.regressor(inputs)
@@ -79,7 +79,7 @@ def test_equals_dense_nnls(seed):
     assert found.certificate.passive + found.certificate.active == expected.size
 
 
-@each_case("seed", range(3))
+@cases("seed", range(3))
 def test_mixed_signs_weights_and_skip_equal_a_dense_reference(seed):
     operator, inputs, outputs = problem(seed=seed, term=QuadraticTerm(-0.8, -0.3), noise=0.1)
     rng = np.random.default_rng(seed)
@@ -343,7 +343,7 @@ def test_blas_is_limited_to_one_thread_only_inside():
     assert all(after[path] == threads for path, threads in before)
 
 
-@each_case(
+@cases(
     ("options", "outputs", "message"),
     [
         ({}, np.zeros(3), "outputs: expected 4 values"),

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 
 from bench.identification import compare, measure_errors
 from bench.models import MemoryCurve, Polynomial, PrandtlIshlinskii, Preisach, uniform_levels
@@ -51,7 +51,7 @@ def test_states_and_skipped_samples():
     assert found["hysterons"].residuals[0] > 40.0
 
 
-@each_case(
+@cases(
     ("arguments", "message"),
     [
         (({}, [0.0], [0.0]), "models: expected at least one"),
@@ -65,7 +65,7 @@ def test_wrong_comparison_is_named(arguments, message):
         compare(*arguments)
 
 
-@each_case(("options", "message"), [({"skip": 2}, "skip"), ({"states": {"spline": None}}, "states: .* got spline")])
+@cases(("options", "message"), [({"skip": 2}, "skip"), ({"states": {"spline": None}}, "states: .* got spline")])
 def test_wrong_options_are_named(options, message):
     with pytest.raises(ValueError, match=message):
         compare(models(), [0.0, 1.0], [0.0, 1.0], **options)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from hypothesis import given, settings, strategies as st
 from hysteretic_plants import random_reversals, through
 
@@ -48,7 +48,7 @@ def test_visits_are_counted_and_said():
     assert found.to_json()["holds"] is True
 
 
-@each_case("inputs", [REPEATED, first_order_reversals(uniform_levels(-1.0, 1.0, 24), (-1.0, 1.0))])
+@cases("inputs", [REPEATED, first_order_reversals(uniform_levels(-1.0, 1.0, 24), (-1.0, 1.0))])
 def test_what_ratchets_may_not_be_a_preisach_model(inputs):
     found = check_return_points(inputs, ratcheting(inputs))
     assert found.holds is False

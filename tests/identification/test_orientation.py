@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from hypothesis import given, strategies as st
 
 from bench.identification import cross_validate, identify, ramps
@@ -37,7 +37,7 @@ def measured(seed=1):
     return SPECIMEN.evaluate(INPUTS) + 0.2 * np.random.default_rng(seed).normal(size=INPUTS.size)
 
 
-@each_case(("name", "options"), CONSTRAINED)
+@cases(("name", "options"), CONSTRAINED)
 def test_the_opposite_output_gives_the_opposite_model(name, options):
     rising, falling = (identify(name, INPUTS, sign * measured(), **options) for sign in (1, -1))
     assert (rising.orientation, falling.orientation) == ("rising", "falling")

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from hypothesis import given, strategies as st
 from other_plants import random_reversals
 
@@ -46,8 +46,8 @@ def session(rng, kinds=KINDS, noise=0.0):
     return inputs, outputs + noise * rng.normal(size=inputs.size)
 
 
-@each_case("kinds", [("offset",), ("gain",), ("input-offset",), ("gain", "drift"), KINDS])
-@each_case("rows", [None, 400])
+@cases("kinds", [("offset",), ("gain",), ("input-offset",), ("gain", "drift"), KINDS])
+@cases("rows", [None, 400])
 def test_what_moved_is_found(kinds, rows):
     inputs, outputs = session(np.random.default_rng(1), kinds)
     found = recalibrate(PREISACH, inputs, outputs, kinds, rows=rows)
@@ -88,7 +88,7 @@ def test_later_rows_change_nothing_and_skipped_ones_neither():
     assert recalibrate(PREISACH, inputs, outputs, KINDS, rows=300, skip=20) == first
 
 
-@each_case(("kinds", "rows", "words"), [
+@cases(("kinds", "rows", "words"), [
     ((), 100, "expected at least one of offset"),
     (("zero",), 100, "expected some of offset, gain, drift, input-offset, got 'zero'"),
     (("gain", "gain"), 100, "gain is given twice"),
@@ -140,7 +140,7 @@ def test_a_model_that_cannot_be_corrected():
     assert not hasattr(TwoStage, "shifted")
 
 
-@each_case("text", ["", "offset,,x", "gain,gain", "zero"])
+@cases("text", ["", "offset,,x", "gain,gain", "zero"])
 def test_kinds_that_are_not_understood(text):
     with pytest.raises(ValueError, match="expected some of offset, gain, drift, input-offset, each once"):
         parse_kinds(text)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from hypothesis import given, settings, strategies as st
 
 from bench.identification import fit, fit_minimum_norm, resolve
@@ -32,8 +32,8 @@ def test_equals_the_singular_value_decomposition(seed, order, samples):
     assert found.diagonal.sum() == pytest.approx(found.rank, abs=1e-6)
 
 
-@each_case("term", [None, QuadraticTerm(1.0, 0.0)])
-@each_case("seed", range(3))
+@cases("term", [None, QuadraticTerm(1.0, 0.0)])
+@cases("seed", range(3))
 def test_with_penalties_it_is_the_map_from_true_to_found_coefficients(seed, term):
     """Found coefficients are linear in the outputs, so that the map's columns are fits of the regressor's."""
     _, regressor, weights, _ = problem(seed, 4, 80, term)

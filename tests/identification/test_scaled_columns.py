@@ -1,7 +1,7 @@
 """Products of centred, scaled columns, and of some of them, against the dense matrix."""
 
 import numpy as np
-from each_case import each_case
+from cases import cases
 from scipy.sparse import csr_array
 
 from bench.identification.fit.scaled_columns import ScaledColumns
@@ -9,8 +9,8 @@ from bench.models import Preisach, QuadraticTerm, uniform_levels
 from bench.models.kernels.memory_kernels import by_column
 
 
-@each_case("penalised", [False, True])
-@each_case("places", [np.arange(17), np.array([0, 3, 4, 9, 14, 16]), np.array([2, 5]), np.array([15])])
+@cases("penalised", [False, True])
+@cases("places", [np.arange(17), np.array([0, 3, 4, 9, 14, 16]), np.array([2, 5]), np.array([15])])
 def test_products_are_those_of_the_dense_columns(penalised, places):
     rng = np.random.default_rng(0)
     operator = Preisach(uniform_levels(-1.0, 1.0, 5), np.zeros(15), reversible=QuadraticTerm(-0.8, -0.3))

@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 
 from bench.identification import cross_validate, identify, ramps
 from bench.models import PrandtlIshlinskii, Preisach, QuadraticTerm, uniform_levels
@@ -29,13 +29,13 @@ def butterfly():
     return inputs, (polarization - 0.5 * (polarization.min() + polarization.max())) ** 2
 
 
-@each_case("name", ["preisach", "preisach-nonmonotonic", "prandtl-ishlinskii", "polynomial"])
-@each_case("sign", [1, -1])
+@cases("name", ["preisach", "preisach-nonmonotonic", "prandtl-ishlinskii", "polynomial"])
+@cases("sign", [1, -1])
 def test_good_data_give_no_warning(name, sign):
     assert identify(name, INPUTS, sign * measured(INPUTS)).warnings == ()
 
 
-@each_case(
+@cases(
     "options",
     [{"smoothing": 1e-3}, {"reversible": "polynomial"}, {"initial": "skip"}, {"initial": "estimate"}, {"levels": 12}],
 )
@@ -57,7 +57,7 @@ def noise():
     return INPUTS, np.random.default_rng(3).normal(size=INPUTS.size)
 
 
-@each_case(
+@cases(
     ("data", "name", "options", "message"),
     [
         (few(), "preisach", {}, r"^61 samples are few for 210 coefficients, .*--cross-validate$"),
@@ -108,7 +108,7 @@ def test_the_remedies_help():
     assert identify("preisach-nonmonotonic", INPUTS, measured(INPUTS), input_unit="°C").warnings == ()
 
 
-@each_case("name", ["preisach", "preisach-signed", "prandtl-ishlinskii", "polynomial"])
+@cases("name", ["preisach", "preisach-signed", "prandtl-ishlinskii", "polynomial"])
 def test_a_constant_record_is_refused(name):
     with pytest.raises(ValueError, match=rf"^outputs: constant at 0.1 in all {INPUTS.size} samples that count"):
         identify(name, INPUTS, np.full(INPUTS.size, 0.1))

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from scipy.optimize import nnls
 
 from bench.identification import (
@@ -172,7 +172,7 @@ def test_each_stage_has_a_smoothness_of_its_own():
     assert found.smoothing == {"first": 0.0, "second": 1e-2}
 
 
-@each_case("order", [20, 25])
+@cases("order", [20, 25])
 def test_both_planes_of_a_summed_model_are_smoothed(order):
     truth = Summed(smooth(0.0, 11.5, ("N", "mm")), smooth(0.0, 3.0, ("V", "mm")), 0.3)
     series, other = campaign(truth, noise=0.1), campaign(truth, seed=1)
@@ -307,7 +307,7 @@ def test_richer_model_wins_on_its_own_data():
         assert two.errors[kind].rms < line.errors[kind].rms
 
 
-@each_case("make", [lambda: preisach(-5.0, 5.0, -1.0, 1.0, 0, order=6), lambda: plays(-5.0, 5.0, [1.0, 0.5])])
+@cases("make", [lambda: preisach(-5.0, 5.0, -1.0, 1.0, 0, order=6), lambda: plays(-5.0, 5.0, [1.0, 0.5])])
 def test_chained_and_paired_regressors(make):
     rng = np.random.default_rng(1)
     operator = make()
@@ -341,7 +341,7 @@ def data():
     return Series.under_load(1.0, [0.0, 1.0, 2.0], [0.0, -1.0, -2.0])
 
 
-@each_case(
+@cases(
     ("make", "message"),
     [
         (lambda: Series("force", [0.0], [0.0], [0.0]), "kind: expected 'length-voltage'"),

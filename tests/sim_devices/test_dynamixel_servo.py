@@ -8,7 +8,7 @@ import warnings
 import numpy as np
 import pytest
 import serial
-from each_case import each_case
+from cases import cases
 from hypothesis import example, given, strategies as st
 
 from bench.base import DeviceConnectionError, DeviceError, VirtualClock
@@ -280,7 +280,7 @@ def test_instruction_that_does_not_exist(pair):
     assert server.receive(frame(0xFE, 0x77)) == b""
 
 
-@each_case(("level", "answered"), [(0, {1}), (1, {1, 2}), (2, {1, 2, 3})])
+@cases(("level", "answered"), [(0, {1}), (1, {1, 2}), (2, {1, 2, 3})])
 def test_status_return_level(level, answered):
     (servo,) = make_servos({})
     server = Dynamixel2Server([servo])
@@ -619,7 +619,7 @@ def test_indirect_data_has_the_properties_of_what_it_stands_for():
         assert caught.value.reason is ErrorNumber.ACCESS
 
 
-@each_case("value", [0, 63, 662, 65535])
+@cases("value", [0, 63, 662, 65535])
 def test_eeprom_cannot_be_reached_indirectly(value):
     assert refused_item(make_servo(), 168, value) is ErrorNumber.DATA_RANGE
 
@@ -647,7 +647,7 @@ def test_power_cycle_is_a_reboot_without_being_asked():
     assert servo.read_item(132) == turned % 4096 != turned
 
 
-@each_case(
+@cases(
     ("address", "length"),
     [(14, 1), (130, 30), (147, 1), (167, 2), (252, 1), (577, 2), (660, 3), (65535, 4), (126, 65535)],
 )
@@ -658,7 +658,7 @@ def test_reading_what_is_not_defined(address, length):
     assert caught.value.reason is ErrorNumber.ACCESS
 
 
-@each_case(
+@cases(
     ("address", "value"),
     [
         (7, 253), (9, 255), (10, 4), (11, 0), (11, 5), (12, 254), (13, 1), (20, 1_044_480), (31, 101), (32, 49),
@@ -736,7 +736,7 @@ def test_reboot_forgets_ram_and_turns():
     assert [servo.read_item(address) for address in (64, 68, 98, 112)] == [0, 2, 0, 0]
 
 
-@each_case(("option", "kept"), [(255, (1, 1)), (1, (9, 1)), (2, (9, 3))])
+@cases(("option", "kept"), [(255, (1, 1)), (1, (9, 1)), (2, (9, 3))])
 def test_factory_reset(option, kept):
     servo = make_servo()
     servo.write_item(7, 9)
@@ -867,7 +867,7 @@ def test_trapezoidal_motion_takes_its_time_to_the_digit():
     assert servo.world.time - start == pytest.approx(expected, abs=1e-5)
 
 
-@each_case(
+@cases(
     ("acceleration", "velocity", "distance", "profile", "seconds"),
     [
         (0, 0, 1000, 0x00, 1000 * COUNT / TOP_SPEED),
@@ -1034,7 +1034,7 @@ def arm(servo, units):
     return 42 * VELOCITY_UNIT
 
 
-@each_case("units", [1, 5, 127])
+@cases("units", [1, 5, 127])
 def test_watchdog_stops_the_shaft_at_its_instant(units):
     servo = make_servo()
     velocity = arm(servo, units)
@@ -1067,7 +1067,7 @@ def test_expired_watchdog_takes_no_goals_until_it_is_cleared():
     assert servo.read_item(132) == 3000
 
 
-@each_case(("offset", "mode", "runs"), [(0, 4, False), (100, 4, True), (-100, 4, True), (100, 1, False)])
+@cases(("offset", "mode", "runs"), [(0, 4, False), (100, 4, True), (-100, 4, True), (100, 1, False)])
 def test_expired_watchdog_with_a_homing_offset_makes_it_run_away(offset, mode, runs):
     """ROBOTIS DynamixelSDK, issue 584."""
     servo = make_servo()
@@ -1119,7 +1119,7 @@ def test_watchdog_is_idle_without_torque():
     assert servo.deadline() == math.inf
 
 
-@each_case("volts", [9.0, 16.5])
+@cases("volts", [9.0, 16.5])
 def test_voltage_is_an_alert_and_a_shutdown_only_if_asked_for(volts):
     for mask, torque in ((52, 1), (53, 0)):
         servo = make_servo()

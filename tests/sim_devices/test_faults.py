@@ -5,7 +5,7 @@ import math
 
 import pytest
 import serial
-from each_case import each_case
+from cases import cases
 from hypothesis import given, settings, strategies as st
 
 from bench.base import ConfigurationError, VirtualClock
@@ -73,10 +73,10 @@ def check_a_fault(rig, name):
 
 @pytest.mark.parametrize("rig", RIGS)
 def test_each_fault_says_what_it_is_and_leaves_no_trace_when_it_has_ended(rig):
-    each_case("name", make(rig)[0].faults)(check_a_fault)(rig=rig)
+    cases("name", make(rig)[0].faults)(check_a_fault)(rig=rig)
 
 
-@each_case("rig", RIGS)
+@cases("rig", RIGS)
 def test_a_laboratory_without_faults_has_no_calendar_in_its_world(rig):
     laboratory, _ = make(rig)
     assert laboratory.next_change() == math.inf
@@ -149,7 +149,7 @@ def test_an_answer_of_another_address_is_whole(vo2, ask):
     assert wrong[-5:-1] == b"%04X" % crc_hqx(wrong[:-5], 0)
 
 
-@each_case("rig", RIGS)
+@cases("rig", RIGS)
 def test_each_protocol_with_addresses_readdresses_its_answers(rig):
     laboratory, _ = make(rig)
     for name, server in laboratory.servers.items():
@@ -225,7 +225,7 @@ def test_a_frozen_instrument_answers_and_obeys_but_its_values_stand(vo2):
     assert tec.read_parameter(1000) == pytest.approx(60.0, abs=1.0)
 
 
-@each_case(
+@cases(
     ("rig", "instrument", "read"),
     [
         ("vo2", "psd", lambda laboratory: laboratory.t7.convert(0)),
@@ -342,7 +342,7 @@ def test_a_clipped_amplifier_gives_no_more():
     assert laboratory.truth()["piezo_voltage"].value > 15.0
 
 
-@each_case("rig", RIGS)
+@cases("rig", RIGS)
 def test_looking_at_the_truth_feeds_no_watchdog(rig):
     laboratory, clock = make(rig)
     if rig == "sma":
@@ -406,7 +406,7 @@ def test_which_answers_are_disturbed_comes_from_the_seed():
     assert 60 < sum(answers(3)) < 140
 
 
-@each_case(
+@cases(
     ("entry", "words"),
     [
         ({"fault": "tec.melt", "at": 1.0}, "has no fault 'tec.melt'; it has: tec-over-current"),

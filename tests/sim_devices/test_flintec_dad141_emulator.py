@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from hypothesis import given, strategies as st
 
 from bench.base import VirtualClock, WallClock
@@ -99,7 +99,7 @@ def test_a_read_may_begin_in_the_middle_of_a_value():
     assert cell.read_registers(0x3501, 3) == cell.read_registers(0x3500, 5)[1:4]
 
 
-@each_case("address", [0x0000, 0x1FFF, 0x2004, 0x2032, 0x3505, 0xFFFF])
+@cases("address", [0x0000, 0x1FFF, 0x2004, 0x2032, 0x3505, 0xFFFF])
 def test_what_is_not_emulated_is_an_illegal_address(address):
     cell = Cell()
     refused(2, lambda: cell.read_registers(address, 1))
@@ -115,7 +115,7 @@ def test_read_only_write_only_and_half_values():
     refused(3, lambda: cell.write_registers(0x2107, [0]))
 
 
-@each_case(
+@cases(
     ("address", "values"),
     [(0x2106, [0, 9]), (0x2106, [0xFFFF, 0xFFFF]), (0x2110, [0, 2]), (0x2112, [0, 0]), (0x2114, [1, 0])]
     + [(0x2061, [each]) for each in (0x00, 0x40, 0x100)]
@@ -125,7 +125,7 @@ def test_values_that_are_not_allowed(address, values):
     refused(3, lambda: Cell().write_registers(address, values))
 
 
-@each_case(
+@cases(
     "wrong",
     [
         {"newtons_per_unit": 0.0},
@@ -146,16 +146,14 @@ def test_wrong_parameters_are_refused(wrong):
         Cell(**wrong)
 
 
-@each_case(("decimals", "step", "shown"), [(3, 1, 12.346), (3, 5, 12.345), (1, 2, 12.4), (0, 10, 10.0)])
+@cases(("decimals", "step", "shown"), [(3, 1, 12.346), (3, 5, 12.345), (1, 2, 12.4), (0, 10, 10.0)])
 def test_resolution(decimals, step, shown):
     cell = Cell(12.3456, decimals=decimals, step=step)
     assert cell.floats(0x2000) == [pytest.approx(shown, rel=1e-7)]
     assert cell.integer(0x2020) == round(shown * 10**decimals)
 
 
-@each_case(
-    ("newtons", "bits"), [(60.0, 0), (60.001, 2), (1e9, 2), (math.inf, 2), (-60.0, 0), (-60.001, 1), (-1e9, 1)]
-)
+@cases(("newtons", "bits"), [(60.0, 0), (60.001, 2), (1e9, 2), (math.inf, 2), (-60.0, 0), (-60.001, 1), (-1e9, 1)])
 def test_range_bits(newtons, bits):
     cell = Cell(newtons)
     assert cell.qualifier() == bits
@@ -201,7 +199,7 @@ def test_peak_and_hold():
     assert (cell.integer(0x2082), cell.integer(0x2086)) == (5000, 5000)
 
 
-@each_case("command", [0x02, 0x08])
+@cases("command", [0x02, 0x08])
 def test_no_tare_and_no_zero_while_moving(command):
     cell = Cell()
     refused(4, lambda: cell.write_registers(0x2061, [command]))  # just switched on
@@ -322,8 +320,8 @@ def filtered(setting: int, **options) -> Cell:
     return cell
 
 
-@each_case("setting", SETTLING_MS)
-@each_case("watch", [0.001, 0.004, 0.02])
+@cases("setting", SETTLING_MS)
+@cases("watch", [0.001, 0.004, 0.02])
 def test_settles_in_the_time_of_the_manual(setting, watch):
     cell = filtered(setting)
     cell.clock.sleep(1.0)
@@ -335,7 +333,7 @@ def test_settles_in_the_time_of_the_manual(setting, watch):
     assert 1000 * (cell.clock.now() - start) == pytest.approx(SETTLING_MS[setting], rel=0.06, abs=1000 * watch)
 
 
-@each_case("setting", range(9))
+@cases("setting", range(9))
 def test_cut_off(setting):
     """The response to a sine wave at the cut-off, by the plant's own clock."""
     cell = filtered(setting)
@@ -364,7 +362,7 @@ def test_how_often_it_is_asked_does_not_matter():
     assert response([0.3, 1.7, 5.0]) == pytest.approx(often, abs=5e-4)
 
 
-@each_case("setting", range(9))
+@cases("setting", range(9))
 def test_a_long_silence_costs_no_more_than_a_short_one(setting):
     cell = filtered(setting)
     cell.load.splits = 0
@@ -381,7 +379,7 @@ def test_on_the_wall_clock_it_costs_no_more():
     assert cell.load.splits < 100
 
 
-@each_case("setting", [0, 3, 7])
+@cases("setting", [0, 3, 7])
 def test_noise_is_that_of_the_setting(setting):
     cell = filtered(setting, noise=0.01, seed=11)
     readings = []
@@ -392,7 +390,7 @@ def test_noise_is_that_of_the_setting(setting):
     assert abs(np.mean(readings)) < 4 * np.std(readings) / math.sqrt(2000)
 
 
-@each_case("lags", [0.1, 0.5, 2.0])
+@cases("lags", [0.1, 0.5, 2.0])
 def test_noise_is_correlated_as_two_lags_make_it(lags):
     cell = filtered(3, noise=0.01, seed=12)
     readings = []
@@ -506,7 +504,7 @@ def test_exchanges():
         assert server.receive(sent).hex(" ") == reply.hex(" "), sent.hex(" ")
 
 
-@each_case("address", [1, 17, 247])
+@cases("address", [1, 17, 247])
 def test_answers_to_its_address_only(address):
     server = ModbusRtuServer(Cell(), address)
     assert server.address == address
@@ -517,7 +515,7 @@ def test_answers_to_its_address_only(address):
         assert not reply or reply[0] == address
 
 
-@each_case("address", [0, 248, -1])
+@cases("address", [0, 248, -1])
 def test_no_other_addresses(address):
     with pytest.raises(ValueError, match="1 to 247"):
         ModbusRtuServer(Cell(), address)
@@ -537,7 +535,7 @@ def test_byte_by_byte():
     assert [server.receive(bytes([byte])) for byte in READ] == [b""] * 7 + [READ_REPLY]
 
 
-@each_case(
+@cases(
     "garbage",
     [
         b"\x00",

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 
 from bench.base import VirtualClock
 from sim_devices.transducers.imperfect import Characteristic, ImperfectSensor, SensorErrors, imperfect, shown
@@ -128,7 +128,7 @@ def test_looking_at_the_truth_changes_nothing():
         assert looked[2]() == other[2]() == pytest.approx(before, abs=1e-9)
 
 
-@each_case("resolution", [0.0, 0.03])
+@cases("resolution", [0.0, 0.03])
 def test_a_course_is_shown_as_each_of_its_values(resolution):
     errors = SensorErrors(gain_error=0.01, offset=0.2, nonlinearity=0.02, resolution=resolution)
     characteristic = Characteristic(errors, -1.0, 3.0)

@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from hypothesis import given, strategies as st
 
 from bench.base import VirtualClock
@@ -62,7 +62,7 @@ def frame(text: str) -> bytes:
 # The register map
 
 
-@each_case(
+@cases(
     ("address", "words"),
     [
         (55100, [0x0011, 0x2233]),
@@ -87,7 +87,7 @@ def test_reads_may_span_values_and_begin_in_the_middle_of_one(t7):
     assert t7.read_registers(55101, 1) == [0x2233]
 
 
-@each_case("address", [28, 1004, 9028, 41014, 55102, 61616, 65535])
+@cases("address", [28, 1004, 9028, 41014, 55102, 61616, 65535])
 def test_what_is_not_emulated_is_an_illegal_address(t7, address):
     with pytest.raises(RegisterError) as refused:
         t7.read_registers(address, 1)
@@ -104,7 +104,7 @@ def test_read_only_and_write_only(t7):
         assert refused.value.code == 2
 
 
-@each_case(("address", "values"), [(1000, [0]), (1001, [0]), (1000, [0, 0, 0]), (40001, [0, 0])])
+@cases(("address", "values"), [(1000, [0]), (1001, [0]), (1000, [0, 0, 0]), (40001, [0, 0])])
 def test_half_a_value_cannot_be_written(t7, address, values):
     with pytest.raises(RegisterError) as refused:
         t7.write_registers(address, values)
@@ -117,7 +117,7 @@ def test_no_number_cannot_be_written(t7):
     assert refused.value.code == 3
 
 
-@each_case(
+@cases(
     ("address", "value", "detail"),
     [
         (40006, 5.0, 2370),
@@ -142,7 +142,7 @@ def test_refused_settings_leave_a_detail(t7, address, value, detail):
     assert t7.read_value(55000) == 0
 
 
-@each_case(
+@cases(
     ("address", "value"),
     [(9000, 1), (9300, 0), (9300, 16385), (10200, 0.0), (61600, 2), (61600, 1)],
 )
@@ -152,7 +152,7 @@ def test_other_refused_settings(t7, address, value):
     assert refused.value.code == 4
 
 
-@each_case(("written", "read"), [(10, 10), (1, 1), (0.1, 0.1), (0.01, 0.01), (0, 10)])
+@cases(("written", "read"), [(10, 10), (1, 1), (0.1, 0.1), (0.01, 0.01), (0, 10)])
 def test_ranges(t7, written, read):
     t7.write_value(40026, written)
     assert t7.read_value(40026) == pytest.approx(read, rel=1e-6)
@@ -171,7 +171,7 @@ def test_outputs(t7):
     assert t7.tdac_volts(2) == -10.0
 
 
-@each_case(("register", "lowest", "highest", "bits"), [(1000, 0.0, 5.0, 12), (30000, -10.0, 10.0, 14)])
+@cases(("register", "lowest", "highest", "bits"), [(1000, 0.0, 5.0, 12), (30000, -10.0, 10.0, 14)])
 def test_outputs_have_steps(t7, register, lowest, highest, bits):
     step = (highest - lowest) / 2**bits
     seen = set()
@@ -261,7 +261,7 @@ def test_quantisation_at_index_1():
     assert seen == set(range(11))
 
 
-@each_case("span", [10.0, 1.0, 0.1, 0.01])
+@cases("span", [10.0, 1.0, 0.1, 0.01])
 def test_clipping(span):
     volts = 0.0
     t7 = make({0: lambda: volts})
@@ -284,7 +284,7 @@ def test_differential():
     assert t7.convert(2) == pytest.approx(2.0, abs=LSB)
 
 
-@each_case("index", range(9))
+@cases("index", range(9))
 def test_noise_by_resolution_index(index):
     t7 = make({0: lambda: 1.2345}, seed=11)
     t7.write_value(41500, index)
@@ -385,7 +385,7 @@ def test_the_plant_stands_at_the_instant_of_expiry():
     assert plant.time == 100.0
 
 
-@each_case("access", ["read", "write", "conversion", "burst", "refused"])
+@cases("access", ["read", "write", "conversion", "burst", "refused"])
 def test_any_communication_feeds(access):
     t7 = make()
     arm(t7)
@@ -477,7 +477,7 @@ def test_two_current_psd():
     assert psd.first() + psd.second() == pytest.approx(2.0)
 
 
-@each_case(
+@cases(
     ("position", "shown"),
     [
         (0.0, 0.0),
@@ -517,7 +517,7 @@ def test_supplies_of_ratiometric_sensors_differ_and_stay():
     assert supplies == [sensor.supply() for sensor in sensors]
 
 
-@each_case(
+@cases(
     ("displacement", "shown"),
     [(0.0, 0.0), (14e-9, 10e-9), (-16e-9, -20e-9), (199.994e-6, 199.99e-6), (200e-6, 200e-6), (1.0, 200e-6)],
 )
@@ -536,7 +536,7 @@ def test_noise_of_a_displacement_sensor():
     assert np.mean(shown) == pytest.approx(50.003e-6, abs=4 * 10.4e-9 / math.sqrt(4000))
 
 
-@each_case(
+@cases(
     ("celsius", "ohms"),
     # The table of a thermistor of 10 kΩ at 25 °C with these coefficients.
     [(0.0, 32650.0), (25.0, 10000.0), (50.0, 3603.0), (100.0, 678.3)],
@@ -638,7 +638,7 @@ def test_amplifier_settles_by_its_time_constant():
     assert 20.0 * (world.time - 1.0) - load.integral == pytest.approx(20.0 * 0.2e-3, rel=0.01)
 
 
-@each_case("interval", [5e-6, 50e-6, 1e-3])
+@cases("interval", [5e-6, 50e-6, 1e-3])
 def test_amplifier_in_a_fast_loop(interval):
     hv, load, world = amplifier()
     output, rng = 0.0, np.random.default_rng(4)
@@ -652,7 +652,7 @@ def test_amplifier_in_a_fast_loop(interval):
         assert abs(load.volts - output) <= hv.STEP / 2 + 1e-9
 
 
-@each_case("rate", [1e-3, 4e-3, 6e-3, 0.02])
+@cases("rate", [1e-3, 4e-3, 6e-3, 0.02])
 def test_load_of_an_amplifier_never_goes_back_on_its_way(rate):
     hv, load, world = amplifier()
     for step in range(300):
@@ -664,7 +664,7 @@ def test_load_of_an_amplifier_never_goes_back_on_its_way(rate):
     assert load.volts == pytest.approx(20.0 * min(rate * 299, 1.5), abs=1e-9)
 
 
-@each_case("offset", [0.0, 2.5])
+@cases("offset", [0.0, 2.5])
 def test_amplifier_is_clipped(offset):
     hv, load, world = amplifier(offset_volts=offset)
     for volts, kept in ((2.0, 40.0), (2.3, 45.0), (-9.0, -45.0), (0.0, 0.0)):
@@ -826,7 +826,7 @@ def test_any_bytes_are_answered_or_end_the_connection(pieces):
         pass
 
 
-@each_case("bad", ["0001 0001 0006 01 03 0000 0001", "0001 0000 0001 01", "0001 0000 040b 01"])
+@cases("bad", ["0001 0001 0006 01 03 0000 0001", "0001 0000 0001 01", "0001 0000 040b 01"])
 def test_a_foreign_header_ends_the_connection_and_no_other(wired, bad):
     with ModbusTcpServer(wired) as server:
         with socket.create_connection(("127.0.0.1", server.port), timeout=60) as spoilt:

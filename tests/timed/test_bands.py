@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 
 from bench.identification import Band, calibrate_band_in_time, identify_in_time
 from bench.identification.design.excitation_class import ExcitationClass
@@ -76,9 +76,7 @@ def test_what_the_fit_chose_is_kept_without_a_block():
     assert same.pointwise == pytest.approx(band.pointwise, rel=0.05)
 
 
-@each_case(
-    "dynamics", ["none", "lag", "resonance,drift", "lag,delay,creep", "resonance,kelvin-voigt", "fading-drift"]
-)
+@cases("dynamics", ["none", "lag", "resonance,drift", "lag,delay,creep", "resonance,kelvin-voigt", "fading-drift"])
 def test_a_hammerstein_model_knows_what_follows_its_operator(dynamics):
     rng = np.random.default_rng(0)
     names = dynamics.split(",")

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 
 from bench.identification import (
     Candidate,
@@ -62,7 +62,7 @@ def test_a_model_is_the_same_after_json():
     np.testing.assert_array_equal(again.densities()[0].values, model.densities()[0].values)
 
 
-@each_case("sign", [1.0, -1.0])
+@cases("sign", [1.0, -1.0])
 def test_every_element_is_found_again_on_uneven_times(sign):
     rng = np.random.default_rng(5)
     t, u = record(rng)
@@ -153,7 +153,7 @@ def test_a_shape_and_a_lag_at_one_rate_are_found_together():
     assert found.linear.lag == (pytest.approx(1.5e-3, rel=0.2), 0.0)
 
 
-@each_case("static", ["preisach", "preisach-signed"])
+@cases("static", ["preisach", "preisach-signed"])
 def test_smoothing_is_that_of_the_operators(static):
     rng = np.random.default_rng(0)
     t, u = record(rng)
@@ -225,7 +225,7 @@ def test_what_the_data_do_not_determine_is_said():
     assert not identify_in_time("hammerstein", t, u, y, **options).model.parameters()
 
 
-@each_case(
+@cases(
     ("options", "message"),
     [
         ({"dynamics": "lag,echo"}, "echo"),

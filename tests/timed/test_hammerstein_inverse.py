@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 
 from bench.analysis import invert_targets
 from bench.base import ConfigurationError
@@ -51,9 +51,9 @@ def span(model):
     return float(np.ptp(model.static.output_range()))
 
 
-@each_case("drift", [{}, {"drift": 0.2}, {"drift": -0.3, "drift_time": 0.4}])
-@each_case("make", [preisach, plays])
-@each_case("part", PARTS)
+@cases("drift", [{}, {"drift": 0.2}, {"drift": -0.3, "drift_time": 0.4}])
+@cases("make", [preisach, plays])
+@cases("part", PARTS)
 def test_the_prediction_of_the_setpoints_is_the_targets(part, make, drift):
     rng = np.random.default_rng(0)
     model = Hammerstein(make(rng), LinearPart(**PARTS[part]), **drift)
@@ -103,7 +103,7 @@ def test_ringing_is_warned_of_where_steps_are_short_beside_the_lag():
     assert smooth.warnings() == []
 
 
-@each_case(
+@cases(
     ("linear", "step", "message"),
     [
         ({"delay": 0.038}, 0.002, r"delay of 0.038 s is as long as the 0.038 s of the targets"),
@@ -117,7 +117,7 @@ def test_what_cannot_be_inverted_is_refused(linear, step, message):
         invert_targets(ModelFile("m", model), np.linspace(0.0, 0.1, 20), times=step * np.arange(20))
 
 
-@each_case("drift", [{}, {"drift": 0.2}, {"drift": -0.3, "drift_time": 0.4}])
+@cases("drift", [{}, {"drift": 0.2}, {"drift": -0.3, "drift_time": 0.4}])
 def test_what_is_ahead_is_the_output_a_delay_later(drift):
     rng = np.random.default_rng(4)
     model = Hammerstein(preisach(rng), LinearPart(0.014, **PARTS["lag and creep"]), **drift)
@@ -131,8 +131,8 @@ def test_what_is_ahead_is_the_output_a_delay_later(drift):
     np.testing.assert_allclose(prompt.evaluate(t[100:], u[100:], state)[:-7], outputs[7:], rtol=0.0, atol=1e-12)
 
 
-@each_case("drift", [{}, {"drift": 0.2}, {"drift": -0.3, "drift_time": 0.4}])
-@each_case("part", ["none", "lag", "lag and creep"])
+@cases("drift", [{}, {"drift": 0.2}, {"drift": -0.3, "drift_time": 0.4}])
+@cases("part", ["none", "lag", "lag and creep"])
 def test_targets_behind_a_delay_of_whole_steps_are_met_after_it(part, drift):
     rng = np.random.default_rng(0)
     model = Hammerstein(preisach(rng), LinearPart(0.014, **PARTS[part]), **drift)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from scipy.integrate import solve_ivp
 
 from bench.models import FilterState, LinearPart, logarithmic_creep
@@ -21,8 +21,8 @@ def record(rng, samples=60):
     return np.cumsum(rng.uniform(0.001, 0.03, samples)), np.cumsum(rng.normal(size=samples))
 
 
-@each_case("name", list(LAGS))
-@each_case("delay", [0.0, 0.0137])
+@cases("name", list(LAGS))
+@cases("delay", [0.0, 0.0137])
 def test_responses_on_uneven_times_are_those_of_the_differential_equations(name, delay):
     t, u = record(np.random.default_rng(1))
     first, second = LAGS[name]
@@ -74,7 +74,7 @@ def test_creep_is_nearly_logarithmic():
     assert slope == pytest.approx(np.full(slope.size, 0.1), rel=0.03)
 
 
-@each_case(
+@cases(
     "arguments",
     [
         {"delay": -1.0},

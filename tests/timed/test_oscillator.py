@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from scipy.integrate import solve_ivp
 
 from bench.identification import identify_in_time
@@ -35,7 +35,7 @@ def reference(t, u_of, m=PUBLISHED):
     return found.y[0] + m.offset
 
 
-@each_case("interpolation", ["linear", "smooth"])
+@cases("interpolation", ["linear", "smooth"])
 def test_responses_on_uneven_times_are_those_of_the_differential_equations(interpolation):
     t = np.cumsum(np.random.default_rng(0).uniform(5e-4, 2e-3, 200))
 

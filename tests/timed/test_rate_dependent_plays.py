@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from hypothesis import given, strategies as st
 
 from bench.analysis import invert_targets
@@ -52,7 +52,7 @@ def integrated(model, times, inputs, substeps):
     return np.array(rows)
 
 
-@each_case("seed", range(4))
+@cases("seed", range(4))
 def test_the_plays_solve_their_differential_equation(seed):
     rng = np.random.default_rng(seed)
     model, (t, u) = specimen(rng), record(rng, 60)
@@ -96,7 +96,7 @@ def test_a_greater_input_never_gives_a_smaller_output(seed):
     assert (model.evaluate(t, above) - model.evaluate(t, u) >= -1e-12).all()
 
 
-@each_case("rate", [0.01, 1.0, 50.0])
+@cases("rate", [0.01, 1.0, 50.0])
 def test_the_threshold_of_a_dragged_play_grows_with_the_rate(rate):
     model = RateDependentPlays([0.2], [0.03], [1.0], (-10.0, 10.0))
     # Ramps of 40 time constants and 10 thresholds.
@@ -108,7 +108,7 @@ def test_the_threshold_of_a_dragged_play_grows_with_the_rate(rate):
     assert y[-1] - u[-1] == pytest.approx(0.2 + 0.03 * rate, rel=1e-9)
 
 
-@each_case("seed", range(3))
+@cases("seed", range(3))
 def test_a_sequence_in_two_parts_is_the_whole(seed):
     rng = np.random.default_rng(seed)
     model, (t, u) = specimen(rng), record(rng)
@@ -138,7 +138,7 @@ def test_a_model_is_the_same_after_json_and_saturation_forgets_the_rest():
     assert model.initial_state() == PlaysState((0.1,) * 9)
 
 
-@each_case(
+@cases(
     ("state", "message"),
     [
         ({"plays": [0.0]}, "the key 'last'"),
@@ -151,7 +151,7 @@ def test_a_wrong_memory_is_refused(state, message):
         RateDependentPlays([0.0], [0.0], [1.0], (0.0, 1.0)).state_from_json(state)
 
 
-@each_case(
+@cases(
     ("fields", "message"),
     [
         ({"thresholds": [0.0]}, "one for each weight"),
@@ -284,7 +284,7 @@ def test_where_the_rate_tells_nothing_the_comparison_leaves_the_plays_as_they_ar
     assert HeldOutInTime(Measurements.of(u, y), t, t.size).evaluate_plays(static, 5) == []
 
 
-@each_case("sign", [1.0, -1.0])
+@cases("sign", [1.0, -1.0])
 def test_a_time_constant_is_found_again(sign):
     t, u = cycles([2, 2, 20, 20, 60, 60, 60], [1.0, 0.5, 1.0, 0.4, 1.0, 0.7, 0.3])
     thresholds = np.arange(8) / 10.0
@@ -299,7 +299,7 @@ def test_a_time_constant_is_found_again(sign):
     assert measure_errors(plant.evaluate(t, u), found.model.evaluate(t, u)).rms_percent < 0.05
 
 
-@each_case("sign", [1.0, -1.0])
+@cases("sign", [1.0, -1.0])
 def test_the_slopes_of_the_search_give_the_gradient_of_the_cost(sign):
     rng = np.random.default_rng(0)
     t, u = cycles([2, 20, 60, 60], [1.0, 0.6, 0.9, 0.4], 500.0)
@@ -343,7 +343,7 @@ def test_plays_without_a_rate_are_given_none():
     assert any("do not determine every time constant" in text for text in forced.warnings)
 
 
-@each_case(
+@cases(
     ("model", "options"),
     [("rate-dependent-plays", {"time_constants": 2}), ("hammerstein", {"levels": 10, "dynamics": "lag"})],
 )
@@ -355,7 +355,7 @@ def test_few_samples_are_warned_of(model, options):
     assert any("24 samples are few" in text for text in found.warnings)
 
 
-@each_case(
+@cases(
     ("options", "message"),
     [
         ({"time_constants": 4}, "time_constants: expected 0 to 3"),

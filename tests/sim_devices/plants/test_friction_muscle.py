@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from scipy.optimize import brentq
 
 from sim_devices.plants.coiled_polymer import CoiledPolymerMuscle, CoiledPolymerParameters
@@ -116,7 +116,7 @@ def test_contacts_are_those_of_the_population(case):
     assert share.std() == pytest.approx(1.0 / math.sqrt(3.0), rel=0.02)
 
 
-@each_case("wrong", [{"contact_count": 0}, {"friction": -0.1}, {"rated_voltage": 6.0}])
+@cases("wrong", [{"contact_count": 0}, {"friction": -0.1}, {"rated_voltage": 6.0}])
 def test_wrong_parameters_are_refused(case, wrong):
     with pytest.raises(ValueError, match=next(iter(wrong))):
         replace(case.plain, **wrong)
@@ -264,8 +264,8 @@ def coil(parameters, temperature, x):
 
 class TestWithoutFriction:
     @mckibben
-    @each_case("voltage", [0.6, 1.5, 3.0])
-    @each_case("load", [1.0, 4.9, 10.0])
+    @cases("voltage", [0.6, 1.5, 3.0])
+    @cases("load", [1.0, 4.9, 10.0])
     def test_force_is_that_of_the_braid_and_the_bladder(self, case, voltage, load):
         muscle = case.make(case.smooth)
         muscle.hang(load)
@@ -277,8 +277,8 @@ class TestWithoutFriction:
         assert braid_force(case.smooth, muscle.pressure, 110e-3 + x) + elastic == pytest.approx(load, abs=1e-8)
 
     @coiled
-    @each_case("voltage", [0.0, 1.5, 3.0])
-    @each_case("load", [0.5, 4.9, 10.0])
+    @cases("voltage", [0.0, 1.5, 3.0])
+    @cases("load", [0.5, 4.9, 10.0])
     def test_force_is_that_of_the_coil(self, case, voltage, load):
         muscle = case.make(case.smooth)
         muscle.hang(load)

@@ -5,7 +5,7 @@ from functools import cached_property
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from hypothesis import given, settings, strategies as st
 from plant_outputs import snapshot
 from scipy.integrate import solve_ivp
@@ -87,7 +87,7 @@ class TestGeometry:
         volts = strip.piezo_coefficient / ep / (3.3e-6 - 17e-6)
         assert piezo_sensitivity(strip) == pytest.approx(-volts * thermal_sensitivity(strip), rel=1e-9)
 
-    @each_case("wrong", [{"length": 0.0}, {"passive_heat": -1.0}, {"piezo_coefficient": math.nan}])
+    @cases("wrong", [{"length": 0.0}, {"passive_heat": -1.0}, {"piezo_coefficient": math.nan}])
     def test_wrong_strips_are_refused(self, wrong):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             Bimorph(**wrong)
@@ -128,7 +128,7 @@ class TestHeat:
         plant.advance(3600.0)
         assert snapshot(plant) == before
 
-    @each_case(
+    @cases(
         ("current", "deflection", "tip"),
         [(-0.1, 101e-6, -14.1), (0.1, -175e-6, 19.8), (-0.05, 59e-6, None), (-0.025, 32e-6, None)],
     )
@@ -211,7 +211,7 @@ class TestHeat:
             errors.append(np.abs(plant._rise + 22.0 - exact).max())
         assert errors[0] > 3.0 * errors[1] > 9.0 * errors[2]
 
-    @each_case("current", [-0.3, 0.1])
+    @cases("current", [-0.3, 0.1])
     def test_settled_heat_to_air_is_the_electrical_power(self, current):
         plant = settled(current)
         assert plant.current * plant.tec_voltage > 1e-4
@@ -331,7 +331,7 @@ class TestPiezo:
         outside = np.flatnonzero(np.abs(response - 1.0) > 0.02)
         assert 50e-6 * outside[-1] == pytest.approx(0.157, abs=0.002)
 
-    @each_case("offset", [0.0, 0.03, -0.03])
+    @cases("offset", [0.0, 0.03, -0.03])
     def test_agrees_with_scipy_at_any_spacing(self, offset):
         # Voltages at multiples of 50 µs, looked at only when they change.
         rng = np.random.default_rng(4)

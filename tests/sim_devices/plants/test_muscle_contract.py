@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from hypothesis import given, settings, strategies as st
 from plant_outputs import snapshot
 
@@ -185,7 +185,7 @@ class TestSpecimen:
         muscle.advance(3600.0)
         assert snapshot(muscle) == before
 
-    @each_case(("name", "value"), [("step", math.nan), ("time_constant", 0.0), ("pretension", None)])
+    @cases(("name", "value"), [("step", math.nan), ("time_constant", 0.0), ("pretension", None)])
     def test_wrong_parameters_are_refused(self, case, name, value):
         with pytest.raises(ValueError, match=name):
             replace(case.plain, **{name: 1.05 * case.largest_load if value is None else value})
@@ -288,7 +288,7 @@ class TestClamped:
         assert muscle.force > 5.0
         assert muscle.length < muscle.position
 
-    @each_case("voltage", [0.0, 3.0])
+    @cases("voltage", [0.0, 3.0])
     def test_overstretched_muscle_stays_at_the_limit(self, case, voltage):
         muscle = case.make()
         muscle.clamp(50e-3)
@@ -298,8 +298,8 @@ class TestClamped:
             assert muscle.force == pytest.approx(case.largest_load, abs=case.rounding)
             assert muscle.position == pytest.approx(50e-3)
 
-    @each_case("voltage", [0.0, 1.5, 3.0])
-    @each_case("load", [0.5, 4.9, 10.0])
+    @cases("voltage", [0.0, 1.5, 3.0])
+    @cases("load", [0.5, 4.9, 10.0])
     def test_changing_between_load_and_servo_is_continuous(self, case, load, voltage):
         def assert_kept(before):
             for name, value in before._asdict().items():
@@ -355,7 +355,7 @@ def test_full_drive_under_the_pretension_erases_the_memory(case):
 
 @heated
 class TestHeat:
-    @each_case("voltage", [0.6, 1.5, 3.0])
+    @cases("voltage", [0.6, 1.5, 3.0])
     def test_time_constant(self, case, voltage):
         muscle = case.make()
         muscle.apply(voltage)
@@ -445,7 +445,7 @@ class TestTime:
                 split.advance(part * 1e-6)
             assert snapshot(split) == snapshot(whole)
 
-    @each_case("part", [0.01, 0.0123, 1.0 / 3.0, 0.7, 60.0])
+    @cases("part", [0.01, 0.0123, 1.0 / 3.0, 0.7, 60.0])
     def test_hours_in_parts(self, case, part):
         """Rounding does not add up, and blocks of noise are used up alike."""
         whole, split = case.make(case.lively), case.make(case.lively)
@@ -502,13 +502,13 @@ class TestTime:
 
 
 class TestRefusals:
-    @each_case("dt", [-1e-9, math.nan, math.inf])
+    @cases("dt", [-1e-9, math.nan, math.inf])
     def test_advance(self, case, dt):
         with pytest.raises(ValueError, match="dt must"):
             case.make().advance(dt)
 
-    @each_case("command", ["apply", "hang", "clamp"])
-    @each_case("side", ["below", "above", "not a number"])
+    @cases("command", ["apply", "hang", "clamp"])
+    @cases("side", ["below", "above", "not a number"])
     def test_commands(self, case, command, side):
         name, lowest, highest = {
             "apply": ("voltage", -0.1, 5.1),

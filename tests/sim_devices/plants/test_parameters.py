@@ -3,7 +3,7 @@
 import math
 
 import pytest
-from each_case import each_case
+from cases import cases
 
 from sim_devices.plants.coiled_polymer import CoiledPolymerParameters
 from sim_devices.plants.hybrid_parameters import HybridParameters
@@ -12,7 +12,7 @@ from sim_devices.plants.sma import SMAParameters
 from sim_devices.plants.vo2 import VO2Parameters
 
 
-@each_case(
+@cases(
     ("kind", "wrong"),
     [
         (SMAParameters, {"grain_count": 0}),

@@ -4,7 +4,7 @@ import math
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from hypothesis import given, settings, strategies as st
 from plant_outputs import snapshot
 
@@ -235,7 +235,7 @@ class TestGrains:
         assert np.array_equal(martensite, before[0])
         assert np.array_equal(oriented, before[1])
 
-    @each_case("celsius_volt", [0.0, 1.2, 1.8, 3.0])
+    @cases("celsius_volt", [0.0, 1.2, 1.8, 3.0])
     def test_length_is_monotone_along_a_monotone_load(self, celsius_volt):
         wire = make()
         wire.apply(celsius_volt)
@@ -333,7 +333,7 @@ class TestClamped:
             one_grain = parameters.transformation_strain * parameters.rest_length / parameters.grain_count
             assert abs(wire.position - wire.length - wire.force / parameters.series_stiffness) <= 1.01 * one_grain
 
-    @each_case("voltage", [0.0, 1.4])
+    @cases("voltage", [0.0, 1.4])
     def test_solution_stays_the_solution(self, voltage):
         """A solved state, solved again, is the same: on the way out and back, at every grain's switch."""
         wire = make()

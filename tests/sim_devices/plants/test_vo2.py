@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 import pytest
-from each_case import each_case
+from cases import cases
 from hypothesis import given, settings, strategies as st
 from plant_outputs import snapshot
 
@@ -63,7 +63,7 @@ class TestSpecimen:
         assert major_width.std() == pytest.approx(2.0, abs=0.1)
         assert np.corrcoef(major_up, np.log(major_width))[0, 1] == pytest.approx(-0.3, abs=0.02)
 
-    @each_case("seed", [0, 2013])
+    @cases("seed", [0, 2013])
     def test_short_moves_sweep_as_many_relays_as_the_density_has(self, seed):
         """A random sample of as many relays would scatter by the root of their number."""
 
@@ -120,7 +120,7 @@ class TestHysteresis:
         )
         assert 260.0 < steepest < 305.0
 
-    @each_case("turn", [60.0, 63.0, 66.0])
+    @cases("turn", [60.0, 63.0, 66.0])
     def test_curve_is_locked_after_a_reversal(self, turn):
         plant = make()
         quasi_static(plant, staircase(22.0, turn, 0.1), dwell=2.0)
@@ -221,7 +221,7 @@ class TestHysteresis:
 
 
 class TestRegulatedPlate:
-    @each_case("size", [0.5, 5.0, 30.0])
+    @cases("size", [0.5, 5.0, 30.0])
     def test_step_response(self, size):
         plant = make()
         quasi_static(plant, [50.0], dwell=60.0)
@@ -306,7 +306,7 @@ class TestRegulatedPlate:
 
 
 class TestPeltier:
-    @each_case("target", [84.0, 15.0])
+    @cases("target", [84.0, 15.0])
     def test_holding_current_has_the_sign_of_the_work(self, target):
         plant = make()
         plant.regulate(target)
@@ -329,7 +329,7 @@ class TestPeltier:
         assert warm.plate_temperature > 84.0
         assert cold.plate_temperature < 15.0
 
-    @each_case("mode", ["drive", "regulate"])
+    @cases("mode", ["drive", "regulate"])
     def test_energy_is_conserved(self, mode):
         """Electrical work equals the heat stored in plate and sink plus what went into the room."""
         p = QUIET
@@ -548,7 +548,7 @@ class TestTime:
                 split.advance(part * 1e-6)
             assert snapshot(split) == snapshot(whole)
 
-    @each_case("part", [0.01, 0.0123, 1.0 / 3.0, 0.7, 60.0])
+    @cases("part", [0.01, 0.0123, 1.0 / 3.0, 0.7, 60.0])
     def test_hours_in_parts(self, part):
         """Rounding does not add up, and blocks of noise are used up alike."""
         whole, split = make(SMALL), make(SMALL)
@@ -609,24 +609,24 @@ class TestTime:
 
 
 class TestRefusals:
-    @each_case("dt", [-1e-9, math.nan, math.inf])
+    @cases("dt", [-1e-9, math.nan, math.inf])
     def test_advance(self, dt):
         with pytest.raises(ValueError, match="dt must"):
             make(SMALL).advance(dt)
 
-    @each_case("target", [-300.0, math.nan, math.inf])
+    @cases("target", [-300.0, math.nan, math.inf])
     def test_targets(self, target):
         with pytest.raises(ValueError, match="target_celsius"):
             make(SMALL).regulate(target)
         with pytest.raises(ValueError, match="initial_temperature"):
             make(SMALL, initial_temperature=target)
 
-    @each_case("limit", [-1.0, math.nan])
+    @cases("limit", [-1.0, math.nan])
     def test_current_limit(self, limit):
         with pytest.raises(ValueError, match="current_limit"):
             make(SMALL).regulate(50.0, current_limit=limit)
 
-    @each_case("current", [5.1, -6.0, math.nan])
+    @cases("current", [5.1, -6.0, math.nan])
     def test_current(self, current):
         plant = make(SMALL)
         with pytest.raises(ValueError, match="current must lie"):

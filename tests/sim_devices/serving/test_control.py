@@ -5,7 +5,7 @@ import socket
 from contextlib import suppress
 
 import pytest
-from each_case import each_case
+from cases import cases
 
 from bench.base import ConfigurationError, DeviceConnectionError
 from bench.rig import AttachedClock, ControlClient
@@ -202,7 +202,7 @@ def test_a_restarted_supply_says_so(sma, opened):
     line.write(b"C\r")
 
 
-@each_case(
+@cases(
     ("line", "words"),
     [
         (b"garbage", "not a line of JSON"),
@@ -352,7 +352,7 @@ def test_what_takes_an_instrument_time_is_ahead_of_the_wall_clock():
     assert clock.now() >= 5.0
 
 
-@each_case("name", ["virtual", "x", "x0", "x-1", "xinf", "xnan", "20", ""])
+@cases("name", ["virtual", "x", "x0", "x-1", "xinf", "xnan", "20", ""])
 def test_a_clock_that_cannot_serve_is_refused(name):
     with pytest.raises(ValueError, match="wall, or xN"):
         make_served_clock(name)

@@ -1,13 +1,13 @@
 """Lines that are no requests of the control socket."""
 
 import pytest
-from each_case import each_case
+from cases import cases
 
 from bench.base import ConfigurationError
 from sim_devices.serving.requests import parse_request
 
 
-@each_case("line", [b'{"do":' * 100_000, b"[" * 100_000, b"\xff\xfe\x00", b"GET / HTTP/1.1", b"\x00" * 10])
+@cases("line", [b'{"do":' * 100_000, b"[" * 100_000, b"\xff\xfe\x00", b"GET / HTTP/1.1", b"\x00" * 10])
 def test_what_is_no_json_is_refused(line):
     with pytest.raises(ConfigurationError, match="not a line of JSON"):
         parse_request(line)
