@@ -37,7 +37,7 @@ from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple, TypeVar
 from pydantic import Field, field_validator
 
 from bench.base import Clock, DeferredModule, DeviceConnectionError, DeviceError, DeviceRestartedError
-from bench.devices import Finding, Identity, LoadCell
+from bench.devices import CheckFinding, Identity, LoadCell
 from drivers.device import LineDevice, Slope
 from drivers.modbus import (
     EMULATED,
@@ -603,7 +603,7 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
                 "instrument off and on, and connect again",
             )
 
-    def self_check(self) -> tuple[Finding, ...]:
+    def self_check(self) -> tuple[CheckFinding, ...]:
         """Read the filter back, and see that the converter works.
 
         Raises DeviceError if the instrument does not answer.
@@ -616,8 +616,8 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
             self._clock.sleep(_POLL)
         works = len(conversions) > 1
         return (
-            Finding("filter", f"{found} in the instrument", advice),
-            Finding(
+            CheckFinding("filter", f"{found} in the instrument", advice),
+            CheckFinding(
                 "converter",
                 f"from {min(conversions)} to {max(conversions)} in {_CONVERSIONS} readings",
                 "" if works else "switch the instrument off and on, if its converter stands still for longer",

@@ -29,7 +29,7 @@ from rich.console import Console
 import bench
 from bench.analysis import TargetResults, target_results
 from bench.base import ConvergenceError, DataError, Workers
-from bench.batch import Campaign, reached_targets, tune
+from bench.batch import RunSeries, reached_targets, tune
 from bench.batch.tuning.search import cost_of
 from bench.control import TwoStageInverse
 from bench.identification import load_model
@@ -227,7 +227,7 @@ def tried(
             settings = {"model": str(model), "controller": case.controller, "sequence_seed": str(seed)}
             if tuning:
                 settings["tuning"] = tuning
-            campaign = Campaign(case.rig, folder / name / str(seed), seed, False, pool)
+            campaign = RunSeries(case.rig, folder / name / str(seed), seed, False, pool)
             runs[name, seed] = campaign, campaign.start(case.protocol, settings)
     found = {name: Sessions(np.full((sessions, 2), math.nan), []) for name in tunings}
     for (name, seed), (campaign, run) in runs.items():

@@ -156,7 +156,7 @@ from .transients.actuator import (
     latency as latency,
 )
 from .transients.recorded_transients import (
-    Recording as Recording,
+    TransientRecording as TransientRecording,
     recording_of as recording_of,
 )
 from .transients.response import (

@@ -47,7 +47,7 @@ _OWN = ("bench", *_OWN_FOLDERS)
 
 
 @dataclass(frozen=True)
-class Entry:
+class RegisteredPart:
     """One registered part.
 
     Attributes
@@ -103,11 +103,11 @@ def _packages() -> list[tuple[str, metadata.Distribution]]:
 
 
 @cache
-def _all_entries() -> tuple[Entry, ...]:
+def _all_entries() -> tuple[RegisteredPart, ...]:
     """Return everything that is registered, in all groups."""
     groups = {f"bench.{group}": group for group in GROUPS}
     return tuple(
-        Entry(groups[point.group], point.name, package, point.value)
+        RegisteredPart(groups[point.group], point.name, package, point.value)
         for package, distribution in _packages()
         for point in distribution.entry_points
         if point.group in groups
@@ -121,14 +121,14 @@ def forget() -> None:
 
 
 @cache
-def entries(group: Group) -> Mapping[str, Entry]:
+def entries(group: Group) -> Mapping[str, RegisteredPart]:
     """Return what is registered in a group, by name, in alphabetical order.
 
     Raises ConfigurationError if two packages register the same name.
     """
     if group not in GROUPS:
         raise ValueError(f"group: expected one of {', '.join(GROUPS)}, got {group!r}")
-    found: dict[str, Entry] = {}
+    found: dict[str, RegisteredPart] = {}
     for entry in _all_entries():
         if entry.group != group:
             continue

@@ -38,12 +38,12 @@ from .campaign.study_tables import (
 )
 from .campaign.tasks import (
     UNFINISHED as UNFINISHED,
+    CampaignTask as CampaignTask,
     Done as Done,
-    Task as Task,
 )
 from .study import (
-    Campaign as Campaign,
     ResultTable as ResultTable,
+    RunSeries as RunSeries,
     Study as Study,
     StudyResult as StudyResult,
     prepare as prepare,

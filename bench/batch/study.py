@@ -55,7 +55,7 @@ _OF_RESULTS = "matplotlib.figure", "bench.dashboard"
 
 
 @dataclass
-class Campaign:
+class RunSeries:
     """A series of runs on one rig, on the virtual clock, each with noise of its own.
 
     Attributes
@@ -91,13 +91,13 @@ class Campaign:
     started: list[Pending[RunResult]] = field(default_factory=list)
     _recordings: dict[Path, Pending[list[Path]]] = field(default_factory=dict)
     _seeds: Iterator[int] = field(init=False)
-    _whole: Campaign | None = None
+    _whole: RunSeries | None = None
 
     def __post_init__(self) -> None:
         (self.folder / "figures").mkdir(parents=True, exist_ok=True)
         self._seeds = (2 * self.seed + k % 2 + 100_000 * (k // 2) for k in itertools.count())
 
-    def part(self, name: str, rig: str) -> Campaign:
+    def part(self, name: str, rig: str) -> RunSeries:
         """Return a campaign on another rig, in a folder of its own below this one."""
         return replace(self, rig=rig, folder=self.folder / name, started=[], _whole=self)
 
@@ -301,7 +301,7 @@ class Study:
     rig: str | None
     summary: str
     description: str
-    carry_out: Callable[[Campaign], StudyResult]
+    carry_out: Callable[[RunSeries], StudyResult]
     published: tuple[Published, ...] = ()
     kernels: tuple[str, ...] = ()
 
@@ -417,7 +417,7 @@ def reproduce(
 
         with CompilationDisplay(console, console):
             on = rig or study.rig or ""
-            campaign = Campaign(on, folder, seed, live, pool, figure_format, recorded, settings)
+            campaign = RunSeries(on, folder, seed, live, pool, figure_format, recorded, settings)
             found = study.carry_out(campaign)
             recordings = campaign.recordings()
     for protocol in settings.keys() - {_protocol_of(run) for run in campaign.runs if settings}:

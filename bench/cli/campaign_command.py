@@ -19,7 +19,7 @@ from bench.cli.command_support import JsonOption, check_outputs, console, error_
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from bench.batch import Done, Executor, Expansion, Task
+    from bench.batch import CampaignTask, Done, Executor, Expansion
 
 app = typer.Typer()
 
@@ -163,11 +163,11 @@ class SayingExecutor:
         self._over.set()
         self._thread.join()
 
-    def submit(self, task: Task) -> None:
+    def submit(self, task: CampaignTask) -> None:
         """Have a task carried out."""
         self._executor.submit(task)
 
-    def next_done(self) -> tuple[Task, Done]:
+    def next_done(self) -> tuple[CampaignTask, Done]:
         """Wait for the next task that is done; return it with what it has left."""
         found = self._executor.next_done()
         self._done += 1

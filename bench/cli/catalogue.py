@@ -44,7 +44,9 @@ class Catalogue:
         problems: list[str] = []
         packages: dict[str, str] = {}
 
-        def loaded(what: Mapping[str, registry.Entry], load: Callable[[str, registry.Entry], Any]) -> dict[str, Any]:
+        def loaded(
+            what: Mapping[str, registry.RegisteredPart], load: Callable[[str, registry.RegisteredPart], Any]
+        ) -> dict[str, Any]:
             found = {}
             for name, entry in what.items():
                 try:
@@ -102,7 +104,7 @@ class Catalogue:
         }
 
 
-def _summary(_: str, entry: registry.Entry) -> str:
+def _summary(_: str, entry: registry.RegisteredPart) -> str:
     summary = getattr(entry.load(), "summary", None)
     if not isinstance(summary, str):
         raise ConfigurationError(

@@ -45,7 +45,7 @@ from .notch_loop import (
     NotchLoopParameters as NotchLoopParameters,
 )
 from .play_inverse import (
-    PlayInverse as PlayInverse,
+    SampledPlayInverse as SampledPlayInverse,
 )
 from .references import (
     AddedSine as AddedSine,

@@ -14,7 +14,7 @@ from bench.models import MemoryCurve, Preisach, PreisachInverse
 
 
 @dataclass(frozen=True, eq=False)
-class Adapter:
+class DensityAdapter:
     """A model, the memory of its plant, and how the next measurement changes the model.
 
     `update` returns a new adapter; nothing is changed in place, so that an earlier model can be taken up again.
@@ -95,7 +95,7 @@ class Adapter:
         """The exact inverse of the present model."""
         return PreisachInverse(self.model, self.policy)
 
-    def update(self, value: float, output: float | None) -> Adapter:
+    def update(self, value: float, output: float | None) -> DensityAdapter:
         """Return the adapter after the input moved monotonically to `value` and `output` was measured there.
 
         Parameters
@@ -141,8 +141,8 @@ class Adapter:
         other.__dict__["inverse"] = inverse._retuned(adapted, (minus, plus, inverse._ends[2]))
         return other
 
-    def _moved(self, state: MemoryCurve, output: float, error: float) -> Adapter:
-        other = object.__new__(Adapter)
+    def _moved(self, state: MemoryCurve, output: float, error: float) -> DensityAdapter:
+        other = object.__new__(DensityAdapter)
         other.__dict__.update(self.__dict__)
         other.__dict__.update(state=state, output=output, error=error)
         return other

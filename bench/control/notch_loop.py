@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bench.base import ConvergenceError, Floats, checks as _checks
-from bench.control.play_inverse import PlayInverse
+from bench.control.play_inverse import SampledPlayInverse
 from bench.control.references import Reference
 from bench.control.tracking import Trace, check_positive
 from bench.models import PrandtlIshlinskii
@@ -130,7 +130,7 @@ class NotchLoop:
     ) -> None:
         p = parameters
         self._reference = reference
-        self._inverse = PlayInverse(hysteresis, p.stroke)
+        self._inverse = SampledPlayInverse(hysteresis, p.stroke)
         self._gain = p.integral / p.rate
         section = notch(frequency, p.rate, damping, p.pole_damping).tolist()
         self._b0, self._b1, self._b2, _, self._a1, self._a2 = section

@@ -11,7 +11,7 @@ import math
 from bench.models import PrandtlIshlinskii
 
 
-class PlayInverse:
+class SampledPlayInverse:
     """The inverse of a Prandtl-Ishlinskii operator one sample at a time, with its memory.
 
     Equal to the operator's `inverse`, but cheap enough for every sample of a fast loop. A move drags the first plays

@@ -11,7 +11,7 @@ import numpy as np
 import rerun as rr
 
 from bench.dashboard.drawing import ALARM, CAUTION, LIMIT, Colour
-from bench.dashboard.rerun_recording import Floats, Ints, Recording, times
+from bench.dashboard.rerun_recording import Floats, Ints, RerunRecording, times
 from bench.devices import Signal
 from bench.rig import SETPOINT, Interlock, Level
 
@@ -109,7 +109,7 @@ class BoundLines:
         self._since: float | None = None
         self._drawn: dict[int, float] = {}
 
-    def write(self, recording: Recording, t: Floats, step: Ints, values: Floats) -> None:
+    def write(self, recording: RerunRecording, t: Floats, step: Ints, values: Floats) -> None:
         """Draw what is near to values, shape (times, signals), in the unit of the signals."""
         if not self._bounds or not np.isfinite(values).any():
             return
@@ -128,5 +128,5 @@ class BoundLines:
                 self._line(recording, path, float(t[-1]), int(step[-1]), bound)
                 self._drawn[i] = float(t[-1])
 
-    def _line(self, recording: Recording, path: str, t: float, step: int, bound: Bound) -> None:
+    def _line(self, recording: RerunRecording, path: str, t: float, step: int, bound: Bound) -> None:
         recording.send_vectors(path, times([t], [step]), np.array([[self._factor * bound.value]]))

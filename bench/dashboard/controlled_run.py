@@ -15,7 +15,7 @@ import rerun.blueprint as rrb
 from bench.base import fitting_prefix
 from bench.dashboard.drawing import Colour, time_view
 from bench.dashboard.entries import End, Part, Ticks
-from bench.dashboard.rerun_recording import Floats, Recording, times
+from bench.dashboard.rerun_recording import Floats, RerunRecording, times
 from bench.dashboard.signal_plots import find_column, likely_magnitude
 from bench.devices import Settled, Signal
 from bench.protocol import TRACES
@@ -169,7 +169,7 @@ class ControlPlots:
         return views
 
 
-class Errors:
+class ErrorPlot:
     """The errors of a run under control: those at its last targets, and that of now.
 
     A target ends with the readings that follow while no controller is at work; their mean less the last reference is
@@ -238,7 +238,7 @@ class Errors:
             self._not_written.append(ended)
             self._readings = []
 
-    def write(self, recording: Recording) -> None:
+    def write(self, recording: RerunRecording) -> None:
         """Write the errors at the targets that have ended since the last call."""
         if self._not_written:
             t, step, error = zip(*self._not_written, strict=True)

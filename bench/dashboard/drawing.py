@@ -21,7 +21,7 @@ from rerun.components import LineStrip2DBatch
 from rerun.encodings import Vec2DBatch
 
 from bench.base import fitting_prefix
-from bench.dashboard.rerun_recording import Floats, Recording
+from bench.dashboard.rerun_recording import Floats, RerunRecording
 from bench.devices import Signal
 from bench.rig import XYPlot
 
@@ -90,7 +90,7 @@ class Frame:
         low, high = self.y_range
         return -(value - low) / (high - low)
 
-    def draw(self, recording: Recording, path: str) -> None:
+    def draw(self, recording: RerunRecording, path: str) -> None:
         """Draw the axes, and give what is logged below `path`/data their units."""
         columns = [(self.x(value), value * self.x_factor) for value in _round_values(*self.x_range)]
         rows = [(self.y(value), value * self.y_factor) for value in _round_values(*self.y_range)]
@@ -108,7 +108,7 @@ class Frame:
         recording.log(f"{path}/data", rr.Transform3D(mat3x3=matrix, translation=shift))
 
     def draw_image(
-        self, recording: Recording, path: str, values: Floats, x: Sequence[float], y: Sequence[float]
+        self, recording: RerunRecording, path: str, values: Floats, x: Sequence[float], y: Sequence[float]
     ) -> None:
         """Draw values from -1 to 1 as colours, the first row at the top, between two values of x and two of y."""
         height, width = values.shape

@@ -9,7 +9,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from bench.dashboard.drawing import INK, MARKER, lines, texts
-from bench.dashboard.rerun_recording import Recording
+from bench.dashboard.rerun_recording import RerunRecording
 from bench.record import bins_of, headline_of
 
 _PATH = "lateness"
@@ -33,7 +33,7 @@ class LatenessPlot:
         self._is_drawn = meta.get("clock", "virtual") != "virtual"
         self._rows = 0
 
-    def draw(self, recording: Recording, recorded: Mapping[str, Mapping[str, Any]]) -> None:
+    def draw(self, recording: RerunRecording, recorded: Mapping[str, Mapping[str, Any]]) -> None:
         """Draw the histograms by the label of the loop, see `Lateness.to_json`; nothing if there are none."""
         if not (self._is_drawn and recorded):
             return

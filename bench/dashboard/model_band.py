@@ -19,7 +19,7 @@ from bench.base import fitting_prefix
 from bench.control import widened
 from bench.dashboard.drawing import CAUTION, Colour
 from bench.dashboard.entries import Part, Tick, Ticks, single
-from bench.dashboard.rerun_recording import Floats, Recording, times
+from bench.dashboard.rerun_recording import Floats, RerunRecording, times
 from bench.devices import Settled, Signal
 from bench.identification import Band, ModelFile, input_half_widths
 from bench.models import Operator
@@ -154,7 +154,7 @@ class ModelBand:
             reference=reference,
         )
 
-    def draw(self, recording: Recording) -> None:
+    def draw(self, recording: RerunRecording) -> None:
         """Write how the lines look."""
         level = f"{100.0 * self._band.level:g} %"
         names = [f"− {level}", f"+ {level}", f"− {level}, other class", f"+ {level}, other class"]
@@ -193,7 +193,7 @@ class ModelBand:
             table = np.column_stack(_parted(setpoints, self._setpoint_widths(rows), foreign))
             self._drawn.append((f"{self._setpoint.path}/setpoint_band", when, self._setpoint.factor * table))
 
-    def write(self, recording: Recording) -> None:
+    def write(self, recording: RerunRecording) -> None:
         """Write the lines of what was seen since the last call."""
         for path, when, table in self._drawn:
             recording.send_vectors(path, when, table)

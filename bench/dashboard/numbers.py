@@ -11,10 +11,10 @@ import rerun as rr
 
 from bench.base import Expectation, fitting_prefix, format_duration, format_numbers
 from bench.dashboard.bounds import Bound, nearest
-from bench.dashboard.controlled_run import Errors
+from bench.dashboard.controlled_run import ErrorPlot
 from bench.dashboard.entries import End, Part, Ticks
 from bench.dashboard.model_band import ModelBand
-from bench.dashboard.rerun_recording import Recording, times
+from bench.dashboard.rerun_recording import RerunRecording, times
 from bench.dashboard.signal_plots import likely_magnitude
 from bench.devices import Signal
 from bench.record import Event, StepRecord, expected_steps
@@ -40,7 +40,7 @@ class Numbers:
         Columns of the signals whose values are shown, the most important first.
     bounds : sequence of Bound
         Of the signals.
-    errors : Errors or None
+    errors : ErrorPlot or None
         Of a run under control.
     band : ModelBand or None
         Of the model in the run; it has seen the entries first.
@@ -52,7 +52,7 @@ class Numbers:
         signals: Sequence[Signal],
         shown: Sequence[int],
         bounds: Sequence[Bound],
-        errors: Errors | None,
+        errors: ErrorPlot | None,
         band: ModelBand | None = None,
     ) -> None:
         self._band = band
@@ -109,7 +109,7 @@ class Numbers:
             self._last = self._t
             self._pending.append((self._t, self._step, self._text()))
 
-    def write(self, recording: Recording) -> None:
+    def write(self, recording: RerunRecording) -> None:
         """Write the panels that were kept."""
         if self._pending:
             t, step, text = zip(*self._pending, strict=True)

@@ -12,7 +12,7 @@ from bench.base import fitting_prefix
 from bench.dashboard.drawing import FAINT, INK, MARKER, Frame, line_style, lines, point_style, texts, xy_view
 from bench.dashboard.entries import ModelDensity
 from bench.dashboard.memories import SignalMemory, StageMemory, memory_of
-from bench.dashboard.rerun_recording import Floats, Recording, times
+from bench.dashboard.rerun_recording import Floats, RerunRecording, times
 from bench.dashboard.xy_plots import Points
 from bench.devices import Signal
 from bench.models import density_unit
@@ -47,7 +47,7 @@ class Planes:
                 self._memories[path] = memory
                 self._extents[path] = (float(model.density.levels[0]), float(model.density.levels[-1]))
 
-    def draw(self, recording: Recording) -> None:
+    def draw(self, recording: RerunRecording) -> None:
         """Draw the first input's plane."""
         for path in self._memories:
             recording.log(f"{path}/data/memory", line_style(1.75, MARKER))
@@ -59,7 +59,7 @@ class Planes:
             lattice = [[(low, value), (value, value), (value, high)] for value in inner]
             recording.log("plane/data/lattice", lines(lattice, FAINT, 0.5, -15.0))
 
-    def write(self, recording: Recording, points: Points, drawn: Sequence[int]) -> None:
+    def write(self, recording: RerunRecording, points: Points, drawn: Sequence[int]) -> None:
         """Draw the memory curves at the points whose numbers are `drawn`; all points move that of the first input."""
         shown = frozenset(drawn)
         for path, memory in self._memories.items():
@@ -78,7 +78,7 @@ class Planes:
                 ends = [each[-1] for each in strips]
                 recording.send(f"{path}/data/input", when, rr.Points2D.columns(positions=ends))
 
-    def draw_density(self, recording: Recording, model: ModelDensity) -> None:
+    def draw_density(self, recording: RerunRecording, model: ModelDensity) -> None:
         """Draw a density with its legend, on a plane of its own if it is over another input than the first."""
         density, path = model.density, self._path_of(model)
         self._has_density |= path == "plane"
@@ -135,7 +135,7 @@ class Planes:
         return f"planes/{rr.escape_entity_path_part(density.title or model.name)}"
 
 
-def _draw_plane(recording: Recording, path: str, frame: Frame) -> None:
+def _draw_plane(recording: RerunRecording, path: str, frame: Frame) -> None:
     """Draw axes and triangle of a plane."""
     frame.draw(recording, path)
     low, high = frame.x_range

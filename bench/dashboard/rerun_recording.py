@@ -39,7 +39,7 @@ _FLUSH_SECONDS = 0.5
 _PORTS_TRIED = 50
 
 
-class Recording:
+class RerunRecording:
     """One stream of a recording, into a file or to the viewers that connect; used by one thread at a time.
 
     Streams of one `run_id` are the same recording to a viewer. One with a `path` goes into a file, one with a `port`

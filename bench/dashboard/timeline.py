@@ -8,7 +8,7 @@ import rerun as rr
 
 from bench.dashboard.drawing import Colour
 from bench.dashboard.entries import Part, Ticks
-from bench.dashboard.rerun_recording import Recording, times
+from bench.dashboard.rerun_recording import RerunRecording, times
 from bench.record import Event, StepRecord
 
 _RUNNING = "running"
@@ -44,11 +44,11 @@ class Timeline:
         self.t = 0.0
         """Laboratory time of the last entry, s."""
 
-    def draw(self, recording: Recording) -> None:
+    def draw(self, recording: RerunRecording) -> None:
         """Give the states their colours."""
         recording.log("state/run", rr.StateConfiguration(values=list(_STATES), colors=list(_STATES.values())))
 
-    def write(self, recording: Recording, parts: Sequence[Part]) -> None:
+    def write(self, recording: RerunRecording, parts: Sequence[Part]) -> None:
         """Write events, and the changes that events and steps bring."""
         events: list[tuple[int, Event]] = []
         changes: dict[str, list[tuple[float, int, str]]] = {"run": [], "phase": []}
@@ -77,18 +77,18 @@ class Timeline:
                 t, step, state = zip(*changed, strict=True)
                 recording.send(f"state/{lane}", times(t, step), rr.StateChange.columns(state=state))
 
-    def warn(self, recording: Recording, text: str) -> None:
+    def warn(self, recording: RerunRecording, text: str) -> None:
         """Report a problem of the dashboard itself in the log."""
         _write_events(recording, [(self._step, Event(self.t, "WARN", "dashboard", text))])
 
-    def _colour_phase(self, recording: Recording, phase: str) -> None:
+    def _colour_phase(self, recording: RerunRecording, phase: str) -> None:
         if phase not in self._phases:
             self._phases.append(phase)
             colours = [_PHASE_COLOURS[i % len(_PHASE_COLOURS)] for i in range(len(self._phases))]
             recording.log("state/phase", rr.StateConfiguration(values=self._phases, colors=colours))
 
 
-def _write_events(recording: Recording, events: Sequence[tuple[int, Event]]) -> None:
+def _write_events(recording: RerunRecording, events: Sequence[tuple[int, Event]]) -> None:
     if not events:
         return
     columns = rr.TextLog.columns(

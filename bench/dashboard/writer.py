@@ -16,13 +16,13 @@ from pydantic import ValidationError
 from bench.base import ConfigurationError, problems
 from bench.dashboard.arrangement import Arranged, blueprint, seldom
 from bench.dashboard.bounds import BoundLines, bounds_of
-from bench.dashboard.controlled_run import TRACE_NAMES, WITNESS, ControlPlots, Errors
+from bench.dashboard.controlled_run import TRACE_NAMES, WITNESS, ControlPlots, ErrorPlot
 from bench.dashboard.entries import End, Entry, ModelDensity, Part, Ticks, densities_of, in_parts
 from bench.dashboard.lateness_plot import LatenessPlot
 from bench.dashboard.model_band import ModelBand, Plotted
 from bench.dashboard.numbers import LIVE_SECONDS, Numbers
 from bench.dashboard.planes import Planes
-from bench.dashboard.rerun_recording import Recording, times
+from bench.dashboard.rerun_recording import RerunRecording, times
 from bench.dashboard.signal_plots import plots_by_unit
 from bench.dashboard.timeline import Timeline
 from bench.dashboard.xy_plots import Points, XYPlots
@@ -55,11 +55,11 @@ class Writer:
             self._plots = XYPlots(layout, signals, meta["rig_title"], bounds, fades=bool(controls))
             self._planes = Planes(layout, signals, self._plots.columns, densities_of(models))
         self._control: ControlPlots | None = None
-        self._errors: Errors | None = None
+        self._errors: ErrorPlot | None = None
         if controls:
             witness = (meta.get("slots") or {}).get(WITNESS, {}).get("signal", "")
             self._control = ControlPlots.of(signals, controls, ranges.get(controls), witness)
-            self._errors = Errors(self._control)
+            self._errors = ErrorPlot(self._control)
         self._signals = plots_by_unit(signals, ranges, TRACE_NAMES if controls else ())
         self._bounds = {
             plot.path: BoundLines(
@@ -82,8 +82,8 @@ class Writer:
         self._arranged: object = None
 
     def open(self, path: Path | None, port: int | None) -> None:
-        """Make the recording, see `Recording`, and write everything that does not change."""
-        self.recording = Recording(self._run_id, self._title, path, port)
+        """Make the recording, see `RerunRecording`, and write everything that does not change."""
+        self.recording = RerunRecording(self._run_id, self._title, path, port)
         self.recording.set_property("bench", self._properties)
         self.recording.log("card", rr.TextDocument(self._card, media_type=rr.MediaType.MARKDOWN))
         for plot in self._signals:

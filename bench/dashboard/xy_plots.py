@@ -21,7 +21,7 @@ import rerun.blueprint as rrb
 from bench.dashboard.bounds import Bound
 from bench.dashboard.drawing import Colour, Frame, line_style, lines, point_style, strips_at_once, xy_view
 from bench.dashboard.entries import Ticks
-from bench.dashboard.rerun_recording import Floats, Recording, times
+from bench.dashboard.rerun_recording import Floats, RerunRecording, times
 from bench.dashboard.signal_plots import find_column
 from bench.devices import Signal
 from bench.rig import DashboardLayout
@@ -108,7 +108,7 @@ class XYPlots:
         """Whether the input of the first plot has moved."""
         return self._tracks[0].has_moved
 
-    def draw(self, recording: Recording) -> None:
+    def draw(self, recording: RerunRecording) -> None:
         """Draw the axes."""
         for track in self._tracks:
             self._draw_axes(recording, track)
@@ -117,7 +117,7 @@ class XYPlots:
                 recording.log(f"{track.path}/data/recent", line_style(1.75))
             recording.log(f"{track.path}/data/now", point_style())
 
-    def _draw_axes(self, recording: Recording, track: _Track) -> None:
+    def _draw_axes(self, recording: RerunRecording, track: _Track) -> None:
         frame = track.frame
         frame.draw(recording, track.path)
         low_x, high_x = frame.x_range
@@ -133,7 +133,7 @@ class XYPlots:
             colours.append(bound.colour)
         recording.log(f"{track.path}/data/bounds", lines(strips, colours, 1.0, 5.0))
 
-    def write(self, recording: Recording, points: Points) -> list[int]:
+    def write(self, recording: RerunRecording, points: Points) -> list[int]:
         """Draw the plots to further points; return the numbers of those at which the first was drawn."""
         drawn: list[int] = []
         for track in self._tracks:

@@ -135,7 +135,7 @@ class Limits:
 
 
 @dataclass(frozen=True)
-class Finding:
+class CheckFinding:
     """What a check of an instrument found.
 
     Attributes
@@ -421,7 +421,7 @@ class Device(ABC):
         """Number of requests that were repeated since the device was connected, as their answers were lost."""
         return 0
 
-    def self_check(self) -> tuple[Finding, ...]:
+    def self_check(self) -> tuple[CheckFinding, ...]:
         """Compare what the instrument itself says with the settings; nothing moves, and nothing is changed.
 
         Raises DeviceError if the instrument does not answer.

@@ -72,7 +72,7 @@ class Extremes:
 
 
 @dataclass(frozen=True)
-class Finding:
+class RehearsalFinding:
     """What happened in a rehearsal beside the steps: an interlock, a warning, an error.
 
     Attributes
@@ -117,7 +117,7 @@ class Rehearsal:
         Numbers of the steps in which the operator is asked to do something by hand.
     extremes : mapping of str to Extremes
         Range by signal and set-point, and by difference of two signals that an interlock watches.
-    findings : tuple of Finding
+    findings : tuple of RehearsalFinding
         What happened.
     marks : tuple of (int, float)
         Number of finished steps and laboratory time from the start in s, in order.
@@ -134,7 +134,7 @@ class Rehearsal:
     at_most: float
     prompted: tuple[int, ...]
     extremes: Mapping[str, Extremes]
-    findings: tuple[Finding, ...] = ()
+    findings: tuple[RehearsalFinding, ...] = ()
     marks: tuple[tuple[int, float], ...] = ()
 
     @classmethod
@@ -229,7 +229,7 @@ class Rehearsal:
                 )
                 for name, each in content["extremes"].items()
             },
-            findings=tuple(Finding(**finding) for finding in content["findings"]),
+            findings=tuple(RehearsalFinding(**finding) for finding in content["findings"]),
             marks=tuple((steps, seconds) for steps, seconds in content["marks"]),
         )
 
@@ -346,7 +346,7 @@ class _Kept:
         self.signals = (*signals, *TRACES, LATENESS)
         self.finished: list[float] = []
         self.prompted: list[int] = []
-        self.findings: list[Finding] = []
+        self.findings: list[RehearsalFinding] = []
         self._endless = f"protocol {protocol} does not end in its rehearsal on {twin}, within {{}}"
         self._others = 0
         index = {signal.name: i for i, signal in enumerate(signals)}
@@ -375,7 +375,7 @@ class _Kept:
         if event.kind == "prompt":
             self.prompted.append(len(self.finished))
         elif event.level != "INFO" and event.kind != "end":
-            self.findings.append(Finding(event.t, len(self.finished), event.level, event.kind, event.text))
+            self.findings.append(RehearsalFinding(event.t, len(self.finished), event.level, event.kind, event.text))
         self._others += 1
         if self._others > LONGEST:
             raise ConfigurationError(self._endless.format(f"{LONGEST} notes"))

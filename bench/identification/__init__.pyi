@@ -16,7 +16,7 @@ from .choose.choice import (
 )
 from .choose.cross_validation import (
     CrossValidation as CrossValidation,
-    Trial as Trial,
+    SmoothingTrial as SmoothingTrial,
     cross_validate as cross_validate,
 )
 from .choose.evaluation import (

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from bench.base import RecordError, Stopwatch
 from bench.record.keeping import Keeper
 from bench.record.mirror import Mirror, elsewhere
-from bench.record.rows import Entry, joined
+from bench.record.rows import JournalEntry, joined
 
 LONGEST_UNWRITTEN = 0.1
 """Wall-clock time after which a tick is committed, s."""
@@ -34,7 +34,7 @@ class Background:
         self._keeper = keeper
         self._patience = patience
         self._changed = threading.Condition()
-        self._queue: list[Entry] = []
+        self._queue: list[JournalEntry] = []
         self._put = self._done = self._late = 0
         """Rows so far: handed over, durable, and in the file for those that are late."""
         self._urgent = self._stopping = False
@@ -43,7 +43,7 @@ class Background:
         self._thread = threading.Thread(target=self._work, name="journal", daemon=True)
         self._thread.start()
 
-    def keep_soon(self, entries: Sequence[Entry]) -> None:
+    def keep_soon(self, entries: Sequence[JournalEntry]) -> None:
         """Have rows made durable within 0.1 s."""
         with self._changed:
             first = not self._queue
@@ -53,7 +53,7 @@ class Background:
                 self._changed.notify_all()
             self._raise_failure()
 
-    def keep(self, entries: Sequence[Entry]) -> None:
+    def keep(self, entries: Sequence[JournalEntry]) -> None:
         """Make rows durable, and those before them."""
         with self._changed:
             self._queue += entries
@@ -89,7 +89,7 @@ class Background:
         if failure is not None:
             raise failure
 
-    def _keep_aside(self, entries: Sequence[Entry]) -> None:
+    def _keep_aside(self, entries: Sequence[JournalEntry]) -> None:
         try:
             if self._aside is None:
                 _, path = elsewhere(self._keeper.store.path)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from bench.base import RecordError, Stopwatch
 from bench.record.mirror import NAME as MIRROR_NAME, Mirror, elsewhere, second_files
-from bench.record.rows import FILE_NAME, Entry, split
+from bench.record.rows import FILE_NAME, JournalEntry, split
 from bench.record.store import Store
 
 RESERVE_NAME = "journal.reserve"
@@ -61,7 +61,7 @@ class Keeper:
         self.notices: list[str] = []
         self.is_short = False
         self.spare: list[Mirror] = []
-        self._waiting: list[Entry] = []
+        self._waiting: list[JournalEntry] = []
         """Rows that are in a second file only."""
         self._why = ""
         self._is_closed = False
@@ -76,12 +76,12 @@ class Keeper:
         with suppress(OSError):
             self._reserve.write_bytes(b"\xa5" * _RESERVE)
 
-    def begin(self, entries: Sequence[Entry]) -> None:
+    def begin(self, entries: Sequence[JournalEntry]) -> None:
         """Put the rows that the journal has at its beginning into the second file."""
         assert self._mirror is not None
         self._mirror.append(entries)
 
-    def keep(self, entries: Sequence[Entry]) -> None:
+    def keep(self, entries: Sequence[JournalEntry]) -> None:
         """Make rows durable.
 
         Raises RecordError if they are nowhere, or the journal has been removed or replaced; what there was is in
@@ -155,7 +155,7 @@ class Keeper:
         mirror = self._elsewhere or self._mirror
         return self.store.path.parent / MIRROR_NAME if mirror is None else mirror.path
 
-    def _append(self, entries: Sequence[Entry]) -> bool:
+    def _append(self, entries: Sequence[JournalEntry]) -> bool:
         if self._mirror is not None:
             try:
                 self._mirror.append(entries)
@@ -165,7 +165,7 @@ class Keeper:
                 return True
         return False
 
-    def _write(self, entries: Sequence[Entry]) -> bool:
+    def _write(self, entries: Sequence[JournalEntry]) -> bool:
         """Write into the journal; return whether that was possible."""
         self._tried = Stopwatch()
         try:
@@ -187,7 +187,7 @@ class Keeper:
         self._waiting = []
         return True
 
-    def _keep_beside(self, entries: Sequence[Entry], is_beside: bool) -> None:
+    def _keep_beside(self, entries: Sequence[JournalEntry], is_beside: bool) -> None:
         """Make rows durable in a second file: beside the journal, or else on another medium, or in the reserve."""
         problem: OSError | None = None
         if is_beside and self._mirror is not None:

@@ -24,7 +24,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import IO
 
-from bench.record.rows import IDENTITY, TABLES, TEXTS, Entry, entry, meta_row, split, unpacked
+from bench.record.rows import IDENTITY, TABLES, TEXTS, JournalEntry, entry, meta_row, split, unpacked
 from bench.rig import is_own
 
 NAME = "journal.mirror"
@@ -62,7 +62,7 @@ class Mirror:
         self._file = os.fdopen(_open(path, os.O_RDWR | os.O_CREAT), "r+b", buffering=0)
         self._end = self._file.seek(0, os.SEEK_END)
 
-    def append(self, entries: Iterable[Entry]) -> None:
+    def append(self, entries: Iterable[JournalEntry]) -> None:
         """Append rows, all or none; they are durable after `sync` only."""
         data = b"".join(map(_encoded, (*self._unsaid, *entries)))
         try:
@@ -80,7 +80,7 @@ class Mirror:
         """Make what was appended durable."""
         _sync(self._file.fileno())
 
-    def entries(self) -> list[Entry]:
+    def entries(self) -> list[JournalEntry]:
         """Return the rows, also of a file that has been removed meanwhile."""
         self._file.seek(0)
         entries = list(split(_decoded(self._file)))
@@ -107,7 +107,7 @@ def readable_second_files(journal: Path) -> list[Path]:
     return readable
 
 
-def read_mirror(path: Path, identity: str | None = None) -> Iterator[Entry]:
+def read_mirror(path: Path, identity: str | None = None) -> Iterator[JournalEntry]:
     """Yield the intact rows as they were written: ticks of one write together; none of a missing or foreign file.
 
     Parameters
@@ -157,13 +157,13 @@ def _open(path: Path, flags: int) -> int:
     raise _ForeignFileError(errno.EPERM, "it is not a file of this user", str(path))
 
 
-def _encoded(entry: Entry) -> bytes:
+def _encoded(entry: JournalEntry) -> bytes:
     table, payload = TABLES.index(entry.table), entry.payload
     numbers = len(entry.row) - TEXTS[entry.table]
     return b"".join((_MARK, _HEAD.pack(table, len(entry.rows), numbers, len(payload), zlib.crc32(payload)), payload))
 
 
-def _decoded(file: IO[bytes]) -> Iterator[Entry]:
+def _decoded(file: IO[bytes]) -> Iterator[JournalEntry]:
     size = os.fstat(file.fileno()).st_size
     data, start, passed = b"", 0, 0
 
@@ -198,4 +198,4 @@ def _decoded(file: IO[bytes]) -> Iterator[Entry]:
         parts = [payload[each * i : each * (i + 1)] for i in range(count)]
         rows = [(row, part) for part in parts if (row := unpacked(TABLES[table], numbers, part)) is not None]
         if rows:
-            yield Entry(TABLES[table], [row for row, _ in rows], b"".join(part for _, part in rows))
+            yield JournalEntry(TABLES[table], [row for row, _ in rows], b"".join(part for _, part in rows))

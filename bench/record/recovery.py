@@ -26,7 +26,7 @@ from bench.record.rows import (
     RECOVERED_NAME,
     SCHEMA,
     TABLES,
-    Entry,
+    JournalEntry,
     canonical,
     checksums,
     entry,
@@ -230,7 +230,7 @@ class _Left:
         The keys of bad ones.
     cut : set of str
         The tables of which there may be more rows than are known.
-    signals : dict of int to Entry
+    signals : dict of int to JournalEntry
         By position, in the place of signals whose rows are lost.
     signals_of_rows : int
         Most values of signals that a numbered row has.
@@ -238,15 +238,15 @@ class _Left:
         What SQLite finds wrong.
     """
 
-    rows: dict[str, dict[Any, Entry]] = field(default_factory=lambda: {table: {} for table in _SMALL})
+    rows: dict[str, dict[Any, JournalEntry]] = field(default_factory=lambda: {table: {} for table in _SMALL})
     numbers: dict[str, _Numbers] = field(default_factory=lambda: {table: _Numbers() for table in FIRST})
     bad: dict[str, list[Any]] = field(default_factory=lambda: {table: [] for table in TABLES})
     cut: set[str] = field(default_factory=set)
-    signals: dict[Any, Entry] = field(default_factory=dict)
+    signals: dict[Any, JournalEntry] = field(default_factory=dict)
     signals_of_rows: int = 0
     problem: str = ""
 
-    def add(self, entry: Entry) -> None:
+    def add(self, entry: JournalEntry) -> None:
         """Add good rows."""
         if entry.table in _SMALL:
             self.rows[entry.table][entry.row[0]] = entry
@@ -256,7 +256,7 @@ class _Left:
             self.numbers[entry.table].add(int(row[0]), int(row[0]))
 
 
-def _small_state(left: _Left, table: str, whole: Mapping[Any, Entry], *, is_cut: bool) -> TableState:
+def _small_state(left: _Left, table: str, whole: Mapping[Any, JournalEntry], *, is_cut: bool) -> TableState:
     good, bad = left.rows[table], left.bad[table]
     lost = set(bad) - set(whole)
     lacking = set(bad) | (set(whole) - set(good))
@@ -316,7 +316,7 @@ def _salvage(journal: Path) -> _Left:
     return left
 
 
-def _identity(meta: Mapping[Any, Entry], seconds: Sequence[Path]) -> str:
+def _identity(meta: Mapping[Any, JournalEntry], seconds: Sequence[Path]) -> str:
     """Return the number of a journal; where it has lost it, that of the first second file that has rows."""
     if IDENTITY in meta:
         return str(parse_json(meta[IDENTITY].row[1]))
@@ -335,7 +335,7 @@ def _beside(seconds: Sequence[Path], identity: str) -> _Left:
     return found
 
 
-def _rows_of(journal: Path, seconds: Sequence[Path], identity: str, tables: Sequence[str]) -> Iterator[Entry]:
+def _rows_of(journal: Path, seconds: Sequence[Path], identity: str, tables: Sequence[str]) -> Iterator[JournalEntry]:
     """Yield the good rows of some tables, last those of the journal itself, which may come a second time."""
     for second in seconds:
         yield from (each for each in read_mirror(second, identity) if each.table in tables)
@@ -360,7 +360,7 @@ def _problem(db: sqlite3.Connection) -> str:
     return "" if found == "ok" else found.replace("\n", " ")
 
 
-def _readable(db: sqlite3.Connection, table: str, cut: set[str], bad: list[Any]) -> Iterator[Entry]:
+def _readable(db: sqlite3.Connection, table: str, cut: set[str], bad: list[Any]) -> Iterator[JournalEntry]:
     """Yield the good rows of a table that SQLite can read, around what it cannot.
 
     The table is added to `cut` if there may be others, and the keys of bad rows to `bad`. Where rows are numbered,
@@ -405,13 +405,13 @@ def _blocks(db: sqlite3.Connection, statement: str) -> Iterator[list[tuple[Any, 
         yield rows
 
 
-def _checked(table: str, rows: Sequence[tuple[Any, ...]], bad: list[Any]) -> Iterator[Entry]:
+def _checked(table: str, rows: Sequence[tuple[Any, ...]], bad: list[Any]) -> Iterator[JournalEntry]:
     """Yield the rows whose checksums fit, ticks together; the keys of others are added to `bad`."""
     if table == "telemetry" and rows:
         with suppress(ValueError, TypeError):
             numbers = np.array(rows, dtype=np.float64)
             if (np.array(checksums(numbers[:, :-1]), dtype=np.float64) == numbers[:, -1]).all():
-                yield Entry(table, [row[:-1] for row in rows], canonical(numbers[:, :-1]).tobytes())
+                yield JournalEntry(table, [row[:-1] for row in rows], canonical(numbers[:, :-1]).tobytes())
                 return
     for columns in rows:
         kept = None
@@ -427,7 +427,10 @@ def _checked(table: str, rows: Sequence[tuple[Any, ...]], bad: list[Any]) -> Ite
 
 
 def _write(
-    copy: Path, whole: Mapping[str, Mapping[Any, Entry]], rows: Iterator[Entry], more: Mapping[str, object]
+    copy: Path,
+    whole: Mapping[str, Mapping[Any, JournalEntry]],
+    rows: Iterator[JournalEntry],
+    more: Mapping[str, object],
 ) -> None:
     if copy.exists():
         raise ConfigurationError(f"{copy} exists already; nothing is overwritten, so name another one by --out")

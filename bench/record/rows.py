@@ -148,7 +148,7 @@ def canonical(numbers: npt.ArrayLike) -> npt.NDArray[np.float64]:
     return array
 
 
-class Entry(NamedTuple):
+class JournalEntry(NamedTuple):
     """Rows that are to be kept: one, or several of the telemetry.
 
     Attributes
@@ -181,7 +181,7 @@ class Entry(NamedTuple):
         return [(*row, zlib.crc32(content[size * i : size * (i + 1)])) for i, row in enumerate(self.rows)]
 
 
-def entry(table: str, row: Sequence[Any]) -> Entry:
+def entry(table: str, row: Sequence[Any]) -> JournalEntry:
     """Return a row as it is kept.
 
     Raises ValueError or TypeError if one of its values is neither a number nor a text, nor the content of a file.
@@ -194,30 +194,30 @@ def entry(table: str, row: Sequence[Any]) -> Entry:
             texts.append(base64.b64encode(value))
         else:
             numbers.append(math.nan if value is None else value)
-    return Entry(table, (tuple(row),), b"".join((_packed(numbers), *(text + b"\0" for text in texts))))
+    return JournalEntry(table, (tuple(row),), b"".join((_packed(numbers), *(text + b"\0" for text in texts))))
 
 
-def ticks(rows: Sequence[tuple[float, ...]]) -> Entry:
+def ticks(rows: Sequence[tuple[float, ...]]) -> JournalEntry:
     """Return rows of the telemetry as they are kept."""
     payload = b"".join(map(_packed, rows)) if len(rows) <= _FEW_ROWS else canonical(rows).tobytes()
-    return Entry("telemetry", rows, payload)
+    return JournalEntry("telemetry", rows, payload)
 
 
-def split(entries: Iterable[Entry]) -> Iterator[Entry]:
+def split(entries: Iterable[JournalEntry]) -> Iterator[JournalEntry]:
     """Yield an entry a row."""
     for several in entries:
         size = len(several.payload) // len(several.rows)
         for i, row in enumerate(several.rows):
-            yield Entry(several.table, (row,), several.payload[size * i : size * (i + 1)])
+            yield JournalEntry(several.table, (row,), several.payload[size * i : size * (i + 1)])
 
 
-def joined(entries: Iterable[Entry]) -> list[Entry]:
+def joined(entries: Iterable[JournalEntry]) -> list[JournalEntry]:
     """Return entries with neighbouring rows of the telemetry in one."""
-    result: list[Entry] = []
+    result: list[JournalEntry] = []
     for each in entries:
         if result and each.table == result[-1].table == "telemetry":
             former = result.pop()
-            each = Entry(each.table, [*former.rows, *each.rows], former.payload + each.payload)
+            each = JournalEntry(each.table, [*former.rows, *each.rows], former.payload + each.payload)
         result.append(each)
     return result
 
@@ -251,7 +251,7 @@ def unpacked(table: str, count: int, payload: bytes) -> tuple[Any, ...] | None:
 
 
 def checksum(row: Sequence[str | float | None]) -> int:
-    """Return the CRC-32 of a row, see `Entry`; raise ValueError or TypeError if it has neither number nor text."""
+    """Return the CRC-32 of a row; raise ValueError or TypeError if it has neither number nor text."""
     return zlib.crc32(entry("", row).payload)
 
 

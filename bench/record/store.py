@@ -7,7 +7,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing, suppress
 from pathlib import Path
 
-from bench.record.rows import TABLES, Entry, entry, table_definitions
+from bench.record.rows import TABLES, JournalEntry, entry, table_definitions
 
 _LOG_PAGES = 64
 """Pages after which the write-ahead log is folded in and overwritten, of a journal whose commits wait for the disk.
@@ -46,7 +46,7 @@ class Store:
         for setting in self._settings:
             self._db.execute(f"PRAGMA {setting}")
 
-    def create(self, signals: Sequence[str], entries: Iterable[Entry]) -> None:
+    def create(self, signals: Sequence[str], entries: Iterable[JournalEntry]) -> None:
         """Make the tables, with their first rows."""
         self._db.execute("BEGIN IMMEDIATE")
         for statement in table_definitions(signals):
@@ -54,7 +54,7 @@ class Store:
         self._insert(entries)
         self._db.execute("COMMIT")
 
-    def write(self, entries: Sequence[Entry]) -> None:
+    def write(self, entries: Sequence[JournalEntry]) -> None:
         """Commit rows, all or none."""
         if len(entries) == 1 and len(entries[0].rows) == 1:
             self._insert(entries)
@@ -73,7 +73,7 @@ class Store:
         """Remove entries of the metadata."""
         self._db.executemany("DELETE FROM meta WHERE key = ?", [(key,) for key in keys])
 
-    def _insert(self, entries: Iterable[Entry]) -> None:
+    def _insert(self, entries: Iterable[JournalEntry]) -> None:
         for each in entries:
             marks = ", ".join("?" * (len(each.row) + (each.table != "files")))
             # A row that comes a second time, from the second file, is the same.
@@ -115,7 +115,7 @@ class Store:
                     return f"table {table} has {rows} rows of {count}"
         return ""
 
-    def entries(self) -> list[Entry]:
+    def entries(self) -> list[JournalEntry]:
         """Return every row, also of a file that has been removed."""
         return [
             entry(table, row if table == "files" else row[:-1])

@@ -10,7 +10,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from bench.record.rows import SCHEMA, Entry, entry
+from bench.record.rows import SCHEMA, JournalEntry, entry
 
 UNKNOWN = "unknown"
 
@@ -23,7 +23,7 @@ _BEHIND = {"steps": ("setpoints", "seen"), "telemetry": ("step", "checksum")}
 """The columns between which those of the signals stand."""
 
 
-def signal_rows(db: sqlite3.Connection, found: Mapping[Any, Entry]) -> dict[Any, Entry]:
+def signal_rows(db: sqlite3.Connection, found: Mapping[Any, JournalEntry]) -> dict[Any, JournalEntry]:
     """Return rows for the signals that are not found: by their names, which are columns of other tables.
 
     Unit and description are unknown.
@@ -38,17 +38,17 @@ def signal_rows(db: sqlite3.Connection, found: Mapping[Any, Entry]) -> dict[Any,
     return {}
 
 
-def unnamed_signals(quantity: int) -> dict[Any, Entry]:
+def unnamed_signals(quantity: int) -> dict[Any, JournalEntry]:
     """Return rows for signals whose names are lost as well."""
     return _signals([f"signal_{i}" for i in range(quantity)])
 
 
-def _signals(names: Sequence[str]) -> dict[Any, Entry]:
+def _signals(names: Sequence[str]) -> dict[Any, JournalEntry]:
     lost = f"{UNKNOWN}; its row in the record was lost"
     return {i: entry("signals", (i, name, "?", lost, 3)) for i, name in enumerate(names)}
 
 
-def metadata(journal: Path, files: Mapping[Any, Entry], events: Iterable[Sequence[Any]]) -> dict[str, Any]:
+def metadata(journal: Path, files: Mapping[Any, JournalEntry], events: Iterable[Sequence[Any]]) -> dict[str, Any]:
     """Return metadata of a run, as far as the other rows and the name of its folder tell; the rest says so.
 
     What it takes to repeat or to resume the run is not among them.

@@ -22,7 +22,7 @@ from bench.record.keeping import RESERVE_NAME, Keeper
 from bench.record.mirror import NAME as MIRROR_NAME, read_mirror, second_files
 from bench.record.model_files import add_model
 from bench.record.reading import Record
-from bench.record.rows import FIRST, IDENTITY, SCHEMA, Entry, Event, StepRecord, entry, meta_row, split, ticks
+from bench.record.rows import FIRST, IDENTITY, SCHEMA, Event, JournalEntry, StepRecord, entry, meta_row, split, ticks
 from bench.record.store import Store
 
 _READERS = 10.0
@@ -293,12 +293,12 @@ class Journal:
         self._counts[table] += 1
         return number
 
-    def _take_ticks(self) -> list[Entry]:
+    def _take_ticks(self) -> list[JournalEntry]:
         """Return the ticks that wait, which wait no longer."""
         waiting, self._waiting = self._waiting, []
         return [ticks(waiting)] if waiting else []
 
-    def _write(self, entries: Sequence[Entry]) -> None:
+    def _write(self, entries: Sequence[JournalEntry]) -> None:
         """Make rows durable, and before them the ticks that wait."""
         entries = [*self._take_ticks(), *entries]
         if self._background is not None:

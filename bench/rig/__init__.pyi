@@ -45,7 +45,7 @@ from .interlocks.config import (
     Level as Level,
 )
 from .interlocks.watch import (
-    Finding as Finding,
+    InterlockFinding as InterlockFinding,
     InterlockWatch as InterlockWatch,
 )
 from .layout import (

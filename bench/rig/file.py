@@ -262,13 +262,13 @@ class RigFile:
         return replace(self, laboratory=lambda *_: laboratory)
 
 
-def packaged_rigs(problems: list[str] | None = None) -> dict[str, registry.Entry]:
+def packaged_rigs(problems: list[str] | None = None) -> dict[str, registry.RegisteredPart]:
     """Return the rigs of all installed packages by name, each with the entry that brings it.
 
     An entry of the group `bench.rigs` is a package; its `*.toml` files are rigs. One that cannot be imported is left
     out, and joins `problems`. Raises ConfigurationError if two packages bring a rig of the same name.
     """
-    found: dict[str, registry.Entry] = {}
+    found: dict[str, registry.RegisteredPart] = {}
     for entry in registry.entries("rigs").values():
         try:
             package = entry.load()

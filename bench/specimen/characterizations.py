@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from bench.analysis import Recording, recording_of
+from bench.analysis import TransientRecording, recording_of
 from bench.base import DataError
 from bench.record import Record
 from bench.rig import RigFile, RoleTable
@@ -29,7 +29,7 @@ def slots_of_twin(file: RigFile) -> tuple[RoleTable, RoleTable]:
     return roles["drive"], roles["response"]
 
 
-def read_recording(path: Path, file: RigFile) -> Recording:
+def read_recording(path: Path, file: RigFile) -> TransientRecording:
     """Read a run of a rig.
 
     Raises

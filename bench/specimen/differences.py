@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.analysis import Recording
+from bench.analysis import TransientRecording
 from bench.base import Floats
 
 SLOPES = 3
@@ -18,12 +18,12 @@ _FEWEST = 12
 """Fewest numbers whose mean square counts."""
 
 
-def least_known(recordings: Sequence[Recording], of_model: Sequence[Floats]) -> int | None:
+def least_known(recordings: Sequence[TransientRecording], of_model: Sequence[Floats]) -> int | None:
     """Return the run that the model knows least, of those that say something of other histories; None if none does.
 
     Parameters
     ----------
-    recordings : sequence of Recording
+    recordings : sequence of TransientRecording
         The runs.
     of_model : sequence of ndarray
         Errors of the model at the readings of each, output units.

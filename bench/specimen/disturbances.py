@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.analysis import MEDIAN_OF_DIFFERENCES, Recording, at_rows, latency
+from bench.analysis import MEDIAN_OF_DIFFERENCES, TransientRecording, at_rows, latency
 from bench.base import Floats
 from bench.models import Operator
 from bench.specimen.differences import SLOPES, Differences, least_known
@@ -111,7 +111,9 @@ class _Pairs:
         return np.asarray(np.ravel_multi_index((self.time, self.slope, self.kind), _CLASSES))
 
 
-def noise_of(recordings: Sequence[Recording], signal: str, dynamics: Dynamics, *, outliers: bool = False) -> Noise:
+def noise_of(
+    recordings: Sequence[TransientRecording], signal: str, dynamics: Dynamics, *, outliers: bool = False
+) -> Noise:
     """Return the noise of a signal that stands still within holds, such as what is read of the drive."""
     holds = [hold for r in recordings for hold in _holds(r, signal, dynamics)]
     if not holds:
@@ -172,7 +174,7 @@ class _Hold:
         return float(np.median(self.values))
 
 
-def _holds(recording: Recording, signal: str, dynamics: Dynamics) -> list[_Hold]:
+def _holds(recording: TransientRecording, signal: str, dynamics: Dynamics) -> list[_Hold]:
     """Return the settled part of each hold that has readings enough."""
     values = recording.columns[signal]
     rows = np.flatnonzero(settled_rows(recording, dynamics) & np.isfinite(values))
@@ -217,7 +219,7 @@ def _is_relative(far: Floats, levels: Floats) -> bool:
 
 
 def identify_disturbances(
-    recordings: Sequence[Recording],
+    recordings: Sequence[TransientRecording],
     operators: Sequence[Operator[Any]],
     dynamics: Dynamics,
     signal: str,
@@ -231,7 +233,7 @@ def identify_disturbances(
 
     Parameters
     ----------
-    recordings : sequence of Recording
+    recordings : sequence of TransientRecording
         The runs.
     operators, dynamics
         The specimen as far as it is known.
@@ -339,7 +341,10 @@ class _Errors:
 
 
 def _errors_of_model(
-    parts: Sequence[Part], recordings: Sequence[Recording], of_model: Sequence[Floats], left: Sequence[Floats]
+    parts: Sequence[Part],
+    recordings: Sequence[TransientRecording],
+    of_model: Sequence[Floats],
+    left: Sequence[Floats],
 ) -> _Errors | None:
     """Return the errors in the run that the model knows least, of those that say something of other histories."""
     run = least_known(recordings, of_model)
@@ -347,7 +352,7 @@ def _errors_of_model(
 
 
 def mean_effects(
-    recordings: Sequence[Recording], operators: Sequence[Operator[Any]], dynamics: Dynamics
+    recordings: Sequence[TransientRecording], operators: Sequence[Operator[Any]], dynamics: Dynamics
 ) -> list[Floats]:
     """Return what wander adds to the response at each row of each run, on average over simulations.
 
@@ -367,7 +372,9 @@ def mean_effects(
 class Part:
     """A run, simulated without disturbances, and the pairs of its rows within holds."""
 
-    def __init__(self, recording: Recording, operators: tuple[Operator[Any], ...], dynamics: Dynamics) -> None:
+    def __init__(
+        self, recording: TransientRecording, operators: tuple[Operator[Any], ...], dynamics: Dynamics
+    ) -> None:
         self._recording, self._operators, self._dynamics = recording, operators, dynamics
         self._step = max(dynamics.step, _STEP)
         first = float(recording.driven[0])
@@ -478,7 +485,7 @@ def evidence(parts: Sequence[Part]) -> tuple[Floats, Floats]:
     return holds.reshape(_CLASSES), independent.reshape(_CLASSES)
 
 
-def _response_noise(parts: Sequence[Part], recordings: Sequence[Recording], signal: str) -> Noise:
+def _response_noise(parts: Sequence[Part], recordings: Sequence[TransientRecording], signal: str) -> Noise:
     """Return the noise of the response: of neighbouring rows in the class of slopes where they differ least."""
     found: list[float | None] = []
     for kind in (1, 0):
@@ -505,7 +512,7 @@ def _noise(found: Sequence[float | None], resolution: float) -> Noise:
     return Noise(known if reading is None else reading, known if quick is None else quick, resolution)
 
 
-def settled_rows(recording: Recording, dynamics: Dynamics) -> NDArray[np.bool_]:
+def settled_rows(recording: TransientRecording, dynamics: Dynamics) -> NDArray[np.bool_]:
     """Return at which rows the rest counts as still: so long after a change of the set-point, by its size."""
     actuator, response = dynamics.actuator, dynamics.response
     constant = 0.0 if actuator.order == 0 else max(1.0, 2.0 * actuator.damping) / actuator.frequency

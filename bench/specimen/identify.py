@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.analysis import IdentifiedActuator, Recording, grid_step, identify_actuator
+from bench.analysis import IdentifiedActuator, TransientRecording, grid_step, identify_actuator
 from bench.base import DataError
 from bench.devices import Signal
 from bench.identification import cross_validate, identify, load_model
@@ -50,7 +50,7 @@ class IdentifiedTwin:
 
     Attributes
     ----------
-    recordings : tuple of Recording
+    recordings : tuple of TransientRecording
         What it was identified from.
     model_name : str
         Name of the model, or of its file.
@@ -72,7 +72,7 @@ class IdentifiedTwin:
         What the runs could not say, each with what to record instead, in a sentence.
     """
 
-    recordings: tuple[Recording, ...]
+    recordings: tuple[TransientRecording, ...]
     model_name: str
     model: Operator[Any]
     actuator: IdentifiedActuator
@@ -302,7 +302,7 @@ def device_of(signal: str, file: RigFile) -> str:
     return max(fitting, key=len, default="") if signal not in file.derived else ""
 
 
-def measured_signals(recording: Recording, file: RigFile) -> dict[str, list[Signal]]:
+def measured_signals(recording: TransientRecording, file: RigFile) -> dict[str, list[Signal]]:
     """Return the signals that each device measures, by device; without set-points."""
     found: dict[str, list[Signal]] = {entry.name: [] for entry in file.devices}
     for signal in recording.signals:
@@ -312,7 +312,7 @@ def measured_signals(recording: Recording, file: RigFile) -> dict[str, list[Sign
     return found
 
 
-def _source(recordings: Sequence[Recording], file: RigFile) -> tuple[str, tuple[tuple[float, float], ...]]:
+def _source(recordings: Sequence[TransientRecording], file: RigFile) -> tuple[str, tuple[tuple[float, float], ...]]:
     """Return the signal of a device that the response comes from, and the pairs that lead to it."""
     first = recordings[0]
     response, drive = first.response, first.drive
@@ -344,7 +344,9 @@ def _source(recordings: Sequence[Recording], file: RigFile) -> tuple[str, tuple[
     )
 
 
-def _identify_model(recording: Recording, file: RigFile, units: Mapping[str, str]) -> tuple[str, Operator[Any]]:
+def _identify_model(
+    recording: TransientRecording, file: RigFile, units: Mapping[str, str]
+) -> tuple[str, Operator[Any]]:
     """Return the model of the least error of cross-validation, of those that identification offers."""
     chosen = recording.is_reading
     inputs, outputs = recording.driven[chosen], recording.responded[chosen]
@@ -367,7 +369,7 @@ def _identify_model(recording: Recording, file: RigFile, units: Mapping[str, str
 
 
 def _signals(
-    recordings: Sequence[Recording],
+    recordings: Sequence[TransientRecording],
     file: RigFile,
     dynamics: Dynamics,
     drive: Noise,

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.analysis import Recording
+from bench.analysis import TransientRecording
 from bench.base import BenchError
 from bench.devices import Dwell
 from bench.protocol import Note, Phase, Reading, Step, find_protocol
@@ -39,7 +39,7 @@ class ReadingTime:
     setpoint: float = 0.0
 
 
-def time_readings(recordings: Sequence[Recording], file: RigFile) -> ReadingTime | None:
+def time_readings(recordings: Sequence[TransientRecording], file: RigFile) -> ReadingTime | None:
     """Return the times of runs of a rig; None if their protocols cannot be followed."""
     whole, quick, moved = [], [], []
     for recording in recordings:
@@ -65,7 +65,7 @@ def time_readings(recordings: Sequence[Recording], file: RigFile) -> ReadingTime
     return ReadingTime(max(reading, 0.0), float(np.median(quick)) if quick else 0.0, setpoint)
 
 
-def _followed(recording: Recording, file: RigFile) -> Iterator[tuple[Step, StepRecord]]:
+def _followed(recording: TransientRecording, file: RigFile) -> Iterator[tuple[Step, StepRecord]]:
     """Yield the steps that the protocol of a run asked for, with their records, as far as it can be followed."""
     try:
         definition = find_protocol(str(recording.meta["protocol"]))
@@ -90,7 +90,7 @@ def _followed(recording: Recording, file: RigFile) -> Iterator[tuple[Step, StepR
         return
 
 
-def _slots(recording: Recording, file: RigFile) -> Slots:
+def _slots(recording: TransientRecording, file: RigFile) -> Slots:
     signals = {signal.name: signal for signal in recording.signals}
     found = {}
     for name, bound in recording.meta.get("slots", {}).items():

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.analysis import Recording, SimulatedDrive, identify_lag, late_parts
+from bench.analysis import SimulatedDrive, TransientRecording, identify_lag, late_parts
 from bench.base import Floats
 from bench.models import ActuatorDynamics, Operator, ResponseDynamics
 from bench.specimen.correction import identify_correction
@@ -56,7 +56,7 @@ class IdentifiedResponse:
 
 
 def identify_response(
-    recordings: Sequence[Recording], actuator: ActuatorDynamics, model: Operator[Any]
+    recordings: Sequence[TransientRecording], actuator: ActuatorDynamics, model: Operator[Any]
 ) -> IdentifiedResponse:
     """Identify the response of a specimen, whose model and actuator are known."""
     dynamics, uncertainty = identify_lag(recordings, actuator, [model.evaluate] * len(recordings))
@@ -79,7 +79,10 @@ def identify_response(
 
 
 def correct_response(
-    response: IdentifiedResponse, recordings: Sequence[Recording], model: Operator[Any], effects: Sequence[Floats]
+    response: IdentifiedResponse,
+    recordings: Sequence[TransientRecording],
+    model: Operator[Any],
+    effects: Sequence[Floats],
 ) -> IdentifiedResponse:
     """Return a response whose correction gives what was measured together with what disturbances add on average.
 
@@ -87,7 +90,7 @@ def correct_response(
     ----------
     response : IdentifiedResponse
         The response, with any correction.
-    recordings : sequence of Recording
+    recordings : sequence of TransientRecording
         The runs it was identified from.
     model : Operator
         The model.

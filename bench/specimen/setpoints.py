@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.analysis import Recording
+from bench.analysis import TransientRecording
 from bench.base import Floats
 from bench.models import ActuatorDynamics, Operator
 from bench.specimen.disturbances import Noise, with_outliers
@@ -24,13 +24,13 @@ _CHANCE = 3.0
 
 
 def identify_setpoints(
-    recordings: Sequence[Recording], actuator: ActuatorDynamics, noise: Noise, model: Operator[Any]
-) -> tuple[Noise, tuple[Recording, ...]]:
+    recordings: Sequence[TransientRecording], actuator: ActuatorDynamics, noise: Noise, model: Operator[Any]
+) -> tuple[Noise, tuple[TransientRecording, ...]]:
     """Return how exactly set-points were carried out, and the recordings with those that were.
 
     Parameters
     ----------
-    recordings : sequence of Recording
+    recordings : sequence of TransientRecording
         The runs.
     actuator : ActuatorDynamics
         The actuator. Of one that does not follow at once nothing is known, as it is late.
@@ -71,7 +71,7 @@ def _explains(readings: Noise, count: int, levels: Floats, limit: float) -> bool
     return abs(count - expected) <= _CHANCE * math.sqrt(expected)
 
 
-def _levels(recording: Recording) -> Floats:
+def _levels(recording: TransientRecording) -> Floats:
     """Return the drive at each set-point: the median of what was read, or the set-point where nothing was."""
     levels = recording.setpoints.copy()
     last = recording.last_change
@@ -80,7 +80,7 @@ def _levels(recording: Recording) -> Floats:
     return levels
 
 
-def _unexplained(recordings: Sequence[Recording], levels: Sequence[Floats], model: Operator[Any]) -> float:
+def _unexplained(recordings: Sequence[TransientRecording], levels: Sequence[Floats], model: Operator[Any]) -> float:
     """Return the mean square by which the response goes on otherwise than the model, from hold to hold."""
     found = []
     for recording, level in zip(recordings, levels, strict=True):

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from bench.analysis import Recording
+from bench.analysis import TransientRecording
 from bench.base import DataError, Floats
 from bench.models import Preisach
 from bench.specimen.disturbances import Noise, settled_rows
@@ -29,7 +29,7 @@ _SWEEP = "a run that sweeps the drive up and down in small increments, such as d
 _MODEL = "or give a model by --model FILE"
 
 
-def run_of_model(recordings: Sequence[Recording]) -> tuple[Recording, int]:
+def run_of_model(recordings: Sequence[TransientRecording]) -> tuple[TransientRecording, int]:
     """Return the run whose readings determine most of a model of hysteresis, and how many numbers they determine.
 
     These are counted by the rank of the least-squares problem of a Preisach operator on the range of all runs. A
@@ -43,12 +43,14 @@ def run_of_model(recordings: Sequence[Recording]) -> tuple[Recording, int]:
     return recordings[best], counts[best]
 
 
-def raise_if_wrong(recordings: Sequence[Recording], response: IdentifiedResponse, model: str, unit: str) -> None:
+def raise_if_wrong(
+    recordings: Sequence[TransientRecording], response: IdentifiedResponse, model: str, unit: str
+) -> None:
     """Raise DataError if a model says less of the response than a constant in each run would.
 
     Parameters
     ----------
-    recordings : sequence of Recording
+    recordings : sequence of TransientRecording
         The runs.
     response : IdentifiedResponse
         With the errors of the model.
@@ -70,7 +72,9 @@ def raise_if_wrong(recordings: Sequence[Recording], response: IdentifiedResponse
     )
 
 
-def doubts_of_model(recordings: Sequence[Recording], response: IdentifiedResponse, unit: str) -> Iterator[str]:
+def doubts_of_model(
+    recordings: Sequence[TransientRecording], response: IdentifiedResponse, unit: str
+) -> Iterator[str]:
     """Yield in a sentence that the error of a model is great, if it is; parameters as of `raise_if_wrong`."""
     height = float(np.ptp(np.concatenate([r.responded[r.is_reading] for r in recordings])))
     if response.rms_model > _POOR * height:
@@ -80,7 +84,7 @@ def doubts_of_model(recordings: Sequence[Recording], response: IdentifiedRespons
         )
 
 
-def doubts_of_sweep(recording: Recording, count: int) -> Iterator[str]:
+def doubts_of_sweep(recording: TransientRecording, count: int) -> Iterator[str]:
     """Yield in a sentence that a run determines few numbers of a model, if it does; see `run_of_model`."""
     if count < _ENOUGH:
         yield (
@@ -91,13 +95,18 @@ def doubts_of_sweep(recording: Recording, count: int) -> Iterator[str]:
 
 
 def doubts_of_disturbances(
-    recordings: Sequence[Recording], dynamics: Dynamics, drive: Noise, response: Noise, wander: Wander, drift: Wander
+    recordings: Sequence[TransientRecording],
+    dynamics: Dynamics,
+    drive: Noise,
+    response: Noise,
+    wander: Wander,
+    drift: Wander,
 ) -> Iterator[str]:
     """Yield in a sentence which disturbances the twin has none of, as no reading could tell them, if there are any.
 
     Parameters
     ----------
-    recordings : sequence of Recording
+    recordings : sequence of TransientRecording
         The runs.
     dynamics : Dynamics
         Of the specimen: what is at rest when.
@@ -121,7 +130,7 @@ def doubts_of_disturbances(
         )
 
 
-def _drive_at_readings(recording: Recording) -> Floats:
+def _drive_at_readings(recording: TransientRecording) -> Floats:
     """Return the set-points at which the readings of steps were taken, from the first that is known on."""
     last = recording.last_change[recording.is_reading]
     return recording.setpoints[last[last >= 0]]
@@ -138,7 +147,7 @@ def _determined(drive: Floats, low: float, high: float) -> int:
     return int(np.linalg.matrix_rank(np.column_stack([rows, np.ones(len(rows))])))
 
 
-def _pairs_at_rest(recording: Recording, dynamics: Dynamics) -> int:
+def _pairs_at_rest(recording: TransientRecording, dynamics: Dynamics) -> int:
     """Return how many neighbouring rows of a kind, of one hold, are both at rest."""
     count = 0
     for kind in (False, True):

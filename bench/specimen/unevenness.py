@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.analysis import Recording
+from bench.analysis import TransientRecording
 from bench.base import Floats
 from bench.models import Operator
 from bench.specimen.differences import SLOPES, Differences, least_known
@@ -27,7 +27,7 @@ _SEED = 1000
 
 
 def identify_unevenness(
-    recordings: Sequence[Recording],
+    recordings: Sequence[TransientRecording],
     of_model: Sequence[Floats],
     left: Sequence[Floats],
     operators: Sequence[Operator[Any]],
@@ -39,7 +39,7 @@ def identify_unevenness(
 
     Parameters
     ----------
-    recordings : sequence of Recording
+    recordings : sequence of TransientRecording
         The runs.
     of_model, left : sequence of ndarray
         Errors of the model at the readings of each, and what the correction leaves of them.

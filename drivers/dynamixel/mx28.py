@@ -27,7 +27,7 @@ from typing import ClassVar, Literal, NamedTuple, Self, TypeVar
 from pydantic import Field, field_validator, model_validator
 
 from bench.base import Clock, ConfigurationError, DeviceConnectionError, DeviceError, DeviceRestartedError
-from bench.devices import Actuator, Finding, Identity, Limits, Status
+from bench.devices import Actuator, CheckFinding, Identity, Limits, Status
 from drivers.device import RecoverableDevice, attempt, watchdog_field
 from drivers.dynamixel.protocol2 import (
     PING,
@@ -674,7 +674,7 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
     def _refusal(self, what: str, error: RefusedError) -> DeviceError:
         return DeviceError(self.name, f"refused {what}: {error}")
 
-    def self_check(self) -> tuple[Finding, ...]:
+    def self_check(self) -> tuple[CheckFinding, ...]:
         """Report the supply voltage and the temperature, and whether a power cycle can lose a turn.
 
         Raises DeviceError if the servo does not answer.
@@ -684,4 +684,6 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
         turns = f"the limits span {span:.2g} turns"
         if span >= 1.0:
             turns += "; which of them it is in is lost when it is switched off"
-        return Finding("power supply", f"{0.1 * voltage:.1f} V, servo {temperature} °C"), Finding("turns", turns)
+        return CheckFinding("power supply", f"{0.1 * voltage:.1f} V, servo {temperature} °C"), CheckFinding(
+            "turns", turns
+        )

@@ -16,7 +16,7 @@ from typing import TypeVar
 from pydantic import Field
 
 from bench.base import Clock, DeviceError
-from bench.devices import Finding
+from bench.devices import CheckFinding
 from drivers.device import LineActuator
 from drivers.labjack_t7.device import T7ConnectionSettings, T7Device
 from drivers.labjack_t7.registers import (
@@ -296,14 +296,14 @@ class T7LineDevice(T7Device[LineSettingsT], LineActuator[LineSettingsT, LabJackT
                 self._output.unguard()
         super().close()
 
-    def self_check(self) -> tuple[Finding, ...]:
+    def self_check(self) -> tuple[CheckFinding, ...]:
         """Read the watchdog of the instrument back.
 
         Raises DeviceError if the instrument does not answer.
         """
         found, wanted = self._output.guarded_for, self._settings.watchdog
         if found is not None and found <= wanted:
-            return (Finding("watchdog read back", f"{found} s in the instrument, switches {self._output} off"),)
+            return (CheckFinding("watchdog read back", f"{found} s in the instrument, switches {self._output} off"),)
         text = "does not switch it off" if found is None else f"{found} s"
         advice = f"end what else uses the instrument: {wanted} s was written on connecting"
-        return (Finding("watchdog read back", f"{self._output}: {text}", advice),)
+        return (CheckFinding("watchdog read back", f"{self._output}: {text}", advice),)

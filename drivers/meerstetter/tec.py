@@ -28,7 +28,7 @@ from bench.base import (
     DeviceRestartedError,
     WatchdogError,
 )
-from bench.devices import Finding, Identity, Limits, Status, TECAmplifier, TECMode
+from bench.devices import CheckFinding, Identity, Limits, Status, TECAmplifier, TECMode
 from drivers.device import STATUS_AGE, RecoverableDevice, attempt, watchdog_field
 from drivers.meerstetter.device_errors import DEVICE_ERRORS, UNKNOWN_ERROR
 from drivers.meerstetter.mecom import (
@@ -609,7 +609,7 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
                 f"refused {value:g} as its {parameter.title} (parameter {parameter.number}): {error}{allowed}",
             ) from None
 
-    def self_check(self) -> tuple[Finding, ...]:
+    def self_check(self) -> tuple[CheckFinding, ...]:
         """Compare limits with the settings, and temperature limits with the device's error thresholds.
 
         Raises DeviceError if the device does not answer.
@@ -622,13 +622,13 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         ):
             found = self._read(parameter)
             advice = "" if found == single(wanted) else f"another program changed it from {wanted:g} {unit}; end that"
-            findings.append(Finding(key, f"{found:g} {unit} in the device", advice))
+            findings.append(CheckFinding(key, f"{found:g} {unit} in the device", advice))
         lowest, highest = self._read(_LOWEST_OBJECT), self._read(_HIGHEST_OBJECT)
         low, high = settings.temperature_limits
         advice = ""
         if self._mode is TECMode.TEMPERATURE and not lowest <= low <= high <= highest:
             advice = f"set temperature_limits, {low:g} to {high:g} °C, within the thresholds of errors 137 and 138"
         text = f"{lowest:g} to {highest:g} °C of the object, up to {self._read(_HIGHEST_SINK):g} °C of the sink"
-        findings.append(Finding("error thresholds", text, advice))
+        findings.append(CheckFinding("error thresholds", text, advice))
         text = f"{self._read(_SUPPLY_VOLTAGE):.3g} V, base plate {self._read(_BASE_TEMPERATURE):.3g} °C"
-        return (*findings, Finding("power supply", text))
+        return (*findings, CheckFinding("power supply", text))

@@ -32,7 +32,7 @@ from typing import ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from bench.base import Clock, ConfigurationError, DeviceConnectionError, DeviceError, DeviceRestartedError
-from bench.devices import Finding, Identity, Limits, Status, VoltageSupply
+from bench.devices import CheckFinding, Identity, Limits, Status, VoltageSupply
 from drivers.device import RecoverableDevice, attempt
 from drivers.roboteq.canopen import ABSENT, AbortedError, Entry, MissedError, NodeLine, NodeSettings, described
 from drivers.roboteq.process_data import ProcessData, Report
@@ -619,7 +619,7 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
     def _refused(self, item: Entry, value: int, sub: int, error: AbortedError) -> DeviceError:
         return DeviceError(self.name, f"refused {value} as its {described(item, sub)}: {error}")
 
-    def self_check(self) -> tuple[Finding, ...]:
+    def self_check(self) -> tuple[CheckFinding, ...]:
         """Compare the battery voltage with the limits; the watchdog cannot be read by CANopen.
 
         Raises DeviceError if the device does not answer.
@@ -631,4 +631,4 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
         if battery < highest:
             advice = f"check the power supply, or lower voltage_limits: {highest:g} V cannot be reached"
         unread = f"^RWD cannot be read by CANopen; the rig file says {1e3 * self._settings.watchdog:g} ms"
-        return Finding("power supply", f"{battery:.1f} V", advice), Finding("watchdog read back", unread)
+        return CheckFinding("power supply", f"{battery:.1f} V", advice), CheckFinding("watchdog read back", unread)

@@ -26,8 +26,8 @@ from bench.control import (
     ControllerSpec,
     NotchLoop,
     NotchLoopParameters,
-    PlayInverse,
     Reference,
+    SampledPlayInverse,
     Trace,
     check_positive,
 )
@@ -245,7 +245,7 @@ class _MidRanging:
         self._step = parameters.period * parameters.every
         self._settings = np.array([parameters.gain, self._step, parameters.integral_time, parameters.maximum_current])
         self._prepare(model.reference)
-        self._inverse = inverse = PlayInverse(model.hysteresis, parameters.stroke) if piezo else None
+        self._inverse = inverse = SampledPlayInverse(model.hysteresis, parameters.stroke) if piezo else None
         self._integral_gain = integral * parameters.period
         self._integral = 0.0
         self._probe: LatenessProbe | None = None

@@ -14,7 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.analysis import Published, calibrate_run, errors_text, plot_fit, plot_tracking
-from bench.batch import Campaign, ResultTable, Study, StudyResult
+from bench.batch import ResultTable, RunSeries, Study, StudyResult
 from bench.identification import measure_errors
 from bench.record import Record
 from rigs.hybrid.design import Design
@@ -230,7 +230,7 @@ class _Runs(NamedTuple):
     sweep: RunResult
 
 
-def _carry_out(campaign: Campaign) -> StudyResult:
+def _carry_out(campaign: RunSeries) -> StudyResult:
     frequencies = ", ".join(map(str, FREQUENCIES))
     sweep = {"amplitude": str(SWEEP_AMPLITUDE), "frequencies": frequencies, "periods": "3"}
     started = [
@@ -332,7 +332,7 @@ def _carry_out(campaign: Campaign) -> StudyResult:
 
 
 def _start(
-    campaign: Campaign,
+    campaign: RunSeries,
     model: Path,
     settings: Mapping[str, str],
     overrides: Mapping[str, str] | None = None,
@@ -496,7 +496,7 @@ def _fits(found: HybridIdentification, runs: _Runs) -> Iterator[_Fit]:
     )
 
 
-def _draw_models(campaign: Campaign, found: HybridIdentification, runs: _Runs) -> Iterator[Path]:
+def _draw_models(campaign: RunSeries, found: HybridIdentification, runs: _Runs) -> Iterator[Path]:
     """Have the paper's figures drawn; yield their files."""
     for fit in _fits(found, runs):
         yield campaign.draw(
@@ -516,7 +516,7 @@ def _draw_models(campaign: Campaign, found: HybridIdentification, runs: _Runs) -
         )
 
 
-def _draw_control(campaign: Campaign, moves: Mapping[str, Tracked]) -> Iterator[Path]:
+def _draw_control(campaign: RunSeries, moves: Mapping[str, Tracked]) -> Iterator[Path]:
     """Have each controller's moves drawn; yield the files."""
     for name, each in moves.items():
         tracking = each.true

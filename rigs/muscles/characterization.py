@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.analysis import Curve, plot_panels
-from bench.batch import Campaign, ResultTable
+from bench.batch import ResultTable, RunSeries
 from bench.identification import CoupledIdentification, FirstStage, ModelFile, Series, measure_series
 from bench.models import TwoStage
 from rigs.muscles.identification import (
@@ -104,7 +104,7 @@ def json_key(name: str) -> str:
     return name.replace("-", "_")
 
 
-def start_runs(campaign: Campaign) -> dict[str, Pending[RunResult]]:
+def start_runs(campaign: RunSeries) -> dict[str, Pending[RunResult]]:
     """Start the four protocols of a muscle; the campaign's seed chooses the random voltages of the verification."""
     with campaign.workers.together():
         runs = {
@@ -152,7 +152,7 @@ def identify_models(measured: Measurements, folder: Path) -> Iterator[tuple[Mode
 
 
 def conclude(
-    campaign: Campaign,
+    campaign: RunSeries,
     runs: Mapping[str, Pending[RunResult]],
     measured: Measurements,
     models: Mapping[ModelName, CoupledIdentification[Any]],
@@ -167,7 +167,7 @@ def conclude(
     return Characterization(measured.resting, measured.series, verification, models)
 
 
-def characterize(campaign: Campaign, runs: Mapping[str, Pending[RunResult]]) -> Characterization:
+def characterize(campaign: RunSeries, runs: Mapping[str, Pending[RunResult]]) -> Characterization:
     """Identify each model from the four runs of a muscle; the model files go into the campaign's folder.
 
     Raises

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.analysis import (
-    Recording,
+    TransientRecording,
     WholeIdentification,
     identify_dynamics,
     identify_transients,
@@ -183,7 +183,7 @@ def identify_muscle_dynamics(model: Model, force_run: Path, length_runs: Sequenc
     return replace(found, noise={**found.noise, "length": noise_of(lengths, lengths.responded)})
 
 
-def _parts(recording: Recording, label: str) -> list[Recording]:
+def _parts(recording: TransientRecording, label: str) -> list[TransientRecording]:
     """Return the part of a recording from the first to the last step of a label, or none."""
     steps = [step for step in recording.steps if step.label == label]
     return [recording.within(steps[0].started, steps[-1].finished)] if steps else []

@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from bench.analysis import Curve, plot_panels
-from bench.batch import Campaign, Study, StudyResult
+from bench.batch import RunSeries, Study, StudyResult
 from rigs.muscles.characterization import Characterization, characterize, errors_table, plot_lengths, start_runs
 
 MUSCLES = {
@@ -30,7 +30,7 @@ VERDICT = tuple(
 )
 
 
-def carry_out(campaign: Campaign) -> StudyResult:
+def carry_out(campaign: RunSeries) -> StudyResult:
     """Characterize both muscles and identify the models.
 
     The values are errors in percent of the range by muscle, and `fv`, `lv`, `lf` and `verification`. Raises
@@ -61,7 +61,7 @@ STUDY = Study(
 )
 
 
-def _draw(campaign: Campaign, measured: Characterization) -> list[Path]:
+def _draw(campaign: RunSeries, measured: Characterization) -> list[Path]:
     """Draw the three hysteresis relationships as they were measured."""
     voltages, forces, _ = measured.resting
     paths = [

@@ -22,7 +22,7 @@ from bench.analysis import (
     plot_sequence_and_errors,
     plot_tracking,
 )
-from bench.batch import Campaign, ResultTable, Study, StudyResult, reached_targets, true_errors
+from bench.batch import ResultTable, RunSeries, Study, StudyResult, reached_targets, true_errors
 from bench.identification import predict_series
 from bench.models import Density
 from bench.rig import load_rig
@@ -133,7 +133,7 @@ VERDICT = (
 )
 
 
-def carry_out(campaign: Campaign) -> StudyResult:
+def carry_out(campaign: RunSeries) -> StudyResult:
     """Run the paper's experiments and the control beyond it, and identify the models.
 
     The values are errors in percent of the range by `fv`, `lv`, `lf` and `verification`, and those of `control` in
@@ -250,7 +250,7 @@ def _errors(
     return {key: value * controlled.scale for key, value in found.items()}
 
 
-def _draw(campaign: Campaign, measured: Characterization) -> list[Path]:
+def _draw(campaign: RunSeries, measured: Characterization) -> list[Path]:
     voltages, forces, _ = measured.resting
     models = {name: found for name, found in measured.models.items() if name in _SHOWN}
     names = {title: name for name, title in TITLES.items()}
@@ -313,7 +313,7 @@ def _cells(density: Density) -> int:
     return int(np.count_nonzero(np.isfinite(density.values)))
 
 
-def _draw_control(campaign: Campaign, reached: Mapping[str, Mapping[str, TargetResults]]) -> list[Path]:
+def _draw_control(campaign: RunSeries, reached: Mapping[str, Mapping[str, TargetResults]]) -> list[Path]:
     paths = []
     for key, results in reached.items():
         _, name, _, unit, scale = CONTROL[key].controlled

@@ -32,7 +32,7 @@ from bench.analysis import (
     transients_of,
 )
 from bench.base import DataError
-from bench.batch import Campaign, ResultTable, Study, StudyResult, reached_targets, true_errors
+from bench.batch import ResultTable, RunSeries, Study, StudyResult, reached_targets, true_errors
 from bench.identification import measure_errors
 from bench.models import MemoryCurve
 from bench.record import Record
@@ -205,7 +205,7 @@ VERDICT = (
 )
 
 
-def carry_out(campaign: Campaign) -> StudyResult:
+def carry_out(campaign: RunSeries) -> StudyResult:
     """Run the paper's experiments, identify its models, and track with every controller.
 
     Raises BenchError if a run did not complete; its record is kept.
@@ -406,7 +406,7 @@ def _parameters(operator: Any) -> dict[str, float]:  # noqa: ANN401 - the non-mo
 
 
 def _draw_models(
-    campaign: Campaign,
+    campaign: RunSeries,
     models: Mapping[str, IdentifiedFile],
     inputs: Floats,
     outputs: Floats,
@@ -482,7 +482,7 @@ def _published(keys: Iterable[str], kind: str) -> dict[str, float]:
 
 
 def _draw_control(
-    campaign: Campaign, reached: Mapping[str, TargetResults], followed: Mapping[tuple[int, str], FollowingResult]
+    campaign: RunSeries, reached: Mapping[str, TargetResults], followed: Mapping[tuple[int, str], FollowingResult]
 ) -> list[Path]:
     output, error = "curvature / (1/m)", "error / (1/m)"
     names = {title: key.replace("_", "-") for key, (title, *_) in CONTROLLERS.items()}

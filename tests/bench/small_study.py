@@ -1,7 +1,7 @@
 """A study of seconds: four short runs, one of which another waits for, and a figure."""
 
 from bench.analysis import plot_errors
-from bench.batch import Campaign, ResultTable, Study, StudyResult
+from bench.batch import ResultTable, RunSeries, Study, StudyResult
 from bench.record import Record
 
 SETTINGS = {"duration": "4", "settling": "2"}
@@ -12,7 +12,7 @@ def readings(run):
         return record.telemetry()["curvature"]
 
 
-def carry_out(campaign: Campaign) -> StudyResult:
+def carry_out(campaign: RunSeries) -> StudyResult:
     """Hold the temperature in each run, and start one that depends on the results of the others."""
     runs = [campaign.start("creep", {**SETTINGS, "hot": hot}) for hot in ("65", "70", "75")]
     found = [readings(run.result()) for run in runs]
@@ -26,7 +26,7 @@ def carry_out(campaign: Campaign) -> StudyResult:
     )
 
 
-def carry_out_wrongly(campaign: Campaign) -> StudyResult:
+def carry_out_wrongly(campaign: RunSeries) -> StudyResult:
     """Start a run that is refused beside one that goes on."""
     campaign.start("damped-oscillation", {})
     campaign.start("creep", {**SETTINGS, "hot": "1000"}).result()

@@ -35,7 +35,7 @@ from bench.models import (
 )
 from bench.protocol import TRACES, Settled
 from bench.record import FILE_NAME, Event, Journal, Lateness, Record, StepRecord, add_model
-from bench.record.rows import Entry
+from bench.record.rows import JournalEntry
 from bench.rig import DashboardLayout, XYPlot
 
 
@@ -264,7 +264,7 @@ def keep_journal(
     folder.mkdir()
     journal = Journal(folder / FILE_NAME, signals, meta)
     # One transaction for all: the file need not outlive a power cut here.
-    rows: list[Entry] = []
+    rows: list[JournalEntry] = []
     journal._keeper.keep, keep = rows.extend, journal._keeper.keep  # type: ignore[method-assign]
     for entry in entries:
         if isinstance(entry, StepRecord):

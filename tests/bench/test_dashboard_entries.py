@@ -9,7 +9,7 @@ from hypothesis import given, strategies as st
 
 pytest.importorskip("rerun")
 
-from bench.dashboard.controlled_run import ControlPlots, Errors
+from bench.dashboard.controlled_run import ControlPlots, ErrorPlot
 from bench.dashboard.entries import Entry, Tick, Ticks, in_parts, merged, portions, single, size
 from bench.devices import Signal
 from bench.protocol import TRACES, Settled
@@ -65,7 +65,7 @@ def test_portions_are_full_but_the_last(entries: list[Entry], most: int) -> None
 
 @given(st.lists(TICKS | STEPS, max_size=30))
 def test_the_errors_are_the_same_tick_by_tick(entries: list[Entry]) -> None:
-    at_once, one_by_one = (Errors(ControlPlots.of(SIGNALS, "output", None)) for _ in range(2))
+    at_once, one_by_one = (ErrorPlot(ControlPlots.of(SIGNALS, "output", None)) for _ in range(2))
     for part in in_parts(entries):
         at_once.see(part)
     for entry in entries:

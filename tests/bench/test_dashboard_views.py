@@ -9,7 +9,7 @@ import pytest
 from rerun.chunk import RrdReader
 
 from bench.dashboard.bounds import bounds_of, nearest
-from bench.dashboard.controlled_run import ControlPlots, Errors
+from bench.dashboard.controlled_run import ControlPlots, ErrorPlot
 from bench.dashboard.drawing import Frame
 from bench.dashboard.entries import End, Tick, in_parts
 from bench.dashboard.writer import Writer
@@ -71,8 +71,8 @@ def targets(errors: list[float], disturbance: float = 1.0) -> list[object]:
     return entries
 
 
-def seen(entries: list[object]) -> Errors:
-    errors = Errors(ControlPlots.of(SIGNALS, "curvature", None))
+def seen(entries: list[object]) -> ErrorPlot:
+    errors = ErrorPlot(ControlPlots.of(SIGNALS, "curvature", None))
     for part in in_parts(entries):  # type: ignore[arg-type]
         errors.see(part)
     return errors
@@ -233,7 +233,7 @@ def test_the_error_that_a_witness_sees_is_told_from_the_noise_of_the_sensor(tmp_
         Tick(float(i), 0, (60.0, 60.1, 500.0 + noise, 500.0, math.nan, math.nan, math.nan, 500.0 + error))
         for i, (noise, error) in enumerate(zip(noisy, true, strict=True))
     ]
-    errors = Errors(ControlPlots.of(signals, "curvature", None, "witness_curvature"))
+    errors = ErrorPlot(ControlPlots.of(signals, "curvature", None, "witness_curvature"))
     for part in in_parts(entries):
         errors.see(part)
     assert errors.rms()[1] == pytest.approx(30.0)

@@ -7,7 +7,7 @@ from cases import cases
 from hypothesis import given, strategies as st
 
 from bench.base import ConfigurationError, VirtualClock
-from bench.base.registry import Entry
+from bench.base.registry import RegisteredPart
 from bench.control import Playback
 from bench.protocol import (
     Dwell,
@@ -501,7 +501,7 @@ class TestPackaged:
         for module in ("one", "two"):
             (package / f"{module}.py").write_text(TestFiles.GOOD, encoding="utf-8")
         monkeypatch.syspath_prepend(str(tmp_path))
-        twins = Entry("protocols", "twins", "twin-package", "twin_protocols")
+        twins = RegisteredPart("protocols", "twins", "twin-package", "twin_protocols")
         monkeypatch.setattr("bench.base.registry.entries", lambda _: {"twins": twins})
         with pytest.raises(ConfigurationError, match="two protocols are named soak: one of package twin-package"):
             packaged_protocols()
@@ -513,8 +513,8 @@ class TestPackaged:
         (package / "good.py").write_text(TestFiles.GOOD, encoding="utf-8")
         (package / "bad.py").write_text("import no_such_module\n")
         monkeypatch.syspath_prepend(str(tmp_path))
-        broken = Entry("protocols", "broken", "a-package", "broken_protocols")
-        gone = Entry("protocols", "gone", "b-package", "no_such_package")
+        broken = RegisteredPart("protocols", "broken", "a-package", "broken_protocols")
+        gone = RegisteredPart("protocols", "gone", "b-package", "no_such_package")
         monkeypatch.setattr("bench.base.registry.entries", lambda _: {"broken": broken, "gone": gone})
         packaged = packaged_protocols()
         assert list(packaged.protocols) == ["soak"]

@@ -51,9 +51,9 @@ def test_the_log_of_rerun_is_left_alone_otherwise():
 
 
 def test_a_file_that_is_whole(tmp_path):
-    from bench.dashboard.rerun_recording import Recording
+    from bench.dashboard.rerun_recording import RerunRecording
 
-    recording = Recording("run", "a run", tmp_path / "run.rrd", None)
+    recording = RerunRecording("run", "a run", tmp_path / "run.rrd", None)
     recording.set_property("bench", {"rig": "none"})
     recording.close()
     assert is_whole(tmp_path / "run.rrd")

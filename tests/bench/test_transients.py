@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from cases import cases
 
-from bench.analysis import Recording, at_rows, identify_dynamics, identify_transients, noise_of
+from bench.analysis import TransientRecording, at_rows, identify_dynamics, identify_transients, noise_of
 from bench.base import DataError
 from bench.identification import ModelFile, parse_model
 from bench.models import ActuatorDynamics, IdentifiedDynamics, Preisach, ResponseDynamics, uniform_levels
@@ -38,7 +38,7 @@ def recording(lag, power, *, period=1.0, hold=20.0, error=0.0, setpoints=SINE):
     response = MODEL.evaluate(held ** (1.0 / power)) + off[np.searchsorted(changes, grid - 1e-9, side="right") - 1]
     rows = np.arange(round(period / 0.01), grid.size, round(period / 0.01)) - 1
     noise = QUIET * rng.standard_normal((2, rows.size))
-    return Recording(
+    return TransientRecording(
         path=Path("run"), meta={}, signals=(), steps=(), times=grid[rows], is_reading=np.zeros(rows.size, dtype=bool),
         columns={"drive": drive[rows] + noise[0], "response": response[rows] + noise[1]}, changes=changes,
         setpoints=setpoints, drive="drive", response="response", ticks=(np.empty(0), np.empty(0)),

@@ -12,7 +12,7 @@ from bench.batch.tuning.search import (
     FACTOR,
     FAILED,
     MARGIN,
-    Trial,
+    TuningTrial,
     confirm,
     cost_of,
     get,
@@ -21,7 +21,7 @@ from bench.batch.tuning.search import (
     put,
     search,
 )
-from bench.batch.tuning.tuning_runs import Task, TuningRuns, start_of
+from bench.batch.tuning.tuning_runs import TuningRuns, TuningTask, start_of
 from bench.cli import main
 from bench.control import ControllerSetup, controller_spec, tuning_text
 from bench.control.tuning_file import load_tuning
@@ -35,7 +35,7 @@ NUMBERS = {"wait": 8.0, "arrival": {"hold": 0.4}}
 
 
 def failed(numbers):
-    return Trial(numbers, FAILED, 2.0, 1.0, math.inf)
+    return TuningTrial(numbers, FAILED, 2.0, 1.0, math.inf)
 
 
 def evaluate(candidates):
@@ -44,7 +44,7 @@ def evaluate(candidates):
     for numbers in candidates:
         wait, hold = get(numbers, "wait"), get(numbers, "arrival.hold")
         cost = math.log(wait / 3.0) ** 2 + math.log(hold) ** 2 + 1.0
-        found.append(Trial(numbers, cost, cost, 1.0, cost) if wait >= 2.5 else failed(numbers))
+        found.append(TuningTrial(numbers, cost, cost, 1.0, cost) if wait >= 2.5 else failed(numbers))
     return found
 
 
@@ -79,7 +79,7 @@ def test_numbers_that_gain_only_together_are_found():
         for numbers in candidates:
             wait, hold = math.log(get(numbers, "wait") / 8.0), math.log(get(numbers, "arrival.hold") / 0.4)
             cost = 3.0 - wait + 1.2 * abs(wait - hold)
-            found.append(Trial(numbers, cost, cost, 1.0, cost))
+            found.append(TuningTrial(numbers, cost, cost, 1.0, cost))
         return found
 
     names = ("wait", "arrival.hold")
@@ -103,7 +103,7 @@ def test_a_search_begins_with_the_numbers_of_the_rig_file_over_those_of_the_cont
     rig.write_text(f'extends = "vo2"\n{tables}\nclose_enough = 6\narrival = {{ tolerance = 0.02 }}\n')
     spec = controller_spec("target", "closed-loop-inverse")
     setup = ControllerSetup(model=ModelFile("preisach", FILM), limits=(21.0, 84.0))
-    task = Task("tracking", "closed-loop-inverse", "response")
+    task = TuningTask("tracking", "closed-loop-inverse", "response")
     found = start_of(task, str(rig), spec.numbers(setup), spec.tunable)
     assert (found["close_enough"], found["corrections"], found["arrival"]["tolerance"]) == (6.0, 4, 0.02)
     # What is given without decimals need not stay a whole number.
@@ -116,7 +116,7 @@ def test_the_operator_ends_a_search(tmp_path):
         def result(self):
             raise AbortError("ended by Ctrl-C")
 
-    task = Task("tracking", "closed-loop-inverse", "response")
+    task = TuningTask("tracking", "closed-loop-inverse", "response")
     runs = TuningRuns(task, "vo2", ModelFile("preisach", FILM), tmp_path, workers=None, settings={})
     with pytest.raises(AbortError):
         runs._trial(NUMBERS, {("as-identified", 0): Ended()})
@@ -147,7 +147,9 @@ def test_the_first_numbers_stay_if_none_is_better_in_other_sessions():
         """Sessions in which the first numbers cost more than the others, each by its own gain."""
         return [
             lambda candidates, gain=gain: [
-                Trial(each, 1.0 + gain, 1.0, 1.0, 1.0) if each is NUMBERS else Trial(each, 1.0, rms, 1.0, 1.0)
+                TuningTrial(each, 1.0 + gain, 1.0, 1.0, 1.0)
+                if each is NUMBERS
+                else TuningTrial(each, 1.0, rms, 1.0, 1.0)
                 for each in candidates
             ]
             for gain in gains
@@ -171,9 +173,9 @@ def test_one_session_in_which_the_first_numbers_fail_hides_no_other():
         """Sessions in which the others cost so much, and the first numbers 1, or fail where it is None."""
         return [
             lambda candidates, cost=cost: [
-                Trial(each, cost or 1.0, 1.0, 1.0, 1.0)
+                TuningTrial(each, cost or 1.0, 1.0, 1.0, 1.0)
                 if each is not NUMBERS
-                else (failed(each) if cost is None else Trial(each, 1.0, 1.0, 1.0, 1.0))
+                else (failed(each) if cost is None else TuningTrial(each, 1.0, 1.0, 1.0, 1.0))
                 for each in candidates
             ]
             for cost in costs

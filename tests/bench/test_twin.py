@@ -12,7 +12,7 @@ import pytest
 from cases import cases
 
 import bench
-from bench.analysis import Recording, identify_actuator
+from bench.analysis import TransientRecording, identify_actuator
 from bench.base import ConfigurationError, DataError
 from bench.cli import main
 from bench.identification import load_model
@@ -241,7 +241,7 @@ def recording_of(dynamics, noise=0.0):
 
 def recording_from(times, drive, changes, setpoints):
     """A recording of a drive, read at some times."""
-    return Recording(
+    return TransientRecording(
         path=Path("run"), meta={}, signals=(), steps=(), times=times, is_reading=np.ones(times.size, dtype=bool),
         columns={"drive": drive, "response": drive}, changes=changes, setpoints=setpoints, drive="drive",
         response="response", ticks=(np.empty(0), np.empty(0)),

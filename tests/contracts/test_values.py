@@ -17,7 +17,7 @@ CHANGING = {
 }
 """What is no value but a state."""
 BY_IDENTITY = {
-    "bench.control.adaptation.Adapter",
+    "bench.control.adaptation.DensityAdapter",
     "bench.control.approach.Approach",
     "bench.control.predictive._Lag",
     "bench.control.two_stage_inverse.TwoStageInverse",

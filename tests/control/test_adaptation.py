@@ -7,7 +7,7 @@ import pytest
 from cases import cases
 from hypothesis import given, strategies as st
 
-from bench.control.adaptation import Adapter
+from bench.control.adaptation import DensityAdapter
 from bench.models import MemoryCurve, Preisach, PreisachInverse, QuadraticTerm, uniform_levels
 
 
@@ -49,7 +49,7 @@ def test_equals_the_definition(seed, uneven, noise):
         levels /= levels[-1]
         model = Preisach(levels, model.density, 0.1, model.reversible, (-0.1, 1.2))
     start = MemoryCurve.from_negative_saturation(-0.1).advance(rng.uniform(-0.1, 1.2, 6))
-    adapter = Adapter(model, start, step=0.7, bias_step=0.2, noise=noise, uncertainty=0.5)
+    adapter = DensityAdapter(model, start, step=0.7, bias_step=0.2, noise=noise, uncertainty=0.5)
     masses = model.density * model.cell_areas()
     regularisation = 2.0 * noise**2 / (0.25 * np.mean(masses**2))
     expected, state, before = model, start, math.nan
@@ -82,7 +82,7 @@ def test_equals_the_definition(seed, uneven, noise):
 def test_nothing_is_changed_in_place():
     model = plant()
     density = model.density.copy()
-    first = Adapter(model)
+    first = DensityAdapter(model)
     second = first.update(0.5, 0.1).update(0.8, 5.0)
     np.testing.assert_array_equal(model.density, density)
     assert first.model is model
@@ -94,7 +94,7 @@ def test_nothing_is_changed_in_place():
 
 
 def test_samples_without_output_move_the_memory_only():
-    adapter = Adapter(plant()).update(0.5, 0.2)
+    adapter = DensityAdapter(plant()).update(0.5, 0.2)
     moved = adapter.update(0.9, None)
     assert moved.model is adapter.model
     assert moved.state == adapter.state.step(0.9)
@@ -130,8 +130,8 @@ def reference(count=4000):
 def test_adaptation_follows_a_drifting_gain(seed, noise, ratio):
     truth, targets = plant(seed=seed), reference()
     drift = np.linspace(1.0, 1.05, targets.size)
-    fixed, _ = track(Adapter(truth), truth, targets, drift, noise, seed, adapting=False)
-    adapter = Adapter(truth, noise=noise or None)
+    fixed, _ = track(DensityAdapter(truth), truth, targets, drift, noise, seed, adapting=False)
+    adapter = DensityAdapter(truth, noise=noise or None)
     adapted, after = track(adapter, truth, targets, drift, noise, seed)
     half = targets.size // 2
     assert np.sqrt(np.mean(adapted[half:] ** 2)) < ratio * np.sqrt(np.mean(fixed[half:] ** 2))
@@ -145,7 +145,7 @@ def test_density_stays_bounded_under_noise():
     truth = plant()
     # Half a percent of the output's span in each reading.
     targets = np.tile(reference(), 3)
-    errors, after = track(Adapter(truth, noise=0.01), truth, targets, np.ones(targets.size), 0.01, 1)
+    errors, after = track(DensityAdapter(truth, noise=0.01), truth, targets, np.ones(targets.size), 0.01, 1)
     masses = after.model.density * after.model.cell_areas()
     assert (after.model.density >= 0.0).all()
     assert masses.sum() == pytest.approx(1.0, abs=0.05)
@@ -157,13 +157,13 @@ def test_density_stays_bounded_under_noise():
 @cases(
     ("make", "message"),
     [
-        (lambda: Adapter(Preisach([0.0, 1.0], [-1.0])), "model: expected a density >= 0"),
-        (lambda: Adapter(plant(), step=2.0), "step: expected 0 <= step < 2"),
-        (lambda: Adapter(plant(), bias_step=1.5), "bias_step: expected"),
-        (lambda: Adapter(plant(), noise=0.0), "noise: expected a positive"),
-        (lambda: Adapter(plant(), uncertainty=0.0), "uncertainty: expected"),
-        (lambda: Adapter(plant()).update(math.nan, 0.0), "value: expected a finite"),
-        (lambda: Adapter(plant()).update(0.5, math.nan), "output: expected a finite"),
+        (lambda: DensityAdapter(Preisach([0.0, 1.0], [-1.0])), "model: expected a density >= 0"),
+        (lambda: DensityAdapter(plant(), step=2.0), "step: expected 0 <= step < 2"),
+        (lambda: DensityAdapter(plant(), bias_step=1.5), "bias_step: expected"),
+        (lambda: DensityAdapter(plant(), noise=0.0), "noise: expected a positive"),
+        (lambda: DensityAdapter(plant(), uncertainty=0.0), "uncertainty: expected"),
+        (lambda: DensityAdapter(plant()).update(math.nan, 0.0), "value: expected a finite"),
+        (lambda: DensityAdapter(plant()).update(0.5, math.nan), "output: expected a finite"),
     ],
 )
 def test_wrong_input_is_named(make, message):

@@ -7,7 +7,7 @@ import pytest
 from cases import cases
 from hypothesis import given, strategies as st
 
-from bench.control import PlayInverse
+from bench.control import SampledPlayInverse
 from bench.models import DeadZones, PrandtlIshlinskii
 
 MICRO, NANO = 1e-6, 1e-9
@@ -26,7 +26,7 @@ def test_inverse_by_samples_equals_the_inverse_operator(wanted):
     low, high = operator.output_range()
     stroke = 9 * MICRO
     bounded = np.clip(MICRO * np.array(wanted), max(low - operator.bias, -stroke), min(high - operator.bias, stroke))
-    inverse = PlayInverse(operator, stroke)
+    inverse = SampledPlayInverse(operator, stroke)
     assert inverse.output == 0.0
     voltages = []
     for each, within in zip(wanted, bounded, strict=True):
@@ -40,7 +40,7 @@ def test_inverse_by_samples_equals_the_inverse_operator(wanted):
 def test_inverse_by_samples_does_not_drift():
     operator, rng = plays(), np.random.default_rng(0)
     wanted = np.clip(np.cumsum(0.2 * MICRO * rng.standard_normal(50_000)), -8 * MICRO, 8 * MICRO)
-    inverse = PlayInverse(operator)
+    inverse = SampledPlayInverse(operator)
     voltages = [inverse.input(each) for each in wanted.tolist()]
     assert voltages == pytest.approx(operator.inverse_operator().evaluate(wanted + operator.bias), abs=1e-9)
 
@@ -48,8 +48,8 @@ def test_inverse_by_samples_does_not_drift():
 @cases(
     ("make", "message"),
     [
-        (lambda: PlayInverse(plays(), 0.0), "stroke: expected a positive"),
-        (lambda: PlayInverse(replace(plays(), after=DeadZones([0.0], [1.0, 2.0]))), "expected an operator of"),
+        (lambda: SampledPlayInverse(plays(), 0.0), "stroke: expected a positive"),
+        (lambda: SampledPlayInverse(replace(plays(), after=DeadZones([0.0], [1.0, 2.0]))), "expected an operator of"),
     ],
 )
 def test_wrong_input_is_named(make, message):

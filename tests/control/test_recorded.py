@@ -30,7 +30,7 @@ from bench.control import (
     staircase,
     tracking_targets,
 )
-from bench.control.adaptation import Adapter
+from bench.control.adaptation import DensityAdapter
 from bench.control.baselines import IntegralControl, IntegralParameters, LookUp
 from bench.control.following import ClosedLoopFollower, FollowingParameters, IntegralFollower, OpenLoopFollower
 from bench.control.latched import Latched, LatchParameters
@@ -255,7 +255,7 @@ def stretching(**arguments):
 def adapting():
     levels = uniform_levels(0.0, 10.0, 10)
     model = Preisach(levels, np.ones(55), 1.0)
-    adapter, rng, rows = Adapter(model), np.random.default_rng(3), []
+    adapter, rng, rows = DensityAdapter(model), np.random.default_rng(3), []
     state = model.initial_state()
     for number in range(60):
         value = float(rng.uniform(0.0, 10.0))

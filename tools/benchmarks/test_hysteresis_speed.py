@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from bench.control.adaptation import Adapter
+from bench.control.adaptation import DensityAdapter
 from bench.identification import damped_oscillation
 from bench.models import PrandtlIshlinskii, Preisach, PreisachInverse, ThermalExpansion, uniform_levels
 
@@ -154,7 +154,7 @@ def test_adaptation(capsys):
         inputs = 54.0 + 12.0 * np.sin(np.arange(2000) / 40.0)
         outputs = 1.02 * operator.evaluate(inputs) + 0.4 * np.random.default_rng(0).normal(size=inputs.size)
         pairs = list(zip(inputs.tolist(), outputs.tolist(), strict=True))
-        start = Adapter(operator, noise=0.4).update(*pairs[0])
+        start = DensityAdapter(operator, noise=0.4).update(*pairs[0])
 
         def updates(adapter=start, pairs=pairs):
             for value, output in pairs:

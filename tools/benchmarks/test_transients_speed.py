@@ -7,7 +7,7 @@ from statistics import median
 import numpy as np
 import pytest
 
-from bench.analysis import Recording, identify_dynamics, identify_transients
+from bench.analysis import TransientRecording, identify_dynamics, identify_transients
 from bench.models import Preisach, uniform_levels
 from bench.models.kernels import actuator_kernels as _kernels
 
@@ -28,7 +28,7 @@ def recording(model):
     _kernels.hold_back(45.0, drive, seen, GRID, 4.0, 1.0)
     rows = np.arange(round(PERIOD / GRID), held.size, round(PERIOD / GRID))
     noise = 1e-3 * rng.standard_normal((2, rows.size))
-    return Recording(
+    return TransientRecording(
         path=Path("run"), meta={}, signals=(), steps=(), times=GRID * (rows + 1), is_reading=np.ones(rows.size, bool),
         columns={"drive": drive[rows] + noise[0], "response": model.evaluate(seen)[rows] + noise[1]},
         changes=HOLD * np.arange(HOLDS), setpoints=setpoints, drive="drive", response="response",

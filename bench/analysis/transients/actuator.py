@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.analysis.transients.recorded_transients import Recording
+from bench.analysis.transients.recorded_transients import TransientRecording
 from bench.base import DeferredModule, Floats
 from bench.models import ActuatorDynamics
 
@@ -82,7 +82,7 @@ def at_rows(times: Floats, values: Floats, first: float, step: float, delay: flo
 class _Part:
     """The first part of a recording, up to `end` s, with what its simulations have in common."""
 
-    def __init__(self, recording: Recording, end: float) -> None:
+    def __init__(self, recording: TransientRecording, end: float) -> None:
         rows = recording.times <= end
         self.driven, self.weights = recording.driven[rows], _weights(recording)[rows]
         self._recording, self._end, self._times = recording, end, recording.times[rows]
@@ -107,7 +107,7 @@ class _Part:
         return positions
 
 
-def identify_actuator(recordings: Sequence[Recording], longest: float = LONGEST_PART) -> IdentifiedActuator:
+def identify_actuator(recordings: Sequence[TransientRecording], longest: float = LONGEST_PART) -> IdentifiedActuator:
     """Identify the dynamics of the drive of some runs, of each by as long a part, s."""
     from scipy.optimize import least_squares
 
@@ -183,7 +183,7 @@ def identify_actuator(recordings: Sequence[Recording], longest: float = LONGEST_
     return IdentifiedActuator(causal, uncertainties, float(np.sqrt(np.mean(left**2))))
 
 
-def start_position(recording: Recording, dynamics: ActuatorDynamics) -> float:
+def start_position(recording: TransientRecording, dynamics: ActuatorDynamics) -> float:
     """Return the position (before gain and offset) of the drive at the beginning of a recording, input units."""
     return (float(recording.driven[0]) - dynamics.offset) / dynamics.gain
 
@@ -202,7 +202,7 @@ def latency(dynamics: ActuatorDynamics) -> float:
     return dynamics.delay + (grid_step(dynamics) if dynamics.order == 0 else 0.0)
 
 
-def _candidates(slow: float, recordings: Sequence[Recording]) -> list[dict[str, float]]:
+def _candidates(slow: float, recordings: Sequence[TransientRecording]) -> list[dict[str, float]]:
     """Return the numbers of each candidate with their first guesses."""
     rate = {"rate": _fastest(recordings)}
     lags = [{"frequency": frequency / slow, "delay": 0.0} for frequency in (1.0, 3.0)]
@@ -211,7 +211,7 @@ def _candidates(slow: float, recordings: Sequence[Recording]) -> list[dict[str, 
     return [*plain, *(each | rate for each in (*lags, *pairs))]
 
 
-def _weights(recording: Recording) -> Floats:
+def _weights(recording: TransientRecording) -> Floats:
     """Return the weight of each row: less while the drive moves, as the instants of readings are uncertain."""
     moves = np.abs(np.diff(recording.driven))
     rates = moves / np.maximum(np.diff(recording.times), 1e-3)
@@ -220,7 +220,7 @@ def _weights(recording: Recording) -> Floats:
     return np.asarray(1.0 / np.sqrt(noise**2 + (_INSTANT * fastest) ** 2))
 
 
-def _time_scale(recordings: Sequence[Recording]) -> float:
+def _time_scale(recordings: Sequence[TransientRecording]) -> float:
     """Return a first guess of the time constant, s: how long the drive is away from its set-point after a change."""
     areas, sizes = 0.0, 0.0
     for r in recordings:
@@ -233,7 +233,7 @@ def _time_scale(recordings: Sequence[Recording]) -> float:
     return float(np.clip(areas / max(sizes, 1e-300), 0.02, 100.0))
 
 
-def _fastest(recordings: Sequence[Recording]) -> float:
+def _fastest(recordings: Sequence[TransientRecording]) -> float:
     """Return the fastest change that was seen over a time that is long beside the uncertainty of instants."""
     found = []
     for r in recordings:

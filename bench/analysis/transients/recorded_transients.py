@@ -21,7 +21,7 @@ else:
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class TransientRecording:
     """A run; rows are quick readings (telemetry) and readings (steps), in order of time.
 
     Attributes
@@ -87,7 +87,7 @@ class Recording:
         before = self.last_change
         return np.asarray(np.where(before < 0, np.inf, self.times - self.changes[np.maximum(before, 0)]))
 
-    def within(self, start: float, end: float) -> Recording:
+    def within(self, start: float, end: float) -> TransientRecording:
         """Return the part between two instants on the clock of the run, s, both included; times begin anew."""
         rows = (self.times >= start - self.zero - 1e-9) & (self.times <= end - self.zero + 1e-9)
         first = float(self.times[rows][0])
@@ -127,7 +127,7 @@ def _steps_until(end: float, step: float) -> int:
     return int(np.ceil(end / step)) + 1
 
 
-def recording_of(path: Path, record: Record, device: str, drive: str, response: str) -> Recording:
+def recording_of(path: Path, record: Record, device: str, drive: str, response: str) -> TransientRecording:
     """Return what a run recorded of a drive and a response.
 
     Parameters
@@ -177,7 +177,7 @@ def recording_of(path: Path, record: Record, device: str, drive: str, response: 
             f"{path}: the set-point of {device} does not change, so that there is no transient from which dynamics "
             "could be identified; run creep or damped-oscillation"
         )
-    return Recording(
+    return TransientRecording(
         path=path,
         meta=record.meta,
         signals=signals,

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from bench.analysis.transients.actuator import LONGEST_PART, at_rows, grid_step, latency, start_position
-from bench.analysis.transients.recorded_transients import Recording
+from bench.analysis.transients.recorded_transients import TransientRecording
 from bench.base import DeferredModule, Floats
 from bench.models import ActuatorDynamics, ResponseDynamics
 
@@ -45,7 +45,7 @@ class SimulatedDrive:
 
     Parameters
     ----------
-    recording : Recording
+    recording : TransientRecording
         The run.
     actuator : ActuatorDynamics
         Its actuator.
@@ -58,7 +58,7 @@ class SimulatedDrive:
         Of the grid, s.
     """
 
-    def __init__(self, recording: Recording, actuator: ActuatorDynamics, end: float) -> None:
+    def __init__(self, recording: TransientRecording, actuator: ActuatorDynamics, end: float) -> None:
         self.step = grid_step(actuator)
         self._actuator = actuator
         self._times, self._late = recording.times[recording.times <= end], latency(actuator)
@@ -90,7 +90,7 @@ def late_parts(outputs: Floats, step: float, times: Sequence[float]) -> Floats:
 
 
 def identify_lag(
-    recordings: Sequence[Recording],
+    recordings: Sequence[TransientRecording],
     actuator: ActuatorDynamics,
     models: Sequence[Model],
     longest: float = LONGEST_PART,
@@ -164,7 +164,7 @@ def identify_lag(
 
 
 def refine_lag(
-    recordings: Sequence[Recording],
+    recordings: Sequence[TransientRecording],
     actuator: ActuatorDynamics,
     models: Sequence[Model],
     found: ResponseDynamics,
@@ -213,7 +213,7 @@ def refine_lag(
     return replace(found, lag=better.lag, power=better.power), _uncertainty(squares_of, better, rows)
 
 
-def _shapes_of_holds(recording: Recording, end: float) -> list[tuple[slice, Floats, Floats]]:
+def _shapes_of_holds(recording: TransientRecording, end: float) -> list[tuple[slice, Floats, Floats]]:
     """Return the rows of each hold up to an instant, s, that has enough of them, their weights and their response.
 
     The response is weighted.
@@ -237,7 +237,7 @@ def _uncertainty(squares_of: Callable[[float, float], float], lagged: ResponseDy
     return lagged.lag * math.sqrt(2.0 * middle / count / curvature)
 
 
-def _weights(recording: Recording) -> Floats:
+def _weights(recording: TransientRecording) -> Floats:
     """Return the weight of each row: less while the response moves, as the instants of readings are uncertain."""
     moves = np.abs(np.diff(recording.responded))
     rates = moves / np.maximum(np.diff(recording.times), 1e-3)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.analysis.transients.actuator import IdentifiedActuator, identify_actuator
-from bench.analysis.transients.recorded_transients import Recording, recording_of
+from bench.analysis.transients.recorded_transients import TransientRecording, recording_of
 from bench.analysis.transients.response import POWERS, Model, identify_lag, refine_lag
 from bench.base import DataError, Floats
 from bench.models import ActuatorDynamics, IdentifiedDynamics, ResponseDynamics
@@ -28,7 +28,7 @@ _QUIET = 25.0
 """Percentile of the holds by their noise: on steep branches the response moves with what the drive wanders."""
 
 
-def read_transients(path: Path, drive: str, response: str) -> Recording | None:
+def read_transients(path: Path, drive: str, response: str) -> TransientRecording | None:
     """Return what a run recorded of a drive and a response; None if it shows no transient.
 
     Parameters
@@ -61,7 +61,7 @@ class Transients:
 
     Attributes
     ----------
-    recordings : tuple of Recording
+    recordings : tuple of TransientRecording
         The runs.
     actuator : IdentifiedActuator
         The dynamics of the drive.
@@ -71,13 +71,13 @@ class Transients:
         Median time from a change of the set-point to the next reading, s.
     """
 
-    recordings: tuple[Recording, ...]
+    recordings: tuple[TransientRecording, ...]
     actuator: IdentifiedActuator
     noise: tuple[float, float]
     first_look: float
 
 
-def identify_transients(recordings: Sequence[Recording]) -> Transients:
+def identify_transients(recordings: Sequence[TransientRecording]) -> Transients:
     """Identify what the transients of runs show without a model of the specimen."""
     noise = (
         max(noise_of(each, each.driven) for each in recordings),
@@ -95,7 +95,7 @@ def identify_dynamics(
     transients: Transients,
     models: Sequence[Model],
     names: tuple[str, str] = ("input", "output"),
-    swings: Sequence[Recording] = (),
+    swings: Sequence[TransientRecording] = (),
 ) -> IdentifiedDynamics:
     """Identify the dynamics of a response beside those of its drive.
 
@@ -107,7 +107,7 @@ def identify_dynamics(
         For each of the runs what comes of the drive at rest.
     names : (str, str)
         What drive and response are called.
-    swings : sequence of Recording
+    swings : sequence of TransientRecording
         Moves over the whole range of the drive, a recording for each model, if there are any. They tell the power of
         the drive that lags: small steps are nearly the same by either.
     """
@@ -134,7 +134,7 @@ def identify_dynamics(
     )
 
 
-def _follows_at_once(recording: Recording) -> bool:
+def _follows_at_once(recording: TransientRecording) -> bool:
     """Return whether the first look after a change of the set-point shows nothing of the change any more."""
     rows = np.searchsorted(recording.times, recording.changes + _MOMENT)
     steps = np.diff(np.append(recording.driven[0], recording.setpoints))
@@ -148,7 +148,7 @@ def _follows_at_once(recording: Recording) -> bool:
     return abs(share) <= max(3.0 * float(np.sqrt(left @ left / (steps.size - 1) / squares)), _LEAST)
 
 
-def noise_of(recording: Recording, values: Floats) -> float:
+def noise_of(recording: TransientRecording, values: Floats) -> float:
     """Return the noise of readings: of neighbouring rows late in a hold, in the quiet ones of the holds.
 
     At least what rounding leaves: the last digit over √12.
@@ -166,14 +166,14 @@ def noise_of(recording: Recording, values: Floats) -> float:
     return max(float(np.percentile(found, _QUIET)), digit / math.sqrt(12.0))
 
 
-def _hold_times(recording: Recording) -> Floats:
+def _hold_times(recording: TransientRecording) -> Floats:
     """Return the length of the hold of each row, s; infinite before the first."""
     ends = np.append(recording.changes[1:], recording.times[-1])
     lengths = np.append(np.inf, ends - recording.changes)
     return np.asarray(lengths[recording.last_change + 1])
 
 
-def _first_looks(recording: Recording) -> Floats:
+def _first_looks(recording: TransientRecording) -> Floats:
     """Return how long after each change of the set-point the next row was taken, s."""
     rows = np.searchsorted(recording.times, recording.changes + 1e-6)
     known = rows < recording.times.size

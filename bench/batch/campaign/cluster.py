@@ -22,7 +22,7 @@ from rich.console import Console
 from bench.base import ConfigurationError, DataError, TasksDisplay, needed_for, registry
 from bench.batch.campaign.execution import settled
 from bench.batch.campaign.sources import code_digest, content_of
-from bench.batch.campaign.tasks import UNFINISHED, Done, Task
+from bench.batch.campaign.tasks import UNFINISHED, CampaignTask, Done
 
 _CONNECTING = 30
 """Wall-clock time within which a scheduler has to answer, s."""
@@ -57,7 +57,7 @@ class Parcel:
 
     Attributes
     ----------
-    task : Task
+    task : CampaignTask
         The task.
     code : str
         Hash of the programs with which it is meant to be carried out.
@@ -67,7 +67,7 @@ class Parcel:
         By the path of a file that it reads, content by name, of those beside it as well.
     """
 
-    task: Task
+    task: CampaignTask
     code: str
     folders: dict[str, bytes]
     files: dict[str, dict[str, bytes]]
@@ -105,7 +105,7 @@ class ClusterExecutor:
             raise ConfigurationError(f"--scheduler {address}: {type(error).__name__}: {error}") from None
         self._completed = library.as_completed([], loop=self._client.loop, raise_errors=False)
         self._campaign = campaign
-        self._tasks: dict[str, Task] = {}
+        self._tasks: dict[str, CampaignTask] = {}
         self._display = TasksDisplay(console, f"tasks at {address}")
 
     def __enter__(self) -> Self:
@@ -119,7 +119,7 @@ class ClusterExecutor:
         self._client.cancel([*self._completed.futures])
         self._client.close()
 
-    def submit(self, task: Task) -> None:
+    def submit(self, task: CampaignTask) -> None:
         """Have a task carried out on any worker; the tasks of a worker that dies are done again."""
         files = {str(path): content_of(path, beside) for path, beside in task.files.items()}
         folders = {name: packed(self._campaign / name) for name in task.needs}
@@ -129,7 +129,7 @@ class ClusterExecutor:
         self._completed.add(future)
         self._display.add()
 
-    def next_done(self) -> tuple[Task, Done]:
+    def next_done(self) -> tuple[CampaignTask, Done]:
         """Wait for a task, and put its folder where it belongs."""
         future = next(self._completed)
         task = self._tasks.pop(future.key)

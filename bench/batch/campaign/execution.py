@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Protocol
 
 from bench.base import BenchError, ConfigurationError, Pending, Workers
-from bench.batch.campaign.tasks import DONE_NAME, SHOWN_DIGITS, UNFINISHED, Done, Task
+from bench.batch.campaign.tasks import DONE_NAME, SHOWN_DIGITS, UNFINISHED, CampaignTask, Done
 from bench.rig import Holder, Locks
 
 FILE_NAME = "campaign.toml"
@@ -19,10 +19,10 @@ FILE_NAME = "campaign.toml"
 class Executor(Protocol):
     """Carries tasks out, many at a time."""
 
-    def submit(self, task: Task) -> None:
+    def submit(self, task: CampaignTask) -> None:
         """Have a task carried out; all that it needs is in the folder of the campaign."""
 
-    def next_done(self) -> tuple[Task, Done]:
+    def next_done(self) -> tuple[CampaignTask, Done]:
         """Wait for a task that was submitted, and return it with what it left; its folder is there by then."""
 
 
@@ -40,20 +40,20 @@ class WorkersExecutor:
     def __init__(self, workers: Workers, campaign: Path) -> None:
         self._workers = workers
         self._campaign = campaign
-        self._pending: dict[Pending[Done], Task] = {}
+        self._pending: dict[Pending[Done], CampaignTask] = {}
 
-    def submit(self, task: Task) -> None:
+    def submit(self, task: CampaignTask) -> None:
         """Have a task carried out."""
         self._pending[self._workers.submit_as(task.name, task.carry_out, self._campaign)] = task
 
-    def next_done(self) -> tuple[Task, Done]:
+    def next_done(self) -> tuple[CampaignTask, Done]:
         """Wait for a task."""
         pending = next(iter(self._workers.as_completed(self._pending)))
         task = self._pending.pop(pending)
         return task, settled(task, pending.error, None if pending.error else pending.result())
 
 
-def settled(task: Task, error: BaseException | None, done: Done | None) -> Done:
+def settled(task: CampaignTask, error: BaseException | None, done: Done | None) -> Done:
     """Return what a task left, also where it has raised."""
     if done is not None:
         return done
@@ -127,7 +127,7 @@ def _aside(folder: Path) -> Path:
     return next(each for name in names if not (each := folder.with_name(name)).exists())
 
 
-def done_before(tasks: Mapping[str, Task], campaign: Path) -> Before:
+def done_before(tasks: Mapping[str, CampaignTask], campaign: Path) -> Before:
     """Return what earlier starts have left of tasks in the folder of a campaign."""
     found = {name: task.done_in(campaign / name) for name, task in tasks.items()}
     done = {name: each for name, each in found.items() if each is not None}
@@ -144,7 +144,9 @@ def done_before(tasks: Mapping[str, Task], campaign: Path) -> Before:
     return Before({name: done[name] for name in tasks if name in done}, places, lost)
 
 
-def carry_out_tasks(tasks: Mapping[str, Task], before: Mapping[str, Done], executor: Executor) -> dict[str, Done]:
+def carry_out_tasks(
+    tasks: Mapping[str, CampaignTask], before: Mapping[str, Done], executor: Executor
+) -> dict[str, Done]:
     """Carry out all tasks that were not done before; return what each has left, by name, in the order of `tasks`.
 
     A task whose needs could not be carried out is refused.

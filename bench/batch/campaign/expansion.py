@@ -28,11 +28,11 @@ from bench.batch.campaign.known_rig import KnownRig
 from bench.batch.campaign.sources import PROGRAMS, code_digest, digest, file_digest
 from bench.batch.campaign.tasks import (
     SHOWN_DIGITS,
+    CampaignTask,
     ComparisonTask,
     ModelTask,
     RunTask,
     StudyTask,
-    Task,
     identification_options,
 )
 from bench.batch.study import Study
@@ -72,7 +72,7 @@ class Expansion:
 
     Attributes
     ----------
-    tasks : mapping of str to Task
+    tasks : mapping of str to CampaignTask
         By name; those that others need come before them.
     varying : mapping of str to tuple of str
         By the name of a table of runs, what differs among its runs, in the order in which it is shown.
@@ -84,7 +84,7 @@ class Expansion:
         Packages whose kernels the tasks take, but for those of laboratories, which are compiled by now.
     """
 
-    tasks: Mapping[str, Task]
+    tasks: Mapping[str, CampaignTask]
     varying: Mapping[str, tuple[str, ...]]
     plans: Mapping[str, tuple[float, float]]
     units: Mapping[tuple[str, str], str]
@@ -114,7 +114,7 @@ class _Expander:
         self._protocols: dict[str, tuple[ProtocolDefinition, str]] = {}
         self._plans: dict[str, Plan | None] = {}
         self._digests: dict[str, str] = {}
-        self._tasks: dict[str, Task] = {}
+        self._tasks: dict[str, CampaignTask] = {}
         self._runs: dict[str, list[RunTask]] = {}
         self._models: dict[str, dict[tuple[str, int], list[ModelTask]]] = {}
         self._several: dict[str, bool] = {}
@@ -470,7 +470,7 @@ class _Expander:
             varying = ["rig"] * (len(table.rigs) > 1) + ["seed"]
             self._add(StudyTask(_name(table.name, values, varying, identity), identity, table.name, given, seed))
 
-    def _add(self, task: Task) -> None:
+    def _add(self, task: CampaignTask) -> None:
         if task.name in self._tasks:
             raise ConfigurationError(f"{self._file.path}: {task.name}: two runs are the same; give each value once")
         self._tasks[task.name] = task

@@ -16,7 +16,7 @@ from bench.analysis import RunFolder, Session, compare_models, identify_file, re
 from bench.base import AbortError, BenchError, DataError, Workers, parse_json, registry, write_json_file
 from bench.batch.campaign.sources import PROGRAMS, PROGRAMS_AND_RIGS, digest
 from bench.batch.campaign.study_tables import FILE_NAME as STUDY_NAME, write_study
-from bench.batch.study import Campaign, Study
+from bench.batch.study import RunSeries, Study
 from bench.execution import Run, carry_out
 from bench.protocol import find_protocol
 from bench.record import FILE_NAME as JOURNAL_NAME, Record
@@ -63,7 +63,7 @@ class Done:
 
 
 @dataclass(frozen=True)
-class Task(ABC):
+class CampaignTask(ABC):
     """One task.
 
     Attributes
@@ -97,7 +97,7 @@ class Task(ABC):
         """The files in its folder that its results are in, for people and for other tasks."""
         return ()
 
-    def moved(self, places: Mapping[str, str]) -> Task:  # noqa: ARG002 - of a task without files
+    def moved(self, places: Mapping[str, str]) -> CampaignTask:  # noqa: ARG002 - of a task without files
         """Return the same task with its files in other places, by their old path."""
         return self
 
@@ -166,7 +166,7 @@ class Task(ABC):
 
 
 @dataclass(frozen=True)
-class RunTask(Task):
+class RunTask(CampaignTask):
     """A run on an emulated rig, on the virtual clock.
 
     Attributes
@@ -226,7 +226,7 @@ class RunTask(Task):
             found[Path(self.protocol.partition(".py")[0] + ".py")] = PROGRAMS
         return found
 
-    def moved(self, places: Mapping[str, str]) -> Task:
+    def moved(self, places: Mapping[str, str]) -> CampaignTask:
         """Return the same run with its files in other places."""
         file, suffix, name = self.protocol.partition(".py")
         return replace(
@@ -280,7 +280,7 @@ class RunTask(Task):
 
 
 @dataclass(frozen=True)
-class ModelTask(Task):
+class ModelTask(CampaignTask):
     """The identification of a model from a run, or from several together.
 
     Attributes
@@ -351,7 +351,7 @@ class ModelTask(Task):
 
 
 @dataclass(frozen=True)
-class ComparisonTask(Task):
+class ComparisonTask(CampaignTask):
     """The errors of models on a run.
 
     Attributes
@@ -409,7 +409,7 @@ class ComparisonTask(Task):
 
 
 @dataclass(frozen=True)
-class StudyTask(Task):
+class StudyTask(CampaignTask):
     """A study with one seed.
 
     Attributes
@@ -441,7 +441,7 @@ class StudyTask(Task):
         made = scratch / "made"
         # The cores are shared by the tasks of the campaign.
         with Workers(1) as workers:
-            found = study.carry_out(Campaign(self.rig or study.rig or "", made, self.seed, False, workers))
+            found = study.carry_out(RunSeries(self.rig or study.rig or "", made, self.seed, False, workers))
         write_study(found, made)
         return made, Done(self.identity, "completed", "", dict(flat_numbers(found.values)))
 

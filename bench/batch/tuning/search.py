@@ -49,7 +49,7 @@ Numbers = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
-class Trial:
+class TuningTrial:
     """What runs of a controller with some numbers gave.
 
     Attributes
@@ -78,7 +78,7 @@ class Trial:
         return not (math.isfinite(self.rms) and math.isfinite(self.worst))
 
 
-Evaluate = Callable[[Sequence[Numbers]], list[Trial]]
+Evaluate = Callable[[Sequence[Numbers]], list[TuningTrial]]
 """Carries out the runs of several candidates beside each other."""
 
 
@@ -118,8 +118,8 @@ def cost_of(rms: float, seconds: float, scale: tuple[float, float], time_weight:
 
 
 def search(
-    start: Numbers, names: Sequence[str], evaluate: Evaluate, tell: Callable[[Trial], None], rounds: int = 2
-) -> Trial:
+    start: Numbers, names: Sequence[str], evaluate: Evaluate, tell: Callable[[TuningTrial], None], rounds: int = 2
+) -> TuningTrial:
     """Return the best numbers that are found by changing one after another, and then all together at random.
 
     What two numbers gain only together, as shorter waits with more corrections do, no change of one shows.
@@ -172,7 +172,7 @@ def search(
     return best
 
 
-def confirm(trials: Sequence[Trial], sessions: Sequence[Evaluate]) -> tuple[Trial, Trial]:
+def confirm(trials: Sequence[TuningTrial], sessions: Sequence[Evaluate]) -> tuple[TuningTrial, TuningTrial]:
     """Return trials of the first numbers of a search and of its best, means over sessions that it has not seen.
 
     The best `FINALISTS` of the others take part, even if none was better in the search: a session may flatter the
@@ -190,7 +190,7 @@ def confirm(trials: Sequence[Trial], sessions: Sequence[Evaluate]) -> tuple[Tria
     return before, min(after, key=lambda each: each.cost, default=before)
 
 
-def _better(trials: Sequence[Trial], first: Sequence[Trial]) -> bool:
+def _better(trials: Sequence[TuningTrial], first: Sequence[TuningTrial]) -> bool:
     if any(each.failed for each in trials):
         return False
     both = [(a, b) for a, b in zip(trials, first, strict=True) if not b.failed]
@@ -203,9 +203,9 @@ def _better(trials: Sequence[Trial], first: Sequence[Trial]) -> bool:
     return float(differences.mean()) < most and max(a.rms for a, _ in both) <= WORST * max(b.rms for _, b in both)
 
 
-def _mean(trials: Sequence[Trial]) -> Trial:
+def _mean(trials: Sequence[TuningTrial]) -> TuningTrial:
     values = [(each.cost, each.rms, each.seconds, each.worst) for each in trials]
-    return Trial(trials[0].numbers, *(sum(each) / len(trials) for each in zip(*values, strict=True)))
+    return TuningTrial(trials[0].numbers, *(sum(each) / len(trials) for each in zip(*values, strict=True)))
 
 
 def multiplied(numbers: Numbers, name: str, factor: float) -> Numbers:

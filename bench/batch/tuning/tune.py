@@ -12,8 +12,8 @@ from typing import Any
 from rich.console import Console
 
 from bench.base import BenchError, ConfigurationError, wall_time
-from bench.batch.tuning.search import ERRORS, MARGIN, TIME_WEIGHT, WORST, Trial, confirm, search
-from bench.batch.tuning.tuning_runs import Task, TuningRuns, start_of, task_of
+from bench.batch.tuning.search import ERRORS, MARGIN, TIME_WEIGHT, WORST, TuningTrial, confirm, search
+from bench.batch.tuning.tuning_runs import TuningRuns, TuningTask, start_of, task_of
 from bench.control import ControllerSetup, controller_spec, tuning_text
 from bench.identification import load_model
 from bench.models import TwoStage
@@ -26,11 +26,11 @@ class Tuned:
 
     Attributes
     ----------
-    task : Task
+    task : TuningTask
         What they are for.
     twin : str
         The emulated rig on which they were found.
-    first, best : Trial
+    first, best : TuningTrial
         The numbers before and after, in sessions that the search has not seen. The same if nothing better was found.
     trials : int
         Number of trials of the search.
@@ -40,10 +40,10 @@ class Tuned:
         What the tuning file says of where they come from.
     """
 
-    task: Task
+    task: TuningTask
     twin: str
-    first: Trial
-    best: Trial
+    first: TuningTrial
+    best: TuningTrial
     trials: int
     others: dict[str, Any]
     provenance: dict[str, str | float]
@@ -127,9 +127,9 @@ def tune(
         options={"duration": float(given.get("duration", 20.0))},
     )
     begin = start_of(task, rig, spec.numbers(setup), spec.tunable)
-    trials: list[Trial] = []
+    trials: list[TuningTrial] = []
 
-    def tell(trial: Trial) -> None:
+    def tell(trial: TuningTrial) -> None:
         trials.append(trial)
         text = f"{len(trials):3}  cost {trial.cost:.4g}  RMS {trial.rms:.4g}  {dict(trial.numbers)}"
         shown.print(text, highlight=False, markup=False)

@@ -13,8 +13,8 @@ import numpy as np
 
 from bench.analysis import TargetResults
 from bench.base import AbortError, BenchError, ConfigurationError
-from bench.batch.study import Campaign, reached_targets
-from bench.batch.tuning.search import GAIN_HIGH, MARGIN, TIME_WEIGHT, Numbers, Trial, cost_of, perturbed_models
+from bench.batch.study import RunSeries, reached_targets
+from bench.batch.tuning.search import GAIN_HIGH, MARGIN, TIME_WEIGHT, Numbers, TuningTrial, cost_of, perturbed_models
 from bench.control import controller_spec
 from bench.identification import ModelFile
 from bench.models import TwoStage
@@ -33,7 +33,7 @@ _WITHIN_REACH = 1.0 - 0.95 / MARGIN
 
 
 @dataclass(frozen=True)
-class Task:
+class TuningTask:
     """What a controller is tuned for: its protocol, its name there, and the slot of the rig that it controls."""
 
     protocol: str
@@ -46,7 +46,7 @@ class Task:
         return {"length-control": "coupled-length", "force-control": "coupled-force"}.get(self.protocol, _TARGETS)
 
 
-def task_of(file: ModelFile, controller: str, protocol: str | None) -> Task:
+def task_of(file: ModelFile, controller: str, protocol: str | None) -> TuningTask:
     """Return what a controller of a model is tuned for; by a protocol, if one is given.
 
     Raises ConfigurationError if the protocol has no such controllers.
@@ -55,7 +55,7 @@ def task_of(file: ModelFile, controller: str, protocol: str | None) -> Task:
     chosen = protocol or offered[0]
     if chosen not in offered:
         raise ConfigurationError(f"--protocol {chosen}: a model {file.name} is controlled by {' or '.join(offered)}")
-    return Task(chosen, controller, FORCE if chosen == "force-control" else "response")
+    return TuningTask(chosen, controller, FORCE if chosen == "force-control" else "response")
 
 
 class Scale(NamedTuple):
@@ -85,7 +85,7 @@ class TuningRuns:
 
     Parameters
     ----------
-    task : Task
+    task : TuningTask
         What is tuned.
     rig : str
         The emulated rig, or a twin.
@@ -107,7 +107,7 @@ class TuningRuns:
         Part of the RMS error of the first numbers that costs as much as their time, at least 0.
     """
 
-    task: Task
+    task: TuningTask
     rig: str
     file: ModelFile
     folder: Path
@@ -133,7 +133,7 @@ class TuningRuns:
             self._models[name] = self.folder / f"{name}.json"
             model.save(self._models[name])
 
-    def __call__(self, candidates: Sequence[Numbers]) -> list[Trial]:
+    def __call__(self, candidates: Sequence[Numbers]) -> list[TuningTrial]:
         """Return trials of some numbers; their runs go on beside each other.
 
         Raises BenchError if those of the first trial fail with the model as it is, AbortError if the operator ended a
@@ -149,7 +149,7 @@ class TuningRuns:
         for seed in range(self.first_seed, self.first_seed + self.seeds):
             for name, path in self._models.items():
                 # The same noise and the same targets for all candidates.
-                campaign = Campaign(
+                campaign = RunSeries(
                     self.rig, self.folder / f"{self._count:03}" / name, seed, live=False, workers=self.workers
                 )
                 settings = {"model": str(path), "controller": self.task.controller, "sequence_seed": str(seed + 1)}
@@ -164,7 +164,7 @@ class TuningRuns:
                 )
         return found
 
-    def _trial(self, numbers: Numbers, runs: Mapping[tuple[str, int], Pending[RunResult]]) -> Trial:
+    def _trial(self, numbers: Numbers, runs: Mapping[tuple[str, int], Pending[RunResult]]) -> TuningTrial:
         reached: dict[tuple[str, int], TargetResults | None] = {}
         for key, run in runs.items():
             try:
@@ -192,7 +192,7 @@ class TuningRuns:
             for name, runs in scores.items()
         }
         cost = 0.5 * (costs.pop(_AS_IDENTIFIED) + max(costs.values()))
-        return Trial(numbers, cost, rms, seconds, worst)
+        return TuningTrial(numbers, cost, rms, seconds, worst)
 
 
 def _score(results: TargetResults | None, nominal: TargetResults | None) -> tuple[float, float]:
@@ -208,7 +208,7 @@ def _score(results: TargetResults | None, nominal: TargetResults | None) -> tupl
     return rms, float(results.seconds[within].mean())
 
 
-def start_of(task: Task, rig: str, numbers: Any, tunable: Sequence[str]) -> Numbers:  # noqa: ANN401 - a dataclass
+def start_of(task: TuningTask, rig: str, numbers: Any, tunable: Sequence[str]) -> Numbers:  # noqa: ANN401 - a dataclass
     """Return the numbers from which the search begins: those of the rig file over those of the controller."""
     table = dict((load_rig(rig).protocols.get(task.protocol) or {}).get("tuning", {}).get(task.controller, {}))
     found: dict[str, Any] = dict(table)

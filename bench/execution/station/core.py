@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from enum import Enum
 
 from bench.base import BenchError, GuardianError, InterlockError
-from bench.rig import Finding, InterlockWatch, Level
+from bench.rig import InterlockFinding, InterlockWatch, Level
 
 _FIRST_PROMISE = 10.0
 """What counts before the bench has promised anything, s."""
@@ -159,7 +159,7 @@ class StationCore:
         *,
         now: float | None = None,
         factor: float = 1.0,
-    ) -> tuple[Finding, ...]:
+    ) -> tuple[InterlockFinding, ...]:
         """Judge readings by the interlocks; trip if one acts.
 
         Parameters
@@ -177,7 +177,7 @@ class StationCore:
 
         Returns
         -------
-        tuple of Finding
+        tuple of InterlockFinding
             What begins and what is over, below the level `safe`.
         """
         # The samples of a block are judged after it, when a look may have come in between.

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 from bench.base import Clock
 from bench.devices import Device, Floats
-from bench.rig import Finding, Look, RigDescription
+from bench.rig import InterlockFinding, Look, RigDescription
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ def masked(devices: Iterable[Device]) -> list[News]:
     ]
 
 
-def news_of(findings: Iterable[Finding]) -> list[News]:
+def news_of(findings: Iterable[InterlockFinding]) -> list[News]:
     """Return what interlocks below the level `safe` have found, for the record."""
     return [
         News("INFO" if each.over else "WARN", "warning" if each.early else "interlock", each.text)

@@ -13,7 +13,7 @@ from bench.devices import Floats, Status
 from bench.execution.station.core import StationCore
 from bench.execution.station.interface import Arrivals, News, Station, masked, news_of
 from bench.execution.station.reconnection import TRIES, longest_away, reconnect
-from bench.rig import Finding, InterlockWatch, Look, Rig, make_safe, raise_if_unsafe
+from bench.rig import InterlockFinding, InterlockWatch, Look, Rig, make_safe, raise_if_unsafe
 
 _T = TypeVar("_T")
 
@@ -254,7 +254,7 @@ class LocalStation(Station):
                     device.glance()
         return False
 
-    def _note(self, findings: tuple[Finding, ...]) -> None:
+    def _note(self, findings: tuple[InterlockFinding, ...]) -> None:
         if findings:
             self._news += news_of(findings)
 

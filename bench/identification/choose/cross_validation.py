@@ -26,7 +26,7 @@ Fitted = Callable[[Floats], Fit]
 
 
 @dataclass(frozen=True)
-class Trial:
+class SmoothingTrial:
     """One row of a cross-validation table.
 
     Parameters
@@ -57,15 +57,15 @@ class Trial:
 class CrossValidation:
     """A table of trials, in the order asked for."""
 
-    trials: tuple[Trial, ...]
+    trials: tuple[SmoothingTrial, ...]
 
     @property
-    def best(self) -> Trial:
+    def best(self) -> SmoothingTrial:
         """The trial of the least error on samples left out."""
         return min(self.trials, key=lambda trial: trial.rms)
 
     @property
-    def smoothest(self) -> Trial:
+    def smoothest(self) -> SmoothingTrial:
         """The trial of the greatest smoothing whose error does not differ from the least."""
         near = EQUAL * self.best.rms
         return max((trial for trial in self.trials if trial.rms <= near), key=lambda trial: trial.smoothing)
@@ -241,7 +241,7 @@ def _trial(
     weights: Floats,
     fold: Indices,
     counts: Floats | None = None,
-) -> Trial:
+) -> SmoothingTrial:
     """Return how well fits predict what was left out; samples of no fold, −1, are in every fit and in no error.
 
     The errors count with `counts`, or as the fits do.
@@ -256,7 +256,7 @@ def _trial(
         squares[left_out] = error[left_out] ** 2
         training.append(_rms(error**2, np.where(left_out | (fold < 0), 0.0, counts)))
     rms = [_rms(squares, np.where(fold == k, counts, 0.0)) for k in numbers]
-    return Trial(
+    return SmoothingTrial(
         smoothing=smoothing,
         levels=None if levels is None else int(levels),
         rms=_rms(squares, np.where(fold < 0, 0.0, counts)),

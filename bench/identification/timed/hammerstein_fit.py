@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from bench.base import Floats
 from bench.identification.by_name import FitProblem, Identification, Initial, set_up_problem
-from bench.identification.choose.cross_validation import Fitted, Trial, compare_smoothing
+from bench.identification.choose.cross_validation import Fitted, SmoothingTrial, compare_smoothing
 from bench.identification.choose.trust import judge_fit
 from bench.identification.fit.least_squares import Fit, one_thread
 from bench.identification.fit.orientation import NAMES, Orientation, has_orientation
@@ -208,7 +208,7 @@ def set_up_search(
     return problem, Search(times, problem, problem.regressor.dense(), roots, signs, smoothing)
 
 
-def _cross_validated(search: Search, found: Found, tried: Sequence[float]) -> Trial:
+def _cross_validated(search: Search, found: Found, tried: Sequence[float]) -> SmoothingTrial:
     """Return the smoothing of the least error on blocks left out of the fit of the coefficients."""
     columns, drifts = search.responses(found.elements, found.values)
     sign = search.sign(found.fit)

@@ -21,7 +21,7 @@ from bench.rig.interlocks.criteria import (
 
 
 @dataclass(frozen=True)
-class Finding:
+class InterlockFinding:
     """Something that an interlock found, when it acts and when that is over.
 
     Attributes
@@ -73,7 +73,7 @@ class InterlockWatch:
         # Those with something that may act or is not over: mostly none.
         self._restless: list[_Course] = []
         self._latest = -math.inf
-        self._tripped: Finding | None = None
+        self._tripped: InterlockFinding | None = None
         watched = [course.interlock for course in self._courses]
         self._names = {name for each in watched for name in (each.signal, each.minus) if name}
         self._names |= {f"{each.setpoint}{SETPOINT}" for each in watched if each.setpoint}
@@ -88,7 +88,7 @@ class InterlockWatch:
         return frozenset(name for name in self._names if not name.endswith(SETPOINT))
 
     @property
-    def active(self) -> tuple[Finding, ...]:
+    def active(self) -> tuple[InterlockFinding, ...]:
         """What has begun and is not over, in the order of the interlocks; one of level `safe` is never over."""
         return tuple(finding for course in self._courses for finding in course.active if finding is not None)
 
@@ -108,7 +108,7 @@ class InterlockWatch:
 
     def look(
         self, t: float, values: Mapping[str, float], setpoints: Mapping[str, float] | None = None
-    ) -> tuple[Finding, ...]:
+    ) -> tuple[InterlockFinding, ...]:
         """Look at one set of readings.
 
         Parameters
@@ -123,7 +123,7 @@ class InterlockWatch:
 
         Returns
         -------
-        tuple of Finding
+        tuple of InterlockFinding
             What begins and what is over at this look, in the order of the interlocks.
 
         Raises
@@ -136,7 +136,7 @@ class InterlockWatch:
                 f"a look at {t:g} s follows one at {self._latest:g} s; looks have to be in order of time"
             )
         self._latest = t = max(t, self._latest)
-        found: list[Finding] = []
+        found: list[InterlockFinding] = []
         restless: list[_Course] = []
         for course, signal, low, high, stale in self._plain:
             if not course.restless and signal in values and low <= (value := values[signal]) <= high:
@@ -155,7 +155,7 @@ class InterlockWatch:
 
     def check(
         self, t: float, values: Mapping[str, float], setpoints: Mapping[str, float] | None = None
-    ) -> tuple[Finding, ...]:
+    ) -> tuple[InterlockFinding, ...]:
         """Look at one set of readings, and return what begins and what is over below the level `safe`; see `look`.
 
         Raises
@@ -220,7 +220,7 @@ class _Course:
         short = len(self._further) == (self.stale is not None) and not interlock.signal.endswith(SETPOINT)
         self.plain = interlock.signal if short and not (interlock.settle or interlock.minus) else ""
         """The signal, if readings in the quiet range that do not stand still need no further look; else empty."""
-        self.active: list[Finding | None] = [None] * len(self._criteria)
+        self.active: list[InterlockFinding | None] = [None] * len(self._criteria)
         self._acted = [math.nan] * len(self._criteria)
 
     def _make_criteria(self) -> None:
@@ -259,7 +259,11 @@ class _Course:
         return self._settling.until
 
     def look(
-        self, t: float, values: Mapping[str, float], setpoints: Mapping[str, float] | None, found: list[Finding]
+        self,
+        t: float,
+        values: Mapping[str, float],
+        setpoints: Mapping[str, float] | None,
+        found: list[InterlockFinding],
     ) -> None:
         interlock = self.interlock
         if self._settling is not None:
@@ -293,7 +297,7 @@ class _Course:
         names = [name for name in (self.interlock.signal, self.interlock.minus) if name.endswith(SETPOINT)]
         return any(math.isnan(_reading(name, values, setpoints) or 0.0) for name in names)
 
-    def _act(self, t: float, value: float, criterion: _Criterion, i: int, found: list[Finding]) -> None:
+    def _act(self, t: float, value: float, criterion: _Criterion, i: int, found: list[InterlockFinding]) -> None:
         interlock, finding, since = self.interlock, self.active[i], criterion.since
         if finding is None:
             if since is None or t - since < criterion.seconds or t < self._settled(criterion):
@@ -302,7 +306,7 @@ class _Course:
             early = isinstance(criterion, _Near)
             text = f"{'warning' if early else 'interlock'}: {criterion.seen(t, since, value)}"
             level = Level.WARN if early else interlock.level
-            self.active[i] = Finding(interlock, level, text, since, value, early=early)
+            self.active[i] = InterlockFinding(interlock, level, text, since, value, early=early)
         elif finding.level is Level.SAFE:
             return
         elif since is None:
@@ -312,7 +316,7 @@ class _Course:
             return
         elif finding.level is Level.HOLD and t - self._acted[i] >= interlock.hold_at_most:
             text = f"interlock: {criterion.seen(t, since, value)}; it was not back {interlock.hold_at_most:g} s after"
-            self.active[i] = Finding(interlock, Level.SAFE, text, since, value)
+            self.active[i] = InterlockFinding(interlock, Level.SAFE, text, since, value)
         else:
             return
         found.extend(each for each in (self.active[i],) if each is not None)

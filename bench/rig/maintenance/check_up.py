@@ -10,7 +10,7 @@ from datetime import date
 from functools import partial
 
 from bench.base import BenchError, Clock, DeviceConnectionError, DeviceError, wall_time
-from bench.devices import Actuator, Device, DeviceDescription, DriverSettings, Finding, Limits, Status
+from bench.devices import Actuator, CheckFinding, Device, DeviceDescription, DriverSettings, Limits, Status
 from bench.rig.file import RigFile
 from bench.rig.maintenance.opening import Workplace
 from bench.rig.maintenance.safe_state import SAFE, make_safe
@@ -43,7 +43,7 @@ class DeviceCheck:
         Name of the device; empty for the rig.
     identity : str
         Which instrument it is; empty if it did not say.
-    findings : tuple of Finding
+    findings : tuple of CheckFinding
         All of them, those without an advice as well.
     failed : bool
         Whether it could not be connected, or a reading failed.
@@ -53,7 +53,7 @@ class DeviceCheck:
 
     device: str
     identity: str
-    findings: tuple[Finding, ...]
+    findings: tuple[CheckFinding, ...]
     failed: bool = False
     unsafe: bool = False
 
@@ -81,9 +81,9 @@ def check_up(place: Workplace, exercise: bool, keep_on: Callable[[], None]) -> l
     failed: set[str] = set()
     devices: dict[str, Device] = {}
     unsafe: set[str] = set()
-    whole: list[Finding] = []
+    whole: list[CheckFinding] = []
 
-    def of(name: str, check: Callable[[], Iterable[Finding]]) -> None:
+    def of(name: str, check: Callable[[], Iterable[CheckFinding]]) -> None:
         keep_on()
         try:
             found[name].extend(check())
@@ -119,7 +119,9 @@ def check_up(place: Workplace, exercise: bool, keep_on: Callable[[], None]) -> l
         for name, state in make_safe(devices.values()).items():
             if state != SAFE:
                 unsafe.add(name)
-                found[name].append(Finding("safe state", state, f"unplug what {name} drives, or its power supply"))
+                found[name].append(
+                    CheckFinding("safe state", state, f"unplug what {name} drives, or its power supply")
+                )
         for device in devices.values():
             # A line that is gone cannot be closed either.
             with suppress(Exception):
@@ -131,7 +133,7 @@ def check_up(place: Workplace, exercise: bool, keep_on: Callable[[], None]) -> l
     return [*checks, DeviceCheck("", "", tuple(whole))]
 
 
-def _calibration(settings: DriverSettings, today: date) -> list[Finding]:
+def _calibration(settings: DriverSettings, today: date) -> list[CheckFinding]:
     """Say when a device was calibrated, and whether it is due again."""
     day, due = settings.calibrated, settings.calibration_due
     parts = [*([f"of {day}"] if day else []), *([f"due on {due}"] if due else [])]
@@ -139,20 +141,22 @@ def _calibration(settings: DriverSettings, today: date) -> list[Finding]:
         return []
     if due is not None and due <= today:
         parts.append(f"{(today - due).days} days ago")
-        return [Finding("calibration", ", ".join(parts), "calibrate it, then set calibrated and calibration_due")]
-    return [Finding("calibration", ", ".join(parts))]
+        return [
+            CheckFinding("calibration", ", ".join(parts), "calibrate it, then set calibrated and calibration_due")
+        ]
+    return [CheckFinding("calibration", ", ".join(parts))]
 
 
-def _failure(name: str, error: BenchError) -> Finding:
+def _failure(name: str, error: BenchError) -> CheckFinding:
     text = str(error).removeprefix(f"{name}: ")
     if isinstance(error, DeviceConnectionError):
-        return Finding("connection", text, "see that it is on and connected as the rig file says")
+        return CheckFinding("connection", text, "see that it is on and connected as the rig file says")
     if isinstance(error, DeviceError):
-        return Finding("error", text, "do as it says; `bench recover` clears an error that the instrument keeps")
-    return Finding("rig file", text, "correct the rig file")
+        return CheckFinding("error", text, "do as it says; `bench recover` clears an error that the instrument keeps")
+    return CheckFinding("rig file", text, "correct the rig file")
 
 
-def _readings(device: Device, place: Workplace, ticks: dict[str, float]) -> list[Finding]:
+def _readings(device: Device, place: Workplace, ticks: dict[str, float]) -> list[CheckFinding]:
     """Say what a device reads, how much that varies, and how long it takes; its `glance` joins `ticks`, s."""
     glances, glance_time = _repeat(device.glance, GLANCES, place.clock)
     measurements, measure_time = _repeat(device.measure, MEASUREMENTS, place.clock)
@@ -175,13 +179,13 @@ def _readings(device: Device, place: Workplace, ticks: dict[str, float]) -> list
             if lock.signal == signal.name and not lock.minus and not lock.low <= value <= lock.high:
                 text += f"; outside of its interlock, {lock.low:g} to {lock.high:g} {signal.unit}"
                 advice = "bring it into the range of its interlock before a run"
-        findings.append(Finding(signal.name, text, advice))
+        findings.append(CheckFinding(signal.name, text, advice))
     text = f"{1e3 * glance_time:.3g} ms a quick reading, {1e3 * measure_time:.3g} ms a measurement"
     advice = ""
     if device.watchdog and measure_time > SHARE_OF_WATCHDOG * device.watchdog:
         text += f", {measure_time / device.watchdog:.0%} of its watchdog of {device.watchdog:g} s"
         advice = "take fewer samples in a measurement, or lengthen the watchdog"
-    return [*findings, Finding("time", text, advice)]
+    return [*findings, CheckFinding("time", text, advice)]
 
 
 def _repeat(read: Callable[[], dict[str, float]], times: int, clock: Clock) -> tuple[list[dict[str, float]], float]:
@@ -219,9 +223,9 @@ def _reading(role: RoleTable, devices: Mapping[str, Device]) -> str:
     return reading_of(role, known)
 
 
-def _limits(device: Actuator, roles: Mapping[str, RoleTable]) -> list[Finding]:
+def _limits(device: Actuator, roles: Mapping[str, RoleTable]) -> list[CheckFinding]:
     """Compare the ranges of the roles with the limits of the device."""
-    findings = [Finding("limits", str(device.limits))]
+    findings = [CheckFinding("limits", str(device.limits))]
     for name, role in roles.items():
         if role.device != device.name:
             continue
@@ -230,7 +234,7 @@ def _limits(device: Actuator, roles: Mapping[str, RoleTable]) -> list[Finding]:
             beyond = [f"{value:g}" for value in each if value not in device.limits]
             if beyond:
                 findings.append(
-                    Finding(
+                    CheckFinding(
                         "limits",
                         f"roles.{name}.{key}: {' and '.join(beyond)} beyond {device.limits}",
                         f"correct roles.{name}.{key}, or the limits in devices.{device.name}",
@@ -239,36 +243,38 @@ def _limits(device: Actuator, roles: Mapping[str, RoleTable]) -> list[Finding]:
     return findings
 
 
-def _watchdog(device: Actuator, file: RigFile) -> list[Finding]:
+def _watchdog(device: Actuator, file: RigFile) -> list[CheckFinding]:
     """Judge the watchdog that the driver declares."""
     watchdog, period = device.watchdog, file.telemetry.period
     if watchdog is None:
         if not device.heats:
-            return [Finding("watchdog", "none")]
-        return [Finding("watchdog", "none, and its output heats", f"set the key watchdog of devices.{device.name}")]
+            return [CheckFinding("watchdog", "none")]
+        return [
+            CheckFinding("watchdog", "none, and its output heats", f"set the key watchdog of devices.{device.name}")
+        ]
     text = f"{watchdog:g} s"
     if period > SHARE_OF_WATCHDOG * watchdog:
         return [
-            Finding(
+            CheckFinding(
                 "watchdog",
                 f"{text}, with {period:g} s between two readings (telemetry.period)",
                 f"let telemetry.period be {SHARE_OF_WATCHDOG * watchdog:g} s at most, or lengthen the watchdog",
             )
         ]
-    return [Finding("watchdog", text)]
+    return [CheckFinding("watchdog", text)]
 
 
-def _times(file: RigFile, devices: Mapping[str, Device], ticks: Mapping[str, float]) -> list[Finding]:
+def _times(file: RigFile, devices: Mapping[str, Device], ticks: Mapping[str, float]) -> list[CheckFinding]:
     """Compare the time of one reading of all devices with the telemetry and the shortest watchdog."""
     total, period = math.fsum(ticks.values()), file.telemetry.period
     watchdogs = [device.watchdog for device in devices.values() if device.watchdog]
     shortest = min(watchdogs, default=math.inf)
     text = f"{1e3 * total:.3g} ms a quick reading of all devices, every {period:g} s"
     if total > period:
-        return [Finding("time", text, "lengthen telemetry.period, or read faster (speed of the lines, samples)")]
+        return [CheckFinding("time", text, "lengthen telemetry.period, or read faster (speed of the lines, samples)")]
     if total > SHARE_OF_WATCHDOG * shortest:
-        return [Finding("time", f"{text}; the shortest watchdog is {shortest:g} s", "lengthen the watchdog")]
-    return [Finding("time", text)]
+        return [CheckFinding("time", f"{text}; the shortest watchdog is {shortest:g} s", "lengthen the watchdog")]
+    return [CheckFinding("time", text)]
 
 
 def _exercised(roles: Mapping[str, RoleTable], devices: Mapping[str, Device]) -> dict[str, RoleTable]:
@@ -300,14 +306,14 @@ def exercise_setpoint(role: RoleTable, limits: Limits) -> float:
 
 def _exercise(
     devices: Mapping[str, Device], name: str, role: RoleTable, clock: Clock, keep_on: Callable[[], None]
-) -> list[Finding]:
+) -> list[CheckFinding]:
     """Set an actuator near its rest, see that its reading follows, and make it safe again."""
     device = devices[name]
     assert isinstance(device, Actuator)
     signal = _reading(role, devices)
     source = next((each for each in devices.values() if signal in (s.name for s in each.signals)), None)
     if source is None:
-        return [Finding("exercise", f"{signal} cannot be read, so {name} was not moved", "connect its device")]
+        return [CheckFinding("exercise", f"{signal} cannot be read, so {name} was not moved", "connect its device")]
     quick, _ = _repeat(source.glance, GLANCES, clock)
     noise = deviation([values[signal] for values in quick])
     begin, target = quick[-1][signal], exercise_setpoint(role, device.limits)
@@ -329,12 +335,12 @@ def _exercise(
         f"{target:g} {device.limits.unit}"
     )
     if problem is not None:
-        return [Finding("exercise", f"{text}: {problem}", "see that the output is connected and not blocked")]
+        return [CheckFinding("exercise", f"{text}: {problem}", "see that the output is connected and not blocked")]
     moved, way = value - begin, target - begin
     if abs(way) <= near or (moved * way > 0 and abs(moved) > _SIGNIFICANT * noise):
-        return [Finding("exercise", text)]
+        return [CheckFinding("exercise", text)]
     advice = "see that the output is connected, and the sensor on it"
-    return [Finding("exercise", f"{text}, so it does not follow", advice)]
+    return [CheckFinding("exercise", f"{text}, so it does not follow", advice)]
 
 
 def _has_failed(status: Status) -> bool:

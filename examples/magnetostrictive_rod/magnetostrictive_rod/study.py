@@ -7,7 +7,7 @@ from typing import Any
 
 from bench.analysis import errors_json, identify_file
 from bench.base import Pending
-from bench.batch import Campaign, ResultTable, Study, StudyResult, reached_targets
+from bench.batch import ResultTable, RunSeries, Study, StudyResult, reached_targets
 from bench.execution import RunResult
 
 MODELS: Mapping[str, Mapping[str, Any]] = {
@@ -32,7 +32,7 @@ TABLE = ResultTable(
 )
 
 
-def carry_out(campaign: Campaign) -> StudyResult:
+def carry_out(campaign: RunSeries) -> StudyResult:
     """Run the experiments and evaluate them; raises `BenchError` if a run did not complete."""
     measured = campaign.run("damped-oscillation", {"half_cycles": "24"})
     identification: dict[str, Any] = {}
