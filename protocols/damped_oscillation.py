@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from bench.identification import excitation
+from bench.identification import damped_oscillation as oscillation_setpoints
 from bench.protocol import Dwell, Messages, Phase, Slots, Step, from_slot, parameter, protocol
 from protocols.preparation import (
     DRIVE,
@@ -44,9 +44,9 @@ def damped_oscillation(parameters: Parameters, slots: Slots) -> Messages:
     drive, unit = slots["drive"].device, slots["drive"].setpoint_unit
     check_order(parameters, "low < center < high", unit)
     ends = parameters.low, parameters.high, parameters.center, parameters.half_cycles
-    corners = excitation.damped_oscillation(*ends, step=parameters.high - parameters.low)
+    corners = oscillation_setpoints(*ends, step=parameters.high - parameters.low)
     check_increment(parameters, float(np.abs(np.diff(corners)).sum()), ("low", "high"), unit)
-    setpoints = excitation.damped_oscillation(*ends, step=parameters.increment)
+    setpoints = oscillation_setpoints(*ends, step=parameters.increment)
     yield from reset(slots, float(setpoints[0]), parameters.dwell, load=parameters.load)
     yield Phase("rise")
     direction = 1.0

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bench.identification import covering_sequence, sequences as design
+from bench.identification import covering_sequence, first_order_reversals as reversal_setpoints
 from bench.models import uniform_levels
 from bench.protocol import Dwell, Messages, Phase, Slots, Step, from_slot, parameter, protocol
 from protocols.preparation import DRIVE, DRIVE_AND_RESPONSE, LOAD, LOOP, SweepParameters, check_order, reset
@@ -39,7 +39,7 @@ def first_order_reversals(parameters: Parameters, slots: Slots) -> Messages:
     From positive saturation down to each level in turn, and up again level by level (Mayergoyz, *Mathematical
     Models of Hysteresis and Their Applications*, 2003, chapter 1).
     """
-    sequence = design.first_order_reversals(*_grid(parameters, slots), per_cell=parameters.per_cell)
+    sequence = reversal_setpoints(*_grid(parameters, slots), per_cell=parameters.per_cell)
     yield from _carry_out(parameters, slots, sequence)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from bench.identification import excitation
+from bench.identification import random_validation as validation_setpoints
 from bench.protocol import Dwell, Messages, Phase, Slots, Step, from_slot, parameter, protocol
 from protocols.preparation import (
     DRIVE,
@@ -50,7 +50,7 @@ def random_validation(parameters: Parameters, slots: Slots) -> Messages:
     # One ramp may go from end to end.
     lowest, highest = min(ends, key=ends.__getitem__), max(ends, key=ends.__getitem__)
     check_increment(parameters, ends[highest] - ends[lowest], (lowest, highest), unit)
-    setpoints = excitation.random_validation(
+    setpoints = validation_setpoints(
         np.random.default_rng(parameters.sequence_seed),
         count=parameters.count,
         operating=(parameters.low, parameters.high),

@@ -35,10 +35,6 @@ from .choose.selected import (
 from .choose.time_stage import (
     Task as Task,
 )
-from .design import (
-    excitation as excitation,
-    sequences as sequences,
-)
 from .design.continuation import (
     Continuation as Continuation,
     continue_design as continue_design,

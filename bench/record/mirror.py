@@ -4,7 +4,7 @@ It is written before the journal. Where the journal cannot be written for a whil
 the disk is full, a row is durable as soon as this file is; where the journal is damaged, the rows come from here.
 
 An entry is a mark, a head (table, quantity of rows and of numbers in each, length and CRC-32 of the rest), and the
-rows' numbers and texts as in `bench.record.rows.Entry`. What is damaged or cut off is left out when it is read.
+rows' numbers and texts as in `JournalEntry`. What is damaged or cut off is left out when it is read.
 
 Before the rows of a journal stands the random number that its metadata has, as a row of these. Rows that follow
 another number, or none, are not of this journal, and are left out.
