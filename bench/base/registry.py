@@ -160,7 +160,7 @@ def check_own_packages() -> None:
 
     Raises ConfigurationError if one is; names both folders.
     """
-    home = Path(__file__).resolve().parents[1]
+    home = Path(__file__).resolve().parents[2]
     for name in _OWN_FOLDERS:
         spec = importlib.util.find_spec(name)
         # A folder, with or without `__init__.py`, or a single file.

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Self
 
-from bench.base import ConfigurationError, DataError, RecordError, Stopwatch
+from bench.base import ConfigurationError, DataError, RecordError, Stopwatch, json_text
 from bench.devices import Signal, check_signal_names
 from bench.record.background import LONGEST_UNWRITTEN, Background
 from bench.record.ending import Ending
@@ -74,7 +74,9 @@ class Journal:
             raise ConfigurationError(f"{path} exists already; a record of a run is never overwritten")
         names = [signal.name for signal in signals]
         check_signal_names(names)
-        identity = secrets.token_hex(16)
+        # Nobody has a reason to forge the record of a run that moves nothing, and equal runs have equal records.
+        content = json_text(dict(meta)).encode(errors="surrogatepass")
+        identity = secrets.token_hex(16) if flushed else hashlib.sha256(content).hexdigest()[:32]
         heading = {"schema": SCHEMA, IDENTITY: identity, **meta}
         entries = [entry("meta", meta_row(key, value)) for key, value in heading.items()]
         entries += [

@@ -67,7 +67,7 @@ class Bench:
         self.clock = clock or VirtualClock()
         self.rig = Rig(load_rig(path), self.clock, seed)
         self.tec, self.probe = self.rig.devices["tec"], self.rig.devices["probe"]
-        self.journal = Journal(folder / FILE_NAME, self.rig.signals + TRACES * traces, {})
+        self.journal = Journal(folder / FILE_NAME, self.rig.signals + TRACES * traces, {}, flushed=False)
         self.interrupts = Interrupts()
         self.watcher = Watcher()
         station = LocalStation(self.rig)

@@ -52,7 +52,6 @@ class TestFlags:
             "SIGVTALRM",
             "SIGPROF",
             "SIGXCPU",
-            "SIGPOLL",
         ],
     )
     def test_the_system_ends_at_once(self, name):
