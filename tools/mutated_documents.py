@@ -221,7 +221,8 @@ def try_tuning(folder: Path, rng: random.Random) -> str:
     document["model"] |= {"input_unit": "°C", "output_unit": "1/m"}
     model.write_text(json.dumps(document), encoding="utf-8")
     words = ["run", "following", "--rig", "vo2", "--dry-run", "--set", f"model={model}", "--set", f"tuning={file}",
-             "--set", "controller=open-loop-inverse", "--set", "low=0", "--set", "high=0.5"]  # fmt: skip
+             "--set", "controller=open-loop-inverse", "--set", "fallback=open-loop",
+             "--set", "low=0", "--set", "high=0.5"]  # fmt: skip
     return try_document(file, toml_of(TUNING), rng, lambda: call(*words).code == 0, ("provenance", "tuning"))
 
 

@@ -164,8 +164,9 @@ def objections(template: Any, changed: Any, free: tuple[str, ...] = (), path: st
             yield f"{path}: not a list"
             return
         for index, value in enumerate(changed):
-            # Entries of a list are alike.
-            yield from objections(template[min(index, len(template) - 1)], value, free, f"{path}[{index}]")
+            # Entries may come twice or change places, so that one counts which is like any of the template's.
+            place = f"{path}[{index}]"
+            yield from min(([*objections(entry, value, free, place)] for entry in template), key=len, default=[])
     elif isinstance(template, bool) or isinstance(changed, bool) or template is None:
         if type(template) is not type(changed) and template is not None:
             yield f"{path}: {changed!r} in the place of {template!r}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler
@@ -21,24 +21,40 @@ def _no_boolean(value: object) -> object:
     return value
 
 
-def _with_numbers(schema: Any) -> Any:  # noqa: ANN401 - a schema, or part of one
-    """Return a schema in which every number is checked."""
-    if schema["type"] in ("float", "int"):
-        return core_schema.no_info_before_validator_function(_no_boolean, schema)
-    if schema.get("function", {}).get("function") is _no_boolean:
+def _no_null(value: object) -> object:
+    if isinstance(value, str) and "\0" in value:
+        raise PydanticCustomError("null_character", "a text may not have a null character")
+    return value
+
+
+_CHECKS = {"float": _no_boolean, "int": _no_boolean, "str": _no_null}
+
+
+def _check_of(schema: Any) -> Callable[[object], object] | None:  # noqa: ANN401 - a schema, or part of one
+    """Return the check that a schema of numbers or texts lacks; a literal 1 would be equal to true."""
+    if schema["type"] == "literal":
+        numbers = all(isinstance(value, int) and not isinstance(value, bool) for value in schema["expected"])
+        return _no_boolean if numbers else None
+    return _CHECKS.get(schema["type"])
+
+
+def _checked(schema: Any) -> Any:  # noqa: ANN401 - a schema, or part of one
+    """Return a schema in which every number and every text is checked."""
+    if (check := _check_of(schema)) is not None:
+        return core_schema.no_info_before_validator_function(check, schema)
+    if schema.get("function", {}).get("function") in _CHECKS.values():
         return schema
     changed = dict(schema)
     for key, inner in _inner(schema):
         if isinstance(inner, list):
             changed[key] = [
-                (_with_numbers(each[0]), *each[1:]) if isinstance(each, tuple) else _with_numbers(each)
-                for each in inner
+                (_checked(each[0]), *each[1:]) if isinstance(each, tuple) else _checked(each) for each in inner
             ]
         elif key in ("fields", "choices"):
             # Fields by name, of which one may be `type`, and choices of a union by tag.
-            changed[key] = {name: _with_numbers(each) for name, each in inner.items()}
+            changed[key] = {name: _checked(each) for name, each in inner.items()}
         else:
-            changed[key] = _with_numbers(inner)
+            changed[key] = _checked(inner)
     return changed
 
 
@@ -52,12 +68,13 @@ class CheckedTable(BaseModel):
     """Base of tables that come from files: refuses keys that it does not know, and numbers that are none.
 
     `nan`, `inf`, and `true` or `false` in the place of a number are refused; pydantic itself would take `true` for 1.
+    So is a text with a null character, which no name of a file can have.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
     @classmethod
     def __get_pydantic_core_schema__(cls, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:  # noqa: ANN401
-        """Return the schema of pydantic, with numbers that may not be `true` or `false`."""
-        schema: dict[str, Any] = _with_numbers(handler(source))
+        """Return the schema of pydantic, with the checks of numbers and texts."""
+        schema: dict[str, Any] = _checked(handler(source))
         return schema

@@ -4,6 +4,7 @@ import ast
 import json
 import math
 from pathlib import Path
+from typing import Literal
 
 import pytest
 from cases import cases
@@ -57,6 +58,7 @@ class Limits(CheckedTable):
     either: bool | float = False
     levels: tuple[float, ...] = ()
     named: dict[str, float | None] = Field(default_factory=dict)
+    version: Literal[1] = 1
 
 
 class Tables(CheckedTable):
@@ -66,11 +68,24 @@ class Tables(CheckedTable):
 
 
 @pytest.mark.parametrize(
-    "table", [{"low": True}, {"count": False}, {"levels": [1.0, True]}, {"named": {"a": True}}, {"low": math.nan}]
+    "table",
+    [
+        {"low": True},
+        {"count": False},
+        {"levels": [1.0, True]},
+        {"named": {"a": True}},
+        {"low": math.nan},
+        {"version": True},
+    ],
 )
 def test_a_table_takes_no_truth_for_a_number(table):
     with pytest.raises(ValidationError):
         Tables(limits=[table])
+
+
+def test_a_table_takes_no_text_with_a_null_character():
+    with pytest.raises(ValidationError):
+        Tables(type="a\0b")
 
 
 def test_a_table_takes_numbers():
