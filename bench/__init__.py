@@ -25,9 +25,9 @@ __all__ = ["identify", "invert", "load", "open_rig", "predict", "report", "run"]
 def __getattr__(name: str) -> Any:  # noqa: ANN401 - any of the names above
     if name not in __all__:
         raise AttributeError(f"module 'bench' has no attribute {name!r}")
-    from bench import api as face
+    from bench import api
 
-    return getattr(face, name)
+    return getattr(api, name)
 
 
 def __dir__() -> list[str]:
