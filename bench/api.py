@@ -22,14 +22,18 @@ import numpy.typing as npt
 from rich.console import Console
 
 from bench.analysis import (
+    FEWEST_ROWS,
     PAGE_NAME,
+    ColumnNames,
+    FitOptions,
     IdentifiedFile,
     InvertedTargets,
     ReadingOptions,
     RunFolder,
-    identify_file,
+    identify_model,
     invert_targets,
     predict as predict_file,
+    read_dataset,
     report_run,
 )
 from bench.base import BenchError, DeviceError, VirtualClock, wall_time
@@ -174,9 +178,9 @@ def identify(
         Columns, by name or by number from 1; of a run, the reading of its slot `drive` and the signal of its slot
         `response` if not given.
     **options
-        As in `bench.analysis.identify_file`: `smoothing`, `skip`, `cross_validated`, `initial`, `orientation`,
-        `time_column` for a model with time, and the options of the model; and those of `ReadingOptions` where the
-        layout of a file is not found from it: `delimiter`, `decimal`, `encoding`, `skip_lines`, `table`.
+        As in `bench.analysis.FitOptions`: `smoothing`, `skip`, `cross_validated`, `initial`, `orientation`, and the
+        options of the model; `time_column` for a model with time and `weights_column`; and those of `ReadingOptions`
+        where the layout of a file is not found from it: `delimiter`, `decimal`, `encoding`, `skip_lines`, `table`.
 
     Raises
     ------
@@ -207,7 +211,9 @@ def identify(
     reading = ReadingOptions(
         **{field.name: options.pop(field.name) for field in fields(ReadingOptions) if field.name in options}
     )
-    return identify_file(folder, input_column=input, output_column=output, model=model, reading=reading, **options)
+    names = ColumnNames(input, output, options.pop("time_column", None), options.pop("weights_column", None))
+    data = read_dataset([folder], names, reading, at_least=FEWEST_ROWS)
+    return identify_model(data, model, FitOptions.of(options))
 
 
 def predict(

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 import bench
-from bench.analysis import identify_file, target_results
+from bench.analysis import target_results
 from bench.record import Record
 
 WIDER = ("major_width", "minor_width", "major_width_spread", "minor_width_spread")
@@ -30,9 +30,9 @@ def main(sessions: int) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         run = bench.run("damped-oscillation", "vo2", out=folder, clock="virtual", overrides=IDEAL)
-        found = identify_file(
-            run.folder, input_column="tec_temperature", output_column="curvature", model="preisach-nonmonotonic",
-            levels=20, plane=(30.0, 70.0), reference=20.0,
+        found = bench.identify(
+            run, "preisach-nonmonotonic", input="tec_temperature", output="curvature", levels=20,
+            plane=(30.0, 70.0), reference=20.0,
         )  # fmt: skip
         found.file.save(folder / "model.json")
         print(f"{'specimen':28}{'adaptation':12}{'first 60':>16}{'then':>16}")

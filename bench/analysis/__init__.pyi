@@ -9,7 +9,12 @@ from .designs import (
 )
 from .examined import (
     Examined as Examined,
+    compare_models as compare_models,
     examine as examine,
+    load_models as load_models,
+    outside_of_range as outside_of_range,
+    predict as predict,
+    predictions_of as predictions_of,
 )
 from .export.run_export import (
     export_run as export_run,
@@ -42,21 +47,18 @@ from .model_choice import (
     ALL as ALL,
     SelectedModel as SelectedModel,
     TestedModel as TestedModel,
-    evaluate_on_test as evaluate_on_test,
+    evaluate_on as evaluate_on,
+    evaluate_on_rows as evaluate_on_rows,
     named_models as named_models,
     select_model as select_model,
 )
 from .model_service import (
+    FitOptions as FitOptions,
     IdentifiedFile as IdentifiedFile,
     certificate_lines as certificate_lines,
     check_template as check_template,
-    check_unit as check_unit,
-    compare_models as compare_models,
-    errors_json as errors_json,
-    identify_file as identify_file,
+    identify_model as identify_model,
     option_names as option_names,
-    outside_of_range as outside_of_range,
-    predict as predict,
     transients_of as transients_of,
 )
 from .models_of_several_runs import (
@@ -69,7 +71,7 @@ from .prediction_figures import (
 )
 from .predictions import (
     Predictions as Predictions,
-    Quantity as Quantity,
+    errors_json as errors_json,
 )
 from .report.model_card import (
     write_card as write_card,
@@ -111,31 +113,30 @@ from .session_recalibration import (
 )
 from .tables.data import (
     FEWEST_ROWS as FEWEST_ROWS,
+    Quantity as Quantity,
     read_columns as read_columns,
     write_csv as write_csv,
 )
-from .tables.imported import (
-    import_file as import_file,
-)
-from .tables.joined_files import (
+from .tables.dataset import (
+    NO_TIMES as NO_TIMES,
+    ColumnNames as ColumnNames,
+    Dataset as Dataset,
+    check_unit as check_unit,
     is_rows as is_rows,
     parse_rows as parse_rows,
-    read_files as read_files,
+    read_dataset as read_dataset,
+    read_for as read_for,
+    time_names as time_names,
+)
+from .tables.imported import (
+    import_file as import_file,
 )
 from .tables.reading.options import (
     ReadingOptions as ReadingOptions,
 )
 from .tables.starting_state import (
-    starting_state as starting_state,
-)
-from .tables.times import (
-    NO_TIMES as NO_TIMES,
-    choose_times as choose_times,
-    find_times as find_times,
     foreign_drift as foreign_drift,
-    named_times as named_times,
-    read_times as read_times,
-    time_quantity as time_quantity,
+    starting_state as starting_state,
 )
 from .tracking_errors import (
     FOLLOW as FOLLOW,

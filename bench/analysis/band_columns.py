@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from bench.analysis.tables.dataset import Dataset
 from bench.base import header_with_unit
 from bench.identification import (
     Band,
@@ -216,18 +217,12 @@ def invert_band(
 
 
 def calibrate(
-    found: Identification[Any],
-    inputs: Floats,
-    outputs: Floats,
-    weights: Floats | None,
-    skip: int,
-    penalties: Regularization,
-    options: Mapping[str, Any],
-    times: Floats | None,
+    found: Identification[Any], data: Dataset, skip: int, penalties: Regularization, options: Mapping[str, Any]
 ) -> Band:
     """Return the band of the model that was identified with the same arguments; errors as `calibrate_band`."""
-    if times is not None:
-        return calibrate_band_in_time(found, times, inputs, outputs, weights=weights, skip=skip, **options)
+    inputs, outputs, weights = data.inputs, data.outputs, data.weights
+    if data.times is not None:
+        return calibrate_band_in_time(found, data.times, inputs, outputs, weights=weights, skip=skip, **options)
     own = dict(options)
     initial, orientation = own.pop("initial", None), own.pop("orientation", "auto")
     problem = set_up_problem(

@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from bench.analysis.model_service import check_unit
-from bench.analysis.tables.data import read_columns, write_csv
+from bench.analysis.tables.data import write_csv
+from bench.analysis.tables.dataset import ColumnNames, check_unit, read_for
 from bench.analysis.tables.reading.options import ReadingOptions
 from bench.base import ConfigurationError, DataError, header_with_unit
 from bench.identification import (
@@ -112,14 +112,14 @@ def continue_file(
     name = input_column or str(model.provenance.get("input", ""))
     if not name:
         raise DataError(f"model {model.name} does not say which column its inputs were; give --input")
-    columns = read_columns(data, [name], options=reading)
-    check_unit(model.operator.input_unit, columns.units[name], name)
+    measured = read_for([model], data, ColumnNames(name), reading)
+    check_unit(model.operator.input_unit, measured.input)
     low, high = model.operator.output_range()
     rms = float(model.provenance.get("rms", 0.0))
     noise = rms / (high - low) if rms > 0.0 and high > low else NOISE
     try:
         return continue_design(
-            model.operator, columns.values[name], seconds=seconds, dwell=dwell, state=model.initial, noise=noise
+            model.operator, measured.inputs, seconds=seconds, dwell=dwell, state=model.initial, noise=noise
         )
     except ValueError as error:
         raise ConfigurationError(f"design: {error}") from None

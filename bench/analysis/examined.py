@@ -1,20 +1,23 @@
-"""A model's predictions for one file of measurements, with the session recalibrated and the band about them."""
+"""What models give for measurements, with the session recalibrated and bands: `bench predict`, `bench compare`."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from bench.analysis.band_columns import BandedPrediction, predict_band
-from bench.analysis.predictions import check_finite
+from bench.analysis.predictions import Predictions, check_finite, errors_json, time_quantity
 from bench.analysis.session_recalibration import Session
-from bench.analysis.tables.times import bind_times
+from bench.analysis.tables.dataset import Dataset
+from bench.analysis.tables.starting_state import StartingState, bind_times, foreign_drift, starting_state
 from bench.base import ConfigurationError
-from bench.identification import Errors, ModelFile, Recalibration, measure_errors
-from bench.models import TimedSequence
+from bench.identification import Comparison, Errors, ModelFile, Recalibration, compare, load_model, measure_errors
+from bench.models import Operator, TimedSequence
 
 Floats = npt.NDArray[np.float64]
 
@@ -85,32 +88,26 @@ class Examined:
 
 def examine(
     model: ModelFile,
-    inputs: Floats,
-    measured: Floats | None = None,
+    data: Dataset,
     *,
     state: Any = None,  # noqa: ANN401 - each operator has its own
     session: Session | None = None,
     skip: int = 0,
-    times: Floats | None = None,
 ) -> Examined:
-    """Return what a model gives for a sequence of inputs, shape (N,).
+    """Return what a model gives for a dataset.
 
     Parameters
     ----------
     model : ModelFile
         The model.
-    inputs : ndarray, shape (N,)
-        In the unit of the model, finite.
-    measured : ndarray, shape (N,), or None
-        Measured outputs.
+    data : Dataset
+        Inputs in the unit of the model, and what else there is.
     state : object
         State before the first row; None is the initial one.
     session : Session, optional
         What is estimated of the session from measured outputs.
     skip : int
         First rows that drive the memory but do not count.
-    times : ndarray, shape (N,), or None
-        s, for a model with time.
 
     Raises
     ------
@@ -119,8 +116,9 @@ def examine(
     DataError
         If an output is not finite.
     """
-    bound = bind_times(model, times)
-    times = times if isinstance(bound, TimedSequence) else None
+    bound = bind_times(model, data.times)
+    times = data.times if isinstance(bound, TimedSequence) else None
+    inputs, measured = data.inputs, None if data.output is None else data.outputs
     units = model.response.input_unit, model.response.output_unit
     if session is None:
         with np.errstate(over="ignore", invalid="ignore"):
@@ -140,4 +138,169 @@ def examine(
         predict_band(model, inputs + found.values.get("input-offset", 0.0), state, times),
         units,
         session.first_unused(inputs.size, skip),
+    )
+
+
+def predict(
+    model: ModelFile,
+    inputs: Floats,
+    *,
+    initial: str | None = None,
+    continue_memory: bool = False,
+    times: Floats | None = None,
+) -> Floats:
+    """Return the outputs of a model for a sequence of inputs, shape (N,), in its unit.
+
+    Parameters
+    ----------
+    model : ModelFile
+        The model.
+    inputs : ndarray, shape (N,)
+        Inputs in the unit of the model, finite.
+    initial, continue_memory
+        The state before the first input, as for `starting_state`.
+    times : ndarray, shape (N,), or None
+        s, for a model with time.
+
+    Raises
+    ------
+    ConfigurationError
+        If a model with time has none.
+    """
+    start = starting_state(model, initial=initial, continue_memory=continue_memory)
+    return bind_times(model, times).evaluate(inputs, start.state)
+
+
+def outside_of_range(model: ModelFile, inputs: Floats) -> str:
+    """Return a warning if inputs leave the range for which the model was identified, else an empty text."""
+    low, high = model.response.input_range
+    outside = np.flatnonzero((inputs < low) | (inputs > high))
+    if outside.size == 0:
+        return ""
+    return (
+        f"{outside.size} of {inputs.size} inputs (first: row {outside[0] + 1}, {inputs[outside[0]]:g}) are outside "
+        f"of {low:g} to {high:g} {model.response.input_unit}, for which the model was identified"
+    )
+
+
+@dataclass(frozen=True)
+class ComparedModels:
+    """How several models do on one set of measurements.
+
+    Attributes
+    ----------
+    comparisons : mapping of str to Comparison
+        By the model file's name.
+    predictions : Predictions
+        What each model gives, row by row.
+    examined : mapping of str to Examined
+        The session recalibrated and the band of each model, by the same names.
+    warnings : tuple of str
+        What of a model belongs to its own record only.
+    """
+
+    comparisons: Mapping[str, Comparison]
+    predictions: Predictions
+    examined: Mapping[str, Examined] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def unit(self) -> str:
+        """The unit of the output."""
+        return self.predictions.unit
+
+    @property
+    def skip(self) -> int:
+        """The number of first rows left out of the errors."""
+        return self.predictions.skip
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the comparison for programs: `raw` and `rezeroed` errors, `offset` and `skipped` of each model."""
+        return {
+            name: {
+                "raw": errors_json(entry.raw),
+                "rezeroed": errors_json(entry.rezeroed),
+                "offset": entry.offset,
+                "skipped": self.skip,
+                **(self.examined[name].to_json() if name in self.examined else {}),
+                **({"recalibrated": errors_json(mended)} if (mended := self.recalibrated(name)) else {}),
+            }
+            for name, entry in self.comparisons.items()
+        }
+
+    def recalibrated(self, name: str) -> Errors | None:
+        """Return a model's errors after recalibration, over the same rows as the others; None without one."""
+        found = self.examined.get(name)
+        return None if found is None or found.recalibration is None else found.errors()
+
+
+def load_models(paths: Sequence[Path]) -> dict[str, ModelFile]:
+    """Return model files by the names under which they are compared; raises DataError if one cannot be read."""
+    found: dict[str, ModelFile] = {}
+    for path in paths:
+        found[path.stem if path.stem not in found else str(path)] = load_model(path)
+    return found
+
+
+def compare_models(
+    models: Mapping[str, ModelFile],
+    data: Dataset,
+    *,
+    skip: int | None = None,
+    initial: str | None = None,
+    session: Session | None = None,
+) -> ComparedModels:
+    """Compare models on measurements.
+
+    Parameters
+    ----------
+    models : mapping of str to ModelFile
+        The models by the name of their file.
+    data : Dataset
+        Input and output, and for models with time the times.
+    skip, initial
+        First rows that drive the memory but do not count, and the state before them, as for `starting_state`. Of
+        the numbers of rows of the models the greatest is taken for all, so that their errors are of the same rows.
+    session : Session, optional
+        What is estimated of the session for each model; the rows that it uses do not count either.
+
+    Raises
+    ------
+    DataError
+        If units do not fit, or an output is not finite.
+    ConfigurationError
+        If `skip` leaves nothing, there is no such initial state, or times are missing.
+    """
+    inputs, outputs, times = data.inputs, data.outputs, data.times
+    operators: dict[str, Operator[Any] | TimedSequence] = {}
+    starts: dict[str, StartingState] = {}
+    for name, file in models.items():
+        data.check_units(file)
+        operators[name] = bind_times(file, times)
+        starts[name] = starting_state(file, inputs, initial=initial, skip=skip)
+    states = {name: start.state for name, start in starts.items()}
+    most = max(start.skip for start in starts.values())
+    examined = {
+        name: examine(file, data, state=states[name], session=session, skip=most) for name, file in models.items()
+    }
+    first = most if session is None else session.first_unused(inputs.size, most)
+    comparisons = compare(operators, inputs, outputs, states=states, skip=first)
+    predictions = predictions_of(next(iter(models.values())), data, examined, first)
+    drifts = (
+        () if session is not None else tuple(filter(None, (foreign_drift(each, inputs) for each in models.values())))
+    )
+    return ComparedModels(comparisons, predictions, examined, drifts)
+
+
+def predictions_of(model: ModelFile, data: Dataset, examined: Mapping[str, Examined], skip: int) -> Predictions:
+    """Return what models give for a dataset, row by row, in the units of the first where the file does not say."""
+    driven, unit = model.response.input_unit, model.response.output_unit
+    return Predictions(
+        replace(data.input, unit=data.input.unit or driven),
+        unit,
+        {name: entry.predicted for name, entry in examined.items()},
+        data.output,
+        time_quantity(data.times),
+        skip=skip,
+        bands={name: entry.band for name, entry in examined.items() if entry.band is not None},
     )

@@ -9,8 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.analysis.predictions import check_finite
-from bench.analysis.tables.starting_state import starting_state
-from bench.analysis.tables.times import bind_times
+from bench.analysis.tables.starting_state import bind_times, starting_state
 from bench.base import ConfigurationError, DataError
 from bench.identification import ModelFile
 from bench.models import Policy, Reach, TimedSequence

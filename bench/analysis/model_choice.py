@@ -11,19 +11,11 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from bench.analysis.model_service import IdentifiedFile, errors_json
-from bench.analysis.tables.data import FEWEST_ROWS, check_excitation
-from bench.analysis.tables.joined_files import (
-    check_rows,
-    fitted_rows,
-    is_rows,
-    overwritten_from,
-    parse_rows,
-    read_files,
-)
-from bench.analysis.tables.reading.options import ReadingOptions
-from bench.analysis.tables.starting_state import left_out
-from bench.analysis.tables.times import bind_times, read_times
+from bench.analysis.model_service import FitOptions, IdentifiedFile
+from bench.analysis.predictions import errors_json
+from bench.analysis.tables.data import FEWEST_ROWS
+from bench.analysis.tables.dataset import Dataset, check_rows, overwritten_from, parse_rows
+from bench.analysis.tables.starting_state import bind_times, left_out
 from bench.base import ConfigurationError, DataError, Workers
 from bench.identification import (
     Comparison,
@@ -35,9 +27,11 @@ from bench.identification import (
     Task,
     check_words,
     compare,
+    measure_errors,
+    model_options,
     select,
 )
-from bench.models import Operator, find_model, identifiable_models, timed_models
+from bench.models import Operator, TimedModel, find_model, identifiable_models, timed_models
 
 MOST_ROWS = 4000
 """Rows by which models are compared: of more, evenly chosen ones; the chosen model is fitted to all."""
@@ -89,12 +83,14 @@ class SelectedModel:
         """Whether the chosen model is one with time."""
         return self.model in timed_models()
 
-    def settings(self) -> dict[str, Any]:
-        """Return the chosen settings as `identify_file` takes them."""
+    def settings(self, given: FitOptions) -> FitOptions:
+        """Return the given options with the chosen settings."""
         chosen = self.selection.chosen.candidate
-        orientation = {} if chosen.orientation == "auto" else {"orientation": chosen.orientation}
-        skip = {"skip": self.known} if chosen.initial == "skip" else {}
-        return {**chosen.options, **orientation, **skip, "initial": chosen.initial, "smoothing": chosen.smoothing}
+        own = {**given.own, **chosen.options, "initial": chosen.initial}
+        if chosen.orientation != "auto":
+            own["orientation"] = chosen.orientation
+        skip = self.known if chosen.initial == "skip" else given.skip
+        return replace(given, smoothing=chosen.smoothing, skip=skip, own=own)
 
     def rows(self) -> list[dict[str, Any]]:
         """Return the table: `COLUMNS` by name, errors in output units."""
@@ -173,40 +169,23 @@ def named_models(text: str) -> tuple[str, ...]:
 
 
 def select_model(
-    paths: Sequence[Path],
-    *,
-    input_column: str,
-    output_column: str,
-    models: Sequence[str],
-    given: Given,
-    console: Console,
-    skip: int = 0,
-    train: slice | None = None,
-    time_column: str | None = None,
-    reading: ReadingOptions | None = None,
+    data: Dataset, models: Sequence[str], given: Given, options: FitOptions, console: Console
 ) -> SelectedModel:
     """Compare models on measurements by what is left out of their fits.
 
     Parameters
     ----------
-    paths : sequence of Path
-        Files that `read_columns` reads, or runs; each starts with a memory of its own.
-    input_column, output_column : str
-        Columns of the models' input and output.
+    data : Dataset
+        Input and output; each file starts with a memory of its own. With the times of one file models with time take
+        part.
     models : sequence of str
         Names of the models.
     given : Given
         Settings that are not to be chosen, and whether times were asked for.
+    options : FitOptions
+        Rows that are fitted and tested, and first rows that are neither.
     console : Console
         Where the progress is drawn.
-    skip : int
-        First rows that are neither fitted nor tested.
-    train : slice or None
-        Rows that are fitted and tested; all if None.
-    time_column : str or None
-        Column of times, with which models with time take part; of one file.
-    reading : ReadingOptions, optional
-        What is known of the layout of the files.
 
     Raises
     ------
@@ -219,37 +198,27 @@ def select_model(
         check_words(given.initial, given.orientation)
     except ValueError as error:
         raise ConfigurationError(f"--{error}") from None
-    if skip < 0:
-        raise ConfigurationError(f"--skip {skip}: expected a number of rows ≥ 0")
-    if time_column is not None and len(paths) > 1:
-        raise ConfigurationError(f"--time: expected one file, as times are those of one record; got {len(paths)}")
-    names = (input_column, output_column, *([time_column] if time_column else ()))
-    files = read_files(paths, names, at_least=FEWEST_ROWS, options=reading)
-    inputs, outputs = (files.columns.values[name] for name in (input_column, output_column))
-    check_excitation(files.columns, input_column)
-    fitted, _ = fitted_rows(files, inputs, train)
+    inputs, skip = data.inputs, options.skip
+    fitted, _ = data.fitted_rows(options.train, skip)
     fitted[:skip] = False
     if fitted.sum() < FEWEST_ROWS:
-        raise DataError(
-            f"{files.columns.source}: {int(fitted.sum())} rows are left; at least {FEWEST_ROWS} are needed"
-        )
+        raise DataError(f"{data.source}: {int(fitted.sum())} rows are left; at least {FEWEST_ROWS} are needed")
     _check_options(models, given)
-    whole = Measurements.of(inputs, outputs, fitted)
+    whole = Measurements.of(inputs, data.outputs, fitted)
     measured = whole.thinned(MOST_ROWS)
     few = measured.inputs.size <= _FEW_ROWS
     in_time = None
-    if time_column is not None and (given.is_time_asked or inputs.size <= _MOST_UNASKED):
+    if data.times is not None and (given.is_time_asked or inputs.size <= _MOST_UNASKED):
         # A linear part needs the rows between.
-        in_time = HeldOutInTime(whole, read_times(files.columns, time_column), measured.inputs.size)
+        in_time = HeldOutInTime(whole, data.times, measured.inputs.size)
     try:
         kernels = ("bench.models", "bench.identification")
         with Workers(1 if few else None, console, "models", kernels=kernels) as workers:
             selection = select(measured, models, given, lambda tasks: _carry_out(workers, tasks), in_time)
     except ValueError as error:
         raise ConfigurationError(f"no model can be fitted: {error}") from None
-    return SelectedModel(
-        selection, files.columns.units[output_column], max(whole.known, skip), tuple(selection.warnings())
-    )
+    assert data.output is not None
+    return SelectedModel(selection, data.output.unit, max(whole.known, skip), tuple(selection.warnings()))
 
 
 def _carry_out(workers: Workers, tasks: Sequence[tuple[str, Task]]) -> Iterable[list[Evaluation]]:
@@ -258,8 +227,6 @@ def _carry_out(workers: Workers, tasks: Sequence[tuple[str, Task]]) -> Iterable[
 
 
 def _check_options(models: Sequence[str], given: Given) -> None:
-    from bench.identification import model_options
-
     known = {option.name for model in models for option in model_options(find_model(model))}
     for name in given.options:
         if name not in known:
@@ -298,55 +265,31 @@ class TestedModel:
         }
 
 
-def evaluate_on_test(
-    found: IdentifiedFile, test: str, columns: tuple[str, str], reading: ReadingOptions | None
-) -> TestedModel:
-    """Return the errors of a model on rows `START:STOP` of its own measurements, or on another file.
+def evaluate_on_rows(found: IdentifiedFile, test: str) -> TestedModel:
+    """Return the errors of a model on rows `START:STOP` of its own measurements; its memory goes through all of them.
 
-    Of its own measurements the memory goes on through all rows. Another file starts with an unknown memory: its first
-    rows, until the inputs have overwritten it, are left out.
-
-    Parameters
-    ----------
-    found : IdentifiedFile
-        The model with the measurements it was identified from.
-    test : str
-        The rows, or a path.
-    columns : tuple of str
-        Input and output column of another file.
-    reading : ReadingOptions or None
-        What is known of the layout of another file.
-
-    Raises
-    ------
-    DataError
-        If another file cannot be used.
-    ConfigurationError
-        If there is no such row.
+    Raises ConfigurationError if there is no such row.
     """
-    if is_rows(test):
-        rows = parse_rows("--test", test)
-        check_rows("--test", rows, found.inputs.size)
-        predicted = (found.outputs - found.identification.residuals)[rows]
-        if not predicted.size:
-            raise ConfigurationError(f"--test {test}: there are {found.inputs.size} rows")
-        return TestedModel(f"rows {test}", _compared(found.outputs[rows], predicted), 0)
-    path = Path(test)
-    time_column = found.file.provenance.get("time")
-    names = (*columns, *([time_column] if time_column else ()))
-    read = read_files([path], names, at_least=FEWEST_ROWS, options=reading).columns
-    inputs, outputs = (read.values[name] for name in columns)
-    model = bind_times(found.file, read_times(read, time_column) if time_column else None)
-    skip = 0 if isinstance(model, Operator) and model.memoryless else left_out(overwritten_from(inputs), inputs.size)
-    state = {"model": found.identification.initial_state}
-    return TestedModel(path.name, compare({"model": model}, inputs, outputs, states=state, skip=skip)["model"], skip)
-
-
-def _compared(measured: Any, predicted: Any) -> Comparison:  # noqa: ANN401 - arrays
-    from bench.identification import measure_errors
-
+    rows = parse_rows("--test", test)
+    outputs = found.outputs
+    check_rows("--test", rows, outputs.size)
+    measured, predicted = outputs[rows], (outputs - found.identification.residuals)[rows]
+    if not measured.size:
+        raise ConfigurationError(f"--test {test}: there are {outputs.size} rows")
     residuals = measured - predicted
     offset = float(residuals.mean())
-    return Comparison(
-        measure_errors(measured, predicted), measure_errors(measured, predicted + offset), offset, residuals
-    )
+    raw, rezeroed = measure_errors(measured, predicted), measure_errors(measured, predicted + offset)
+    return TestedModel(f"rows {test}", Comparison(raw, rezeroed, offset, residuals), 0)
+
+
+def evaluate_on(found: IdentifiedFile, data: Dataset) -> TestedModel:
+    """Return the errors of a model on another file; raises DataError if its times do not increase.
+
+    It starts with an unknown memory: its first rows, until the inputs have overwritten it, are left out.
+    """
+    inputs = data.inputs
+    model = bind_times(found.file, data.times if isinstance(found.file.response, TimedModel) else None)
+    skip = 0 if isinstance(model, Operator) and model.memoryless else left_out(overwritten_from(inputs), inputs.size)
+    states = {"model": found.identification.initial_state}
+    compared = compare({"model": model}, inputs, data.outputs, states=states, skip=skip)["model"]
+    return TestedModel(data.name, compared, skip)

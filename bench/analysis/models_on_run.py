@@ -10,9 +10,8 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.analysis.band_columns import BandedPrediction, predict_band
-from bench.analysis.predictions import Quantity
-from bench.analysis.tables.starting_state import starting_state
-from bench.analysis.tables.times import bind_times
+from bench.analysis.tables.data import Quantity
+from bench.analysis.tables.starting_state import bind_times, starting_state
 from bench.base import DataError
 from bench.identification import Errors, ModelFile, measure_errors, parse_model
 from bench.models import Operator, TimedModel

@@ -9,39 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.analysis.band_columns import BandedPrediction
+from bench.analysis.tables.data import Quantity
 from bench.base import DataError, header_with_unit
 from bench.identification import Errors, measure_errors
 
 Floats = npt.NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Quantity:
-    """A column of measurements.
-
-    Attributes
-    ----------
-    name : str
-        As it was asked for; a unit at the end, as in `force [N]`, is that of the quantity.
-    unit : str
-        Empty if unknown.
-    values : ndarray, shape (N,)
-        In that unit.
-    """
-
-    name: str
-    unit: str
-    values: Floats
-
-    @property
-    def header(self) -> str:
-        """The head of the column, with the unit."""
-        return header_with_unit(self.title, self.unit)
-
-    @property
-    def title(self) -> str:
-        """The name without the unit."""
-        return self.name.removesuffix(f"[{self.unit}]").rstrip() if self.unit else self.name
 
 
 def check_finite(
@@ -130,3 +102,20 @@ class Predictions:
             prefix = f"{name} " if len(self.predicted) > 1 else ""
             columns += [(f"{prefix}{head}", values) for head, values in band.columns(self.predicted[name])]
         return columns
+
+
+def errors_json(errors: Errors) -> dict[str, float]:
+    """Return error measures for programs: `max`, `rms`, `average` in output units, and percentages."""
+    return {
+        "max": errors.maximum,
+        "rms": errors.rms,
+        "average": errors.average,
+        "max_percent": errors.maximum_percent,
+        "rms_percent": errors.rms_percent,
+        "average_percent": errors.average_percent,
+    }
+
+
+def time_quantity(times: Floats | None) -> Quantity | None:
+    """Return times, shape (N,) in s, as a column of results; None without them."""
+    return None if times is None else Quantity("time", "s", times)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -13,7 +14,7 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from bench.analysis import BandedPrediction, Examined
+    from bench.analysis import BandedPrediction, Examined, Session
 
 BandOption = Annotated[
     bool,
@@ -24,24 +25,34 @@ BandOption = Annotated[
 BandsOption = Annotated[
     bool, typer.Option("--bands", help="Show how many of the measured outputs each model's prediction band covers.")
 ]
-RecalibrateOption = Annotated[
-    str | None,
-    typer.Option(
-        "--recalibrate",
-        metavar="KINDS",
-        help="What has moved since the model's data, estimated from the measured output: some of offset, gain, "
-        "drift, input-offset, with commas.",
-    ),
-]
-RecalibrateRowsOption = Annotated[
-    int | None,
-    typer.Option(
-        "--recalibrate-rows",
-        min=1,
-        metavar="ROWS",
-        help="First rows by which that is estimated; errors are those of the others. All if not given.",
-    ),
-]
+
+
+@dataclass(frozen=True)
+class Recalibrating:
+    """The options of the recalibration of a session."""
+
+    recalibrate: Annotated[
+        str | None,
+        typer.Option(
+            metavar="KINDS",
+            help="What has moved since the model's data, estimated from the measured output: some of offset, gain, "
+            "drift, input-offset, with commas.",
+        ),
+    ] = None
+    recalibrate_rows: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            metavar="ROWS",
+            help="First rows by which that is estimated; errors are those of the others. All if not given.",
+        ),
+    ] = None
+
+    def session(self) -> Session | None:
+        """Return what is estimated; None if nothing is. Raises ConfigurationError as `Session.parse`."""
+        from bench.analysis import Session
+
+        return Session.parse(self.recalibrate, self.recalibrate_rows)
 
 
 def print_band(found: BandedPrediction, residuals: npt.NDArray[np.float64] | None = None, name: str = "") -> None:

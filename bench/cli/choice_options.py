@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bench.analysis import ReadingOptions
-from bench.base import ConfigurationError, print_plain
+from bench.base import print_plain
 from bench.cli.command_support import check_outputs, console, print_rows
-from bench.cli.data_options import offer_options
 from bench.cli.model_options import ModelOptions
 
 if TYPE_CHECKING:
-    from bench.analysis import IdentifiedFile, SelectedModel, TestedModel
+    from bench.analysis import (
+        ColumnNames,
+        Dataset,
+        FitOptions,
+        IdentifiedFile,
+        ReadingOptions,
+        SelectedModel,
+        TestedModel,
+    )
     from bench.identification import Candidate
 
 # Rows of the printed table; all are in the file.
@@ -74,8 +80,8 @@ def _comparing(
     return Comparing(parse_rows("--train", train) if train is not None else None, test, table_out)
 
 
-offer_comparing = offer_options(_comparing, "comparing")
-"""Offer a command's users the options of the comparison of models, in place of its parameter `comparing`."""
+ComparingGroup = Annotated[Comparing, _comparing]
+"""The options of the comparison of models, and of its test."""
 
 
 def is_comparison(model: str) -> bool:
@@ -86,70 +92,45 @@ def is_comparison(model: str) -> bool:
 
 
 def choose_model(
-    files: Sequence[Path],
-    columns: tuple[str, str],
-    model: str,
-    options: ModelOptions,
-    settings: dict[str, Any],
-    comparing: Comparing,
-    *,
-    skip: int,
-    time_column: str | None,
-    is_time_asked: bool,
-    reading: ReadingOptions,
+    data: Dataset, model: str, options: ModelOptions, fit: FitOptions, comparing: Comparing, *, is_time_asked: bool
 ) -> SelectedModel:
     """Compare models on measurements, and print the table.
 
     Parameters
     ----------
-    files, columns, skip, time_column, reading
+    data : Dataset
         The measurements.
-    is_time_asked : bool
-        Whether the column of times was asked for, not found.
     model : str
         `all`, or names with commas between them.
     options : ModelOptions
         Options of models that are given.
-    settings : dict
-        `smoothing`, `ridge`, `initial` and `orientation` as given.
+    fit : FitOptions
+        How they are fitted, as far as it is given.
     comparing : Comparing
         The options of the comparison.
+    is_time_asked : bool
+        Whether the column of times was asked for, not found.
 
     Raises
     ------
     ConfigurationError
-        If an option is for one model, or none can be fitted.
+        If none can be fitted.
     """
     from bench.analysis import named_models, select_model
     from bench.identification import Given
 
-    if settings["ridge"] is not None:
-        raise ConfigurationError("--ridge goes with one --model NAME")
-    if options.levels_to_try:
-        raise ConfigurationError("--levels: give one number, or none, to compare models; or one --model")
-    orientation = settings["orientation"]
+    orientation = fit.own["orientation"]
     given = Given(
         options.values,
-        initial=settings["initial"],
+        initial=fit.own["initial"],
         orientation=None if orientation == "auto" else orientation,
-        smoothing=settings["smoothing"],
+        smoothing=fit.smoothing,
         is_time_asked=is_time_asked,
     )
-    found = select_model(
-        files,
-        input_column=columns[0],
-        output_column=columns[1],
-        models=named_models(model),
-        given=given,
-        console=console,
-        skip=skip,
-        train=comparing.train,
-        time_column=time_column,
-        reading=reading,
-    )
+    found = select_model(data, named_models(model), given, fit, console)
     _print_table(found)
-    if time_column is not None and not is_time_asked:
-        _print_line(_on_found_times(found, time_column))
+    if data.time is not None and not is_time_asked:
+        _print_line(_on_found_times(found, data.time.name))
     if comparing.table_out is not None:
         found.save(comparing.table_out)
         print_plain(console, f"table: {comparing.table_out}")
@@ -206,34 +187,42 @@ def _print_table(found: SelectedModel) -> None:
         _print_line("with time: no lag, resonance, delay, creep or drift behind the best operators is worth it")
 
 
-def find_common_times(
-    files: Sequence[Path], tests: Sequence[Path], columns: tuple[str, str], model: str, reading: ReadingOptions
-) -> str | None:
-    """Return the column of times that nobody named, where a model with time may use it.
+def read_measured(
+    files: Sequence[Path], names: ColumnNames, model: str, comparing: Comparing, reading: ReadingOptions
+) -> tuple[Dataset, Dataset | None]:
+    """Read the measurements, and the file for tests if there is one, before anything is fitted.
 
-    None of several files, as times are those of one record, and if it is one of the model's own or missing from a
-    file for tests. What is in the way of comparing models with time is printed.
+    Where nobody named a column of times and a model with time may use it, it is looked for. Not in several files, as
+    times are those of one record. What is in the way of comparing models with time is printed.
     """
-    from bench.analysis import find_times, named_times
+    from bench.analysis import FEWEST_ROWS, NO_TIMES, read_dataset, time_names
     from bench.base import DataError
     from bench.models import timed_models
 
-    if len(files) > 1 or not (is_comparison(model) or model in timed_models()):
-        return None
-    if not is_comparison(model):
-        return named_times(files[0], reading)
-    try:
-        name = find_times(files[0], reading)
-    except DataError as error:
-        print_plain(console, f"{error}: time is left out")
-        return None
-    if name in columns:
-        return None
-    for test in tests:
-        if name is not None and named_times(test, reading, name) != name:
-            print_plain(console, f"{test.name} has no column {name}: time is left out")
-            return None
-    return name
+    several = is_comparison(model)
+    is_sought = names.time is None and len(files) == 1 and (several or model in timed_models())
+    names = replace(
+        names, time=None if names.time == NO_TIMES else names.time, times=time_names(files[0]) if is_sought else ()
+    )
+    data = read_dataset(files, names, reading, at_least=FEWEST_ROWS)
+    if is_sought and several and data.time is not None:
+        try:
+            is_other = data.time.name not in (names.input, names.output) and data.times is not None
+        except DataError as error:
+            print_plain(console, f"{error}: time is left out")
+            is_other = False
+        data = data if is_other else data.without_time()
+    if not comparing.test_files:
+        return data, None
+    time = None if data.time is None else data.time.name
+    wanted = replace(names, weights=None, time=time, times=())
+    if is_sought and several and time is not None:
+        wanted = replace(wanted, time=None, times=(time,))
+    test = read_dataset(comparing.test_files, wanted, reading, at_least=FEWEST_ROWS)
+    if test.time is None and time is not None:
+        print_plain(console, f"{test.name} has no column {time}: time is left out")
+        data = data.without_time()
+    return data, test
 
 
 def _on_found_times(found: SelectedModel, name: str) -> str:
@@ -270,26 +259,13 @@ def _describe(one: Candidate) -> str:
     return ", ".join(part for part in parts if part and part != "none")
 
 
-def check_test(path: Path, columns: tuple[str, str], time_column: str | None, reading: ReadingOptions) -> None:
-    """Check that a file for tests can be read, before anything is fitted.
-
-    Raises DataError if it cannot.
-    """
-    from bench.analysis import FEWEST_ROWS, read_files
-
-    names = (*columns, *([time_column] if time_column else ()))
-    read_files([path], names, at_least=FEWEST_ROWS, options=reading)
-
-
-def print_test(
-    found: IdentifiedFile, comparing: Comparing, columns: tuple[str, str], reading: ReadingOptions
-) -> TestedModel | None:
-    """Print the errors of a model on the test rows, if there are any, and return them."""
-    from bench.analysis import evaluate_on_test
+def print_test(found: IdentifiedFile, comparing: Comparing, test: Dataset | None) -> TestedModel | None:
+    """Print the errors of a model on the test rows or file, if there are any, and return them."""
+    from bench.analysis import evaluate_on, evaluate_on_rows
 
     if comparing.test is None:
         return None
-    tested = evaluate_on_test(found, comparing.test, columns, reading)
+    tested = evaluate_on_rows(found, comparing.test) if test is None else evaluate_on(found, test)
     unit = found.file.response.output_unit
     raw, rezeroed = tested.comparison.raw, tested.comparison.rezeroed
     skipped = f", first {tested.skip} rows left out" if tested.skip else ""

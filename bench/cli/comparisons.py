@@ -11,9 +11,9 @@ from rich.text import Text
 
 from bench.analysis import ReadingOptions
 from bench.base import ConfigurationError, print_plain, show_table
-from bench.cli.band_options import BandsOption, RecalibrateOption, RecalibrateRowsOption, print_examined
+from bench.cli.band_options import BandsOption, Recalibrating, print_examined
 from bench.cli.command_support import JsonOption, check_outputs, console, show_compilation, warn, write_json
-from bench.cli.data_options import layout_options, print_assumptions
+from bench.cli.data_options import ReadingGroup, offer_groups, print_assumptions
 from bench.cli.model_commands import InitialOption
 from bench.cli.patience import show_patience
 from bench.cli.written import print_figures, write_rows
@@ -25,7 +25,7 @@ app = typer.Typer()
 
 
 @app.command("compare")
-@layout_options
+@offer_groups
 @show_compilation()
 def compare_(
     compared: Annotated[list[Path], typer.Argument(metavar="A B", help="Model files with --data; or two runs.")],
@@ -57,8 +57,8 @@ def compare_(
     ] = None,
     initial: InitialOption = None,
     bands: BandsOption = False,
-    recalibrate: RecalibrateOption = None,
-    recalibrate_rows: RecalibrateRowsOption = None,
+    *,
+    recalibrating: Recalibrating,
     out: Annotated[
         Path | None,
         typer.Option(metavar="FILE.csv", help="For models: file for input, measured output, and by model the rest."),
@@ -68,8 +68,7 @@ def compare_(
         Path | None, typer.Option(metavar="FILE.html", help="For two runs: page of the comparison, in one file.")
     ] = None,
     json_file: JsonOption = None,
-    *,
-    reading: ReadingOptions,
+    reading: ReadingGroup,
 ) -> None:
     """Compare models on measurements that they may not have seen; or, without `--data`, two runs with each other.
 
@@ -82,10 +81,9 @@ def compare_(
     """
     if data is None:
         of_models = (
-            input_column, output_column, time_column, skip, initial, bands, recalibrate, recalibrate_rows, out,
-            figures,
+            input_column, output_column, time_column, skip, initial, bands, out, figures,
         )  # fmt: skip
-        if any(of_models) or reading != ReadingOptions():
+        if any(of_models) or reading != ReadingOptions() or recalibrating != Recalibrating():
             raise ConfigurationError(
                 "--input, --output, --time, --skip, --initial, --bands, --recalibrate, --out, --figures and how a "
                 "file is read are for models, with --data FILE"
@@ -95,23 +93,16 @@ def compare_(
         return
     if html is not None:
         raise ConfigurationError("--html is for two runs, without --data; --figures draws models")
-    from bench.analysis import Session, compare_models
+    from bench.analysis import ColumnNames, compare_models, load_models, read_for
 
-    session = Session.parse(recalibrate, recalibrate_rows)
     check_outputs(out=out, figures=figures, json_file=json_file, read=(data, *compared))
+    session = recalibrating.session()
     with show_patience(f"reading {data.name}"):
-        result = compare_models(
-            compared,
-            data,
-            input_column,
-            output_column,
-            skip=skip,
-            initial=initial,
-            time_column=time_column,
-            session=session,
-            reading=reading,
-        )
-    print_assumptions(data.name, result.assumptions)
+        models = load_models(compared)
+        names = ColumnNames(input_column or "", output_column or "", time_column)
+        measured = read_for([*models.values()], data, names, reading)
+        result = compare_models(models, measured, skip=skip, initial=initial, session=session)
+    print_assumptions(data.name, measured.assumptions)
     for warning in result.warnings:
         warn(warning)
     if result.skip:

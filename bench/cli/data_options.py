@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Callable
+from dataclasses import is_dataclass
 from typing import Annotated, Any
 
 import typer
@@ -36,37 +37,40 @@ def _layout(
     return ReadingOptions(delimiter, decimal, encoding, skip_lines, table)
 
 
-def offer_options(source: Callable[..., Any], name: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Return a decorator that offers a command's users the parameters of a function in place of a parameter.
+ReadingGroup = Annotated[ReadingOptions, _layout]
+"""The options of the layout of a file."""
 
-    The command gets what the function returns for them.
 
-    Parameters
-    ----------
-    source : callable
-        Its signature is that of the options.
-    name : str
-        The parameter of the command that they replace.
+def offer_groups(command: Callable[..., None]) -> Callable[..., None]:
+    """Offer a command's users, in place of each parameter that is a group of options, the options of the group.
+
+    A group is a dataclass whose fields are annotated as options, or is annotated with a function whose parameters
+    are, and which returns the value of the group.
     """
+    own = inspect.signature(command, eval_str=True)
+    groups: dict[str, tuple[Callable[..., Any], list[str]]] = {}
+    offered: list[inspect.Parameter] = []
+    for name, parameter in own.parameters.items():
+        source: Any = (*getattr(parameter.annotation, "__metadata__", ()), parameter.annotation)[0]
+        is_group = inspect.isfunction(source) or is_dataclass(source)
+        if not is_group:
+            offered.append(parameter)
+            continue
+        options = inspect.signature(source, eval_str=True).parameters
+        groups[name] = source, list(options)
+        offered += options.values()
 
-    def decorate(command: Callable[..., None]) -> Callable[..., None]:
-        own, added = inspect.signature(command, eval_str=True), inspect.signature(source, eval_str=True).parameters
-        kept = [parameter for key, parameter in own.parameters.items() if key != name]
+    @functools.wraps(command)
+    def grouped(**arguments: Any) -> None:  # noqa: ANN401 - the command's own
+        made = {
+            name: make(**{option: arguments.pop(option) for option in options})
+            for name, (make, options) in groups.items()
+        }
+        command(**arguments, **made)
 
-        @functools.wraps(command)
-        def offered(**arguments: Any) -> None:  # noqa: ANN401 - the command's own
-            made = source(**{key: arguments.pop(key) for key in added})
-            command(**arguments, **{name: made})
-
-        keywords = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in (*kept, *added.values())]
-        offered.__signature__ = own.replace(parameters=keywords)  # type: ignore[attr-defined]
-        return offered
-
-    return decorate
-
-
-layout_options = offer_options(_layout, "reading")
-"""Offer a command's users the options of the layout of a file, in place of its parameter `reading`."""
+    keywords = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in offered]
+    grouped.__signature__ = own.replace(parameters=keywords)  # type: ignore[attr-defined]
+    return grouped
 
 
 def print_assumptions(name: str, assumptions: str) -> None:

@@ -11,7 +11,7 @@ from rich.table import Table
 from bench.analysis import ReadingOptions
 from bench.base import ConfigurationError, show_table
 from bench.cli.command_support import JsonOption, check_outputs, console, print_rows, show_compilation, write_json
-from bench.cli.data_options import layout_options
+from bench.cli.data_options import ReadingGroup, offer_groups
 from bench.cli.patience import show_patience
 
 if TYPE_CHECKING:
@@ -21,7 +21,7 @@ app = typer.Typer()
 
 
 @app.command()
-@layout_options
+@offer_groups
 @show_compilation()
 def design(
     rig: Annotated[
@@ -63,7 +63,7 @@ def design(
     ] = None,
     json_file: JsonOption = None,
     *,
-    reading: ReadingOptions,
+    reading: ReadingGroup,
 ) -> None:
     """Compare excitation sequences: what each tells about a plane, and the laboratory time that it takes.
 
@@ -144,7 +144,7 @@ def _continue(
     dwell: float,
     out: Path | None,
     json_file: Path | None,
-    reading: ReadingOptions,
+    reading: ReadingGroup,
 ) -> None:
     from bench.analysis import continue_file, write_sequence
     from bench.identification import load_model

@@ -7,16 +7,15 @@ from typing import Annotated
 
 import typer
 
-from bench.analysis import ReadingOptions
 from bench.base import print_plain
 from bench.cli.command_support import JsonOption, check_outputs, console, write_json
-from bench.cli.data_options import layout_options, print_assumptions
+from bench.cli.data_options import ReadingGroup, offer_groups, print_assumptions
 
 app = typer.Typer()
 
 
 @app.command("import")
-@layout_options
+@offer_groups
 def import_(
     file: Annotated[
         Path, typer.Argument(metavar="FILE", help="Table of measurements (text, .gz, .mat, .xlsx, .parquet).")
@@ -36,7 +35,7 @@ def import_(
     ),
     json_file: JsonOption = None,
     *,
-    reading: ReadingOptions,
+    reading: ReadingGroup,
 ) -> None:
     """Make a run of a file of measurements of another program: each row becomes a reading.
 

@@ -2,23 +2,22 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from bench.analysis import ReadingOptions
 from bench.base import ConfigurationError, print_plain
-from bench.cli.band_options import BandOption, RecalibrateOption, RecalibrateRowsOption, print_band, print_examined
+from bench.cli.band_options import BandOption, Recalibrating, print_band, print_examined
 from bench.cli.choice_options import (
     Comparing,
-    check_test,
+    ComparingGroup,
     choose_model,
-    find_common_times,
     is_comparison,
-    offer_comparing,
     print_test,
+    read_measured,
 )
 from bench.cli.command_support import (
     JsonOption,
@@ -29,10 +28,13 @@ from bench.cli.command_support import (
     warn,
     write_json,
 )
-from bench.cli.data_options import layout_options, print_assumptions
-from bench.cli.model_options import ModelOptions, offer_model_options
+from bench.cli.data_options import ReadingGroup, offer_groups, print_assumptions
+from bench.cli.model_options import ModelGroup, ModelOptions
 from bench.cli.patience import show_patience
 from bench.cli.written import print_figures, write_fit, write_rows
+
+if TYPE_CHECKING:
+    from bench.analysis import FitOptions
 
 app = typer.Typer()
 
@@ -71,10 +73,137 @@ TimeColumn = Annotated[
 ]
 
 
+@dataclass(frozen=True)
+class Fitting:
+    """What `bench identify` fits, and how: its options."""
+
+    input_column: Annotated[str, typer.Option("--input", metavar="COLUMN", help="Input column.")]
+    output_column: Annotated[str, typer.Option("--output", metavar="COLUMN", help="Output column.")]
+    model: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME[,NAME...]|all",
+            help="Model to fit; `bench list` shows the names. Of several, or all, the one that predicts best what is "
+            "left out of its fit.",
+        ),
+    ] = "all"
+    smoothing: Annotated[
+        float | None,
+        typer.Option(
+            min=0.0,
+            help="Weight of the roughness penalty on the density; if not given, 0, and by cross-validation for "
+            "signed densities.",
+        ),
+    ] = None
+    ridge: Annotated[
+        float | None,
+        typer.Option(min=0.0, help="Weight of the penalty on the size of the density; if not given, as --smoothing."),
+    ] = None
+    skip: Annotated[
+        int,
+        typer.Option(min=0, metavar="ROWS", help="First rows, which drive the memory but are left out of the fit."),
+    ] = 0
+    initial: Annotated[
+        str | None,
+        typer.Option(
+            metavar="KIND",
+            help="Memory at the first row: negative or positive saturation, or unknown: skip the rows that it could "
+            "reach, or estimate it.",
+        ),
+    ] = None
+    time_column: Annotated[
+        str | None,
+        typer.Option(
+            "--time",
+            metavar="COLUMN|none",
+            help="Column of times: models with time take part in the comparison. If not given, one named time or t, "
+            "by which a model is chosen only if it errs 1.2 times less; none leaves time out.",
+        ),
+    ] = None
+    static: Annotated[
+        str | None,
+        typer.Option(metavar="NAME", help="Operator within a model with time, such as preisach (hammerstein)."),
+    ] = None
+    dynamics: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LIST",
+            help="What follows the operator: lag, resonance, delay, creep, kelvin-voigt, drift, fading-drift, or "
+            "none; chosen by the data if not given (hammerstein).",
+        ),
+    ] = None
+    orientation: Annotated[
+        str,
+        typer.Option(
+            metavar="KIND",
+            help="Whether the output rises or falls with the input: auto (what fits better), rising, falling.",
+        ),
+    ] = "auto"
+    weights_column: Annotated[
+        str | None,
+        typer.Option("--weights", metavar="COLUMN", help="Column of the weight of each row in the fit, ≥ 0."),
+    ] = None
+    cross_validate: Annotated[
+        bool, typer.Option("--cross-validate", help="Choose the smoothing by cross-validation, and show the table.")
+    ] = False
+    band: BandOption = False
+
+    def settings(self, comparing: Comparing, options: ModelOptions) -> FitOptions:
+        """Return the options of the fit; with several models without those of one."""
+        from bench.analysis import FitOptions
+
+        own: dict[str, Any] = {"initial": self.initial, "orientation": self.orientation}
+        if not is_comparison(self.model):
+            own |= {**options.values, "static": self.static, "dynamics": self.dynamics}
+        return FitOptions(
+            self.smoothing,
+            self.ridge,
+            self.skip,
+            self.cross_validate,
+            options.levels_to_try,
+            comparing.train,
+            self.band,
+            own,
+        )
+
+    def check(self, comparing: Comparing, options: ModelOptions) -> None:
+        """Check that the options go together, before anything is read.
+
+        Raises ConfigurationError otherwise.
+        """
+        if self.input_column == self.output_column:
+            raise ConfigurationError(
+                f"--input and --output are the same column, {self.input_column}; a model needs two"
+            )
+        if not is_comparison(self.model):
+            if comparing.table_out is not None:
+                raise ConfigurationError("--table-out goes with --model all, or several models")
+            return
+        if self.cross_validate or self.weights_column:
+            raise ConfigurationError("--cross-validate and --weights go with one --model NAME")
+        if self.static is not None or self.dynamics is not None:
+            raise ConfigurationError("--static and --dynamics go with --model hammerstein")
+        if self.ridge is not None:
+            raise ConfigurationError("--ridge goes with one --model NAME")
+        if options.levels_to_try:
+            raise ConfigurationError("--levels: give one number, or none, to compare models; or one --model")
+
+
+@dataclass(frozen=True)
+class FitOutputs:
+    """What `bench identify` writes: its options."""
+
+    out: Annotated[Path | None, typer.Option(metavar="model.json", help="Model file to write.")] = None
+    card: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.md", help="Model card to write: data, errors, limits of validity, command line."),
+    ] = None
+    figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for figures.")] = None
+    json_file: JsonOption = None
+
+
 @app.command("identify")
-@offer_comparing
-@offer_model_options
-@layout_options
+@offer_groups
 @show_compilation()
 def identify_(
     context: typer.Context,
@@ -85,87 +214,11 @@ def identify_(
             help="Tables of measurements (text, .gz, .mat, .xlsx, .parquet), or folders of runs; one model of all.",
         ),
     ],
-    input_column: Annotated[str, typer.Option("--input", metavar="COLUMN", help="Input column.")],
-    output_column: Annotated[str, typer.Option("--output", metavar="COLUMN", help="Output column.")],
-    model: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME[,NAME...]|all",
-            help="Model to fit; `bench list` shows the names. Of several, or all, the one that predicts best what is "
-            "left out of its fit.",
-        ),
-    ] = "all",
-    smoothing: Annotated[
-        float | None,
-        typer.Option(
-            min=0.0,
-            help="Weight of the roughness penalty on the density; if not given, 0, and by cross-validation for "
-            "signed densities.",
-        ),
-    ] = None,
-    ridge: Annotated[
-        float | None,
-        typer.Option(min=0.0, help="Weight of the penalty on the size of the density; if not given, as --smoothing."),
-    ] = None,
-    skip: Annotated[
-        int,
-        typer.Option(min=0, metavar="ROWS", help="First rows, which drive the memory but are left out of the fit."),
-    ] = 0,
-    initial: Annotated[
-        str | None,
-        typer.Option(
-            metavar="KIND",
-            help="Memory at the first row: negative or positive saturation, or unknown: skip the rows that it could "
-            "reach, or estimate it.",
-        ),
-    ] = None,
-    time_column: Annotated[
-        str | None,
-        typer.Option(
-            "--time",
-            metavar="COLUMN|none",
-            help="Column of times: models with time take part in the comparison. If not given, one named time or t, "
-            "by which a model is chosen only if it errs 1.2 times less; none leaves time out.",
-        ),
-    ] = None,
-    static: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="Operator within a model with time, such as preisach (hammerstein)."),
-    ] = None,
-    dynamics: Annotated[
-        str | None,
-        typer.Option(
-            metavar="LIST",
-            help="What follows the operator: lag, resonance, delay, creep, kelvin-voigt, drift, fading-drift, or "
-            "none; chosen by the data if not given (hammerstein).",
-        ),
-    ] = None,
-    orientation: Annotated[
-        str,
-        typer.Option(
-            metavar="KIND",
-            help="Whether the output rises or falls with the input: auto (what fits better), rising, falling.",
-        ),
-    ] = "auto",
-    weights_column: Annotated[
-        str | None,
-        typer.Option("--weights", metavar="COLUMN", help="Column of the weight of each row in the fit, ≥ 0."),
-    ] = None,
-    cross_validate: Annotated[
-        bool, typer.Option("--cross-validate", help="Choose the smoothing by cross-validation, and show the table.")
-    ] = False,
-    band: BandOption = False,
-    out: Annotated[Path | None, typer.Option(metavar="model.json", help="Model file to write.")] = None,
-    card: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.md", help="Model card to write: data, errors, limits of validity, command line."),
-    ] = None,
-    figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for figures.")] = None,
-    json_file: JsonOption = None,
-    *,
-    reading: ReadingOptions,
-    options: ModelOptions,
-    comparing: Comparing,
+    fitting: Fitting,
+    outputs: FitOutputs,
+    reading: ReadingGroup,
+    options: ModelGroup,
+    comparing: ComparingGroup,
 ) -> None:
     """Identify a hysteresis model from measurements, and say how good it is.
 
@@ -175,91 +228,55 @@ def identify_(
     its steps are taken: `bench identify RUN --input voltage --output displacement --model preisach --out model.json`;
     `--table telemetry` takes those within its steps, as of a fast loop.
     """
-    from bench.analysis import NO_TIMES, certificate_lines, identify_file
+    from bench.analysis import ColumnNames, certificate_lines, identify_model
 
-    check_outputs(out=out, card=card, figures=figures, json_file=json_file, read=[*files, *comparing.test_files])
-    names = ", ".join(file.name for file in files)
-    columns = (input_column, output_column)
-    if input_column == output_column:
-        raise ConfigurationError(f"--input and --output are the same column, {input_column}; a model needs two")
-    is_time_asked = time_column is not None
-    if not is_time_asked:
-        time_column = find_common_times(files, comparing.test_files, columns, model, reading)
-    elif time_column == NO_TIMES:
-        time_column = None
-    if comparing.test_files:
-        check_test(comparing.test_files[0], columns, time_column, reading)
-    settings: dict[str, Any] = {
-        "smoothing": smoothing,
-        "ridge": ridge,
-        "initial": initial,
-        "orientation": orientation,
-        "skip": skip,
-    }
+    out = outputs.out
+    check_outputs(
+        out=out,
+        card=outputs.card,
+        figures=outputs.figures,
+        json_file=outputs.json_file,
+        read=[*files, *comparing.test_files],
+    )
+    fitting.check(comparing, options)
+    names = ColumnNames(fitting.input_column, fitting.output_column, fitting.time_column, fitting.weights_column)
+    model, fit = fitting.model, fitting.settings(comparing, options)
+    patience = f"reading and fitting {', '.join(file.name for file in files)}"
+    with show_patience(patience):
+        data, test = read_measured(files, names, model, comparing, reading)
     selected = None
     if is_comparison(model):
-        if cross_validate or weights_column:
-            raise ConfigurationError("--cross-validate and --weights go with one --model NAME")
-        if static is not None or dynamics is not None:
-            raise ConfigurationError("--static and --dynamics go with --model hammerstein")
-        selected = choose_model(
-            files,
-            columns,
-            model,
-            options,
-            settings,
-            comparing,
-            skip=skip,
-            time_column=time_column,
-            is_time_asked=is_time_asked,
-            reading=reading,
-        )
-        model, settings = selected.model, settings | selected.settings()
-        time_column = time_column if selected.is_timed else None
-    elif comparing.table_out is not None:
-        raise ConfigurationError("--table-out goes with --model all, or several models")
-    else:
-        settings |= {**options.values, "static": static, "dynamics": dynamics}
-    with show_patience(f"reading and fitting {names}"):
-        found = identify_file(
-            files,
-            input_column=input_column,
-            output_column=output_column,
-            model=model,
-            time_column=time_column,
-            cross_validated=cross_validate,
-            weights_column=weights_column,
-            levels_to_try=options.levels_to_try,
-            train=comparing.train,
-            band=band,
-            reading=reading,
-            **settings,
-        )
+        is_time_asked = fitting.time_column is not None
+        selected = choose_model(data, model, options, fit, comparing, is_time_asked=is_time_asked)
+        model, fit = selected.model, selected.settings(fit)
+        data = data if selected.is_timed else data.without_time()
+    with show_patience(patience):
+        found = identify_model(data, model, fit)
     if selected is not None:
         found = selected.record_in(found)
     # Before anything is printed: a terminal that fails must not cost the fit.
     if out is not None:
         found.file.save(out)
-    print_assumptions(names, found.assumptions)
+    print_assumptions(data.name, data.assumptions)
     if found.trials is not None:
         console.print(f"cross-validation, errors in {found.file.response.output_unit or 'output units'}:")
         console.print(found.trials.table(), highlight=False, markup=False)
     for warning in found.warnings:
         warn(warning)
-    print_rows(f"{model} from {names}", certificate_lines(found))
+    print_rows(f"{model} from {data.name}", certificate_lines(found))
     if found.band is not None:
         print_band(found.band)
     if out is not None:
         print_plain(console, f"model: {out}")
-    tested = print_test(found, comparing, columns, reading)
-    write_fit(found, files[0], context=context, out=out, card=card, figures=figures)
+    tested = print_test(found, comparing, test)
+    write_fit(found, context=context, out=out, card=outputs.card, figures=outputs.figures)
     more = {"test": tested.to_json()} if tested else {}
     more |= {"selection": selected.to_json()} if selected else {}
-    write_json(json_file, found.summary() | more)
+    write_json(outputs.json_file, found.summary() | more)
 
 
 @app.command("predict")
-@layout_options
+@offer_groups
 @show_compilation()
 def predict_(
     model_path: ModelArgument,
@@ -281,12 +298,11 @@ def predict_(
     ] = None,
     initial: InitialOption = None,
     continue_memory: ContinueMemory = False,
-    recalibrate: RecalibrateOption = None,
-    recalibrate_rows: RecalibrateRowsOption = None,
+    *,
+    recalibrating: Recalibrating,
     figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for figures.")] = None,
     json_file: JsonOption = None,
-    *,
-    reading: ReadingOptions,
+    reading: ReadingGroup,
 ) -> None:
     """Apply a model to a column of inputs, row by row.
 
@@ -297,55 +313,36 @@ def predict_(
     those for the session of the measured output.
     """
     from bench.analysis import (
-        Predictions,
-        Quantity,
-        Session,
-        check_unit,
-        choose_times,
+        ColumnNames,
         errors_json,
         examine,
         foreign_drift,
         outside_of_range,
-        read_columns,
-        read_times,
+        predictions_of,
+        read_for,
         starting_state,
-        time_quantity,
     )
     from bench.identification import load_model
 
     check_outputs(out=out, figures=figures, json_file=json_file, read=(model_path, file))
-    session = Session.parse(recalibrate, recalibrate_rows)
+    session = recalibrating.session()
     model = load_model(model_path)
-    time_column = choose_times(model, file, time_column, reading)
     with show_patience(f"reading {file.name}"):
-        names = [name for name in (input_column, output_column, time_column) if name]
-        columns = read_columns(file, names, options=reading)
-    print_assumptions(file.name, columns.assumptions)
-    inputs = columns.values[input_column]
-    check_unit(model.response.input_unit, columns.units[input_column], input_column)
-    if output_column:
-        check_unit(model.response.output_unit, columns.units[output_column], output_column)
+        data = read_for([model], file, ColumnNames(input_column, output_column or None, time_column), reading)
+    print_assumptions(file.name, data.assumptions)
+    data.check_units(model)
+    inputs = data.inputs
     if warning := outside_of_range(model, inputs):
         warn(warning)
     if session is None and (warning := foreign_drift(model, inputs)):
         warn(warning)
     start = starting_state(model, inputs, initial=initial, skip=skip, continue_memory=continue_memory)
-    measured = columns.values[output_column] if output_column else None
-    times = read_times(columns, time_column) if time_column else None
-    found = examine(model, inputs, measured, state=start.state, session=session, skip=start.skip, times=times)
+    found = examine(model, data, state=start.state, session=session, skip=start.skip)
     unit = model.response.output_unit
-    rows = Predictions(
-        Quantity(input_column, columns.units[input_column] or model.response.input_unit, inputs),
-        unit,
-        {model.name: found.predicted},
-        Quantity(output_column, unit, columns.values[output_column]) if output_column else None,
-        time_quantity(times),
-        skip=found.first,
-        bands={model.name: found.band} if found.band else {},
-    )
+    rows = predictions_of(model, data, {model.name: found}, found.first)
     result: dict[str, Any] = {"model": model.name, "samples": int(inputs.size), "out": str(out), **found.to_json()}
     print_examined(found)
-    if output_column:
+    if data.output is not None:
         errors = rows.errors()[model.name]
         result |= {**errors_json(errors), "skipped": found.first}
         print_rows(
@@ -372,7 +369,7 @@ class PolicyOption(Enum):
 
 
 @app.command()
-@layout_options
+@offer_groups
 @show_compilation()
 def invert(
     model_path: ModelArgument,
@@ -390,7 +387,7 @@ def invert(
     continue_memory: ContinueMemory = False,
     json_file: JsonOption = None,
     *,
-    reading: ReadingOptions,
+    reading: ReadingGroup,
 ) -> None:
     """Compute the set-points that bring a model's output to one target after another.
 
@@ -405,12 +402,11 @@ def invert(
     from bench.analysis import (
         NEAR,
         TOO_EARLY,
+        ColumnNames,
         check_unit,
-        choose_times,
         invert_band,
         invert_targets,
-        read_columns,
-        read_times,
+        read_for,
         starting_state,
         write_csv,
     )
@@ -419,19 +415,18 @@ def invert(
 
     check_outputs(out=out, json_file=json_file, read=(model_path, file))
     model = load_model(model_path)
-    time_column = choose_times(model, file, time_column, reading)
     with show_patience(f"reading {file.name}"):
-        columns = read_columns(file, [name for name in (column, time_column) if name], options=reading)
-    print_assumptions(file.name, columns.assumptions)
+        data = read_for([model], file, ColumnNames(column, time=time_column), reading)
+    print_assumptions(file.name, data.assumptions)
     units = (model.response.input_unit, model.response.output_unit)
-    check_unit(units[1], columns.units[column], column)
+    check_unit(units[1], data.input)
     found = invert_targets(
         model,
-        columns.values[column],
+        data.inputs,
         policy=policy.value,
         initial=initial,
         continue_memory=continue_memory,
-        times=read_times(columns, time_column) if time_column else None,
+        times=data.times,
     )
     for warning in found.warnings():
         warn(warning)

@@ -11,7 +11,6 @@ from rich.table import Table
 
 from bench.base import ConfigurationError
 from bench.cli.command_support import console, parse_assignments, print_rows
-from bench.cli.data_options import offer_options
 
 if TYPE_CHECKING:
     from bench.models import ModelSpec
@@ -104,8 +103,8 @@ def _model_options(
     return ModelOptions(values, counts if len(counts) > 1 else ())
 
 
-offer_model_options = offer_options(_model_options, "options")
-"""Offer a command's users the options of a model, in place of its parameter `options`."""
+ModelGroup = Annotated[ModelOptions, _model_options]
+"""The options of a model."""
 
 
 def _level_counts(text: str | None) -> tuple[int, ...]:

@@ -23,13 +23,7 @@ def print_figures(paths: Iterable[Path]) -> None:
 
 
 def write_fit(
-    found: IdentifiedFile,
-    data: Path,
-    *,
-    context: typer.Context,
-    out: Path | None,
-    card: Path | None,
-    figures: Path | None,
+    found: IdentifiedFile, *, context: typer.Context, out: Path | None, card: Path | None, figures: Path | None
 ) -> None:
     """Draw the figures of a fit in a folder and write its model card, if asked for, and print where they are.
 
@@ -45,7 +39,7 @@ def write_fit(
     if card is not None:
         from bench.analysis import write_card
 
-        write_card(card, found, data, command=command_line(context), model=out, figures=drawn)
+        write_card(card, found, found.data.paths[0], command=command_line(context), model=out, figures=drawn)
         print_plain(console, f"card: {card}")
 
 

@@ -15,6 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.analysis import (
+    FEWEST_ROWS,
+    ColumnNames,
+    FitOptions,
     FollowingResult,
     IdentifiedFile,
     Published,
@@ -22,13 +25,14 @@ from bench.analysis import (
     errors_json,
     errors_text,
     following_result,
-    identify_file,
+    identify_model,
     plot_densities,
     plot_errors,
     plot_fit,
     plot_sequence_and_errors,
     plot_tracking,
     predict,
+    read_dataset,
     transients_of,
 )
 from bench.base import DataError
@@ -229,18 +233,12 @@ def carry_out(campaign: RunSeries) -> StudyResult:
     # Loaded while they run.
     truth = true_curvatures(campaign.rig)
     characterized = characterization.result().folder
-    transients = transients_of([characterized], INPUT, OUTPUT)
+    data = read_dataset([characterized], ColumnNames(INPUT, OUTPUT), at_least=FEWEST_ROWS)
+    transients = transients_of(data)
 
     def identified(key: str) -> IdentifiedFile:
         name, options = MODELS[key].model, MODELS[key].options
-        found = identify_file(
-            characterized,
-            input_column=INPUT,
-            output_column=OUTPUT,
-            model=name,
-            transients=transients,
-            **options,
-        )
+        found = identify_model(data, name, FitOptions.of(options), transients)
         found.file.save(Path(model_path(key if MODELS[key].validation is None else name)))
         return found
 

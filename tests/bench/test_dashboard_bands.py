@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
-from bench.analysis import identify_file, invert_band
+import bench as bench_functions
+from bench.analysis import invert_band
 from bench.analysis.band_columns import predict_band
 from bench.dashboard.entries import End, Tick
 from bench.dashboard.writer import Writer
@@ -224,11 +225,11 @@ def test_models_without_a_band_or_of_other_units_have_none(tmp_path, model):
 @pytest.mark.slow
 def test_a_run_under_control_records_it(bench, tmp_path):
     """The model on the dashboard follows the readings as the controller's does."""
-    found = identify_file(
+    found = bench_functions.identify(
         Path(__file__).parents[2] / "recordings" / "reference" / "vo2-damped-oscillation",
-        input_column="tec_temperature",
-        output_column="curvature",
-        model="preisach-nonmonotonic",
+        "preisach-nonmonotonic",
+        input="tec_temperature",
+        output="curvature",
         levels=10,
         plane=(30.0, 70.0),
         band=True,

@@ -16,7 +16,8 @@ RUN = ("--rig", "vo2", "--clock", "virtual")
 @pytest.fixture(scope="module")
 def measured(tmp_path_factory):
     """A file of a play's output, and its model."""
-    from bench.analysis import identify_file, write_csv
+    from bench import identify
+    from bench.analysis import write_csv
     from bench.identification import covering_sequence
     from bench.models import uniform_levels
 
@@ -28,9 +29,7 @@ def measured(tmp_path_factory):
         outputs.append(play)
     outputs = np.array(outputs) + 0.1 * np.random.default_rng(0).standard_normal(inputs.size)
     write_csv(folder / "data.csv", ["tec [°C]", "curvature [1/m]"], [inputs, outputs])
-    found = identify_file(
-        folder / "data.csv", input_column="tec", output_column="curvature", model="preisach", levels=10
-    )
+    found = identify(folder / "data.csv", "preisach", input="tec", output="curvature", levels=10)
     found.file.save(folder / "model.json")
     return folder
 

@@ -6,7 +6,7 @@ from cases import cases
 from hypothesis import example, given, settings, strategies as st
 
 from bench.analysis import ReadingOptions, read_columns, write_csv
-from bench.analysis.tables.data import Columns, check_excitation
+from bench.analysis.tables.data import Quantity, check_excitation
 from bench.analysis.tables.reading.heads import split_unit
 from bench.base import ConfigurationError, DataError
 from bench.devices import Settled, Signal
@@ -241,24 +241,24 @@ class TestRuns:
 
 
 class TestExcitation:
-    def columns(self, values):
-        return Columns("data.csv", {"force": np.array(values, dtype=float)}, {"force": "N"})
+    def check(self, values):
+        return check_excitation("data.csv", Quantity("force", "N", np.array(values, dtype=float)))
 
     def test_one_that_changes_is_good(self):
-        assert check_excitation(self.columns(range(20)), "force") == []
+        assert self.check(range(20)) == []
 
     def test_constant(self):
         with pytest.raises(
             DataError, match=r"data\.csv: column force is 3 in all 20 rows, so nothing can be identified"
         ):
-            check_excitation(self.columns([3.0] * 20), "force")
+            self.check([3.0] * 20)
 
     def test_plateaus_are_odd_though_usable(self):
-        (warning,) = check_excitation(self.columns(np.repeat([1.0, 2.0, 3.0], 10)), "force")
+        (warning,) = self.check(np.repeat([1.0, 2.0, 3.0], 10))
         assert "column force: 27 of 30 rows repeat the row before" in warning
 
     def test_a_few_repetitions_are_no_plateau(self):
-        assert check_excitation(self.columns(np.repeat(np.arange(10), 2)), "force") == []
+        assert self.check(np.repeat(np.arange(10), 2)) == []
 
 
 def test_a_damaged_page_of_a_parquet_file_is_refused(tmp_path):

@@ -11,7 +11,9 @@ import pytest
 from cases import cases
 from matplotlib.figure import Figure
 
+from bench import identify
 from bench.analysis import (
+    ColumnNames,
     Predictions,
     Quantity,
     compare_models,
@@ -19,15 +21,16 @@ from bench.analysis import (
     draw_identification,
     draw_predicted,
     errors_text,
-    identify_file,
+    load_models,
     read_columns,
+    read_dataset,
     write_card,
 )
 from bench.analysis.report.model_card import sha256_of
 from bench.base import DataError
 
 COLUMNS = ("--input", "voltage", "--output", "displacement")
-NAMES = {"input_column": "voltage", "output_column": "displacement"}
+NAMES = {"input": "voltage", "output": "displacement"}
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +55,7 @@ def models(loop):
     paths = {}
     for name, options in (("preisach", {"levels": 8}), ("polynomial", {"degree": 3})):
         paths[name] = loop.parent / f"{name}.json"
-        identify_file(loop, **NAMES, model=name, **options).file.save(paths[name])
+        identify(loop, name, **NAMES, **options).file.save(paths[name])
     return paths
 
 
@@ -142,7 +145,7 @@ class TestRows:
 class TestFigures:
     @pytest.mark.parametrize("model", ["preisach", "polynomial"])
     def test_a_fit_is_drawn_with_the_errors_of_the_text(self, tmp_path, loop, drawn, model):
-        found = identify_file(loop, **NAMES, model=model, skip=60)
+        found = identify(loop, model, **NAMES, skip=60)
         paths = draw_identification(found, tmp_path / "figures")
         assert [path.name for path in paths] == list(drawn)
         errors = found.identification.errors
@@ -159,7 +162,7 @@ class TestFigures:
         assert drawn[f"{model}-errors.png"][1].get_xlabel() == "row"
 
     def test_cells_that_the_samples_of_the_fit_leave_out_are_hatched(self, tmp_path, loop, drawn):
-        found = identify_file(loop, **NAMES, model="preisach", skip=60)
+        found = identify(loop, "preisach", **NAMES, skip=60)
         # The memory has swept them, the fit has not seen it.
         assert found.coverage.fraction == 1.0
         draw_identification(found, tmp_path)
@@ -178,7 +181,9 @@ class TestFigures:
         assert drawn["m-errors.png"][1].lines[0].get_xdata()[-1] == 2.0
 
     def test_compared_models_share_their_figures(self, tmp_path, loop, models, drawn):
-        compared = compare_models(list(models.values()), loop, None, None, skip=30)
+        compared = compare_models(
+            load_models([*models.values()]), read_dataset([loop], ColumnNames(**NAMES)), skip=30
+        )
         draw_comparison(compared, tmp_path)
         _, *residuals = drawn["models-errors.png"]
         assert [texts_of(axes)[0].partition(":")[0] for axes in residuals] == list(models)
@@ -190,7 +195,7 @@ class TestFigures:
             assert shown == pytest.approx(compared.comparisons[name].raw.maximum, rel=6e-3)
 
     def test_a_figure_that_cannot_be_written_is_named(self, tmp_path, loop):
-        found = identify_file(loop, **NAMES, model="polynomial")
+        found = identify(loop, "polynomial", **NAMES)
         (tmp_path / "polynomial-loops.png").mkdir()
         with pytest.raises(DataError, match=r"polynomial-loops\.png cannot be written"):
             draw_identification(found, tmp_path)
@@ -313,7 +318,7 @@ class TestCard:
         assert (tmp_path / "model.json").read_text() == model
 
     def test_a_model_without_memory_has_a_card(self, tmp_path, loop):
-        found = identify_file(loop, **NAMES, model="polynomial")
+        found = identify(loop, "polynomial", **NAMES)
         write_card(tmp_path / "a|b.md", found, loop, command="bench", model=None, figures=[])
         card = read_card(tmp_path / "a|b.md")
         assert "Figures" not in card

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from bench.analysis import read_files
+from bench.analysis import ColumnNames, read_dataset
 from bench.identification import load_model, ramps
 from bench.models import PrandtlIshlinskii
 
@@ -203,8 +203,8 @@ def test_one_model_of_several_files(bench, record, tmp_path):
     )
     assert code == 0, err
     assert json.loads(result.read_text())["rms_percent"] < 3.0
-    files = read_files([record, tmp_path / "second.csv"], ["voltage", "travel"], at_least=10, options=None)
-    assert files.starts[1] == len(record.read_text().splitlines()) - 1
+    data = read_dataset([record, tmp_path / "second.csv"], ColumnNames("voltage", "travel"))
+    assert data.starts[1] == len(record.read_text().splitlines()) - 1
 
 
 @pytest.mark.parametrize(

@@ -5,13 +5,15 @@ import json
 import numpy as np
 import pytest
 
-from bench.analysis import compare_models, identify_file, starting_state
+from bench import identify
+from bench.analysis import ColumnNames, compare_models, load_models, read_dataset, starting_state
 from bench.analysis.tables.starting_state import digest
 from bench.base import ConfigurationError
 from bench.identification import ModelFile, load_model
 from bench.models import PrandtlIshlinskii, Preisach, identifiable_models, uniform_levels
 
 COLUMNS = ("--input", "voltage", "--output", "displacement")
+NAMES = {"input": "voltage", "output": "displacement"}
 LEVELS = uniform_levels(0.0, 10.0, 8)
 
 INITIAL = [{}, *({"initial": kind} for kind in ("negative", "positive", "skip"))]
@@ -71,9 +73,9 @@ def test_a_model_has_the_errors_of_its_identification_on_its_data(tmp_path, data
     """For every registered model and option, to the last digit."""
     path = tmp_path / "model.json"
     for name, options in cases:
-        found = identify_file(data[sign], input_column="voltage", output_column="displacement", model=name, **options)
+        found = identify(data[sign], name, **NAMES, **options)
         found.file.save(path)
-        compared = compare_models([path], data[sign], None, None)
+        compared = compare_models(load_models([path]), read_dataset([data[sign]], ColumnNames(**NAMES)))
         skip = found.identification.skip
         assert compared.skip == skip == load_model(path).provenance["skipped"], (name, options)
         assert compared.comparisons["model"].raw == found.identification.errors, (name, options)
@@ -161,9 +163,7 @@ def test_figures_say_the_errors_of_the_text(monkeypatch, tmp_path, data):
         save(figure, *arguments, **options)
 
     monkeypatch.setattr(Figure, "savefig", noted)
-    found = identify_file(
-        data[1], input_column="voltage", output_column="displacement", model="preisach", initial="skip", levels=6
-    )
+    found = identify(data[1], "preisach", **NAMES, initial="skip", levels=6)
     assert found.identification.skip > 0
     draw_identification(found, tmp_path)
     errors, unit = found.identification.errors, found.file.operator.output_unit

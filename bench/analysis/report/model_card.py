@@ -13,7 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.analysis.model_service import IdentifiedFile, certificate_lines
-from bench.analysis.predictions import Predictions, Quantity
+from bench.analysis.predictions import Predictions
+from bench.analysis.tables.data import Quantity
 from bench.base import DataError
 from bench.identification import Errors
 from bench.models import MemoryCurve, Operator, TimedModel
@@ -136,7 +137,7 @@ def _data(
     return [
         ("source", source),
         ("SHA-256", digest),
-        *([("layout", found.assumptions)] if found.assumptions else []),
+        *([("layout", found.data.assumptions)] if found.data.assumptions else []),
         ("rows", f"{found.inputs.size}{first}"),
         *([] if rows.time is None else [("sampling rate", _sampling(rows.time))]),
         ("input", _extent(rows.input)),

@@ -10,15 +10,16 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table as Columns
 
+from bench.analysis.examined import ComparedModels
 from bench.analysis.export.run_export import make_folder
 from bench.analysis.figures.canvas import check_matplotlib
 from bench.analysis.figures.fits import plot_errors, plot_loops
 from bench.analysis.figures.panels import plot_signals
 from bench.analysis.figures.planes import plot_coverage, plot_densities
-from bench.analysis.model_service import ComparedModels, IdentifiedFile, errors_json
+from bench.analysis.model_service import IdentifiedFile
 from bench.analysis.models_on_run import ModelOnRun, apply_models, models_of
 from bench.analysis.prediction_figures import draw_predictions
-from bench.analysis.predictions import Predictions
+from bench.analysis.predictions import Predictions, errors_json
 from bench.analysis.report.page.render import write_page
 from bench.analysis.report.page.run_page import run_page
 from bench.analysis.report.page.run_parts import watched_pairs

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
+from bench.analysis.tables.reading.heads import SECONDS
 from bench.analysis.tables.reading.matlab import HDF5, read_matlab
 from bench.analysis.tables.reading.options import ReadingOptions
 from bench.analysis.tables.reading.parquet import read_parquet
@@ -17,7 +18,7 @@ from bench.analysis.tables.reading.spreadsheet import read_spreadsheet
 from bench.analysis.tables.reading.table import ReadColumns
 from bench.analysis.tables.reading.text import reading_errors
 from bench.analysis.tables.reading.text_table import read_text
-from bench.base import ConfigurationError, DataError
+from bench.base import ConfigurationError, DataError, header_with_unit
 from bench.record import Record
 
 FEWEST_ROWS = 10
@@ -37,6 +38,35 @@ Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)
+class Quantity:
+    """A column of measurements.
+
+    Attributes
+    ----------
+    name : str
+        As it was asked for; a unit at the end, as in `force [N]`, is that of the quantity.
+    unit : str
+        Empty if unknown.
+    values : ndarray, shape (N,)
+        In that unit.
+    """
+
+    name: str
+    unit: str
+    values: Floats
+
+    @property
+    def header(self) -> str:
+        """The head of the column, with the unit."""
+        return header_with_unit(self.title, self.unit)
+
+    @property
+    def title(self) -> str:
+        """The name without the unit."""
+        return self.name.removesuffix(f"[{self.unit}]").rstrip() if self.unit else self.name
+
+
+@dataclass(frozen=True)
 class Columns:
     """Columns that were asked for.
 
@@ -50,16 +80,28 @@ class Columns:
         Unit by the same names, empty where the source does not say.
     assumptions : str
         What was assumed about the layout of a file, such as `tab-separated, decimal comma`; empty for a run.
+    time : str or None
+        Name of the column of times that was looked for and found.
     """
 
     source: str
     values: Mapping[str, Floats]
     units: Mapping[str, str]
     assumptions: str = ""
+    time: str | None = None
+
+    def quantity(self, name: str) -> Quantity:
+        """Return a column."""
+        return Quantity(name, self.units[name], self.values[name])
 
 
 def read_columns(
-    path: Path, names: Sequence[str], *, at_least: int = 1, options: ReadingOptions | None = None
+    path: Path,
+    names: Sequence[str],
+    *,
+    at_least: int = 1,
+    options: ReadingOptions | None = None,
+    times: Sequence[str] = (),
 ) -> Columns:
     """Read columns of a file of measurements, or the readings of a run.
 
@@ -76,6 +118,8 @@ def read_columns(
         Fewest rows that make sense.
     options : ReadingOptions, optional
         What is known of the layout of a file; the rest is found.
+    times : sequence of str
+        The first of these columns that is there, can be read, and has a unit of time or none, is read too.
 
     Raises
     ------
@@ -87,15 +131,50 @@ def read_columns(
         If an option does not apply.
     """
     options = options or ReadingOptions()
-    if path.is_dir() or path.suffix == ".sqlite":
+    if is_run(path):
         options.check_only(path, "a run", "table")
-        columns = _from_run(path, names, options.table or _STEPS, at_least)
+        columns = _from_run(path, names, options.table or _STEPS, at_least, times)
     else:
-        found = _reader(path)(path, names, options)
-        values = dict(zip(names, found.values, strict=True))
-        columns = Columns(str(path), values, dict(zip(names, found.units, strict=True)), ", ".join(found.notes))
+        try:
+            found = _reader(path)(path, names, options, times)
+        except DataError:
+            if not times:
+                raise
+            # Of a file that can be read without times their column is at fault.
+            read_columns(path, names, at_least=at_least, options=options)
+            return read_columns(path, names, at_least=at_least, options=options, times=times[1:])
+        values = dict(zip(found.names, found.values, strict=True))
+        units = dict(zip(found.names, found.units, strict=True))
+        columns = Columns(str(path), values, units, ", ".join(found.notes), (*found.names[len(names) :], None)[0])
     _check_rows(path, len(next(iter(columns.values.values()))), at_least)
     return columns
+
+
+def seconds_of(source: str, column: Quantity) -> Floats:
+    """Return a column of times, shape (N,), in s.
+
+    Raises DataError if its unit is none of time, or the times do not increase: names the row.
+    """
+    name, unit, values = column.name, column.unit, column.values
+    if unit not in SECONDS:
+        raise DataError(
+            f"{source}: column {name} is in {unit}; expected a time in {', '.join(filter(None, SECONDS))}"
+        )
+    times = values * SECONDS[unit]
+    wrong = np.flatnonzero(np.diff(times) <= 0.0)
+    if wrong.size:
+        row = int(wrong[0]) + 2
+        before, after = values[row - 2 : row]
+        raise DataError(
+            f"{source}: column {name} does not increase in row {row} ({after:g} after {before:g}); "
+            "times must be those of one record, in order"
+        )
+    return times
+
+
+def is_run(path: Path) -> bool:
+    """Return whether a path is that of a run, its folder or its journal, not of a table."""
+    return path.is_dir() or path.suffix == ".sqlite"
 
 
 def _check_rows(path: Path, rows: int, at_least: int, otherwise: str = "") -> None:
@@ -103,7 +182,7 @@ def _check_rows(path: Path, rows: int, at_least: int, otherwise: str = "") -> No
         raise DataError(f"{path}: has {rows} rows of data; at least {at_least} are needed{otherwise}")
 
 
-def check_excitation(columns: Columns, name: str) -> list[str]:
+def check_excitation(source: str, column: Quantity) -> list[str]:
     """Check that a column can serve as the input of an identification; return what is odd about it, though usable.
 
     Raises
@@ -111,27 +190,26 @@ def check_excitation(columns: Columns, name: str) -> list[str]:
     DataError
         If it is constant.
     """
-    check_variation(columns, name)
-    values = columns.values[name]
+    check_variation(source, column)
+    values = column.values
     repeated = int(np.count_nonzero(np.diff(values) == 0.0))
     if repeated > _LONGEST_PLATEAU * values.size:
         return [
-            f"column {name}: {repeated} of {values.size} rows repeat the row before; "
+            f"column {column.name}: {repeated} of {values.size} rows repeat the row before; "
             "plateaus add weight but no information"
         ]
     return []
 
 
-def check_variation(columns: Columns, name: str) -> None:
+def check_variation(source: str, column: Quantity) -> None:
     """Check that a column varies.
 
     Raises DataError if it is constant.
     """
-    values = columns.values[name]
+    values = column.values
     if np.ptp(values) == 0.0:
         raise DataError(
-            f"{columns.source}: column {name} is {values[0]:g} in all {values.size} rows, so "
-            "nothing can be identified"
+            f"{source}: column {column.name} is {values[0]:g} in all {values.size} rows, so nothing can be identified"
         )
 
 
@@ -199,7 +277,7 @@ def _as_text(cell: object) -> object:
     return cell
 
 
-def _reader(path: Path) -> Callable[[Path, Sequence[str], ReadingOptions], ReadColumns]:
+def _reader(path: Path) -> Callable[[Path, Sequence[str], ReadingOptions, Sequence[str]], ReadColumns]:
     """Return what reads a kind of file, by its ending or its first bytes."""
     with reading_errors(path), path.open("rb") as file:
         start = file.read(len(_OLD_SPREADSHEET))
@@ -214,7 +292,7 @@ def _reader(path: Path) -> Callable[[Path, Sequence[str], ReadingOptions], ReadC
     return read_text
 
 
-def _from_run(path: Path, names: Sequence[str], chosen: str, at_least: int) -> Columns:
+def _from_run(path: Path, names: Sequence[str], chosen: str, at_least: int, times: Sequence[str]) -> Columns:
     if chosen not in (_STEPS, _TELEMETRY):
         raise ConfigurationError(f"--table {chosen!r}: {path} is a run; expected {_STEPS} or {_TELEMETRY}")
     with Record(path) as record:
@@ -223,6 +301,9 @@ def _from_run(path: Path, names: Sequence[str], chosen: str, at_least: int) -> C
         for name in names:
             if name not in known:
                 raise DataError(f"{path}: has no column {name!r}; it has: {', '.join(known)}")
+        own = [name for name in times if name in known and record.unit(name) in SECONDS]
+        own = [name for name in own if np.isfinite(table[name]).all()]
+        names = [*names, *own[:1]]
         values = {name: table[name] for name in names}
         units = {name: record.unit(name) for name in names}
         if chosen == _STEPS and len(table) < at_least and (ticks := record.count("telemetry")) >= at_least:
@@ -233,4 +314,4 @@ def _from_run(path: Path, names: Sequence[str], chosen: str, at_least: int) -> C
         if bad.size:
             row = "step" if chosen == _STEPS else "reading"
             raise DataError(f"{path}: {row} {bad[0]}, column {name}: there is no value")
-    return Columns(str(path), values, units)
+    return Columns(str(path), values, units, time=(*own, None)[0])

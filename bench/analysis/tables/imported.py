@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bench.analysis.tables.data import read_columns
+from bench.analysis.tables.data import is_run, read_columns, seconds_of
+from bench.analysis.tables.dataset import time_names
 from bench.analysis.tables.reading.heads import split_unit
 from bench.analysis.tables.reading.options import ReadingOptions
-from bench.analysis.tables.times import find_times, read_times
 from bench.base import ConfigurationError, DataError, redacted_command, wall_time
 from bench.devices import Settled, Signal
 from bench.record import FILE_NAME, Event, Journal, StepRecord, current_user, make_folder, version_of
@@ -83,17 +83,25 @@ def import_file(
     ConfigurationError
         If a column is asked for twice, or two signals have one name.
     """
-    if path.is_dir() or path.suffix == ".sqlite":
+    if is_run(path):
         raise DataError(f"{path} is a run already")
     wanted = [input_column, output_column, *others]
     if len(set(wanted)) < len(wanted):
         raise ConfigurationError(f"columns {', '.join(wanted)}: one of them is asked for twice")
-    time_column = time_column or _times(path, reading)
-    columns = read_columns(path, [*wanted, *([time_column] if time_column else [])], options=reading)
+    asked = [time_column] if time_column else []
+    columns = read_columns(path, [*wanted, *asked], options=reading, times=() if asked else time_names(path))
     rows = len(columns.values[input_column])
-    times = np.arange(1.0, rows + 1.0) if time_column is None else read_times(columns, time_column)
+    found = None
+    if time := time_column or columns.time:
+        try:
+            found = seconds_of(columns.source, columns.quantity(time))
+        except DataError:
+            # Those that nobody asked for may be of several records.
+            if asked:
+                raise
+    times = np.arange(1.0, rows + 1.0) if found is None else found
     signals = [_signal(name, columns.units[name]) for name in wanted]
-    assumptions = [columns.assumptions, *(["rows are 1 s apart"] if time_column is None else [])]
+    assumptions = [columns.assumptions, *(["rows are 1 s apart"] if found is None else [])]
     folder = make_folder(out, f"{_word(path.stem)}-{PROTOCOL}")
     meta = _metadata(path, folder.name, title, signals, dict(zip(("input", "output"), wanted, strict=False)), times)
     # A file that is still there needs no row to be durable before the next.
@@ -109,14 +117,6 @@ def import_file(
     journal.finish(status="completed", reason="", finished=float(elapsed[-1]), safe_state={})
     journal.close()
     return ImportedRun(folder, rows, ", ".join(filter(None, assumptions)))
-
-
-def _times(path: Path, reading: ReadingOptions | None) -> str | None:
-    """Return the column of times, None if there is none of one record."""
-    try:
-        return find_times(path, reading)
-    except DataError:
-        return None
 
 
 def _signal(column: str, unit: str) -> Signal:

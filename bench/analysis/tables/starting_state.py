@@ -1,4 +1,4 @@
-"""Where a model starts from on measurements, and which of their first rows count."""
+"""How a model is applied to measurements: where it starts from, which first rows count, and at which times."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from bench.base import ConfigurationError
 from bench.identification import ModelFile
-from bench.models import TimedModel
+from bench.models import Hammerstein, Operator, TimedModel, TimedSequence
 
 Floats = npt.NDArray[np.float64]
 Start: TypeAlias = Literal["file", "negative", "positive", "skip"]
@@ -90,6 +90,32 @@ def starting_state(
 def left_out(unknown: int, rows: int) -> int:
     """Return how many first rows nobody asked to leave out are: those of unknown memory, unless half of all are."""
     return 0 if unknown > rows // 2 else unknown
+
+
+def foreign_drift(file: ModelFile, inputs: Floats) -> str:
+    """Return a warning if a model's drift is applied to inputs, shape (N,), of another record; else an empty text."""
+    model = file.model
+    own = file.provenance.get("input_sha256")
+    if not isinstance(model, Hammerstein) or not model.drift or own in (None, digest(inputs)):
+        return ""
+    value, unit = model.parameters()["drift"]
+    return (
+        f"{file.name} has a drift of {value:.3g} {unit}, which is that of its own record, from its first row on; "
+        "--recalibrate offset,drift estimates what it is in this one"
+    )
+
+
+def bind_times(file: ModelFile, times: Floats | None) -> Operator[Any] | TimedSequence:
+    """Return what evaluates inputs: the operator, or the model with time at these times, s.
+
+    Raises ConfigurationError if a model with time has none.
+    """
+    model = file.response
+    if not isinstance(model, TimedModel):
+        return model
+    if times is None:
+        raise ConfigurationError(f"model {file.name} needs the time of each row: give --time COLUMN")
+    return model.at(times)
 
 
 def digest(inputs: Floats) -> str:

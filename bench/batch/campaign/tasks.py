@@ -12,7 +12,20 @@ from typing import Any, TypeAlias
 
 from rich.console import Console
 
-from bench.analysis import RunFolder, Session, compare_models, identify_file, results_json, whole_identification
+from bench.analysis import (
+    FEWEST_ROWS,
+    ColumnNames,
+    FitOptions,
+    RunFolder,
+    Session,
+    compare_models,
+    identify_model,
+    load_models,
+    read_dataset,
+    read_for,
+    results_json,
+    whole_identification,
+)
 from bench.base import AbortError, BenchError, DataError, Workers, parse_json, registry, write_json_file
 from bench.batch.campaign.sources import PROGRAMS, PROGRAMS_AND_RIGS, digest
 from bench.batch.campaign.study_tables import FILE_NAME as STUDY_NAME, write_study
@@ -294,7 +307,7 @@ class ModelTask(CampaignTask):
     input, output : str
         Columns; empty for the signals of the slots `drive` and `response`.
     options : mapping
-        Options of the identification, as `bench.analysis.model_service.identify_file` takes them.
+        Options of the identification, as `bench.analysis.FitOptions.of` takes them.
     label : str
         What tells it from the others of its rig and seed.
     """
@@ -336,13 +349,9 @@ class ModelTask(CampaignTask):
             whole.identify({str(run.meta["protocol"]): run.folder for run in runs}).save(made / MODEL_NAME)
             return made, Done(self.identity, "completed")
         (source,) = runs
-        found = identify_file(
-            source.folder,
-            input_column=self.input or source.signal_of("drive"),
-            output_column=self.output or source.signal_of("response"),
-            model=self.model,
-            **identification_options(self.options),
-        )
+        names = ColumnNames(self.input or source.signal_of("drive"), self.output or source.signal_of("response"))
+        data = read_dataset([source.folder], names, at_least=FEWEST_ROWS)
+        found = identify_model(data, self.model, FitOptions.of(identification_options(self.options)))
         found.file.save(made / MODEL_NAME)
         summary, unit = found.summary(), found.file.operator.output_unit or "1"
         units = {"max": unit, "rms": unit, "rms_percent": "%"}
@@ -391,14 +400,10 @@ class ComparisonTask(CampaignTask):
         source = completed_run(campaign, self.source)
         session = Session.parse(self.recalibrate or None, self.recalibrate_rows)
         results: dict[str, tuple[float, str]] = {}
+        names = ColumnNames(self.input or source.signal_of("drive"), self.output or source.signal_of("response"))
         for name, task in self.models.items():
-            found = compare_models(
-                [campaign / task / MODEL_NAME],
-                source.folder,
-                self.input or source.signal_of("drive"),
-                self.output or source.signal_of("response"),
-                session=session,
-            )
+            models = load_models([campaign / task / MODEL_NAME])
+            found = compare_models(models, read_for([*models.values()], source.folder, names), session=session)
             (compared,) = found.comparisons
             errors = found.recalibrated(compared) or found.comparisons[compared].raw
             unit = found.unit or "1"
@@ -460,7 +465,7 @@ def _own_fields(task: RunTask | ComparisonTask) -> dict[str, Any]:
 
 
 def identification_options(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Return options from a file as `identify_file` takes them: ranges are pairs, of several levels one is chosen."""
+    """Return options from a file as `FitOptions.of` takes them: ranges are pairs, of several levels one is chosen."""
     found = {key: tuple(value) if isinstance(value, list) else value for key, value in options.items()}
     if isinstance(levels := found.get("levels"), tuple):
         del found["levels"]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from bench.analysis import errors_json, identify_file
+from bench.analysis import FEWEST_ROWS, ColumnNames, FitOptions, errors_json, identify_model, read_dataset
 from bench.base import Pending
 from bench.batch import ResultTable, RunSeries, Study, StudyResult, reached_targets
 from bench.execution import RunResult
@@ -37,10 +37,9 @@ def carry_out(campaign: RunSeries) -> StudyResult:
     measured = campaign.run("damped-oscillation", {"half_cycles": "24"})
     identification: dict[str, Any] = {}
     runs: dict[str, dict[str, Pending[RunResult]]] = {}
+    data = read_dataset([measured.folder], ColumnNames("coil_current", "strain"), at_least=FEWEST_ROWS)
     for name, options in MODELS.items():
-        model = identify_file(
-            measured.folder, input_column="coil_current", output_column="strain", model=name, **options
-        )
+        model = identify_model(data, name, FitOptions.of(options))
         path = campaign.folder / f"{name}.json"
         model.file.save(path)
         identification[name] = errors_json(model.identification.errors)

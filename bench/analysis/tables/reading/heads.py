@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -17,6 +18,9 @@ _SYMBOL = (
 _FACTOR = rf"{_SYMBOL}(?:\^?[-−]?[1-9]|[²³]|⁻[¹²³])?"
 _UNIT = rf"(?:1|{_FACTOR})(?:\s?[/*·⋅.]\s?\(?{_FACTOR}\)?|\s{_FACTOR})*|1|-"
 _SPELLINGS = {"degC": "°C", "deg_C": "°C", "ºC": "°C", "celsius": "°C", "º": "°", "sec": "s"}
+
+SECONDS = {"": 1.0, "s": 1.0, "ms": 1e-3, "µs": 1e-6, "μs": 1e-6, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
+"""Seconds in each unit that a column of times may have."""
 
 
 class NoColumnError(DataError):
@@ -148,6 +152,18 @@ def find_place(path: Path, heads: Sequence[Head], columns: int, name: str) -> in
         )
     known = ", ".join(head.text for head in heads if head.text)
     raise NoColumnError(f"{path}: has no column {name!r}; it has: {known} (or a number, 1 to {columns})")
+
+
+def with_times(
+    names: Sequence[str], times: Sequence[str], heads: Sequence[Head], find: Callable[[str], int]
+) -> list[str]:
+    """Return names of columns, and the first of `times` that `find` finds, with a unit of time or none."""
+    for name in times:
+        with suppress(DataError):
+            place = find(name)
+            if (heads[place].unit if place < len(heads) else "") in SECONDS:
+                return [*names, name]
+    return list(names)
 
 
 def _spelled(unit: str) -> str:

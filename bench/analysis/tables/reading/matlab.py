@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bench.analysis.tables.reading.heads import find_place, make_heads
+from bench.analysis.tables.reading.heads import find_place, make_heads, with_times
 from bench.analysis.tables.reading.options import ReadingOptions
 from bench.analysis.tables.reading.table import NO_ROW_LEFT_OUT, ReadColumns
 from bench.analysis.tables.reading.text import reading_errors
@@ -20,7 +20,7 @@ HDF5 = b"\x89HDF"
 _HDF5_REMEDY = "is a MATLAB file of version 7.3 (HDF5); save it with save(..., '-v7') or as CSV"
 
 
-def read_matlab(path: Path, names: Sequence[str], options: ReadingOptions) -> ReadColumns:
+def read_matlab(path: Path, names: Sequence[str], options: ReadingOptions, times: Sequence[str] = ()) -> ReadColumns:
     """Read columns of a MATLAB file of version 4, 6 or 7.
 
     Columns are the vectors, the columns of each matrix `A` as `A(:,1)`, and the fields of each structure `S` as
@@ -52,6 +52,7 @@ def read_matlab(path: Path, names: Sequence[str], options: ReadingOptions) -> Re
     found = _choose(path, variables, options.table)
     heads = make_heads(list(found))
     arrays = list(found.values())
+    names = with_times(names, times, heads, lambda name: find_place(path, heads, len(heads), name))
     chosen = [arrays[find_place(path, heads, len(heads), name)] for name in names]
     lengths = {len(column) for column in chosen}
     if len(lengths) > 1:
@@ -68,7 +69,7 @@ def read_matlab(path: Path, names: Sequence[str], options: ReadingOptions) -> Re
             )
     units = [heads[find_place(path, heads, len(heads), name)].unit for name in names]
     notes = ("MATLAB", *((f"table {options.table}",) if options.table else ()))
-    return ReadColumns(chosen, units, notes)
+    return ReadColumns(names, chosen, units, notes)
 
 
 def _choose(path: Path, variables: dict[str, Any], table: str | None) -> dict[str, npt.NDArray[np.float64]]:

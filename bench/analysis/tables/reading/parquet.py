@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.analysis.tables.reading.heads import find_place, make_heads
+from bench.analysis.tables.reading.heads import find_place, make_heads, with_times
 from bench.analysis.tables.reading.moments import since_first
 from bench.analysis.tables.reading.options import ReadingOptions
 from bench.analysis.tables.reading.table import NO_ROW_LEFT_OUT, ReadColumns
@@ -15,7 +15,7 @@ from bench.analysis.tables.reading.text import reading_errors
 from bench.base import DataError, needed_for
 
 
-def read_parquet(path: Path, names: Sequence[str], options: ReadingOptions) -> ReadColumns:
+def read_parquet(path: Path, names: Sequence[str], options: ReadingOptions, times: Sequence[str] = ()) -> ReadColumns:
     """Read columns of a Parquet file.
 
     Raises
@@ -35,6 +35,7 @@ def read_parquet(path: Path, names: Sequence[str], options: ReadingOptions) -> R
         try:
             texts = pq.read_schema(path).names
             heads = make_heads(texts)
+            names = with_times(names, times, heads, lambda name: find_place(path, heads, len(heads), name))
             places = [find_place(path, heads, len(heads), name) for name in names]
             table = pq.ParquetFile(path, page_checksum_verification=True).read(
                 columns=[texts[place] for place in places]
@@ -56,5 +57,5 @@ def read_parquet(path: Path, names: Sequence[str], options: ReadingOptions) -> R
                 "save the file without it, or with a number there"
             )
     values = [1e-6 * column if moment else column for column, moment in zip(values, are_moments, strict=True)]
-    values, units, times = since_first(values, [heads[place].unit for place in places], names, are_moments)
-    return ReadColumns(values, units, ("Parquet", *times))
+    values, units, moments = since_first(values, [heads[place].unit for place in places], names, are_moments)
+    return ReadColumns(names, values, units, ("Parquet", *moments))

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.analysis.tables.reading.heads import find_place
+from bench.analysis.tables.reading.heads import find_place, with_times
 from bench.analysis.tables.reading.layout import SAMPLE_LINES, Header, Row, count_lines, find_header
 from bench.analysis.tables.reading.moments import moment_in, since_first, with_moments
 from bench.analysis.tables.reading.options import ReadingOptions
@@ -18,7 +18,9 @@ from bench.analysis.tables.reading.text import reading_errors
 from bench.base import DataError, needed_for
 
 
-def read_spreadsheet(path: Path, names: Sequence[str], options: ReadingOptions) -> ReadColumns:
+def read_spreadsheet(
+    path: Path, names: Sequence[str], options: ReadingOptions, times: Sequence[str] = ()
+) -> ReadColumns:
     """Read columns of a sheet: the only one, or the one that `options.table` names or numbers.
 
     Raises
@@ -55,6 +57,7 @@ def read_spreadsheet(path: Path, names: Sequence[str], options: ReadingOptions) 
     header = find_header(rows[:SAMPLE_LINES], ".")
     if header is None:
         raise DataError(f"{path}: sheet {title}: has no numbers")
+    names = with_times(names, times, header.heads, lambda name: find_place(path, header.heads, header.columns, name))
     places = [find_place(path, header.heads, header.columns, name) for name in names]
     values: list[list[float]] = [[] for _ in names]
     body, remarks = _without_summary([row for row in rows if row.line > header.start], header, places)
@@ -75,10 +78,10 @@ def read_spreadsheet(path: Path, names: Sequence[str], options: ReadingOptions) 
         *remarks,
     )
     units = [header.heads[place].unit if place < len(header.heads) else "" for place in places]
-    arrays, units, times = since_first(
+    arrays, units, since = since_first(
         [np.array(column) for column in values], units, names, [place in moments for place in places]
     )
-    return ReadColumns(arrays, units, (*notes, *times))
+    return ReadColumns(names, arrays, units, (*notes, *since))
 
 
 def _without_summary(

@@ -24,14 +24,17 @@ class ReadColumns:
 
     Attributes
     ----------
+    names : list of str
+        Those that were asked for, and that of a column of times where one was looked for and found.
     values : list of ndarray
-        In the order in which they were asked for, shape (rows,) each, finite.
+        In the same order, shape (rows,) each, finite.
     units : list of str
         Likewise; empty where the file does not say.
     notes : tuple of str
         What was assumed about the file.
     """
 
+    names: list[str]
     values: list[npt.NDArray[np.float64]]
     units: list[str]
     notes: tuple[str, ...]

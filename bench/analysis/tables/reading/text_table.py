@@ -13,7 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.analysis.tables.reading.formats import check_format
-from bench.analysis.tables.reading.heads import NoColumnError, find_place
+from bench.analysis.tables.reading.heads import NoColumnError, find_place, with_times
 from bench.analysis.tables.reading.layout import (
     D_EXPONENTS,
     Layout,
@@ -46,7 +46,7 @@ class _BreakError(Exception):
     """Lines that may not be of the table."""
 
 
-def read_text(path: Path, names: Sequence[str], options: ReadingOptions) -> ReadColumns:
+def read_text(path: Path, names: Sequence[str], options: ReadingOptions, times: Sequence[str] = ()) -> ReadColumns:
     """Read columns of a text file.
 
     Parameters
@@ -57,6 +57,8 @@ def read_text(path: Path, names: Sequence[str], options: ReadingOptions) -> Read
         Columns by head, head without its unit, or number from 1.
     options : ReadingOptions
         What is known of its layout.
+    times : sequence of str
+        The first of these columns that is there, with a unit of time or none, is read too.
 
     Raises
     ------
@@ -69,15 +71,16 @@ def read_text(path: Path, names: Sequence[str], options: ReadingOptions) -> Read
         raise ConfigurationError(f"--table {options.table!r}: the tables of a text file have numbers, from 1")
     file = open_text(path, options.encoding)
     try:
-        return _read(file, names, options)
+        return _read(file, names, options, times)
     except csv.Error as error:
         raise DataError(f"{path} cannot be read as a table: {error}") from None
 
 
-def _read(file: TextFile, names: Sequence[str], options: ReadingOptions) -> ReadColumns:
+def _read(file: TextFile, names: Sequence[str], options: ReadingOptions, times: Sequence[str]) -> ReadColumns:
     lines = read_sample(file, options.skip_lines)
     check_format(file.path, lines)
     layout = _choose(file, options, lines)
+    names = with_times(names, times, layout.heads, lambda name: _place(file, layout, name))
     places = _find_places(file, names, options, layout, lines)
     body = _Body(file, layout, names, places)
     after: tuple[str, ...] = ()
@@ -105,7 +108,7 @@ def _read(file: TextFile, names: Sequence[str], options: ReadingOptions) -> Read
     )
     units = [layout.heads[place].unit if place < len(layout.heads) else "" for place in places]
     values, units, remarks = since_first(values, units, names, [place in body.moments for place in places])
-    return ReadColumns(values, units, (*notes, *remarks))
+    return ReadColumns(names, values, units, (*notes, *remarks))
 
 
 def _choose(file: TextFile, options: ReadingOptions, lines: Sequence[str]) -> Layout:
@@ -142,11 +145,7 @@ def _find_places(
     places: list[int] = []
     for name in names:
         try:
-            places.append(
-                find_place(file.path, layout.heads, layout.columns, name)
-                if _fits(layout)
-                else _place_by_number(file, layout, name)
-            )
+            places.append(_place(file, layout, name))
         except NoColumnError as error:
             raise missing_column(error, name, file, options, layout, lines) from None
     return places
@@ -291,11 +290,9 @@ class _Body:
         return False
 
 
-def _fits(layout: Layout) -> bool:
-    return bool(layout.heads) or "no header" in layout.notes
-
-
-def _place_by_number(file: TextFile, layout: Layout, name: str) -> int:
+def _place(file: TextFile, layout: Layout, name: str) -> int:
+    if layout.heads or "no header" in layout.notes:
+        return find_place(file.path, layout.heads, layout.columns, name)
     if name.isdecimal() and 1 <= int(name) <= layout.columns:
         return int(name) - 1
     raise NoColumnError(

@@ -1,0 +1,290 @@
+"""The measurements of a command: read and checked once, and handed through from their files to the report."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from bench.analysis.tables.data import (
+    FEWEST_ROWS,
+    Quantity,
+    check_excitation,
+    is_run,
+    read_columns,
+    seconds_of,
+)
+from bench.analysis.tables.reading.options import ReadingOptions
+from bench.base import ConfigurationError, DataError
+from bench.identification import ModelFile
+from bench.models import PolynomialPlays, TimedModel
+
+Floats = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
+
+_ROWS = re.compile(r"(\d*):(\d*)")
+
+NO_TIMES = "none"
+"""Stands for a column of times where a file's own is to be left out."""
+
+# Heads that name a column of times.
+_TIMES = ("time", "t", "Time", "time_s", "t_s", "Time_s", "timestamp", "Timestamp", "datetime")
+
+
+@dataclass(frozen=True)
+class ColumnNames:
+    """Which columns are read, by name or by number from 1.
+
+    Attributes
+    ----------
+    input : str
+        The input of a model, or the targets of its inverse.
+    output, time, weights : str or None
+        The measured output, when each row was taken, and the weight of each row in a fit, >= 0.
+    times : tuple of str
+        Columns of times of which the first that there is serves, where `time` is not given.
+    """
+
+    input: str
+    output: str | None = None
+    time: str | None = None
+    weights: str | None = None
+    times: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """Measurements from one file or several, one after another.
+
+    Attributes
+    ----------
+    paths : tuple of Path
+        The files, or folders of runs.
+    source : str
+        The same for messages.
+    input : Quantity
+        Inputs, shape (N,), finite as the others.
+    output, time : Quantity or None
+        Measured outputs and times, shape (N,) each, as far as they were read.
+    weights : ndarray, shape (N,), or None
+        Weight of each row in a fit; 1 if None.
+    starts : tuple of int
+        First row of each file.
+    assumptions : str
+        What was assumed about the layout of the files; empty for a run.
+    """
+
+    paths: tuple[Path, ...]
+    source: str
+    input: Quantity
+    output: Quantity | None = None
+    time: Quantity | None = None
+    weights: Floats | None = None
+    starts: tuple[int, ...] = (0,)
+    assumptions: str = ""
+
+    @property
+    def name(self) -> str:
+        """The names of the files."""
+        return ", ".join(path.name for path in self.paths)
+
+    @property
+    def inputs(self) -> Floats:
+        """The inputs, shape (N,)."""
+        return self.input.values
+
+    @property
+    def outputs(self) -> Floats:
+        """The measured outputs, shape (N,). They must have been read."""
+        assert self.output is not None
+        return self.output.values
+
+    @cached_property
+    def times(self) -> Floats | None:
+        """When each row was taken, shape (N,) in s; None if that was not read.
+
+        Raises DataError if the unit is none of time, or the times do not increase: names the row.
+        """
+        return None if self.time is None else seconds_of(self.source, self.time)
+
+    def without_time(self) -> Dataset:
+        """Return the same rows without their times."""
+        return replace(self, time=None)
+
+    def check_units(self, model: ModelFile) -> None:
+        """Check that input and output are in the units of a model; an unknown unit passes.
+
+        Raises DataError if both are known and differ.
+        """
+        check_unit(model.response.input_unit, self.input)
+        if self.output is not None:
+            check_unit(model.response.output_unit, self.output)
+
+    def fitted_rows(self, rows: slice | None = None, skip: int = 0) -> tuple[Flags, tuple[str, ...]]:
+        """Return which rows are fitted, shape (N,), and what is odd about the measurements, though usable.
+
+        Each further file starts with a memory of its own, which nobody knows: its rows are fitted from where its
+        inputs have overwritten what they do at all.
+
+        Parameters
+        ----------
+        rows : slice or None
+            Rows that may be fitted; all if None.
+        skip : int
+            Number of first rows that drive the memory but do not count.
+
+        Raises
+        ------
+        DataError
+            If the input is constant, or too few rows are left.
+        ConfigurationError
+            If no row may be fitted, or there are not so many rows.
+        """
+        inputs = self.inputs
+        if skip < 0:
+            raise ConfigurationError(f"--skip {skip}: expected a number of rows ≥ 0")
+        if inputs.size - skip < FEWEST_ROWS:
+            left = max(inputs.size - skip, 0)
+            raise DataError(f"{self.source}: --skip {skip} leaves {left} of {inputs.size} rows; too few")
+        check_rows("--train", rows, inputs.size)
+        chosen = np.zeros(inputs.size, dtype=bool)
+        chosen[slice(None) if rows is None else rows] = True
+        warnings = []
+        for start, stop in pairwise((*self.starts[1:], inputs.size)):
+            until = overwritten_from(inputs[start:stop])
+            if until > (stop - start) // 2:
+                warnings.append(
+                    f"the file of rows {start} to {stop - 1} overwrites its unknown memory only at row "
+                    f"{start + until}: its start is taken as if it followed the end of the file before"
+                )
+            else:
+                chosen[start : start + until] = False
+        if not chosen.any():
+            raise ConfigurationError(f"--train leaves none of {inputs.size} rows")
+        return chosen, (*check_excitation(self.source, self.input), *warnings)
+
+
+def read_dataset(
+    paths: Sequence[Path],
+    names: ColumnNames,
+    reading: ReadingOptions | None = None,
+    *,
+    at_least: int = 1,
+) -> Dataset:
+    """Read measurements from files that `read_columns` reads, each of them once; errors as there.
+
+    Raises DataError too if the unit of a column differs from file to file, ConfigurationError if several files have
+    times.
+    """
+    if names.time is not None and len(paths) > 1:
+        raise ConfigurationError(f"--time: expected one file, as times are those of one record; got {len(paths)}")
+    wanted = [name for name in (names.input, names.output, names.weights, names.time) if name]
+    found = [
+        read_columns(path, wanted, at_least=at_least, options=reading, times=() if names.time else names.times)
+        for path in paths
+    ]
+    first = found[0]
+    for path, each in zip(paths, found, strict=True):
+        for name in wanted:
+            if each.units[name] != first.units[name]:
+                raise DataError(
+                    f"{path}: column {name} is in {each.units[name] or 'no unit'}; in {paths[0]} it is in "
+                    f"{first.units[name] or 'no unit'}"
+                )
+
+    def joined(name: str | None) -> Quantity | None:
+        if name is None:
+            return None
+        values = [each.values[name] for each in found]
+        return Quantity(name, first.units[name], values[0] if len(values) == 1 else np.concatenate(values))
+
+    driven, weights = joined(names.input), joined(names.weights)
+    assert driven is not None
+    starts = np.cumsum([0, *(each.values[names.input].size for each in found[:-1])])
+    notes = [f"{path.name}: {each.assumptions}" for path, each in zip(paths, found, strict=True) if each.assumptions]
+    several = len(paths) > 1
+    return Dataset(
+        tuple(paths),
+        ", ".join(path.name for path in paths) if several else first.source,
+        driven,
+        joined(names.output),
+        joined(names.time or first.time),
+        None if weights is None else weights.values,
+        tuple(starts.tolist()),
+        "; ".join(notes) if several else first.assumptions,
+    )
+
+
+def read_for(
+    models: Sequence[ModelFile], path: Path, names: ColumnNames, reading: ReadingOptions | None = None
+) -> Dataset:
+    """Read measurements for models; errors as `read_dataset`.
+
+    An empty name of input or output is that of the data of the first model. Times that nobody named are looked for if
+    a model takes them.
+    """
+    own = models[0].provenance
+    output = str(own.get("output", "")) if names.output == "" else names.output
+    timed = next((file for file in models if isinstance(file.model, TimedModel)), None)
+    times = () if timed is None else time_names(path, timed)
+    names = replace(names, input=names.input or str(own.get("input", "")), output=output, times=times)
+    return read_dataset([path], names, reading)
+
+
+def time_names(path: Path, model: ModelFile | None = None) -> tuple[str, ...]:
+    """Return the columns that may hold the times of a file; that of the data of a model first.
+
+    Of a run no other is: its steps are quasi-static.
+    """
+    own = None if model is None else model.provenance.get("time")
+    return (*([str(own)] if own else []), *(() if is_run(path) else _TIMES))
+
+
+def check_unit(expected: str, column: Quantity) -> None:
+    """Check that a column's unit is that of the model; an unknown unit passes.
+
+    Raises DataError if both are known and differ.
+    """
+    if column.unit and expected and column.unit != expected:
+        raise DataError(f"column {column.name} is in {column.unit}; the model has it in {expected}")
+
+
+def is_rows(text: str) -> bool:
+    """Return whether a text has the form of a range of rows, `START:STOP`."""
+    return _ROWS.fullmatch(text) is not None
+
+
+def parse_rows(option: str, text: str) -> slice:
+    """Return the rows of `START:STOP`, counted from 0 without STOP; either may be left out.
+
+    Raises ConfigurationError if it is none.
+    """
+    match = _ROWS.fullmatch(text)
+    if match is None:
+        raise ConfigurationError(f"{option} {text}: expected rows as START:STOP, such as 0:3000 or 3000:")
+    start, stop = (int(part) if part else None for part in match.groups())
+    return slice(start, stop)
+
+
+def check_rows(option: str, rows: slice | None, count: int) -> None:
+    """Check that rows that are asked for are there.
+
+    Raises ConfigurationError if there are fewer.
+    """
+    if rows is not None and max(rows.stop or 0, rows.start or 0) > count:
+        text = f"{'' if rows.start is None else rows.start}:{'' if rows.stop is None else rows.stop}"
+        raise ConfigurationError(f"{option} {text} goes beyond the last row: there are {count}")
+
+
+def overwritten_from(inputs: Floats) -> int:
+    """Return the first row from which inputs, shape (N,), have overwritten all memory that they ever do."""
+    low, high = float(inputs.min()), float(inputs.max())
+    if low == high:
+        return 0
+    return PolynomialPlays(np.zeros(1), np.ones(1), np.zeros(1), (low, high)).unknown_until(inputs)
