@@ -71,7 +71,6 @@ from .prediction_figures import (
 )
 from .predictions import (
     Predictions as Predictions,
-    errors_json as errors_json,
 )
 from .report.model_card import (
     write_card as write_card,

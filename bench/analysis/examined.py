@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.analysis.band_columns import BandedPrediction, predict_band
-from bench.analysis.predictions import Predictions, check_finite, errors_json, time_quantity
+from bench.analysis.predictions import Predictions, check_finite, time_quantity
 from bench.analysis.session_recalibration import Session
 from bench.analysis.tables.dataset import Dataset
 from bench.analysis.tables.starting_state import StartingState, bind_times, foreign_drift, starting_state
@@ -218,12 +218,10 @@ class ComparedModels:
         """Return the comparison for programs: `raw` and `rezeroed` errors, `offset` and `skipped` of each model."""
         return {
             name: {
-                "raw": errors_json(entry.raw),
-                "rezeroed": errors_json(entry.rezeroed),
-                "offset": entry.offset,
+                **entry.to_json(),
                 "skipped": self.skip,
                 **(self.examined[name].to_json() if name in self.examined else {}),
-                **({"recalibrated": errors_json(mended)} if (mended := self.recalibrated(name)) else {}),
+                **({"recalibrated": mended.to_json()} if (mended := self.recalibrated(name)) else {}),
             }
             for name, entry in self.comparisons.items()
         }

@@ -12,7 +12,6 @@ import numpy as np
 from rich.console import Console
 
 from bench.analysis.model_service import FitOptions, IdentifiedFile
-from bench.analysis.predictions import errors_json
 from bench.analysis.tables.data import FEWEST_ROWS
 from bench.analysis.tables.dataset import Dataset, check_rows, overwritten_from, parse_rows
 from bench.analysis.tables.starting_state import bind_times, left_out
@@ -255,14 +254,7 @@ class TestedModel:
 
     def to_json(self) -> dict[str, Any]:
         """Return the errors for programs."""
-        found = self.comparison
-        return {
-            "source": self.source,
-            "skipped": self.skip,
-            "raw": errors_json(found.raw),
-            "rezeroed": errors_json(found.rezeroed),
-            "offset": found.offset,
-        }
+        return {"source": self.source, "skipped": self.skip, **self.comparison.to_json()}
 
 
 def evaluate_on_rows(found: IdentifiedFile, test: str) -> TestedModel:

@@ -12,10 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.analysis.band_columns import BandedPrediction, calibrate, predict_band
-from bench.analysis.predictions import Predictions, errors_json, time_quantity
+from bench.analysis.predictions import Predictions, time_quantity
 from bench.analysis.tables.data import Quantity, check_variation, is_run
-from bench.analysis.tables.dataset import Dataset
-from bench.analysis.tables.starting_state import bind_times, digest, starting_state
+from bench.analysis.tables.dataset import Dataset, digest
 from bench.analysis.transients.transient_dynamics import (
     Transients,
     identify_dynamics,
@@ -190,9 +189,9 @@ class IdentifiedFile:
         return {
             "model": found.model_name,
             "samples": int(self.inputs.size - found.skip),
-            **({} if self.fitted is None else {"fitted": self.fitted, "all_rows": errors_json(self.all_errors)}),
+            **({} if self.fitted is None else {"fitted": self.fitted, "all_rows": self.all_errors.to_json()}),
             "levels": densities[0].levels.size - 1 if (densities := operator.densities()) else None,
-            **errors_json(found.errors),
+            **found.errors.to_json(),
             "kkt": certificate.kkt_residual,
             "converged": certificate.converged,
             "passive": certificate.passive,
@@ -332,7 +331,7 @@ def identify_model(
         "skipped": found.skip,
         "initial": own.get("initial"),
         "input_sha256": digest(inputs),
-        **errors_json(found.errors),
+        **found.errors.to_json(),
         "kkt": found.certificate.kkt_residual,
         "smoothing": penalties.smoothing,
         "ridge": penalties.ridge,
@@ -444,36 +443,6 @@ def _shape(operator: Operator[Any] | TimedModel[Any]) -> dict[str, float]:
 def _largest(uncertainties: Floats) -> float | None:
     known = uncertainties[np.isfinite(uncertainties)]
     return float(known.max()) if known.size else None
-
-
-def predict(
-    model: ModelFile,
-    inputs: Floats,
-    *,
-    initial: str | None = None,
-    continue_memory: bool = False,
-    times: Floats | None = None,
-) -> Floats:
-    """Return the outputs of a model for a sequence of inputs, shape (N,), in its unit.
-
-    Parameters
-    ----------
-    model : ModelFile
-        The model.
-    inputs : ndarray, shape (N,)
-        Inputs in the unit of the model, finite.
-    initial, continue_memory
-        The state before the first input, as for `starting_state`.
-    times : ndarray, shape (N,), or None
-        s, for a model with time.
-
-    Raises
-    ------
-    ConfigurationError
-        If a model with time has none.
-    """
-    start = starting_state(model, initial=initial, continue_memory=continue_memory)
-    return bind_times(model, times).evaluate(inputs, start.state)
 
 
 def certificate_lines(identified: IdentifiedFile) -> Sequence[tuple[str, str]]:

@@ -104,18 +104,6 @@ class Predictions:
         return columns
 
 
-def errors_json(errors: Errors) -> dict[str, float]:
-    """Return error measures for programs: `max`, `rms`, `average` in output units, and percentages."""
-    return {
-        "max": errors.maximum,
-        "rms": errors.rms,
-        "average": errors.average,
-        "max_percent": errors.maximum_percent,
-        "rms_percent": errors.rms_percent,
-        "average_percent": errors.average_percent,
-    }
-
-
 def time_quantity(times: Floats | None) -> Quantity | None:
     """Return times, shape (N,) in s, as a column of results; None without them."""
     return None if times is None else Quantity("time", "s", times)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bench.base import print_plain
-from bench.cli.command_support import check_outputs, console, print_rows
+from bench.cli.command_support import console, print_rows
 from bench.cli.model_options import ModelOptions
 
 if TYPE_CHECKING:
@@ -31,21 +31,30 @@ _SHOWN = 10
 
 @dataclass(frozen=True)
 class Comparing:
-    """What the command line says of the comparison of models.
+    """The options of the comparison of models, and of its test."""
 
-    Attributes
-    ----------
-    train : slice or None
-        Rows that are fitted.
-    test : str or None
-        Rows or a file on which the model is tested.
-    table_out : Path or None
-        File for the table.
-    """
+    train: Annotated[
+        str | None,
+        typer.Option(
+            metavar="START:STOP", help="Rows to fit, from 0, without STOP; the others still drive the memory."
+        ),
+    ] = None
+    test: Annotated[
+        str | None,
+        typer.Option(
+            metavar="START:STOP|FILE", help="Rows, or another file, on which the errors of the model are stated."
+        ),
+    ] = None
+    table_out: Annotated[
+        Path | None, typer.Option(metavar="FILE.csv", help="File for the table of the models that were compared.")
+    ] = None
 
-    train: slice | None = None
-    test: str | None = None
-    table_out: Path | None = None
+    @property
+    def train_rows(self) -> slice | None:
+        """The rows that are fitted; raises ConfigurationError if the option names none."""
+        from bench.analysis import parse_rows
+
+        return None if self.train is None else parse_rows("--train", self.train)
 
     @property
     def test_files(self) -> tuple[Path, ...]:
@@ -53,35 +62,6 @@ class Comparing:
         from bench.analysis import is_rows
 
         return () if self.test is None or is_rows(self.test) else (Path(self.test),)
-
-
-def _comparing(
-    train: Annotated[
-        str | None,
-        typer.Option(
-            metavar="START:STOP", help="Rows to fit, from 0, without STOP; the others still drive the memory."
-        ),
-    ] = None,
-    test: Annotated[
-        str | None,
-        typer.Option(
-            metavar="START:STOP|FILE", help="Rows, or another file, on which the errors of the model are stated."
-        ),
-    ] = None,
-    table_out: Annotated[
-        Path | None, typer.Option(metavar="FILE.csv", help="File for the table of the models that were compared.")
-    ] = None,
-) -> Comparing:
-    """Return what the command line says of the comparison of models; its signature is that of the options."""
-    from bench.analysis import parse_rows
-
-    if table_out is not None:
-        check_outputs(out=table_out)
-    return Comparing(parse_rows("--train", train) if train is not None else None, test, table_out)
-
-
-ComparingGroup = Annotated[Comparing, _comparing]
-"""The options of the comparison of models, and of its test."""
 
 
 def is_comparison(model: str) -> bool:

@@ -13,12 +13,12 @@ from bench.base import ConfigurationError, print_plain
 from bench.cli.band_options import BandOption, Recalibrating, print_band, print_examined
 from bench.cli.choice_options import (
     Comparing,
-    ComparingGroup,
     choose_model,
     is_comparison,
     print_test,
     read_measured,
 )
+from bench.cli.command_line import command_line
 from bench.cli.command_support import (
     JsonOption,
     check_outputs,
@@ -29,9 +29,9 @@ from bench.cli.command_support import (
     write_json,
 )
 from bench.cli.data_options import ReadingGroup, offer_groups, print_assumptions
-from bench.cli.model_options import ModelGroup, ModelOptions
+from bench.cli.model_options import ModelOptions
 from bench.cli.patience import show_patience
-from bench.cli.written import print_figures, write_fit, write_rows
+from bench.cli.written import print_figures, write_rows
 
 if TYPE_CHECKING:
     from bench.analysis import FitOptions
@@ -155,16 +155,8 @@ class Fitting:
         own: dict[str, Any] = {"initial": self.initial, "orientation": self.orientation}
         if not is_comparison(self.model):
             own |= {**options.values, "static": self.static, "dynamics": self.dynamics}
-        return FitOptions(
-            self.smoothing,
-            self.ridge,
-            self.skip,
-            self.cross_validate,
-            options.levels_to_try,
-            comparing.train,
-            self.band,
-            own,
-        )
+        levels, train = options.levels_to_try, comparing.train_rows
+        return FitOptions(self.smoothing, self.ridge, self.skip, self.cross_validate, levels, train, self.band, own)
 
     def check(self, comparing: Comparing, options: ModelOptions) -> None:
         """Check that the options go together, before anything is read.
@@ -217,8 +209,8 @@ def identify_(
     fitting: Fitting,
     outputs: FitOutputs,
     reading: ReadingGroup,
-    options: ModelGroup,
-    comparing: ComparingGroup,
+    options: ModelOptions,
+    comparing: Comparing,
 ) -> None:
     """Identify a hysteresis model from measurements, and say how good it is.
 
@@ -231,13 +223,9 @@ def identify_(
     from bench.analysis import ColumnNames, certificate_lines, identify_model
 
     out = outputs.out
-    check_outputs(
-        out=out,
-        card=outputs.card,
-        figures=outputs.figures,
-        json_file=outputs.json_file,
-        read=[*files, *comparing.test_files],
-    )
+    check_outputs(**vars(outputs), read=[*files, *comparing.test_files])
+    if comparing.table_out is not None:
+        check_outputs(out=comparing.table_out)
     fitting.check(comparing, options)
     names = ColumnNames(fitting.input_column, fitting.output_column, fitting.time_column, fitting.weights_column)
     model, fit = fitting.model, fitting.settings(comparing, options)
@@ -269,7 +257,17 @@ def identify_(
     if out is not None:
         print_plain(console, f"model: {out}")
     tested = print_test(found, comparing, test)
-    write_fit(found, context=context, out=out, card=outputs.card, figures=outputs.figures)
+    drawn: list[Path] = []
+    if outputs.figures is not None:
+        from bench.analysis import draw_identification
+
+        drawn = draw_identification(found, outputs.figures)
+        print_figures(drawn)
+    if outputs.card is not None:
+        from bench.analysis import write_card
+
+        write_card(outputs.card, found, command=command_line(context), model=out, figures=drawn)
+        print_plain(console, f"card: {outputs.card}")
     more = {"test": tested.to_json()} if tested else {}
     more |= {"selection": selected.to_json()} if selected else {}
     write_json(outputs.json_file, found.summary() | more)
@@ -314,7 +312,6 @@ def predict_(
     """
     from bench.analysis import (
         ColumnNames,
-        errors_json,
         examine,
         foreign_drift,
         outside_of_range,
@@ -344,7 +341,7 @@ def predict_(
     print_examined(found)
     if data.output is not None:
         errors = rows.errors()[model.name]
-        result |= {**errors_json(errors), "skipped": found.first}
+        result |= {**errors.to_json(), "skipped": found.first}
         print_rows(
             f"{model.name} on {file.name}",
             (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -21,58 +22,45 @@ _FEWEST_LEVELS, _MOST_LEVELS = 2, 1000
 
 @dataclass(frozen=True)
 class ModelOptions:
-    """What the command line says of a model.
+    """The options of a model."""
 
-    Parameters
-    ----------
-    values : mapping of str to object
-        Options of the model's template by name, as far as they are given.
-    levels_to_try : tuple of int
-        Numbers of levels for cross-validation, if several are given.
-    """
-
-    values: dict[str, Any]
-    levels_to_try: tuple[int, ...] = ()
-
-
-def _model_options(
     levels: Annotated[
         str | None,
         typer.Option(
             metavar="NUMBER[,NUMBER...]",
             help="Levels of the Preisach plane; 20 if not given. Of several numbers cross-validation chooses.",
         ),
-    ] = None,
+    ] = None
     level_values: Annotated[
         str | None,
         typer.Option(metavar="VALUE,VALUE...", help="The levels themselves, in input units, instead of --levels."),
-    ] = None,
+    ] = None
     spacing: Annotated[
         str | None,
         typer.Option(metavar="KIND", help="Of the levels: uniform, or quantiles of the inputs at the reversals."),
-    ] = None,
+    ] = None
     plane: Annotated[
         tuple[float, float] | None,
         typer.Option(
             metavar="LOW HIGH", help="Ends of the Preisach plane, in input units; the model's own if not given."
         ),
-    ] = None,
+    ] = None
     reversible: Annotated[
         str | None,
         typer.Option(metavar="KIND", help="Reversible part beside the density: none, linear, quadratic, polynomial."),
-    ] = None,
+    ] = None
     degree: Annotated[
         int | None,
         typer.Option(min=1, max=60, help="Degree of a polynomial: of the model (12) or the reversible part (5)."),
-    ] = None,
-    plays: Annotated[int | None, typer.Option(min=1, max=1000, help="Number of plays.")] = None,
+    ] = None
+    plays: Annotated[int | None, typer.Option(min=1, max=1000, help="Number of plays.")] = None
     maximum: Annotated[
         float | None, typer.Option(help="Greatest threshold of the plays or elements, in input units.")
-    ] = None,
-    origin: Annotated[float | None, typer.Option(help="Input of the relaxed state, in input units.")] = None,
-    dead_zones: Annotated[
-        int | None, typer.Option(min=0, max=1000, help="Number of dead zones after the plays.")
-    ] = None,
+    ] = None
+    origin: Annotated[float | None, typer.Option(help="Input of the relaxed state, in input units.")] = None
+    dead_zones: Annotated[int | None, typer.Option(min=0, max=1000, help="Number of dead zones after the plays.")] = (
+        None
+    )
     options: Annotated[
         list[str] | None,
         typer.Option(
@@ -81,30 +69,34 @@ def _model_options(
             help="Another option of the model, as `bench list MODEL` names it: a number, numbers with commas, or a "
             "word; repeatable.",
         ),
-    ] = None,
-) -> ModelOptions:
-    """Return what the command line says of a model; its signature is that of the options."""
-    named: dict[str, Any] = {
-        "spacing": spacing, "plane": plane, "reversible": reversible, "degree": degree, "plays": plays,
-        "maximum": maximum, "origin": origin, "dead_zones": dead_zones,
-    }  # fmt: skip
-    values = {name: value for name, value in named.items() if value is not None}
-    for name, text in parse_assignments("--option", options or ()).items():
-        if name in values:
-            raise ConfigurationError(f"--option {name}={text}: {name} is given twice")
-        values[name] = _value(text)
-    if level_values is not None:
-        if levels is not None:
-            raise ConfigurationError("--levels and --level-values: give one of them")
-        values["levels"] = tuple(_numbers("--level-values", level_values))
-    counts = _level_counts(levels)
-    if len(counts) == 1:
-        values["levels"] = counts[0]
-    return ModelOptions(values, counts if len(counts) > 1 else ())
+    ] = None
 
+    @cached_property
+    def levels_to_try(self) -> tuple[int, ...]:
+        """Numbers of levels for cross-validation, if several are given."""
+        counts = _level_counts(self.levels)
+        return counts if len(counts) > 1 else ()
 
-ModelGroup = Annotated[ModelOptions, _model_options]
-"""The options of a model."""
+    @cached_property
+    def values(self) -> dict[str, Any]:
+        """The options of the model's template by name, as far as they are given.
+
+        Raises ConfigurationError if one is given twice, or is none.
+        """
+        named = ("spacing", "plane", "reversible", "degree", "plays", "maximum", "origin", "dead_zones")
+        values = {name: value for name in named if (value := getattr(self, name)) is not None}
+        for name, text in parse_assignments("--option", self.options or ()).items():
+            if name in values:
+                raise ConfigurationError(f"--option {name}={text}: {name} is given twice")
+            values[name] = _value(text)
+        if self.level_values is not None:
+            if self.levels is not None:
+                raise ConfigurationError("--levels and --level-values: give one of them")
+            values["levels"] = tuple(_numbers("--level-values", self.level_values))
+        counts = _level_counts(self.levels)
+        if len(counts) == 1:
+            values["levels"] = counts[0]
+        return values
 
 
 def _level_counts(text: str | None) -> tuple[int, ...]:

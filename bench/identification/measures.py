@@ -49,6 +49,17 @@ class Errors:
         """Mean absolute error in percent of the output range; NaN if that is zero."""
         return self._percent(self.average)
 
+    def to_json(self) -> dict[str, float]:
+        """Return the errors for programs: `max`, `rms`, `average` in output units, and percentages."""
+        return {
+            "max": self.maximum,
+            "rms": self.rms,
+            "average": self.average,
+            "max_percent": self.maximum_percent,
+            "rms_percent": self.rms_percent,
+            "average_percent": self.average_percent,
+        }
+
     def _percent(self, value: float) -> float:
         return 100.0 * value / self.span if self.span > 0.0 else float("nan")
 
@@ -91,6 +102,10 @@ class Comparison:
     rezeroed: Errors
     offset: float
     residuals: Floats
+
+    def to_json(self) -> dict[str, Any]:
+        """Return errors and offset for programs."""
+        return {"raw": self.raw.to_json(), "rezeroed": self.rezeroed.to_json(), "offset": self.offset}
 
 
 def compare(

@@ -22,7 +22,6 @@ from bench.analysis import (
     IdentifiedFile,
     Published,
     TargetResults,
-    errors_json,
     errors_text,
     following_result,
     identify_model,
@@ -283,9 +282,9 @@ def carry_out(campaign: RunSeries) -> StudyResult:
         {
             "session_offset": sign * SESSION_OFFSET,
             "tracking_offset": sign * TRACKING_OFFSET,
-            "identification": {key: errors_json(model.identification.errors) for key, model in models.items()},
+            "identification": {key: model.identification.errors.to_json() for key, model in models.items()},
             "validation": {
-                key: errors_json(measure_errors(outputs, predicted)) for key, predicted in predictions.items()
+                key: measure_errors(outputs, predicted).to_json() for key, predicted in predictions.items()
             },
             "kkt": {key: model.identification.certificate.kkt_residual for key, model in models.items()},
             "parameters": _parameters(models["nonmonotonic"].file.operator),

@@ -319,13 +319,13 @@ class TestCard:
 
     def test_a_model_without_memory_has_a_card(self, tmp_path, loop):
         found = identify(loop, "polynomial", **NAMES)
-        write_card(tmp_path / "a|b.md", found, loop, command="bench", model=None, figures=[])
+        write_card(tmp_path / "a|b.md", found, command="bench", model=None, figures=[])
         card = read_card(tmp_path / "a|b.md")
         assert "Figures" not in card
         assert card["Limits of validity"]["memory before the first row"][0].startswith("none")
         assert sha256_of(loop) == card["Data"]["SHA-256"][0]
         with pytest.raises(DataError, match=r"model card .* cannot be written"):
-            write_card(tmp_path / "none" / "card.md", found, loop, command="bench", model=None, figures=[])
+            write_card(tmp_path / "none" / "card.md", found, command="bench", model=None, figures=[])
 
 
 @pytest.mark.parametrize("command", ["predict", "compare"])

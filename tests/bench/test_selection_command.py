@@ -207,6 +207,33 @@ def test_one_model_of_several_files(bench, record, tmp_path):
     assert data.starts[1] == len(record.read_text().splitlines()) - 1
 
 
+def test_each_file_is_parsed_once(bench, tmp_path, monkeypatch):
+    """Also where times are looked for, models are compared, and one of them is fitted and tested on another file."""
+    drifting(tmp_path / "record.csv")
+    drifting(tmp_path / "other.csv")
+    parsed = []
+    read = np.loadtxt
+
+    def noted(lines, **options):
+        parsed.append(options["usecols"])
+        return read(lines, **options)
+
+    monkeypatch.setattr(np, "loadtxt", noted)
+    model = tmp_path / "model.json"
+    identify = ("identify", tmp_path / "record.csv", *COLUMNS)
+    for arguments, files in (
+        ((*identify, *TWO, "--test", tmp_path / "other.csv"), 2),
+        ((*identify, "--model", "hammerstein", "--dynamics", "drift", "--levels", 4, "--out", model), 1),
+        (("predict", model, tmp_path / "other.csv", *COLUMNS, "--out", tmp_path / "predicted.csv"), 1),
+        (("compare", model, "--data", tmp_path / "other.csv"), 1),
+        (("invert", model, tmp_path / "other.csv", "--column", "travel", "--out", tmp_path / "setpoints.csv"), 1),
+    ):
+        parsed.clear()
+        code, _, err = bench(*arguments)
+        assert code == 0, err
+        assert len(parsed) == files, (arguments, parsed)
+
+
 @pytest.mark.parametrize(
     ("options", "word"),
     [

@@ -7,7 +7,7 @@ import pytest
 
 from bench import identify
 from bench.analysis import ColumnNames, compare_models, load_models, read_dataset, starting_state
-from bench.analysis.tables.starting_state import digest
+from bench.analysis.tables.dataset import digest
 from bench.base import ConfigurationError
 from bench.identification import ModelFile, load_model
 from bench.models import PrandtlIshlinskii, Preisach, identifiable_models, uniform_levels

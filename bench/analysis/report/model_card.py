@@ -27,7 +27,7 @@ _SHOWN = 10
 
 
 def write_card(
-    path: Path, found: IdentifiedFile, data: Path, *, command: str, model: Path | None, figures: Sequence[Path]
+    path: Path, found: IdentifiedFile, *, command: str, model: Path | None, figures: Sequence[Path]
 ) -> None:
     """Write the card of a model as Markdown, UTF-8.
 
@@ -37,8 +37,6 @@ def write_card(
         The file to write; figures are linked relative to its folder.
     found : IdentifiedFile
         The model and the fit behind it.
-    data : Path
-        File or run that it was identified from.
     command : str
         Command line that identifies it again.
     model : Path or None
@@ -53,8 +51,8 @@ def write_card(
     """
     text = model_card(
         found,
-        data.name,
-        sha256_of(data),
+        found.data.paths[0].name,
+        sha256_of(found.data.paths[0]),
         command=command,
         model="" if model is None else model.name,
         figures=[Path(os.path.relpath(each, path.parent)).as_posix() for each in figures],

@@ -19,7 +19,7 @@ from bench.analysis.figures.planes import plot_coverage, plot_densities
 from bench.analysis.model_service import IdentifiedFile
 from bench.analysis.models_on_run import ModelOnRun, apply_models, models_of
 from bench.analysis.prediction_figures import draw_predictions
-from bench.analysis.predictions import Predictions, errors_json
+from bench.analysis.predictions import Predictions
 from bench.analysis.report.page.render import write_page
 from bench.analysis.report.page.run_page import run_page
 from bench.analysis.report.page.run_parts import watched_pairs
@@ -93,7 +93,7 @@ def report_run(
         compared = [*models_of(record), *_given_with_band(record), *models]
         applied = apply_models(record, steps, compared) if len(steps) else []
         comparison = {
-            each.file.name: {**errors_json(each.errors), "unit": each.unit, "skipped": each.skip} for each in applied
+            each.file.name: {**each.errors.to_json(), "unit": each.unit, "skipped": each.skip} for each in applied
         }
         more = _draw_errors(applied, folder, figure_format)
         controlled = str(record.meta.get("controls", ""))

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 import numpy.typing as npt
 
+from bench.analysis.tables.dataset import digest
 from bench.base import ConfigurationError
 from bench.identification import ModelFile
 from bench.models import Hammerstein, Operator, TimedModel, TimedSequence
@@ -116,8 +116,3 @@ def bind_times(file: ModelFile, times: Floats | None) -> Operator[Any] | TimedSe
     if times is None:
         raise ConfigurationError(f"model {file.name} needs the time of each row: give --time COLUMN")
     return model.at(times)
-
-
-def digest(inputs: Floats) -> str:
-    """Return by what the inputs of a model's own data, shape (N,), are known again."""
-    return hashlib.sha256(np.ascontiguousarray(inputs, dtype="<f8").tobytes()).hexdigest()

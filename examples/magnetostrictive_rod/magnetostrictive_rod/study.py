@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from bench.analysis import FEWEST_ROWS, ColumnNames, FitOptions, errors_json, identify_model, read_dataset
+from bench.analysis import FEWEST_ROWS, ColumnNames, FitOptions, identify_model, read_dataset
 from bench.base import Pending
 from bench.batch import ResultTable, RunSeries, Study, StudyResult, reached_targets
 from bench.execution import RunResult
@@ -42,7 +42,7 @@ def carry_out(campaign: RunSeries) -> StudyResult:
         model = identify_model(data, name, FitOptions.of(options))
         path = campaign.folder / f"{name}.json"
         model.file.save(path)
-        identification[name] = errors_json(model.identification.errors)
+        identification[name] = model.identification.errors.to_json()
         # They go on beside each other.
         runs[name] = {
             controller: campaign.start("tracking", {"model": str(path), "controller": controller, "count": "20"})
