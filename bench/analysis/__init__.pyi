@@ -14,7 +14,6 @@ from .examined import (
     load_models as load_models,
     outside_of_range as outside_of_range,
     predict as predict,
-    predictions_of as predictions_of,
 )
 from .export.run_export import (
     export_run as export_run,

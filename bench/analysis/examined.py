@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.analysis.band_columns import BandedPrediction, predict_band
-from bench.analysis.predictions import Predictions, check_finite, time_quantity
+from bench.analysis.predictions import Predictions, check_finite
 from bench.analysis.session_recalibration import Session
 from bench.analysis.tables.dataset import Dataset
 from bench.analysis.tables.starting_state import StartingState, bind_times, foreign_drift, starting_state
@@ -120,25 +120,20 @@ def examine(
     times = data.times if isinstance(bound, TimedSequence) else None
     inputs, measured = data.inputs, None if data.output is None else data.outputs
     units = model.response.input_unit, model.response.output_unit
-    if session is None:
-        with np.errstate(over="ignore", invalid="ignore"):
-            predicted = np.asarray(bound.evaluate(inputs, state))
-        check_finite(model.name, "output", predicted, units[1], inputs, "input", units[0])
-        return Examined(predicted, measured, None, predict_band(model, inputs, state, times), units, skip)
-    if measured is None:
-        raise ConfigurationError("--recalibrate needs measured outputs: name their column with --output")
-    found = session.estimate(bound, inputs, measured, skip=skip, state=state)
+    found, first = None, skip
+    if session is not None:
+        if measured is None:
+            raise ConfigurationError("--recalibrate needs measured outputs: name their column with --output")
+        found = session.estimate(bound, inputs, measured, skip=skip, state=state)
+        first = session.first_unused(inputs.size, skip)
     with np.errstate(over="ignore", invalid="ignore"):
-        predicted = found.predict(bound, inputs, state)
+        predicted = (
+            np.asarray(bound.evaluate(inputs, state)) if found is None else found.predict(bound, inputs, state)
+        )
     check_finite(model.name, "output", predicted, units[1], inputs, "input", units[0])
-    return Examined(
-        predicted,
-        measured,
-        found,
-        predict_band(model, inputs + found.values.get("input-offset", 0.0), state, times),
-        units,
-        session.first_unused(inputs.size, skip),
-    )
+    moved = 0.0 if found is None else found.values.get("input-offset", 0.0)
+    band = predict_band(model, inputs + moved, state, times)
+    return Examined(predicted, measured, found, band, units, first)
 
 
 def predict(
@@ -283,22 +278,10 @@ def compare_models(
     }
     first = most if session is None else session.first_unused(inputs.size, most)
     comparisons = compare(operators, inputs, outputs, states=states, skip=first)
-    predictions = predictions_of(next(iter(models.values())), data, examined, first)
+    predicted = {name: entry.predicted for name, entry in examined.items()}
+    bands = {name: entry.band for name, entry in examined.items()}
+    predictions = Predictions.of(next(iter(models.values())), data, predicted, first, bands)
     drifts = (
         () if session is not None else tuple(filter(None, (foreign_drift(each, inputs) for each in models.values())))
     )
     return ComparedModels(comparisons, predictions, examined, drifts)
-
-
-def predictions_of(model: ModelFile, data: Dataset, examined: Mapping[str, Examined], skip: int) -> Predictions:
-    """Return what models give for a dataset, row by row, in the units of the first where the file does not say."""
-    driven, unit = model.response.input_unit, model.response.output_unit
-    return Predictions(
-        replace(data.input, unit=data.input.unit or driven),
-        unit,
-        {name: entry.predicted for name, entry in examined.items()},
-        data.output,
-        time_quantity(data.times),
-        skip=skip,
-        bands={name: entry.band for name, entry in examined.items() if entry.band is not None},
-    )

@@ -12,8 +12,8 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.analysis.band_columns import BandedPrediction, calibrate, predict_band
-from bench.analysis.predictions import Predictions, time_quantity
-from bench.analysis.tables.data import Quantity, check_variation, is_run
+from bench.analysis.predictions import Predictions
+from bench.analysis.tables.data import check_variation, is_run
 from bench.analysis.tables.dataset import Dataset, digest
 from bench.analysis.transients.transient_dynamics import (
     Transients,
@@ -169,16 +169,9 @@ class IdentifiedFile:
 
     def predictions(self) -> Predictions:
         """Return the outputs of the model beside the measurements, as the fit has them."""
-        operator, names, band = self.file.response, self.file.provenance, self.band
-        return Predictions(
-            Quantity(names["input"], operator.input_unit, self.inputs),
-            operator.output_unit,
-            {self.file.name: self.outputs - self.identification.residuals},
-            Quantity(names["output"], operator.output_unit, self.outputs),
-            time_quantity(self.data.times),
-            skip=self.identification.skip,
-            bands={} if band is None else {self.file.name: band},
-        )
+        name, found = self.file.name, self.identification
+        predicted = {name: self.outputs - found.residuals}
+        return Predictions.of(self.file, self.data, predicted, found.skip, {name: self.band})
 
     def summary(self) -> dict[str, Any]:
         """Return the result for programs."""

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from bench.analysis.band_columns import BandedPrediction
 from bench.analysis.tables.data import Quantity
+from bench.analysis.tables.dataset import Dataset
 from bench.base import DataError, header_with_unit
-from bench.identification import Errors, measure_errors
+from bench.identification import Errors, ModelFile, measure_errors
 
 Floats = npt.NDArray[np.float64]
 
@@ -66,6 +67,27 @@ class Predictions:
     skip: int = 0
     bands: Mapping[str, BandedPrediction] = field(default_factory=dict)
 
+    @classmethod
+    def of(
+        cls,
+        model: ModelFile,
+        data: Dataset,
+        predicted: Mapping[str, Floats],
+        skip: int,
+        bands: Mapping[str, BandedPrediction | None],
+    ) -> Predictions:
+        """Return what models give for a dataset; units that its file does not say are those of `model`."""
+        unit = model.response.output_unit
+        return cls(
+            replace(data.input, unit=data.input.unit or model.response.input_unit),
+            unit,
+            predicted,
+            data.output and replace(data.output, unit=data.output.unit or unit),
+            None if data.times is None else Quantity("time", "s", data.times),
+            skip=skip,
+            bands={name: band for name, band in bands.items() if band is not None},
+        )
+
     def __post_init__(self) -> None:
         """Raise DataError if an output is not finite."""
         for name, values in self.predicted.items():
@@ -102,8 +124,3 @@ class Predictions:
             prefix = f"{name} " if len(self.predicted) > 1 else ""
             columns += [(f"{prefix}{head}", values) for head, values in band.columns(self.predicted[name])]
         return columns
-
-
-def time_quantity(times: Floats | None) -> Quantity | None:
-    """Return times, shape (N,) in s, as a column of results; None without them."""
-    return None if times is None else Quantity("time", "s", times)

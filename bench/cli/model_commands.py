@@ -312,10 +312,10 @@ def predict_(
     """
     from bench.analysis import (
         ColumnNames,
+        Predictions,
         examine,
         foreign_drift,
         outside_of_range,
-        predictions_of,
         read_for,
         starting_state,
     )
@@ -336,7 +336,7 @@ def predict_(
     start = starting_state(model, inputs, initial=initial, skip=skip, continue_memory=continue_memory)
     found = examine(model, data, state=start.state, session=session, skip=start.skip)
     unit = model.response.output_unit
-    rows = predictions_of(model, data, {model.name: found}, found.first)
+    rows = Predictions.of(model, data, {model.name: found.predicted}, found.first, {model.name: found.band})
     result: dict[str, Any] = {"model": model.name, "samples": int(inputs.size), "out": str(out), **found.to_json()}
     print_examined(found)
     if data.output is not None:

@@ -97,7 +97,8 @@ def model_card(
         Links to figures.
     """
     rows = found.predictions()
-    measured = Quantity(found.file.provenance["output"], rows.unit, found.outputs)
+    measured = rows.measured
+    assert measured is not None
     sections = {
         "Data": _table(("", ""), _data(found, rows, measured, source, digest)),
         "Errors": _table(("error", measured.unit or "output units", "% of the range"), _errors(found)),
