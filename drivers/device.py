@@ -40,7 +40,11 @@ def watchdog_field(default: float, longest: float, effect: str) -> Any:  # noqa:
 
 
 class Line(Protocol):
-    """A connection to an instrument."""
+    """A connection to an instrument.
+
+    One that knows them has two attributes more: `lost`, whether it failed and has to be opened again, and `repeats`,
+    the number of requests that were repeated.
+    """
 
     def close(self) -> None:
         """Release the line."""
@@ -63,6 +67,8 @@ class LineDevice(Device, Generic[SettingsT, LineT]):
     """
 
     _identity: Identity
+    _earlier_repeats = 0
+    _closed = False
 
     def __init__(self, name: str, settings: SettingsT, clock: Clock, line: LineT) -> None:
         super().__init__(name, clock)
@@ -144,8 +150,20 @@ class LineDevice(Device, Generic[SettingsT, LineT]):
 
     def _renew_line(self) -> None:
         """Close the line, and open another to the same address."""
+        repeats = self.repeats
         self._line.close()
         self._line = self._open_line(self.name, self._settings, self._clock)
+        self._earlier_repeats, self._closed = repeats, False
+
+    def _begin(self) -> None:
+        """Open the line again if it was lost."""
+        if getattr(self._line, "lost", False) and not self._closed:
+            self.reconnect()
+
+    @property
+    def repeats(self) -> int:
+        """Number of requests that were repeated since the device was connected, as their answers were lost."""
+        return self._earlier_repeats + getattr(self._line, "repeats", 0)
 
     def _check_unchanged(self) -> None:
         """Raise `DeviceError` unless the instrument is as the driver left it: not restarted, without an error."""
@@ -159,6 +177,7 @@ class LineDevice(Device, Generic[SettingsT, LineT]):
 
     def close(self) -> None:
         """Release the line; an output that is on stays on until the instrument's watchdog acts."""
+        self._closed = True
         self._line.close()
 
 

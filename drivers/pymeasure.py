@@ -25,33 +25,29 @@ from __future__ import annotations
 import ast
 import importlib
 import importlib.util
-import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from functools import reduce
+from functools import partial, reduce
 from typing import Annotated, Any, ClassVar
 
 from pydantic import AfterValidator, Field, ValidationInfo, field_validator
 
-from bench.base import Clock, ConfigurationError, DeviceConnectionError, DeviceError, DeviceRestartedError, registry
+from bench.base import Clock, ConfigurationError, DeviceConnectionError, DeviceError, registry
 from bench.devices import (
     ANY_TEXT,
     DriverSettings,
     Expected,
-    GeneralActuator,
-    GeneralSensor,
     Identity,
-    Limits,
     Name,
     QuantityTable,
-    Status,
     TargetTable,
     check_arrival,
     not_empty,
     template,
 )
-from drivers.device import LineDevice, attempt
-from drivers.quantities import arrival_of, check_ranges, check_read_back, identity_of, output_lost, signals_of
+from drivers.device import attempt
+from drivers.quantities import identity_of
+from drivers.table import SwitchedLine, TableActuator, TableLine, TableSensor
 
 _NOT_A_NUMBER = 9.9e37  # SCPI's infinity
 
@@ -214,19 +210,59 @@ def _check_property(info: ValidationInfo, key: str, path: str) -> None:
         raise ValueError(f"{key} = {path!r}: {reference} has no such property")
 
 
-class InstrumentLine:
+class InstrumentLine(TableLine):
     """A connected PyMeasure instrument, whose errors are those of the bench.
 
-    Attributes
-    ----------
-    lost : bool
-        Whether a request has failed on the line. As a late answer could be taken for the next, it is opened again.
+    As a late answer could be taken for the next, the line is opened again after each request that failed on it.
     """
 
-    def __init__(self, device: str, instrument: Any) -> None:  # noqa: ANN401 - of an optional library
-        self._device = device
-        self.instrument = instrument
-        self.lost = False
+    source = target_source = "property"
+
+    def __init__(self, device: str, settings: SensorSettings, clock: Clock) -> None:  # noqa: ARG002 - as lines are made
+        TableLine.__init__(self, device, settings.signals)
+        self._settings = settings
+        # Each class and each adapter fails in a way of its own.
+        try:
+            self.instrument = instrument_class(settings.instrument)(settings.address, **settings.options)
+        except Exception as error:
+            raise DeviceConnectionError(
+                device, f"cannot open {settings.address}: {type(error).__name__}: {error}"
+            ) from None
+
+    def identify(self, resends: int) -> Identity:  # noqa: ARG002 - the library does not repeat
+        """Return which instrument answers; raise `DeviceConnectionError` if it is not as the settings say."""
+        settings = self._settings
+        if not hasattr(type(self.instrument), "id"):
+            return Identity("unknown", settings.instrument.partition(":")[2], "unknown", "unknown")
+        answer = str(self.get("id")).strip()
+        if template(settings.identity).match(answer) is None:
+            raise DeviceConnectionError(
+                self._device, f"{settings.address} is {answer!r}, expected {settings.identity!r}; check the address"
+            )
+        return identity_of(answer)
+
+    def start(self) -> None:
+        """Carry out the actions of `setup`."""
+        self.act_all(self._settings.setup)
+
+    def quantities(self, names: Iterable[str]) -> dict[str, float]:
+        """Read the properties of quantities."""
+        tables = self._settings.signals
+        return {name: self.number(tables[name].property) * tables[name].scale for name in names}
+
+    def errors(self) -> list[str]:
+        """Return what `check_errors` of the instrument returns, if the settings ask for it."""
+        return [str(error) for error in self.get("check_errors")() or ()] if self._settings.check_errors else []
+
+    def shut_down(self) -> None:
+        """Shut the instrument down, unless the settings say otherwise."""
+        if self._settings.shutdown:
+            self.act("shutdown()")
+
+    def act_all(self, actions: Iterable[str]) -> None:
+        """Carry out calls and assignments, in this order."""
+        for action in actions:
+            self.act(action)
 
     def get(self, path: str) -> Any:  # noqa: ANN401 - of any type
         """Return a property."""
@@ -276,187 +312,55 @@ def _is_of_the_line(error: Exception) -> bool:
     return isinstance(error, OSError | pyvisa.errors.Error)
 
 
-class SensorAdapter(LineDevice[SensorSettings, InstrumentLine], GeneralSensor):
-    """A PyMeasure instrument that measures: its signals are those of the rig file."""
+class _SwitchingLine(InstrumentLine, SwitchedLine):
+    """A connected PyMeasure instrument that takes a set-point."""
 
-    Settings: ClassVar[type[SensorSettings]] = SensorSettings
+    def __init__(self, device: str, settings: ActuatorSettings, clock: Clock) -> None:
+        InstrumentLine.__init__(self, device, settings, clock)
+        self.target = self._target = settings.setpoint
+        self._actions = settings
 
-    def __init__(self, name: str, settings: SensorSettings, clock: Clock, line: InstrumentLine) -> None:
-        unknown = Identity("unknown", settings.instrument.partition(":")[2], "unknown", "unknown")
-        GeneralSensor.__init__(self, name, clock, unknown, signals_of(settings.signals))
-        self._settings, self._line = settings, line
+    def write_setpoint(self, value: float) -> None:
+        """Set the property."""
+        self.set(self._target.property, value / self._target.scale)
 
-    @classmethod
-    def _open_line(cls, name: str, settings: SensorSettings, clock: Clock) -> InstrumentLine:  # noqa: ARG003
-        try:
-            return InstrumentLine(name, instrument_class(settings.instrument)(settings.address, **settings.options))
-        # Each class and each adapter fails in a way of its own.
-        except Exception as error:
-            raise DeviceConnectionError(
-                name, f"cannot open {settings.address}: {type(error).__name__}: {error}"
-            ) from None
+    def read_setpoint(self) -> float | None:
+        """Return the property, or None if it is not to be read back."""
+        return self.number(self._target.property) * self._target.scale if self._target.read_back else None
 
-    def _begin(self) -> None:
-        """Open the line again if it was lost."""
-        if self._line.lost:
-            self.reconnect()
+    def prepare(self) -> None:
+        """Carry out `setup` and `before_on`."""
+        self.act_all((*self._actions.setup, *self._actions.before_on))
 
-    def _check_unchanged(self) -> None:
-        self._read_quantities()
+    def switch_on(self) -> None:
+        """Carry out `on`."""
+        self.act_all(self._actions.on)
 
-    def _identify(self) -> Identity:
-        settings = self._settings
-        if not hasattr(type(self._line.instrument), "id"):
-            return self._identity
-        answer = str(self._line.get("id")).strip()
-        if template(settings.identity).match(answer) is None:
-            raise DeviceConnectionError(
-                self.name, f"{settings.address} is {answer!r}, expected {settings.identity!r}; check the address"
-            )
-        return identity_of(answer)
-
-    def _start(self) -> None:
-        for action in self._settings.setup:
-            self._line.act(action)
-
-    def measure_quantities(self) -> dict[str, float]:
-        """Measure every quantity."""
-        self._begin()
-        values = self._read_quantities()
-        self._check_errors("measuring")
-        return values
-
-    def close(self) -> None:
-        """Shut the instrument down, unless the settings say otherwise, and release the line."""
-        try:
-            if self._settings.shutdown:
-                self._line.act("shutdown()")
-        finally:
-            super().close()
-
-    def _read_quantities(self) -> dict[str, float]:
-        tables = self._settings.signals
-        values = {name: self._line.number(table.property) * table.scale for name, table in tables.items()}
-        check_ranges(self.name, tables, values)
-        return values
-
-    def _check_errors(self, doing: str) -> None:
-        if self._settings.check_errors:
-            found = self._line.get("check_errors")()
-            if found:
-                raise DeviceError(self.name, f"reports after {doing}: {'; '.join(map(str, found))}")
-
-
-class Adapter(SensorAdapter, GeneralActuator):
-    """A PyMeasure instrument that takes a set-point, and measures its signals.
-
-    `set` checks that the output is as it was left, sets the property and reads it back. It switches an output on that
-    is off by `on`, after `setup` and `before_on` once more. `safe` carries out all of the key `safe`, over a line of
-    its own if the one in use does not answer; it is confirmed by the property `output` where there is one. An output
-    that is off without the bench is found by the next reading: a protection, or a restart if the set-point is lost
-    as well, after which nothing is set.
-    """
-
-    Settings: ClassVar[type[SensorSettings]] = ActuatorSettings
-
-    def __init__(self, name: str, settings: ActuatorSettings, clock: Clock, line: InstrumentLine) -> None:
-        target = settings.setpoint
-        limits = Limits(*target.limits, target.unit)
-        GeneralActuator.__init__(
-            self,
-            name,
-            clock,
-            Identity("unknown", settings.instrument.partition(":")[2], "unknown", "unknown"),
-            signals_of(settings.signals),
-            limits,
-            description=target.description,
-            precision=target.precision,
-        )
-        self._settings, self._line = settings, line
-        self._actuator_settings = settings
-        self._on = False
-        self._left = math.nan
-        self._restart: DeviceRestartedError | None = None
-
-    def send(self, value: float) -> Status:
-        """Send a set-point that is within the limits, and switch the output on if it is off."""
-        settings, was_on = self._actuator_settings, self._on
-        target = settings.setpoint
-        self._begin()
-        self._check_output()
-        for action in () if was_on else (*settings.setup, *settings.before_on):
-            self._line.act(action)
-        self._line.set(target.property, value / target.scale)
-        if target.read_back:
-            check_read_back(self.name, target, value, self._ask_setpoint())
-        for action in () if was_on else settings.on:
-            self._line.act(action)
-        self._check_errors(f"set-point {value:g} {target.unit}")
-        self._on, self._left = True, value
-        if not was_on:
-            self._check_output()
-        return arrival_of(self.name, self._clock, target, value, self._read_quantities)
-
-    def switch_off(self) -> None:
-        """Carry out what reaches the safe state, over a fresh line if the one in use does not answer."""
-        self._on = False
+    def try_off(self, *, fresh: bool) -> list[DeviceError]:  # noqa: ARG002 - a new instance is always fresh
+        """Carry out all of `safe`, and see that `output` is false."""
         # A lost line may take its whole time-out for each message.
-        failures = [] if self._line.lost else self._try_off()
-        if self._line.lost:
-            try:
-                self._renew_line()
-            except DeviceError as error:
-                failures = failures or [error]
-            else:
-                failures = self._try_off()
-        if failures:
-            raise DeviceError(
-                self.name, f"does not confirm that its output is off ({failures[0]}); switch it off by hand"
-            )
+        if self.lost:
+            return []
+        return attempt(*(partial(self.act, action) for action in self._actions.safe)) or attempt(self._confirm_off)
 
-    def _try_off(self) -> list[DeviceError]:
-        """Try everything that switches off; return what failed."""
-        settings = self._actuator_settings
-        failures = attempt(*(lambda action=action: self._line.act(action) for action in settings.safe))
-        return failures or attempt(self._confirm_off)
+    def reads_on(self) -> bool | None:
+        """Return whether the property `output` is true; None without one."""
+        return None if self._actions.output is None else bool(self.get(self._actions.output))
 
     def _confirm_off(self) -> None:
-        output = self._actuator_settings.output
-        if output is not None and self._line.get(output):
-            raise DeviceError(self.name, f"{output} is true")
+        if self.reads_on():
+            raise DeviceError(self._device, f"{self._actions.output} is true")
 
-    def _begin(self) -> None:
-        if self._restart is not None:
-            raise self._restart
-        super()._begin()
 
-    def _check_unchanged(self) -> None:
-        self._check_output()
-        if self._on:
-            target = self._actuator_settings.setpoint
-            if target.read_back:
-                check_read_back(self.name, target, self._left, self._ask_setpoint())
+class SensorAdapter(TableSensor[InstrumentLine]):
+    """A PyMeasure instrument that measures."""
 
-    def _ask_setpoint(self) -> float:
-        target = self._actuator_settings.setpoint
-        return self._line.number(target.property) * target.scale
+    Settings: ClassVar[type[DriverSettings]] = SensorSettings
+    Line: ClassVar[type[TableLine]] = InstrumentLine
 
-    def measure_quantities(self) -> dict[str, float]:
-        """Measure every quantity, and check that the output is still on if it was switched on."""
-        values = super().measure_quantities()
-        self._check_output()
-        return values
 
-    def _check_output(self) -> None:
-        """Raise if an output that was switched on is off, or the instrument has restarted before."""
-        if self._restart is not None:
-            raise self._restart
-        settings = self._actuator_settings
-        target = settings.setpoint
-        if not self._on or settings.output is None or self._line.get(settings.output):
-            return
-        lost = target.read_back and abs(self._ask_setpoint() - self._left) > target.tolerance * (1.0 + 1e-9)
-        problem = output_lost(self.name, setpoint_lost=lost)
-        if isinstance(problem, DeviceRestartedError):
-            self._restart = problem
-        raise problem
+class Adapter(TableActuator):
+    """A PyMeasure instrument that takes a set-point, and measures."""
+
+    Settings: ClassVar[type[DriverSettings]] = ActuatorSettings
+    Line: ClassVar[type[TableLine]] = _SwitchingLine

@@ -292,11 +292,6 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
         """Longest time that `safe` takes on a line that works, s, with the reboot of a servo that refuses."""
         return _SAFE_WITHIN
 
-    @property
-    def repeats(self) -> int:
-        """Number of requests that were repeated since the device was connected."""
-        return self._line.repeats
-
     def set(self, value: float) -> Status:
         """Move to a set-point, with a resolution of 0.00153 rad; switches the torque on if it is off.
 
@@ -428,9 +423,7 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
             raise self._refusal("its indirect addresses", error) from None
 
     def _renew_line(self) -> None:
-        repeats = self._line.repeats
         super()._renew_line()
-        self._line.repeats = repeats
         self._read_feedback = self._line.reading(_INDIRECT_DATA, _FEEDBACK.size)
 
     def _ensure_answers(self) -> None:

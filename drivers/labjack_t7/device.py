@@ -65,8 +65,3 @@ class T7Device(LineDevice[T7SettingsT, LabJackT7]):
         """Go on over another connection if the present one was lost; errors are those of `Device.reconnect`."""
         with self._line.in_haste():
             super().reconnect()
-
-    @property
-    def repeats(self) -> int:
-        """Number of requests that were repeated since the device was connected, as their answers were lost."""
-        return self._line.repeats

@@ -99,7 +99,7 @@ class TECLine:
 
     def follow(self, line: TECLine) -> None:
         """Go on counting where another line to the device has ended, as an answer to it may still come."""
-        self._sequence, self.repeats = line._sequence, line.repeats
+        self._sequence = line._sequence
 
     @contextmanager
     def in_haste(self) -> Iterator[None]:

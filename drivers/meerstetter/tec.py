@@ -274,11 +274,6 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         return self._settings.watchdog or None
 
     @property
-    def repeats(self) -> int:
-        """Number of requests that were sent again since the device was connected."""
-        return self._line.repeats
-
-    @property
     def output_enabled(self) -> bool:
         """Whether the output stage is on, as the device reports now."""
         return self._state() is _State.RUN

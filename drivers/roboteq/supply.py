@@ -199,11 +199,6 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
         """Longest time that `safe` takes on a line that works, s: the ramp, and again after the emergency stop."""
         return _SAFE_WITHIN
 
-    @property
-    def repeats(self) -> int:
-        """Number of requests that were repeated since the device was connected."""
-        return self._line.repeats
-
     def set(self, value: float) -> Status:
         """Apply a voltage in V, as `output` defines it.
 
@@ -250,11 +245,6 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
         """
         with self._lock:
             super().reconnect()
-
-    def _renew_line(self) -> None:
-        repeats = self._line.repeats
-        super()._renew_line()
-        self._line.repeats = repeats
 
     def _check_unchanged(self) -> None:
         if self._process_data is not None and not self._process_data.is_marked(self._line):

@@ -118,12 +118,6 @@ class TextLine:
             found.append(answer)
         return found
 
-    def raise_errors(self, doing: str) -> None:
-        """Raise one `DeviceError` with everything in the queue of errors, if there is anything."""
-        found = self.errors()
-        if found:
-            raise DeviceError(self._device, f"reports after {doing}: {'; '.join(found)}")
-
     def _is_no_error(self, answer: str) -> bool:
         if self._settings.no_error:
             return template(self._settings.no_error).match(answer) is not None

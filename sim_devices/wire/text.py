@@ -2,8 +2,36 @@
 
 from __future__ import annotations
 
+from abc import abstractmethod
+from typing import ClassVar
+
 from sim_devices.instruments.scpi import INPUT_OVERRUN, LONGEST_MESSAGE, EmulatedTextInstrument
 from sim_devices.wire import WireServer
+
+
+class LineServer(WireServer):
+    """An emulated instrument that is asked and told by lines of ASCII; a subclass says what it answers.
+
+    Attributes
+    ----------
+    end : bytes
+        End of a line, of both directions.
+    """
+
+    protocol = "lines of text"
+    end: ClassVar[bytes] = b"\n"
+    _received = b""
+
+    @abstractmethod
+    def answer(self, message: str) -> str | None:
+        """Obey a message, and return its answer, or None if it has none."""
+
+    def receive(self, data: bytes) -> bytes:
+        """Take bytes from the host, in pieces of any size; return what the instrument sends."""
+        *lines, rest = (self._received + data).split(self.end)
+        self._received = rest if len(rest) <= LONGEST_MESSAGE else b""
+        answers = [self.answer(line.decode("ascii", "replace")) for line in lines]
+        return b"".join(answer.encode("ascii", "replace") + self.end for answer in answers if answer is not None)
 
 
 class TextServer(WireServer):

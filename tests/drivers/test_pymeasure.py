@@ -19,7 +19,7 @@ from bench.base import (
 from bench.contracts import ActuatorContract, ActuatorLineLostContract, RestartedActuatorContract
 from bench.devices import ActuatorTable
 from bench.rig import load_rig
-from drivers.pymeasure import Adapter, InstrumentLine, SensorAdapter, parse_action
+from drivers.pymeasure import Adapter, SensorAdapter, parse_action
 from sim_devices.instruments.scpi import EmulatedTextInstrument, Meter
 from sim_devices.wire.text import TextServer
 from sim_devices.world import World
@@ -50,8 +50,11 @@ def expected_protocol(exchange):
 
 def on_protocol(instrument, kind=Adapter, table=TABLE):
     """Return the adapter of an instrument that PyMeasure itself has made."""
-    settings = kind.Settings(address="none", **table)
-    return kind("supply", settings, VirtualClock(), InstrumentLine("supply", instrument))
+    settings, clock = kind.Settings(address="none", **table), VirtualClock()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("drivers.pymeasure.instrument_class", lambda _: lambda _: instrument)
+        line = kind.Line("supply", settings, clock)
+    return kind("supply", settings, clock, line)
 
 
 def test_what_is_sent_is_what_pymeasure_expects():
@@ -68,6 +71,7 @@ def test_what_is_sent_is_what_pymeasure_expects():
         (":MEAS:VOLT?", "3.001"),
         (":MEAS:CURR?", "0.25"),
         ("OUTPut?", "1"),
+        (":SOUR:VOLT?", "3.000"),
         (":SOUR:VOLT 0", None),
         ("OUTPut 0", None),
         ("OUTPut?", "0"),
@@ -516,8 +520,9 @@ def test_a_line_that_failed_is_opened_again_by_the_next_call(instruments):
 
 def test_a_sensor_is_read_when_its_line_is_opened_again(instruments):
     settings = instruments.connect()._settings
-    meter = SensorAdapter("meter", settings, VirtualClock(), InstrumentLine("meter", instruments[0]))
-    instruments[0].failing["voltage"] = OSError("timeout")
+    clock = VirtualClock()
+    meter = SensorAdapter("meter", settings, clock, SensorAdapter.Line("meter", settings, clock))
+    instruments[-1].failing["voltage"] = OSError("timeout")
     with pytest.raises(DeviceConnectionError):
         meter._check_unchanged()
 
