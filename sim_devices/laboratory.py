@@ -12,7 +12,7 @@ from typing import ClassVar
 import numpy as np
 
 from bench.base import Clock, ConfigurationError
-from bench.rig import ScheduledFault
+from bench.rig import LaboratorySettings, ScheduledFault
 from sim_devices import protocol_emulated
 from sim_devices.faults.calendar import Calendar
 from sim_devices.faults.fault import Fault, FaultEvent
@@ -86,6 +86,7 @@ class EmulatedLaboratory:
         The faults that have happened.
     """
 
+    Settings: ClassVar[type[LaboratorySettings]] = LaboratorySettings
     kernels: ClassVar[tuple[str, ...]] = ()
 
     def __init__(

@@ -2,6 +2,9 @@ from .devices import (
     ActuatorContract as ActuatorContract,
     DeviceContract as DeviceContract,
 )
+from .emulated import (
+    OnEmulatedRig as OnEmulatedRig,
+)
 from .faults import (
     ActuatorLineLostContract as ActuatorLineLostContract,
     LineLostContract as LineLostContract,

@@ -1,0 +1,70 @@
+"""What the contracts need, from an emulated rig."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any, ClassVar
+
+import pytest
+
+from bench.base import Clock, VirtualClock
+from bench.devices import Device
+from bench.rig import Rig, load_rig
+
+
+class OnEmulatedRig:
+    """Connects the device under test on its emulated rig. It stands before the contracts.
+
+    ::
+
+        class TestContract(OnEmulatedRig, ActuatorContract, RestartedActuatorContract):
+            rig_file, device_name = "frame.toml", "frame"
+
+    Attributes
+    ----------
+    rig_file : str
+        The rig file, from the folder of the test on.
+    device_name : str
+        The device, by its name in the rig file. The fixture `twin` is the emulated instrument at its port: the
+        contract of a restart calls its `power_cycle`, and reads the true output, 0 when it is off, as its `output`.
+    """
+
+    rig_file: ClassVar[str]
+    device_name: ClassVar[str]
+
+    @pytest.fixture
+    def rig(self) -> Iterator[Rig]:
+        """Connect the rig; make its devices safe and close them afterwards."""
+        path = Path(inspect.getfile(type(self))).parent / self.rig_file
+        with Rig(load_rig(str(path)), VirtualClock(), seed=0) as rig:
+            yield rig
+
+    @pytest.fixture
+    def device(self, rig: Rig) -> Device:
+        """Return the device under test."""
+        return rig.devices[self.device_name]
+
+    @pytest.fixture
+    def clock(self, rig: Rig) -> Clock:
+        """Return the clock of the rig."""
+        return rig.clock
+
+    @pytest.fixture
+    def twin(self, rig: Rig) -> Any:  # noqa: ANN401 - of any class
+        """Return the emulated instrument of the device."""
+        (settings,) = (entry.settings for entry in rig.file.devices if entry.name == self.device_name)
+        laboratory: Any = rig.laboratory
+        return laboratory.instruments[getattr(settings, "port", "").removeprefix("emulated://")]
+
+    @pytest.fixture
+    def restart(self, twin: Any) -> Callable[[], object]:  # noqa: ANN401 - of any class
+        """Return what switches the instrument off and on again."""
+        restart: Callable[[], object] = twin.power_cycle
+        return restart
+
+    @pytest.fixture
+    def output(self, twin: Any) -> Callable[[], float]:  # noqa: ANN401 - of any class
+        """Return what tells the true output of the instrument."""
+        return lambda: float(twin.output)
