@@ -1,18 +1,12 @@
 """The Flintec DAD 141.1, the amplifier of a strain-gauge load cell, by Modbus RTU.
 
 Sources: Flintec DAD 141.1 Technical Manual, Modbus Communication, Rev 2.3, for the registers; Flintec DAD 141.1
-Technical Manual, Rev 2.5, 10.1 (identity), 10.2 (zero tracking), 10.4 (filters) and 10.5 (taring); MODBUS over
-Serial Line, Specification and Implementation Guide V1.02, 2.5.1.1, for the pause between frames.
+Technical Manual, Rev 2.5, 10.1 (identity), 10.2 (zero tracking), 10.4 (filters) and 10.5 (taring).
 
 The instrument is calibrated at its own keys, for a weight in a unit that the user chose; the settings convert it to
 newtons. Nothing is saved in its EEPROM: a power cycle restores the filter that was saved, and forgets the tare. Zero
 tracking takes loads that change slowly for a drift of the zero, so it has to be off (ZT = 0). It belongs to the
 calibration, which is sealed by a counter (TAC); so the driver refuses an instrument that tracks, and changes nothing.
-
-Modbus RTU does not say which request a reply belongs to, and this instrument reads its registers by functions 3 and 4
-alike. So the driver takes them in turn: a doubled or late reply to the request before shows by its function. After a
-reply that is missing or damaged it asks for as many registers as for no other request, until a reply of that length
-comes: what the instrument sent before has passed then.
 
 An instrument that is switched on is silent for longer than 0.3 s (0.4 s after the command SR, says the manual). So
 after a longer silence, and after a lost reply, the filter is read again: if it has fallen back to the saved one, the
@@ -30,48 +24,25 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable, Sequence
-from contextlib import suppress
-from typing import TYPE_CHECKING, ClassVar, Literal, NamedTuple, TypeVar
+from collections.abc import Sequence
+from typing import ClassVar, NamedTuple
 
 from pydantic import Field, field_validator
 
-from bench.base import Clock, DeferredModule, DeviceConnectionError, DeviceError, DeviceRestartedError
+from bench.base import Clock, DeviceConnectionError, DeviceError, DeviceRestartedError
 from bench.devices import CheckFinding, Identity, LoadCell
 from drivers.device import LineDevice, Slope
-from drivers.modbus import (
-    EMULATED,
-    READ,
-    READ_INPUT,
-    NoReplyError,
-    RefusedError,
-    RtuClient,
-    UnexpectedReplyError,
-    exception_text,
-    swapped,
-    unpack,
-)
-from drivers.serial_line import RESENDS, SerialSettings, lost_line, no_answer, open_port
-
-if TYPE_CHECKING:
-    from drivers import pymodbus_client
-else:
-    pymodbus_client = DeferredModule("drivers.pymodbus_client")
-
-T = TypeVar("T")
+from drivers.modbus import READ, READ_INPUT, swapped, unpack
+from drivers.modbus_rtu import RefusalError, Register, RtuLine, RtuSettings
 
 CUTOFF_HZ = (17.0, 18.0, 8.0, 4.0, 3.0, 2.0, 1.0, 0.5, 0.25)
 """3 dB cut-off by filter setting (Technical Manual, 10.4.2); 0 is the anti-aliasing filter alone."""
 
-_FIRST_OF_ECHO = _ADC_SAMPLE = 0x202A
+_FIRST_OF_ECHO = 0x202A
 _DEVICE_ID = 0x202C
 _FIRMWARE = 0x202E
-_SERIAL_NUMBER = 0x2034
 _COMMAND = 0x2061
 _PEAK = 0x2080
-_FILTER = 0x2106
-_FILTER_MODE = 0x2110
-_ZERO_TRACKING = 0x2122
 _COMBINED = 0x3500
 
 _RESET_TARE = 0x04
@@ -91,37 +62,16 @@ _CONVERSIONS = 5  # looked at by the check of the instrument itself
 
 _BLOCK = struct.Struct(">ffH")
 _READING, _WRITING, _COMMANDING = "reading register 0x{:04X}", "writing register 0x{:04X}", "command 0x{:02X}"
-_ECHO_REGISTERS = (6, 8)  # numbers that no other request reads
-_LATEST = 3.0  # time-outs after a request by which even a reply that others overtook has come
-_QUIET = 0.25  # time-outs of silence after which a damaged reply is over
 _SHORTEST_RESTART = 0.3  # s of silence that no restart of the instrument goes below
 _SAME_TARE = 1e-6  # of the weights, by which a tare of single precision may differ from itself
 _STALE_LOOKS = 10
-_FAST_LINE = 19200  # Bd above which the pause between frames does not get shorter
-_FAST_PAUSE = 1.75e-3  # s
 
 
-class DAD141Settings(SerialSettings):
-    """Rig-file settings of a DAD 141.1."""
+class DAD141Settings(RtuSettings):
+    """Rig-file settings of a DAD 141.1: address, speed, parity and mode RTU are those of its menu 8."""
 
-    address: int = Field(default=1, ge=1, le=247, description="Modbus address (menu 8.3), 1 to 247")
     baudrate: int = Field(
         default=115200, ge=9600, le=115200, description="speed of the line (menu 8.1) in Bd, 9600 to 115200"
-    )
-    parity: Literal["N", "E", "O"] = Field(
-        default="N", description="parity (menu 8.7): N for none, E for even, O for odd"
-    )
-    timeout: float = Field(
-        default=0.2,
-        ge=0.02,
-        le=10.0,
-        description="wait for a reply, s: 0.02 to 10; a request is sent three times at most",
-    )
-    pause: float | None = Field(
-        default=None,
-        ge=0.0,
-        le=1.0,
-        description="silence before a request, s: 0 to 1; unless given, 3.5 characters, or 1.75 ms above 19200 Bd",
     )
     filter: int = Field(
         default=3,
@@ -182,156 +132,20 @@ class _Block(NamedTuple):
         return self.gross - self.net
 
 
-class _Line:
-    """The serial line to one instrument: its registers, and sending again.
+class _Line(RtuLine):
+    """The line to a DAD 141.1, which reads its registers by functions 3 and 4 alike."""
 
-    Attributes
-    ----------
-    lost : bool
-        Whether the line itself failed, so that it has to be opened again.
-    longest_silence : float
-        Longest time between two replies since the attribute was last set to zero, s.
-    repeats : int
-        Number of requests that were repeated.
-    """
-
-    def __init__(self, name: str, settings: DAD141Settings, clock: Clock) -> None:
-        self._name = name
-        self._settings = settings
-        self._clock = clock
-        self._pause = _frame_pause(settings)
-        self._silent_since = self._answered_at = self._late_until = clock.now()
-        self._function = READ
-        self._in_step = True
-        self._echoes = 0
-        self._is_open = True
-        self.lost = False
-        self.longest_silence = 0.0
-        self.repeats = 0
-        self._client: RtuClient | pymodbus_client.SerialClient
-        if settings.port.startswith(EMULATED):
-            self._client = RtuClient(open_port(name, settings), settings.address)
-        else:
-            self._client = pymodbus_client.SerialClient(name, settings, settings.address, settings.parity)
-
-    def close(self) -> None:
-        """Release the line."""
-        self._is_open = False
-        self._client.close()
-
-    def read(self, address: int, count: int) -> list[int]:
-        """Get `count` registers from `address` on, each 0 to 65535."""
-        return list(struct.unpack(f">{count}H", self._read(address, count)))
-
-    def read_integer(self, address: int) -> int:
-        """Get a 32-bit integer."""
-        return int.from_bytes(self._read(address, 2), "big", signed=True)
+    reading = (READ, READ_INPUT)
+    first_of_echo = _FIRST_OF_ECHO
+    set_at = ", see its menu 8"
 
     def read_block(self) -> _Block:
         """Get the combined registers."""
-        return _Block(*_BLOCK.unpack(self._read(_COMBINED, 5)))
-
-    def set_integer(self, title: str, address: int, value: int) -> None:
-        """Set a 32-bit integer and read it back; `title` is its name for messages."""
-        data = struct.pack(">i", value)
-        self._exchange(_WRITING, address, lambda: self._client.write(address, data))
-        actual = self.read_integer(address)
-        if actual != value:
-            raise DeviceError(
-                self._name,
-                f"{title} reads back {actual} after {value} was written; is another program using the instrument?",
-            )
+        return _Block(*_BLOCK.unpack(self.read_bytes(_COMBINED, 5)))
 
     def command(self, value: int) -> None:
         """Give a command of register 0x2061."""
-        self._exchange(_COMMANDING, value, lambda: self._client.write_one(_COMMAND, value))
-
-    def _read(self, address: int, count: int) -> bytes:
-        function = self._function = READ_INPUT if self._function == READ else READ
-        return self._exchange(_READING, address, lambda: self._client.read(address, count, function))
-
-    def _exchange(self, doing: str, number: int, request: Callable[[], T]) -> T:
-        if not self._is_open:
-            raise DeviceConnectionError(
-                self._name, f"the line {self._settings.port} is closed; connect again, so that the set-up is checked"
-            )
-        if self.lost:
-            raise DeviceConnectionError(self._name, f"the line {self._settings.port} was lost; open it again")
-        problem: NoReplyError | None = None
-        try:
-            for attempt in range(1 + RESENDS):
-                self.repeats += attempt > 0
-                try:
-                    if not self._in_step:
-                        self._catch_up()
-                    return self._once(request)
-                except NoReplyError as error:
-                    problem = problem or error
-                    self._in_step = False
-        except RefusedError as error:
-            raise _RefusalError(self._name, error.code, doing.format(number)) from error
-        except OSError as error:
-            self.lost = True
-            raise lost_line(self._name, self._settings, error, ", then connect again") from error
-        if isinstance(problem, UnexpectedReplyError):
-            raise DeviceConnectionError(
-                self._name, f"{problem}; check that no other master is on the line"
-            ) from problem
-        settings = self._settings
-        raise no_answer(
-            self._name,
-            settings,
-            f"no good reply within {settings.timeout:g} s",
-            "address",
-            settings.address,
-            speed=f"{settings.baudrate} Bd, menu 8.1; parity {settings.parity}, menu 8.7; mode RTU, menu 8.8",
-        ) from problem
-
-    def _once(self, request: Callable[[], T]) -> T:
-        if self._pause:
-            self._clock.sleep_until(self._silent_since + self._pause)
-        sent_at = self._clock.now()
-        try:
-            reply = request()
-        except RefusedError:
-            self._note_answer()
-            raise
-        except NoReplyError:
-            self._silent_since = self._clock.now()
-            self._late_until = sent_at + _LATEST * self._settings.timeout
-            raise
-        self._note_answer()
-        return reply
-
-    def _note_answer(self) -> None:
-        now = self._clock.now()
-        self.longest_silence = max(self.longest_silence, now - self._answered_at)
-        self._silent_since = self._answered_at = now
-
-    def _catch_up(self) -> None:
-        """Let late replies pass: what comes before the reply to a request like no other is old.
-
-        Raises `NoReplyError` if that has no reply, and `OSError` if the line is lost or does not fall silent.
-        """
-        settings = self._settings
-        self._client.settle(_QUIET * settings.timeout)
-        late_until = self._late_until
-        self._echoes += 1
-        count = _ECHO_REGISTERS[self._echoes % len(_ECHO_REGISTERS)]
-        function = READ if self._echoes & len(_ECHO_REGISTERS) else READ_INPUT
-        with suppress(RefusedError):
-            self._once(lambda: self._client.read(_FIRST_OF_ECHO, count, function))
-        # No line turns replies round, but what is between two may.
-        if (left := late_until - self._clock.now()) > 0.0:
-            self._client.settle(left)
-        self._in_step = True
-
-
-class _RefusalError(DeviceError):
-    """The instrument answered with a Modbus exception."""
-
-    def __init__(self, device: str, code: int, doing: str) -> None:
-        super().__init__(device, exception_text(code, doing))
+        self.write_one("command 0x{:02X}", value, _COMMAND, value)
 
 
 class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
@@ -348,13 +162,18 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
 
     Settings: ClassVar[type[DAD141Settings]] = DAD141Settings
 
+    conversion = Register(0x202A, int, "I32", "last result of the converter")
+    serial_number = Register(0x2034, int, "I32", "serial number")
+    filter = Register(0x2106, int, "I32", "filter")
+    filter_mode = Register(0x2110, int, "I32", "filter mode")
+    zero_tracking = Register(0x2122, int, "I32", "zero tracking")
+
     def __init__(self, name: str, settings: DAD141Settings, clock: Clock, line: _Line) -> None:
         super().__init__(name, settings, clock, line)
         self._signal = f"{name}_force"
         self._tared: bool
         self._tare: float
         self._restart = ""
-        self._earlier_repeats = 0
         # Half a period of the filter's cut-off makes the noise of the readings nearly independent.
         self._interval = 0.5 / CUTOFF_HZ[settings.filter] if settings.interval is None else settings.interval
         self._gross = math.nan
@@ -371,14 +190,14 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
 
     def _start(self) -> None:
         settings, line = self._settings, self._line
-        if (tracking := line.read_integer(_ZERO_TRACKING)) != 0:
+        if (tracking := self.zero_tracking) != 0:
             raise DeviceError(
                 self.name,
                 f"zero tracking is on (ZT = {tracking}): it would take slow changes of a small load for drift; "
                 "switch it off by the commands CE, ZT 0 and CS of the instrument, then connect again",
             )
-        line.set_integer("filter mode", _FILTER_MODE, _IIR)
-        line.set_integer("filter", _FILTER, settings.filter)
+        self.filter_mode = _IIR
+        self.filter = settings.filter
         if settings.keep_tare and (block := line.read_block()).qualifier & _TARE_SET:
             self._tared, self._tare = True, block.tare
         else:
@@ -442,21 +261,6 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
         """Longest time of `safe`, s: none."""
         return 0.0
 
-    @property
-    def repeats(self) -> int:
-        """Number of requests that were repeated since the device was connected, as their answers were lost."""
-        return self._earlier_repeats + self._line.repeats
-
-    def close(self) -> None:
-        """Release the line."""
-        super().close()
-        self._line.lost = False
-
-    def _renew_line(self) -> None:
-        repeats = self.repeats
-        super()._renew_line()
-        self._earlier_repeats = repeats
-
     def _check_unchanged(self) -> None:
         self._checked_block()
         self._check_set_up()
@@ -478,9 +282,9 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
                 raise self._wrong(
                     f"gives 0x{high:04X}{low:04X} for its firmware, which no DAD 141.1 does; check the address"
                 )
-            serial_number = line.read_integer(_SERIAL_NUMBER)
+            serial_number = self.serial_number
             self._check_order()
-        except _RefusalError as error:
+        except RefusalError as error:
             reason = str(error).removeprefix(f"{self.name}: ")
             raise self._wrong(f"is not a DAD 141.1: {reason}; check the address") from error
         minor, major = low >> 8, low & 0xFF
@@ -545,12 +349,11 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
         """Raise if the instrument has restarted; open the line again if it was lost."""
         if self._restart:
             raise DeviceRestartedError(self.name, self._restart)
-        if self._line.lost:
-            self.reconnect()
+        super()._begin()
 
     def _check_set_up(self) -> None:
         """Raise `DeviceRestartedError` if the instrument has lost its set-up."""
-        found, wanted = self._line.read_integer(_FILTER), self._settings.filter
+        found, wanted = self.filter, self._settings.filter
         if found != wanted:
             self._restart = (
                 f"the instrument was switched off, or set up by its keys: its filter (FL) is {found}, not {wanted}; "
@@ -591,7 +394,7 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
         suspicious = self._adc_looks >= _STALE_LOOKS
         if not suspicious and self._adc_looks and now - self._adc_seen < limit / _STALE_LOOKS:
             return
-        adc = self._line.read_integer(_ADC_SAMPLE)
+        adc = self.conversion
         if adc != self._adc:
             self._adc, self._adc_since, self._adc_looks = adc, now, 0
         self._adc_seen = now
@@ -608,11 +411,11 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
 
         Raises DeviceError if the instrument does not answer.
         """
-        wanted, found = self._settings.filter, self._line.read_integer(_FILTER)
+        wanted, found = self._settings.filter, self.filter
         advice = "" if found == wanted else f"another program changed it from {wanted}; end that"
         conversions = set()
         for _ in range(_CONVERSIONS):
-            conversions.add(self._line.read_integer(_ADC_SAMPLE))
+            conversions.add(self.conversion)
             self._clock.sleep(_POLL)
         works = len(conversions) > 1
         return (
@@ -633,13 +436,3 @@ def _agree(weight: float, digits: int) -> bool:
 
 def _integer(words: Sequence[int]) -> int:
     return int(unpack("i", words)[0])
-
-
-def _frame_pause(settings: DAD141Settings) -> float:
-    """Return the silence between frames in s; by default the 3.5 characters of Modbus, 1.75 ms above 19200 Bd."""
-    if settings.pause is not None:
-        return settings.pause
-    if settings.baudrate > _FAST_LINE:
-        return _FAST_PAUSE
-    bits = 10 if settings.parity == "N" else 11
-    return 3.5 * bits / settings.baudrate

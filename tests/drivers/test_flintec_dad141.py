@@ -108,7 +108,7 @@ class Bench:
 def bench(request, monkeypatch) -> Iterator[Bench]:
     """Return a bench for either client: that of emulated lines, and that of real ones."""
     if request.param == "pymodbus":
-        monkeypatch.setattr("drivers.flintec_dad141.EMULATED", "nothing://")
+        monkeypatch.setattr("drivers.modbus_rtu.EMULATED", "nothing://")
     bench = Bench()
     yield bench
     for cell in bench.cells:
