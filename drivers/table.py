@@ -296,6 +296,9 @@ class TableSensor(LineDevice[Any, LineT], GeneralSensor):
     def _ask(self, names: Iterable[str]) -> dict[str, float]:
         tables = {name: self._line.tables[name] for name in names}
         values = self._line.quantities(tables)
+        for name, value in values.items():
+            if not math.isfinite(value):
+                raise DeviceError(self.name, f"{name} is {value}, no number; check instrument and wiring")
         check_ranges(self.name, tables, values)
         return values
 
