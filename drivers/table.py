@@ -16,7 +16,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from typing import Any, ClassVar, Self, TypeVar, cast, overload
 
-from pydantic import Field, create_model
+from pydantic import Field, create_model, model_validator
 
 from bench.base import Clock, DeviceConnectionError, DeviceError, DeviceRestartedError
 from bench.devices import (
@@ -213,8 +213,8 @@ class TableSensor(LineDevice[Any, LineT], GeneralSensor):
     """A device that measures what its table says.
 
     A class with rows has them as defaults of its `Settings`; further keys of the settings are given defaults as
-    keyword arguments of the class. `measure` also reads the errors that the instrument has kept, `glance` does not.
-    A call after the line was lost opens it again.
+    keyword arguments of the class. A rig file may give other values for single keys. `measure` also reads the errors
+    that the instrument has kept, `glance` does not. A call after the line was lost opens it again.
     """
 
     Settings: ClassVar[type[DriverSettings]]
@@ -462,6 +462,21 @@ def _with_defaults(device: type[TableSensor[Any]], defaults: Mapping[str, object
         known = base.model_fields[key]
         field = Field(default=value, validate_default=True, description=known.description)
         fields[key] = (known.rebuild_annotation(), field)
-    settings = create_model("Settings", __base__=base, __module__=device.__module__, __doc__=base.__doc__, **fields)
+    fill = model_validator(mode="before")(lambda given: _merged(defaults, given))
+    settings = create_model(
+        "Settings",
+        __base__=base,
+        __module__=device.__module__,
+        __doc__=base.__doc__,
+        __validators__={"fill": fill},
+        **fields,
+    )
     settings.__qualname__ = f"{device.__qualname__}.Settings"
     return settings
+
+
+def _merged(defaults: object, given: object) -> object:
+    """Return tables with the keys that are given, and the defaults of those that are not."""
+    if not (isinstance(defaults, Mapping) and isinstance(given, Mapping)):
+        return given
+    return {**defaults, **{key: _merged(defaults.get(key), value) for key, value in given.items()}}

@@ -110,10 +110,18 @@ def test_a_restart_is_found_and_nothing_is_set_after_it(oven, twin):
     oven.safe()
 
 
-def test_the_settings_say_otherwise_where_they_do(connect):
-    setpoint = {"command": "P {value:.1f}", "query": "P?", "unit": "W", "limits": [0.0, 30.0]}
-    assert connect(setpoint=setpoint).limits == Limits(0.0, 30.0, "W")
-    assert connect().limits == Limits(0.0, 50.0, "W")
+def test_the_settings_say_otherwise_key_by_key(connect, twin):
+    oven = connect(setpoint={"limits": [0.0, 30.0]}, signals={"temperature": {"limits": [0.0, 20.0]}})
+    assert oven.limits == Limits(0.0, 30.0, "W")
+    assert oven.reading_limits == {"oven_temperature": Limits(0.0, 20.0, "°C")}
+    assert oven.current == 0.25
+    oven.power = 10.0
+    assert twin.power == 10.0
+    for settings in (Oven.Settings(port="a"), Oven.Settings.model_validate({"port": "a"})):
+        assert settings.setpoint.limits == (0.0, 50.0)
+        assert settings.signals["temperature"].limits == (-10.0, 300.0)
+    more = connect(signals={"heat": {"query": "P?", "unit": "W"}})
+    assert [each.name for each in more.signals] == ["oven_temperature", "oven_current", "oven_heat"]
 
 
 def test_a_subclass_has_the_rows_of_its_base(connect):

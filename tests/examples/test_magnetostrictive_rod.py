@@ -141,7 +141,7 @@ with bench.open_rig("magnetostrictive-rod") as rig:
     coil.set(1.5).wait()
     coil.reconnect()
     assert abs(coil.measure()["coil_current"] - 1.5) < 0.01
-    source._off()
+    source.power_cycle()
     for call in (coil.glance, lambda: coil.set(1.0), coil.reconnect):
         try:
             call()
@@ -153,7 +153,7 @@ with bench.open_rig("magnetostrictive-rod") as rig:
 
 
 def test_a_restart_of_its_source_is_found_and_nothing_is_set_after_it(python):
-    said = "coil: has restarted: its output is off without the bench; connect again\n"
+    said = "coil: its output is off and its set-point is lost: it has restarted; connect again\n"
     assert python("-c", RESTART) == 3 * said
 
 
