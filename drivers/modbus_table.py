@@ -139,7 +139,6 @@ class _MeasuringLine(RtuLine, TableLine):
         self.first_of_echo = min(table.at for table in settings.signals.values())
 
     def identify(self, resends: int) -> Identity:
-        """Return which instrument answers; raise `DeviceConnectionError` if it is not as the settings say."""
         keys = self._keys
         with self.at_most(resends):
             model = "Modbus instrument"
@@ -158,12 +157,10 @@ class _MeasuringLine(RtuLine, TableLine):
         return Identity("unknown", model, number, "unknown")
 
     def start(self) -> None:
-        """Write the registers of `setup`, and read them back."""
         for each in self._keys.setup:
             self.write_number(f"register 0x{each.at:04X}", each.at, each.kind, each.value)
 
     def quantities(self, names: Iterable[str]) -> dict[str, float]:
-        """Read the registers of quantities."""
         tables = self._keys.signals
         return {name: self.read_number(tables[name].at, tables[name].kind) * tables[name].scale for name in names}
 
@@ -191,34 +188,27 @@ class _SwitchingLine(_MeasuringLine, SwitchedLine):
         self.safe_within = 5.0 * settings.timeout
 
     def write_setpoint(self, value: float) -> None:
-        """Write the set-point; it is read back."""
         target = self._target
         self.write_number("set-point", target.at, target.kind, value / target.scale)
 
     def written(self, value: float) -> float:
-        """Return a set-point as it stands in its registers."""
         target = self._target
         return unpack_number(target.kind, pack_number(target.kind, value / target.scale)) * target.scale
 
     def read_setpoint(self) -> float | None:
-        """Read the set-point."""
         return self.read_number(self._target.at, self._target.kind) * self._target.scale
 
     def prepare(self) -> None:
-        """Write the registers of `setup`."""
         self.start()
 
     def switch_on(self) -> None:
-        """Write what switches the output on."""
         self.write_number("output", self._output.at, "U16", self._output.on)
 
     def try_off(self, *, fresh: bool) -> list[DeviceError]:  # noqa: ARG002 - a line finds its step by itself
-        """Write what switches the output off, at once and on a line in step, and read it back."""
         self.tell(self._output.at, self._output.off)
         return attempt(partial(self.write_number, "output", self._output.at, "U16", self._output.off))
 
     def reads_on(self) -> bool | None:
-        """Return whether the output is on; raise `DeviceError` if it is neither on nor off."""
         output = self._output
         found = self.read_number(output.at, "U16")
         if found not in (output.on, output.off):

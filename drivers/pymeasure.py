@@ -210,7 +210,7 @@ def _check_property(info: ValidationInfo, key: str, path: str) -> None:
         raise ValueError(f"{key} = {path!r}: {reference} has no such property")
 
 
-class InstrumentLine(TableLine):
+class _MeasuringLine(TableLine):
     """A connected PyMeasure instrument, whose errors are those of the bench.
 
     As a late answer could be taken for the next, the line is opened again after each request that failed on it.
@@ -230,7 +230,6 @@ class InstrumentLine(TableLine):
             ) from None
 
     def identify(self, resends: int) -> Identity:  # noqa: ARG002 - the library does not repeat
-        """Return which instrument answers; raise `DeviceConnectionError` if it is not as the settings say."""
         settings = self._settings
         if not hasattr(type(self.instrument), "id"):
             return Identity("unknown", settings.instrument.partition(":")[2], "unknown", "unknown")
@@ -242,35 +241,28 @@ class InstrumentLine(TableLine):
         return identity_of(answer)
 
     def start(self) -> None:
-        """Carry out the actions of `setup`."""
         self.act_all(self._settings.setup)
 
     def quantities(self, names: Iterable[str]) -> dict[str, float]:
-        """Read the properties of quantities."""
         tables = self._settings.signals
         return {name: self.number(tables[name].property) * tables[name].scale for name in names}
 
     def errors(self) -> list[str]:
-        """Return what `check_errors` of the instrument returns, if the settings ask for it."""
         return [str(error) for error in self.get("check_errors")() or ()] if self._settings.check_errors else []
 
     def shut_down(self) -> None:
-        """Shut the instrument down, unless the settings say otherwise."""
         if self._settings.shutdown:
             self.act("shutdown()")
 
     def act_all(self, actions: Iterable[str]) -> None:
-        """Carry out calls and assignments, in this order."""
         for action in actions:
             self.act(action)
 
     def get(self, path: str) -> Any:  # noqa: ANN401 - of any type
-        """Return a property."""
         with self._errors(f"reading {path}"):
             return _get(self.instrument, path)
 
     def number(self, path: str) -> float:
-        """Return a property that is a number; raises `DeviceError` if it is none."""
         value = self.get(path)
         try:
             number = float(value)
@@ -281,17 +273,14 @@ class InstrumentLine(TableLine):
         return number
 
     def set(self, path: str, value: float) -> None:
-        """Set a property."""
         with self._errors(f"setting {path} to {value:g}"):
             _set(self.instrument, path, value)
 
     def act(self, text: str) -> None:
-        """Carry out a call or an assignment."""
         with self._errors(text):
             parse_action(text)(self.instrument)
 
     def close(self) -> None:
-        """Release the line; the instrument keeps its state."""
         with self._errors("closing"):
             self.instrument.adapter.close()
 
@@ -312,39 +301,33 @@ def _is_of_the_line(error: Exception) -> bool:
     return isinstance(error, OSError | pyvisa.errors.Error)
 
 
-class _SwitchingLine(InstrumentLine, SwitchedLine):
+class _SwitchingLine(_MeasuringLine, SwitchedLine):
     """A connected PyMeasure instrument that takes a set-point."""
 
     def __init__(self, device: str, settings: ActuatorSettings, clock: Clock) -> None:
-        InstrumentLine.__init__(self, device, settings, clock)
+        _MeasuringLine.__init__(self, device, settings, clock)
         self.target = self._target = settings.setpoint
         self._actions = settings
 
     def write_setpoint(self, value: float) -> None:
-        """Set the property."""
         self.set(self._target.property, value / self._target.scale)
 
     def read_setpoint(self) -> float | None:
-        """Return the property, or None if it is not to be read back."""
         return self.number(self._target.property) * self._target.scale if self._target.read_back else None
 
     def prepare(self) -> None:
-        """Carry out `setup` and `before_on`."""
         self.act_all((*self._actions.setup, *self._actions.before_on))
 
     def switch_on(self) -> None:
-        """Carry out `on`."""
         self.act_all(self._actions.on)
 
     def try_off(self, *, fresh: bool) -> list[DeviceError]:  # noqa: ARG002 - a new instance is always fresh
-        """Carry out all of `safe`, and see that `output` is false."""
         # A lost line may take its whole time-out for each message.
         if self.lost:
             return []
         return attempt(*(partial(self.act, action) for action in self._actions.safe)) or attempt(self._confirm_off)
 
     def reads_on(self) -> bool | None:
-        """Return whether the property `output` is true; None without one."""
         return None if self._actions.output is None else bool(self.get(self._actions.output))
 
     def _confirm_off(self) -> None:
@@ -352,11 +335,11 @@ class _SwitchingLine(InstrumentLine, SwitchedLine):
             raise DeviceError(self._device, f"{self._actions.output} is true")
 
 
-class SensorAdapter(TableSensor[InstrumentLine]):
+class SensorAdapter(TableSensor[_MeasuringLine]):
     """A PyMeasure instrument that measures."""
 
     Settings: ClassVar[type[DriverSettings]] = SensorSettings
-    Line: ClassVar[type[TableLine]] = InstrumentLine
+    Line: ClassVar[type[TableLine]] = _MeasuringLine
 
 
 class Adapter(TableActuator):

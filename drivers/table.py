@@ -41,10 +41,8 @@ class TableLine(ABC):
 
     Attributes
     ----------
-    source : str
-        Key of a table that says where the instrument has a quantity, such as `query`.
-    target_source : str
-        The same of a set-point, such as `command`.
+    source, target_source : str
+        Key of a table that says where the instrument has a quantity and a set-point, such as `query` and `command`.
     tables : mapping of str to QuantityTable
         What is measured, by name.
     lost : bool
@@ -468,7 +466,7 @@ def _with_defaults(device: type[TableSensor[Any]], defaults: Mapping[str, object
         __base__=base,
         __module__=device.__module__,
         __doc__=base.__doc__,
-        __validators__={"fill": fill},
+        __validators__={"fill": cast("Any", fill)},
         **fields,
     )
     settings.__qualname__ = f"{device.__qualname__}.Settings"

@@ -57,7 +57,6 @@ class _MeasuringLine(TextLine, TableLine):
         TextLine.__init__(self, name, settings, clock)
 
     def identify(self, resends: int) -> Identity:
-        """Return which instrument answers; raise `DeviceConnectionError` if it is not as the table says."""
         settings = self._settings
         if not settings.identity_query:
             return Identity("unknown", "text instrument", settings.port, "unknown")
@@ -71,7 +70,6 @@ class _MeasuringLine(TextLine, TableLine):
         return identity_of(answer)
 
     def start(self) -> None:
-        """Send the messages of `setup`, after a look at the queue of errors."""
         # What happened before is nobody's fault here.
         self.errors()
         self.set_up()
@@ -79,12 +77,10 @@ class _MeasuringLine(TextLine, TableLine):
             self.raise_errors("the messages of setup")
 
     def set_up(self) -> None:
-        """Send the messages of `setup`."""
         for message in self._settings.setup:
             self.tell(message)
 
     def quantities(self, names: Iterable[str]) -> dict[str, float]:
-        """Ask for quantities, in the unit of their tables."""
         tables = {name: self._settings.signals[name] for name in names}
         values = {}
         for query, sharing in signals_by_query(tables).items():
@@ -107,7 +103,6 @@ class _SwitchingLine(_MeasuringLine, SwitchedLine):
         self.safe_within = settings.timeout + (len(self._output.off) + 2) * (settings.delay + _MESSAGE_TIME)
 
     def start(self) -> None:
-        """Send the messages of `setup`, and see that the limits are within the range of the instrument."""
         super().start()
         table = self._table
         if table.range_queries is not None:
@@ -121,25 +116,20 @@ class _SwitchingLine(_MeasuringLine, SwitchedLine):
             self.raise_errors("the questions of range_queries")
 
     def write_setpoint(self, value: float) -> None:
-        """Send a set-point, and wait until it was carried out where that can be asked for."""
         self.tell(self._command.fill({self._command.names[0]: value / self._table.scale}))
         if self._settings.completion_query:
             self.ask(self._settings.completion_query, _DONE)
 
     def written(self, value: float) -> float:
-        """Return a set-point as its message says it."""
         return written_number(self._command, value / self._table.scale) * self._table.scale
 
     def read_setpoint(self) -> float | None:
-        """Return the set-point that the instrument has; None without a question for it."""
         return self._ask_number(self._table.query, template(self._table.reply)) if self._table.query else None
 
     def prepare(self) -> None:
-        """Send the messages of `setup`."""
         self.set_up()
 
     def switch_on(self) -> None:
-        """Send the messages of `output.on`."""
         for message in self._output.on:
             self.tell(message)
 
@@ -158,7 +148,6 @@ class _SwitchingLine(_MeasuringLine, SwitchedLine):
         return attempt(self._confirm_off if self._output.query else self._confirm_heard)
 
     def reads_on(self) -> bool | None:
-        """Return whether the output is on; None without a question for it."""
         return self._is_on(RESENDS) if self._output.query else None
 
     def _is_on(self, resends: int) -> bool:
