@@ -251,6 +251,13 @@ class RecoverableDevice(LineActuator[SettingsT, LineT]):
             self._clock.sleep(_START_POLL)
 
 
+def refuse_hiding(device: type, name: str, kind: type) -> None:
+    """Raise `TypeError` if a row of a class hides what its bases have, unless that is a row of that kind as well."""
+    for base in device.__mro__[1:]:
+        if name in vars(base) and not isinstance(vars(base)[name], kind):
+            raise TypeError(f"{device.__name__}.{name}: {base.__name__} has this name already; choose another")
+
+
 def attempt(*steps: Callable[[], object]) -> list[DeviceError]:
     """Take every step, also after one that fails; return the failures."""
     failures = []

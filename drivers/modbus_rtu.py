@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, Self, TypeVar, overload
 from pydantic import Field
 
 from bench.base import Clock, DeferredModule, DeviceConnectionError, DeviceError
+from drivers.device import refuse_hiding
 from drivers.modbus import (
     EMULATED,
     READ,
@@ -307,6 +308,9 @@ class Register(Generic[NumberT]):
         self._kind: Callable[[float], NumberT] = kind
         self._address, self._form, self._description = address, form, description
         self.__doc__ = f"{description[:1].upper()}{description[1:]}."
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        refuse_hiding(owner, name, Register)
 
     @overload
     def __get__(self, device: None, owner: object = None) -> Self: ...

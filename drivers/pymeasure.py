@@ -324,7 +324,7 @@ class _SwitchingLine(_MeasuringLine, SwitchedLine):
     def try_off(self, *, fresh: bool) -> list[DeviceError]:  # noqa: ARG002 - a new instance is always fresh
         # A lost line may take its whole time-out for each message.
         if self.lost:
-            return []
+            return [DeviceConnectionError(self._device, "the line was lost before")]
         return attempt(*(partial(self.act, action) for action in self._actions.safe)) or attempt(self._confirm_off)
 
     def reads_on(self) -> bool | None:

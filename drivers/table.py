@@ -29,7 +29,7 @@ from bench.devices import (
     Status,
     TargetTable,
 )
-from drivers.device import LineDevice
+from drivers.device import LineDevice, attempt, refuse_hiding
 from drivers.quantities import arrival_of, check_ranges, check_read_back, output_lost, signals_of
 from drivers.serial_line import RESENDS
 
@@ -168,6 +168,7 @@ class Row:
         self.__doc__ = f"{description[:1].upper()}{description[1:]}, {unit}."
 
     def __set_name__(self, owner: type, name: str) -> None:
+        refuse_hiding(owner, name, Row)
         self._name = name
 
     def table(self, source: str) -> dict[str, object]:
@@ -263,7 +264,9 @@ class TableSensor(LineDevice[Any, LineT], GeneralSensor):
     def quantity(self, name: str) -> float:
         """Measure one quantity, by its name without that of the device; raises as `measure` does."""
         self._begin()
-        return self._ask([name])[name]
+        value = self._ask([name])[name]
+        self._check_output()
+        return value
 
     def measure_quantities(self) -> dict[str, float]:
         """Measure every quantity, and read the errors that the instrument has kept."""
@@ -276,7 +279,9 @@ class TableSensor(LineDevice[Any, LineT], GeneralSensor):
     def glance(self) -> dict[str, float]:
         """Measure every signal, without a look at the errors that were kept; values by signal name."""
         self._begin()
-        return {f"{self.name}_{name}": value for name, value in self._ask(self._line.tables).items()}
+        values = self._ask(self._line.tables)
+        self._check_output()
+        return {f"{self.name}_{name}": value for name, value in values.items()}
 
     def close(self) -> None:
         """Release the line; an output that is on stays on, unless the instrument is shut down on closing."""
@@ -287,6 +292,9 @@ class TableSensor(LineDevice[Any, LineT], GeneralSensor):
 
     def _check_in_use(self) -> None:
         """Raise `DeviceError` unless output and set-point are as they were left; a sensor has none."""
+
+    def _check_output(self) -> None:
+        """Raise `DeviceError` unless the output is as it was left; a sensor has none."""
 
     def _check_unchanged(self) -> None:
         self._ask(self._line.tables)
@@ -337,6 +345,7 @@ class TableActuator(TableSensor[SwitchedLine], GeneralActuator):
         """Return the set-point that the instrument has; the one that was sent last if it cannot be asked for."""
         self._begin()
         found = self._line.read_setpoint()
+        self._check_output()
         return self._setpoint if found is None else found
 
     def send(self, value: float) -> Status:
@@ -368,23 +377,12 @@ class TableActuator(TableSensor[SwitchedLine], GeneralActuator):
         if self._line.off_changes_setpoint:
             self._left = math.nan
         failures = self._line.try_off(fresh=False)
-        if self._line.lost or any(isinstance(failure, DeviceConnectionError) for failure in failures):
-            try:
-                self._renew_line()
-            except DeviceError as error:
-                failures = failures or [error]
-            else:
-                failures = self._line.try_off(fresh=True)
+        if any(isinstance(failure, DeviceConnectionError) for failure in failures):
+            more = attempt(self._renew_line) or self._line.try_off(fresh=True)
+            failures = [*failures, *more] if more else []
         if failures:
-            raise DeviceError(
-                self.name, f"does not confirm that its output is off ({failures[0]}); switch it off by hand"
-            )
-
-    def glance(self) -> dict[str, float]:
-        """Measure every signal and check the output; values by signal name."""
-        values = super().glance()
-        self._check_output()
-        return values
+            said = "; ".join(map(str, failures))
+            raise DeviceError(self.name, f"does not confirm that its output is off ({said}); switch it off by hand")
 
     def _begin(self) -> None:
         if self._restart is not None:

@@ -100,9 +100,12 @@ def test_a_set_point_is_assigned_and_read_back(oven, twin):
     assert twin.power == 19.0
 
 
-def test_a_restart_is_found_and_nothing_is_set_after_it(oven, twin):
+@pytest.mark.parametrize("first", ["temperature", "power", "glance", "measure"])
+def test_a_restart_is_found_and_nothing_is_set_after_it(oven, twin, first):
     oven.power = 20.0
     twin.power, twin.on = 0.0, False
+    with pytest.raises(DeviceRestartedError, match="it has restarted"):
+        getattr(oven, first)()
     for act in (oven.glance, lambda: oven.temperature, lambda: oven.set(5.0), lambda: oven.power):
         with pytest.raises(DeviceRestartedError, match="it has restarted"):
             act()
@@ -169,6 +172,12 @@ def test_a_class_that_makes_no_sense_is_refused_when_it_is_made():
         class Typo(SCPISensor, identiy="X"):
             pass
 
+    for name, owner in (("limits", "GeneralActuator"), ("setpoint", "GeneralActuator"), ("name", "Device")):
+        with pytest.raises((TypeError, RuntimeError)) as raised:
+            type("Hiding", (Oven,), {name: Reading("T?", "°C", None, "temperature")})
+        # Python 3.11 wraps what a row raises when it is given its name.
+        said = str(raised.value.__cause__ or raised.value)
+        assert f"Hiding.{name}: {owner} has this name already; choose another" in said
     with pytest.raises(TypeError, match="Two has 2 set-points; a device has one"):
 
         class Two(Oven):
