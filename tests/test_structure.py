@@ -37,6 +37,7 @@ LONGEST = 700
 OPENS_LINES = {("bench.rig", "Rig"), *((library, None) for library in ("serial", "can", "pymodbus", "pyvisa"))}
 WHERE_LINES_ARE_OPENED = {
     "bench/batch/campaign/known_rig.py",
+    "bench/contracts/emulated.py",
     "bench/contracts/on_a_rig.py",
     "bench/api.py",
     "bench/execution/guardian/__main__.py",

@@ -36,9 +36,11 @@ class OnEmulatedRig:
 
     @pytest.fixture
     def rig(self) -> Iterator[Rig]:
-        """Connect the rig; make its devices safe and close them afterwards."""
-        path = Path(inspect.getfile(type(self))).parent / self.rig_file
-        with Rig(load_rig(str(path)), VirtualClock(), seed=0) as rig:
+        """Connect the rig; make its devices safe and close them afterwards. A rig that is real is refused."""
+        file = load_rig(str(Path(inspect.getfile(type(self))).parent / self.rig_file))
+        if not file.emulated:
+            pytest.fail(f"{file.path} is a real rig, whose devices would move; use pytest --pyargs bench.contracts")
+        with Rig(file, VirtualClock(), seed=0) as rig:
             yield rig
 
     @pytest.fixture
