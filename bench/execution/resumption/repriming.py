@@ -53,7 +53,8 @@ class Resumption:
         Signal of the slot `drive`; empty if there is none.
     sigmas : float
         Standard deviations by which they may differ, beside the larger of the resolution and 0.5 % of what the
-        signal went through. A response may differ by what the same makes of it on the slope of the branch, too.
+        signal went through, for creep. A response may differ besides by what the same of the drive makes of it on the
+        slope of the branch: a set-point is hit a little beside, and a room that has become warmer acts like that.
     required : bool
         Whether the run ends if they differ by more; otherwise that is recorded, and the run goes on.
     by_hand : bool
@@ -130,6 +131,7 @@ def reprime(run: RunAtHand, past: Resumption, settle: Callable[[Settle], None]) 
 
 
 def _disagreements(run: RunAtHand, past: Resumption, readings: Sequence[Mapping[str, float]]) -> list[str]:
+    """Return what differs from the record by more than `Resumption.sigmas` says."""
     fed = past.fed
     described: Mapping[str, Signal] = run.station.description.by_name
     found = []
@@ -191,12 +193,14 @@ def _slope(fed: Fed, drive: str, name: str) -> float:
 def _noise(fed: Fed, name: str) -> float:
     """Return the noise of a signal at rest: the larger of that of ticks and that of readings.
 
-    That of the last ticks is free of drift: a median of differences within one step. It is zero for a signal that
-    stands on one digit and jumps now and then: readings that differ from the tick before them show such jumps.
+    That of the last ticks is free of drift: a median of differences within the second halves of steps, as in the
+    first ones the specimen goes to its place. It is zero for a signal that stands on one digit and jumps now and
+    then: readings that differ from the tick before them show such jumps.
     """
     ticks = fed.past.ticks
     values, steps = ticks[name][-_TICKS:], ticks["step"][-_TICKS:]
-    differences = np.abs(np.diff(values))[np.diff(steps) == 0]
+    of_steps = [np.abs(np.diff(values[steps == step])) for step in np.unique(steps)]
+    differences = np.concatenate([np.empty(0), *(each[each.size // 2 :] for each in of_steps)])
     differences = differences[np.isfinite(differences)]
     of_ticks = float(np.median(differences)) / _NORMAL if differences.size else 0.0
     return max(of_ticks, _jumps(fed, name))
