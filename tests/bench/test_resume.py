@@ -270,7 +270,7 @@ class TestResume:
         assert len(steps_of(folder)) == 2 - shared
 
     def test_stops_where_the_specimen_is_another(self, climb, monkeypatch):
-        folder = climb()
+        folder = climb(dwell=20.0)
         # A tenth of what it went through.
         monkeypatch.setattr(Plate, "sensed", lambda plate: plate.now() + 1.0)
         result = resume(Resume(folder=folder), silent())
