@@ -29,6 +29,10 @@ def load_tuning(path: Path) -> dict[str, dict[str, Any]]:
     tables = content.get("tuning")
     if not isinstance(tables, dict) or not all(isinstance(table, dict) for table in tables.values()):
         raise ConfigurationError(f"{path} is not a tuning file: expected tables [tuning.CONTROLLER]")
+    if unknown := content.keys() - {"tuning", "provenance"}:
+        raise ConfigurationError(
+            f"tuning file {path} has a key {min(unknown)!r}; expected tables [tuning.CONTROLLER] and [provenance]"
+        )
     return tables
 
 

@@ -43,6 +43,18 @@ if TYPE_CHECKING:
 
 FORMAT = "bench-model"
 VERSION = 2
+_KEYS = {
+    "format",
+    "version",
+    "kind",
+    "name",
+    "model",
+    "memory",
+    "initial",
+    "band",
+    "dynamics",
+    "provenance",
+}
 _PROVENANCE: Mapping[str, tuple[type | tuple[type, ...], str]] = {
     "skipped": (int, "a whole number"), "rms": ((int, float), "a number"), "input": (str, "a text"),
     "output": (str, "a text"), "time": (str, "a text"), "input_sha256": (str, "a text"),
@@ -230,9 +242,14 @@ def parse_model(content: object, source: str) -> ModelFile:
     if (version := content.get("version")) != VERSION:
         raise DataError(f"model file {source} has version {version!r}; this bench reads version {VERSION}")
     try:
+        if unknown := content.keys() - _KEYS:
+            raise ValueError(f"unknown key {min(unknown)!r}; expected {', '.join(sorted(_KEYS))}")
+        name = content["name"]
+        if not isinstance(name, str):
+            raise TypeError(f"name: expected a text, got {name!r}")
         document = content["model"]
         model = model_from_json(document)
-        _check_numbers(document, model.to_json())
+        _check_fields(document, model.to_json())
         if content["kind"] != model.kind:
             raise ValueError(f"kind: expected {model.kind!r}, the type of the model, got {content['kind']!r}")
         memory, initial = content["memory"], content.get("initial")
@@ -252,21 +269,24 @@ def parse_model(content: object, source: str) -> ModelFile:
             value = provenance.get(key)
             if value is not None and (isinstance(value, bool) or not isinstance(value, kind)):
                 raise TypeError(f"provenance: expected {what} for {key}, got {value!r}")
-        return ModelFile(str(content["name"]), model, memory, provenance, initial, band, dynamics)
+        return ModelFile(name, model, memory, provenance, initial, band, dynamics)
     except KeyError as error:
         raise DataError(f"model file {source} is damaged: key {error} is missing") from None
     except (ValueError, TypeError, AttributeError, OverflowError) as error:
         raise DataError(f"model file {source} is damaged: {error}") from None
 
 
-def _check_numbers(said: object, held: object) -> None:
-    """Raise ValueError if a model holds a number where its file says `true` or `false`."""
+def _check_fields(said: object, held: object) -> None:
+    """Raise ValueError if a file says what its model does not hold, or `true` or `false` for a number."""
     if isinstance(said, dict) and isinstance(held, dict):
-        for key in said.keys() & held.keys():
-            _check_numbers(said[key], held[key])
+        for key, value in said.items():
+            if key in held:
+                _check_fields(value, held[key])
+            elif value is not None:
+                raise ValueError(f"unknown key {key!r} of the model")
     elif isinstance(said, list) and isinstance(held, list | tuple):
         for each, other in zip(said, held, strict=False):
-            _check_numbers(each, other)
+            _check_fields(each, other)
     elif isinstance(said, bool) and isinstance(held, int | float) and not isinstance(held, bool):
         raise ValueError("expected a number, got true or false")
 

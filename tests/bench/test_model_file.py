@@ -114,6 +114,12 @@ class TestUnusable:
         with pytest.raises(DataError, match=f"has version .*; this bench reads version {VERSION}"):
             parse_model({**content(), "version": version}, "m.json")
 
+    def test_an_unknown_key_and_a_name_that_is_no_text_are_refused(self):
+        document = content()
+        for wrong in ({"extra": 1}, {"name": math.nan}, {"model": {**document["model"], "extra": 1}}):
+            with pytest.raises(DataError, match=r"m\.json"):
+                parse_model({**document, **wrong}, "m.json")
+
     @cases("key", ["name", "kind", "model", "memory", "provenance"])
     def test_a_missing_key_is_named(self, key):
         document = content()

@@ -249,7 +249,12 @@ def test_a_tuning_file_is_read_by_the_parameter_of_a_protocol(tmp_path):
 
 @cases(
     ("content", "said"),
-    [("[tuning", "not TOML"), ("[rig]\na = 1\n", r"expected tables \[tuning.CONTROLLER\]"), (None, "cannot be read")],
+    [
+        ("[tuning", "not TOML"),
+        ("[rig]\na = 1\n", r"expected tables \[tuning.CONTROLLER\]"),
+        ("[tuning.latched]\n[x]\n", "has a key 'x'"),
+        (None, "cannot be read"),
+    ],
 )
 def test_what_is_no_tuning_file_is_refused(tmp_path, content, said):
     path = tmp_path / "tuning.toml"
