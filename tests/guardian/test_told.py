@@ -115,7 +115,7 @@ def check_what_is_told(folder, name):
         (listed,) = list_runs(run.folder)
         assert (listed.status, listed.result) == ("failed", record.reason)
         notes = (run.folder / BLACK_BOX_NAME).read_text(encoding="utf-8")
-        assert "http://127.0.0.1/\\u2026 was not told of the end" in notes
+        assert "http://127.0.0.1/… was not told of the end" in notes
         texts = [run.said, *(path.read_bytes().decode(errors="replace") for path in run.folder.rglob("*.*"))]
         assert not [text for text in texts if TOKEN in text]
 
