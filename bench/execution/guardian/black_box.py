@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.base import json_text, wall_time
-from bench.record import BLACK_BOX_NAME
+from bench.record import BEGIN, BLACK_BOX_NAME
 
 _KEPT = 150
 """Looks that are kept for the record of what went before a trip: 30 s at 5 Hz."""
@@ -26,9 +26,10 @@ class BlackBox:
         self._thread = threading.Thread(target=self._write, name="black box", daemon=True)
         self._thread.start()
 
-    def keep_in(self, folder: Path) -> None:
-        """Write to the folder of a run from now on."""
+    def keep_in(self, folder: Path, **content: Any) -> None:  # noqa: ANN401 - anything that JSON can hold
+        """Write to the folder of a run from now on, first what begins; looks before that come with the next note."""
         self._path = folder / BLACK_BOX_NAME
+        self._write_down(BEGIN, content)
 
     def saw(self, values: dict[str, float]) -> None:
         """Note a look; it is written only if something happens within the next half a minute."""
@@ -38,6 +39,9 @@ class BlackBox:
         """Write down that something happened, and the looks before it."""
         while self._looks:
             self._queue.put(json_text({"what": "look", **self._looks.popleft()}))
+        self._write_down(what, content)
+
+    def _write_down(self, what: str, content: dict[str, Any]) -> None:
         self._queue.put(json_text({"what": what, "at": wall_time().isoformat(), **content}))
 
     def close(self) -> None:

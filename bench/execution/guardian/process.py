@@ -37,7 +37,7 @@ from bench.execution.notify import WITHIN, Notifier
 from bench.execution.station.core import StationCore
 from bench.execution.station.interface import News, masked, news_of
 from bench.execution.station.reconnection import TRIES, lines_of, longest_away
-from bench.record import BEGIN, END, FAILED, Event
+from bench.record import END, FAILED, Event
 from bench.rig import SAFE as IS_SAFE, AttachedClock, InterlockWatch, Look, Rig
 
 _SAFE_WITHIN = 3.0
@@ -329,7 +329,7 @@ class Guardian:
         self._reply(message)
 
     def _keep_record(self, message: Message) -> None:
-        self._box.keep_in(Path(message["folder"]))
+        self._box.keep_in(Path(message["folder"]), rig=self._rig.file.name, process=os.getpid())
         self._writes_stacks = bool(message["stacks"])
         passed = (self._rig.clock.date() - datetime.fromisoformat(message["epoch"])).total_seconds()
         self._zero = self._rig.clock.now() - passed
@@ -337,7 +337,6 @@ class Guardian:
         for notifier in self._notifiers:
             notifier.facts = message["facts"]
         self._keeps_record = True
-        self._box.note(BEGIN, rig=self._rig.file.name, process=os.getpid())
         self._reply(message)
 
     def _look(self, message: Message, tries: int = TRIES) -> None:
