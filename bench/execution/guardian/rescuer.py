@@ -17,7 +17,7 @@ import threading
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 from bench.base import ENDING, BenchError, parse_json
 from bench.execution.guardian.parent import SIGKILL, ParentProcess
@@ -146,13 +146,15 @@ def main() -> int:
     # It ends with its guardian only.
     for number in (*ENDING, signal.SIGINT):
         signal.signal(number, signal.SIG_IGN)
-    content = parse_json(sys.stdin.buffer.readline())
+    # Without a buffer: a thread that waits for one would keep the interpreter from its end.
+    pipe = io.FileIO(sys.stdin.fileno(), closefd=False)
+    content = parse_json(pipe.readline())
     guardian = ParentProcess(content["guardian"])
     report = Report(Path(content["report"]))
     # The drivers as well: nothing has to be loaded any more when it counts.
     names = [entry.name for entry in load_rig(content["rig"], content["overrides"]).devices]
     signs: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-    threading.Thread(target=_read, args=(signs,), daemon=True).start()
+    threading.Thread(target=_read, args=(pipe, signs), daemon=True).start()
     report.write({})
     if not is_needed(signs):
         return 0
@@ -172,10 +174,8 @@ def main() -> int:
     return 0
 
 
-def _read(signs: queue.SimpleQueue[bytes]) -> None:
-    # From the buffer, which may have taken in more than the first line.
-    signs_of_life = cast("io.BufferedReader", sys.stdin.buffer)
-    while sign := signs_of_life.read1(4096):
+def _read(pipe: io.FileIO, signs: queue.SimpleQueue[bytes]) -> None:
+    while sign := pipe.read(4096):
         signs.put(sign)
     signs.put(b"")
 
