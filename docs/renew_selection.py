@@ -21,7 +21,7 @@ from statistics import median
 
 from renew_measured import put
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "benchmarks"))
+sys.path.insert(0, str(Path(__file__).parents[1] / "tools" / "benchmarks"))
 
 from selection_quality import CASES, KINDS, MEASURED, WITHIN, Case, Outcome, case, choose, measured_case
 
@@ -31,9 +31,9 @@ PAGE = ROOT / "docs" / "reference" / "model-selection.md"
 
 def state() -> str:
     """Return a digest of the code on which the errors depend."""
-    parts = [ROOT / "bench" / name for name in ("hysteresis", "identification", "timed")]
+    parts = [ROOT / "bench" / name for name in ("models", "identification")]
     files = sorted(file for part in parts for file in part.rglob("*.py"))
-    files.append(ROOT / "tests" / "benchmarks" / "selection_quality.py")
+    files.append(ROOT / "tools" / "benchmarks" / "selection_quality.py")
     return hashlib.sha256(b"".join(file.read_bytes() for file in files)).hexdigest()[:16]
 
 

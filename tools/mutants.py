@@ -36,7 +36,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-MODULES = ("bench/control", "bench/execution/engine.py", "bench/journal", "drivers")
+MODULES = ("bench/control", "bench/execution/engine.py", "bench/record", "drivers")
 TESTS = ("tests/control", "tests/drivers", "tests/contracts", "tests/bench", "tests/protocols")
 TABLES = ("tests/contracts/test_settings.py", "tests/contracts/test_values.py")
 MOST_TESTS, MOST_SECONDS = 600, 40.0

@@ -81,7 +81,7 @@ LOOK = 400
 
 SOURCES = ("bench", "drivers", "protocols", "rigs", "sim_devices")
 VIEWS = ("bench/dashboard", "bench/record/lateness.py", "bench/base/units.py")
-WITHOUT_EFFECT = ("bench/cli", "bench/contracts", "bench/panel", "bench/skeletons", "bench/upkeep", *VIEWS)
+WITHOUT_EFFECT = ("bench/cli", "bench/contracts", "bench/panel", "bench/rig/maintenance", *VIEWS)
 """Of the sources, those that a run does not depend on."""
 
 

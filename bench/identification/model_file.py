@@ -43,7 +43,9 @@ if TYPE_CHECKING:
 
 FORMAT = "bench-model"
 VERSION = 2
+# A record adds when it kept the model.
 _KEYS = {
+    "kept",
     "format",
     "version",
     "kind",

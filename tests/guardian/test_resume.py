@@ -2,7 +2,7 @@ import os
 import signal
 
 import pytest
-from benches import is_on, seconds_until
+from benches import is_on, rescuer_of, seconds_until
 from guarded_run import find_guardian
 from killing import kill_after
 
@@ -29,6 +29,7 @@ def kill_both(bench):
     guardian = find_guardian(bench.pid)
     # Held first: a bench that lives on for a moment makes safe what its guardian left, and has the locks meanwhile.
     os.kill(bench.pid, signal.SIGSTOP)
+    os.kill(rescuer_of(guardian), signal.SIGKILL)
     os.kill(guardian, signal.SIGKILL)
     bench.kill()
 
