@@ -25,6 +25,7 @@ from bench.protocol import packaged_protocols
 
 # Nothing that reads the width of the terminal or the entry points when it is imported.
 LIBRARIES = (
+    "filterpy.kalman",
     "matplotlib.figure",
     "numba",
     # Rerun loads it.
