@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
 from functools import partial
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -83,6 +84,9 @@ _DEFINITE = 1.1
 """Longest time of a plan over its shortest, up to which it says when the run ends."""
 _LAST_WORDS = 1.0
 """Longest wait for a terminal at the end, s."""
+
+_PREPARATION = 120.0
+"""Wall-clock time (s) from the connection of the devices to the first step: a record and its views are opened."""
 
 
 @dataclass(frozen=True)
@@ -212,6 +216,9 @@ class RunContext(ExitStack):
         run = self.run
         if run.rehearse and self._again is None and run.clock != "virtual":
             self._rehearsal = _rehearsed(run, self.rig_file, self.parameters, self._console, self.interrupts)
+        elif self.clock.sleep_waits:
+            # Loading the filters takes a second, as a rehearsal would have done: no device waits for that later.
+            import_module("filterpy.kalman")
         if self._rehearsal is not None:
             self._rehearsal.raise_if_wrong()
 
@@ -240,7 +247,10 @@ class RunContext(ExitStack):
     def open_record(self) -> None:
         """Make the folder of the run and its journal, or open those of the run that died."""
         run, again, description = self.run, self._again, self.station.description
-        files = dict(run.original.files) if run.original else self._given_files()
+        if run.original:
+            files = dict(run.original.files)
+        else:
+            files = given_files(run.protocol, self._stated, self.rig_file, run.faults)
         self._models = (
             [] if self._dashboard_class is None else [*models_among(files, "the files of the run").values()]
         )
@@ -317,9 +327,6 @@ class RunContext(ExitStack):
             self._dashboard.finish(outcome.status, outcome.reason, outcome.lateness)
         return outcome
 
-    def _given_files(self) -> dict[str, bytes]:
-        return dict(given_files(self.run.protocol, self._stated, self.rig_file, self.run.faults))
-
     def _take_folder(self, meta: dict[str, Any]) -> None:
         """Lock the folder of the run, have the guardian keep its record there, and write the rig file into it."""
         again, folder, file = self._again, self.folder, self.rig_file
@@ -329,6 +336,7 @@ class RunContext(ExitStack):
         with _written_into(folder):
             if (guardian := self.guardian) is not None:
                 began = (meta if again is None else again.meta)["epoch"]
+                guardian.promise(_PREPARATION, "the run is prepared")
                 guardian.keep_record(folder, self.run.notify, facts_of(meta, folder), began)
             if again is None:
                 (folder / RIG_FILE_NAME).write_text(file.text, encoding="utf-8")

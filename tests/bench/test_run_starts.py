@@ -3,6 +3,8 @@
 import io
 import shutil
 import signal
+import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -65,6 +67,24 @@ def test_a_start_that_fails_behind_the_journal_leaves_no_folder(asked, tmp_path,
     with pytest.raises(ConfigurationError, match="no display"):
         carry_out(asked, silent())
     assert not (tmp_path / "runs").exists()
+
+
+LOADED = []
+
+
+@protocol(needs=())
+def see_what_is_loaded(parameters: ProtocolParameters) -> Messages:
+    """Note whether the filters are loaded before the first step."""
+    LOADED.append("filterpy.kalman" in sys.modules)
+    yield Step({}, Dwell(0.0))
+
+
+def test_filters_are_loaded_before_a_run_on_real_time_begins(asked, monkeypatch):
+    monkeypatch.delitem(sys.modules, "filterpy.kalman", raising=False)
+    LOADED.clear()
+    carry_out(replace(asked, protocol=see_what_is_loaded, clock="x100", rehearse=False), silent())
+    assert LOADED
+    assert all(LOADED)
 
 
 class TestNewFolder:
