@@ -1,4 +1,4 @@
-"""What is made from data: tables from files, models from tables, comparisons, figures, reports and exports."""
+"""Analysis of data: tables from files, models from tables, comparisons, figures, reports and exports."""
 
 from lazy_loader import attach_stub
 

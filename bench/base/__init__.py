@@ -1,4 +1,4 @@
-"""What every other package needs: errors, the clock, units, the registry of parts, and worker processes.
+"""The foundation of all packages: errors, the clock, units, the registry of parts, and worker processes.
 
 It also has the decorators of compiled kernels, strict readers of JSON and TOML, and the display of long computations.
 Nothing here knows a device, a model or a run.

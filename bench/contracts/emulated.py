@@ -1,4 +1,4 @@
-"""What the contracts need, from an emulated rig."""
+"""Fixtures of the contracts on an emulated rig."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an operator does: commands to devices, answers to questions, and letters from a panel to a run."""
+"""Input of an operator: commands to devices, answers to questions, and letters from a panel to a run."""
 
 from lazy_loader import attach_stub
 
