@@ -12,6 +12,7 @@ import typer
 from bench.base import print_plain
 from bench.cli.command_support import console, print_rows
 from bench.cli.model_options import ModelOptions
+from bench.cli.patience import show_patience
 
 if TYPE_CHECKING:
     from bench.analysis import (
@@ -72,7 +73,7 @@ def is_comparison(model: str) -> bool:
 
 
 def choose_model(
-    data: Dataset, model: str, options: ModelOptions, fit: FitOptions, comparing: Comparing, *, is_time_asked: bool
+    data: Dataset, model: str, options: ModelOptions, fit: FitOptions, comparing: Comparing
 ) -> SelectedModel:
     """Compare models on measurements, and print the table.
 
@@ -88,8 +89,6 @@ def choose_model(
         How they are fitted, as far as it is given.
     comparing : Comparing
         The options of the comparison.
-    is_time_asked : bool
-        Whether the column of times was asked for, not found.
 
     Raises
     ------
@@ -97,7 +96,7 @@ def choose_model(
         If none can be fitted.
     """
     from bench.analysis import named_models, select_model
-    from bench.identification import Given
+    from bench.identification import ONE_RUN, Given
 
     orientation = fit.own["orientation"]
     given = Given(
@@ -105,12 +104,15 @@ def choose_model(
         initial=fit.own["initial"],
         orientation=None if orientation == "auto" else orientation,
         smoothing=fit.smoothing,
-        is_time_asked=is_time_asked,
+        ridge=fit.ridge,
     )
-    found = select_model(data, named_models(model), given, fit, console)
+    with show_patience(f"{data.name}"):
+        found = select_model(data, named_models(model), given, fit)
     _print_table(found)
-    if data.time is not None and not is_time_asked:
-        _print_line(_on_found_times(found, data.time.name))
+    _print_line(_on_times(found))
+    for advice in found.selection.advice:
+        if advice.code == ONE_RUN:
+            _print_line(str(advice))
     if comparing.table_out is not None:
         found.save(comparing.table_out)
         print_plain(console, f"table: {comparing.table_out}")
@@ -122,27 +124,28 @@ def _print_table(found: SelectedModel) -> None:
     selection = found.selection
     unit = found.unit or "units"
     heads = [
-        ("", "", "deg. of", "training", "held out", "", "% of", "other", "CPU"),
-        ("", "model", "freedom", unit, unit, "±", "range", f"cycles, {unit}", "s"),
+        ("", "", "deg. of", "training", "score", "% of", "blocks", "other", "CPU"),
+        ("", "model", "freedom", unit, unit, "range", unit, f"cycles, {unit}", "s"),
     ]
-    shown = list(selection.evaluations[:_SHOWN])
-    shown += [each for each in (selection.chosen,) if each not in shown]
+    usable = [score for score in selection.scores if not score.failure]
+    shown = usable[:_SHOWN]
+    shown += [score for score in (selection.chosen,) if score not in shown]
     rows = [
         (
-            "*" if each is selection.chosen else "+" if each is selection.best else "",
-            _describe(each.candidate),
-            f"{each.free:.0f}",
-            f"{each.training:.3g}",
-            f"{each.rms:.3g}",
-            f"{each.spread:.1g}",
-            f"{100.0 * each.rms / selection.span:.2f}",
-            f"{each.units_rms:.3g}" if each.units else "-",
-            f"{each.seconds:.1f}",
+            "*" if score is selection.chosen else "",
+            _describe(score.candidate),
+            f"{score.freedom:.1f}",
+            f"{score.training:.3g}",
+            f"{score.error:.4g}",
+            f"{100.0 * score.error / selection.span:.3g}",
+            f"{score.blocks_rms:.3g}",
+            f"{score.cycles_rms:.3g}" if score.cycles else "-",
+            f"{score.seconds:.1f}",
         )
-        for each in shown
+        for score in shown
     ]
     widths = [max(map(len, column)) for column in zip(*heads, *rows, strict=True)]
-    _print_line("models by their RMS error on what was left out of the fit")
+    _print_line("models by their score, the RMS error on what was left out of the fit")
     for row in (*heads, *rows):
         # Marks and names begin a column, numbers end it.
         cells = [
@@ -150,21 +153,19 @@ def _print_table(found: SelectedModel) -> None:
             for place, (text, width) in enumerate(zip(row, widths, strict=True))
         ]
         _print_line(f"{cells[0]} {'  '.join(cells[1:])}".rstrip())
-    more = len(selection.evaluations) - len(shown)
+    more = len(selection.scores) - len(shown)
+    _print_line("* chosen: the fewest degrees of freedom within 2 % of the least score" + _on_bounded(found))
+    if more > 0:
+        _print_line(f"{more} more were tried; --table-out FILE.csv writes all")
     _print_line(
-        "* chosen; + least error of those that may be, if that is another"
-        + (f"; {more} more were worse or given up" if more > 0 else "")
+        f"left out: contiguous blocks of the {selection.rows} rows compared, with gaps of {selection.gap}, or whole "
+        "files; and whole kinds of cycles"
     )
-    _print_line(
-        f"held out: contiguous blocks of the {selection.rows} rows compared, with gaps of {selection.gap}; "
-        "other cycles: whole kinds of cycles left out"
-    )
-    if (
-        selection.has_times
-        and selection.is_time_asked
-        and not any(each.candidate.static for each in selection.evaluations)
-    ):
-        _print_line("with time: no lag, resonance, delay, creep or drift behind the best operators is worth it")
+
+
+def _on_bounded(found: SelectedModel) -> str:
+    """Return the rule of a record of one kind of cycle, if it made the choice."""
+    return ", among planes with signs that err at most twice as much" if found.selection.is_bounded else ""
 
 
 def read_measured(
@@ -205,23 +206,13 @@ def read_measured(
     return data, test
 
 
-def _on_found_times(found: SelectedModel, name: str) -> str:
-    """Return what became of a column of times that nobody asked for."""
-    selection = found.selection
-    if not selection.has_times:
-        return (
-            f"column {name} holds times, of too few or too many rows to be tried unasked: --time {name} compares "
-            "models with time all the same"
-        )
+def _on_times(found: SelectedModel) -> str:
+    """Return what became of the times."""
+    if not found.selection.has_times:
+        return "times are not known, so that no lag, creep, drift, viscosity or friction was tried: --time COLUMN"
     if found.is_timed:
-        return (
-            f"column {name} holds times: the chosen model takes time, as it errs at least 1.2 times less than what "
-            "would be chosen without. --time none leaves time out"
-        )
-    return (
-        f"column {name} holds times: no model with time errs 1.2 times less than the chosen one. "
-        f"--time {name} compares them as equals"
-    )
+        return "the chosen model takes the times of the rows; --time none leaves them out"
+    return "no lag, creep, drift, viscosity or friction lowers the score: the chosen model takes no times"
 
 
 def _print_line(text: str) -> None:
@@ -231,11 +222,12 @@ def _print_line(text: str) -> None:
 def _describe(one: Candidate) -> str:
     """Return a model with its settings in short: those that differ from none."""
     own = dict(one.options)
-    parts = [own.pop("static") + " with " + own.pop("dynamics") if "static" in own else one.model]
+    parts = [f"{one.model} with {one.dynamics.replace(',', ' and ')}" if one.dynamics else one.model]
     parts += [value if isinstance(value, str) else f"{name} {value}" for name, value in own.items() if value]
     parts.append(one.orientation if one.orientation == "falling" else "")
     parts.append(f"start {one.initial}" if one.initial else "")
     parts.append(f"smooth {one.smoothing:g}" if one.smoothing else "")
+    parts.append(f"ridge {one.ridge:g}" if one.ridge else "")
     return ", ".join(part for part in parts if part and part != "none")
 
 

@@ -116,8 +116,8 @@ class Fitting:
         typer.Option(
             "--time",
             metavar="COLUMN|none",
-            help="Column of times: models with time take part in the comparison. If not given, one named time or t, "
-            "by which a model is chosen only if it errs 1.2 times less; none leaves time out.",
+            help="Column of times: models with time take part in the comparison. If not given, one named time or t; "
+            "none leaves time out.",
         ),
     ] = None
     static: Annotated[
@@ -128,8 +128,8 @@ class Fitting:
         str | None,
         typer.Option(
             metavar="LIST",
-            help="What follows the operator: lag, resonance, delay, creep, kelvin-voigt, drift, fading-drift, or "
-            "none; chosen by the data if not given (hammerstein).",
+            help="What follows the operator or stands beside it: lag, resonance, delay, creep, kelvin-voigt, drift, "
+            "fading-drift, viscous, friction, or none; chosen by the data if not given (hammerstein).",
         ),
     ] = None
     orientation: Annotated[
@@ -175,8 +175,6 @@ class Fitting:
             raise ConfigurationError("--cross-validate and --weights go with one --model NAME")
         if self.static is not None or self.dynamics is not None:
             raise ConfigurationError("--static and --dynamics go with --model hammerstein")
-        if self.ridge is not None:
-            raise ConfigurationError("--ridge goes with one --model NAME")
         if options.levels_to_try:
             raise ConfigurationError("--levels: give one number, or none, to compare models; or one --model")
 
@@ -234,8 +232,7 @@ def identify_(
         data, test = read_measured(files, names, model, comparing, reading)
     selected = None
     if is_comparison(model):
-        is_time_asked = fitting.time_column is not None
-        selected = choose_model(data, model, options, fit, comparing, is_time_asked=is_time_asked)
+        selected = choose_model(data, model, options, fit, comparing)
         model, fit = selected.model, selected.settings(fit)
         data = data if selected.is_timed else data.without_time()
     with show_patience(patience):

@@ -60,12 +60,15 @@ class PatienceDisplay:
         self._progress.stop()
 
     def say(self, stage: str, share: float) -> None:
-        """Show a stage of the work, and the share of it that is done, 0 to 1; a share never falls."""
-        if stage != self._stage:
-            self._stage = stage
-            self._progress.reset(self._task, total=1.0, description=f"{self._text}: {stage}")
+        """Show a stage of the work, and the share of it that is done, 0 to 1; a share never falls.
+
+        What follows a colon in the name of a stage may change while it goes on.
+        """
+        if stage.partition(":")[0] != self._stage:
+            self._stage = stage.partition(":")[0]
+            self._progress.reset(self._task, total=1.0)
         done = self._progress.tasks[0].completed
-        self._progress.update(self._task, completed=max(share, done))
+        self._progress.update(self._task, completed=max(share, done), description=f"{self._text}: {stage}")
 
     def _draw_later(self) -> None:
         # Not while kernels are compiled, which is drawn on the same console.

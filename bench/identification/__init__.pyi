@@ -10,30 +10,27 @@ from .by_name import (
     identify as identify,
     set_up_problem as set_up_problem,
 )
-from .choose.choice import (
-    Given as Given,
-    select as select,
+from .choose.advice import (
+    ONE_RUN as ONE_RUN,
+    Advice as Advice,
 )
 from .choose.cross_validation import (
     CrossValidation as CrossValidation,
     SmoothingTrial as SmoothingTrial,
     cross_validate as cross_validate,
 )
-from .choose.evaluation import (
-    Candidate as Candidate,
-    Evaluation as Evaluation,
-    Measurements as Measurements,
-)
-from .choose.memory_tests import (
-    MemoryTest as MemoryTest,
-    check_congruency as check_congruency,
-    check_return_points as check_return_points,
-)
-from .choose.selected import (
+from .choose.rule import (
+    Given as Given,
     Selection as Selection,
+    choose as choose,
+    compared_models as compared_models,
+    select as select,
 )
-from .choose.time_stage import (
-    Task as Task,
+from .choose.score import (
+    Candidate as Candidate,
+    Measurements as Measurements,
+    Score as Score,
+    evaluate as evaluate,
 )
 from .design.continuation import (
     Continuation as Continuation,
@@ -99,6 +96,11 @@ from .measures import (
     compare as compare,
     measure_errors as measure_errors,
 )
+from .memory_tests import (
+    MemoryTest as MemoryTest,
+    check_congruency as check_congruency,
+    check_return_points as check_return_points,
+)
 from .model_file import (
     ModelFile as ModelFile,
     is_model as is_model,
@@ -120,9 +122,6 @@ from .resonance import (
     DynamicsIdentification as DynamicsIdentification,
     ThirdOrder as ThirdOrder,
     identify_dynamics as identify_dynamics,
-)
-from .timed.held_out import (
-    HeldOutInTime as HeldOutInTime,
 )
 from .timed.identify_in_time import (
     identify_in_time as identify_in_time,

@@ -22,7 +22,7 @@ import numpy as np
 from bench.base import Floats, checks as _checks, say_share, shares_to
 from bench.identification.branches import turning_points
 from bench.identification.by_name import FitProblem
-from bench.identification.choose.folds import near
+from bench.identification.choose.splits import near
 from bench.identification.design.excitation_class import LEAST_SWING, ExcitationClass
 from bench.identification.fit.cell_layout import Flags, Indices
 from bench.identification.fit.covariance import PredictionVariance, prediction_variance

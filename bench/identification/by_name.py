@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bench.base import Floats, checks as _checks
-from bench.identification.choose.trust import check_interpolation, check_record, check_skipped, judge_fit
 from bench.identification.fit.least_squares import Certificate, Fit, counted_weights
 from bench.identification.fit.orientation import (
     NAMES,
@@ -26,6 +25,7 @@ from bench.identification.fit.shape import fit_operator, fit_shape, undetermined
 from bench.identification.inspection import check_data
 from bench.identification.measures import Errors, measure_errors
 from bench.identification.options import check_options
+from bench.identification.trust import check_interpolation, check_record, check_skipped, judge_fit
 from bench.models import ModelSpec, Operator, Regressor, TimedModel, find_model
 
 M = TypeVar("M", bound=Operator[Any] | TimedModel[Any])
@@ -187,10 +187,14 @@ class FitProblem:
 
         They are 0 for models with signs, and for those without cells.
         """
-        if not self.spec.constrained and not self.regressor.base.size and (smoothing or ridge):
-            raise ValueError(f"{'smoothing' if smoothing else 'ridge'}: this model has no cells of a density")
-        if self.spec.constrained or not self.regressor.base.size or (smoothing is not None and ridge is not None):
+        if self.spec.constrained:
             return Regularization(smoothing or 0.0, ridge or 0.0)
+        if not self.regressor.base.size:
+            if smoothing:
+                raise ValueError("smoothing: this model has no cells of a density")
+            return Regularization(0.0, ridge or 0.0)
+        if smoothing is not None and ridge is not None:
+            return Regularization(smoothing, ridge)
         return choose_regularization(self.regressor, self.outputs, self.weights, self.skip, smoothing, ridge)
 
     def fit(self, smoothing: float, weights: Floats | None = None, ridge: float = 0.0) -> Fit:

@@ -135,20 +135,24 @@ def _maxwell_slip(
 
 
 BOUC_WEN = ModelSpec("Bouc-Wen operator, rate-independent, with a spring", BoucWen, _bouc_wen)
-DUHEM = ModelSpec(
-    "Duhem operator of Coleman and Hodgdon", Duhem, _duhem, sizes={"degree": (3, 5, 7)}, saturates=False
-)
+DUHEM = ModelSpec("Duhem operator of Coleman and Hodgdon", Duhem, _duhem, variants={"degree": (3, 5, 7)})
 GENERALIZED_PRANDTL_ISHLINSKII = ModelSpec(
     "Prandtl-Ishlinskii operator between two tanh envelopes, for loops that saturate or are asymmetric",
     GeneralizedPrandtlIshlinskii,
     _generalized_prandtl_ishlinskii,
+    is_compared=False,
 )
 KRASNOSELSKII_POKROVSKII = ModelSpec(
     "Krasnosel'skii-Pokrovskii operator: relays with slope, on a plane",
     KrasnoselskiiPokrovskii,
     _krasnoselskii_pokrovskii,
-    sizes={"levels": (10, 20)},
+    variants={"levels": (10, 20)},
+    is_compared=False,
 )
 MAXWELL_SLIP = ModelSpec(
-    "Maxwell-slip operator: springs that slip under a force", MaxwellSlip, _maxwell_slip, sizes={"elements": (5, 15)}
+    "Maxwell-slip operator: springs that slip under a force",
+    MaxwellSlip,
+    _maxwell_slip,
+    variants={"elements": (5, 15)},
+    is_compared=False,
 )

@@ -160,17 +160,28 @@ def _polynomial_plays(
     *,
     degree: Annotated[int, OptionHelp("of the polynomial")] = 3,
     plays: Annotated[int, OptionHelp("number of plays, of thresholds evenly below half the range")] = 3,
+    powers: Annotated[int, OptionHelp("degree of the polynomial of each play")] = 1,
+    origin: Annotated[
+        float | None, OptionHelp("input of the relaxed state, input units", "the first input of the data")
+    ] = None,
     input_range: InputRange = None,
     input_unit: str = "",
     output_unit: str = "",
 ) -> PolynomialPlays:
-    for name, value in (("degree", degree), ("plays", plays)):
+    for name, value in (("degree", degree), ("plays", plays), ("powers", powers)):
         if value < 1:
             raise ValueError(f"{name}: expected at least 1, got {value}")
     low, high = input_span(inputs, "input_range") if input_range is None else input_range
     thresholds = 0.5 * (high - low) * np.arange(1, plays + 1) / (plays + 1)
     return PolynomialPlays(
-        np.zeros(degree), thresholds, np.zeros(plays), (low, high), input_unit=input_unit, output_unit=output_unit
+        np.zeros(degree),
+        thresholds,
+        np.zeros(plays * powers),
+        (low, high),
+        input_unit=input_unit,
+        output_unit=output_unit,
+        powers=powers,
+        origin=float(inputs[0]) if origin is None else origin,
     )
 
 
@@ -236,54 +247,52 @@ def _fit_dead_zones(
     return replace(template, weights=found.coefficients[: plain.shape[1]], after=after)
 
 
-_REVERSIBLE = {"reversible": ("none", "linear", "polynomial")}
-_LEVELS = {"levels": (10, 20, 40)}
+_STRUCTURES = {"reversible": ("none", "linear"), "levels": (10, 20, 40)}
 
 PREISACH = ModelSpec(
     "Preisach operator with a nonnegative density",
     Preisach,
     _preisach,
     estimate_state=estimate_memory,
-    variants=_REVERSIBLE,
-    sizes=_LEVELS,
+    variants=_STRUCTURES,
 )
 PREISACH_SIGNED = ModelSpec(
     "Preisach operator with a density of either sign",
     Preisach,
     _preisach,
     constrained=False,
-    variants=_REVERSIBLE,
-    sizes=_LEVELS,
+    variants=_STRUCTURES,
+    is_compared=False,
 )
 PREISACH_NONMONOTONIC = ModelSpec(
     "nonnegative Preisach operator and a quadratic thermal term, for non-monotonic hysteresis",
     Preisach,
     _nonmonotonic,
     estimate_state=estimate_memory,
-    sizes=_LEVELS,
+    variants={"levels": (10, 20, 40)},
+    is_compared=False,
 )
 PRANDTL_ISHLINSKII = ModelSpec(
     "Prandtl-Ishlinskii operator with nonnegative weights, and dead zones on request",
     PrandtlIshlinskii,
     _prandtl_ishlinskii,
     refine=_fit_dead_zones,
-    variants={"dead_zones": (0, 4)},
-    sizes={"plays": (5, 15, 30)},
+    variants={"dead_zones": (0, 4), "plays": (5, 15, 30)},
+    is_compared=False,
 )
 POLYNOMIAL = ModelSpec(
     "single-valued polynomial, without memory",
     Polynomial,
     _polynomial,
     constrained=False,
-    sizes={"degree": (1, 3, 5, 8, 12)},
+    variants={"degree": (1, 3, 5)},
 )
 POLYNOMIAL_PLAYS = ModelSpec(
-    "polynomial and a few plays of either sign, for few samples",
+    "polynomial of the input and polynomials of plays, of either sign",
     PolynomialPlays,
     _polynomial_plays,
     constrained=False,
-    variants={"degree": (1, 3, 5)},
-    sizes={"plays": (2, 5)},
+    variants={"degree": (1, 3), "powers": (1, 2, 3), "plays": (3, 6, 10, 20)},
 )
 TWO_STAGE = ModelSpec("one operator inside another: length = H2[force - H1[voltage]]", TwoStage)
 SUMMED = ModelSpec("the difference of two operators: length = H3[force] - H4[voltage]", Summed)

@@ -19,6 +19,7 @@ from .dynamic.actuator_dynamics import (
 from .dynamic.hammerstein import (
     Hammerstein as Hammerstein,
     HammersteinState as HammersteinState,
+    velocities as velocities,
 )
 from .dynamic.linear_parts import (
     FilterState as FilterState,

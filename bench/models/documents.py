@@ -24,10 +24,13 @@ class Document:
         The class's name in files.
     parts : mapping of str to callable
         What makes the value of a field of JSON, for fields whose JSON is an object of its own.
+    added : tuple of str
+        Fields that files of earlier versions lack; these files mean their defaults.
     """
 
     kind: ClassVar[str]
     parts: ClassVar[Parts] = {}
+    added: ClassVar[tuple[str, ...]] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Return the model as a JSON object: its `type`, then its fields."""
@@ -42,7 +45,8 @@ class Document:
         """
         values: dict[str, Any] = {}
         for field in fields(cls):  # type: ignore[arg-type]
-            if not field.init or (field.default in (None, "") and field.name not in document):
+            is_optional = field.default in (None, "") or field.name in cls.added
+            if not field.init or (is_optional and field.name not in document):
                 continue
             value = _checks.json_field(document, field.name, cls.kind)
             part = cls.parts.get(field.name)

@@ -32,14 +32,9 @@ class ModelSpec:
     estimate_state : callable or None
         Takes template, inputs, outputs, weights, skip and smoothing; returns the initial state that they suggest.
     variants : mapping of str to tuple
-        Values of options of `template` that `bench identify --model all` compares, each in combination with all
-        others.
-    sizes : mapping of str to tuple
-        Values of options of `template` from the coarsest to the finest, which it goes through together as long as
-        the error falls.
-    saturates : bool
-        Whether all memory is lost at the ends of the operating range, so that `negative` and `positive` can say what
-        a record begins with. If not, the choice of a model rather leaves out its first rows.
+        Values of options of `template` that a comparison of models tries, in all combinations.
+    is_compared : bool
+        Whether the model takes part in a comparison that names no models.
     fit_in_time : callable or None
         For a model with time (`TimedModel`), in place of `template`: takes times, inputs, outputs and the keyword
         options `weights`, `skip`, `initial`, units and its own; returns an `Identification`.
@@ -52,8 +47,7 @@ class ModelSpec:
     refine: Callable[..., Any] | None = None
     estimate_state: Callable[..., Any] | None = None
     variants: Mapping[str, tuple[Any, ...]] = field(default_factory=dict)
-    sizes: Mapping[str, tuple[Any, ...]] = field(default_factory=dict)
-    saturates: bool = True
+    is_compared: bool = True
     fit_in_time: Callable[..., Any] | None = None
 
 

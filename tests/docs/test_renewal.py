@@ -101,53 +101,9 @@ def test_followers_have_a_row_for_each_rig_and_reference(renewal):
     ]
 
 
-def test_the_table_of_the_choice_shows_each_ratio_and_counts_those_within_the_bound(of_docs):
-    table = of_docs("renew_selection").table
-    outcome = of_docs("selection_quality").Outcome
-
-    def found(error):
-        return outcome("duhem, degree 5", error, "duhem, degree 7", 1.0, 3.0, 2, 263, 9.0)
-
-    records = {("duhem", "mixed"): 1.1, ("duhem", "drift"): 1.3, ("butterfly", "mixed"): 1.0}
-    shown = table({record: [found(error)] for record, error in records.items()})
-    assert shown.splitlines() == [
-        "| record | duhem | butterfly |",
-        "| --- | --- | --- |",
-        "| mixed | 1.10 / 1.00, 1.10 | 1.00 / 1.00, 1.00 |",
-        "| drift | 1.30 / 1.00, **1.30** (2 of 263) |  |",
-        "",
-        "Within 1.2 times the best: 2 of 3.",
-    ]
-    over_seeds = table({("duhem", "mixed"): [found(error) for error in (1.1, 2.5, 1.0)]})
-    assert over_seeds.splitlines()[2:] == [
-        "| mixed | 1.10 / 1.00, 1.10 (2.50) |",
-        "",
-        "Within 1.2 times the best: 1 of 1, and 2 of 3 single records.",
-    ]
-
-
-def test_the_table_over_seeds_shows_median_and_greatest_ratio(of_docs):
-    outcome = of_docs("selection_quality").Outcome
-    found = [outcome("a", error, "b", 2.0, 3.0, 1, 263, 9.0) for error in (2.0, 5.0, 2.2)]
-    assert of_docs("renew_selection").over_seeds({"duhem": found}).splitlines() == [
-        "| plant | median ratio | greatest | within | by a cubic with plays |",
-        "| --- | --- | --- | --- | --- |",
-        "| duhem | 1.10 | 2.50 | 2 of 3 | 1.67 |",
-    ]
-
-
-def test_a_case_is_measured_once_in_one_state_of_the_code(of_docs, tmp_path, monkeypatch):
+def test_the_table_of_the_choice_keeps_what_was_before(of_docs):
     renewal = of_docs("renew_selection")
-    measured = []
-
-    def choose(one):
-        measured.append(one)
-        return renewal.Outcome("a", 2.0, "b", 1.0, 3.0, 1, 263, 9.0)
-
-    monkeypatch.setattr(renewal, "choose", choose)
-    found = [renewal.outcome(tmp_path, "duhem", "60 samples", lambda: "case") for _ in range(2)]
-    assert measured == ["case"]
-    assert found[0] == found[1]
-    monkeypatch.setattr(renewal, "STATE", "another")
-    renewal.outcome(tmp_path, "duhem", "60 samples", lambda: "case")
-    assert len(measured) == 2
+    outcome = renewal.Outcome
+    found = [outcome("duhem", error, "duhem", 1.0, 3.0, ("one-run", "one-kind"), 9.0) for error in (1.1, 2.5, 1.3)]
+    made = renewal.row(["duhem", "mixed", "0.11", "", "", ""], found)
+    assert made == "| duhem | mixed | 0.11 | 1.30 | 1.00 | one-kind |"

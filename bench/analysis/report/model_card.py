@@ -112,7 +112,7 @@ def model_card(
         )
     if (selection := found.file.provenance.get("selection")) is not None:
         unit = selection["unit"] or "output units"
-        heads = ("model", f"held out, {unit}", "±", "% of the range", f"other cycles, {unit}", "free", "")
+        heads = ("model", f"score, {unit}", "% of the range", f"blocks, {unit}", f"other cycles, {unit}", "free", "")
         sections["Models compared"] = _table(heads, _compared(selection["table"]))
     if found.trials is not None:
         sections["Selection"] = _fenced(found.trials.table())
@@ -168,13 +168,12 @@ def _compared(table: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
     shown = [*whole[:_SHOWN], *(row for row in whole[_SHOWN:] if row["note"] == "chosen")]
     return [
         (
-            f"{row['model']} {row['options']}".strip(),
+            " ".join(filter(None, (row["model"], row["options"], row["initial"]))),
             *(
-                "" if row[name] is None else f"{row[name]:.{digits}g}"
-                for name, digits in (("held_out_rms", 3), ("held_out_spread", 1), ("held_out_percent", 3))
+                "" if row[name] is None else f"{row[name]:.3g}"
+                for name in ("score", "score_percent", "held_out_rms", "units_rms")
             ),
-            "" if row["units_rms"] is None else f"{row['units_rms']:.3g}",
-            f"{row['free']:.0f}",
+            f"{row['free']:.1f}",
             row["note"],
         )
         for row in shown

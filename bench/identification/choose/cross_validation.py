@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from bench.base import Floats
 from bench.identification.by_name import Initial, set_up_problem
-from bench.identification.choose.folds import fold_numbers
+from bench.identification.choose.splits import fold_numbers
 from bench.identification.fit.cell_layout import CellLayout, Indices
 from bench.identification.fit.least_squares import Fit, counted_weights, fit_cells
 from bench.identification.fit.orientation import Orientation

@@ -14,12 +14,13 @@ import numpy as np
 
 from bench.base import Floats
 from bench.identification.fit.least_squares import Fit, fit, fit_minimum_norm
+from bench.identification.fit.ridge import fit_ridge
 from bench.models import Operator, Regressor
 
 # Relative change of parameters, cost and gradient at which a search ends, and its greatest number of steps: of the
 # searches from several starts, and of the one that goes on from the best of them.
-_COARSE = (1e-5, 30)
-_FINE = (1e-10, 100)
+_COARSE = (1e-3, 30)
+_FINE = (1e-8, 100)
 # Relative step of the differences: a constrained linear fit is exact to about 1e-12.
 _STEP = 1e-6
 # Searches are begun from so many starts: those that fit best as they are.
@@ -40,8 +41,10 @@ def fit_operator(
 ) -> Fit:
     """Return the coefficients of an operator: with its signs if constrained, else free.
 
-    Free coefficients without a penalty are those of the least norm.
+    Free coefficients of a density without a penalty are those of the least norm.
     """
+    if not regressor.base.size and not (constrained and operator.nonnegative().any()):
+        return fit_ridge(regressor, outputs, ridge, weights=weights, skip=skip)
     if not constrained and not smoothing and not ridge:
         return fit_minimum_norm(regressor, outputs, weights=weights, skip=skip)
     if not constrained and regressor.base.size > _MOST_CELLS:

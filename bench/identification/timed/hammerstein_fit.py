@@ -19,32 +19,27 @@ from numpy.typing import ArrayLike
 from bench.base import Floats
 from bench.identification.by_name import FitProblem, Identification, Initial, set_up_problem
 from bench.identification.choose.cross_validation import Fitted, SmoothingTrial, compare_smoothing
-from bench.identification.choose.trust import judge_fit
 from bench.identification.fit.least_squares import Fit, one_thread
 from bench.identification.fit.orientation import NAMES, Orientation, has_orientation
 from bench.identification.fit.regularization import Regularization
 from bench.identification.measures import measure_errors
 from bench.identification.options import OptionHelp
-from bench.identification.timed.hammerstein_search import FREE, Found, Search, find_best, search_ends
-from bench.identification.timed.parsimony import WORTH, chance_of, check_size, deviations_of, is_worth
+from bench.identification.timed.hammerstein_search import FREE, Found, Search, beside, find_best, search_ends
+from bench.identification.timed.parsimony import check_size, deviations_of
+from bench.identification.trust import judge_fit
 from bench.models import Hammerstein, HammersteinState, Regressor, check_sequence
 
-ELEMENTS = ("lag", "resonance", "delay", "creep", "kelvin-voigt", "drift", "fading-drift")
-"""What can follow the operator: see `identify_hammerstein`."""
+ELEMENTS = ("lag", "resonance", "delay", "creep", "kelvin-voigt", "drift", "fading-drift", "viscous", "friction")
+"""What can follow the operator or stand beside it: see `identify_hammerstein`."""
 
-CHOICE = ("lag", "resonance", "delay", "creep", "drift")
+CHOICE = ("lag", "resonance", "delay", "creep", "drift", "viscous", "friction")
 """What is chosen among if nobody says what follows."""
-
-WORTH_OF_DRIFT = 0.2
-"""Part by which a drift must lower the RMS error: it belongs to one record, and rates that grow look like one."""
 
 # What cannot stand beside each other.
 _EXCLUSIVE = ({"lag", "resonance"}, {"creep", "kelvin-voigt"}, {"drift", "fading-drift"})
 # Numbers of a regressor up to which the shape of the operator is found anew with what follows it, and the relative
 # step of its differences.
 _RESHAPED, _STEP_OF_SHAPE = 500_000, 1e-6
-# Ratio of two sums of squares from which the sign of the operator is clear, whatever follows it.
-_CLEAR = 100.0
 # Evaluations of a search that only chooses among elements, and of one for a shape: it and a lag stand for each other
 # along a valley, and 40 may leave three times the error on other inputs.
 _FEW, _EVALUATIONS = 8, 200
@@ -64,6 +59,7 @@ def identify_hammerstein(
     smoothing: Annotated[
         float | Sequence[float], OptionHelp("weight of the roughness penalty on the density; of several the best")
     ] = 0.0,
+    ridge: Annotated[float, OptionHelp("weight of the penalty on coefficients of free signs")] = 0.0,
     **options: Any,  # noqa: ANN401 - those of the operator
 ) -> Identification[Any]:
     """Return the Hammerstein model that fits a measured sequence best in the least-squares sense.
@@ -76,6 +72,8 @@ def identify_hammerstein(
     `kelvin-voigt`    one Kelvin-Voigt element a decade, each with a strength of its own
     `drift`           in proportion to time
     `fading-drift`    1 - exp(-time / time constant)
+    `viscous`         in proportion to the velocity of the input
+    `friction`        tanh(velocity / speed)
     `none`            the operator alone
     ================  ==========================================================================================
 
@@ -90,11 +88,13 @@ def identify_hammerstein(
     static : str
         Name of the operator in `bench.models`.
     dynamics : str or None
-        Elements as listed above, separated by commas. None chooses among lag, resonance, delay, creep and drift: one
-        after the other as long as it lowers the RMS error by 0.5 %, and more than its parameters would by chance.
+        Elements as listed above, separated by commas. None chooses among all but `kelvin-voigt` and `fading-drift`:
+        one after the other as long as it lowers the criterion of Schwarz (Annals of Statistics 6, 461, 1978).
     smoothing : float or sequence of float
         Weight of the roughness penalty on the density, see `fit`; 0 for an operator without one. Of several, the one
         of the least error on blocks left out of the fit of the coefficients, see `cross_validate`.
+    ridge : float
+        Weight of the penalty on the coefficients of an operator of free signs without a density, see `fit_ridge`.
     **options
         Those of the operator; see `identify`. A Preisach operator has a linear reversible part unless they say
         otherwise.
@@ -119,11 +119,12 @@ def identify_hammerstein(
         options=options,
         # What follows the operator hardly depends on the weight; without any a fine plane takes it for hysteresis.
         smoothing=tried[len(tried) // 2],
+        ridge=ridge,
     )
     warnings = list(problem.warnings())
     penalties = Regularization(tried[0], 0.0) if any(tried) else None
     with one_thread():
-        search, found = choose_elements(search) if chosen is None else _reshaped(search, find_best(search, chosen))
+        search, found = choose_elements(search) if chosen is None else reshape(search, find_best(search, chosen))
         if len(tried) > 1:
             best = _cross_validated(search, found, tried)
             penalties = Regularization(best.smoothing, 0.0, best.rms, best.spread, best.training_rms)
@@ -133,18 +134,26 @@ def identify_hammerstein(
     parameters = search.parameters(found.elements)
     for parameter, value, deviation in zip(parameters, found.values, found.deviations, strict=True):
         # A delay or creep of 0 is an answer; a time at its bound is not.
-        if parameter.name in ("lag", "frequency", "damping", "drift") and not deviation < 1.0:
+        if parameter.name in ("lag", "frequency", "damping", "drift", "friction") and not deviation < 1.0:
             warnings.append(
                 f"the data do not determine the {parameter.name} of the linear part; leave it out with --dynamics, "
                 "or give data with faster and slower inputs"
             )
         elif parameter.name == "delay" and value > 0.99 * parameter.high:
             warnings.append("the delay is the longest that is tried; check the columns of time and output")
-    part, time = search.linear(parameters, found.values)
+    follows = search.linear(parameters, found.values)
     count = search.columns.shape[1]
-    drift = float(found.fit.coefficients[count]) if found.fit.coefficients.size > count else 0.0
+    strengths = dict(zip(beside(found.elements), found.fit.coefficients[count:].tolist(), strict=True))
     operator = problem.template.with_coefficients(found.fit.coefficients[:count], found.fit.bias)
-    model = Hammerstein(operator, part, drift, time)
+    model = Hammerstein(
+        operator,
+        follows.part,
+        strengths.get("drift", strengths.get("fading-drift", 0.0)),
+        follows.drift_time,
+        strengths.get("viscous", 0.0),
+        strengths.get("friction", 0.0),
+        follows.friction_speed,
+    )
     state = HammersteinState(problem.state)
     predicted = model.evaluate(moments, sequence, state)
     residuals = measured - predicted
@@ -190,97 +199,81 @@ def set_up_search(
     static: str,
     options: Mapping[str, Any],
     smoothing: float = 0.0,
+    ridge: float = 0.0,
+    shape: Sequence[float] = (),
 ) -> tuple[FitProblem, Search]:
     """Return the problem of the operator alone, and the search for what follows it; see `identify_hammerstein`."""
     if static == "preisach":
         options = {"reversible": "linear", **options}
     problem = set_up_problem(
-        static, inputs, outputs, weights, skip, smoothing, initial, dict(options), orientation=orientation
+        static,
+        inputs,
+        outputs,
+        weights,
+        skip,
+        smoothing,
+        initial,
+        dict(options),
+        orientation=orientation,
+        shape=shape,
     )
     if smoothing and not problem.regressor.base.size:
         raise ValueError(f"smoothing: {static} has no cells of a density")
+    if ridge and (problem.spec.constrained or problem.regressor.base.size):
+        raise ValueError(f"ridge: {static} has coefficients with signs, or cells of a density")
     check_size(*problem.regressor.shape, "levels")
     # The output of a lag may fall while the operator rises: the sign is found with the linear part.
     oriented = has_orientation(problem.spec, problem.template)
     signs: tuple[Literal[1, -1], ...] = (1, -1) if oriented and orientation == "auto" else (problem.orientation,)
     roots = np.sqrt(problem.weights)
     roots[: problem.skip] = 0.0
-    return problem, Search(times, problem, problem.regressor.dense(), roots, signs, smoothing)
+    return problem, Search(times, problem, problem.regressor.dense(), roots, signs, smoothing, ridge)
 
 
 def _cross_validated(search: Search, found: Found, tried: Sequence[float]) -> SmoothingTrial:
     """Return the smoothing of the least error on blocks left out of the fit of the coefficients."""
-    columns, drifts = search.responses(found.elements, found.values)
+    columns, others = search.responses(found.elements, found.values)
     sign = search.sign(found.fit)
 
     def fitted(weight: float) -> Fitted:
-        return lambda weights: search.fit_columns(columns, drifts, weights, sign, weight)
+        return lambda weights: search.fit_columns(columns, others, weights, sign, weight)
 
-    regressor = Regressor.of_columns(np.column_stack([columns, drifts]))
+    regressor = Regressor.of_columns(np.column_stack([columns, others]))
     return compare_smoothing(fitted, regressor, search.static.outputs, search.roots**2, tried).best
 
 
-def choose_elements(
-    search: Search, among: Sequence[str] = CHOICE, worth_of_drift: float = WORTH_OF_DRIFT
-) -> tuple[Search, Found]:
-    """Return the elements that are worth it, one after the other, with the rest.
+def choose_elements(search: Search) -> tuple[Search, Found]:
+    """Return the elements that lower the criterion of Schwarz, added one after the other, with the rest.
 
-    The search that is returned has the operator's shape as it is with them. A drift must lower the RMS error by
-    `worth_of_drift`.
+    The search that is returned has the operator's shape as it is with them.
     """
-    search, found = _of_clear_sign(search)
     used = max(int(np.count_nonzero(search.roots)), 1)
-    chance = chance_of(used)
+
+    def criterion(trial: Found) -> float:
+        parameters = trial.values.size + len(beside(trial.elements))
+        return used * math.log(max(trial.cost, 1e-300)) + parameters * math.log(used)
+
+    found = find_best(search, ())
     shortest, longest = search.creep_span
+    among = [name for name in CHOICE if name != "creep" or longest >= 10.0 * shortest]
     while found.cost > 0.0:
-        basis, trials = search.principal[:, :FREE], []
+        trials = []
         for element in among:
             kept = tuple(name for name in found.elements if not any({name, element} <= group for group in _EXCLUSIVE))
-            if element in found.elements or (element == "lag" and "resonance" in found.elements):
-                continue
-            if element == "creep" and longest < 10.0 * shortest:
-                continue
-            trials += search_ends(search, (*kept, element), found, basis, starts=1, evaluations=_FEW)
-        # Each parameter must be worth more than chance, so that a resonance does not stand for a lag.
-        least = min(trials, key=lambda trial: _log_cost(trial) + _count(trial) * chance, default=found)
-        reshaped, best = search, least
-        if least.elements:
-            reshaped, best = _reshaped(search, find_best(search, least.elements, found, rounds=1))
-        added = set(best.elements) - set(found.elements)
-        more = max(_count(best) - _count(found), 1)
-        if not is_worth(found.cost, best.cost, more, used, worth_of_drift if "drift" in added else WORTH):
+            if element not in found.elements:
+                elements = (*kept, element)
+                trials += search_ends(search, elements, found, search.principal[:, :FREE], starts=1, evaluations=_FEW)
+        # Only the most promising is worth the constrained fit.
+        least = min(trials, key=criterion)
+        reshaped, best = reshape(search, find_best(search, least.elements, found, rounds=1))
+        if criterion(best) >= criterion(found):
             break
         search, found = reshaped, best
-        # Beside what was added, an earlier element may be worth no more than chance.
-        for element in [name for name in found.elements if name not in added]:
-            fewer = tuple(name for name in found.elements if name != element)
-            reshaped, best = _reshaped(search, find_best(search, fewer, found, rounds=1))
-            if not _log_cost(best) - _log_cost(found) > max(_count(found) - _count(best), 1) * chance:
-                search, found, among = reshaped, best, [name for name in among if name != element]
     return search, min(find_best(search, found.elements), found, key=lambda each: each.cost)
 
 
-def _of_clear_sign(search: Search) -> tuple[Search, Found]:
-    """Return a search and its fit without elements; of one sign, if the other leaves a hundred times the squares.
-
-    A fit with signs takes most of the time.
-    """
-    ends = [(one, find_best(one, ())) for one in (replace(search, signs=(sign,)) for sign in search.signs)]
-    clear, best = min(ends, key=lambda end: end[1].cost)
-    return clear if max(found.cost for _, found in ends) > _CLEAR * best.cost else search, best
-
-
-def _log_cost(found: Found) -> float:
-    return math.log(max(found.cost, 1e-300))
-
-
-def _count(found: Found) -> int:
-    """Return the number of parameters of the elements, a drift's rate among them."""
-    return found.values.size + ("drift" in found.elements)
-
-
-def _reshaped(search: Search, found: Found) -> tuple[Search, Found]:
-    """Return search and parameters with the operator's shape fitted together with them.
+def reshape(search: Search, found: Found, tolerance: float = 1e-10) -> tuple[Search, Found]:
+    """Return search and parameters with the operator's shape fitted together with them, to a relative tolerance.
 
     A shape that was found without what follows the operator has taken some of that for hysteresis. Both are varied at
     once: in turns they would creep along the valley in which one stands for the other.
@@ -297,11 +290,11 @@ def _reshaped(search: Search, found: Found) -> tuple[Search, Found]:
 
     def at(values: Floats) -> tuple[FitProblem, Fit, Floats]:
         static = search.static.with_shape(values[:count].tolist())
-        part, time = search.linear(parameters, values[count:])
-        columns = part.respond(search.times, static.regressor.dense())[0]
-        drifts = search.drifts(found.elements, time)
-        fitted = search.fit_columns(columns, drifts, search.static.weights, sign)
-        predicted = fitted.bias + np.column_stack([columns, drifts]) @ fitted.coefficients
+        follows = search.linear(parameters, values[count:])
+        columns = follows.part.respond(search.times, static.regressor.dense())[0]
+        others = search.beside(found.elements, follows)
+        fitted = search.fit_columns(columns, others, search.static.weights, sign)
+        predicted = fitted.bias + np.column_stack([columns, others]) @ fitted.coefficients
         return static, fitted, search.roots * (search.static.outputs - predicted)
 
     def residuals(values: Floats) -> Floats:
@@ -312,9 +305,9 @@ def _reshaped(search: Search, found: Found) -> tuple[Search, Found]:
         np.clip([*shape.values, *found.values], low, high),
         bounds=(low, high),
         x_scale="jac",
-        ftol=1e-10,
-        xtol=1e-10,
-        gtol=1e-10,
+        ftol=tolerance,
+        xtol=tolerance,
+        gtol=tolerance,
         diff_step=np.full(low.size, _STEP_OF_SHAPE),
         max_nfev=_EVALUATIONS,
     )

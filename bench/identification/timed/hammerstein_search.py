@@ -13,8 +13,9 @@ import numpy as np
 from bench.base import Floats
 from bench.identification.by_name import FitProblem
 from bench.identification.fit.least_squares import Fit, fit, fit_minimum_norm
+from bench.identification.fit.ridge import fit_ridge
 from bench.identification.timed.parsimony import deviations_of, moving
-from bench.models import LinearPart, Regressor, logarithmic_creep
+from bench.models import LinearPart, Regressor, logarithmic_creep, velocities
 
 EVALUATIONS = 40
 """Evaluations of a search."""
@@ -23,8 +24,8 @@ FREE = 30
 """Principal columns of the operator in a first search."""
 
 # Rounds of search and constrained fit, and the relative gain of the cost at which they end.
-_ROUNDS, _GAIN = 6, 1e-7
-_STARTS = 3
+_ROUNDS, _GAIN = 4, 1e-5
+_STARTS = 2
 # Principal columns in the grid that a search starts from.
 _COARSE = 6
 _STEP = 1e-5
@@ -38,6 +39,29 @@ class _Parameter:
     starts: tuple[float, ...]
     low: float
     high: float
+
+
+class Following(NamedTuple):
+    """What follows an operator and stands beside it, but for the strengths of what stands beside it.
+
+    Attributes
+    ----------
+    part : LinearPart
+        Delay, lag or resonance, and creep.
+    drift_time : float
+        Time constant of a drift that fades, s; 0 for another.
+    friction_speed : float
+        Of a friction, input units/s; 0 if there is none.
+    """
+
+    part: LinearPart
+    drift_time: float
+    friction_speed: float
+
+
+def beside(elements: Sequence[str]) -> list[str]:
+    """Return the elements that stand beside the operator, in the order of their columns."""
+    return [name for name in ("drift", "fading-drift", "viscous", "friction") if name in elements]
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,10 +82,12 @@ class Search:
         Signs of the operator's coefficients that are tried.
     smoothing : float
         Weight of the roughness penalty on the density of the operator, see `fit`.
-    longest_period : float
-        Of a resonance, s.
+    ridge : float
+        Weight of the penalty on the coefficients of an operator without a density, see `fit_ridge`.
     elapsed : ndarray, shape (N,)
         Since the first row, s.
+    speeds : ndarray, shape (N,)
+        Velocity of the input, input units/s.
     principal : ndarray, shape (N, r)
         Principal columns of the regressor.
     step : float
@@ -74,13 +100,15 @@ class Search:
     roots: Floats
     signs: tuple[Literal[1, -1], ...]
     smoothing: float = 0.0
-    longest_period: float = math.inf
+    ridge: float = 0.0
     elapsed: Floats = field(init=False)
+    speeds: Floats = field(init=False)
     principal: Floats = field(init=False)
     step: float = field(init=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "elapsed", self.times - self.times[0])
+        object.__setattr__(self, "speeds", velocities(self.times, self.static.inputs))
         object.__setattr__(self, "step", float(np.median(np.diff(self.times))))
         centred = self.columns - self.columns.mean(axis=0)
         strengths, directions = np.linalg.eigh(centred.T @ centred)
@@ -106,7 +134,7 @@ class Search:
                 starts = tuple(np.linspace(shortest - 1.0, longest - 1.0, 12))
                 found.append(_Parameter("lag", starts, shortest - math.log(100.0), longest + 1.0))
             elif element == "resonance":
-                low = math.log(2.0 * math.pi) - min(longest, math.log(self.longest_period))
+                low = math.log(2.0 * math.pi) - longest
                 high = math.log(20.0 * math.pi) - shortest
                 top = math.log(math.pi) - shortest
                 starts = (*np.linspace(max(low, top - 6.0), max(low, top), 13), high - 0.5)
@@ -121,10 +149,13 @@ class Search:
                 found += [_Parameter(f"creep {k}", (0.02,), 0.0, 3.0) for k in range(decades)]
             elif element == "fading-drift":
                 found.append(_Parameter("drift", (longest - 1.0,), longest - 4.6, longest + 2.3))
+            elif element == "friction":
+                top = math.log(max(float(np.abs(self.speeds).max()), 1e-300))
+                found.append(_Parameter("friction", (top - 3.0, top - 1.5), top - 7.0, top + 1.0))
         return found
 
-    def linear(self, parameters: Sequence[_Parameter], values: Floats) -> tuple[LinearPart, float]:
-        """Return the linear part and the time constant of the drift, s."""
+    def linear(self, parameters: Sequence[_Parameter], values: Floats) -> Following:
+        """Return what follows the operator and stands beside it for given parameters."""
         x = {parameter.name: float(value) for parameter, value in zip(parameters, values, strict=True)}
         lag = (math.exp(x["lag"]), 0.0) if "lag" in x else (0.0, 0.0)
         if "frequency" in x:
@@ -137,50 +168,58 @@ class Search:
             shortest, longest = self.creep_span
             times = shortest * (longest / shortest) ** ((np.arange(strengths.size) + 0.5) / strengths.size)
         part = LinearPart(self.step * x.get("delay", 0.0), lag, times, strengths)
-        return part, math.exp(x["drift"]) if "drift" in x else 0.0
+        return Following(part, *(math.exp(x[name]) if name in x else 0.0 for name in ("drift", "friction")))
 
-    def drifts(self, elements: Sequence[str], time: float) -> Floats:
-        """Return the columns of the drift, shape (N, 0) or (N, 1)."""
-        if not {"drift", "fading-drift"} & set(elements):
-            return np.empty((self.times.size, 0))
-        shape = self.elapsed if time == 0.0 else -np.expm1(-self.elapsed / time)
-        return shape[:, None]
+    def beside(self, elements: Sequence[str], follows: Following) -> Floats:
+        """Return the columns of drift, viscosity and friction, those that are among the elements, shape (N, q)."""
+        columns = []
+        for element in beside(elements):
+            if element == "viscous":
+                columns.append(self.speeds)
+            elif element == "friction":
+                columns.append(np.tanh(self.speeds / follows.friction_speed))
+            else:
+                time = follows.drift_time
+                columns.append(self.elapsed if time == 0.0 else -np.expm1(-self.elapsed / time))
+        return np.column_stack(columns) if columns else np.empty((self.times.size, 0))
 
     def responses(self, elements: Sequence[str], values: Floats) -> tuple[Floats, Floats]:
-        """Return the filtered columns of the operator, shape (N, K), and those of the drift for given parameters."""
-        part, time = self.linear(self.parameters(elements), values)
-        return part.respond(self.times, self.columns)[0], self.drifts(elements, time)
+        """Return the filtered columns of the operator, shape (N, K), and those beside it for given parameters."""
+        follows = self.linear(self.parameters(elements), values)
+        return follows.part.respond(self.times, self.columns)[0], self.beside(elements, follows)
 
     def fit(self, elements: Sequence[str], values: Floats) -> Fit:
-        """Return the coefficients of operator and drift for given parameters, of the sign that fits better."""
-        columns, drifts = self.responses(elements, values)
-        fits = [self.fit_columns(columns, drifts, self.static.weights, sign) for sign in self.signs]
+        """Return the coefficients for given parameters, of the sign that fits better."""
+        columns, others = self.responses(elements, values)
+        fits = [self.fit_columns(columns, others, self.static.weights, sign) for sign in self.signs]
         return min(fits, key=lambda each: self.cost(elements, values, each)) if len(fits) > 1 else fits[0]
 
     def fit_columns(
         self,
         columns: Floats,
-        drifts: Floats,
+        others: Floats,
         weights: Floats,
         sign: Literal[1, -1],
         smoothing: float | None = None,
     ) -> Fit:
-        """Return the coefficients of filtered columns and drift, with those of the operator of one sign."""
+        """Return the coefficients of filtered columns, those of the operator of one sign, and those beside them."""
         problem = self.static
         smoothing = self.smoothing if smoothing is None else smoothing
         columns = moving(columns, weights, problem.skip)
         cells, constrained = problem.regressor.base.size, problem.spec.constrained
         turn = sign if constrained else 1
         regressor = Regressor.of_cells(
-            turn * columns[:, :cells], np.column_stack([turn * columns[:, cells:], drifts])
+            turn * columns[:, :cells], np.column_stack([turn * columns[:, cells:], others])
         )
+        if not cells and not (constrained and problem.template.nonnegative().any()):
+            return fit_ridge(regressor, problem.outputs, self.ridge, weights=weights, skip=problem.skip)
         if not constrained and not smoothing:
             return fit_minimum_norm(regressor, problem.outputs, weights=weights, skip=problem.skip)
         found = fit(
             regressor,
             problem.outputs,
             nonnegative=constrained
-            & np.append(problem.template.nonnegative(), np.zeros(drifts.shape[1], dtype=bool)),
+            & np.append(problem.template.nonnegative(), np.zeros(others.shape[1], dtype=bool)),
             weights=weights,
             skip=problem.skip,
             smoothing=smoothing,
@@ -191,11 +230,11 @@ class Search:
 
     def cost(self, elements: Sequence[str], values: Floats, found: Fit) -> float:
         """Return the weighted sum of squares of a fit."""
-        part, time = self.linear(self.parameters(elements), values)
+        follows = self.linear(self.parameters(elements), values)
         count = self.columns.shape[1]
-        response = part.respond(self.times, (self.columns @ found.coefficients[:count])[:, None])[0][:, 0]
-        drift = self.drifts(elements, time) @ found.coefficients[count:]
-        return float(np.sum((self.roots * (self.static.outputs - found.bias - response - drift)) ** 2))
+        response = follows.part.respond(self.times, (self.columns @ found.coefficients[:count])[:, None])[0][:, 0]
+        others = self.beside(elements, follows) @ found.coefficients[count:]
+        return float(np.sum((self.roots * (self.static.outputs - found.bias - response - others)) ** 2))
 
     def sign(self, found: Fit) -> Literal[1, -1]:
         """Return the sign of the operator's coefficients that are constrained."""
@@ -267,10 +306,10 @@ class _Projection:
         key = values.tobytes()
         if self._at is None or self._at.key != key:
             search = self._search
-            part, time = search.linear(self._parameters, values)
+            follows = search.linear(self._parameters, values)
             columns = np.column_stack([
-                self._respond(part),
-                search.drifts(self._elements, time),
+                self._respond(follows.part),
+                search.beside(self._elements, follows),
                 np.ones(search.times.size),
             ])  # fmt: skip
             columns *= search.roots[:, None]
@@ -294,9 +333,9 @@ class _Projection:
         signal = (self._basis @ at.weights[:count])[:, None]
 
         def model(x: Floats) -> Floats:
-            part, time = search.linear(self._parameters, x)
-            drift = search.drifts(self._elements, time)
-            return search.roots * (part.respond(search.times, signal)[0][:, 0] + drift @ at.weights[count:-1])
+            follows = search.linear(self._parameters, x)
+            others = search.beside(self._elements, follows) @ at.weights[count:-1]
+            return search.roots * (follows.part.respond(search.times, signal)[0][:, 0] + others)
 
         slopes = []
         for k, parameter in enumerate(self._parameters):

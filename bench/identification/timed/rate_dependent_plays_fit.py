@@ -17,13 +17,13 @@ from numpy.typing import ArrayLike
 
 from bench.base import Floats
 from bench.identification.by_name import FitProblem, Identification, Initial, set_up_problem
-from bench.identification.choose.trust import judge_fit
 from bench.identification.fit.cell_layout import CellLayout
 from bench.identification.fit.least_squares import Fit, fit_cells, one_thread
 from bench.identification.fit.orientation import NAMES, Orientation
 from bench.identification.measures import measure_errors
 from bench.identification.options import OptionHelp
 from bench.identification.timed.parsimony import check_size, deviations_of, is_worth, moving
+from bench.identification.trust import judge_fit
 from bench.models import PlaysState, PrandtlIshlinskii, RateDependentPlays, Regressor, check_sequence
 
 # Most time constants that are tried if nobody says how many, and the first values of another one.

@@ -1,7 +1,8 @@
-"""The Hammerstein model: a hysteresis operator, then delay, lag or resonance, creep, and a drift in time.
+"""The Hammerstein model: a hysteresis operator, then delay, lag or resonance, creep; beside it viscosity and drift.
 
-y(t) = bias + T(s) [operator(u) - its bias] + drift(t), with T as in `linear_parts`. The operator acts at
-the samples, and its output is a straight line between them.
+y(t) = bias + T(s) [operator(u) - its bias] + viscous u' + friction tanh(u' / friction speed) + drift(t), with T as in
+`linear_parts`. The operator acts at the samples, and its output is a straight line between them. The velocity u' is
+the slope of the parabola through a sample and its neighbours; at the last sample, of the line from the one before.
 """
 
 from __future__ import annotations
@@ -53,16 +54,19 @@ class HammersteinState(NamedTuple):
         Time of the last sample, s; 0 before the first.
     knots : Knots or None
         What the linear part knows; None before the first sample, at which it then is settled.
+    last : float or None
+        Input of the last sample; None before the first, or if the model has no viscous part.
     """
 
     memory: Any
     clock: float = 0.0
     knots: Knots | None = None
+    last: float | None = None
 
 
 @dataclass(frozen=True, eq=False)
 class Hammerstein(TimedModel[HammersteinState]):
-    """A hysteresis operator behind which a linear part and a drift follow.
+    """A hysteresis operator followed by a linear part, with viscous terms and a drift beside it.
 
     Parameters
     ----------
@@ -74,28 +78,51 @@ class Hammerstein(TimedModel[HammersteinState]):
         Output units / s, counted from the first sample of a record; with `drift_time` the final value, output units.
     drift_time : float
         Time constant of a drift that fades, s; 0 for one that does not.
+    viscous : float
+        Output units per input unit/s.
+    friction : float
+        Output units: what a term that saturates with the velocity goes to.
+    friction_speed : float
+        Velocity by which it is at 76 % (tanh 1), input units/s; > 0 if there is friction.
 
     Raises
     ------
     ValueError
-        If a number is not finite or `drift_time` negative.
+        If a number is not finite, or `drift_time` or `friction_speed` negative.
+
+    Notes
+    -----
+    Viscous terms: a Coulomb friction smoothed by tanh, and viscosity, as in models of dampers; Pan et al., A modified
+    hyperbolic tangent model of magneto-rheological dampers, and Kwok et al., Smart Mater. Struct. 15, 1112, 2006.
     """
 
     kind: ClassVar[str] = "hammerstein"
     starts: ClassVar[tuple[str, ...]] = ("negative", "positive", "skip")
     inverse_method: ClassVar[str] = "exact"
+    added: ClassVar[tuple[str, ...]] = ("viscous", "friction", "friction_speed")
     parts: ClassVar[Parts] = {"static": operator_from_json, "linear": LinearPart.from_json}
 
     static: Operator[Any]
     linear: LinearPart
     drift: float = 0.0
     drift_time: float = 0.0
+    viscous: float = 0.0
+    friction: float = 0.0
+    friction_speed: float = 0.0
 
     def __post_init__(self) -> None:
-        for name in ("drift", "drift_time"):
+        for name in ("drift", "drift_time", "viscous", "friction", "friction_speed"):
             object.__setattr__(self, name, _checks.number(name, getattr(self, name)))
-        if self.drift_time < 0.0:
-            raise ValueError(f"drift_time: expected a number >= 0, got {self.drift_time}")
+        for name in ("drift_time", "friction_speed"):
+            if getattr(self, name) < 0.0:
+                raise ValueError(f"{name}: expected a number >= 0, got {getattr(self, name)}")
+        if self.friction and not self.friction_speed:
+            raise ValueError("friction_speed: expected a number > 0, as there is friction; got 0")
+
+    @property
+    def is_viscous(self) -> bool:
+        """Whether the output depends on the velocity of the input."""
+        return bool(self.viscous or self.friction)
 
     @property
     def input_range(self) -> tuple[float, float]:  # type: ignore[override]
@@ -130,8 +157,17 @@ class Hammerstein(TimedModel[HammersteinState]):
             filters, known = knots.filters, len(knots.times)
         response = self.linear.respond(elapsed, values[:, None], filters)[0][known:, 0]
         outputs = self.static.bias + response + self.drift_after(elapsed[known:])
+        last = None
+        if self.is_viscous:
+            last = float(sequence[-1])
+            before = () if state.last is None else (state.last,)
+            moments = elapsed[known - len(before) :] if before else elapsed[known:]
+            speeds = velocities(moments, np.concatenate([before, sequence]))[len(before) :]
+            outputs = outputs + self.viscous * speeds
+            if self.friction:
+                outputs = outputs + self.friction * np.tanh(speeds / self.friction_speed)
         memory = self.static.advance(state.memory, sequence)
-        return outputs, HammersteinState(memory, float(clock[-1]), self._knots(elapsed, values, filters))
+        return outputs, HammersteinState(memory, float(clock[-1]), self._knots(elapsed, values, filters), last)
 
     def _knots(self, times: Floats, values: Floats, filters: FilterState | None) -> Knots:
         first = max(int(np.searchsorted(times, times[-1] - self.linear.delay, side="right")) - 1, 0)
@@ -150,7 +186,16 @@ class Hammerstein(TimedModel[HammersteinState]):
 
         A target that needs two inputs at a time, the first at saturation, is given the last of them alone. Behind a
         delay there is no inverse from sample to sample: that of the model `ahead` is for the targets a delay later.
+
+        Raises
+        ------
+        ValueError
+            If the model has viscous terms: what the input does next decides them.
         """
+        if self.is_viscous:
+            raise ValueError(
+                "a model with viscous terms has no inverse: identify one without them, such as with --dynamics lag"
+            )
         clock, wanted = check_sequence(times, targets=targets)
         state = self.initial_state() if state is None else state
         knots, elapsed = state.knots, _elapsed(clock, state)
@@ -225,6 +270,12 @@ class Hammerstein(TimedModel[HammersteinState]):
             found["drift"] = self.drift, unit if self.drift_time > 0.0 else f"{unit}/s"
         if self.drift_time > 0.0:
             found["drift time"] = self.drift_time, "s"
+        output, velocity = self.output_unit or "output units", f"({self.input_unit or 'input unit'}/s)"
+        if self.viscous:
+            found["viscosity"] = self.viscous, f"{output}/{velocity}"
+        if self.friction:
+            found["friction"] = self.friction, output
+            found["friction speed"] = self.friction_speed, velocity.strip("()")
         return found
 
     def at_rest(self, state: HammersteinState) -> tuple[Operator[Any], Any] | None:
@@ -242,6 +293,8 @@ class Hammerstein(TimedModel[HammersteinState]):
             "kelvin-voigt": part.creep_times.size > 0 and not part.creeps_by_logarithm,
             "drift": self.drift != 0.0 and self.drift_time == 0.0,
             "fading-drift": self.drift_time > 0.0,
+            "viscous": self.viscous != 0.0,
+            "friction": self.friction != 0.0,
         }
         return {"dynamics": ",".join(name for name, is_there in elements.items() if is_there) or "none"}
 
@@ -251,6 +304,7 @@ class Hammerstein(TimedModel[HammersteinState]):
         return {
             "memory": self.static.state_to_json(state.memory),
             "clock": state.clock,
+            "last": state.last,
             "knots": None
             if knots is None
             else {
@@ -280,7 +334,15 @@ class Hammerstein(TimedModel[HammersteinState]):
                 _checks.number("memory", _checks.json_field(found, key, "memory")) for key in ("value", "rate")
             )
             knots = Knots(tuple(times), tuple(values), FilterState(value, rate, tuple(crept)))
-        return HammersteinState(self.static.state_from_json(memory), _checks.number("memory", clock), knots)
+        last = found_last if (found_last := document.get("last")) is None else _checks.number("memory", found_last)
+        return HammersteinState(self.static.state_from_json(memory), _checks.number("memory", clock), knots, last)
+
+
+def velocities(times: Floats, inputs: Floats) -> Floats:
+    """Return the velocity at each sample, input units/s, shape (N,), by second-order differences; 0 of one sample."""
+    if inputs.size < 2:
+        return np.zeros(inputs.size)
+    return np.asarray(np.gradient(inputs, times))
 
 
 def _elapsed(clock: Floats, state: HammersteinState) -> Floats:

@@ -12,7 +12,7 @@ from bench.base import inlined, inner, kernel
 Floats = NDArray[np.float64]
 
 # Error of one step of integration, as part of the scale of the internal variable.
-_TOLERANCE = 1e-13
+_TOLERANCE = 1e-10
 # Rate of the internal variable below which it has come to rest.
 _REST = 1e-13
 # The internal variable is kept below this multiple of its scale: where it stiffens it would grow without end.

@@ -1,4 +1,9 @@
-"""A polynomial and a few plays, of either sign: the least model with memory, for few samples."""
+"""A polynomial of the input and polynomials of plays, with coefficients of either sign.
+
+A sum of functions of plays is an operator of Prandtl-Ishlinskii type whose density depends on the output of each play
+(Krasnosel'skii and Pokrovskii, Systems with Hysteresis, 1989). Beyond the range of the inputs each polynomial goes on
+as the straight line that touches its end, so that no power runs away there.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +25,7 @@ State: TypeAlias = tuple[float, ...]
 
 @dataclass(frozen=True, eq=False)
 class PolynomialPlays(Operator[State]):
-    """A Chebyshev series of the input and weighted plays.
+    """A Chebyshev series of the input, and one of each play.
 
     Parameters
     ----------
@@ -28,22 +33,29 @@ class PolynomialPlays(Operator[State]):
         Coefficients of T1 to Tn on the range mapped to [-1, 1], output units.
     thresholds : array_like, shape (n,)
         Half-widths of the plays, > 0, increasing, input units.
-    weights : array_like, shape (n,)
-        Weights of the plays, output units per input unit.
+    weights : array_like, shape (powers n,)
+        Weights of the plays, output units per input unit; then those of T2 of each play, T3 and so on, output units.
+        A play of threshold r is mapped from the range less r at both ends to [-1, 1].
     input_range : tuple of float
-        The range mapped to [-1, 1], input units.
+        The range mapped to [-1, 1], input units; half of it exceeds the thresholds of plays with powers.
     bias : float
         Constant part, output units.
+    powers : int
+        Degree of the series of each play, >= 1.
+    origin : float or None
+        Input of the relaxed state, in which all plays stand at the input; None for the state of negative saturation.
     input_unit, output_unit : str
         Units, for labels.
 
     Raises
     ------
     ValueError
-        If series or plays are empty or not finite, lengths differ, or thresholds or the range do not increase.
+        If series or plays are empty or not finite, lengths differ, or thresholds or the range do not increase or do
+        not suit each other.
     """
 
     kind: ClassVar[str] = "polynomial-plays"
+    added: ClassVar[tuple[str, ...]] = ("powers", "origin")
     series: Floats
     thresholds: Floats
     weights: Floats
@@ -51,15 +63,29 @@ class PolynomialPlays(Operator[State]):
     bias: float = 0.0
     input_unit: str = ""
     output_unit: str = ""
+    powers: int = 1
+    origin: float | None = None
 
     def __post_init__(self) -> None:
         thresholds = _checks.increasing("thresholds", self.thresholds, least=1)
         if thresholds[0] <= 0.0:
             raise ValueError(f"thresholds: expected positive values, got {thresholds[0]}")
         weights = _checks.samples("weights", self.weights)
-        if weights.size != thresholds.size:
-            raise ValueError(f"weights: expected {thresholds.size} values, one for each play, got {weights.size}")
+        if self.powers < 1:
+            raise ValueError(f"powers: expected at least 1, got {self.powers}")
+        if weights.size != self.powers * thresholds.size:
+            raise ValueError(
+                f"weights: expected {self.powers * thresholds.size} values, {self.powers} for each play, got "
+                f"{weights.size}"
+            )
         low, high = _checks.increasing("input_range", self.input_range).tolist()
+        if self.powers > 1 and not thresholds[-1] < 0.5 * (high - low):
+            raise ValueError(
+                f"thresholds: expected values below half the input range, {0.5 * (high - low):g}, for powers of "
+                f"plays; got {thresholds[-1]:g}"
+            )
+        if self.origin is not None:
+            object.__setattr__(self, "origin", _checks.number("origin", self.origin))
         object.__setattr__(self, "series", _checks.frozen(_checks.samples("series", self.series)))
         object.__setattr__(self, "thresholds", _checks.frozen(thresholds))
         object.__setattr__(self, "weights", _checks.frozen(weights))
@@ -68,11 +94,11 @@ class PolynomialPlays(Operator[State]):
 
     @property
     def coefficients(self) -> Floats:
-        """Weights of the plays, then coefficients of T1 to Tn, shape (n + degree,)."""
+        """Weights of the plays, then coefficients of T1 to Tn, shape (powers n + degree,)."""
         return np.concatenate([self.weights, self.series])
 
     def with_coefficients(self, coefficients: ArrayLike, bias: float) -> PolynomialPlays:
-        """Return the same operator with other coefficients, shape (n + degree,), and bias."""
+        """Return the same operator with other coefficients, shape (powers n + degree,), and bias."""
         values = _checks.samples("coefficients", coefficients)
         plays = self.weights.size
         if values.size != plays + self.series.size:
@@ -80,8 +106,10 @@ class PolynomialPlays(Operator[State]):
         return replace(self, weights=values[:plays], series=values[plays:], bias=bias)
 
     def initial_state(self) -> State:
-        """Return the state of negative saturation."""
-        return self.saturated_state(-1)
+        """Return the relaxed state; that of negative saturation if the operator has no origin."""
+        if self.origin is None:
+            return self.saturated_state(-1)
+        return (self.origin,) * (self.thresholds.size + 1)
 
     def saturated_state(self, direction: int, value: float | None = None) -> State:
         """Return the state at the low (-1) or high (1) end, or at a value, entered from far beyond the other end.
@@ -105,12 +133,17 @@ class PolynomialPlays(Operator[State]):
         return np.asarray(_kernels.plays(sequence, self.thresholds, before))
 
     def regressor(self, inputs: ArrayLike, state: State | None = None) -> Regressor:
-        """Return the columns of the plays and of T1 to Tn."""
+        """Return the columns of the plays, of T2 and so on of the plays, and of T1 to Tn of the input."""
         sequence = _checks.samples("inputs", inputs)
         low, high = self.input_range
-        mapped = (2.0 * sequence - (low + high)) / (high - low)
-        terms = chebyshev.chebvander(mapped, self.series.size)[:, 1:]
-        return Regressor.of_columns(np.column_stack([self._plays(sequence, state), terms]))
+        middle, half = 0.5 * (low + high), 0.5 * (high - low)
+        plays = self._plays(sequence, state)
+        columns = [plays]
+        if self.powers > 1:
+            series = _chebyshev((plays - middle) / (half - self.thresholds), self.powers)
+            columns += [series[..., power] for power in range(1, self.powers)]
+        columns.append(_chebyshev((sequence - middle) / half, self.series.size))
+        return Regressor.of_columns(np.column_stack(columns))
 
     def evaluate(self, inputs: ArrayLike, state: State | None = None) -> Floats:
         """Return the outputs of a sequence, shape (N,), from `state` (default: negative saturation)."""
@@ -131,3 +164,15 @@ class PolynomialPlays(Operator[State]):
     def nonnegative(self) -> NDArray[np.bool_]:
         """Return False for each coefficient: their signs are free."""
         return np.zeros(self.coefficients.size, dtype=bool)
+
+
+def _chebyshev(values: Floats, degree: int) -> Floats:
+    """Return T1 to Tn, a last axis of `degree`, beyond [-1, 1] by their tangents at the ends."""
+    inside = np.clip(values, -1.0, 1.0)
+    terms = chebyshev.chebvander(inside, degree)[..., 1:]
+    if not (inside == values).all():
+        # Tn'(1) = n² and Tn'(-1) = (-1)^(n + 1) n².
+        orders = np.arange(1, degree + 1)
+        slopes = np.where(values[..., None] > 0.0, 1.0, (-1.0) ** (orders + 1)) * orders**2
+        terms = terms + slopes * (values - inside)[..., None]
+    return np.asarray(terms)

@@ -1,0 +1,347 @@
+"""Choice of a model: candidates from coarse to fine, each scored on what is left out of its fit, and one rule.
+
+1. Each family is tried in all its structures, from saturation or at rest, with a medium penalty.
+2. The best structure of each family is tried with the other penalties, then from the other initial memories.
+3. Where times are known, the best of each family is tried with each dynamic element, one after the other as long as
+   the score falls. Then the best of all is tried once more in its other structures, and from its other memories.
+4. The rule: the least score wins; among those within 2 % of it, the fewest degrees of freedom. A record of one kind
+   of cycle cannot tell models apart on other cycles: there a plane with signs wins unless it errs twice as much.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import product
+from typing import Any
+
+import numpy as np
+
+from bench.base import say_share, shares_to
+from bench.identification.by_name import Initial
+from bench.identification.choose.advice import PLANE, Advice, advise
+from bench.identification.choose.score import Candidate, Measurements, Score, evaluate
+from bench.identification.choose.splits import has_one_kind
+from bench.identification.fit.orientation import Orientation, has_orientation
+from bench.models import ModelSpec, Operator, find_model, identifiable_models
+
+SMOOTHING = (1e-2, 1e-3, 1e-1)
+"""Weights of the roughness penalty that are tried, the medium one first. Source: the best of a grid from 1e-4 to 1
+lies within these decades on measured files; see docs/reference/model-selection.md."""
+RIDGE = (1e-4, 1e-6, 1e-2)
+"""Weights of the penalty on coefficients that are tried, likewise. Source: on standardised columns they take from
+hardly any to about half of the degrees of freedom; see docs/reference/model-selection.md."""
+DYNAMICS = ("lag", "creep", "drift", "viscous", "friction")
+"""What is tried behind an operator and beside it, where times are known."""
+TIE = 1.02
+"""Ratio of two scores that is no difference. Source: a hundredth of the standard error of a score over five folds is
+smaller by an order; below it, the order of the table is chance."""
+BOUNDED = 2.0
+"""Ratio up to which a plane with signs wins on a record of one kind of cycle. Source: the coverage of such a record
+says nothing of other cycles, where signs bound the answer of the plane."""
+
+
+@dataclass(frozen=True)
+class Given:
+    """Settings that are not to be chosen; None leaves the choice.
+
+    Attributes
+    ----------
+    options : mapping of str to object
+        Options of models; each model takes those that it has.
+    initial, orientation, smoothing, ridge
+        As `Candidate`.
+    """
+
+    options: Mapping[str, Any] = field(default_factory=dict)
+    initial: Initial | None = None
+    orientation: Orientation | None = None
+    smoothing: float | None = None
+    ridge: float | None = None
+
+
+@dataclass(frozen=True)
+class Selection:
+    """What was tried, and what was chosen.
+
+    Attributes
+    ----------
+    scores : tuple of Score
+        All candidates, by their score; those that failed last.
+    best, chosen : Score
+        That of the least score, and that of the rule.
+    gap : int
+        Rows left out next to each block.
+    rows : int
+        Rows that were fitted and tested.
+    span : float
+        Range of their outputs, output units.
+    advice : tuple of Advice
+        What the record cannot decide, and what to record instead.
+    has_times : bool
+        Whether models with time took part.
+    is_bounded : bool
+        Whether planes with signs were preferred, as the record has one kind of cycle.
+    """
+
+    scores: tuple[Score, ...]
+    best: Score
+    chosen: Score
+    gap: int
+    rows: int
+    span: float
+    advice: tuple[Advice, ...] = ()
+    has_times: bool = False
+    is_bounded: bool = False
+
+
+def compared_models() -> tuple[str, ...]:
+    """Return the models that are compared if none is named: those of each family, and those of other packages."""
+    return tuple(name for name, spec in identifiable_models().items() if spec.is_compared)
+
+
+def select(
+    measured: Measurements,
+    models: Sequence[str],
+    given: Given | None = None,
+) -> Selection:
+    """Return the model that predicts best what was left out of its fit, and what else was tried.
+
+    The progress goes to `say_share`.
+
+    Parameters
+    ----------
+    measured : Measurements
+        The data.
+    models : sequence of str
+        Names of models of `identifiable_models`.
+    given : Given, optional
+        Settings that are not to be chosen.
+
+    Raises
+    ------
+    ValueError
+        If no model can be fitted: names each and why.
+    """
+    search = _Search(measured, given or Given())
+    for step in (search.structures, search.penalties, search.memories, search.dynamics, search.once_more):
+        step(models)
+    scores = tuple(sorted(search.scores, key=lambda score: (score.error, bool(score.failure))))
+    usable = [score for score in scores if not score.failure]
+    if not usable:
+        raise ValueError("; ".join(dict.fromkeys(f"{score.candidate.model}: {score.failure}" for score in scores)))
+    one_kind = has_one_kind(measured.inputs, measured.tested)
+    tested = measured.tested
+    chosen = choose(usable, one_kind)
+    is_bounded = one_kind and chosen.candidate.model == PLANE and len(models) > 1
+    return Selection(
+        scores,
+        usable[0],
+        chosen,
+        measured.gap,
+        int(tested.sum()),
+        float(np.ptp(measured.outputs[tested])),
+        tuple(advise(measured, usable, chosen, one_kind)),
+        measured.times is not None,
+        is_bounded,
+    )
+
+
+def choose(scores: Sequence[Score], one_kind: bool = False) -> Score:
+    """Return the score of the rule: the fewest degrees of freedom within 2 % of the least.
+
+    Parameters
+    ----------
+    scores : sequence of Score
+        Candidates that could be evaluated.
+    one_kind : bool
+        Whether the record has one kind of cycle: planes with signs win if they err at most twice as much.
+    """
+    least = min(score.error for score in scores)
+    if one_kind:
+        planes = [score for score in scores if score.candidate.model == PLANE and score.error <= BOUNDED * least]
+        scores = planes or scores
+    least = min(score.error for score in scores)
+    return min((score for score in scores if score.error <= TIE * least), key=lambda score: score.freedom)
+
+
+class _Search:
+    """The candidates of the choice, step by step; `scores` are those evaluated so far."""
+
+    def __init__(self, measured: Measurements, given: Given) -> None:
+        self.measured, self.given = measured, given
+        self.scores: list[Score] = []
+        self.made: dict[str, list[dict[str, Any]]] = {}
+
+    def structures(self, models: Sequence[str]) -> None:
+        """Try all structures of each model, from saturation or at rest, with the medium penalty."""
+        batches = []
+        for model in models:
+            spec = find_model(model)
+            self.made[model] = self._structures(model, spec)
+            for options in self.made[model]:
+                template = self._template(spec, options)
+                smoothing, ridge = self._penalties(spec, template)
+                orientation: Orientation = self.given.orientation or "auto"
+                if not has_orientation(spec, template):
+                    orientation = "auto"
+                first = Candidate(model, options, orientation, None, smoothing[0], ridge[0])
+                batches.append([replace(first, initial=memory) for memory in self._first_memories(template)])
+        self._evaluate("structures", batches)
+
+    def penalties(self, models: Sequence[str]) -> None:
+        """Try the best structure of each model with the other penalties."""
+        batches = []
+        for best in self._best(models):
+            spec = find_model(best.candidate.model)
+            smoothing, ridge = self._penalties(spec, self._template(spec, best.candidate.options))
+            others = [replace(best.candidate, smoothing=s, ridge=r) for s, r in product(smoothing, ridge)]
+            batches.append([one for one in others if one != best.candidate])
+        self._evaluate("penalties", batches)
+
+    def memories(self, models: Sequence[str]) -> None:
+        """Try the best of each model from the initial memories that were not tried."""
+        batches = [self._other_memories(best.candidate) for best in self._best(models)]
+        scores = self._evaluate("initial memories", batches)
+        self._reshape("initial memories", [min(some, key=lambda score: score.error) for some in scores if some])
+
+    def dynamics(self, models: Sequence[str]) -> None:
+        """Try the best of each model with dynamic elements, one after the other as long as the score falls."""
+        going = self._best(models) if self.measured.times is not None else []
+        while going:
+            batches = []
+            for best in going:
+                before = [name for name in best.candidate.dynamics.split(",") if name]
+                batches.append([
+                    replace(best.candidate, dynamics=",".join([*before, element]))
+                    for element in DYNAMICS
+                    if element not in before
+                ])  # fmt: skip
+            going = self._improve("dynamics", going, batches)
+
+    def once_more(self, models: Sequence[str]) -> None:
+        """Try the other structures of the best candidate of all, then its other memories.
+
+        Its structure was found from another memory, and without what follows it.
+        """
+        for others in (self._other_structures, self._other_memories):
+            best = min(self._best(models), key=lambda score: score.error, default=None)
+            if best is not None:
+                self._evaluate("the best once more", [[replace(one, shape=())] for one in others(best.candidate)])
+
+    def _other_structures(self, best: Candidate) -> list[Candidate]:
+        made = [replace(best, options=options) for options in self.made[best.model]]
+        return [one for one in made if one != best]
+
+    def _other_memories(self, best: Candidate) -> list[Candidate]:
+        """Return a candidate from the initial memories with which it was not tried yet."""
+        spec = find_model(best.model)
+        if self.given.initial is not None or self._template(spec, best.options).memoryless:
+            return []
+        memories: list[Initial | None] = [None, "negative", "positive"]
+        memories += ["skip"] if self.measured.known else []
+        memories += ["estimate"] if spec.estimate_state is not None else []
+        made = [replace(best, initial=memory) for memory in memories]
+        done = {repr(replace(score.candidate, shape=())) for score in self.scores}
+        return [one for one in made if repr(replace(one, shape=())) not in done]
+
+    def _improve(self, what: str, before: Sequence[Score], batches: Sequence[Sequence[Candidate]]) -> list[Score]:
+        """Return the best score of each batch that is better than the one before."""
+        better = [
+            best
+            for old, scores in zip(before, self._evaluate(what, batches), strict=True)
+            if (best := min([old, *scores], key=lambda score: TIE * score.error if score is not old else score.error))
+            is not old
+        ]
+        return self._reshape(what, better)
+
+    def _reshape(self, what: str, found: Sequence[Score]) -> list[Score]:
+        """Return scores, those with a shape as they are if it is found for their own settings, if that is better.
+
+        A shape that was found from another memory, or without what follows the operator, has made up for that.
+        """
+        shaped = [[replace(one.candidate, shape=())] if one.candidate.shape else [] for one in found]
+        again = self._evaluate(what, shaped)
+        return [min([one, *more], key=lambda score: score.error) for one, more in zip(found, again, strict=True)]
+
+    def _evaluate(self, what: str, batches: Sequence[Sequence[Candidate]]) -> list[list[Score]]:
+        """Return the scores of batches of candidates."""
+        found: list[list[Score]] = []
+        for batch in batches:
+            self._say(what, len(found), len(batches))
+            with shares_to(lambda *_: None):
+                found.append(evaluate(self.measured, batch))
+            self.scores += found[-1]
+        return found
+
+    def _say(self, what: str, done: int, count: int) -> None:
+        text = f"comparing {what}: {done + 1} of {count}"
+        usable = [score for score in self.scores if not score.failure]
+        if usable:
+            best = min(usable, key=lambda score: score.error)
+            percent = 100.0 * best.error / max(float(np.ptp(self.measured.outputs)), 1e-300)
+            text += f", best so far {' with '.join(filter(None, (best.candidate.model, best.candidate.dynamics)))}"
+            text += f" {percent:.2g} %"
+        say_share(text, done / count)
+
+    def _best(self, models: Sequence[str]) -> list[Score]:
+        """Return the best candidate of each model that could be evaluated."""
+        found = []
+        for model in models:
+            scores = [score for score in self.scores if score.candidate.model == model and not score.failure]
+            if scores:
+                found.append(min(scores, key=lambda score: score.error))
+        return found
+
+    def _structures(self, model: str, spec: ModelSpec) -> list[dict[str, Any]]:
+        """Return the options of each structure of a model; those of more coefficients than rows only if alone."""
+        assert spec.template is not None
+        taken = inspect.signature(spec.template).parameters
+        fixed = {name: value for name, value in self.given.options.items() if name in taken}
+        varied = {name: values for name, values in spec.variants.items() if name not in fixed}
+        made, counts = [], []
+        for choice in product(*varied.values()):
+            options = fixed | dict(zip(varied, choice, strict=True))
+            try:
+                counts.append(self._template(spec, options).coefficients.size)
+                made.append(options)
+            except (ValueError, TypeError) as error:
+                self.scores.append(Score(Candidate(model, options), failure=str(error)))
+        most = max(int(self.measured.tested.sum()), min(counts, default=0))
+        return [options for options, count in zip(made, counts, strict=True) if count <= most]
+
+    def _template(self, spec: ModelSpec, options: Mapping[str, Any]) -> Operator[Any]:
+        assert spec.template is not None
+        template: Operator[Any] = spec.template(self.measured.inputs, **options)
+        return template
+
+    def _penalties(
+        self, spec: ModelSpec, template: Operator[Any]
+    ) -> tuple[tuple[float | None, ...], tuple[float | None, ...]]:
+        """Return the weights of smoothing and of ridge that are tried."""
+        smoothing: tuple[float | None, ...] = (0.0,)
+        ridge: tuple[float | None, ...] = (0.0,)
+        if template.densities():
+            smoothing = SMOOTHING if spec.constrained else (None,)
+            ridge = (0.0,) if spec.constrained else (None,)
+        elif not spec.constrained and not template.shape_parameters().names:
+            ridge = RIDGE
+        given = self.given
+        if given.smoothing is not None and template.densities():
+            smoothing = (given.smoothing,)
+        if given.ridge is not None and not spec.constrained:
+            ridge = (given.ridge,)
+        return smoothing, ridge
+
+    def _first_memories(self, template: Operator[Any]) -> tuple[Initial | None, ...]:
+        """Return the memories with which all structures are tried: at rest, and in saturation if it differs."""
+        if template.memoryless:
+            return (None,)
+        if self.given.initial is not None:
+            return (self.given.initial,)
+        # Each memory of an operator with a shape is a search of its own.
+        if template.shape_parameters().names:
+            return (None,)
+        relaxed = template.initial_state() != template.saturated_state(-1)
+        return (None, "negative", "positive") if relaxed else (None, "positive")

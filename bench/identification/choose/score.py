@@ -1,0 +1,355 @@
+"""The score of a candidate: how well a model with its settings predicts rows that were left out of its fit."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from bench.base import Floats
+from bench.identification.branches import turning_points
+from bench.identification.by_name import FitProblem, Initial, set_up_problem
+from bench.identification.choose.splits import BLOCKS, GAP, Flags, Fold, block_folds, cycle_folds, run_folds
+from bench.identification.fit.least_squares import Fit, one_thread
+from bench.identification.fit.orientation import NAMES, Orientation, has_orientation
+from bench.identification.timed.hammerstein_fit import reshape, set_up_search
+from bench.identification.timed.hammerstein_search import find_best
+from bench.models import PolynomialPlays
+
+# Turns smaller than this part of the range need not be kept when rows are left out.
+# Source: half of the noise of 1 % that turning points are told from, see `splits`.
+_LEAST_MOVE = 0.005
+# Part of the rows that a memory may take to be known, or all rows are tested. Source: of ten blocks two then remain, one for each of two folds.
+_KNOWN = 0.25
+# Relative tolerance of shape parameters of a candidate. Source: far below the tie of two scores, 2 %.
+_SHAPE = 1e-5
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A model and the settings of its identification.
+
+    Attributes
+    ----------
+    model : str
+        Name of the operator in `bench.models`.
+    options : mapping of str to object
+        Options of the operator, as `identify` takes them.
+    orientation : str
+        Whether the output rises or falls with the input; `auto` leaves it to the fit, or to a model without signs.
+    initial : str or None
+        Memory before the first sample, as `identify` takes it.
+    smoothing, ridge : float or None
+        Weights of the penalties; None leaves them to the fit of a density of either sign.
+    dynamics : str
+        What follows the operator in time, as `identify_hammerstein` takes it; empty for the operator alone.
+    shape : tuple of float
+        Shape parameters of the operator; empty if they are to be found.
+    """
+
+    model: str
+    options: Mapping[str, Any] = field(default_factory=dict)
+    orientation: Orientation = "auto"
+    initial: Initial | None = None
+    smoothing: float | None = 0.0
+    ridge: float | None = 0.0
+    dynamics: str = ""
+    shape: tuple[float, ...] = ()
+
+    @property
+    def fitted(self) -> tuple[str, dict[str, Any]]:
+        """Name and options of the model that is identified: with dynamics, of a Hammerstein model."""
+        if not self.dynamics:
+            return self.model, dict(self.options)
+        return "hammerstein", {"static": self.model, **self.options, "dynamics": self.dynamics}
+
+
+@dataclass(frozen=True, eq=False)
+class Measurements:
+    """What candidates are fitted to.
+
+    Attributes
+    ----------
+    inputs, outputs : ndarray, shape (N,)
+        The measured sequence; all of it drives the memory.
+    fitted : ndarray of bool, shape (N,)
+        Rows that may be fitted and tested.
+    times : ndarray, shape (N,), or None
+        s, strictly increasing; None if they are not known.
+    runs : ndarray of int, shape (N,), or None
+        Number of the run of each row; None of one run.
+    known : int
+        First row that is tested: before it, outputs may depend on what came before the sequence.
+    """
+
+    inputs: Floats
+    outputs: Floats
+    fitted: Flags
+    times: Floats | None = None
+    runs: NDArray[np.int64] | None = None
+    known: int = 0
+
+    @classmethod
+    def of(
+        cls,
+        inputs: Floats,
+        outputs: Floats,
+        fitted: Flags | None = None,
+        times: Floats | None = None,
+        runs: NDArray[np.int64] | None = None,
+    ) -> Measurements:
+        """Return measurements of which rows are tested from where the inputs have overwritten all memory they do.
+
+        If that leaves less than a quarter of those that may be fitted, all are tested.
+        """
+        rows = np.ones(inputs.size, dtype=bool) if fitted is None else fitted
+        span = float(inputs.min()), float(inputs.max())
+        until = 0
+        if span[0] < span[1]:
+            until = PolynomialPlays(np.zeros(1), np.ones(1), np.zeros(1), span).unknown_until(inputs)
+        left = int(rows[until:].sum())
+        return cls(inputs, outputs, rows, times, runs, until if left >= _KNOWN * int(rows.sum()) else 0)
+
+    def thinned(self, most: int) -> Measurements:
+        """Return about `most` rows, evenly chosen; turning points stay as rows that are not fitted.
+
+        The memory of an operator that does not depend on the rate is the same with and without the rows between.
+        """
+        if self.inputs.size <= most:
+            return self
+        chosen = np.zeros(self.inputs.size, dtype=bool)
+        chosen[:: -(-self.inputs.size // most)] = True
+        kept = chosen.copy()
+        kept[turning_points(self.inputs, _LEAST_MOVE * float(np.ptp(self.inputs)))] = True
+        return Measurements(
+            self.inputs[kept],
+            self.outputs[kept],
+            (self.fitted & chosen)[kept],
+            None if self.times is None else self.times[kept],
+            None if self.runs is None else self.runs[kept],
+            int(np.count_nonzero(kept[: self.known])),
+        )
+
+    @property
+    def tested(self) -> Flags:
+        """Rows that may be tested, shape (N,)."""
+        return np.asarray(self.fitted & (np.arange(self.inputs.size) >= self.known), dtype=bool)
+
+    @property
+    def gap(self) -> int:
+        """Rows next to those tested that are not fitted."""
+        return round(GAP * int(self.tested.sum()))
+
+    def blocks(self) -> tuple[Fold, ...]:
+        """Return the folds of contiguous blocks, or of whole runs if several; first rows are in all fits."""
+        tested = self.tested
+        if self.runs is not None and np.unique(self.runs[tested]).size > 1:
+            return self._with_first_rows(run_folds(self.runs, tested))
+        blocks = max(min(BLOCKS, int(tested.sum()) // 2), 2)
+        return self._with_first_rows(block_folds(tested, folds=min(5, blocks), blocks=blocks, gap=self.gap))
+
+    def cycles(self) -> tuple[Fold, ...]:
+        """Return the folds of whole kinds of cycles; none if there is one kind only."""
+        return self._with_first_rows(cycle_folds(self.inputs, self.tested, gap=self.gap))
+
+    def _with_first_rows(self, folds: tuple[Fold, ...]) -> tuple[Fold, ...]:
+        first = self.fitted & ~self.tested
+        return tuple(Fold(fold.tested, fold.trained | first) for fold in folds)
+
+
+@dataclass(frozen=True)
+class Score:
+    """How a candidate did.
+
+    Attributes
+    ----------
+    candidate : Candidate
+        What was evaluated, with the orientation and the shape that the fit found.
+    blocks, cycles : tuple of float
+        Mean squared error of each fold of blocks or runs, and of each fold of kinds of cycles, output units squared.
+    training : float
+        RMS error of the rows fitted, mean over the folds, output units.
+    freedom : float
+        Degrees of freedom of the fit, mean over the folds: effective coefficients and nonlinear parameters.
+    seconds : float
+        CPU time, s.
+    failure : str
+        Why it could not be evaluated.
+    """
+
+    candidate: Candidate
+    blocks: tuple[float, ...] = ()
+    cycles: tuple[float, ...] = ()
+    training: float = float("nan")
+    freedom: float = float("nan")
+    seconds: float = 0.0
+    failure: str = ""
+
+    @property
+    def error(self) -> float:
+        """The score, output units: RMS error over what was left out, cycles counting as much as blocks."""
+        parts = [float(np.mean(part)) for part in (self.blocks, self.cycles) if part]
+        return float(np.sqrt(np.mean(parts))) if parts else float("inf")
+
+    @property
+    def blocks_rms(self) -> float:
+        """RMS error over blocks or runs left out, output units; infinite if it failed."""
+        return float(np.sqrt(np.mean(self.blocks))) if self.blocks else float("inf")
+
+    @property
+    def cycles_rms(self) -> float:
+        """RMS error over kinds of cycles left out, output units; nan if there is one kind only."""
+        return float(np.sqrt(np.mean(self.cycles))) if self.cycles else float("nan")
+
+    @property
+    def spread(self) -> float:
+        """Standard error of `blocks_rms` from the scatter of the folds, output units."""
+        if len(self.blocks) < 2 or not self.blocks_rms > 0.0:
+            return float("nan")
+        return float(np.std(self.blocks, ddof=1) / np.sqrt(len(self.blocks)) / (2.0 * self.blocks_rms))
+
+
+def evaluate(measured: Measurements, candidates: Sequence[Candidate]) -> list[Score]:
+    """Return the scores of candidates; a task that can be sent to a worker process.
+
+    Candidates that differ in their penalties alone are set up once. Shape parameters, time constants, the orientation
+    and an estimated memory are found from all rows; coefficients are fitted without each fold.
+    """
+    folds = measured.blocks(), measured.cycles()
+    scores: list[Score] = []
+    fitters: dict[str, _Fitter | str] = {}
+    for candidate in candidates:
+        begin = time.process_time()
+        key = repr(replace(candidate, smoothing=None, ridge=None))
+        try:
+            with one_thread():
+                if key not in fitters:
+                    fitters[key] = _set_up(measured, candidate)
+                fitter = fitters[key]
+                if isinstance(fitter, str):
+                    scores.append(Score(candidate, failure=fitter))
+                    continue
+                scores.append(_score(measured, candidate, fitter, folds, begin))
+        # A model of another package must not end the comparison of the others.
+        except Exception as error:
+            text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
+            fitters.setdefault(key, text)
+            scores.append(Score(candidate, failure=text, seconds=time.process_time() - begin))
+    return scores
+
+
+@dataclass(frozen=True, eq=False)
+class _Fitter:
+    """Fits a candidate to some of the rows: columns of the linear least squares, and what was found beside them."""
+
+    fit: Callable[[Floats, Candidate], Fit]
+    predict: Callable[[Fit], Floats]
+    skip: int
+    parameters: int
+    orientation: Orientation
+    shape: tuple[float, ...]
+
+
+def _score(
+    measured: Measurements,
+    candidate: Candidate,
+    fitter: _Fitter,
+    folds: tuple[tuple[Fold, ...], tuple[Fold, ...]],
+    begin: float,
+) -> Score:
+    errors: tuple[list[float], list[float]] = ([], [])
+    training, freedom = [], []
+    for found, part in zip(errors, folds, strict=True):
+        for fold in part:
+            weights = fold.trained.astype(np.float64)
+            fit = fitter.fit(weights, candidate)
+            squares = (measured.outputs - fitter.predict(fit)) ** 2
+            found.append(float(squares[fold.tested].mean()))
+            weights[: fitter.skip] = 0.0
+            training.append(float(np.sqrt(weights @ squares / weights.sum())))
+            freedom.append(fit.certificate.effective + fitter.parameters)
+    return Score(
+        replace(candidate, orientation=fitter.orientation, shape=fitter.shape),
+        tuple(errors[0]),
+        tuple(errors[1]),
+        float(np.mean(training)),
+        float(np.mean(freedom)),
+        time.process_time() - begin,
+    )
+
+
+def _set_up(measured: Measurements, candidate: Candidate) -> _Fitter:
+    weights = measured.fitted.astype(np.float64)
+    if candidate.dynamics:
+        return _set_up_in_time(measured, candidate, weights)
+    problem = set_up_problem(
+        candidate.model,
+        measured.inputs,
+        measured.outputs,
+        weights,
+        0,
+        candidate.smoothing or 0.0,
+        candidate.initial,
+        dict(candidate.options),
+        orientation=candidate.orientation,
+        shape=candidate.shape,
+    )
+    _check_skipped(measured, problem)
+
+    def fit(weights: Floats, one: Candidate) -> Fit:
+        penalties = problem.regularization(one.smoothing, one.ridge)
+        return problem.fit(penalties.smoothing, weights, penalties.ridge)
+
+    def predict(found: Fit) -> Floats:
+        return found.bias + problem.regressor.product(found.coefficients)
+
+    template = problem.template
+    orientation = NAMES[problem.orientation] if has_orientation(problem.spec, template) else "auto"
+    parameters, shape = template.count_beside_coefficients(), template.shape_parameters().values
+    return _Fitter(fit, predict, problem.skip, parameters, orientation, tuple(shape))
+
+
+def _set_up_in_time(measured: Measurements, candidate: Candidate, weights: Floats) -> _Fitter:
+    assert measured.times is not None
+    problem, search = set_up_search(
+        measured.times,
+        measured.inputs,
+        measured.outputs,
+        weights,
+        0,
+        candidate.initial,
+        candidate.orientation,
+        static=candidate.model,
+        options=candidate.options,
+        smoothing=candidate.smoothing or 0.0,
+        ridge=candidate.ridge or 0.0,
+        shape=candidate.shape,
+    )
+    _check_skipped(measured, problem)
+    found = find_best(search, tuple(candidate.dynamics.split(",")), rounds=1)
+    if not candidate.shape:
+        search, found = reshape(search, found, _SHAPE)
+    columns, others = search.responses(found.elements, found.values)
+    together = np.column_stack([columns, others])
+    sign = search.sign(found.fit)
+
+    def fit(weights: Floats, one: Candidate) -> Fit:
+        return search.fit_columns(columns, others, weights, sign, one.smoothing)
+
+    def predict(found: Fit) -> Floats:
+        return np.asarray(found.bias + together @ found.coefficients)
+
+    template = search.static.template
+    orientation = NAMES[sign] if has_orientation(search.static.spec, template) else "auto"
+    parameters = found.values.size + template.count_beside_coefficients()
+    return _Fitter(fit, predict, problem.skip, parameters, orientation, tuple(template.shape_parameters().values))
+
+
+def _check_skipped(measured: Measurements, problem: FitProblem) -> None:
+    """Raise ValueError if rows that are tested depend on what came before the record."""
+    if problem.skip > measured.known:
+        raise ValueError(f"its memory is unknown until row {problem.skip}: too few rows are left")
