@@ -14,7 +14,7 @@ from pydantic import Field, InstanceOf
 from bench.base import Clock, ConfigurationError
 from bench.devices import DriverSettings
 from bench.rig import LaboratorySettings
-from bench.specimen import NoiseTable, Specimen, TwinSettings, TwinTable
+from bench.specimen import NoiseTable, Specimen, TwinSettings, TwinTable, rounded
 from sim_devices.instruments.twin import EmulatedTwin, TwinServer
 from sim_devices.laboratory import EmulatedLaboratory, TrueValue
 from sim_devices.world import World
@@ -94,11 +94,11 @@ class TwinLaboratory(EmulatedLaboratory):
     Settings: ClassVar[type[LaboratorySettings]] = TwinLaboratorySettings
 
     def __init__(self, settings: TwinLaboratorySettings, clock: Clock, seed: int) -> None:
-        specimen_stream, session_stream, reading_stream, self._rng = np.random.default_rng(seed).spawn(4)
+        specimen_stream, session_stream, reading_stream = np.random.default_rng(seed).spawn(3)
         drive, response = settings.drive, settings.response
         self._settings = settings
         self._session = settings.session_offset * float(session_stream.standard_normal())
-        self._specimen = Specimen(settings.operators, settings.dynamics, drive.rest, specimen_stream)
+        self._specimen = Specimen(settings.operator, settings.dynamics, drive.rest, specimen_stream)
         at_rest = (drive.rest - drive.offset) / drive.gain
         self.plant = SpecimenPlant(self._specimen, at_rest)
         self._at_rest = at_rest
@@ -164,12 +164,8 @@ class TwinLaboratory(EmulatedLaboratory):
         """Take what a device sets from now on; nan for one that is off."""
         self._outputs[device] = value
         if device == self._settings.drive.device:
-            self.plant.set(self._at_rest if math.isnan(value) else self._carried_out(value))
-
-    def _carried_out(self, setpoint: float) -> float:
-        """Return what becomes of a set-point; one that is off by far has the steps of the others."""
-        setpoints = self._settings.setpoints
-        return setpoints.rounded(setpoints.inexact(setpoint, self._rng))
+            steps = self._settings.drive.resolution
+            self.plant.set(self._at_rest if math.isnan(value) else rounded(value, steps))
 
     def _source(self, signal: str, noise: NoiseTable) -> Callable[[], float]:
         """Return what gives the true value of a signal."""

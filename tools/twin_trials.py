@@ -3,10 +3,10 @@
     python tools/twin_trials.py [--rig vo2 ...] [--specimens 0 1 2] [--sessions 24] [--out FOLDER]
 
 The plants of the packaged rigs are built differently from any twin. Each specimen is characterized once (creep,
-damped-oscillation, random-validation), in sessions of its own; the second run identifies the model of the controller,
-and all three the twin. Then `tracking` runs with that model on both, with other seeds. The table has the medians over
-the sessions of each specimen with their range, and by how much that of the twin is off. The goals are for the median
-over the specimens: the duration within 2 %, the RMS of the error within 30 %.
+damped-oscillation, random-validation), in sessions of its own. The second run identifies the model of the controller,
+and all three the twin, with a model of its own. Then `tracking` runs on both with the controller's model, with other
+seeds. The table has the medians over the sessions of each specimen with their range, and by how much that of the twin
+is off. The goals are for the median over the specimens: the duration within 5 %, the RMS of the error within 40 %.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ SESSIONS = {"vo2": 24, "sma": 24, "hybrid": 8}
 """Sessions of each plant and twin: on vo2 and sma durations differ by 3 to 6 %, errors by 8 to 11 %."""
 SEEDED = {"vo2", "sma"}
 """Rigs whose specimens differ by a seed; of others it is the sessions alone that differ."""
-GOALS = {"duration, s": 0.02, "RMS error, base unit": 0.3}
+GOALS = {"duration, s": 0.05, "RMS error, base unit": 0.4}
 """Of duration and RMS, as a share of the plant's."""
 
 
@@ -70,7 +70,7 @@ def trial(rig: str, specimen: int, folder: Path, sessions: int) -> tuple[NDArray
     validation = bench.run("random-validation", rig, out=folder, seed=first + 2, overrides=other)
     model, twin = folder / "model.json", folder / "twin.toml"
     bench.identify(loops, **MODELS[rig]).file.save(model)
-    write_twin([creep.folder, loops.folder, validation.folder], rig, twin, model)
+    write_twin([creep.folder, loops.folder, validation.folder], rig, twin)
     found = []
     for on, seed, overrides in ((rig, 11, other), (str(twin), 101, {})):
         rows: list[tuple[float, float]] = []

@@ -17,6 +17,7 @@ from .specimen import (
 from .tables import (
     NoiseTable as NoiseTable,
     TwinTable as TwinTable,
+    rounded as rounded,
 )
 from .write import (
     write_twin as write_twin,

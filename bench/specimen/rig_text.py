@@ -5,13 +5,16 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from bench.base import CheckedTable
 from bench.rig import RigFile
-from bench.specimen.identify import IdentifiedTwin, inexact, measured_signals, model_json
-from bench.specimen.specimen import Wander
+from bench.specimen.identify import measured_signals
+from bench.specimen.specimen import Unevenness, Wander
+from bench.specimen.tables import DriveTable, NoiseTable, ResponseTable, TwinTable
+from bench.specimen.twin import IdentifiedTwin
 
 _FASTEST_LINE = 100_000_000
 """Speed of the emulated lines, Bd: their time is part of that of a reading."""
@@ -105,60 +108,29 @@ def _devices(twin: IdentifiedTwin, file: RigFile) -> Iterator[str]:
 
 
 def _emulation(twin: IdentifiedTwin, file: RigFile) -> Iterator[str]:
-    first, actuator, response = twin.recordings[0], twin.actuator.dynamics, twin.response.dynamics
-    units = {signal.name: signal.unit for signal in first.signals}
-    drive, output = units[first.drive], units[first.response]
-    yield from _comments(twin)
-    yield from _table(
-        "emulation",
-        {
-            "laboratory": "twin",
-            "step": _grid(twin),
-            "session_offset": twin.offset,
-            "tasks": _tasks(file, twin),
-        },
-        tail=[
-            f"model = '{model_json(twin.model)}'",
-            *([] if twin.response.correction is None else [f"correction = '{model_json(twin.response.correction)}'"]),
-        ],
-    )
-    yield from _table(
-        "emulation.drive",
-        {
-            "device": file.roles["drive"].device,
-            "signal": first.drive,
-            "rest": float(first.driven[0]),
-            "delay": _delay(twin, file),
-            "frequency": actuator.frequency,
-            "damping": actuator.damping,
-            **({"rate": actuator.rate} if math.isfinite(actuator.rate) else {}),
-            "gain": actuator.gain,
-            "offset": actuator.offset,
-        },
-        {"rest": drive, "delay": "s", "frequency": "rad/s", "rate": f"{drive}/s".replace("°C", "K"), "offset": drive},
-    )
-    if twin.setpoints.resolution:
-        yield from _table("emulation.setpoints", inexact(twin.setpoints), {"resolution": drive})
-    yield from _table(
-        "emulation.response",
-        {
-            "signal": twin.source,
-            "lag": response.lag,
-            "power": response.power,
-            "gain": response.gain,
-            "shares": list(response.shares),
-            "times": list(response.times),
-            **({"conversion": [list(pair) for pair in twin.conversion]} if twin.conversion else {}),
-        },
-        {"lag": "s", "times": "s"},
-    )
-    for name, wander, unit in (("wander", twin.wander, drive.replace("°C", "K")), ("drift", twin.drift, output)):
-        yield from _wander(name, wander, unit)
-    unit = drive.replace("°C", "K")
-    uneven = {"deviation": twin.unevenness.deviation, "length": twin.unevenness.length}
-    yield from _table("emulation.unevenness", uneven, {"deviation": unit, "length": unit})
+    first, found = twin.recordings[0], twin.dynamics
+    actuator, response = found.actuator, found.response
+    yield "# What was identified:"
+    yield from (f"#   {name.strip()}: {text}" for name, text in twin.identified())
+    whole = {
+        "step": found.step,
+        "session_offset": twin.offset,
+        "drift": found.drift,
+        "tasks": _tasks(file, twin),
+    }
+    model = json.dumps(twin.model.to_json(), ensure_ascii=False, separators=(",", ":"))
+    # Without the quote that ends a literal of TOML.
+    text = model.replace("'", "\\u0027")
+    yield from _table("emulation", {"laboratory": "twin", **whole}, TwinTable, f"model = '{text}'")
+    drive = {"device": file.roles["drive"].device, "signal": first.drive, "rest": float(first.driven[0])}
+    drive |= {"resolution": twin.steps, **vars(actuator), "delay": _delay(twin, file)}
+    yield from _table("emulation.drive", {key: each for key, each in drive.items() if each != math.inf}, DriveTable)
+    answer = {"signal": twin.source, **vars(response), "conversion": twin.conversion}
+    yield from _table("emulation.response", answer, ResponseTable)
+    yield from _table("emulation.wander", found.wander.model_dump(), Wander)
+    yield from _table("emulation.unevenness", found.unevenness.model_dump(), Unevenness)
     for name, table in twin.signals.items():
-        yield from _table(f"emulation.signals.{name}", table)
+        yield from _table(f"emulation.signals.{name}", table, NoiseTable)
 
 
 def _delay(twin: IdentifiedTwin, file: RigFile) -> float:
@@ -166,23 +138,12 @@ def _delay(twin: IdentifiedTwin, file: RigFile) -> float:
 
     What was identified counts from when a set-point was about to be sent until all devices had been read.
     """
-    delay, time = twin.actuator.dynamics.delay, twin.reading_time
+    delay, time = twin.dynamics.actuator.delay, twin.reading_time
     if time is not None:
         names = [each.name for each in file.devices]
         read_later = len(names) - 1 - names.index(file.roles["drive"].device)
         delay -= time.setpoint + time.quick * read_later / len(names)
     return max(delay, 0.0)
-
-
-def _comments(twin: IdentifiedTwin) -> Iterator[str]:
-    yield "# What was identified:"
-    yield from (f"#   {name.strip()}: {text}" for name, text in twin.identified())
-
-
-def _grid(twin: IdentifiedTwin) -> float:
-    from bench.analysis import grid_step
-
-    return grid_step(twin.actuator.dynamics)
 
 
 def _tasks(file: RigFile, twin: IdentifiedTwin) -> dict[str, str]:
@@ -194,20 +155,15 @@ def _tasks(file: RigFile, twin: IdentifiedTwin) -> dict[str, str]:
     }
 
 
-def _wander(name: str, wander: Wander, unit: str) -> Iterator[str]:
-    yield from _table(
-        f"emulation.{name}", {"deviation": wander.deviation, "time": wander.time}, {"deviation": unit, "time": "s"}
-    )
-
-
 def _table(
-    name: str, keys: Mapping[str, Any], units: Mapping[str, str] | None = None, tail: Sequence[str] = ()
+    name: str, keys: Mapping[str, Any], described: type[CheckedTable] | None = None, *tail: str
 ) -> Iterator[str]:
+    """Yield the lines of a table, with what its class says of each key."""
     yield f"[{name}]"
+    fields = {} if described is None else described.model_fields
     for key, value in keys.items():
         text = f"{key} = {_value(value)}"
-        unit = (units or {}).get(key, "")
-        yield f"{text:<36}# {unit}" if unit else text
+        yield f"{text:<36}# {fields[key].description}" if key in fields else text
     yield from tail
     yield ""
 
@@ -217,7 +173,7 @@ def _value(value: Any) -> str:  # noqa: ANN401 - any of TOML
         return json.dumps(value, ensure_ascii=False)
     if isinstance(value, bool):
         return "true" if value else "false"
-    if isinstance(value, list):
+    if isinstance(value, list | tuple):
         return f"[{', '.join(map(_value, value))}]"
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{json.dumps(key)} = {_value(each)}" for key, each in value.items()) + " }"

@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from pydantic import Field
 
-from bench.base import DeferredModule, Floats
+from bench.base import CheckedTable, DeferredModule, Floats
 from bench.models import ActuatorDynamics, Operator, ResponseDynamics
 
 if TYPE_CHECKING:
@@ -17,43 +18,26 @@ else:
     _kernels = DeferredModule("bench.models.kernels.actuator_kernels")
 
 
-@dataclass(frozen=True)
-class Wander:
-    """A quantity that wanders with an exponential autocorrelation (Ornstein-Uhlenbeck).
+class Wander(CheckedTable):
+    """Drive that wanders: a Gauss-Markov process of time (IEEE Std 952-1997, annex C). `[emulation.wander]`."""
 
-    Attributes
-    ----------
-    deviation : float
-        Standard deviation, in the unit of the quantity; 0 for none.
-    time : float
-        Correlation time, s.
+    deviation: float = Field(default=0.0, ge=0, description="standard deviation, input units")
+    time: float = Field(default=1.0, gt=0, description="correlation time, s")
+
+
+class Unevenness(CheckedTable):
+    """Error of the model on a new history, as a shift of the drive: a Gauss-Markov process of the way of the drive.
+
+    It is other in each session, and stands while the drive stands. `[emulation.unevenness]`.
     """
 
-    deviation: float = 0.0
-    time: float = 1.0
-
-
-@dataclass(frozen=True)
-class Unevenness:
-    """What the model does not know of the specimen: a shift of the drive that changes as the drive moves.
-
-    It is different in each session, as the error of a model is on a new history; it stands while the drive stands.
-
-    Attributes
-    ----------
-    deviation : float
-        Standard deviation, input units; 0 for none.
-    length : float
-        Travel of the drive after which it is forgotten, input units.
-    """
-
-    deviation: float = 0.0
-    length: float = 1.0
+    deviation: float = Field(default=0.0, ge=0, description="standard deviation, input units")
+    length: float = Field(default=1.0, gt=0, description="way of the drive after which it is forgotten, input units")
 
 
 @dataclass(frozen=True)
 class Dynamics:
-    """All that a specimen has beside its operators.
+    """All that a specimen has beside its hysteresis.
 
     Attributes
     ----------
@@ -65,18 +49,18 @@ class Dynamics:
         From the drive to the response.
     wander : Wander
         Of the drive as the specimen sees it, beside what is read of it, input units.
-    drift : Wander
-        Of the response, output units.
     unevenness : Unevenness
         Of the drive as the specimen sees it.
+    drift : float
+        Random walk of the response (rate random walk of IEEE Std 952-1997), output units per root of a second.
     """
 
     step: float
     actuator: ActuatorDynamics = field(default_factory=ActuatorDynamics)
     response: ResponseDynamics = field(default_factory=ResponseDynamics)
     wander: Wander = field(default_factory=Wander)
-    drift: Wander = field(default_factory=Wander)
     unevenness: Unevenness = field(default_factory=Unevenness)
+    drift: float = 0.0
 
 
 class Specimen:
@@ -84,80 +68,59 @@ class Specimen:
 
     Parameters
     ----------
-    operators : sequence of Operator
-        Their outputs are added: the model, and what of its error repeats.
+    model : Operator
+        Its hysteresis.
     dynamics : Dynamics
         The rest of it.
     start : float
         Drive at the beginning, input units.
-    rng : numpy.random.Generator or None
-        Its wander and drift; without one there is neither.
+    rng : numpy.random.Generator
+        Its wander and drift.
     """
 
-    def __init__(
-        self,
-        operators: tuple[Operator[Any], ...],
-        dynamics: Dynamics,
-        start: float,
-        rng: np.random.Generator | None = None,
-    ) -> None:
-        self._operators = operators
+    def __init__(self, model: Operator[Any], dynamics: Dynamics, start: float, rng: np.random.Generator) -> None:
         self.dynamics = dynamics
-        self._rng = rng
+        self._model, self._rng = model, rng
         actuator, response = dynamics.actuator, dynamics.response
-        position = (start - actuator.offset) / actuator.gain
-        wander = rng.standard_normal() * dynamics.wander.deviation if rng is not None else 0.0
-        self._drift = rng.standard_normal() * dynamics.drift.deviation if rng is not None else 0.0
-        place = rng.standard_normal() * dynamics.unevenness.deviation if rng is not None else 0.0
+        wander, place = (rng.standard_normal(2) * (dynamics.wander.deviation, dynamics.unevenness.deviation)).tolist()
         gain = actuator.gain
+        position = (start - actuator.offset) / gain
         disturbed = position + wander / gain
         lagged = math.copysign(abs(disturbed) ** response.power, disturbed)
         self._state = np.array([position, 0.0, lagged, wander / gain, place / gain])
-        seen = start + wander + place
-        self._memories = [operator.step(operator.initial_state(), seen)[0] for operator in operators]
-        output = sum(operator.value(memory) for operator, memory in zip(operators, self._memories, strict=True))
+        self._memory, output = model.step(model.initial_state(), start + wander + place)
         self._slow = np.full(len(response.times), output)
         self._shares, self._times = np.array(response.shares), np.array(response.times)
+        self._drift = 0.0
         self.drive = start
-        self.response = output * (response.gain + sum(response.shares)) + self._drift
+        self.response = output * (response.gain + sum(response.shares))
 
     def advance(self, setpoints: Floats) -> tuple[Floats, Floats]:
         """Take as many steps of the grid as there are set-points, each in force during its step.
 
-        Returns drive and response after each step, shape (N,).
+        Returns drive and response after each step, shape (N,), in input and output units.
         """
         dynamics, count = self.dynamics, setpoints.size
-        actuator, response = dynamics.actuator, dynamics.response
-        normals = np.zeros((3, count)) if self._rng is None else self._rng.standard_normal((count, 3)).T.copy()
-        scale = 0.0 if self._rng is None else 1.0 / abs(actuator.gain)
-        unevenness = dynamics.unevenness
+        actuator, response, wander, uneven = (
+            dynamics.actuator, dynamics.response, dynamics.wander, dynamics.unevenness
+        )  # fmt: skip
+        normals, gain = self._rng.standard_normal((count, 3)).T.copy(), abs(actuator.gain)
         moved = np.empty((2, count))
         _kernels.follow(
             self._state, setpoints, normals[:2], moved, dynamics.step, actuator.frequency, actuator.damping,
-            actuator.rate, response.lag, response.power, scale * dynamics.wander.deviation, dynamics.wander.time,
-            scale * unevenness.deviation, unevenness.length / abs(actuator.gain),
+            actuator.rate, response.lag, response.power, wander.deviation / gain, wander.time,
+            uneven.deviation / gain, uneven.length / gain,
         )  # fmt: skip
         moved *= actuator.gain
         moved += actuator.offset
-        seen = moved[1]
-        outputs = np.zeros((2, count))
-        for number, operator in enumerate(self._operators):
-            outputs[0] += operator.evaluate(seen, self._memories[number])
-            self._memories[number] = operator.advance(self._memories[number], seen)
+        outputs = np.empty((2, count))
+        outputs[0] = self._model.evaluate(moved[1], self._memory)
+        self._memory = self._model.advance(self._memory, moved[1])
         outputs[1] = response.gain * outputs[0]
         if self._times.size:
             _kernels.creep(self._slow, outputs, dynamics.step, self._shares, self._times)
-        if dynamics.drift.deviation and self._rng is not None:
-            outputs[1] += self._drifts(normals[2])
+        drift = self._drift + dynamics.drift * math.sqrt(dynamics.step) * np.cumsum(normals[2])
+        outputs[1] += drift
+        self._drift = float(drift[-1])
         self.drive, self.response = float(moved[0, -1]), float(outputs[1, -1])
         return moved[0], outputs[1]
-
-    def _drifts(self, normals: Floats) -> Floats:
-        from scipy.signal import lfilter
-
-        drift = self.dynamics.drift
-        decay = math.exp(-self.dynamics.step / drift.time)
-        kicks = drift.deviation * math.sqrt(1.0 - decay**2) * normals
-        values, _ = lfilter([1.0], [1.0, -decay], kicks, zi=[decay * self._drift])
-        self._drift = float(values[-1])
-        return np.asarray(values)

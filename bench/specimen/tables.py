@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any, Self
 
-import numpy as np
 from pydantic import Field, field_validator, model_validator
 
 from bench.base import CheckedTable, parse_json
@@ -44,52 +43,14 @@ class SetpointTable(SignalTable):
         return limits
 
 
-class WanderTable(CheckedTable):
-    """A quantity that wanders: `[emulation.wander]`, of the drive, and `[emulation.drift]`, of the response."""
-
-    deviation: float = Field(default=0.0, ge=0, description="standard deviation, in the unit of the quantity")
-    time: float = Field(default=1.0, gt=0, description="correlation time, s")
-
-    @property
-    def wander(self) -> Wander:
-        """What the specimen takes."""
-        return Wander(self.deviation, self.time)
-
-
-class UnevennessTable(CheckedTable):
-    """What the model does not know, as a shift of the drive: `[emulation.unevenness]`."""
-
-    deviation: float = Field(default=0.0, ge=0, description="standard deviation, input units")
-    length: float = Field(default=1.0, gt=0, description="travel after which it is forgotten, input units")
-
-
-class InexactTable(CheckedTable):
-    """How exactly something is read or carried out."""
-
-    resolution: float = Field(default=0.0, ge=0, description="last digit; 0 for none")
-    outlier_share: float = Field(default=0.0, ge=0, le=1, description="share of values that are further off")
-    outliers: tuple[float, ...] = Field(default=(), description="by how much these are off, quantiles")
-    relative_outliers: bool = Field(default=False, description="whether they are shares of the value")
-
-    def inexact(self, value: float, rng: np.random.Generator) -> float:
-        """Return what becomes of a value."""
-        if self.outliers and rng.random() < self.outlier_share:
-            size = float(rng.choice(self.outliers))
-            return value * (1.0 + size) if self.relative_outliers else value + size
-        return self.rounded(value)
-
-    def rounded(self, value: float) -> float:
-        """Return the nearest multiple of the last digit."""
-        return round(value / self.resolution) * self.resolution if self.resolution else value
-
-
-class NoiseTable(InexactTable):
+class NoiseTable(CheckedTable):
     """How a signal is read: `[emulation.signals.NAME]`."""
 
     level: float = Field(default=0.0, description="what it reads, where nothing moves it")
     follows: str = Field(default="", description="device whose set-point it follows; none if empty")
     reading: float = Field(default=0.0, ge=0, description="noise of a reading, standard deviation")
     quick: float = Field(default=0.0, ge=0, description="noise of a quick reading, standard deviation")
+    resolution: float = Field(default=0.0, ge=0, description="last digit; 0 for none")
 
 
 class DriveTable(CheckedTable):
@@ -98,6 +59,7 @@ class DriveTable(CheckedTable):
     device: str = Field(description="device that takes its set-points")
     signal: str = Field(description="signal that says what it did")
     rest: float = Field(description="what it does while it is off, input units")
+    resolution: float = Field(default=0.0, ge=0, description="steps of its set-points, input units; 0 for none")
     delay: float = Field(default=0.0, ge=0, description="from a set-point to its first effect, s")
     frequency: float = Field(default=0.0, ge=0, description="natural frequency, rad/s; 0 if it follows at once")
     damping: float = Field(default=0.0, ge=0, description="damping ratio; 0 for a lag of first order")
@@ -153,44 +115,43 @@ class TwinTable(LaboratorySettings):
 
     step: float = Field(gt=0, le=1, description="step of the grid of time, s")
     model: str = Field(description="the model, as the content of its file, in JSON")
-    correction: str = Field(default="", description="what of its error repeats, an operator in JSON; none if empty")
     session_offset: float = Field(
         default=0.0, ge=0, description="standard deviation of the response from session to session, output units"
     )
     drive: DriveTable
-    setpoints: InexactTable = InexactTable()
     response: ResponseTable
-    wander: WanderTable = WanderTable()
-    drift: WanderTable = WanderTable()
-    unevenness: UnevennessTable = UnevennessTable()
+    wander: Wander = Wander()
+    unevenness: Unevenness = Unevenness()
+    drift: float = Field(
+        default=0.0, ge=0, description="random walk of the response, output units per root of a second"
+    )
     signals: dict[str, NoiseTable] = Field(default_factory=dict, description="how each signal is read")
     tasks: dict[str, str] = Field(
         default_factory=dict, description="what may be asked of an operator, and the signal that shows it"
     )
 
-    @field_validator("model", "correction")
+    @field_validator("model")
     @classmethod
     def _is_an_operator(cls, text: str) -> str:
-        if text:
-            _operator(text)
+        _operator(text)
         return text
 
     @property
-    def operators(self) -> tuple[Operator[Any], ...]:
-        """The model, and the correction if there is one."""
-        return tuple(_operator(text) for text in (self.model, self.correction) if text)
+    def operator(self) -> Operator[Any]:
+        """The model."""
+        return _operator(self.model)
 
     @property
     def dynamics(self) -> Dynamics:
-        """What the specimen takes beside the operators."""
+        """What the specimen takes beside the model."""
         return Dynamics(
-            self.step,
-            self.drive.dynamics,
-            self.response.dynamics,
-            self.wander.wander,
-            self.drift.wander,
-            Unevenness(self.unevenness.deviation, self.unevenness.length),
+            self.step, self.drive.dynamics, self.response.dynamics, self.wander, self.unevenness, self.drift
         )
+
+
+def rounded(value: float, resolution: float) -> float:
+    """Return the nearest multiple of a last digit, of one that is not 0."""
+    return round(value / resolution) * resolution if resolution else value
 
 
 def _operator(text: str) -> Operator[Any]:

@@ -8,8 +8,9 @@ from pathlib import Path
 
 from bench.base import ConfigurationError
 from bench.rig import load_rig
-from bench.specimen.identify import IdentifiedTwin, identify_twin
+from bench.specimen.identify import identify_twin
 from bench.specimen.rig_text import rig_text
+from bench.specimen.twin import IdentifiedTwin
 
 
 def write_twin(runs: Sequence[Path], rig: str, out: Path, model: Path | None = None) -> IdentifiedTwin:

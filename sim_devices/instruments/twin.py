@@ -21,6 +21,7 @@ from bench.specimen import (
     NoiseTable,
     TwinSettings,
     number_text,
+    rounded,
 )
 from sim_devices.instruments.emulated import EmulatedInstrument
 from sim_devices.wire import WireServer
@@ -51,8 +52,7 @@ class EmulatedTwin(EmulatedInstrument):
         rng: np.random.Generator,
         act: Callable[[float], None],
     ) -> None:
-        own, self._rng = rng.spawn(2)
-        super().__init__(name, world, own)
+        super().__init__(name, world, rng)
         self._settings = settings
         self._meters = dict(meters)
         self._act = act
@@ -108,7 +108,7 @@ class EmulatedTwin(EmulatedInstrument):
 
     def _read(self, name: str, *, quick: bool) -> float:
         true, noise = self._meters[name]
-        return noise.inexact(true() + self._draw(noise.quick if quick else noise.reading), self._rng)
+        return rounded(true() + self._draw(noise.quick if quick else noise.reading), noise.resolution)
 
 
 class TwinServer(WireServer):
