@@ -60,6 +60,7 @@ def twin(measured, model, tmp_path_factory):
     return out, json.loads(found.read_text())
 
 
+@pytest.mark.seeds
 def test_the_model_is_from_the_run_that_sweeps_the_drive(tmp_path):
     """The hold has more steps than the sweep, and says nothing of any other set-point."""
     creep = bench.run("creep", "hybrid", out=tmp_path, seed=1, interval=0.4, duration=24.0)
@@ -83,6 +84,7 @@ def test_a_short_run_makes_a_twin_and_warnings(tmp_path):
     load_rig(str(tmp_path / "twin.toml"))
 
 
+@pytest.mark.seeds
 def test_a_run_under_control_makes_a_twin_and_warnings(model, tmp_path):
     run = bench.run("tracking", "vo2", out=tmp_path, seed=1, model=str(model), count=2).folder
     found = tmp_path / "twin.json"
