@@ -16,7 +16,7 @@ from mutations import STRANGE, mutated_bytes
 
 from bench.base import DataError
 from bench.devices import Settled, Signal
-from bench.record import FILE_NAME, NAME as MIRROR_NAME, RECOVERED_NAME, Event, Journal, Record, StepRecord, Table
+from bench.record import FILE_NAME, NAME as SECOND_NAME, RECOVERED_NAME, Event, Journal, Record, StepRecord, Table
 
 SIGNALS = (Signal("u", "V", "input", 3), Signal("y", "m", "output", 6))
 STEPS = 40
@@ -32,13 +32,16 @@ Rows = dict[str, list[Any]]
 
 @functools.cache
 def records() -> tuple[Path, Path]:
-    """Return the folders of a record that was closed, and of one whose process died."""
+    """Return the folders of a record that was closed, and of one whose process died while rows waited."""
     folders = tuple(Path(tempfile.mkdtemp(prefix="mutated-record-")) for _ in range(2))
     for folder, is_closed in zip(folders, (True, False), strict=True):
         place = folder / "written"
         place.mkdir()
         journal = Journal(place / FILE_NAME, SIGNALS, META, {"a.txt": b"content"}, flushed=False)
+        other = sqlite3.connect(place / FILE_NAME, isolation_level=None)
         for i in range(STEPS):
+            if i == STEPS - 5 and not is_closed:
+                other.execute("BEGIN IMMEDIATE")
             for k in range(5):
                 journal.telemetry(i + 0.1 * k, i, (0.5 * i, 1e-6 * k + i))
             journal.step(StepRecord(i, i, i + 0.5, "up", "", Settled.DWELL, {"d": 0.5 * i}, (0.5 * i, 1e-6 * i)))
@@ -48,6 +51,7 @@ def records() -> tuple[Path, Path]:
             journal.close()
         for path in place.iterdir():
             shutil.copy(path, folder)
+        other.close()
         journal.close()
         shutil.rmtree(place)
     return folders[0], folders[1]
@@ -79,12 +83,12 @@ def try_journal(folder: Path, rng: random.Random) -> str:
     is_closed = rng.random() < 0.5
     run = folder / "run"
     shutil.copytree(records()[not is_closed], run)
-    journal, mirror = run / FILE_NAME, run / MIRROR_NAME
+    journal = run / FILE_NAME
     kind = rng.randrange(6)
     if kind == 0:
         _change_rows(journal, rng)
-    elif kind == 1 and mirror.exists():
-        mirror.write_bytes(mutated_bytes(mirror.read_bytes(), rng))
+    elif kind == 1 and (second := run / SECOND_NAME).exists():
+        second.write_bytes(mutated_bytes(second.read_bytes(), rng))
         if rng.random() < 0.5:
             journal.unlink()
             for companion in run.glob("journal.sqlite-*"):

@@ -400,7 +400,6 @@ class Engine:
         late = {label: each.to_json() for label, each in self._run.lateness.items()}
         pace = self._clock.pace() if isinstance(self._clock, PacedClock) else None
         try:
-            self._journal.make_room()
             self._run.take_news()
             if error is not None:
                 self._run.event("ERROR", "interlock" if isinstance(error, InterlockError) else "error", reason)

@@ -386,9 +386,6 @@ class _Kept:
     def take_notices(self) -> list[str]:
         return []
 
-    def make_room(self) -> None:
-        pass
-
     def finish(self, **_: object) -> None:
         pass
 

@@ -45,9 +45,6 @@ class RunRecord(Protocol):
     def take_notices(self) -> list[str]:
         """Return what happened to the record itself since the last call."""
 
-    def make_room(self) -> None:
-        """Give back the space that is kept for the end of the run."""
-
     def finish(
         self,
         *,

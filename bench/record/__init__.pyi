@@ -31,9 +31,6 @@ from .lateness import (
     headline_of as headline_of,
     lateness_lines as lateness_lines,
 )
-from .mirror import (
-    NAME as NAME,
-)
 from .model_files import (
     add_model as add_model,
 )
@@ -59,6 +56,9 @@ from .run_metadata import (
     metadata as metadata,
     run_name as run_name,
     version_of as version_of,
+)
+from .second_file import (
+    NAME as NAME,
 )
 from .table import (
     Table as Table,

@@ -5,11 +5,10 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from bench.record.keeping import RESERVE_NAME
-from bench.record.mirror import NAME as MIRROR_NAME, readable_second_files
 from bench.record.rows import FILE_NAME, RECOVERED_NAME
+from bench.record.second_file import NAME as SECOND_NAME, second_files
 
-_TRACES = {FILE_NAME, MIRROR_NAME, RECOVERED_NAME}
+_TRACES = {FILE_NAME, SECOND_NAME, RECOVERED_NAME}
 
 
 def find_journals(folder: Path) -> list[Path]:
@@ -20,7 +19,7 @@ def find_journals(folder: Path) -> list[Path]:
 def files_of(journal: Path) -> list[Path]:
     """Return the files that a journal that is written may have in its folder."""
     companions = [journal.with_name(journal.name + end) for end in ("", "-wal", "-shm", "-journal")]
-    return [*companions, journal.with_name(MIRROR_NAME), journal.with_name(RESERVE_NAME)]
+    return [*companions, journal.with_name(SECOND_NAME)]
 
 
 def missing(path: Path) -> str:
@@ -32,7 +31,7 @@ def missing(path: Path) -> str:
                 f"{path} has lost its {FILE_NAME}; {copy} is a recovered copy of it, to be read in its place, and "
                 f"`bench resume {copy}` says how it is resumed"
             )
-        if readable_second_files(folder / FILE_NAME):
+        if second_files(folder / FILE_NAME):
             return (
                 f"{path} has lost its {FILE_NAME}, but a second file has its rows: "
                 f"`bench recover-journal {folder}` writes {RECOVERED_NAME} from them"

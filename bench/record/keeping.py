@@ -4,123 +4,123 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
-import tempfile
+import threading
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from pathlib import Path
 
 from bench.base import RecordError, Stopwatch
-from bench.record.mirror import NAME as MIRROR_NAME, Mirror, elsewhere, second_files
-from bench.record.rows import FILE_NAME, JournalEntry, split
-from bench.record.store import Store
+from bench.record.rows import Row
+from bench.record.second_file import SecondFile, places, remove
+from bench.record.store import OTHERS, Store
 
-RESERVE_NAME = "journal.reserve"
-_RESERVE = 1 << 18
-"""Space that is kept for the end of a run on a full disk, bytes."""
+_LONGEST_UNWRITTEN = 0.1
+"""Wall-clock time after which a tick is committed, s: who watches takes it for at once (Nielsen, Usability
+Engineering, 1993, section 5.5)."""
+
+_BETWEEN_TRIES = 0.5
+"""Wall-clock time between tries to write what waits, s. Chosen: a try takes some ms, 1 % of that."""
+
+_BETWEEN_LOOKS = 30.0
+"""Wall-clock time between looks at the free space, and between foldings of the write-ahead log, s. Chosen: a copy of
+the journal without its log lacks no more, and a disk has room for so long below `_SHORT`."""
 
 _SHORT = 64 << 20
 _SHORT_PART = 0.05
-"""Free space below which a recording has to stop, bytes and part of the disk, whichever is less."""
+"""Free space below which a recording has to stop, bytes and part of the disk, whichever is less. Chosen: 64 MB are
+16 h of ten signals at 10 Hz; 5 % are what ext4 keeps from users (man mke2fs, -m)."""
 
-_BETWEEN_LOOKS = 1.0
-_BETWEEN_TRIES = 0.5
-_BETWEEN_FOLDS = 30.0
-"""Wall-clock times between looks at the free space, tries to write what waits, and foldings of the WAL, s."""
-
-_LAST_WAIT = 5.0
-"""Wall-clock time that the end of a run waits for a program that has the journal locked, s."""
+_LAST_WAIT = 30.0
+"""Wall-clock time that the end of a run waits for the disk, s: as long as Linux does for a command to a disk
+(/sys/block/sda/device/timeout)."""
 
 
 class Keeper:
-    """Keeps the rows of one journal; used by one thread at a time.
+    """Keeps the rows of one journal.
 
     Parameters
     ----------
     store : Store
         The SQLite file.
     identity : str
-        Number of the journal, which its second files have as well; empty for one that has none.
+        Number of the journal, which its second file has as well.
+    patience : float, optional
+        Longest time that a call waits for the disk, s of wall-clock time; a thread of its own writes the SQLite file
+        then. Without it the caller's does.
 
     Attributes
     ----------
     store : Store
-        The SQLite file; another one once the first was removed.
-    identity : str
-        Number of the journal.
+        The SQLite file.
     notices : list of str
         What happened to the journal, for the log; who reads them takes them out.
     is_short : bool
         Whether the disk is nearly full.
-    spare : list of Mirror
-        Further second files, to be closed with the journal.
     """
 
-    def __init__(self, store: Store, identity: str = "") -> None:
+    def __init__(self, store: Store, identity: str, patience: float | None = None) -> None:
         self.store = store
-        self.identity = identity
         self.notices: list[str] = []
         self.is_short = False
-        self.spare: list[Mirror] = []
-        self._waiting: list[JournalEntry] = []
-        """Rows that are in a second file only."""
+        self._identity = identity
+        self._patience = patience
+        self._waiting: list[Row] = []
+        """Rows that the journal does not have yet."""
+        self._put = self._stored = self._doubled = 0
+        """Rows so far: handed over, in the journal, and up to the last one in the second file."""
+        self._second: SecondFile | None = None
         self._why = ""
-        self._is_closed = False
-        folder = store.path.parent
-        self._mirror: Mirror | None = Mirror(folder / MIRROR_NAME, identity)
-        self._elsewhere: Mirror | None = None
-        self._is_whole = True
-        """Whether the second file has every row."""
-        self._reserve = folder / RESERVE_NAME
-        self._looked, self._tried, self._folded = Stopwatch(), Stopwatch(), Stopwatch()
-        # Without space for it there is none for the run either, which will be seen.
-        with suppress(OSError):
-            self._reserve.write_bytes(b"\xa5" * _RESERVE)
+        """Why the journal cannot be written."""
+        self._loss = ""
+        self._is_left = self._is_urgent = self._is_ending = self._is_closed = self._was_slow = False
+        self._defect: Exception | None = None
+        self._tried, self._looked = Stopwatch(), Stopwatch()
+        self._changed = threading.Condition()
+        self._thread: threading.Thread | None = None
+        if patience is not None:
+            # One that hangs with its disk does not keep the process from ending.
+            self._thread = threading.Thread(target=self._work, name="journal", daemon=True)
+            self._thread.start()
 
-    def begin(self, entries: Sequence[JournalEntry]) -> None:
-        """Put the rows that the journal has at its beginning into the second file."""
-        assert self._mirror is not None
-        self._mirror.append(entries)
+    def keep(self, rows: Sequence[Row], *, soon: bool = False) -> None:
+        """Make rows durable, and those before them; if `soon`, have them written within 0.1 s, with what comes next.
 
-    def keep(self, entries: Sequence[JournalEntry]) -> None:
-        """Make rows durable.
-
-        Raises RecordError if they are nowhere, or the journal has been removed or replaced; what there was is in
-        another one then, in which the end of the run can be recorded.
+        Raises RecordError if they are nowhere, or the journal was removed or replaced: then every row is in a second
+        file, into which further ones go.
         """
-        is_beside = self._append(entries)
-        if not self._waiting or self._tried.seconds() >= _BETWEEN_TRIES:
-            is_kept = self._write([*self._waiting, *entries])
-        else:
-            is_kept = False
-        if is_kept:
-            self._look_around()
-        else:
-            self._waiting += entries
-            self._keep_beside(entries, is_beside)
-        if loss := self.store.loss():
-            self._rescue(loss)
-
-    def fold_in(self, *, anyway: bool = False) -> None:
-        """Try what waits, and fold the WAL in if it is time."""
-        if self._waiting and self._tried.seconds() >= _BETWEEN_TRIES:
-            self._write(list(self._waiting))
-        if anyway or self._folded.seconds() >= _BETWEEN_FOLDS:
-            self._folded = Stopwatch()
-            with suppress(sqlite3.Error):
-                self.store.fold_in()
-
-    def make_room(self) -> None:
-        """Give back the space that was kept for the end, and try to write what waits."""
-        _remove(self._reserve)
-        if self._waiting:
-            self._write(list(self._waiting))
+        with self._changed:
+            is_first = not self._waiting
+            self._waiting += rows
+            self._put += len(rows)
+            goal = self._put
+            if self._thread is None:
+                if not soon or self._tried.seconds() >= _LONGEST_UNWRITTEN:
+                    self._try()
+            else:
+                self._is_urgent = self._is_urgent or not soon
+                if is_first or not soon:
+                    self._changed.notify_all()
+                if not soon:
+                    self._changed.wait_for(lambda: self._stored >= goal or self._why or self._defect, self._patience)
+            defect, self._defect = self._defect, None
+            if defect is not None:
+                raise defect
+            if self._loss and not self._is_left:
+                self._leave()
+            if self._doubled < goal and self._stored < goal and (self._why or not soon):
+                first = max(0, self._doubled - self._stored)
+                self._double(self._waiting[first:], self._waiting[:first], is_durable=not soon)
 
     def end(self, counts: Mapping[str, int]) -> str:
-        """Bring everything into the journal; return what is wrong with it, or nothing."""
+        """Bring everything into the journal; return what is wrong with it, by its numbers of rows, or nothing."""
+        self._stop()
+        if self._thread is not None or self._loss:
+            return self._why
         try:
-            self.store.wait_for_others(_LAST_WAIT)
-            self.make_room()
-            self.store.wait_for_others(0.0)
+            self._try(anyway=True)
+            if "locked" in self._why:
+                self.store.wait_for_others(OTHERS)
+                self._try(anyway=True)
+                self.store.wait_for_others(0.0)
             if self._waiting:
                 return self._why
             self.store.fold_in()
@@ -128,131 +128,160 @@ class Keeper:
         except (sqlite3.Error, OSError) as error:
             return str(error)
 
-    def close(self, *, is_whole: bool) -> None:
-        """Close the files; the second one is removed if the journal has everything."""
-        if self._is_closed:
-            return
-        self._is_closed = True
-        if self._waiting:
-            self._write(list(self._waiting))
-        self.store.close()
-        for mirror in (self._mirror, self._elsewhere, *self.spare):
-            if mirror is not None:
-                mirror.close()
-        if is_whole and not self._waiting:
-            for path in second_files(self.store.path):
-                _remove(path)
-        _remove(self._reserve)
+    def close(self) -> None:
+        """Close the files; a second one stays if it has rows that the journal does not have."""
+        self._stop()
+        # Otherwise its disk does not answer.
+        if self._thread is None and not self._is_closed:
+            self._is_closed = True
+            self._try(anyway=True)
+            with suppress(RecordError):
+                self.keep(())
+            self.store.close()
+            if self._second is not None:
+                self._second.close()
 
     @property
     def why(self) -> str:
-        """Why rows wait in a second file; empty if none does."""
-        return self._why
+        """Why rows wait in a second file, and in which one; empty if none does."""
+        return "" if self._second is None else f"{self._why or 'it is slow'}; rows wait in {self._second.path}"
 
-    @property
-    def second_file(self) -> Path:
-        """The file that rows wait in."""
-        mirror = self._elsewhere or self._mirror
-        return self.store.path.parent / MIRROR_NAME if mirror is None else mirror.path
+    def _try(self, *, anyway: bool = False) -> None:
+        """Write what waits into the journal in the caller's thread."""
+        with self._changed:
+            if not self._why or anyway or self._tried.seconds() >= _BETWEEN_TRIES:
+                batch = list(self._waiting)
+                self._settle(batch, *self._commit(batch))
 
-    def _append(self, entries: Sequence[JournalEntry]) -> bool:
-        if self._mirror is not None:
-            try:
-                self._mirror.append(entries)
-            except OSError:
-                self._is_whole = False
-            else:
-                return True
-        return False
+    def _work(self) -> None:
+        """Write what waits into the journal in a thread of its own."""
+        while True:
+            with self._changed:
+                self._changed.wait_for(lambda: (self._waiting and not self._loss) or self._is_ending)
+                # Ticks of a fast loop are written together.
+                rest = (_BETWEEN_TRIES if self._why else _LONGEST_UNWRITTEN) - self._tried.seconds()
+                self._changed.wait_for(lambda: (self._is_urgent and not self._why) or self._is_ending, rest)
+                self._is_urgent = False
+                batch = list(self._waiting)
+            why, loss = self._commit(batch)
+            with self._changed:
+                self._settle(batch, why, loss)
+                if self._is_ending:
+                    return
 
-    def _write(self, entries: Sequence[JournalEntry]) -> bool:
-        """Write into the journal; return whether that was possible."""
-        self._tried = Stopwatch()
+    def _commit(self, rows: Sequence[Row]) -> tuple[str, str]:
+        """Write rows into the journal; return why that was not possible, and how the journal was lost; or nothing."""
+        # SQLite goes on with a file that is removed, and would make a new one where it is opened anew.
+        loss = self._loss or self.store.loss()
         try:
-            if self._why and not _is_busy(self._why):
-                self.store.reconnect()
-            self.store.write(entries)
-        except (sqlite3.OperationalError, sqlite3.DatabaseError, OSError) as error:
-            if isinstance(error, sqlite3.ProgrammingError | sqlite3.IntegrityError):
-                raise
-            if not self._why:
-                self.notices.append(f"the journal cannot be written ({error}); rows wait in a second file")
-            self._why = str(error)
-            return False
-        if self._why:
-            self._why = ""
-            self.notices.append(
-                f"the journal can be written again; {sum(len(each.rows) for each in self._waiting)} rows were waiting"
-            )
-        self._waiting = []
-        return True
+            if rows and not loss:
+                if self._why:
+                    self.store.reconnect()
+                self.store.write(rows)
+                loss = self.store.loss()
+        except Exception as error:
+            if isinstance(error, OSError | sqlite3.OperationalError) or type(error) is sqlite3.DatabaseError:
+                return str(error), loss
+            # It is no fault of the disk, and raised by the next call.
+            self._defect = error
+        finally:
+            self._tried = Stopwatch()
+        if self._looked.seconds() >= _BETWEEN_LOOKS and not loss:
+            self._look_around()
+        return f"it was {loss}" if loss else "", loss
 
-    def _keep_beside(self, entries: Sequence[JournalEntry], is_beside: bool) -> None:
-        """Make rows durable in a second file: beside the journal, or else on another medium, or in the reserve."""
-        problem: OSError | None = None
-        if is_beside and self._mirror is not None:
+    def _settle(self, batch: Sequence[Row], why: str, loss: str) -> None:
+        """Note that rows are in the journal, or why they are not; with them the second file goes."""
+        self._why, self._loss = why, loss
+        if not why:
+            del self._waiting[: len(batch)]
+            self._stored += len(batch)
+            if self._second is not None and self._stored >= self._doubled:
+                self._second.close()
+                remove(self._second.path)
+                self._second = None
+                if not self._was_slow:
+                    self.notices.append("the journal can be written again; it has the rows that were waiting")
+        self._changed.notify_all()
+
+    def _double(self, rows: Sequence[Row], others: Sequence[Row] = (), *, is_durable: bool = True) -> None:
+        """Put rows into the second file; one that is made has the others before them."""
+        former = self._second
+        try:
+            if former is None or not former.is_there:
+                self._second = self._made([*others, *rows])
+            else:
+                former.append(rows)
+                if is_durable:
+                    former.sync()
+        except OSError:
+            # It does not take them any more.
+            self._second = self._made([*others, *rows])
+        self._doubled = self._put
+        if former is not None and self._second is not None and former is not self._second:
+            former.close()
+            if former.path != self._second.path:
+                remove(former.path)
+
+    def _made(self, rows: Sequence[Row]) -> SecondFile:
+        """Return a second file that is made, with its first rows.
+
+        Where the disk of the journal does not answer, none is made on it.
+        """
+        why, problems = self._why or "its disk does not answer", []
+        for path in places(self.store.path)[not self._why :]:
             try:
-                self._mirror.sync()
+                second = SecondFile(path, self._identity, rows)
             except OSError as error:
-                problem = error
-                self._is_whole = False
-            else:
-                return
+                problems.append(f"{path}: {error.strerror or error}")
+                continue
+            # A slow disk may be slow at each step.
+            if self._why or not self._was_slow:
+                self.notices.append(f"the journal cannot be written ({why}); rows wait in {path}")
+            self._was_slow = not self._why
+            return second
+        raise RecordError(
+            f"{self.store.path} cannot be written: {why}; its second file neither: {'; '.join(problems)}"
+        )
+
+    def _leave(self) -> None:
+        """Put every row into a second file, from the journal that is still open, and raise RecordError."""
+        self._is_left = True
+        rows: list[Row] = []
+        problem = ""
         try:
-            if self._elsewhere is None:
-                path, _ = elsewhere(self.store.path)
-                self._elsewhere = Mirror(path, self.identity)
-                self._elsewhere.append(self._waiting)
-                self.notices.append(f"the disk of the journal takes nothing; rows wait in {path}")
-            else:
-                self._elsewhere.append(entries)
-            self._elsewhere.sync()
-        except OSError as error:
-            raise RecordError(
-                f"{self.store.path} cannot be written: {self._why}; its second file neither: {problem or error}"
-            ) from None
+            rows.extend(self.store.rows())
+        except sqlite3.Error as error:
+            problem = f", as far as it could be read ({error})"
+        self._double([*rows, *self._waiting])
+        path, second = self.store.path, self._second
+        assert second is not None
+        raise RecordError(
+            f"{path} was {self._loss} while the run went on; everything so far is in {second.path}{problem}, "
+            f"from which `bench recover-journal {path.parent}` writes it anew, and the run ends here"
+        )
 
     def _look_around(self) -> None:
-        if self._looked.seconds() >= _BETWEEN_LOOKS:
-            self._looked = Stopwatch()
-            self.fold_in()
-            with suppress(OSError):
-                disk = shutil.disk_usage(self.store.path.parent)
-                is_short = disk.free < min(_SHORT, _SHORT_PART * disk.total)
-                if is_short and not self.is_short:
-                    self.notices.append(f"the disk is nearly full ({disk.free >> 20} MB free): recordings stop")
-                self.is_short = is_short
+        """Fold the write-ahead log in, and look at the free space."""
+        self._looked = Stopwatch()
+        with suppress(OSError, sqlite3.Error):
+            self.store.fold_in()
+            disk = shutil.disk_usage(self.store.path.parent)
+            is_short = disk.free < min(_SHORT, _SHORT_PART * disk.total)
+            if is_short and not self.is_short:
+                self.notices.append(f"the disk is nearly full ({disk.free >> 20} MB free): recordings stop")
+            self.is_short = is_short
 
-    def _rescue(self, loss: str) -> None:
-        """Write everything anew elsewhere, from the files that are still open, and go on there; raise RecordError."""
-        former, store = self.store.path, self.store
-        beside = [] if self._mirror is None else self._mirror.entries()
-        rows = {(each.table, each.row[0]): each for each in (*beside, *split(self._waiting))}
-        if not self._is_whole:
-            with suppress(sqlite3.Error):
-                rows = {(each.table, each.row[0]): each for each in store.entries()} | rows
-        message = f"{former} was {loss} while the run went on; "
-        try:
-            folder = Path(tempfile.mkdtemp(prefix=f"{former.parent.name}-rescued-"))
-            signals = [each.row[1] for each in rows.values() if each.table == "signals"]
-            self.store = Store(folder / FILE_NAME)
-            self.store.create(signals, rows.values())
-            mirror = Mirror(folder / MIRROR_NAME, self.identity)
-            mirror.append(list(rows.values()))
-        except (OSError, sqlite3.Error) as error:
-            raise RecordError(f"{message}what is recorded could not be written anew: {error}") from None
-        store.close()
-        if self._mirror is not None:
-            self._mirror.close()
-        self._mirror, self._waiting = mirror, []
-        raise RecordError(f"{message}everything so far is in {self.store.path}, and the run ends here")
-
-
-def _remove(path: Path) -> None:
-    # A medium that cannot be written keeps it.
-    with suppress(OSError):
-        path.unlink()
-
-
-def _is_busy(problem: str) -> bool:
-    return "locked" in problem
+    def _stop(self) -> None:
+        """Write in the caller's thread from now on, if the other one ends."""
+        if self._thread is None:
+            return
+        wait = 0.0 if self._is_ending else _LAST_WAIT
+        with self._changed:
+            self._is_ending = True
+            self._changed.notify_all()
+        self._thread.join(wait)
+        if self._thread.is_alive():
+            self._why = "its disk does not answer"
+        else:
+            self._thread = None

@@ -8,8 +8,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from bench.record.mirror import read_mirror, second_files
-from bench.record.rows import FIRST, IDENTITY, NUMBERS, RECOVERED_NAME
+from bench.record.rows import FIRST, NUMBERS, RECOVERED_NAME
+from bench.record.second_file import refusal
 from bench.record.write_ahead_log import log_damage
 
 Range = tuple[int, int]
@@ -49,10 +49,7 @@ class MissingRows:
         why = f" ({self.damage})" if self.damage else ""
         if self.journal.name == RECOVERED_NAME:
             return f"{self.journal} {what}{why}; they were in no file when it was recovered"
-        return (
-            f"{self.journal} {what}{why}; `bench recover-journal {self.journal}` writes a copy with those that a "
-            "second file has, and bench resume takes them in"
-        )
+        return f"{self.journal} {what}{why}; `bench recover-journal {self.journal}` writes a copy of what is left"
 
     def to_json(self) -> dict[str, Any]:
         """Return it for programs."""
@@ -68,20 +65,18 @@ class MissingRows:
 def find_missing_rows(db: sqlite3.Connection, journal: Path, meta: Mapping[str, Any]) -> MissingRows:
     """Compare a journal that nobody writes with all that says how many rows there were.
 
-    These are the numbers of its rows, its count of them at the end of the run, its write-ahead log, its second file,
-    and the steps that its ticks belong to. What its process was about to write when it died is not missing, as nobody
-    was told that it was recorded.
+    These are the numbers of its rows, its count of them at the end of the run, its write-ahead log, and the steps
+    that its ticks belong to.
     """
-    damage = log_damage(journal.with_name(f"{journal.name}-wal"))
+    damage = log_damage(journal.with_name(f"{journal.name}-wal")) or refusal(journal)
     counts = meta.get("counts")
     try:
         ranges = {table: list(_gaps(db, table)) for table in FIRST}
         last = {table: _last(db, table) for table in FIRST}
         if counts is None:
-            waiting = _waiting(journal, str(meta.get(IDENTITY, "")), last, is_whole=not damage)
             step = db.execute("SELECT step FROM telemetry ORDER BY tick DESC LIMIT 1").fetchone()
             # The step at the last tick need not be finished, those before it are.
-            waiting["steps"] = max(waiting["steps"], -1 if step is None else int(step[0]) - 1)
+            waiting = {} if step is None else {"steps": int(step[0]) - 1}
         else:
             waiting = {table: int(counts[table]) + FIRST[table] - 1 for table in FIRST if table in counts}
     except (sqlite3.DatabaseError, TypeError, ValueError) as error:
@@ -89,7 +84,7 @@ def find_missing_rows(db: sqlite3.Connection, journal: Path, meta: Mapping[str, 
     for table, end in waiting.items():
         if end > last[table]:
             ranges[table].append((last[table] + 1, end))
-    found = {table: tuple(joined_ranges(several)) for table, several in ranges.items() if several}
+    found = {table: tuple(several) for table, several in ranges.items() if several}
     lost = meta.get("recovered", {}).get("lost", {})
     return MissingRows(journal, found, {table: n for table, n in lost.items() if table not in found}, damage)
 
@@ -110,39 +105,6 @@ def _gaps(db: sqlite3.Connection, table: str) -> Iterator[Range]:
 def _last(db: sqlite3.Connection, table: str) -> int:
     last = db.execute(f"SELECT max({NUMBERS[table]}) FROM {table}").fetchone()[0]  # noqa: S608 - own names
     return FIRST[table] - 1 if last is None else int(last)
-
-
-def _waiting(journal: Path, identity: str, last: Mapping[str, int], *, is_whole: bool) -> dict[str, int]:
-    """Return the last numbers of the rows in the second files of a journal.
-
-    A row is handed over when the one before it is durable: of a journal that is whole, the last step or event and the
-    ticks before it are what its process was about to write.
-    """
-    ends = {table: FIRST[table] - 1 for table in FIRST}
-    behind: list[str] = []
-    for second in second_files(journal):
-        for each in read_mirror(second, identity):
-            if each.table in ends:
-                number = int(each.rows[-1][0])
-                ends[each.table] = max(ends[each.table], number)
-                if number > last[each.table]:
-                    behind.append(each.table)
-    is_one_write = behind in (["telemetry"], ["steps"], ["events"], ["telemetry", "steps"], ["telemetry", "events"])
-    return {table: FIRST[table] - 1 for table in FIRST} if is_whole and is_one_write else ends
-
-
-def joined_ranges(ranges: list[Range]) -> Iterator[Range]:
-    """Yield ranges in order, without a number twice and those that touch in one."""
-    if not ranges:
-        return
-    ranges = sorted(ranges)
-    start, end = ranges[0]
-    for first, last in ranges[1:]:
-        if first > end + 1:
-            yield start, end
-            start = first
-        end = max(end, last)
-    yield start, end
 
 
 def _in_words(ranges: tuple[Range, ...]) -> str:

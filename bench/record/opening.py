@@ -6,10 +6,14 @@ import os
 import shutil
 import sqlite3
 import tempfile
+from itertools import chain
 from pathlib import Path
 
 from bench.base import DataError
 from bench.record.finding import cause_of, way_back
+from bench.record.rows import NUMBERS, Row
+from bench.record.second_file import places, read_second_file
+from bench.record.store import insert
 
 
 class OpenedJournal:
@@ -22,6 +26,8 @@ class OpenedJournal:
 
     Attributes
     ----------
+    path : Path
+        The file.
     db : sqlite3.Connection
         To read with.
     remark : str
@@ -34,6 +40,7 @@ class OpenedJournal:
     """
 
     def __init__(self, path: Path) -> None:
+        self.path = path
         self.remark = ""
         self._copy: tempfile.TemporaryDirectory[str] | None = None
         try:
@@ -45,9 +52,9 @@ class OpenedJournal:
                     if "readonly" not in str(error):
                         raise
                     # Its process died while it was closed: SQLite has something to undo first.
-                    self.db = self._copied(path, "was not closed")
+                    self.db = self._copied("was not closed")
             elif any(companion.stat().st_size for companion in _companions(path)):
-                self.db = self._copied(path, "cannot be changed and was not closed")
+                self.db = self._copied("cannot be changed and was not closed")
             else:
                 self.db = _connected(path, "mode=ro&immutable=1")
         # Names in a damaged file may be no text.
@@ -55,12 +62,37 @@ class OpenedJournal:
             self._remove()
             raise DataError(f"{path} is not a readable journal: {cause_of(error)}{way_back(path)}") from error
 
-    def _copied(self, path: Path, why: str) -> sqlite3.Connection:
+    def take_in(self, identity: str) -> str:
+        """Have the rows that only a second file has read like those of the journal; return what is to be said of it.
+
+        Temporary views stand before the tables then. Raises `sqlite3.Error` if they are no rows of these tables.
+        """
+        rows = {place: [*read_second_file(place, identity)] for place in places(self.path)}
+        keys = {"meta": "key", **NUMBERS}
+        count = 0
+        for table, key in keys.items() if any(rows.values()) else ():
+            waiting = f"waiting_{table}"
+            both = f"SELECT * FROM main.{table} UNION ALL SELECT * FROM {waiting}"  # noqa: S608
+            self.db.execute(f"CREATE TEMP TABLE {waiting} AS SELECT * FROM main.{table} LIMIT 0")  # noqa: S608
+            self.db.execute(f"CREATE UNIQUE INDEX temp.keys_of_{table} ON {waiting} ({key})")
+            insert(self.db, (Row(waiting, row.columns) for row in chain(*rows.values()) if row.table == table))
+            self.db.execute(f"DELETE FROM {waiting} WHERE {key} IN (SELECT {key} FROM main.{table})")  # noqa: S608
+            count += self.db.execute(f"SELECT count(*) FROM {waiting}").fetchone()[0]  # noqa: S608
+            self.db.execute(f"CREATE TEMP VIEW {table} AS {both}")
+        if not count:
+            return ""
+        where = " and ".join(str(place) for place, found in rows.items() if found)
+        return (
+            f"{self.path} lacks {count} rows that its second file {where} has, and that are read from there; "
+            f"`bench recover-journal {self.path}` writes a copy with all rows, and bench resume takes them in"
+        )
+
+    def _copied(self, why: str) -> sqlite3.Connection:
         self._copy = tempfile.TemporaryDirectory(prefix="bench-journal-")
-        copy = Path(self._copy.name) / path.name
-        for each in (path, *_companions(path)):
+        copy = Path(self._copy.name) / self.path.name
+        for each in (self.path, *_companions(self.path)):
             shutil.copyfile(each, copy.with_name(each.name))
-        self.remark = f"{path} {why}: it is read from a copy, {copy}"
+        self.remark = f"{self.path} {why}: it is read from a copy, {copy}"
         return _connected(copy, "mode=rw")
 
     def close(self) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import sqlite3
 import warnings
@@ -22,7 +21,7 @@ from bench.record.finding import missing, way_back
 from bench.record.missing_rows import MissingRows, find_missing_rows
 from bench.record.model_files import models_beside
 from bench.record.opening import OpenedJournal
-from bench.record.rows import FILE_NAME, IDENTITY, NUMBERS, SCHEMA, Event, StepRecord, checksum, checksums, quoted
+from bench.record.rows import FILE_NAME, IDENTITY, NUMBERS, SCHEMA, Event, StepRecord, checksums, is_good, quoted
 from bench.record.table import Table
 from bench.rig import is_in_use
 
@@ -38,6 +37,7 @@ _FAILED = {each.value for each in Settled if each.failed}
 class Record:
     """Reads the journal of a run, finished or not, without ever changing it.
 
+    Rows that wait in its second file are read with those of the journal, unless the run goes on.
     Every row is compared with its checksum when it is read; one that does not fit is a DataError which names it.
 
     Parameters
@@ -58,7 +58,7 @@ class Record:
     Warns
     -----
     IncompleteRecordWarning
-        If rows are missing.
+        If rows are missing, or are read from a second file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -72,17 +72,18 @@ class Record:
         except DataError:
             self.close()
             raise
+        goes_on = "status" not in self.meta and is_in_use(self.path.parent)
+        try:
+            self._waiting = "" if goes_on else self._take_in()
+            self.missing = MissingRows(self.path) if goes_on else find_missing_rows(self._db, self.path, self.meta)
+            for text in filter(None, (self._waiting, str(self.missing) if self.missing else "")):
+                warnings.warn(text, IncompleteRecordWarning, stacklevel=2)
+        except (DataError, IncompleteRecordWarning):
+            self.close()
+            raise
         # A recovered copy beside the journal says for itself how far it is good.
         is_silent = "status" not in self.meta and self.path.name == FILE_NAME
         self._ending = ending_of(self.path.parent) if is_silent else None
-        goes_on = "status" not in self.meta and is_in_use(self.path.parent)
-        self.missing = MissingRows(self.path) if goes_on else find_missing_rows(self._db, self.path, self.meta)
-        if self.missing:
-            try:
-                warnings.warn(str(self.missing), IncompleteRecordWarning, stacklevel=2)
-            except IncompleteRecordWarning:
-                self.close()
-                raise
 
     @property
     def identity(self) -> str:
@@ -91,7 +92,18 @@ class Record:
 
     def remark(self) -> str:
         """Return what is unusual: how the journal is read, and which rows are missing; else nothing."""
-        return "; ".join(filter(None, (self._opened.remark, str(self.missing) if self.missing else "")))
+        missing = str(self.missing) if self.missing else ""
+        return "; ".join(filter(None, (self._opened.remark, self._waiting, missing)))
+
+    def _take_in(self) -> str:
+        """Have the rows of its second file read as well; return what is to be said of it."""
+        try:
+            said = self._opened.take_in(self.identity)
+        except sqlite3.Error as error:
+            raise self._damaged(f"its second file does not fit: {error}") from error
+        if said:
+            self._read_heading()
+        return said
 
     def _read_heading(self) -> None:
         try:
@@ -233,10 +245,9 @@ class Record:
     def files(self) -> dict[str, bytes]:
         """Return the content of every file that the run was given, by name."""
         result = {}
-        for name, digest, content in self._query("SELECT name, sha256, content FROM files ORDER BY rowid"):
-            if not isinstance(content, bytes) or hashlib.sha256(content).hexdigest() != digest:
-                raise self._wrong_row("files", name)
-            result[name] = content
+        for row in self._query("SELECT name, sha256, content FROM files ORDER BY rowid"):
+            self._check("files", [row])
+            result[row[0]] = row[2]
         return result
 
     def models(self) -> dict[str, Any]:
@@ -297,11 +308,7 @@ class Record:
     def _check(self, table: str, rows: Sequence[tuple[Any, ...]]) -> None:
         """Raise DataError for the first row that its checksum, the last column, does not fit."""
         for row in rows:
-            try:
-                fits = checksum(row[:-1]) == row[-1]
-            except (ValueError, TypeError):
-                fits = False
-            if not fits:
+            if not is_good(table, row):
                 raise self._wrong_row(table, row[0])
 
     def _wrong_row(self, table: str, row: object) -> DataError:

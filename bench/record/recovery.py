@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import hashlib
 import sqlite3
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass, field
-from itertools import chain
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from bench.base import ConfigurationError, DataError, parse_json
 from bench.record.finding import missing
-from bench.record.mirror import NAME as MIRROR_NAME, read_mirror, readable_second_files
-from bench.record.missing_rows import Range, joined_ranges
+from bench.record.missing_rows import find_missing_rows
 from bench.record.opening import OpenedJournal
 from bench.record.rows import (
     FILE_NAME,
@@ -26,23 +22,20 @@ from bench.record.rows import (
     RECOVERED_NAME,
     SCHEMA,
     TABLES,
-    JournalEntry,
-    canonical,
-    checksums,
-    entry,
-    meta_row,
+    Row,
+    is_good,
+    meta as meta_rows,
+    table_definitions,
 )
-from bench.record.store import Store
-from bench.record.substitutes import metadata, signal_rows, unnamed_signals
+from bench.record.second_file import NAME as SECOND_NAME, read_second_file, second_files
+from bench.record.store import insert
 from bench.record.write_ahead_log import log_damage
 
-_SMALL = tuple(table for table in TABLES if table not in FIRST)
-"""Tables that are held as a whole; the others may have millions of rows."""
+_HEADING = ("meta", "signals")
+"""Tables without which the others cannot be understood."""
 _KEYS = {"meta": "key", "signals": "position", "files": "rowid", **NUMBERS}
-_BESIDE_SIGNALS = {"steps": 8, "telemetry": 3, "events": 5}
-"""Columns of a row, without its checksum, that are no signals."""
 _BLOCK = 4096
-"""Rows that are read together."""
+"""Rows that are held at a time. Chosen: one takes some 1 kB."""
 
 
 @dataclass(frozen=True)
@@ -115,330 +108,215 @@ def recover(path: Path, others: Sequence[Path] = (), out: Path | None = None) ->
     Raises
     ------
     DataError
-        If it is no journal, its schema is of another version, or nothing of it is readable.
+        If it is no journal, its schema is of another version, or its metadata or signals are lost.
     ConfigurationError
         If the copy exists already or cannot be written, or there is no second file that was named.
     """
-    journal = path / FILE_NAME if path.is_dir() else path
+    is_journal = path.is_file() or path.suffix == Path(FILE_NAME).suffix
+    journal = path if is_journal and not path.is_dir() else path / FILE_NAME
     if absent := [other for other in others if not other.is_file()]:
         raise ConfigurationError(f"there is no second file {absent[0]}")
-    found = (*readable_second_files(journal), *others)
-    if not journal.is_file() and not found:
+    seconds = (*second_files(journal), *others)
+    if not journal.is_file() and not seconds:
         raise DataError(missing(path))
-    left = _salvage(journal)
-    identity = _identity(left.rows["meta"], found)
-    if strange := [other for other in others if not any(read_mirror(other, identity)) and any(read_mirror(other))]:
-        raise ConfigurationError(f"{strange[0]} is the second file of another journal")
-    beside = _beside(found, identity)
-    whole = {table: {**beside.rows[table], **left.rows[table]} for table in _SMALL}
-    numbers = {table: left.numbers[table].joined(beside.numbers[table]) for table in FIRST}
-    if not any(whole.values()) and not any(numbers.values()):
-        raise DataError(_hopeless(journal, left.problem, found))
-    meta = {key: parse_json(each.row[1]) for key, each in whole["meta"].items()}
-    # A second file has every row.
-    is_lost = {table: table in left.cut and not beside.rows["meta"].keys() - {IDENTITY} for table in TABLES}
-    if meta.get("schema", None if whole["meta"] and not left.bad["meta"] else SCHEMA) != SCHEMA:
-        raise DataError(f"{journal} has schema version {meta.get('schema')}; this bench reads version {SCHEMA}")
-    substitutes: dict[str, Any] = {}
-    if is_lost["meta"] or set(left.bad["meta"]).difference(whole["meta"]):
-        events = chain.from_iterable(each.rows for each in _rows_of(journal, found, identity, ("events",)))
-        guessed = metadata(journal, whole["files"], events)
-        substitutes = {key: value for key, value in guessed.items() if key not in meta}
-    named = left.signals or unnamed_signals(max(left.signals_of_rows, beside.signals_of_rows))
-    signals = {position: each for position, each in named.items() if position not in whole["signals"]}
-    # What is known to be lost although nothing of it can be read.
-    left.bad["meta"] += [] if not is_lost["meta"] else [key for key in substitutes if key not in left.bad["meta"]]
-    left.bad["signals"] += [position for position in signals if position not in left.bad["signals"]]
-    counts = meta.get("counts", {})
-    tables = {table: _small_state(left, table, whole[table], is_cut=is_lost[table]) for table in _SMALL}
-    tables |= {
-        table: _state(left, table, numbers[table], counts.get(table), is_cut=is_lost[table]) for table in FIRST
-    }
-    tables = {table: tables[table] for table in TABLES}
-    meta = substitutes | meta
-    copy = None
-    if left.problem or any(state.added or state.missing or state.first_bad for state in tables.values()):
-        copy = out or journal.parent / RECOVERED_NAME
-        lost = {table: state.missing for table, state in tables.items() if state.missing}
-        more = dict(substitutes)
-        if lost and meta.get("status") == "completed":
-            more |= {"status": "failed", "reason": "rows of the record were lost"}
-        more["recovered"] = {"from": str(journal), "lost": lost, "substituted": sorted(substitutes)}
-        meta |= more
-        whole["signals"] |= signals
-        _write(copy, whole, _rows_of(journal, found, identity, tuple(FIRST)), more)
-    return Recovery(journal, str(meta.get("status", "unfinished")), left.problem, tables, found, copy)
+    with closing(sqlite3.connect("", isolation_level=None)) as db:
+        left = _gathered(journal, seconds, db)
+        meta = left.meta
+        for other in others:
+            if not any(read_second_file(other, str(meta.get(IDENTITY, "")))):
+                raise ConfigurationError(f"{other} is the second file of another journal, or none")
+        tables = _states(left, journal, db)
+        copy = None
+        if left.problem or any(state.added or state.missing or state.first_bad for state in tables.values()):
+            copy = out or journal.parent / RECOVERED_NAME
+            lost = {table: state.missing for table, state in tables.items() if state.missing}
+            more: dict[str, Any] = {"recovered": {"from": str(journal), "lost": lost}}
+            if lost and meta.get("status") == "completed":
+                more |= {"status": "failed", "reason": "rows of the record were lost"}
+            insert(db, meta_rows(more))
+            meta |= more
+            if copy.exists():
+                raise ConfigurationError(
+                    f"{copy} exists already; nothing is overwritten, so name another one by --out"
+                )
+            try:
+                db.execute("VACUUM INTO ?", (str(copy),))
+            except sqlite3.Error as error:
+                raise ConfigurationError(f"{copy} cannot be written: {error}; name another one by --out") from None
+    return Recovery(journal, str(meta.get("status", "unfinished")), left.problem, tables, seconds, copy)
 
 
-def _hopeless(journal: Path, problem: str, found: Sequence[Path]) -> str:
-    """Return what to say of a journal of which nothing can be read."""
-    text = f"{journal}: nothing of it is readable{f' by SQLite: {problem}' if problem else ''}"
-    if found:
-        return f"{text}, nor of {' and '.join(map(str, found))}"
-    return (
-        f"{text}; there is no second file of it ({MIRROR_NAME} in its folder, which a run removes at its end). One "
-        "that is elsewhere is named by --second"
-    )
-
-
-class _Numbers:
-    """Numbers of rows, as ranges: rows come in the order of their numbers, so that there are few."""
-
-    def __init__(self, ranges: Iterable[Range] = ()) -> None:
-        self.ranges = list(ranges)
-
-    def add(self, first: int, last: int) -> None:
-        if self.ranges:
-            begin, end = self.ranges[-1]
-            if begin <= first <= end + 1 or begin <= last + 1 <= end + 1:
-                self.ranges[-1] = min(begin, first), max(end, last)
-                return
-        self.ranges.append((first, last))
-
-    def joined(self, others: _Numbers) -> _Numbers:
-        """Return these and others, in order and without a number twice."""
-        return _Numbers(joined_ranges([*self.ranges, *others.ranges]))
-
-    def lacking(self, first: int, last: int) -> list[Range]:
-        """Return the ranges of the numbers from `first` to `last` that are not among these, which are in order."""
-        edges = [first - 1, *chain.from_iterable(self.ranges), last + 1]
-        pairs = zip(edges[::2], edges[1::2], strict=True)
-        return [(before + 1, after - 1) for before, after in pairs if after - before > 1]
-
-    @property
-    def last(self) -> int | None:
-        return max((end for _, end in self.ranges), default=None)
-
-    def __contains__(self, number: object) -> bool:
-        return isinstance(number, int) and any(first <= number <= last for first, last in self.ranges)
-
-    def __len__(self) -> int:
-        return sum(last - first + 1 for first, last in self.ranges)
-
-
-@dataclass
+@dataclass(frozen=True)
 class _Left:
-    """What is left of the SQLite file or of second files; numbered rows are counted only, as there may be many.
+    """What is left of a journal.
 
     Attributes
     ----------
-    rows : dict of str to dict
-        The good rows of each small table by their keys.
-    numbers : dict of str to _Numbers
-        The numbers of the good rows of the other tables.
-    bad : dict of str to list
-        The keys of bad ones.
-    cut : set of str
-        The tables of which there may be more rows than are known.
-    signals : dict of int to JournalEntry
-        By position, in the place of signals whose rows are lost.
-    signals_of_rows : int
-        Most values of signals that a numbered row has.
     problem : str
         What SQLite finds wrong.
+    meta : dict of str to object
+        Its metadata.
+    good : dict of str to int
+        By table the number of its good rows.
+    bad, added : dict of str to list
+        By table the keys of its bad rows, and of those that only second files have.
+    cut : set of str
+        Tables of which there may be more rows than are known.
     """
 
-    rows: dict[str, dict[Any, JournalEntry]] = field(default_factory=lambda: {table: {} for table in _SMALL})
-    numbers: dict[str, _Numbers] = field(default_factory=lambda: {table: _Numbers() for table in FIRST})
+    problem: str
+    meta: dict[str, Any] = field(default_factory=dict)
+    good: dict[str, int] = field(default_factory=lambda: dict.fromkeys(TABLES, 0))
     bad: dict[str, list[Any]] = field(default_factory=lambda: {table: [] for table in TABLES})
+    added: dict[str, list[Any]] = field(default_factory=lambda: {table: [] for table in TABLES})
     cut: set[str] = field(default_factory=set)
-    signals: dict[Any, JournalEntry] = field(default_factory=dict)
-    signals_of_rows: int = 0
-    problem: str = ""
-
-    def add(self, entry: JournalEntry) -> None:
-        """Add good rows."""
-        if entry.table in _SMALL:
-            self.rows[entry.table][entry.row[0]] = entry
-            return
-        self.signals_of_rows = max(self.signals_of_rows, len(entry.row) - _BESIDE_SIGNALS[entry.table])
-        for row in entry.rows:
-            self.numbers[entry.table].add(int(row[0]), int(row[0]))
 
 
-def _small_state(left: _Left, table: str, whole: Mapping[Any, JournalEntry], *, is_cut: bool) -> TableState:
-    good, bad = left.rows[table], left.bad[table]
-    lost = set(bad) - set(whole)
-    lacking = set(bad) | (set(whole) - set(good))
-    first = min(lacking, key=_order, default=None)
-    return _counted(len(good), len(whole) - len(good), len(lost), first, is_cut=is_cut)
+def _gathered(journal: Path, seconds: Sequence[Path], db: sqlite3.Connection) -> _Left:
+    """Bring the good rows of a journal and of its second files into an empty database."""
+    opened, problem = _opened(journal)
+    left = _Left(problem)
+    try:
+        own = {table: [] if opened is None else [*_good_rows(opened, table, left)] for table in _HEADING}
+        heading = {row.key: row for rows in own.values() for row in rows}
+        identity = _identity(heading, seconds)
+        beside = [row for second in seconds for row in read_second_file(second, identity)]
+        heading = {row.key: row for row in beside if row.table in _HEADING} | heading
+        left.meta.update(
+            (key, parse_json(row.columns[1])) for (table, key), row in heading.items() if table == "meta"
+        )
+        if left.meta.get("schema", SCHEMA) != SCHEMA:
+            raise DataError(f"{journal} has schema version {left.meta['schema']}; this bench reads version {SCHEMA}")
+        lost = [
+            f"row {key} of table {table}"
+            for table in _HEADING
+            for key in left.bad[table]
+            if (table, key) not in heading
+        ]
+        lost += [f"table {table}" for table in _HEADING if table in left.cut]
+        if lost or "schema" not in left.meta:
+            raise DataError(_hopeless(journal, problem, lost, seconds))
+        names = [row.columns[1] for _, row in sorted(heading.items()) if row.table == "signals"]
+        for statement in table_definitions(names):
+            db.execute(statement)
+        for table in TABLES:
+            rows = iter(own.get(table, ())) if opened is None or table in own else _good_rows(opened, table, left)
+            while block := [*islice(rows, _BLOCK)]:
+                insert(db, block)
+            (left.good[table],) = db.execute(f"SELECT count(*) FROM {table}").fetchone()  # noqa: S608 - own names
+        for row in beside:
+            before = db.total_changes
+            insert(db, [row], otherwise="IGNORE")
+            if db.total_changes > before:
+                left.added[row.table].append(row.columns[0])
+    except sqlite3.Error as error:
+        raise DataError(f"{journal}: its rows do not fit its signals: {error}") from error
+    finally:
+        if opened is not None:
+            opened.close()
+    return left
 
 
-def _state(left: _Left, table: str, whole: _Numbers, count: int | None, *, is_cut: bool) -> TableState:
-    good = left.numbers[table].joined(_Numbers())
-    start = FIRST[table]
-    bad = [key for key in left.bad[table] if key not in whole]
-    known = [whole.last, *(key for key in bad if isinstance(key, int))]
-    last = (
-        max((number for number in known if number is not None), default=start - 1)
-        if count is None
-        else count + start - 1
+def _hopeless(journal: Path, problem: str, lost: Sequence[str], seconds: Sequence[Path]) -> str:
+    """Return what to say of a journal whose metadata or signals are lost."""
+    text = f"{journal}: nothing of it is readable{f' by SQLite: {problem}' if problem else ''}"
+    if lost:
+        text = f"{journal} has lost its heading ({', '.join(lost)}), without which no row can be understood"
+    if seconds:
+        return f"{text}, nor of {' and '.join(map(str, seconds))}"
+    return (
+        f"{text}; there is no second file ({SECOND_NAME}) in its folder; one that is elsewhere is named by --second"
     )
-    gone = whole.lacking(start, last)
-    others = [key for key in bad if not isinstance(key, int) or not start <= key <= last]
-    lost = sum(end - begin + 1 for begin, end in gone) + len(others)
-    lacking = good.lacking(start, max(last, whole.last or last))
-    first = min([*(begin for begin, _ in lacking), *left.bad[table]], key=_order, default=None)
-    # Their end is known all the same.
-    return _counted(len(good), len(whole) - len(good), lost, first, is_cut=is_cut and count is None)
 
 
-def _counted(good: int, added: int, lost: int, first: Any, *, is_cut: bool) -> TableState:  # noqa: ANN401 - a key
-    # The key of a damaged row may be anything.
-    first_bad = "" if first is None else str(int(first)) if isinstance(first, int | float) else str(first)
-    if is_cut and not lost:
-        return TableState(good, added, 1, first_bad or "?")
-    return TableState(good, added, lost, first_bad)
+def _states(left: _Left, journal: Path, db: sqlite3.Connection) -> dict[str, TableState]:
+    """Return how much there is of each table, by what a database has gathered."""
+    missing = find_missing_rows(db, journal, left.meta)
+    states = {}
+    for table in TABLES:
+        ranges = missing.ranges.get(table, ())
+        gone = [key for key in left.bad[table] if key not in left.added[table]]
+        gone = [key for key in gone if not any(first <= key <= last for first, last in ranges)]
+        lost = sum(last - first + 1 for first, last in ranges) + len(gone) + missing.quantities.get(table, 0)
+        is_cut = table in left.cut or (table in FIRST and bool(missing.damage))
+        if is_cut and not lost and (table not in FIRST or "counts" not in left.meta):
+            lost = 1
+        wrong = [*(first for first, _ in ranges), *left.bad[table], *left.added[table]]
+        first_bad = min(wrong, key=_order, default="?" if lost else "")
+        states[table] = TableState(left.good[table], len(left.added[table]), lost, str(first_bad))
+    return states
 
 
 def _order(key: Any) -> tuple[bool, Any]:  # noqa: ANN401 - a key of any table
     return (False, key) if isinstance(key, int | float) else (True, str(key))
 
 
-def _salvage(journal: Path) -> _Left:
+def _opened(journal: Path) -> tuple[OpenedJournal | None, str]:
+    """Open a journal; return also what is wrong with it by SQLite's own check and its write-ahead log, or nothing."""
     if not journal.is_file():
-        return _Left(cut=set(TABLES), problem="it is not there")
+        return None, "it is not there"
     try:
-        opened = _opened(journal)
+        opened = OpenedJournal(journal)
     except DataError as error:
-        return _Left(cut=set(TABLES), problem=str(error.__cause__ or error))
-    try:
-        left = _Left(problem=_problem(opened.db))
-        for table in TABLES:
-            for each in _readable(opened.db, table, left.cut, left.bad[table]):
-                left.add(each)
-        left.signals = signal_rows(opened.db, left.rows["signals"])
-    finally:
-        opened.close()
-    if damage := log_damage(journal.with_name(f"{journal.name}-wal")):
-        left.problem = left.problem or damage
-        left.cut |= FIRST.keys()
-    return left
-
-
-def _identity(meta: Mapping[Any, JournalEntry], seconds: Sequence[Path]) -> str:
-    """Return the number of a journal; where it has lost it, that of the first second file that has rows."""
-    if IDENTITY in meta:
-        return str(parse_json(meta[IDENTITY].row[1]))
-    first = next(chain.from_iterable(map(read_mirror, seconds)), None)
-    if first is None or (first.table, first.row[0]) != ("meta", IDENTITY):
-        return ""
-    return str(parse_json(first.row[1]))
-
-
-def _beside(seconds: Sequence[Path], identity: str) -> _Left:
-    """Return what second files have."""
-    found = _Left()
-    for second in seconds:
-        for each in read_mirror(second, identity):
-            found.add(each)
-    return found
-
-
-def _rows_of(journal: Path, seconds: Sequence[Path], identity: str, tables: Sequence[str]) -> Iterator[JournalEntry]:
-    """Yield the good rows of some tables, last those of the journal itself, which may come a second time."""
-    for second in seconds:
-        yield from (each for each in read_mirror(second, identity) if each.table in tables)
-    if journal.is_file():
-        with suppress(DataError), closing(_opened(journal)) as opened:
-            for table in tables:
-                yield from _readable(opened.db, table, set(), [])
-
-
-def _opened(journal: Path) -> OpenedJournal:
-    opened = OpenedJournal(journal)
+        return None, str(error.__cause__ or error)
     # A text that is damaged is one whose checksum does not fit.
     opened.db.text_factory = lambda content: content.decode("utf-8", "replace")
-    return opened
-
-
-def _problem(db: sqlite3.Connection) -> str:
     try:
-        found = str(db.execute("PRAGMA quick_check(1)").fetchone()[0])
-    except (sqlite3.DatabaseError, UnicodeDecodeError) as error:
-        return str(error)
-    return "" if found == "ok" else found.replace("\n", " ")
+        found = str(opened.db.execute("PRAGMA quick_check(1)").fetchone()[0]).replace("\n", " ")
+    except sqlite3.DatabaseError as error:
+        found = str(error)
+    return opened, ("" if found == "ok" else found) or log_damage(journal.with_name(f"{journal.name}-wal"))
 
 
-def _readable(db: sqlite3.Connection, table: str, cut: set[str], bad: list[Any]) -> Iterator[JournalEntry]:
-    """Yield the good rows of a table that SQLite can read, around what it cannot.
+def _identity(heading: Mapping[tuple[str, Any], Row], seconds: Sequence[Path]) -> str:
+    """Return the number of a journal; where it has lost it, that of the first second file that has rows."""
+    first = next((row for second in seconds for row in read_second_file(second)), None)
+    found = heading.get(("meta", IDENTITY), None if heading else first)
+    return "" if found is None else str(parse_json(found.columns[1]))
 
-    The table is added to `cut` if there may be others, and the keys of bad rows to `bad`. Where rows are numbered,
-    those that lie between two that can be read are known.
+
+def _good_rows(opened: OpenedJournal, table: str, left: _Left) -> Iterator[Row]:
+    """Yield the rows of a table whose checksums fit; the keys of others are noted as bad."""
+    for columns in _readable(opened, table, left.cut):
+        if is_good(table, columns):
+            yield Row(table, columns if table == "files" else columns[:-1])
+        else:
+            left.bad[table].append(columns[0])
+
+
+def _readable(opened: OpenedJournal, table: str, cut: set[str]) -> Iterator[tuple[Any, ...]]:
+    """Yield the rows of a table that SQLite can read, around what it cannot.
+
+    The table is added to `cut` if there may be others. Where rows are numbered, those that lie between two that can
+    be read are known.
     """
     key = _KEYS[table]
     ends: list[Any] = []
     for order in ("ASC", "DESC"):
-        last: Any = None
+        last = None
         try:
-            for rows in _blocks(db, f"SELECT * FROM {table} ORDER BY {key} {order}"):  # noqa: S608 - own names
-                last = rows[-1][0]
-                yield from _checked(table, rows, bad)
-        except (sqlite3.DatabaseError, UnicodeDecodeError):
+            for row in opened.db.execute(f"SELECT * FROM {table} ORDER BY {key} {order}"):  # noqa: S608 - own names
+                last = row[0]
+                yield row
+        except sqlite3.DatabaseError:
             ends.append(last)
         else:
             return
-    if table in FIRST and isinstance(ends[0], int) and isinstance(ends[1], int):
-        for number in range(ends[0] + 1, ends[1]):
-            with suppress(sqlite3.DatabaseError, UnicodeDecodeError):
-                row = db.execute(f"SELECT * FROM {table} WHERE {key} = ?", (number,)).fetchone()  # noqa: S608
-                if row is not None:
-                    yield from _checked(table, [row], bad)
+    are_known = table in FIRST and all(isinstance(end, int) for end in ends)
+    # A damaged number may be any: a file has no more rows than bytes.
+    if are_known and ends[1] - ends[0] <= opened.path.stat().st_size:
+        yield from _between(opened.db, table, ends[0] + 1, ends[1] - 1)
     if table not in FIRST or ends[1] is None:
         cut.add(table)
 
 
-def _blocks(db: sqlite3.Connection, statement: str) -> Iterator[list[tuple[Any, ...]]]:
-    """Yield rows in blocks, also those before one that cannot be read; raises what SQLite does."""
-    rows = []
+def _between(db: sqlite3.Connection, table: str, first: int, last: int) -> Iterator[tuple[Any, ...]]:
+    """Yield the rows with numbers from `first` to `last` that SQLite can read, by halves around what it cannot."""
     try:
-        for row in db.execute(statement):
-            rows.append(row)
-            if len(rows) == _BLOCK:
-                yield rows
-                rows = []
-    except (sqlite3.DatabaseError, UnicodeDecodeError):
-        if rows:
-            yield rows
-        raise
-    if rows:
-        yield rows
-
-
-def _checked(table: str, rows: Sequence[tuple[Any, ...]], bad: list[Any]) -> Iterator[JournalEntry]:
-    """Yield the rows whose checksums fit, ticks together; the keys of others are added to `bad`."""
-    if table == "telemetry" and rows:
-        with suppress(ValueError, TypeError):
-            numbers = np.array(rows, dtype=np.float64)
-            if (np.array(checksums(numbers[:, :-1]), dtype=np.float64) == numbers[:, -1]).all():
-                yield JournalEntry(table, [row[:-1] for row in rows], canonical(numbers[:, :-1]).tobytes())
-                return
-    for columns in rows:
-        kept = None
-        with suppress(ValueError, TypeError):
-            if table != "files":
-                kept = entry(table, columns[:-1])
-            elif hashlib.sha256(columns[2]).hexdigest() == columns[1]:
-                kept = entry(table, columns)
-        if kept is not None and list(kept.columns()) == [columns]:
-            yield kept
-        else:
-            bad.append(columns[0])
-
-
-def _write(
-    copy: Path,
-    whole: Mapping[str, Mapping[Any, JournalEntry]],
-    rows: Iterator[JournalEntry],
-    more: Mapping[str, object],
-) -> None:
-    if copy.exists():
-        raise ConfigurationError(f"{copy} exists already; nothing is overwritten, so name another one by --out")
-    small = (each for table in whole for _, each in sorted(whole[table].items()))
-    added = (entry("meta", meta_row(key, value)) for key, value in more.items())
-    try:
-        store = Store(copy, flushed=False)
-        store.create([each.row[1] for _, each in sorted(whole["signals"].items())], chain(small, rows, added))
-        store.close()
-    except (sqlite3.Error, OSError) as error:
-        raise ConfigurationError(f"{copy} cannot be written: {error}; name another one by --out") from None
+        yield from db.execute(
+            f"SELECT * FROM {table} WHERE {NUMBERS[table]} BETWEEN {first:d} AND {last:d}"  # noqa: S608 - own names
+        ).fetchall()
+    except sqlite3.DatabaseError:
+        if first < last:
+            yield from _between(db, table, first, (first + last) // 2)
+            yield from _between(db, table, (first + last) // 2 + 1, last)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import base64
+import hashlib
 import json
 import math
 import struct
 import zlib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -39,24 +39,6 @@ _TABLES = (
 )
 
 TABLES = ("meta", "signals", "steps", "telemetry", "events", "files")
-
-_PATTERNS = {
-    "meta": "tt",
-    "signals": "ntttn",
-    "steps": "nnntttt",
-    "telemetry": "nnn",
-    "events": "nnttt",
-    "files": "ttt",
-}
-"""The kinds of a row's columns, numbers or texts; one number a signal may follow, and then `_TEXTS_BEHIND`."""
-
-_TEXTS_BEHIND = {"steps": 1}
-
-TEXTS = {table: pattern.count("t") + _TEXTS_BEHIND.get(table, 0) for table, pattern in _PATTERNS.items()}
-"""Quantity of texts in a row."""
-
-_FEW_ROWS = 3
-"""Rows for which numpy takes longer than it saves."""
 
 FIRST = {"steps": 0, "telemetry": 1, "events": 1}
 """The tables whose rows are numbered without a gap, by their first column, and the first number of each."""
@@ -140,123 +122,64 @@ def meta_row(key: str, value: object) -> tuple[str, str]:
     return key, text.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
-def canonical(numbers: npt.ArrayLike) -> npt.NDArray[np.float64]:
-    """Return numbers as they come back from a journal: without a sign of zero, and one nan for all."""
-    array = np.array(numbers, dtype="<f8")
-    array += 0.0
-    array[np.isnan(array)] = math.nan
-    return array
-
-
-class JournalEntry(NamedTuple):
-    """Rows that are to be kept: one, or several of the telemetry.
-
-    Attributes
-    ----------
-    table : str
-        Their table.
-    rows : sequence of tuple
-        Their columns without the checksum.
-    payload : bytes
-        Row by row: its numbers in their order (little-endian doubles; NULL as the quiet nan of positive sign, without
-        a sign of zero), then its texts in their order (UTF-8, each followed by a zero byte). Their CRC-32 is the
-        row's checksum.
-    """
+class Row(NamedTuple):
+    """A row that is to be kept: its table, and its columns without the checksum."""
 
     table: str
-    rows: Sequence[tuple[Any, ...]]
-    payload: bytes
+    columns: tuple[Any, ...]
 
     @property
-    def row(self) -> tuple[Any, ...]:
-        """The first row."""
-        return self.rows[0]
-
-    def columns(self) -> Sequence[tuple[Any, ...]]:
-        """Return the rows as they stand in their table."""
-        if self.table == "files":
-            return self.rows
-        content = memoryview(self.payload)
-        size = len(content) // len(self.rows)
-        return [(*row, zlib.crc32(content[size * i : size * (i + 1)])) for i, row in enumerate(self.rows)]
+    def key(self) -> tuple[str, Any]:
+        """What tells it from the other rows of a journal."""
+        return self.table, self.columns[0]
 
 
-def entry(table: str, row: Sequence[Any]) -> JournalEntry:
-    """Return a row as it is kept.
+def meta(entries: Mapping[str, object]) -> list[Row]:
+    """Return entries of the metadata as rows."""
+    return [Row("meta", meta_row(key, value)) for key, value in entries.items()]
 
-    Raises ValueError or TypeError if one of its values is neither a number nor a text, nor the content of a file.
+
+def sealed(table: str, rows: Sequence[tuple[Any, ...]]) -> Iterator[tuple[Any, ...]]:
+    """Return rows of a table as they stand in it, each with its checksum."""
+    if table == "files":
+        return iter(rows)
+    # By numpy, as a loop may leave a thousand ticks in a second.
+    sums = checksums(np.array(rows, dtype=np.float64)) if table == "telemetry" else map(checksum, rows)
+    return ((*row, found) for row, found in zip(rows, sums, strict=True))
+
+
+def is_good(table: str, columns: Sequence[Any]) -> bool:
+    """Return whether the checksum of a row fits, given as it stands in its table."""
+    if table == "files":
+        return isinstance(columns[2], bytes) and bool(hashlib.sha256(columns[2]).hexdigest() == columns[1])
+    try:
+        return bool(checksum(columns[:-1]) == columns[-1])
+    except (ValueError, TypeError):
+        return False
+
+
+def checksum(row: Sequence[str | float | None]) -> int:
+    """Return the CRC-32 of a row.
+
+    It is that of its numbers in their order (little-endian doubles; NULL as the quiet nan of positive sign, without a
+    sign of zero), then its texts in their order (UTF-8, each followed by a zero byte). Raises ValueError or TypeError
+    if one of its values is neither number nor text.
     """
     numbers, texts = [], []
     for value in row:
         if isinstance(value, str):
-            texts.append(value.encode())
-        elif isinstance(value, bytes):
-            texts.append(base64.b64encode(value))
+            texts.append(value.encode() + b"\0")
         else:
-            numbers.append(math.nan if value is None else value)
-    return JournalEntry(table, (tuple(row),), b"".join((_packed(numbers), *(text + b"\0" for text in texts))))
-
-
-def ticks(rows: Sequence[tuple[float, ...]]) -> JournalEntry:
-    """Return rows of the telemetry as they are kept."""
-    payload = b"".join(map(_packed, rows)) if len(rows) <= _FEW_ROWS else canonical(rows).tobytes()
-    return JournalEntry("telemetry", rows, payload)
-
-
-def split(entries: Iterable[JournalEntry]) -> Iterator[JournalEntry]:
-    """Yield an entry a row."""
-    for several in entries:
-        size = len(several.payload) // len(several.rows)
-        for i, row in enumerate(several.rows):
-            yield JournalEntry(several.table, (row,), several.payload[size * i : size * (i + 1)])
-
-
-def joined(entries: Iterable[JournalEntry]) -> list[JournalEntry]:
-    """Return entries with neighbouring rows of the telemetry in one."""
-    result: list[JournalEntry] = []
-    for each in entries:
-        if result and each.table == result[-1].table == "telemetry":
-            former = result.pop()
-            each = JournalEntry(each.table, [*former.rows, *each.rows], former.payload + each.payload)
-        result.append(each)
-    return result
-
-
-def _packed(numbers: Sequence[float]) -> bytes:
-    """Return numbers as `canonical` does, faster for one row."""
-    numbers = [number + 0.0 for number in numbers]
-    # With infinities the sum is nan as well.
-    if (total := sum(numbers)) != total:
-        numbers = [number if number == number else math.nan for number in numbers]
-    return struct.pack(f"<{len(numbers)}d", *numbers)
-
-
-def unpacked(table: str, count: int, payload: bytes) -> tuple[Any, ...] | None:
-    """Return the row of a payload that begins with `count` numbers, or None if it is none of the table's."""
-    if 8 * count > len(payload):
-        return None
-    numbers = list(np.frombuffer(payload, dtype="<f8", count=count).tolist())
-    try:
-        texts: list[Any] = payload[8 * count :].decode().split("\0")[:-1]
-    except UnicodeDecodeError:
-        return None
-    if table == "files" and len(texts) == 3:
-        texts[2] = base64.b64decode(texts[2])
-    pattern = _PATTERNS[table]
-    values = iter(numbers), iter(texts)
-    if TEXTS[table] != len(texts) or pattern.count("n") > count:
-        return None
-    row = [next(values[kind == "t"]) for kind in pattern]
-    return *row, *values[0], *values[1]
-
-
-def checksum(row: Sequence[str | float | None]) -> int:
-    """Return the CRC-32 of a row; raise ValueError or TypeError if it has neither number nor text."""
-    return zlib.crc32(entry("", row).payload)
+            number = math.nan if value is None else value + 0.0
+            numbers.append(number if number == number else math.nan)
+    return zlib.crc32(b"".join((struct.pack(f"<{len(numbers)}d", *numbers), *texts)))
 
 
 def checksums(numbers: npt.NDArray[np.float64]) -> list[int]:
     """Return the CRC-32 of each row of numbers, shape (rows, columns), as `checksum` does."""
-    content = memoryview(canonical(numbers).tobytes())
+    array = np.array(numbers, dtype="<f8")
+    array += 0.0
+    array[np.isnan(array)] = math.nan
+    content = memoryview(array.tobytes())
     size = 8 * numbers.shape[1]
     return [zlib.crc32(content[start : start + size]) for start in range(0, len(content), size)]

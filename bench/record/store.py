@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import sqlite3
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
+from itertools import groupby
 from pathlib import Path
 
-from bench.record.rows import TABLES, JournalEntry, entry, table_definitions
+from bench.record.rows import TABLES, Row, sealed, table_definitions
+
+OTHERS = 5.0
+"""Wall-clock time that the beginning and the end of a run wait for a program that has the journal locked, s: as long
+as `sqlite3.connect` does by itself."""
 
 _LOG_PAGES = 64
 """Pages after which the write-ahead log is folded in and overwritten, of a journal whose commits wait for the disk.
@@ -35,33 +40,31 @@ class Store:
         self._settings = (
             ("synchronous=FULL", f"wal_autocheckpoint={_LOG_PAGES}") if flushed else ("synchronous=NORMAL",)
         )
-        self._connect(wait)
+        self._wait = wait
+        self._connect()
         made = path.stat()
         self._file = made.st_dev, made.st_ino
 
-    def _connect(self, wait: float = 0.0) -> None:
+    def _connect(self) -> None:
         # One thread at a time, see `Keeper`.
-        self._db = sqlite3.connect(self.path, timeout=wait, isolation_level=None, check_same_thread=False)
+        self._db = sqlite3.connect(self.path, timeout=self._wait, isolation_level=None, check_same_thread=False)
         self._db.execute("PRAGMA journal_mode=WAL")
         for setting in self._settings:
             self._db.execute(f"PRAGMA {setting}")
 
-    def create(self, signals: Sequence[str], entries: Iterable[JournalEntry]) -> None:
+    def create(self, signals: Sequence[str], rows: Sequence[Row]) -> None:
         """Make the tables, with their first rows."""
         self._db.execute("BEGIN IMMEDIATE")
         for statement in table_definitions(signals):
             self._db.execute(statement)
-        self._insert(entries)
+        insert(self._db, rows)
         self._db.execute("COMMIT")
 
-    def write(self, entries: Sequence[JournalEntry]) -> None:
+    def write(self, rows: Sequence[Row]) -> None:
         """Commit rows, all or none."""
-        if len(entries) == 1 and len(entries[0].rows) == 1:
-            self._insert(entries)
-            return
         self._db.execute("BEGIN IMMEDIATE")
         try:
-            self._insert(entries)
+            insert(self._db, rows)
             self._db.execute("COMMIT")
         except sqlite3.Error:
             # SQLite itself may have done so.
@@ -73,15 +76,9 @@ class Store:
         """Remove entries of the metadata."""
         self._db.executemany("DELETE FROM meta WHERE key = ?", [(key,) for key in keys])
 
-    def _insert(self, entries: Iterable[JournalEntry]) -> None:
-        for each in entries:
-            marks = ", ".join("?" * (len(each.row) + (each.table != "files")))
-            # A row that comes a second time, from the second file, is the same.
-            statement = f"INSERT OR REPLACE INTO {each.table} VALUES ({marks})"  # noqa: S608 - own names
-            self._db.executemany(statement, each.columns())
-
     def wait_for_others(self, seconds: float) -> None:
         """Wait for other programs from now on, each time for so long at most, s of wall-clock time."""
+        self._wait = seconds
         self._db.execute(f"PRAGMA busy_timeout={round(1e3 * seconds)}")
 
     def reconnect(self) -> None:
@@ -115,13 +112,11 @@ class Store:
                     return f"table {table} has {rows} rows of {count}"
         return ""
 
-    def entries(self) -> list[JournalEntry]:
-        """Return every row, also of a file that has been removed."""
-        return [
-            entry(table, row if table == "files" else row[:-1])
-            for table in TABLES
-            for row in self._db.execute(f"SELECT * FROM {table}").fetchall()  # noqa: S608 - own names
-        ]
+    def rows(self) -> Iterator[Row]:
+        """Yield every row, also of a file that has been removed."""
+        for table in TABLES:
+            for columns in self._db.execute(f"SELECT * FROM {table}"):  # noqa: S608 - own names
+                yield Row(table, columns if table == "files" else columns[:-1])
 
     def close(self) -> None:
         """Close the file, as one that can be read where nothing can be written."""
@@ -130,3 +125,11 @@ class Store:
             self._db.execute("PRAGMA busy_timeout=0")
             self._db.execute("PRAGMA journal_mode=DELETE")
         self._db.close()
+
+
+def insert(db: sqlite3.Connection, rows: Iterable[Row], otherwise: str = "REPLACE") -> None:
+    """Insert rows; one that comes a second time, as from the second file, is the same."""
+    for table, several in groupby(rows, key=lambda row: row.table):
+        stored = list(sealed(table, [row.columns for row in several]))
+        marks = ", ".join("?" * len(stored[0]))
+        db.executemany(f"INSERT OR {otherwise} INTO {table} VALUES ({marks})", stored)  # noqa: S608 - own names

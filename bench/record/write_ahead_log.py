@@ -8,13 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
-from functools import cache
 from pathlib import Path
-
-import numpy as np
-import numpy.typing as npt
-
-Words = npt.NDArray[np.uint32]
 
 _HEADER, _FRAME = 32, 24
 """Lengths of the header of the log and of that of a frame, bytes."""
@@ -22,8 +16,6 @@ _MAGIC = 0x377F0682
 """First word of a log; its lowest bit says whether checksums are of big-endian words."""
 _SUMMED = 24
 """Bytes of the header that its checksum is of; of a frame these are the first 8, and its page."""
-_BLOCK = 256
-"""Frames that are looked at together."""
 
 
 def log_damage(log: Path) -> str:
@@ -42,8 +34,7 @@ def log_damage(log: Path) -> str:
                 return "the header of its write-ahead log is damaged"
             page = int.from_bytes(header[8:12], "big")
             file.seek(_HEADER)
-            order = ">u4" if header[3] & 1 else "<u4"
-            return _damaged_frame(header, iter(lambda: file.read(_BLOCK * (_FRAME + page)), b""), page, order)
+            return _damaged_frame(header, iter(lambda: file.read(_FRAME + page), b""), page, _order_of(header))
     except FileNotFoundError:
         return ""
 
@@ -53,33 +44,29 @@ def _is_header(header: bytes) -> bool:
     page = int.from_bytes(header[8:12], "big")
     if magic & ~1 != _MAGIC or not 512 <= page <= 65536 or page & (page - 1):
         return False
-    words = np.frombuffer(header[:_SUMMED], ">u4" if magic & 1 else "<u4").astype(np.uint32)
-    return _chained((0, 0), words[None, :])[0] == struct.unpack(">II", header[_SUMMED:])
+    return _chained((0, 0), header[:_SUMMED], _order_of(header)) == struct.unpack(">II", header[_SUMMED:])
 
 
-def _damaged_frame(header: bytes, blocks: Iterator[bytes], page: int, order: str) -> str:
+def _order_of(header: bytes) -> str:
+    return ">" if header[3] & 1 else "<"
+
+
+def _damaged_frame(header: bytes, frames: Iterator[bytes], page: int, order: str) -> str:
     """Return which frame does not fit although it belongs to the log."""
     salts = header[16:24]
     before: tuple[int, int] = struct.unpack(">II", header[24:32])
     number, damaged = 0, 0
-    for block in blocks:
-        count, torn = divmod(len(block), _FRAME + page)
-        frames = np.frombuffer(block[: count * (_FRAME + page)], np.uint8).reshape(count, _FRAME + page)
-        sums = []
-        if not damaged and count:
-            summed = np.concatenate([frames[:, :8], frames[:, _FRAME:]], axis=1)
-            sums = _chained(before, summed.copy().view(order).astype(np.uint32))
-        for i in range(count):
-            number += 1
-            head = frames[i, :_FRAME].tobytes()
-            if not damaged and head[8:16] == salts and sums[i] == struct.unpack(">II", head[16:24]):
-                before = sums[i]
+    for frame in frames:
+        number += 1
+        if not damaged and len(frame) == _FRAME + page and frame[8:16] == salts:
+            found = _chained(_chained(before, frame[:8], order), frame[_FRAME:], order)
+            if found == struct.unpack(">II", frame[16:24]):
+                before = found
                 continue
-            damaged = damaged or number
-            if _is_commit(head, salts):
-                return f"frame {damaged} of its write-ahead log is damaged"
-        if torn and _is_commit(block[-torn:], salts):
-            return f"frame {damaged or number + 1} of its write-ahead log is cut off or damaged"
+        damaged = damaged or number
+        if _is_commit(frame, salts):
+            what = "damaged" if len(frame) == _FRAME + page else "cut off or damaged"
+            return f"frame {damaged} of its write-ahead log is {what}"
     return ""
 
 
@@ -88,34 +75,10 @@ def _is_commit(head: bytes, salts: bytes) -> bool:
     return any(head[4:8]) and (head[8:12] == salts[:4] or head[12:16] == salts[4:])
 
 
-def _chained(before: tuple[int, int], words: Words) -> list[tuple[int, int]]:
-    """Return the checksum after each of several frames, words of shape (frames, words), from that before the first.
-
-    The checksum adds up, modulo 2^32, so that all frames are weighted at once.
-    """
-    weights, carried = _weights(words.shape[1])
-    own = words @ weights
-    result = []
+def _chained(before: tuple[int, int], content: bytes, order: str) -> tuple[int, int]:
+    """Return the checksum after some words, from that before them."""
     first, second = before
-    for k in range(len(own)):
-        first, second = (
-            (carried[i][0] * first + carried[i][1] * second + int(own[k, i])) & 0xFFFFFFFF for i in range(2)
-        )
-        result.append((first, second))
-    return result
-
-
-@cache
-def _weights(count: int) -> tuple[Words, tuple[tuple[int, int], tuple[int, int]]]:
-    """Return how each of `count` words counts in the two sums, shape (count, 2), and how the sums before them do."""
-    # For two words a, b: first += a + second; then second += b + first.
-    weights = np.empty((count, 2), dtype=np.uint32)
-    later = ((1, 0), (0, 1))
-    for pair in reversed(range(count // 2)):
-        for i, (of_first, of_second) in enumerate(later):
-            weights[2 * pair, i] = (of_first + of_second) & 0xFFFFFFFF
-            weights[2 * pair + 1, i] = of_second
-        later = tuple(  # type: ignore[assignment]
-            ((a + b) & 0xFFFFFFFF, (a + 2 * b) & 0xFFFFFFFF) for a, b in later
-        )
-    return weights, later
+    for one, other in struct.iter_unpack(f"{order}II", content):
+        first = (first + one + second) & 0xFFFFFFFF
+        second = (second + other + first) & 0xFFFFFFFF
+    return first, second

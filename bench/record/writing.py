@@ -13,20 +13,20 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Self
 
-from bench.base import ConfigurationError, DataError, RecordError, Stopwatch, json_text
+from bench.base import ConfigurationError, DataError, RecordError, json_text
 from bench.devices import Signal, check_signal_names
-from bench.record.background import LONGEST_UNWRITTEN, Background
 from bench.record.ending import Ending
 from bench.record.finding import cause_of, files_of
-from bench.record.keeping import RESERVE_NAME, Keeper
-from bench.record.mirror import NAME as MIRROR_NAME, read_mirror, second_files
+from bench.record.keeping import Keeper
 from bench.record.model_files import add_model
 from bench.record.reading import Record
-from bench.record.rows import FIRST, IDENTITY, SCHEMA, Event, JournalEntry, StepRecord, entry, meta_row, split, ticks
-from bench.record.store import Store
+from bench.record.rows import FIRST, IDENTITY, SCHEMA, Event, Row, StepRecord, meta as meta_rows
+from bench.record.second_file import places, read_second_file, remove
+from bench.record.store import OTHERS, Store, insert
 
-_READERS = 10.0
-"""Wall-clock time for which a journal that is made or opened again waits for its readers, s."""
+_LAST_WORDS = 1.0
+"""Wall-clock time for which a run whose own thread hangs waits for a program that has its journal locked, s: as long
+as it has for its last words in the terminal (`bench.execution.context`)."""
 
 _END = ("status", "reason", "finished", "safe_state", "counts", "lateness")
 """Entries of the metadata that a run has once it has ended."""
@@ -46,8 +46,9 @@ class Journal:
     files : mapping of str to bytes
         Content of the files that the run was given, by name.
     patience : float, optional
-        Longest time that a call waits for the disk, s of wall-clock time; a thread of its own writes then. Without
-        it the caller's writes, which is faster where nothing waits, as on the virtual clock.
+        Longest time that a call waits for the disk, s of wall-clock time; a thread of its own writes then, and rows
+        that are late go into a second file. Without it the caller's writes, which is faster where nothing waits, as
+        on the virtual clock.
     flushed : bool
         Whether each step and event waits until it is on the disk, so that a loss of power takes nothing either.
         Otherwise the disk gets the journal at its end, and the death of the process alone takes nothing.
@@ -77,33 +78,29 @@ class Journal:
         # Nobody has a reason to forge the record of a run that moves nothing, and equal runs have equal records.
         content = json_text(dict(meta)).encode(errors="surrogatepass")
         identity = secrets.token_hex(16) if flushed else hashlib.sha256(content).hexdigest()[:32]
-        heading = {"schema": SCHEMA, IDENTITY: identity, **meta}
-        entries = [entry("meta", meta_row(key, value)) for key, value in heading.items()]
-        entries += [
-            entry("signals", (position, signal.name, signal.unit, signal.description, signal.precision))
+        rows = meta_rows({"schema": SCHEMA, IDENTITY: identity, **meta})
+        rows += [
+            Row("signals", (position, signal.name, signal.unit, signal.description, signal.precision))
             for position, signal in enumerate(signals)
         ]
-        entries += [
-            entry("files", (name, hashlib.sha256(content).hexdigest(), content)) for name, content in files.items()
+        rows += [
+            Row("files", (name, hashlib.sha256(content).hexdigest(), content)) for name, content in files.items()
         ]
-        for former in second_files(path):
+        for former in places(path):
             # What another user has put there stays, and is not believed.
-            with suppress(OSError):
-                former.unlink(missing_ok=True)
+            remove(former)
         with ExitStack() as made:
             made.callback(_remove, path)
             try:
-                store = Store(path, _READERS, flushed=flushed)
+                store = Store(path, OTHERS, flushed=flushed)
                 made.callback(store.close)
-                store.create(names, entries)
+                store.create(names, rows)
                 store.wait_for_others(0.0)
-                keeper = Keeper(store, identity)
-                made.callback(keeper.close, is_whole=True)
-                keeper.begin(entries)
             except (sqlite3.Error, OSError) as error:
                 raise ConfigurationError(f"{path} cannot be made: {cause_of(error)}") from None
             made.pop_all()
-        self._begin(keeper, signals, dict.fromkeys(FIRST, 0), patience)
+        keeper = Keeper(store, identity, patience)
+        self._begin(keeper, signals, dict.fromkeys(FIRST, 0))
 
     @classmethod
     def reopen(
@@ -132,22 +129,20 @@ class Journal:
         file, signals, counts, lost = take_in(path)
         with Record(file) as record:
             identity = record.identity
-        journal = cls.__new__(cls)
-        was_mirrored = (file.parent / MIRROR_NAME).exists()
-        keeper: Keeper | None = None
         try:
             # A reader may have it for a moment.
-            keeper = Keeper(Store(file, _READERS), identity)
-            keeper.store.forget(_END)
-            keeper.store.wait_for_others(0.0)
-            if not was_mirrored:
-                keeper.begin(keeper.store.entries())
+            with ExitStack() as made:
+                store = Store(file, OTHERS)
+                made.callback(store.close)
+                store.forget(_END)
+                store.wait_for_others(0.0)
+                made.pop_all()
         except (sqlite3.Error, OSError) as error:
-            if keeper is not None:
-                keeper.close(is_whole=False)
             raise DataError(f"{file} cannot be written on: {cause_of(error)}") from None
-        keeper.keep([entry("meta", meta_row(key, value)) for key, value in meta.items()])
-        journal._begin(keeper, signals, counts, patience, lost)
+        keeper = Keeper(store, identity, patience)
+        keeper.keep(meta_rows(meta))
+        journal = cls.__new__(cls)
+        journal._begin(keeper, signals, counts, lost)
         return journal
 
     def _begin(
@@ -155,7 +150,6 @@ class Journal:
         keeper: Keeper,
         signals: Sequence[Signal],
         counts: dict[str, int],
-        patience: float | None,
         lost: Mapping[str, int] = MappingProxyType({}),
     ) -> None:
         """Start with rows that are there already: by table those up to the last one, and of these the lost ones."""
@@ -166,15 +160,10 @@ class Journal:
         self._keeper = keeper
         self._counts = counts
         self._lost = lost
-        self._waiting: list[tuple[float, ...]] = []
-        self._since_write = Stopwatch()
-        self._background = None if patience is None else Background(keeper, patience)
-        self._is_whole = True
-        self._failure: Exception | None = None
 
     @property
     def path(self) -> Path:
-        """The journal; another one once the first was removed."""
+        """The journal."""
         return self._keeper.store.path
 
     @property
@@ -194,11 +183,7 @@ class Journal:
         the next tick, step or event.
         """
         self._counts["telemetry"] = tick = self._counts["telemetry"] + 1
-        self._waiting.append((tick, t, step, *map(float, values)))
-        if self._background is not None:
-            self._background.keep_soon(self._take_ticks())
-        elif self._since_write.seconds() >= LONGEST_UNWRITTEN:
-            self._write(())
+        self._keeper.keep([Row("telemetry", (tick, t, step, *map(float, values)))], soon=True)
 
     def step(self, record: StepRecord) -> None:
         """Record a finished step."""
@@ -214,11 +199,12 @@ class Journal:
             *map(float, record.values),
             json.dumps(record.seen),
         )
-        self._write([entry("steps", row)])
+        self._write(Row("steps", row))
 
     def event(self, event: Event) -> None:
         """Record something that happened."""
-        self._write([entry("events", (self._number("events"), event.t, event.level, event.kind, event.text))])
+        self._counts["events"] = number = self._counts["events"] + 1
+        self._write(Row("events", (number, event.t, event.level, event.kind, event.text)))
 
     def keep_model(self, name: str, t: float, content: Mapping[str, Any]) -> None:
         """Keep a model beside the journal; see `add_model`."""
@@ -230,11 +216,6 @@ class Journal:
         while self._keeper.notices:
             taken.append(self._keeper.notices.pop(0))
         return taken
-
-    def make_room(self) -> None:
-        """Give back the space that is kept for the end of a run on a full disk."""
-        self._stop_background()
-        self._keeper.make_room()
 
     def finish(
         self,
@@ -249,11 +230,8 @@ class Journal:
 
         Raises RecordError if rows are missing or damaged; the status is `failed` then at best.
         """
-        self._stop_background()
-        if self._waiting:
-            self._write(())
         there = {table: count - self._lost.get(table, 0) for table, count in self._counts.items()}
-        problem = self._keeper.end(there) or (str(self._failure) if self._failure else "")
+        problem = self._keeper.end(there)
         lost = ", ".join(f"{count} of {table}" for table, count in self._lost.items())
         if lost:
             lost = f"rows that were lost before the run was resumed: {lost}"
@@ -268,57 +246,25 @@ class Journal:
             "counts": self._counts,
             **({"lateness": dict(lateness)} if lateness else {}),
         }
-        self._keeper.keep([entry("meta", meta_row(key, value)) for key, value in end.items()])
-        problem = problem or self._keeper.why
+        self._keeper.keep(meta_rows(end))
+        problem = self._keeper.why or problem
         if problem:
-            self._is_whole = False
             raise RecordError(
-                f"{self.path} is not whole: {problem}; every row is in {self._keeper.second_file}; "
-                f"`bench recover-journal {self.path}` puts them together"
+                f"{self.path} is not whole: {problem}; `bench recover-journal {self.path}` says what there is"
             )
         if lost:
             raise RecordError(f"{self.path} lacks {lost}")
 
     def close(self) -> None:
         """Close the files; what was recorded stays."""
-        with suppress(RecordError, sqlite3.Error):
-            self._stop_background()
-            if self._waiting:
-                self._write(())
-        # Otherwise its disk does not answer.
-        if self._background is None:
-            self._keeper.close(is_whole=self._is_whole)
+        self._keeper.close()
 
-    def _number(self, table: str) -> int:
-        """Return the number of the next row of a table."""
-        number = FIRST[table] + self._counts[table]
-        self._counts[table] += 1
-        return number
-
-    def _take_ticks(self) -> list[JournalEntry]:
-        """Return the ticks that wait, which wait no longer."""
-        waiting, self._waiting = self._waiting, []
-        return [ticks(waiting)] if waiting else []
-
-    def _write(self, entries: Sequence[JournalEntry]) -> None:
-        """Make rows durable, and before them the ticks that wait."""
-        entries = [*self._take_ticks(), *entries]
-        if self._background is not None:
-            self._background.keep(entries)
-        else:
-            self._keeper.keep(entries)
-        self._since_write = Stopwatch()
+    def _write(self, row: Row) -> None:
+        """Make a row durable, and before it the ticks that wait."""
+        self._keeper.keep([row])
         if self._keeper.is_short and not self._is_told:
             self._is_told = True
             self.when_short()
-
-    def _stop_background(self) -> None:
-        """Write in the caller's thread from now on."""
-        if self._background is not None:
-            if not self._background.stop():
-                raise RecordError(f"{self.path}: its disk does not answer")
-            self._failure = self._background.failure
-            self._background = None
 
 
 def take_in(path: Path) -> tuple[Path, tuple[Signal, ...], dict[str, int], dict[str, int]]:
@@ -341,59 +287,53 @@ def take_in(path: Path) -> tuple[Path, tuple[Signal, ...], dict[str, int], dict[
         As `Journal.reopen`. DataError also if steps or events are lost, as a run is resumed by all of them.
     """
     with Record(path) as record:
-        file, signals = record.path, record.signals
-        if record.status == "completed":
-            raise ConfigurationError(f"{file} is the record of a run that was completed")
-        # Each row is checked, also where only its number is needed.
-        record.steps(), record.telemetry(), record.events()
+        file, identity = record.path, record.identity
+        _check_can_be_written_on(record)
+    seconds = [each for each in places(file) if any(read_second_file(each, identity))]
+    if seconds:
+        try:
+            with closing(Store(file, OTHERS)) as store:
+                for second in seconds:
+                    store.write([row for row in read_second_file(second, identity) if row.table in ("meta", *FIRST)])
+        except (sqlite3.Error, OSError) as error:
+            raise DataError(f"{file} cannot be written on: {cause_of(error)}") from None
+        for second in seconds:
+            remove(second)
+    with Record(file) as record:
+        _check_can_be_written_on(record)
         numbers = {table: record.numbers(table) for table in FIRST}
-        identity = record.identity
-        lost: dict[str, int] = dict(record.meta.get("recovered", {}).get("lost", {}))
-        has_ended = "status" in record.meta
-    beside = {
-        (each.table, each.row[0]): each
-        for second in second_files(file)
-        for each in split(read_mirror(second, identity))
-        if each.table not in FIRST or each.row[0] not in numbers[each.table]
-    }
-    if not has_ended and ("meta", "status") in beside:
-        raise ConfigurationError(
-            f"{file} is the record of a run that has ended, of which rows wait in a second file; "
-            f"`bench recover-journal {file}` puts them together"
-        )
-    missing = [each for (table, _), each in beside.items() if table in FIRST]
-    for each in missing:
-        numbers[each.table].add(int(each.row[0]))
+        known: dict[str, int] = dict(record.meta.get("recovered", {}).get("lost", {}))
+        signals = record.signals
     # A number is never given twice, also where rows before it are lost.
     counts = {table: max(found, default=FIRST[table] - 1) + 1 - FIRST[table] for table, found in numbers.items()}
-    lost = {**lost, **{table: counts[table] - len(found) for table, found in numbers.items()}}
+    lost = {**known, **{table: counts[table] - len(found) for table, found in numbers.items()}}
     for table in ("steps", "events"):
         if lost[table]:
             raise DataError(
                 f"{file} lacks {lost[table]} of its {table}, which are lost, and a run is resumed by all of them; "
                 "start the run anew"
             )
-    if missing:
-        try:
-            with closing(Store(file, _READERS)) as store:
-                store.write(missing)
-        except (sqlite3.Error, OSError) as error:
-            raise DataError(f"{file} cannot be written on: {cause_of(error)}") from None
     return file, signals, counts, {table: count for table, count in lost.items() if count}
+
+
+def _check_can_be_written_on(record: Record) -> None:
+    """Raise an error if the run was completed, or a row is damaged, also where only its number is needed."""
+    if record.status == "completed":
+        raise ConfigurationError(f"{record.path} is the record of a run that was completed")
+    record.steps(), record.telemetry(), record.events()
 
 
 def _remove(journal: Path) -> None:
     """Remove the files of a journal that could not be made."""
     with suppress(OSError):
-        for path in (*files_of(journal), *second_files(journal)):
+        for path in files_of(journal):
             path.unlink(missing_ok=True)
 
 
 def abandon(path: Path, ending: Ending) -> None:
-    """Record the end of a run whose own thread hangs, if its file can be written within a second."""
-    with suppress(OSError):
-        (path.parent / RESERVE_NAME).unlink(missing_ok=True)
-    with suppress(sqlite3.Error), closing(sqlite3.connect(path, timeout=1.0)) as db, db:
-        for key, value in asdict(ending).items():
-            rows = entry("meta", meta_row(key, value)).columns()
-            db.executemany("INSERT OR IGNORE INTO meta VALUES (?, ?, ?)", rows)
+    """Record the end of a run whose own thread hangs, if its file can be written within a second.
+
+    What stands there already stays.
+    """
+    with suppress(sqlite3.Error), closing(sqlite3.connect(path, timeout=_LAST_WORDS)) as db, db:
+        insert(db, meta_rows(asdict(ending)), otherwise="IGNORE")

@@ -5,7 +5,6 @@ import os
 import shutil
 import signal
 import socket
-import stat
 import sys
 import tempfile
 import traceback
@@ -16,8 +15,8 @@ import pytest
 from bench.base import BenchError
 from bench.devices import Signal
 from bench.record import FILE_NAME, Event, Journal, Record, recover
-from bench.record.mirror import Mirror, elsewhere, read_mirror
-from bench.record.rows import entry
+from bench.record.rows import Row
+from bench.record.second_file import SecondFile, places, read_second_file
 from bench.rig import Holder, Locks
 
 pytestmark = pytest.mark.skipif(
@@ -147,78 +146,62 @@ def test_what_is_planted_for_a_lock_is_neither_followed_nor_believed(shared, kin
 @pytest.mark.parametrize("kind", PLANTED)
 def test_what_is_planted_for_a_second_file_is_neither_followed_nor_believed(shared, kind):
     journal = own(shared) / "run" / FILE_NAME
-    places = [str(path) for path in elsewhere(journal)]
+    _, place = places(journal)
     forged = own(shared, THEM) / "rows"
-
-    def forge():
-        with_rows = Mirror(forged, "0123")
-        with_rows.append([entry("events", (number, 0.0, "INFO", "note", "forged")) for number in range(1, 9)])
-        with_rows.close()
-        for place in places:
-            Path(place).unlink(missing_ok=True)
-            Path(place).with_name("second").unlink(missing_ok=True)
-            plant(kind, Path(place), forged.read_bytes(), own(shared) / "file")
 
     def record():
         journal.parent.mkdir()
         made = Journal(journal, SIGNALS, {})
         made.event(Event(0.0, "INFO", "note", "ours"))
-        problems = []
-        for place in places:
-            try:
-                Mirror(Path(place), "0123").append([entry("events", (2, 0.0, "INFO", "note", "ours"))])
-            except OSError as error:
-                problems.append(str(error))
         with Record(journal) as record:
-            remark = record.remark()
-        added = recover(journal).tables["events"].added
-        made.close()
-        return {
-            "remark": remark,
-            "added": added,
-            "problems": problems,
-            "read": [len(list(read_mirror(Path(p)))) for p in places],
-        }
+            return record.identity
 
+    def forge():
+        with_rows = SecondFile(forged, identity)
+        with_rows.append([Row("events", (number, 0.0, "INFO", "note", "forged")) for number in range(1, 9)])
+        with_rows.close()
+        plant(kind, place, forged.read_bytes(), own(shared) / "file")
+
+    def read():
+        problem = ""
+        try:
+            SecondFile(place, identity)
+        except OSError as error:
+            problem = str(error)
+        with Record(journal) as record:
+            remark, count = record.remark(), len(record.events())
+        return [problem, remark, count, recover(journal).tables["events"].added, len(list(read_second_file(place)))]
+
+    identity = as_user(US, record)["value"]
     as_user(THEM, forge)
-    said = as_user(US, record)["value"]
-    assert (said["remark"], said["added"], said["read"]) == ("", 0, [0, 0])
-    assert len(said["problems"]) == 2
-    assert "ours" not in forged.read_text(errors="replace")
+    problem, *said = as_user(US, read)["value"]
+    assert said == ["", 1, 0, 0]
+    assert str(place) in problem
     assert untouched(shared)
 
 
-def test_second_files_and_rescued_folders_are_not_read(shared):
+def test_second_files_are_not_read_by_others(shared):
     journal = own(shared) / "run" / FILE_NAME
 
     def record():
         journal.parent.mkdir()
         made = Journal(journal, SIGNALS, {})
-        for place in elsewhere(journal):
-            file = Mirror(place, "0123")
-            file.append([entry("events", (1, 0.0, "INFO", "note", "ours"))])
-            file.close()
-        journal.rename(journal.with_name("other"))
+        shutil.rmtree(journal.parent)
         try:
             made.event(Event(0.0, "INFO", "note", "ours"))
         except BenchError:
             made.close()
         return [str(path) for path in shared.iterdir()]
 
-    def read(paths):
-        readable = []
-        for path in map(Path, paths):
-            try:
-                path.read_bytes() if path.is_file() else list(path.iterdir())
-            except PermissionError:
-                continue
-            readable.append(str(path))
-        return readable
+    def read(path):
+        try:
+            return Path(path).read_text()
+        except PermissionError:
+            return "refused"
 
-    left = as_user(US, record)["value"]
-    kinds = {(stat.S_IFMT(Path(path).stat().st_mode), stat.S_IMODE(Path(path).stat().st_mode)) for path in left}
-    assert kinds == {(stat.S_IFREG, 0o600), (stat.S_IFDIR, 0o700)}
-    assert as_user(THEM, read, left)["value"] == []
+    (left,) = as_user(US, record)["value"]
+    assert "ours" in Path(left).read_text()
+    assert as_user(THEM, read, left)["value"] == "refused"
 
 
 def test_a_lock_of_ours_is_honoured_and_not_removed_by_others(shared):

@@ -35,7 +35,6 @@ from bench.models import (
 )
 from bench.protocol import TRACES, Settled
 from bench.record import FILE_NAME, Event, Journal, Lateness, Record, StepRecord, add_model
-from bench.record.rows import JournalEntry
 from bench.rig import DashboardLayout, XYPlot
 
 
@@ -262,10 +261,8 @@ def keep_journal(
 ) -> Path:
     meta = {**META, "run": folder.name, "controls": controls, "dashboard": dashboard or to_table(LAYOUT)}
     folder.mkdir()
-    journal = Journal(folder / FILE_NAME, signals, meta)
-    # One transaction for all: the file need not outlive a power cut here.
-    rows: list[JournalEntry] = []
-    journal._keeper.keep, keep = rows.extend, journal._keeper.keep  # type: ignore[method-assign]
+    # The file need not outlive a power cut here.
+    journal = Journal(folder / FILE_NAME, signals, meta, flushed=False)
     for entry in entries:
         if isinstance(entry, StepRecord):
             journal.step(entry)
@@ -273,8 +270,6 @@ def keep_journal(
             journal.event(entry)
         else:
             journal.telemetry(*entry)
-    journal._keeper.keep = keep  # type: ignore[method-assign]
-    keep(rows)
     journal.finish(status="completed", reason="", finished=1e4, safe_state={"tec": "safe"})
     journal.close()
     if models is None:

@@ -285,10 +285,11 @@ class TestTelemetryThatWaits:
 
     def record_until_some_wait(self, journal):
         """Record ticks, the force of each its number; return how many there are, some of them not yet written."""
-        for tick in range(1000):
-            journal.telemetry(0.1 * tick, 0, (1.0, float(tick)))
-            if journal._waiting:
-                return tick + 1
+        with Record(journal.path) as run:
+            for tick in range(1000):
+                journal.telemetry(0.1 * tick, 0, (1.0, float(tick)))
+                if run.count("telemetry") < tick + 1:
+                    return tick + 1
         raise AssertionError("no tick ever waited")
 
     @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The parts of a journal by themselves: second file, keeper, thread, SQLite file, and reading damaged ones."""
+"""The parts of a journal by themselves: second file, reading damaged rows, writing on, recovering."""
 
 import json
 import math
@@ -6,21 +6,18 @@ import os
 import sqlite3
 import sys
 import tempfile
-import threading
-from collections import namedtuple
+import warnings
 from contextlib import closing
 
 import numpy as np
 import pytest
 
-from bench.base import ConfigurationError, DataError, IncompleteRecordWarning, RecordError
+from bench.base import ConfigurationError, DataError, IncompleteRecordWarning
 from bench.devices import Settled, Signal
 from bench.record import (
     BLACK_BOX_NAME,
     FILE_NAME,
-    NAME as MIRROR_NAME,
-    RECOVERED_NAME,
-    SCHEMA,
+    NAME as SECOND_NAME,
     Ending,
     Event,
     Journal,
@@ -28,16 +25,12 @@ from bench.record import (
     StepRecord,
     abandon,
     add_model,
-    background,
-    keeping,
     opening,
     recover,
     take_in,
 )
-from bench.record.background import Background
-from bench.record.keeping import RESERVE_NAME, Keeper
-from bench.record.mirror import Mirror, elsewhere, read_mirror
-from bench.record.rows import TABLES, checksum, checksums, entry, meta_row, split, ticks
+from bench.record.rows import TABLES, Row, checksum, checksums, meta
+from bench.record.second_file import SecondFile, places, read_second_file
 from bench.record.store import Store
 
 SIGNALS = (Signal("force", "N", "force"),)
@@ -51,461 +44,111 @@ def other_disk(tmp_path_factory, monkeypatch):
     return folder
 
 
-@pytest.fixture
-def synced(monkeypatch):
-    """The files that were made durable, by their names, in order."""
-    files, sync = [], Mirror.sync
-    monkeypatch.setattr(Mirror, "sync", lambda self: files.append(self.path.name) or sync(self))
-    return files
-
-
 def step(number, started=None):
     first = float(number if started is None else started)
     return StepRecord(number, first, first + 0.5, "", "", Settled.DWELL, {"tec": 20.0}, (float(number),))
 
 
 def note(number):
-    return entry("events", (number, float(number), "INFO", "note", f"event {number}"))
+    return Row("events", (number, float(number), "INFO", "note", f"event {number}"))
 
 
-def new_store(tmp_path):
+def step_row(number):
+    return Row("steps", (number, 50.0, 50.5, "", "", "dwell", "{}", 1.0, "[]"))
+
+
+def unfinished(tmp_path, *waiting):
+    """Write two steps of a run that did not end, and rows that wait in its second file."""
     store = Store(tmp_path / FILE_NAME)
-    head = [entry("meta", meta_row("schema", SCHEMA)), entry("signals", (0, "force", "N", "force", 3))]
-    store.create(["force"], head)
-    return store, head
-
-
-@pytest.fixture
-def keeper(tmp_path):
-    store, head = new_store(tmp_path)
-    keeper = Keeper(store)
-    keeper.begin(head)
-    yield keeper
-    keeper.close(is_whole=True)
-
-
-def stored(keeper_or_store):
-    store = getattr(keeper_or_store, "store", keeper_or_store)
-    return [each.row[0] for each in store.entries() if each.table == "events"]
-
-
-def refuse(monkeypatch, store, problem="database is locked"):
-    """Have a store refuse every row; return how to let it take them again."""
-
-    def write(_entries):
-        raise sqlite3.OperationalError(problem)
-
-    monkeypatch.setattr(store, "write", write)
-    return lambda: monkeypatch.undo()
-
-
-class At:
-    """A stopwatch that has run for so long."""
-
-    def __init__(self, seconds):
-        self.seconds = lambda: seconds
-
-
-class TestMirror:
-    def test_half_of_an_entry_is_taken_off_again(self, tmp_path):
-        file = Mirror(tmp_path / MIRROR_NAME)
-        file.append([note(1)])
-        real = file._file
-
-        class Full:
-            def __getattr__(self, name):
-                return getattr(real, name)
-
-            def write(self, data):
-                return real.write(data[: len(data) // 2])
-
-        file._file = Full()
-        with pytest.raises(OSError, match="takes no more"):
-            file.append([note(2)])
-        file._file = real
-        file.append([note(3)])
-        assert [each.row[0] for each in file.entries()] == [1, 3]
-        file.append([note(4)])
-        assert [each.row[0] for each in read_mirror(file.path)] == [1, 3, 4]
+    store.create(["force"], [*meta({"schema": 3, "identity": "one"}), Row("signals", (0, "force", "N", "force", 3))])
+    store.write([step_row(0), step_row(1)])
+    store.close()
+    if waiting:
+        file = SecondFile(tmp_path / SECOND_NAME, "one")
+        file.append(waiting)
         file.close()
 
-    def test_what_is_there_stays(self, tmp_path):
-        for number in (1, 2):
-            file = Mirror(tmp_path / MIRROR_NAME)
+
+class TestSecondFile:
+    def write(self, path, *numbers, identity="one"):
+        file = SecondFile(path, identity)
+        for number in numbers:
             file.append([note(number)])
-            file.close()
-        assert [each.row[0] for each in read_mirror(tmp_path / MIRROR_NAME)] == [1, 2]
-
-    @pytest.mark.parametrize("spoilt", ["head", "payload", "end"])
-    def test_a_damaged_entry_is_left_out(self, tmp_path, spoilt):
-        path = tmp_path / MIRROR_NAME
-        file = Mirror(path)
-        file.append([note(1)])
-        first = path.stat().st_size
-        file.append([note(2), ticks([(1, 0.5, 0, 2.0), (2, 1.5, 0, 3.0)])])
         file.close()
-        data = bytearray(path.read_bytes())
-        place = {"head": 4, "payload": first - 3, "end": len(data) - 3}[spoilt]
-        data[place] ^= 0x41
-        path.write_bytes(data)
-        found = [(each.table, each.row[0]) for each in split(read_mirror(path))]
-        rest = [("telemetry", 1), ("telemetry", 2)]
-        assert found == ([("events", 1), ("events", 2)] if spoilt == "end" else [("events", 2), *rest])
+        return path
+
+    def events(self, path, identity="one"):
+        return [row.columns[0] for row in read_second_file(path, identity) if row.table == "events"]
+
+    def test_a_damaged_line_is_left_out(self, tmp_path):
+        path = self.write(tmp_path / SECOND_NAME, 1, 2, 3)
+        data = path.read_bytes()
+        for place in range(data.index(b"event 2") - 40, data.index(b"event 2") + 5):
+            path.write_bytes(data[:place] + bytes([data[place] ^ 0x41]) + data[place + 1 :])
+            assert {1, 3} >= {*self.events(path)} >= {3}
 
     def test_one_that_is_cut_off(self, tmp_path):
-        path = tmp_path / MIRROR_NAME
-        file = Mirror(path)
-        file.append([note(1), note(2)])
-        file.close()
+        path = self.write(tmp_path / SECOND_NAME, 1, 2)
         data = path.read_bytes()
-        for length in range(len(data) // 2, len(data)):
+        for length in range(len(data) * 2 // 3 + 9, len(data) - 1):
             path.write_bytes(data[:length])
-            assert [each.row[0] for each in read_mirror(path)] == [1]
-
-    def test_where_others_are(self, tmp_path, other_disk):
-        first, late = elsewhere(tmp_path / FILE_NAME)
-        assert (first.parent, first.suffix, late.suffix) == (other_disk, ".mirror", ".late")
-        assert len(first.stem) == len("bench-") + 24
-        assert elsewhere(tmp_path / "other.sqlite")[0] != first
+            assert self.events(path) == [1]
 
     def test_every_row_comes_back_as_it_was_kept(self, tmp_path):
-        rows = {
-            "meta": ("run", '"µ"'),
-            "signals": (0, "force", "N", "a load cell", 3),
-            "steps": (0, 0.0, 0.5, "up", "", "dwell", '{"tec": 1.5}', 1.0, None, "[0.25]"),
-            "telemetry": (1, 0.25, 0, 1.5, None),
-            "events": (1, 0.5, "INFO", "note", "text with = and four"),
-            "files": ("a.bin", "digest", bytes(range(256))),
-        }
-        assert rows.keys() == set(TABLES)
-        file = Mirror(tmp_path / "rows.mirror")
-        file.append([entry(table, row) for table, row in rows.items()])
+        rows = [
+            Row("meta", ("run", '"µ"')),
+            Row("signals", (0, "force", "N", "a load cell", 3)),
+            Row("steps", (0, 0.0, 0.5, "up", "", "dwell", '{"tec": 1.5}', 1e-300, -math.inf, "[0.25]")),
+            Row("telemetry", (1, 0.1 + 0.2, 0, np.float64(1.5), math.nan)),
+            Row("events", (1, 0.5, "INFO", "note", "a\nnew line")),
+            Row("files", ("a.bin", "digest", bytes(range(256)))),
+        ]
+        assert [row.table for row in rows] == [*TABLES]
+        file = SecondFile(tmp_path / SECOND_NAME, "one")
+        file.append(rows)
         file.close()
-        read = {each.table: each.row for each in read_mirror(file.path)}
-        for table, row in rows.items():
-            # A missing number is nan in the file.
-            np.testing.assert_equal(read[table], tuple(math.nan if value is None else value for value in row))
+        for row, read in zip(rows, [*read_second_file(file.path, "one")][1:], strict=True):
+            np.testing.assert_equal(read, row)
 
-    @pytest.mark.parametrize("count", [1, 3, 4, 20])
-    def test_ticks_are_kept_alike_one_by_one_and_together(self, count):
-        rows = [(i, 0.1 * i, 0, -0.0, math.nan, math.inf) for i in range(count)]
-        together = ticks(rows).payload
-        assert together == b"".join(ticks([row]).payload for row in rows)
-        # Neither the sign of a zero nor that of a nan is kept.
-        assert together == ticks([(*row[:3], 0.0, -math.nan, math.inf) for row in rows]).payload
-
-    def test_rows_of_another_journal_are_left_out(self, tmp_path):
-        path = tmp_path / "rows.mirror"
-        for identity, number in (("", 1), ("one", 2), ("other", 3), ("one", 4)):
-            file = Mirror(path, identity)
-            file.append([note(number)])
-            file.append([note(number + 10)])
-            file.close()
-        for identity, numbers in (("one", [2, 12, 4, 14]), ("other", [3, 13]), ("", [1, 11]), ("none of them", [])):
-            assert [each.row[0] for each in read_mirror(path, identity) if each.table == "events"] == numbers
+    def test_one_of_another_journal_is_left_out(self, tmp_path):
+        path = self.write(tmp_path / SECOND_NAME, 1, 2)
+        assert self.events(path, "other") == self.events(path, "") == []
+        with pytest.raises(FileExistsError):
+            SecondFile(path, "other")
+        data = path.read_bytes()
+        path.write_bytes(data[data.index(b"\n") + 1 :])
+        assert self.events(path) == self.events(path, None) == []
 
     @pytest.mark.skipif(sys.platform == "win32", reason="needs links and users of POSIX")
     @pytest.mark.parametrize("forged", ["link", "second name", "of another user"])
-    def test_elsewhere_nothing_of_another_user_is_followed_or_believed(self, tmp_path, monkeypatch, forged):
-        path, _ = elsewhere(tmp_path / FILE_NAME)
-        file = Mirror(path)
-        file.append([note(1)])
-        file.close()
-        assert path.stat().st_mode & 0o077 == 0
-        assert [each.row[0] for each in read_mirror(path)] == [1]
+    @pytest.mark.parametrize("where", [0, 1])
+    def test_nothing_of_another_user_is_followed_or_believed(self, tmp_path, forged, where):
+        journal = Journal(tmp_path / FILE_NAME, SIGNALS, {})
+        with Record(tmp_path) as record:
+            identity = record.identity
+        path = self.write(places(tmp_path / FILE_NAME)[where], 1, identity=identity)
+        assert path.stat().st_mode & 0o777 == 0o600
         theirs = tmp_path / "theirs"
-        if forged == "of another user" and os.geteuid() == 0:
+        if forged == "of another user":
+            if os.geteuid() != 0:
+                pytest.skip("needs root, who can give files away")
             os.chown(path, 65534, -1)
-        elif forged == "of another user":
-            monkeypatch.setattr(os, "geteuid", lambda: 65533)
         elif forged == "link":
             path.rename(theirs)
             path.symlink_to(theirs)
         else:
             theirs.hardlink_to(path)
-        assert list(read_mirror(path)) == []
         content = path.read_bytes()
-        with pytest.raises(OSError, match=r"link|not a file of this user"):
-            Mirror(path)
+        assert self.events(path, identity) == []
+        # In the folder of the run it is said; elsewhere anybody could have it said.
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            with Record(tmp_path) as record:
+                assert ("is not read" in record.missing.damage) is (where == 0) is bool(said)
+        with pytest.raises(FileExistsError):
+            SecondFile(path, identity)
         assert path.read_bytes() == content
-
-
-class TestKeeper:
-    def test_rows_that_wait_are_durable_in_the_second_file_and_are_written_first(self, keeper, monkeypatch, synced):
-        again = refuse(monkeypatch, keeper.store)
-        keeper._tried = At(1.0)
-        keeper.keep([note(1)])
-        assert synced == [MIRROR_NAME]
-        assert keeper.why == "database is locked"
-        assert keeper.notices == ["the journal cannot be written (database is locked); rows wait in a second file"]
-        keeper.keep([note(2)])  # so soon it is not tried again
-        assert [each.row[0] for each in read_mirror(keeper.second_file) if each.table == "events"] == [1, 2]
-        again()
-        keeper._tried = At(0.49)
-        keeper.keep([note(3)])
-        assert stored(keeper) == []
-        keeper._tried = At(0.5)
-        keeper.keep([note(4)])
-        assert stored(keeper) == [1, 2, 3, 4]
-        assert keeper.why == ""
-        assert keeper.notices[1:] == ["the journal can be written again; 3 rows were waiting"]
-
-    @pytest.mark.parametrize(("problem", "reconnects"), [("database is locked", 0), ("disk I/O error", 1)])
-    def test_a_file_is_opened_anew_after_a_failure_of_the_disk(self, keeper, monkeypatch, problem, reconnects):
-        again, opened = refuse(monkeypatch, keeper.store, problem), []
-        keeper.keep([note(1)])
-        again()
-        monkeypatch.setattr(keeper.store, "reconnect", lambda: opened.append(1))
-        keeper._tried = At(1.0)
-        keeper.keep([note(2)])
-        assert len(opened) == reconnects
-        assert stored(keeper) == [1, 2]
-
-    def test_what_is_no_fault_of_the_disk_is_raised(self, keeper, monkeypatch):
-        def write(_entries):
-            raise sqlite3.IntegrityError("wrong")
-
-        monkeypatch.setattr(keeper.store, "write", write)
-        with pytest.raises(sqlite3.IntegrityError):
-            keeper.keep([note(1)])
-
-    def test_a_second_file_that_takes_nothing_has_one_elsewhere(self, keeper, monkeypatch, synced, other_disk):
-        refuse(monkeypatch, keeper.store)
-
-        def full(_entries):
-            raise OSError(28, "No space left on device")
-
-        keeper._mirror.append = full
-        for number in (1, 2):
-            keeper.keep([note(number)])
-        (path,) = other_disk.iterdir()
-        assert keeper.second_file == path
-        assert [each.row[0] for each in read_mirror(path)] == [1, 2]
-        assert synced == [path.name] * 2
-        assert f"rows wait in {path}" in keeper.notices[-1]
-        assert not keeper._is_whole
-
-    def test_a_second_file_that_cannot_be_made_durable_has_one_elsewhere(self, keeper, monkeypatch, other_disk):
-        again = refuse(monkeypatch, keeper.store)
-        keeper._tried = At(1.0)
-        broken = keeper._mirror
-
-        def sync(self, original=Mirror.sync):
-            if self is broken:
-                raise OSError(5, "Input/output error")
-            original(self)
-
-        monkeypatch.setattr(Mirror, "sync", sync)
-        keeper.keep([note(1)])
-        (path,) = other_disk.iterdir()
-        assert [each.row[0] for each in read_mirror(path)] == [1]
-        assert not keeper._is_whole
-        again()
-
-    def test_rows_that_are_nowhere_end_the_run(self, keeper, monkeypatch):
-        refuse(monkeypatch, keeper.store, "disk I/O error")
-
-        def full(*_):
-            raise OSError(28, "No space left on device")
-
-        monkeypatch.setattr(Mirror, "append", full)
-        with pytest.raises(RecordError, match=r"cannot be written: disk I/O .*; its second file neither: .*No space"):
-            keeper.keep([note(1)])
-        monkeypatch.undo()
-
-    def test_what_waits_is_tried_again_while_nothing_happens(self, keeper, monkeypatch):
-        again = refuse(monkeypatch, keeper.store)
-        keeper.keep([note(1)])
-        again()
-        for seconds, found in ((0.49, []), (0.5, [1])):
-            keeper._tried = At(seconds)
-            keeper.fold_in()
-            assert stored(keeper) == found
-
-    def test_the_log_is_folded_in_now_and_then(self, keeper, monkeypatch):
-        folded = []
-        monkeypatch.setattr(keeper.store, "fold_in", lambda: folded.append(1))
-        for seconds, anyway, count in ((29.9, False, 0), (30.0, False, 1), (1.0, True, 2)):
-            keeper._folded = At(seconds)
-            keeper.fold_in(anyway=anyway)
-            assert len(folded) == count
-        keeper.fold_in()
-        assert len(folded) == 2
-
-    @pytest.mark.parametrize(
-        ("total", "free", "is_short"),
-        [
-            (1 << 40, 64 << 20, False),
-            (1 << 40, (64 << 20) - 1, True),
-            (100 << 20, 5 << 20, False),
-            (100 << 20, 5e6, True),
-        ],
-    )
-    def test_a_disk_that_is_nearly_full(self, keeper, monkeypatch, total, free, is_short):
-        usage = namedtuple("usage", "total used free")
-        monkeypatch.setattr(keeping.shutil, "disk_usage", lambda _: usage(total, 0, int(free)))
-        keeper._looked = At(0.99)
-        keeper.keep([note(1)])
-        assert not keeper.is_short
-        for number in (2, 3):
-            keeper._looked = At(1.0)
-            keeper.keep([note(number)])
-            assert keeper.is_short is is_short
-        told = [each for each in keeper.notices if "nearly full" in each]
-        assert told == [f"the disk is nearly full ({int(free) >> 20} MB free): recordings stop"] * is_short
-
-    def test_space_is_kept_and_given_back(self, keeper):
-        reserve = keeper.store.path.parent / RESERVE_NAME
-        assert reserve.stat().st_size == 1 << 18
-        keeper.make_room()
-        assert not reserve.exists()
-
-    def test_the_end_waits_for_others(self, keeper, monkeypatch):
-        waits = []
-        monkeypatch.setattr(keeper.store, "wait_for_others", waits.append)
-        keeper.keep([note(1)])
-        assert keeper.end({"events": 1}) == ""
-        assert waits == [5.0, 0.0]
-        assert keeper.end({"events": 2}) == "table events has 1 rows of 2"
-
-    def test_the_end_of_one_whose_rows_still_wait(self, keeper, monkeypatch):
-        again = refuse(monkeypatch, keeper.store)
-        keeper.keep([note(1)])
-        assert keeper.end({"events": 1}) == "database is locked"
-        again()
-        assert keeper.end({"events": 1}) == ""
-        assert stored(keeper) == [1]
-
-    def test_closing_writes_what_waits_and_is_done_once(self, tmp_path, monkeypatch):
-        store, head = new_store(tmp_path)
-        keeper = Keeper(store)
-        keeper.begin(head)
-        again = refuse(monkeypatch, store)
-        keeper.keep([note(1)])
-        again()
-        closed, close = [], store.close
-        monkeypatch.setattr(store, "close", lambda: closed.append(1) or close())
-        for _ in range(2):
-            keeper.close(is_whole=True)
-        assert closed == [1]
-        assert sorted(path.name for path in tmp_path.iterdir()) == [FILE_NAME]
-        with closing(sqlite3.connect(tmp_path / FILE_NAME)) as db:
-            assert db.execute("SELECT count(*) FROM events").fetchone() == (1,)
-
-    def test_one_that_is_not_whole_keeps_its_second_file(self, tmp_path):
-        store, head = new_store(tmp_path)
-        keeper = Keeper(store)
-        keeper.begin(head)
-        keeper.close(is_whole=False)
-        assert {path.name for path in tmp_path.iterdir()} == {FILE_NAME, MIRROR_NAME}
-
-    def test_one_that_is_removed_goes_on_with_every_row(self, keeper, other_disk):
-        keeper.keep([note(1)])
-        keeper._mirror.append = lambda _: (_ for _ in ()).throw(OSError("full"))
-        keeper.keep([note(2)])
-        keeper.store.path.unlink()
-        with pytest.raises(RecordError, match="was removed while the run went on; everything so far is in"):
-            keeper.keep([note(3)])
-        assert stored(keeper) == [1, 2, 3]
-        assert keeper.store.path.parent.parent == other_disk
-
-
-class TestBackground:
-    def test_an_idle_thread_folds_the_log_in(self, keeper, monkeypatch):
-        folded = threading.Event()
-        monkeypatch.setattr(background, "_IDLE", 0.01)
-        monkeypatch.setattr(keeper, "fold_in", folded.set)
-        thread = Background(keeper, 30.0)
-        # One that hangs with its disk does not keep the process from ending.
-        assert thread._thread.daemon
-        assert folded.wait(30.0)
-        assert thread.stop()
-
-    def test_what_is_late_is_durable_elsewhere(self, keeper, monkeypatch, synced, other_disk):
-        held, keep = threading.Event(), keeper.keep
-        monkeypatch.setattr(keeper, "keep", lambda entries: held.wait(30.0) and keep(entries))
-        thread = Background(keeper, 0.05)
-        for number in (1, 2):
-            thread.keep([note(number)])
-        (path,) = other_disk.iterdir()
-        assert path.suffix == ".late"
-        assert synced == [path.name] * 2
-        assert [each.row[0] for each in read_mirror(path)] == [1, 2]
-        assert [each for each in keeper.notices if "is slow" in each] == [
-            f"the disk of the journal is slow; rows that wait are in {path} as well"
-        ]
-        held.set()
-        assert thread.stop()
-        assert stored(keeper) == [1, 2]
-        assert [each.path for each in keeper.spare] == [path]
-
-    def test_what_is_late_and_nowhere_else_ends_the_run(self, keeper, monkeypatch):
-        held, keep = threading.Event(), keeper.keep
-        monkeypatch.setattr(keeper, "keep", lambda entries: held.wait(30.0) and keep(entries))
-        thread = Background(keeper, 0.05)
-
-        def full(self, _entries):
-            raise OSError(28, "No space left on device", str(self.path))
-
-        monkeypatch.setattr(Mirror, "append", full)
-        with pytest.raises(RecordError, match=r"is not written in time, nor .*\.late"):
-            thread.keep([note(1)])
-        monkeypatch.undo()
-        held.set()
-        assert thread.stop()
-
-    def test_a_failure_is_raised_by_the_next_call(self, keeper, monkeypatch):
-        def fail(_entries):
-            raise RecordError("gone")
-
-        monkeypatch.setattr(keeper, "keep", fail)
-        thread = Background(keeper, 30.0)
-        with pytest.raises(RecordError, match="gone"):
-            thread.keep([note(1)])
-        assert thread.stop()
-        assert thread.failure is None
-
-
-class TestStore:
-    def test_rows_are_written_all_or_none(self, tmp_path):
-        store, _ = new_store(tmp_path)
-        wrong = entry("events", (2, 2.0, "INFO", "note"))
-        with pytest.raises(sqlite3.Error):
-            store.write([note(1), wrong])
-        assert stored(store) == []
-        store.write([note(1), note(2)])
-        store.write([note(3)])
-        assert stored(store) == [1, 2, 3]
-        store.close()
-
-    def test_rows_that_come_again_are_the_same(self, tmp_path):
-        store, _ = new_store(tmp_path)
-        for _ in range(2):
-            store.write([note(1)])
-        assert stored(store) == [1]
-        store.close()
-
-    def test_what_is_forgotten(self, tmp_path):
-        store, _ = new_store(tmp_path)
-        store.write([entry("meta", meta_row("status", "failed"))])
-        store.forget(["status", "reason"])
-        assert [each.row[0] for each in store.entries() if each.table == "meta"] == ["schema"]
-        store.close()
-
-    def test_a_closed_one_has_no_companions(self, tmp_path):
-        store, _ = new_store(tmp_path)
-        store.write([note(1)])
-        store.close()
-        assert [path.name for path in tmp_path.iterdir()] == [FILE_NAME]
-
-    def test_where_it_was_made(self, tmp_path):
-        store, _ = new_store(tmp_path)
-        assert store.loss() == ""
-        store.path.unlink()
-        assert store.loss() == "removed"
-        store.path.write_bytes(b"")
-        assert store.loss() == "replaced"
-        store.close()
+        journal.close()
 
 
 @pytest.mark.parametrize("table", ["meta", "signals", "steps", "telemetry", "events", "files"])
@@ -524,6 +167,12 @@ def test_a_row_whose_checksum_does_not_fit_is_told_and_left_out(tmp_path, table)
     with closing(sqlite3.connect(tmp_path / FILE_NAME)) as db, db:
         (rows,) = db.execute(f"SELECT count(*) FROM {table}").fetchone()
         db.execute(f"UPDATE {table} SET {column} = 7 WHERE {key} = {wanted}")
+    if table in ("meta", "signals"):
+        with pytest.raises(
+            DataError, match=f"has lost its heading .row {str(wanted).strip(chr(39))} of table {table}"
+        ):
+            recover(tmp_path)
+        return
     found = recover(tmp_path)
     state = found.tables[table]
     assert (state.good, state.missing, state.first_bad) == (rows - 1, 1, str(wanted).strip("'"))
@@ -544,11 +193,8 @@ def test_a_journal_with_bytes_that_are_no_text_is_a_message(tmp_path, change):
         path.write_bytes(path.read_bytes().replace(b"CREATE TABLE telemetry", b"CREATE TABLE \xdf\xdf\xdfemetry"))
     with pytest.raises(DataError, match=r"not a readable journal|damaged"), Record(tmp_path) as record:
         record.telemetry()
-    if change.startswith("UPDATE"):
-        assert recover(tmp_path).copy is not None
-    else:
-        with pytest.raises(DataError, match="nothing of it is readable"):
-            recover(tmp_path)
+    with pytest.raises(DataError, match=r"nothing of it is readable|has lost its heading"):
+        recover(tmp_path)
 
 
 @pytest.mark.parametrize("table", ["steps", "telemetry", "events"])
@@ -576,111 +222,81 @@ def test_rows_that_are_gone_from_a_completed_record_are_told(tmp_path, table, nu
         assert table in record.damage()
 
 
-def test_a_second_file_of_another_journal_is_not_believed(tmp_path, other_disk):
-    for name in ("mine", "other"):
-        folder = tmp_path / name
-        folder.mkdir()
-        journal = Journal(folder / FILE_NAME, SIGNALS, {})
-        journal.event(Event(0.0, "INFO", "note", name))
-        content = {path: path.read_bytes() for path in folder.iterdir()}
-        journal.close()
-        for path, data in content.items():
-            path.write_bytes(data)
-    forged, _ = elsewhere(tmp_path / "mine" / FILE_NAME)
-    file = Mirror(forged, "0123456789abcdef0123456789abcdef")
-    file.append([entry("events", (9, 9.0, "INFO", "note", "forged"))])
-    file.close()
-    with Record(tmp_path / "mine") as record:
-        assert "forged" not in record.remark()
-        assert record.remark() == ""
-    assert recover(tmp_path / "mine").tables["events"].added == 0
+def test_a_second_file_of_another_journal_is_not_believed(tmp_path):
+    Journal(tmp_path / FILE_NAME, SIGNALS, {}).close()
+    for path in (*places(tmp_path / FILE_NAME), tmp_path / "named"):
+        file = SecondFile(path, "0123456789abcdef0123456789abcdef")
+        file.append([note(9)])
+        file.close()
+    with Record(tmp_path) as record:
+        assert (record.remark(), record.events()) == ("", [])
+    assert recover(tmp_path).copy is None
     with pytest.raises(ConfigurationError, match="of another journal"):
-        recover(tmp_path / "mine", [tmp_path / "other" / MIRROR_NAME])
-    # Where the journal has lost its number, the file beside it has it.
-    for name in (FILE_NAME, f"{FILE_NAME}-wal", f"{FILE_NAME}-shm"):
-        (tmp_path / "mine" / name).unlink(missing_ok=True)
-    assert recover(tmp_path / "mine").tables["events"].added == 1
-    journal = Journal.reopen(tmp_path / "mine" / RECOVERED_NAME)
-    journal.close()
+        recover(tmp_path, [tmp_path / "named"])
+    # A new run in this place has none.
+    (tmp_path / FILE_NAME).unlink()
+    Journal(tmp_path / FILE_NAME, SIGNALS, {}).close()
+    assert not any(path.exists() for path in places(tmp_path / FILE_NAME))
 
 
 class TestReading:
-    def write(self, tmp_path, *entries):
-        store, _ = new_store(tmp_path)
-        store.write(list(entries))
-        store.close()
-        return Record(tmp_path)
+    @pytest.mark.parametrize(
+        ("table", "columns", "problem"),
+        [
+            ("steps", (2, 0.0, 0.5, "", "", "nonsense", "{}", 1.0, "[]"), "step 2: "),
+            ("telemetry", (1, "soon", 0, 2.0), "table telemetry: "),
+        ],
+    )
+    def test_a_row_that_is_none_has_a_good_checksum_all_the_same(self, tmp_path, table, columns, problem):
+        unfinished(tmp_path)
+        with closing(sqlite3.connect(tmp_path / FILE_NAME)) as db, db:
+            marks = "?, " * len(columns)
+            db.execute(f"INSERT INTO {table} VALUES ({marks} ?)", (*columns, checksum(columns)))
+        with Record(tmp_path) as record, pytest.raises(DataError, match=f"is damaged: {problem}"):
+            list(record.step_records()) if table == "steps" else record.telemetry()
 
-    def test_a_step_that_is_none_has_a_good_checksum_all_the_same(self, tmp_path):
-        row = (0, 0.0, 0.5, "", "", "nonsense", "{}", 1.0, "[]")
-        with (
-            self.write(tmp_path, entry("steps", row)) as record,
-            pytest.raises(DataError, match="is damaged: step 0: "),
-        ):
-            list(record.step_records())
+    def test_rows_that_only_a_second_file_has_are_read_and_said(self, tmp_path):
+        unfinished(tmp_path, *map(step_row, (1, 2, 4)), *meta({"status": "failed", "rig": "vo2"}))
+        with pytest.warns(IncompleteRecordWarning) as said:
+            opened = Record(tmp_path)
+        with opened as record:
+            assert record.steps()["step"].tolist() == [0, 1, 2, 4]
+            assert (record.status, record.meta["rig"]) == ("failed", "vo2")
+            assert record.missing.ranges == {"steps": ((3, 3),)}
+        first, second = (str(each.message) for each in said)
+        assert f"lacks 4 rows that its second file {tmp_path / SECOND_NAME} has" in first
+        assert "lacks rows that were recorded: steps 3" in second
+        assert first in record.remark()
 
-    def test_ticks_that_are_no_numbers(self, tmp_path):
-        row = entry("telemetry", (1, "soon", 0, 2.0))
-        with self.write(tmp_path, row) as record, pytest.raises(DataError, match="is damaged: table telemetry: "):
-            record.telemetry()
-
-    def test_rows_that_only_a_second_file_has_are_counted_by_their_numbers(self, tmp_path):
-        with _unfinished(tmp_path):
-            pass
-        file = Mirror(tmp_path / MIRROR_NAME)
-        file.append([entry("steps", (n, 50.0, 50.5, "", "", "dwell", "{}", 1.0, "[]")) for n in (1, 2, 3)])
-        file.close()
-        with Record(tmp_path) as record:
-            assert record.missing.ranges == {"steps": ((2, 3),)}
-            assert "bench recover-journal" in record.remark()
+    def test_a_second_file_with_other_columns_is_an_error(self, tmp_path):
+        unfinished(tmp_path, Row("steps", (2, 1.0)))
+        for read in (Record, recover):
+            with pytest.raises(DataError, match="fit"):
+                read(tmp_path)
 
     def test_checksums_of_many_rows_are_those_of_each(self):
         rows = np.array([[1.0, np.nan, -0.0], [np.inf, 2.5, -3.0]])
         assert checksums(rows) == [checksum(tuple(row)) for row in rows.tolist()]
-        several = ticks([tuple(map(float, (n, n, 0, n))) for n in range(1, 40)])
-        assert [each.payload for each in split([several])] == [ticks([row]).payload for row in several.rows]
-        assert several.payload == b"".join(each.payload for each in split([several]))
-
-
-def _unfinished(tmp_path):
-    """Write two steps of a run that did not end."""
-    store, _ = new_store(tmp_path)
-    store.write([entry("steps", (n, 50.0, 50.5, "", "", "dwell", "{}", 1.0, "[]")) for n in (0, 1)])
-    return closing(store)
+        # Neither the sign of a zero nor that of a nan is kept.
+        assert checksum((0.0, None)) == checksum((-0.0, -math.nan))
 
 
 class TestWritingOn:
-    def test_a_run_whose_end_waits_is_not_written_on(self, tmp_path):
-        with _unfinished(tmp_path):
-            pass
-        file = Mirror(tmp_path / MIRROR_NAME)
-        file.append([entry("meta", meta_row("status", "completed"))])
-        file.close()
-        with pytest.raises(ConfigurationError, match=r"a run that has ended, of which rows wait in a second file"):
-            take_in(tmp_path)
-
     def test_what_waits_is_taken_in_and_numbered_on(self, tmp_path):
-        with _unfinished(tmp_path):
-            pass
-        file = Mirror(tmp_path / MIRROR_NAME)
-        file.append([entry("steps", (n, 50.0, 50.5, "", "", "dwell", "{}", 1.0, "[]")) for n in (1, 2)])
-        file.append([note(1)])
-        file.close()
-        path, signals, counts, lost = take_in(tmp_path)
+        unfinished(tmp_path, step_row(1), step_row(2), note(1))
+        with pytest.warns(IncompleteRecordWarning):
+            path, signals, counts, lost = take_in(tmp_path)
         assert (path, signals[0].name) == (tmp_path / FILE_NAME, "force")
         assert counts == {"steps": 3, "telemetry": 0, "events": 1}
         assert lost == {}
+        assert [each.name for each in tmp_path.iterdir()] == [FILE_NAME]
         with Record(tmp_path) as record:
             assert len(record.steps()) == 3
 
+    @pytest.mark.filterwarnings("ignore::bench.base.IncompleteRecordWarning")
     @pytest.mark.parametrize("waits", [True, False])
     def test_one_that_cannot_be_written_on(self, tmp_path, monkeypatch, waits):
-        with _unfinished(tmp_path):
-            pass
-        if waits:
-            file = Mirror(tmp_path / MIRROR_NAME)
-            file.append([entry("steps", (2, 50.0, 50.5, "", "", "dwell", "{}", 1.0, "[]"))])
-            file.close()
+        unfinished(tmp_path, *[step_row(2)] * waits)
 
         def refuse(*_):
             raise sqlite3.OperationalError("attempt to write a readonly database")
@@ -688,12 +304,12 @@ class TestWritingOn:
         monkeypatch.setattr(Store, "write" if waits else "forget", refuse)
         with pytest.raises(DataError, match=r"cannot be written on: .*readonly"):
             Journal.reopen(tmp_path)
+        assert (tmp_path / SECOND_NAME).exists() is waits
 
     def test_the_end_of_one_whose_thread_hangs(self, tmp_path):
         journal = Journal(tmp_path / FILE_NAME, SIGNALS, {"rig": "vo2"})
         journal.step(step(0))
         abandon(journal.path, Ending("aborted", "it hangs", {"tec": "safe"}))
-        assert not (tmp_path / RESERVE_NAME).exists()
         with Record(tmp_path) as record:
             assert (record.status, record.meta["reason"]) == ("aborted", "it hangs")
             assert record.meta["safe_state"] == {"tec": "safe"}
@@ -732,19 +348,14 @@ class TestWritingOn:
 
 class TestRecovering:
     def test_a_journal_of_another_schema_is_refused(self, tmp_path):
-        store = Store(tmp_path / FILE_NAME)
-        store.create(["force"], [entry("meta", meta_row("schema", 2)), entry("signals", (0, "force", "N", "", 3))])
-        store.close()
+        unfinished(tmp_path)
+        with closing(Store(tmp_path / FILE_NAME)) as store:
+            store.write(meta({"schema": 2}))
         with pytest.raises(DataError, match="has schema version 2; this bench reads version 3"):
             recover(tmp_path)
 
     def test_a_copy_that_cannot_be_written(self, tmp_path):
-        with _unfinished(tmp_path):
-            pass
-        (tmp_path / MIRROR_NAME).unlink(missing_ok=True)
-        file = Mirror(tmp_path / MIRROR_NAME)
-        file.append([entry("steps", (2, 50.0, 50.5, "", "", "dwell", "{}", 1.0, "[]"))])
-        file.close()
+        unfinished(tmp_path, step_row(2))
         with pytest.raises(ConfigurationError, match=r"cannot be written: .*name another one by --out"):
             recover(tmp_path, out=tmp_path / "no folder" / "copy.sqlite")
         recovery = recover(tmp_path)
@@ -776,8 +387,7 @@ class TestRecovering:
 
 class TestModels:
     def test_a_model_file_is_readable_text(self, tmp_path):
-        with _unfinished(tmp_path):
-            pass
+        unfinished(tmp_path)
         for number in (1, 2):
             add_model(tmp_path, f"film {number}", 5.0, {"unit": "°C"})
         text = (tmp_path / "models" / "film 1.json").read_text(encoding="utf-8")
@@ -787,8 +397,7 @@ class TestModels:
             assert list(record.models()) == ["film 1", "film 2"]
 
     def test_one_that_cannot_be_written(self, tmp_path):
-        with _unfinished(tmp_path):
-            pass
+        unfinished(tmp_path)
         (tmp_path / "models").write_text("a file in its place")
         with pytest.raises(DataError, match=r"model file .* cannot be written"):
             add_model(tmp_path, "film", 5.0, {})
@@ -817,8 +426,7 @@ def test_a_model_is_kept_beside_the_journal(tmp_path):
 
 @pytest.mark.parametrize("problem", ["disk I/O error", "database disk image is malformed"])
 def test_a_journal_that_cannot_be_opened_is_named(tmp_path, monkeypatch, problem):
-    with _unfinished(tmp_path):
-        pass
+    unfinished(tmp_path)
 
     def refuse(*_):
         raise sqlite3.OperationalError(problem)
@@ -826,18 +434,3 @@ def test_a_journal_that_cannot_be_opened_is_named(tmp_path, monkeypatch, problem
     monkeypatch.setattr(opening, "_connected", refuse)
     with pytest.raises(DataError, match=f"is not a readable journal: {problem}"):
         Record(tmp_path)
-
-
-def test_readers_are_waited_for_at_the_beginning_and_nobody_later(tmp_path, monkeypatch):
-    waits, create, forget = [], Store.create, Store.forget
-
-    def wait_of(store):
-        return store._db.execute("PRAGMA busy_timeout").fetchone()[0]
-
-    monkeypatch.setattr(Store, "create", lambda self, *a: waits.append(wait_of(self)) or create(self, *a))
-    monkeypatch.setattr(Store, "forget", lambda self, *a: waits.append(wait_of(self)) or forget(self, *a))
-    for opened in (lambda: Journal(tmp_path / FILE_NAME, SIGNALS, {}), lambda: Journal.reopen(tmp_path)):
-        journal = opened()
-        assert wait_of(journal._keeper.store) == 0
-        journal.close()
-    assert waits == [10_000, 10_000]

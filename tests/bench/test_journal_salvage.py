@@ -1,11 +1,11 @@
 """What is left of a journal of which a page is overwritten, or that is gone: found, said, and read again."""
 
+import json
 import random
 import shutil
 import sqlite3
-import time
 from contextlib import closing
-from datetime import datetime
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,11 +13,10 @@ from heater_laboratory import RIG
 from heater_protocols import stairs
 
 import bench as face
-from bench.base import ConfigurationError, DataError, RecordError
-from bench.devices import Signal
+from bench.base import DataError, IncompleteRecordWarning, RecordError
 from bench.record import (
     FILE_NAME,
-    NAME as MIRROR_NAME,
+    NAME as SECOND_NAME,
     RECOVERED_NAME,
     Event,
     Journal,
@@ -25,20 +24,8 @@ from bench.record import (
     find_journals,
     recover,
 )
-from bench.record.keeping import Keeper
-from bench.record.mirror import Mirror
-from bench.record.rows import checksum, ticks
-
-
-@pytest.fixture(params=["America/Los_Angeles"])
-def zone(request):
-    """Let the computer stand in another time zone; Windows has no such variable."""
-    set_zone = getattr(time, "tzset", int)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("TZ", request.param)
-        set_zone()
-        yield
-    set_zone()
+from bench.record.rows import Row, checksum
+from bench.record.second_file import SecondFile
 
 
 @pytest.fixture(scope="module")
@@ -71,98 +58,48 @@ def rows_of(path):
 
 
 class TestAnOverwrittenPage:
-    @pytest.mark.parametrize("table", ["meta", "signals", "files"])
+    @pytest.mark.parametrize("table", ["steps", "telemetry", "events", "files"])
     def test_leaves_the_rows_of_the_other_tables(self, bench, completed, folder, tmp_path, table):
         overwrite(folder, table)
-        code, out, err = bench("recover-journal", folder)
+        journal = (folder / FILE_NAME).read_bytes()
+        code, out, err = bench("recover-journal", folder, "--json", tmp_path / "found.json")
         assert (code, err) == (8, "")
         assert "status: failed" in out
-        before, after = rows_of(completed), rows_of(folder / RECOVERED_NAME)
-        assert after[:3] == before[:3]
-        assert after[3] == ({} if table == "files" else before[3])
-        with Record(folder / RECOVERED_NAME) as record:
-            assert record.status == "failed"
-            assert record.meta["recovered"]["lost"][table] > 0
-            assert list(record.meta["recovered"]["lost"]) == [table]
-            assert [signal.name for signal in record.signals][:2] == ["tec_setpoint", "tec_temperature"]
-            assert (record.signals[0].unit == "?") is (table == "signals")
-        # What is read of a run can be read of the copy.
-        copy = tmp_path / "copy"
-        copy.mkdir()
-        shutil.copy(folder / RECOVERED_NAME, copy / FILE_NAME)
-        for command in (
-            ["runs", tmp_path],
-            ["report", copy, "--out", tmp_path / "report"],
-            ["compare", copy, completed],
-        ):
-            assert bench(*command)[0] == 0
+        assert "completed" not in out
+        assert (folder / FILE_NAME).read_bytes() == journal
+        found = json.loads((tmp_path / "found.json").read_text())
+        assert (found["is_complete"], found["copy"]) == (False, str(folder / RECOVERED_NAME))
+        assert {name for name, state in found["tables"].items() if state["missing"]} == {table}
+        before = rows_of(completed)
+        with pytest.warns(IncompleteRecordWarning):
+            after = rows_of(Path(found["copy"]))
+        place = ["steps", "telemetry", "events", "files"].index(table)
+        assert [*after[:place], *after[place + 1 :]] == [*before[:place], *before[place + 1 :]]
+        assert len(after[place]) < len(before[place])
+        with pytest.warns(IncompleteRecordWarning), Record(folder / RECOVERED_NAME) as record:
+            assert record.meta["recovered"]["from"] == str(folder / FILE_NAME)
+        code, _, err = bench("recover-journal", folder)
+        assert code == 2
+        assert "exists already" in err
 
-    @pytest.mark.usefixtures("zone")
-    def test_that_has_the_metadata_leaves_what_other_rows_tell_of_them(self, completed, folder):
-        overwrite(folder, "meta")
-        found = recover(folder)
-        assert found.tables["meta"].missing > 20
-        with Record(completed) as before, Record(found.copy) as after:
-            assert after.meta["rig_file"] == before.meta["rig_file"]
-            assert after.meta["run"] == folder.name
-            assert after.meta["finished"] == before.meta["finished"]
-            assert (after.meta["rig"], after.meta["protocol"]) == ("unknown", "unknown")
-            assert "protocol" in after.meta["recovered"]["substituted"]
-            # The folder is named after the second, in UTC wherever the computer stands.
-            assert abs(_seconds(after.meta["epoch"]) - _seconds(before.meta["host"]["started"])) < 60.0
-
-    def test_of_a_copy_without_metadata_is_neither_repeated_nor_resumed(self, bench, folder, tmp_path):
-        overwrite(folder, "meta")
-        copy = tmp_path / "copy"
-        copy.mkdir()
-        recover(folder, out=copy / FILE_NAME)
-        for command in (["repeat", copy, "--out", tmp_path / "again"], ["resume", copy]):
-            code, _, err = bench(*command)
-            assert code in (2, 3)
-            assert "a recovered copy of a record whose metadata were lost" in err
+    @pytest.mark.parametrize("table", ["meta", "signals"])
+    def test_that_has_the_heading_leaves_nothing_and_says_so(self, bench, folder, table):
+        overwrite(folder, table)
+        code, _, err = bench("recover-journal", folder)
+        assert code == 3
+        assert f"has lost its heading (table {table})" in err
+        assert not (folder / RECOVERED_NAME).exists()
 
     def test_that_is_the_first_leaves_nothing_and_says_so(self, bench, folder):
         overwrite(folder, None)
         code, _, err = bench("recover-journal", folder)
         assert code == 3
         assert "nothing of it is readable by SQLite: file is not a database" in err
-        assert "there is no second file of it (journal.mirror in its folder" in err
-        (folder / MIRROR_NAME).write_bytes(b"nothing")
+        assert f"there is no second file ({SECOND_NAME}) in its folder" in err
+        (folder / SECOND_NAME).write_bytes(b"nothing")
         code, _, err = bench("recover-journal", folder)
         assert code == 3
-        assert f"nor of {folder / MIRROR_NAME}" in err
-
-    def test_of_rows_that_only_a_second_file_has_is_no_loss(self, tmp_path):
-        journal = Journal(tmp_path / FILE_NAME, (), {"rig": "vo2"})
-        journal.event(Event(0.0, "INFO", "note", "one"))
-        mirror = (tmp_path / MIRROR_NAME).read_bytes()
-        journal.close()
-        (tmp_path / MIRROR_NAME).write_bytes(mirror)
-        overwrite(tmp_path, "meta")
-        found = recover(tmp_path)
-        assert found.is_complete
-        # The number of the journal is one of them.
-        assert found.tables["meta"].added == 3
-
-    def test_of_a_second_file_that_has_lost_its_beginning_leaves_the_rows(self, tmp_path):
-        journal = Journal(tmp_path / FILE_NAME, [Signal("force", "N", "")], {"rig": "vo2"})
-        for tick in range(3):
-            journal.telemetry(0.1 * tick, 0, (float(tick),))
-        journal.event(Event(1.0, "INFO", "note", "one"))
-        content = (tmp_path / MIRROR_NAME).read_bytes()
-        journal.close()
-        # The rows of metadata, signals and telemetry begin with the number of their table.
-        (tmp_path / MIRROR_NAME).write_bytes(content[content.index(b"\xb5row\x03") :])
-        (tmp_path / FILE_NAME).unlink()
-        found = recover(tmp_path)
-        assert not found.is_complete
-        with Record(found.copy) as record:
-            assert record.telemetry()["signal_0"].tolist() == [0.0, 1.0, 2.0]
-            assert record.signals[0].unit == "?"
-
-
-def _seconds(time):
-    return datetime.fromisoformat(time).timestamp()
+        assert f"nor of {folder / SECOND_NAME}" in err
 
 
 class TestDamage:
@@ -186,13 +123,27 @@ class TestDamage:
             assert record.missing.ranges == {"telemetry": ((3, 3),)}
             assert "bench recover-journal" in record.damage()
 
-    def test_that_recovery_says_is_not_called_completed(self, bench, folder):
+    def test_that_is_a_flipped_bit_is_one_row(self, folder):
         with closing(sqlite3.connect(folder / FILE_NAME)) as db, db:
             db.execute("UPDATE telemetry SET t = t + 1 WHERE tick = 3")
-        code, out, _ = bench("recover-journal", folder)
-        assert code == 8
-        assert "status: failed" in out
-        assert "completed" not in out
+        found = recover(folder)
+        assert found.status == "failed"
+        assert found.tables["telemetry"].first_bad == "3"
+        assert [state.missing for state in found.tables.values()].count(0) == 5
+
+    def test_is_none_in_a_whole_one_which_is_left_alone(self, bench, folder):
+        before = sorted(folder.iterdir())
+        code, out, _ = bench("recover-journal", folder / FILE_NAME)
+        assert code == 0
+        assert "the journal is whole" in out
+        assert sorted(folder.iterdir()) == before
+
+    def test_cannot_be_looked_for_in_what_is_no_journal(self, bench, tmp_path):
+        code, _, err = bench("recover-journal", tmp_path)
+        assert (code, err.count("\n")) == (3, 1)
+        (tmp_path / FILE_NAME).write_bytes(b"nothing")
+        code, _, err = bench("recover-journal", tmp_path, "--second", tmp_path / "absent")
+        assert code == 2
 
 
 class TestALostJournal:
@@ -219,7 +170,7 @@ class TestALostJournal:
             assert code == 3
             assert f"`bench recover-journal {lost}`" in err
         recover(lost)
-        (lost / MIRROR_NAME).unlink()
+        (lost / SECOND_NAME).unlink()
         assert find_journals(lost.parent) == [lost / FILE_NAME]
         with pytest.raises(DataError, match=f"{lost / RECOVERED_NAME} is a recovered copy of it"):
             Record(lost)
@@ -267,15 +218,15 @@ class TestWritingOnACopyThatLacksRows:
             assert record.status == "failed"
             assert "it lacks rows that were lost" in record.meta["reason"]
             np.testing.assert_equal(record.meta["counts"]["telemetry"], len(before) + 2)
-        assert not (copy / MIRROR_NAME).exists()
+        assert not (copy / SECOND_NAME).exists()
 
     def test_takes_a_row_in_that_a_second_file_has(self, completed, copy):
         with closing(sqlite3.connect(completed / FILE_NAME)) as db:
             row = db.execute("SELECT * FROM telemetry WHERE tick = 3").fetchone()
         with Record(copy) as record:
-            mirror = Mirror(copy / MIRROR_NAME, record.identity)
-        mirror.append([ticks([row[:-1]])])
-        mirror.close()
+            second = SecondFile(copy / SECOND_NAME, record.identity)
+        second.append([Row("telemetry", row[:-1])])
+        second.close()
         assert checksum(row[:-1]) == row[-1]
         Journal.reopen(copy).close()
         with Record(completed) as before, Record(copy) as after:
@@ -287,13 +238,3 @@ class TestWritingOnACopyThatLacksRows:
             db.execute(f"DELETE FROM {table} WHERE {key} = 2")
         with pytest.raises(DataError, match=f"lacks 1 of its {table}, which are lost"):
             Journal.reopen(copy)
-
-
-def test_a_journal_that_cannot_be_made_leaves_nothing(tmp_path, monkeypatch):
-    def refuse(*_):
-        raise OSError("no space")
-
-    monkeypatch.setattr(Keeper, "begin", refuse)
-    with pytest.raises(ConfigurationError, match="cannot be made: no space"):
-        Journal(tmp_path / FILE_NAME, (), {})
-    assert [*tmp_path.iterdir()] == []

@@ -72,7 +72,7 @@ def test_damaged_rows_and_lost_journals_are_marked(bench, runs, tmp_path):
         shutil.copytree(runs["plain"], folder)
     with closing(sqlite3.connect(damaged / FILE_NAME)) as db, db:
         db.execute("UPDATE telemetry SET t = t + 1 WHERE tick = 3")
-    (lost / FILE_NAME).rename(lost / "journal.mirror")
+    (lost / FILE_NAME).rename(lost / "journal.second")
     _, found = listed(bench, tmp_path, tmp_path / "all")
     by_name = {run["folder"]: run for run in found}
     assert [run["status"] for run in found] == ["damaged", "damaged"]

@@ -1,7 +1,6 @@
 """A run that cannot start leaves nothing behind; one whose record is lost says how many steps it has."""
 
 import io
-import shutil
 import signal
 import sys
 from dataclasses import replace
@@ -15,7 +14,7 @@ from rich.console import Console
 from bench.base import ConfigurationError, RecordError
 from bench.execution import Run, carry_out
 from bench.protocol import Dwell, Messages, ProtocolParameters, Step, parameter, protocol
-from bench.record import FILE_NAME, RIG_FILE_NAME, NewFolder, Record, make_folder
+from bench.record import FILE_NAME, RIG_FILE_NAME, NewFolder, Record, make_folder, recover
 
 
 @pytest.fixture
@@ -131,7 +130,8 @@ def test_the_step_that_a_lost_journal_ends_the_run_with_is_counted(rig_file, tmp
     outcome = carry_out(run, silent()).outcome
     assert isinstance(outcome.error, RecordError)
     assert outcome.is_safe
-    rescued = str(outcome.error).partition("everything so far is in ")[2].partition(FILE_NAME)[0]
-    with Record(Path(rescued)) as record:
+    (folder,) = (tmp_path / "runs").iterdir()
+    found = recover(folder)
+    assert found.is_complete
+    with Record(found.copy) as record:
         assert len(record.steps()) == outcome.steps == 3
-    shutil.rmtree(rescued)

@@ -12,7 +12,6 @@ CHANGING = {
     "bench.control.approach.Approach",
     "bench.control.predictive._Lag",
     "bench.record.lateness.Lateness",
-    "bench.record.recovery._Left",
     "drivers.dynamixel.mx28._Standstill",
 }
 """What is no value but a state."""
