@@ -10,7 +10,6 @@ import numpy as np
 from bench.analysis import FOLLOW, read_columns
 from bench.control import (
     ControllerSetup,
-    Fallback,
     FollowReference,
     SupervisedFollower,
     controller_names,
@@ -19,7 +18,14 @@ from bench.control import (
     modulated_sine,
 )
 from bench.protocol import Caution, Control, Messages, Phase, Slots, from_slot, parameter, protocol, unit_of
-from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LOOP, check_order, load_checked_model
+from protocols.preparation import (
+    DRIVE_AND_RESPONSE,
+    LOAD,
+    LOOP,
+    SupervisedParameters,
+    check_order,
+    load_checked_model,
+)
 from protocols.session import SessionParameters, begin_session, keep_adapted, session_kinds
 
 _DRIVE = unit_of("drive")
@@ -28,7 +34,7 @@ _MOST = 10_000_000
 """Most set-points of the sine."""
 
 
-class Parameters(SessionParameters):
+class Parameters(SessionParameters, SupervisedParameters):
     """What can be set."""
 
     controller: str = parameter(
@@ -42,8 +48,12 @@ class Parameters(SessionParameters):
     period: float = parameter(200.0, unit="s", low=1, high=1e6, help="period of the sine, whose amplitude varies")
     duration: float = parameter(800.0, unit="s", low=1, high=1e7, help="how long the sine is followed")
     rate: float = parameter(2.0, unit="1/s", low=0.01, high=50, help="set-points and readings per second")
-    fallback: Fallback = parameter(
-        "none", unit="", help="what goes on in place of a controller that is given up; none ends the run"
+    allowed_error: float = parameter(
+        0.03,
+        unit="1",
+        above=0.0,
+        high=1.0,
+        help="allowed RMS error, as a part of the range of the model's output: that of a drive that lags included",
     )
     fastest: float = parameter(
         from_slot("drive", "rate"), unit=f"{_DRIVE}/s", above=0.0, help="what the drive can follow"
@@ -91,7 +101,7 @@ def following(parameters: Parameters, slots: Slots) -> Messages:
         "follow",
         parameters.controller,
         setup,
-        span=setup.spans.output,
+        parameters.rules(setup.spans.output),
         fallback=parameters.fallback,
         **parameters.tuning.get("open-loop-inverse", {}),
     )

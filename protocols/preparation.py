@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Generator, Mapping
 from typing import TypeAlias, TypeVar
 
-from bench.control import Tuning, load_model_for, saturated_below
+from bench.control import Fallback, Rules, Tuning, load_model_for, saturated_below
 from bench.devices import Actuator, Signal
 from bench.identification import ModelFile
 from bench.protocol import (
@@ -76,6 +76,40 @@ class RampParameters(SweepParameters):
     increment: float = parameter(
         from_slot("drive", "increment"), unit=DRIVE, above=0.0, help="largest difference of neighbouring set-points"
     )
+
+
+class SupervisedParameters(ProtocolParameters):
+    """What can be set where a controller is given up by its errors."""
+
+    allowed_error: float = parameter(
+        0.02,
+        unit="1",
+        above=0.0,
+        high=1.0,
+        help="allowed RMS error, as a part of the range of the model's output; without feedback at least that of the "
+        "model on its own data",
+    )
+    judged_targets: int = parameter(
+        5,
+        unit="1",
+        low=3,
+        high=1000,
+        help="number of last targets whose errors are judged; of a moving reference, stretches of the dwell time",
+    )
+    judged_quantile: float = parameter(
+        0.95,
+        unit="1",
+        low=0.6,
+        high=0.9999,
+        help="quantile from which on an error is not by chance beyond the allowed one, or that of the model alone",
+    )
+    fallback: Fallback = parameter(
+        "none", unit="", help="what goes on in place of a controller that is given up; none ends the run"
+    )
+
+    def rules(self, span: float) -> Rules:
+        """Return by which errors a controller is given up whose model has an output of a range (output units)."""
+        return Rules(allowed=self.allowed_error * span, targets=self.judged_targets, quantile=self.judged_quantile)
 
 
 class ControlledParameters(LoadedParameters):

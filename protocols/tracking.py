@@ -9,7 +9,6 @@ import numpy as np
 from bench.analysis import REACH, READING, read_columns
 from bench.control import (
     ControllerSetup,
-    Fallback,
     ReachTarget,
     Supervised,
     controller_names,
@@ -31,14 +30,21 @@ from bench.protocol import (
     protocol,
     unit_of,
 )
-from protocols.preparation import DRIVE_AND_RESPONSE, LOAD, LOOP, check_order, load_checked_model
+from protocols.preparation import (
+    DRIVE_AND_RESPONSE,
+    LOAD,
+    LOOP,
+    SupervisedParameters,
+    check_order,
+    load_checked_model,
+)
 from protocols.session import SessionParameters, begin_session, keep_adapted, session_kinds
 
 _TARGETS_A_NOTE = 10
 """Targets after which what an adaptation has learnt is noted."""
 
 
-class Parameters(SessionParameters):
+class Parameters(SessionParameters, SupervisedParameters):
     """What can be set."""
 
     controller: str = parameter(
@@ -56,9 +62,6 @@ class Parameters(SessionParameters):
     sequence_seed: int = parameter(1, unit="1", low=0, help="seed of the generated targets")
     readings: int = parameter(
         10, unit="1", low=1, high=1000, help="readings at each target once it is reached", changeable=True
-    )
-    fallback: Fallback = parameter(
-        "none", unit="", help="what goes on in place of a controller that is given up; none ends the run"
     )
     timeout: float = parameter(
         300.0, unit="s", low=1, high=86400, help="longest time for one target", changeable=True
@@ -103,7 +106,7 @@ def tracking(parameters: Parameters, slots: Slots) -> Messages:
         "target",
         parameters.controller,
         setup,
-        span=setup.spans.output,
+        parameters.rules(setup.spans.output),
         fallback=parameters.fallback,
         **parameters.tuning.get("open-loop-inverse", {}),
     )

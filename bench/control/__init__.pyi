@@ -10,7 +10,6 @@ from .catalogue import (
     Fallback as Fallback,
     controller_names as controller_names,
     controller_spec as controller_spec,
-    greatest_error as greatest_error,
     load_model_for as load_model_for,
     make_controller as make_controller,
     make_supervised as make_supervised,
@@ -58,6 +57,7 @@ from .references import (
     tracking_targets as tracking_targets,
 )
 from .supervision import (
+    Rules as Rules,
     Supervised as Supervised,
     SupervisedFollower as SupervisedFollower,
 )

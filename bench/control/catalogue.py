@@ -19,7 +19,7 @@ from bench.control.following import ClosedLoopFollower, FollowingParameters, Int
 from bench.control.latched import Latched, LatchParameters
 from bench.control.model_filters import AdaptationName, ModelFilter, model_filter
 from bench.control.opposite_output import OppositeOutput
-from bench.control.supervision import HOLDS, Supervised, SupervisedFollower
+from bench.control.supervision import Rules, Supervised, SupervisedFollower
 from bench.control.tracking import ClosedLoopInverse, CorrectionParameters, OpenLoopInverse
 from bench.control.tuning import Spans, tuned
 from bench.identification import ModelFile, load_model
@@ -80,6 +80,13 @@ class ControllerSetup:
         Raises ConfigurationError if neither says it.
         """
         return time_to_rest(self.dwell, self.model, f"controller {self.name}")
+
+    @property
+    def stretch(self) -> int:
+        """Number of periods in which actuator and specimen come to rest; 1 if nothing says it."""
+        dynamics = self.model.dynamics
+        known = self.dwell is not None or (dynamics is not None and dynamics.time_constant > 0.0)
+        return max(1, round(self.rest / self.period)) if known else 1
 
     @property
     def start(self) -> Any:  # noqa: ANN401 - each operator has its own
@@ -148,8 +155,8 @@ class ControllerSpec:
     tunable: tuple[str, ...] = ()
     """Those of them that it may change, all positive; one of a table as `TABLE.NAME`, those that change together as
     `NAME+NAME`."""
-    holds: Callable[[ControllerSetup], float] | None = None
-    """Of a controller without feedback: returns the greatest RMS error of a model that still holds, output units."""
+    own_error: Callable[[ControllerSetup], float] | None = None
+    """Of a controller without feedback: returns the RMS error that its model leaves by itself, output units."""
     misses: bool = False
     """Whether it may miss targets by design, as one for comparison; its errors then are not judged."""
 
@@ -229,8 +236,8 @@ def make_supervised(
     task: str,
     name: str,
     setup: ControllerSetup,
+    rules: Rules,
     *,
-    span: float,
     fallback: Fallback = "none",
     **options: Any,  # noqa: ANN401
 ) -> S:
@@ -242,8 +249,8 @@ def make_supervised(
         `Supervised` for a sequence of targets, `SupervisedFollower` for a moving reference.
     task, name, setup
         As in `make_controller`.
-    span : float
-        Range of the output by the model, output units.
+    rules : Rules
+        By which errors it is given up, as the rig file says; what depends on the controller is filled in.
     fallback : {"none", "open-loop"}
         See `Fallback`.
     options
@@ -256,40 +263,23 @@ def make_supervised(
     """
     controller = make_controller(task, name, setup)
     spec = controller_spec(task, name)
-    judged: dict[str, Any] = {
-        "judges": setup.adaptation == "off" and not spec.misses,
-        "holds": math.nan if spec.holds is None else spec.holds(setup),
-    }
+    own = 0.0 if spec.own_error is None else spec.own_error(setup)
+    rules = replace(
+        rules,
+        allowed=max(rules.allowed, own),
+        judges=setup.adaptation == "off" and not spec.misses,
+        feedback=spec.own_error is None,
+    )
+    make: Callable[..., S] = partial(kind, controller, setup.stretch if kind is SupervisedFollower else setup.limits)
     if fallback == "none":
-        return kind(controller, setup.limits, span, **judged)
+        return make(rules)
     opened = replace(setup, options=options)
     # What it needs of the model is known before anything moves.
     make_controller(task, _OPEN, opened)
-    return kind(
-        controller,
-        setup.limits,
-        span,
-        lambda state: make_controller(task, _OPEN, replace(opened, state=state)),
-        **judged,
-    )
-
-
-def greatest_error(own: float, span: float) -> float:
-    """Return the greatest RMS error of a model that still holds, output units.
-
-    Parameters
-    ----------
-    own : float
-        RMS error of the model on the data from which it was identified, output units.
-    span : float
-        Width of its range, output units.
-    """
-    return max(_OWN * own, HOLDS * span)
+    return make(rules, lambda state: make_controller(task, _OPEN, replace(opened, state=state)))
 
 
 _OPEN = "open-loop-inverse"
-_OWN = 2.25
-"""By how much more than on its own data a model may err."""
 
 
 @dataclass(frozen=True)
@@ -354,8 +344,8 @@ def _predictive(setup: ControllerSetup) -> PredictiveFollower:
     return PredictiveFollower(inverse, dynamics, setup.start, setup.limits, parameters, setup.model_filter())
 
 
-def _holds(setup: ControllerSetup) -> float:
-    return greatest_error(float(setup.model.provenance.get("rms", 0.0)), setup.spans.output)
+def _own_error(setup: ControllerSetup) -> float:
+    return float(setup.model.provenance.get("rms", 0.0))
 
 
 OPEN_LOOP_INVERSE = ControllerSpec(
@@ -366,7 +356,7 @@ OPEN_LOOP_INVERSE = ControllerSpec(
     adapts=True,
     numbers=lambda s: _Settling(s.rest),
     tunable=("wait",),
-    holds=_holds,
+    own_error=_own_error,
 )
 CLOSED_LOOP_INVERSE = ControllerSpec(
     "the inverse of the model, corrected by the measured disturbance",
@@ -395,7 +385,7 @@ OPEN_LOOP_FOLLOWER = ControllerSpec(
     "the inverse of the model, without feedback",
     lambda s: OpenLoopFollower(s.inverse(), s.start, s.limits, s.tuned(FollowingParameters.scaled), s.model_filter()),
     adapts=True,
-    holds=_holds,
+    own_error=_own_error,
 )
 CLOSED_LOOP_FOLLOWER = ControllerSpec(
     "the inverse of the model, corrected by the measured disturbance",

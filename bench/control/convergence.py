@@ -4,19 +4,26 @@ from __future__ import annotations
 
 import math
 
-MOST_SWINGS = 6
-"""From this swing of the set-point on, with a reference that stands, a controller does not converge."""
+SWINGS_OF_A_TARGET = 3
+"""Swings that one target asks for at most. Derivation: beyond it, past an end of the transition, and back."""
+MOST_SWINGS = 2 * SWINGS_OF_A_TARGET
+"""From this swing of the set-point on, with a reference that stands, a controller does not converge.
+
+Derivation: a target may be aimed at twice, by a controller and by the one that takes its place.
+"""
 
 _END = 0.25
-"""What counts as one end of the set-point's range, as a part of it."""
+"""What counts as one end of the set-point's range, as a part of it.
+
+Derivation: a swing of half of the range is no correction; the other half lies in equal parts at both ends.
+"""
 
 
 class LimitCycleWatch:
     """Counts how often a set-point swings from one end of its range to the other while the reference stands.
 
     A controller that was tuned on another specimen can drive the actuator to and fro for ever, with an output that
-    stays near its reference on average. A target asks for two or three such swings at most: beyond it, past an end of
-    the transition, and back.
+    stays near its reference on average. A target asks for `SWINGS_OF_A_TARGET` at most.
 
     Parameters
     ----------

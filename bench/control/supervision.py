@@ -5,93 +5,91 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from bench.base import ConvergenceError
-from bench.control.convergence import MOST_SWINGS, LimitCycleWatch
+from bench.base import ConvergenceError, Floats
+from bench.control.convergence import SWINGS_OF_A_TARGET, LimitCycleWatch
 from bench.control.loops import Foreseeing, Reaching
 from bench.control.model_filters import ModelFilter
 from bench.control.tracking import Command, Follower, Trace
 from bench.models import Reach
 
-TARGETS = 5
-"""Number of targets in a row over which errors are judged."""
-SAMPLES = 200
-"""Number of samples of a moving reference over which they are judged."""
-HOLDS = 0.03
-"""Part of the output's range that a model may err by that fits its own data well: sessions differ. Feedback that errs
-by more does not do what it is for."""
-_CHANCE_OF_TARGETS = 2.7
-"""Ratio of two RMS errors over five targets, each without the greatest, that chance exceeds in 5 % of cases."""
-_CHANCE_OF_SAMPLES = 2.25
-"""The same for a moving reference, whose errors are alike over many samples: as of five that are not."""
-_TOLERANCE = 0.02
-"""Part of the range within which the model alone is not taken for better."""
-_WARNED = 0.008
-"""The same part from which on there is a warning."""
-_MISSED = 0.01
-"""Part of the range by which a target that cannot be met is missed without a warning."""
-_DOUBTED = 2.0
-"""Factor below the error that ends an open loop from which on there is a warning, if its model errs by itself."""
-_MOVING = 1.5
-"""How much more a model may err where the reference moves: the actuator's lag is no part of its error at rest."""
-_SWINGS = MOST_SWINGS - 2
-"""Swings at one target after which its controller is given up: fewer than those that end the run."""
+
+@dataclass(frozen=True, kw_only=True)
+class Rules:
+    """By which errors a controller is given up; keys of the rig file.
+
+    Parameters
+    ----------
+    allowed : float
+        Allowed RMS error, output units, > 0. Of a controller without feedback at least that of its model.
+    targets : int
+        Number of last targets that are judged, >= 3.
+    quantile : float
+        Quantile at which chance is excluded, above 0.5 and below 1.
+    judges : bool
+        Whether errors are judged. Not of a controller that corrects its model, which takes its time, nor of one that
+        may miss targets by design.
+    feedback : bool
+        Whether the controller has feedback. One without is as good as its model, which is not compared with itself.
+
+    Notes
+    -----
+    Both are textbook tests of variances (NIST/SEMATECH, *e-Handbook of Statistical Methods*, sections 1.3.5.8 and
+    1.3.5.9): that of F compares the controller's error with that of its model alone, that of χ² with the allowed one.
+    One missed target is no reason to end a run: both leave the greatest error out, with its degree of freedom, and so
+    err on the side of the controller.
+    """
+
+    allowed: float
+    targets: int = 5
+    quantile: float = 0.95
+    judges: bool = True
+    feedback: bool = True
+
+    def bounds(self) -> tuple[float, float, float]:
+        """Return the greatest ratios of mean squares that chance explains: to the model's, and to the allowed one.
+
+        The third is the ratio of all errors to the allowed one up to which they are within it, and not by chance.
+        """
+        from scipy.special import chdtri, fdtri
+
+        others, beside = self.targets - 1, 1.0 - self.quantile
+        return (
+            float(fdtri(others, others, self.quantile)),
+            float(chdtri(others, beside)) / others,
+            float(chdtri(self.targets, self.quantile)) / self.targets,
+        )
 
 
 class _Supervision:
-    """What the supervision of targets and of a moving reference have in common.
+    """What the supervision of targets and of a moving reference have in common: the rules, and what follows of them.
 
     Parameters
     ----------
     controller : object
         The controller.
-    limits : (float, float)
-        Set-points that it may ask for, input units.
-    span : float
-        Range of the output by the model, output units, > 0.
+    rules : Rules
+        By which errors it is given up.
     fallback : callable or None
         Makes the controller that goes on, from the memory of the one that is given up. Without it a
         `ConvergenceError` ends the run in the safe state.
-    judges : bool
-        Whether errors are judged. Not of a controller that corrects its model, which takes its time, nor of one that
-        may miss targets by design.
-    holds : float
-        Of a controller without feedback: greatest RMS error of a model that still holds, output units. nan for one
-        with feedback, whose model may err by more.
-
-    Notes
-    -----
-    A controller is given up by the RMS of the errors of a window without the greatest: one missed target is no reason
-    to end a run. A warning is by the RMS of all.
     """
-
-    _window = TARGETS
-    _over = "targets"
-    _chance = _CHANCE_OF_TARGETS
-    _strict = True
-    """Whether an error beyond the tolerance ends the run, also where the model alone would err by more."""
 
     def __init__(
         self,
         controller: Any,  # noqa: ANN401 - `Reaching` or `Follower`
-        limits: tuple[float, float],
-        span: float,
+        rules: Rules,
         fallback: Callable[[Any], Any] | None = None,
-        *,
-        judges: bool = True,
-        holds: float = math.nan,
     ) -> None:
         self._controller: Any = controller
-        self._limits = limits
-        self._span = span
+        self._rules = rules
+        self._to_model, self._to_allowed, self._within = rules.bounds()
         self._fallback = fallback
-        self._judges = judges
-        self._holds = holds
-        self._judged: deque[tuple[float, float]] = deque(maxlen=self._window)
+        self._judged: deque[tuple[float, float]] = deque(maxlen=rules.targets)
         self._notice = ""
         self._warned = False
         self.gave_up = False
@@ -125,39 +123,36 @@ class _Supervision:
         notice, self._notice = self._notice, ""
         return notice
 
-    def _judge(self, error: float) -> None:
-        """Take the error of a target or sample, output units; give the controller up if it does no good.
+    @property
+    def _is_judging(self) -> bool:
+        return self._rules.judges and not self.gave_up
 
-        Raises ConvergenceError if nothing goes on in its place.
+    def _judge(self, error: float, alone: float) -> None:
+        """Take mean squares at a target: of the error, and of that of the model alone, nan if nobody knows it.
+
+        Raises ConvergenceError if the controller is given up and nothing goes on in its place.
         """
-        without = self.trace.disturbance
         if not math.isfinite(error):
             return
-        self._judged.append((error, without))
-        if len(self._judged) < self._window:
+        self._judged.append((error, alone))
+        if len(self._judged) < self._rules.targets:
             return
-        squares = np.sort(np.square(self._judged), axis=0)
-        everything = math.sqrt(float(np.mean(squares[:, 0])))
+        table = np.sort(self._judged, axis=0)
+        everything = float(table[:, 0].mean())
         # Of a controller that does not say what its model errs by, that is not known.
-        errors, without = np.sqrt(np.mean(squares[:-1], axis=0)).tolist()
-        over = f"over {self._window} {self._over} its error"
-        but = f"{over} but for the greatest is {errors:.3g} RMS"
-        if not math.isnan(self._holds):
-            known = f"and that of a model that holds at most {self._holds:.3g}"
-            if errors > self._holds:
-                self._give_up(f"{but}, {known}")
-            elif everything > max(self._holds / _DOUBTED, min(self._holds, _DOUBTED * HOLDS * self._span)):
-                self._warn(f"the open loop errs: {over} is {everything:.3g} RMS, {known}")
+        errors, alone = table[:-1].mean(axis=0).tolist()
+        allowed, feedback = self._rules.allowed**2, self._rules.feedback
+        if everything <= (self._within if feedback else 1.0) * allowed:
             return
-        text = f"{but}, {100.0 * errors / self._span:.2g} % of the range"
-        known = f"{text}, and that of its model alone, without feedback, {without:.3g}"
-        if errors > _TOLERANCE * self._span and errors > self._chance * without:
-            self._give_up(known)
-        elif errors > HOLDS * self._span and self._strict and self._fallback is None:
-            self._give_up(text if math.isnan(without) else known)
-        elif everything > _WARNED * self._span:
-            part = 100.0 * everything / self._span
-            self._warn(f"the controller leaves an error: {over} is {everything:.3g} RMS, {part:.2g} % of the range")
+        text = f"over {len(table)} targets its error is {math.sqrt(everything):.3g} RMS, {math.sqrt(errors):.3g} but "
+        text += f"for the greatest; allowed is {self._rules.allowed:.3g}"
+        worse = feedback and errors > self._to_model * alone
+        if worse:
+            self._give_up(f"{text}, and the model alone, without feedback, would err by {math.sqrt(alone):.3g}")
+        elif errors > self._to_allowed * allowed and not (feedback and self._fallback):
+            self._give_up(text)
+        else:
+            self._warn(f"the {'controller' if feedback else 'model'} leaves an error: {text}")
 
     def _warn(self, text: str) -> None:
         """Have something said, once in a run."""
@@ -165,7 +160,7 @@ class _Supervision:
             self._notice, self._warned = text, True
 
     def _give_up(self, why: str) -> None:
-        if math.isnan(self._holds):
+        if self._rules.feedback:
             text, remedy = f"the controller does not converge: {why}", "tune it for this specimen, "
         else:
             text, remedy = f"the model does not hold for this specimen: {why}", "correct it by adaptation=session, "
@@ -183,25 +178,20 @@ class _Supervision:
 class Supervised(_Supervision):
     """A target controller that is given up when it does not converge: a `Reaching`.
 
-    It does not if it sends the actuator to and fro between the ends of its range at one target; or if over several
-    targets it errs by more than its model does at the same places, and more than by chance: then the model alone,
-    without feedback, would have been better; or if it says so itself (`doubt`); or, without a fallback, if it errs by
-    more than 3 % of the range. One without feedback is given up where its model does not hold. One missed target of
-    several is no reason, but from 0.8 % of the range on there is a warning. Targets that cannot be met do not count;
-    one that is missed by more than 1 % is warned of. Parameters as `_Supervision`.
+    It is by the rules; if it sends the actuator to and fro between the ends of its range at one target; or if it says
+    so itself (`doubt`). Targets that cannot be met do not count; one that is missed by more than what is allowed is
+    warned of. Parameters as `_Supervision`; `limits` are the set-points that it may ask for, input units.
     """
 
     def __init__(
         self,
         controller: Reaching,
         limits: tuple[float, float],
-        span: float,
+        rules: Rules,
         fallback: Callable[[Any], Reaching] | None = None,
-        *,
-        judges: bool = True,
-        holds: float = math.nan,
     ) -> None:
-        super().__init__(controller, limits, span, fallback, judges=judges, holds=holds)
+        super().__init__(controller, rules, fallback)
+        self._limits = limits
         self._watch = LimitCycleWatch(*limits)
         self._target = self._output = math.nan
         self._finished = False
@@ -227,7 +217,7 @@ class Supervised(_Supervision):
         if self.gave_up:
             return command
         self._watch.note(command.setpoint, self._target)
-        if self._watch.swings < _SWINGS:
+        if self._watch.swings <= SWINGS_OF_A_TARGET:
             return command
         low, high = self._limits
         self._give_up(
@@ -239,43 +229,36 @@ class Supervised(_Supervision):
 
     def _judge_target(self) -> None:
         """Judge how the last target was met."""
-        if not self._judges or self.gave_up or not self._finished:
+        if not self._is_judging or not self._finished:
             return
         error = self._output - self._target
         if self.reach is not Reach.MET:
-            if math.isnan(self._holds) and abs(error) > _MISSED * self._span:
-                missed = f"missed by {100.0 * abs(error) / self._span:.2g} % of the range"
-                self._warn(f"the target {self._target:.4g} cannot be met within the limits: {missed}")
+            if self._rules.feedback and abs(error) > self._rules.allowed:
+                self._warn(f"the target {self._target:.4g} cannot be met within the limits: missed by {error:.3g}")
         elif doubt := getattr(self._controller, "doubt", ""):
             self._give_up(str(doubt))
         else:
-            self._judge(error)
+            self._judge(error**2, self.trace.disturbance**2)
 
 
 class SupervisedFollower(_Supervision):
-    """A follower that is given up where it errs by more than its model, and more than by chance: a `Follower`.
+    """A follower that is given up by the rules: a `Follower`.
 
-    That is judged from 2 % of the range on; from 0.8 % on there is a warning. One without feedback is given up where
-    its model does not hold. Samples at which the reference stands, as on the way to its beginning, or cannot be met,
-    do not count. Parameters as `_Supervision`.
+    Of a reference that moves, a stretch in which the specimen forgets an error counts as one target. Samples at which
+    the reference stands, as on the way to its beginning, or cannot be met, do not count. Parameters as `_Supervision`,
+    and `stretch`, the number of samples in one stretch.
     """
-
-    _window = SAMPLES
-    _over = "samples"
-    _chance = _CHANCE_OF_SAMPLES
-    _strict = False
 
     def __init__(
         self,
         controller: Follower,
-        limits: tuple[float, float],
-        span: float,
+        stretch: int,
+        rules: Rules,
         fallback: Callable[[Any], Follower] | None = None,
-        *,
-        judges: bool = True,
-        holds: float = math.nan,
     ) -> None:
-        super().__init__(controller, limits, span, fallback, judges=judges, holds=_MOVING * holds)
+        super().__init__(controller, rules, fallback)
+        self._stretch = stretch
+        self._samples: list[tuple[float, float]] = []
         self._reference = math.nan
 
     @property
@@ -283,7 +266,7 @@ class SupervisedFollower(_Supervision):
         """Number of coming periods whose reference the controller at work wants; 0 for none."""
         return self._controller.horizon if isinstance(self._controller, Foreseeing) else 0
 
-    def foresee(self, references: NDArray[np.float64]) -> None:
+    def foresee(self, references: Floats) -> None:
         """Take the reference at the end of each coming period; see `Foreseeing`."""
         if isinstance(self._controller, Foreseeing):
             self._controller.foresee(references)
@@ -291,9 +274,12 @@ class SupervisedFollower(_Supervision):
     def update(self, t: float, measured_input: float, output: float, reference: float) -> float:
         """Take in a reading; see `Follower`. Raises ConvergenceError if the follower does no good."""
         # The last reference is that of now.
-        moves = reference != self._reference
-        if moves and self._judges and not self.gave_up and self.reach is Reach.MET:
-            self._judge(output - self._reference)
+        error, moves = output - self._reference, reference != self._reference
+        if moves and self._is_judging and self.reach is Reach.MET and math.isfinite(error):
+            self._samples.append((error, self.trace.disturbance))
+        if len(self._samples) == self._stretch:
+            self._judge(*np.mean(np.square(self._samples), axis=0).tolist())
+            self._samples = []
         self._reference = reference
         setpoint: float = self._controller.update(t, measured_input, output, reference)
         return setpoint

@@ -11,7 +11,6 @@ from bench.analysis import REACH, READING
 from bench.base import DataError
 from bench.control import (
     ControllerSetup,
-    Fallback,
     ReachTarget,
     Supervised,
     Tuning,
@@ -27,7 +26,6 @@ from bench.protocol import (
     Messages,
     Note,
     Phase,
-    ProtocolParameters,
     Slots,
     Step,
     Views,
@@ -45,7 +43,7 @@ from protocols.muscles.parts import (
     prepare_on_stage,
     reset_under_weights,
 )
-from protocols.preparation import Part
+from protocols.preparation import Part, SupervisedParameters
 
 Output = Literal["length", "force"]
 
@@ -53,7 +51,7 @@ _TARGETS_AT_A_LOAD = 5
 _GRACE = 60.0
 
 
-class Controlled(ProtocolParameters):
+class Controlled(SupervisedParameters):
     """Parameters of either task."""
 
     model: str = parameter(
@@ -69,9 +67,6 @@ class Controlled(ProtocolParameters):
     sequence_seed: int = parameter(1, unit="1", low=0, help="seed of the targets")
     tuning: Tuning = parameter(
         {}, unit="", help="numbers of controllers in place of those from the model: a tuning file, or tables"
-    )
-    fallback: Fallback = parameter(
-        "none", unit="", help="what goes on in place of a controller that is given up; none ends the run"
     )
     duration: float = parameter(20.0, unit="s", low=2, high=3600, help="time for each target")
     readings: int = parameter(5, unit="1", low=1, high=1000, help="readings at each target after that time")
@@ -175,7 +170,7 @@ def _make_controller(
         f"coupled-{output}",
         parameters.controller,
         setup,
-        span=span,
+        parameters.rules(span),
         fallback=parameters.fallback,
         **opened,
     )

@@ -36,7 +36,6 @@ from bench.control import (
     Trace,
     TwoStageInverse,
     check_positive,
-    greatest_error,
     saturation,
     tuned,
     widened,
@@ -445,15 +444,15 @@ def _task(setup: ControllerSetup, kind: type[Task]) -> Task:
     return kind.of_model(inverse, state, setup.limits, noise, _timing(setup).model_error)
 
 
-def _holds(setup: ControllerSetup, kind: type[Task]) -> float:
-    """Return the greatest RMS error of a model that still holds, output units."""
+def _own_error(setup: ControllerSetup, kind: type[Task]) -> float:
+    """Return the RMS error that the model leaves by itself, output units."""
     low, high = _task(setup, kind).output_range()
     # The file states errors in percent of the range.
-    own = setup.model.provenance.get("errors", {}).get(kind.kind, {}).get("rms", 0.0)
+    own = 0.01 * setup.model.provenance.get("errors", {}).get(kind.kind, {}).get("rms", 0.0)
     timing = _timing(setup)
     # What is left of a move at the end of its time, of moves between targets at random.
-    left = math.exp(-timing.duration / max(timing.time_constant, SHORTEST_WAIT)) * (high - low) / math.sqrt(6.0)
-    return math.hypot(greatest_error(0.01 * own * (high - low), high - low), left)
+    left = math.exp(-timing.duration / max(timing.time_constant, SHORTEST_WAIT)) / math.sqrt(6.0)
+    return math.hypot(own, left) * (high - low)
 
 
 def _with_inverse(summary: str, controller: Callable[..., MuscleController], kind: type[Task]) -> ControllerSpec:
@@ -463,7 +462,7 @@ def _with_inverse(summary: str, controller: Callable[..., MuscleController], kin
         numbers=_timing,
         # The lead is by a number of periods.
         tunable=("period+horizon", "horizon", "caution", "model_error") if controller is MuscleClosedLoop else (),
-        holds=(lambda s: _holds(s, kind)) if controller is MuscleOpenLoop else None,
+        own_error=(lambda s: _own_error(s, kind)) if controller is MuscleOpenLoop else None,
     )
 
 

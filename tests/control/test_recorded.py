@@ -21,6 +21,7 @@ from bench.control import (
     FollowReference,
     NotchLoop,
     NotchLoopParameters,
+    Rules,
     SmoothMoves,
     Spans,
     Supervised,
@@ -339,7 +340,9 @@ SCENES = {
         IntegralControl((0.0, 10.0), IntegralParameters.scaled(spans(), 8.0)), Plant(film())
     ),
     "supervised": lambda: reaching(
-        Supervised(ClosedLoopInverse(film().inverse()), (0.0, 10.0), 1.0), Plant(film(), offset=0.2), (0.3, 0.7, 0.5)
+        Supervised(ClosedLoopInverse(film().inverse()), (0.0, 10.0), Rules(allowed=0.02)),
+        Plant(film(), offset=0.2),
+        (0.3, 0.7, 0.5),
     ),
     "following in open loop": lambda: following(
         OpenLoopFollower(film().inverse(), parameters=FollowingParameters(0.5, 0.1, lead=1.2)), Plant(film()), sine

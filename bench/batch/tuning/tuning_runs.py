@@ -126,7 +126,7 @@ class TuningRuns:
         if role is None:
             raise ConfigurationError(f"rig {self.rig} does not bind [roles.{self.task.slot}]")
         self._signal = role.signal or role.reading
-        self._opened = controller_spec(self.task.kind, self.task.controller).holds is not None
+        self._opened = controller_spec(self.task.kind, self.task.controller).own_error is not None
         self._models = {}
         others = perturbed_models(self.file, force=self.task.slot == FORCE)
         for name, model in {_AS_IDENTIFIED: self.file, **others}.items():
