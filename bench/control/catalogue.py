@@ -20,7 +20,7 @@ from bench.control.latched import Latched, LatchParameters
 from bench.control.model_filters import AdaptationName, ModelFilter, model_filter
 from bench.control.opposite_output import OppositeOutput
 from bench.control.supervision import Rules, Supervised, SupervisedFollower
-from bench.control.tracking import ClosedLoopInverse, CorrectionParameters, OpenLoopInverse
+from bench.control.tracking import TO_REST, ClosedLoopInverse, CorrectionParameters, OpenLoopInverse
 from bench.control.tuning import Spans, tuned
 from bench.identification import ModelFile, load_model
 from bench.models import FallingInverse, Inverse, Operator, Policy, ResponseDynamics
@@ -31,8 +31,6 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 S = TypeVar("S", Supervised, SupervisedFollower)
 
-_TO_REST = 10.0
-"""Time constants in which a specimen comes to rest to the sensor's noise."""
 _END_OF_PLANE = 0.005
 """Part of a plane by which its lower end may lie below the set-point that saturates the specimen."""
 
@@ -186,7 +184,7 @@ def time_to_rest(dwell: float | None, model: ModelFile, who: str) -> float:
             f"{who}: nothing says how long the specimen takes to come to rest; give "
             "[roles.drive] dwell = ... (s) in the rig file, or identify the model from a run with transients"
         )
-    return _TO_REST * dynamics.time_constant
+    return TO_REST * dynamics.time_constant
 
 
 def controller_names(task: str) -> tuple[str, ...]:
@@ -270,7 +268,8 @@ def make_supervised(
         judges=setup.adaptation == "off" and not spec.misses,
         feedback=spec.own_error is None,
     )
-    make: Callable[..., S] = partial(kind, controller, setup.stretch if kind is SupervisedFollower else setup.limits)
+    of_task: Any = setup.stretch if kind is SupervisedFollower else setup.limits
+    make: Callable[..., S] = partial(kind, controller, of_task)
     if fallback == "none":
         return make(rules)
     opened = replace(setup, options=options)
@@ -305,8 +304,15 @@ def _look_up(setup: ControllerSetup) -> LookUp:
 def _correction(setup: ControllerSetup) -> CorrectionParameters:
     found = CorrectionParameters.scaled(setup.spans)
     response = setup.response
-    further = 0.0 if response is None else _TO_REST * response.lag
+    further = 0.0 if response is None else TO_REST * response.lag
     return replace(found, arrival=replace(found.arrival, patience=found.arrival.patience + further))
+
+
+def _latch_parameters(setup: ControllerSetup) -> LatchParameters:
+    inverse: Any = setup.inverse()
+    noise = None if setup.model.dynamics is None else setup.model.dynamics.noise.get("output")
+    operator = inverse.opposite.operator if isinstance(inverse, FallingInverse) else inverse.operator
+    return LatchParameters.of(operator, setup.rest, noise)
 
 
 def _latched(setup: ControllerSetup) -> Latched | OppositeOutput:
@@ -318,7 +324,7 @@ def _latched(setup: ControllerSetup) -> Latched | OppositeOutput:
         )
     options = dict(setup.options)
     correction = tuned(Latched.correction(setup.spans), options.pop("correction", {}))
-    numbers = setup.tuned(partial(LatchParameters.scaled, dwell=setup.rest), options)
+    numbers = setup.tuned(lambda _: _latch_parameters(setup), options)
     if isinstance(inverse, FallingInverse):
         opposite: Any = inverse.opposite
         return OppositeOutput(Latched(opposite, numbers, setup.start, setup.limits, correction))
@@ -370,8 +376,8 @@ CLOSED_LOOP_INVERSE = ControllerSpec(
 LATCHED = ControllerSpec(
     "backs off at the target, where the hysteresis holds the output",
     _latched,
-    numbers=lambda s: LatchParameters.scaled(s.spans, s.rest),
-    tunable=("approach", "creep_gain", "creep_until", "fine_period"),
+    numbers=_latch_parameters,
+    tunable=("wander", "noise", "steepest", "farthest"),
 )
 POLYNOMIAL = ControllerSpec("the look-up table of a model without memory", _look_up, misses=True)
 INTEGRAL = ControllerSpec(

@@ -6,112 +6,144 @@ import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
+import numpy as np
+
 from bench.control.estimators import DisturbanceEstimator
-from bench.control.tracking import Arrival, Correcting, CorrectionParameters, Move, Sample, Script, check_positive
+from bench.control.model_filters import GATE, INPUT_ERROR
+from bench.control.tracking import (
+    TO_REST,
+    Arrival,
+    Correcting,
+    CorrectionParameters,
+    Move,
+    Sample,
+    Script,
+    check_positive,
+)
 from bench.control.tuning import Spans
 from bench.models import MemoryCurve, Preisach, PreisachInverse
 
 Direction = Literal[-1, 1]
 
 _UNLOCKED = 3
-"""Targets in a row at which no lock held, after which it is not to be expected."""
+"""Targets in a row at which no lock held, after which it is not to be expected.
+
+Derivation: each of them has been approached `tries` times from either side; one may lie where no lock holds.
+"""
+_RARE = 3.0
+"""Standard deviations beyond which an error of the input is not expected: one in 370, if it is normal.
+
+Source: the three-sigma rule (ISO 7870-2, control charts).
+"""
 
 
 @dataclass(frozen=True)
 class LatchParameters:
-    """Numbers of the latched controller."""
+    """What the latched controller knows of actuator, specimen and sensor; all its other numbers follow from that.
 
-    approach: float
-    """How far before the target, in output units, the approach by the model ends."""
-    arrival: Arrival
-    """When the actuator has arrived after a move of the approach."""
-    creep_least: float
-    creep_most: float
-    """Slowest and fastest creep, input units per second."""
-    creep_gain: float
-    """Creep per output unit of the error that is left, input units per second and output unit."""
-    creep_offset: float
-    """Error at which the creep would be slowest, output units: what stepping back will take away."""
-    creep_fast: float
-    """Fastest creep towards a target that the model has further ahead, input units per second."""
-    creep_until: float
-    """Error at which the creep ends, output units: `creep_offset` and what the actuator still moves on."""
-    step_back: float
-    """Move back from the extreme, input units."""
-    nearest: float
+    Each of these can stand in the rig file; what is not there comes from the model.
+    """
+
+    wander: float
+    """Standard deviation by which the specimen's input differs unseen from the measured one, input units."""
+    noise: float
+    """Standard deviation of one reading of the output, output units."""
+    steepest: float
+    """Greatest slope of the output on a branch, output units per input unit."""
+    locked_slope: float
+    """Mean slope of the output behind a reversal, output units per input unit; not 0."""
     farthest: float
-    """Least and greatest distance behind the extreme that the fine loop may go, input units. Nearer, what the input
-    wanders unseen would move the extreme; farther, hysterons switch back, the slope of the output changes its sign,
-    and the loop would run away."""
-    lock_within: float
-    """Error after stepping back with which the fine loop can deal, output units."""
-    accept: float
-    """Error that may be left after the fine loop, output units; with more the lock has been lost."""
-    walk_variance: float
-    reading_variance: float
-    """Variances of the estimate of the locked output, for each reading, output units squared: what the input wanders
-    unseen, by the small slope; noise of one reading."""
-    end_margin: float
-    """Within this distance of the outputs at saturation, in output units, and beyond them, the incremental inverse
-    alone is used."""
-    creep_horizon: float
-    """Time in which the creep reaches a target that the model has further ahead than the creep would come, as after a
-    turn, s; `creep_fast` limits it."""
-    creep_limit: float
-    """Longest creep, s."""
-    settle: float
-    """Time after stepping back before locking is decided, s."""
-    fine_period: float
-    """Time between moves of the fine loop, s."""
-    approach_done: float = 1.8
-    """Multiple of `approach` before the target at which the approach is over."""
-    approach_corrections: int = 8
-    """Greatest number of corrections of an approach."""
+    """Greatest distance behind the extreme that the fine loop may go, input units: farther, hysterons switch back,
+    the slope of the output changes its sign, and the loop would run away. By the model half of the width of a cell: so
+    a quarter of the hysterons of one switch back, and of narrower ones the plane says nothing."""
+    rest: float
+    """Time in which actuator and specimen come to rest, s."""
     tries: int = 10
     """Greatest number of approaches, each from the other side, before falling back."""
     fine_moves: int = 5
     """Number of moves of the fine loop."""
-    fine_gain: float = 1.0
-    """Part of the estimated error that one move takes away, 0 to 2."""
 
     def __post_init__(self) -> None:
-        check_positive(self)
-        if not self.nearest <= self.step_back <= self.farthest:
+        check_positive(self, "wander", "noise", "steepest", "farthest", "rest", "tries", "fine_moves")
+        if not math.isfinite(self.locked_slope) or self.locked_slope == 0.0:
+            raise ValueError(f"locked_slope: expected a number other than 0, got {self.locked_slope}")
+        if not self.nearest < self.farthest:
             raise ValueError(
-                f"step_back: expected a value within nearest = {self.nearest} and farthest = {self.farthest}, "
-                f"got {self.step_back}"
+                f"farthest: expected more than {_RARE:g} times wander, {self.nearest:g}, got {self.farthest}"
             )
-        if self.creep_least > self.creep_most:
-            raise ValueError(f"creep_least: expected at most creep_most = {self.creep_most}, got {self.creep_least}")
-        if self.fine_gain >= 2.0:
-            raise ValueError(f"fine_gain: expected less than 2, where the loop is unstable, got {self.fine_gain}")
 
     @classmethod
-    def scaled(cls, spans: Spans, dwell: float) -> LatchParameters:
-        """Return the defaults for a model and an actuator that comes to rest within `dwell` (s)."""
-        u, y = spans
-        return cls(
-            approach=1.3e-2 * y,
-            arrival=Arrival(tolerance=1.6e-3 * u, hold=dwell / 40.0, patience=1.875 * dwell),
-            creep_least=1.92e-3 * u / dwell,
-            creep_most=1.52e-2 * u / dwell,
-            creep_gain=0.72 * u / y / dwell,
-            creep_offset=9.5e-4 * y,
-            creep_fast=3.84e-2 * u / dwell,
-            creep_until=1.75e-3 * y,
-            step_back=8e-3 * u,
-            nearest=1.3e-3 * u,
-            farthest=1.75e-2 * u,
-            lock_within=2.4e-3 * y,
-            accept=8e-4 * y,
-            walk_variance=(5e-5 * y) ** 2,
-            reading_variance=(2e-4 * y) ** 2,
-            end_margin=2.6e-3 * y,
-            creep_horizon=0.5 * dwell,
-            creep_limit=7.5 * dwell,
-            settle=dwell / 8.0,
-            fine_period=dwell / 8.0,
-        )
+    def of(cls, operator: Preisach, rest: float, noise: float | None = None) -> LatchParameters:
+        """Return those of a model and an actuator that comes to rest within `rest` (s).
+
+        Without a known `noise` (output units) it is that of the closed loop (`CorrectionParameters`).
+        """
+        spans = Spans.of(operator)
+        if noise is None:
+            noise = math.sqrt(CorrectionParameters.scaled(spans).reading_variance)
+        low, high = operator.input_range
+        values = np.linspace(low, high, 50 * operator.order)
+        branch = operator.evaluate(np.concatenate([values, values[::-1]]), operator.saturated_state(-1, low))
+        steepest = float(np.abs(np.diff(branch)).max() / (values[1] - values[0]))
+        locked = float(np.mean([reversible_slope(operator, value) for value in values.tolist()]))
+        cell = float(np.diff(operator.levels).min())
+        return cls(INPUT_ERROR * spans.input, noise, steepest, locked, 0.5 * cell, rest)
+
+    @property
+    def lag(self) -> float:
+        """Time constant of actuator and specimen, s; also the time between two moves of the fine loop."""
+        return self.rest / TO_REST
+
+    @property
+    def nearest(self) -> float:
+        """Least distance behind the extreme, input units: nearer, a wander of three σ would move the extreme."""
+        return _RARE * self.wander
+
+    @property
+    def step_back(self) -> float:
+        """Move back from the extreme, input units: into the middle of where the lock holds."""
+        return 0.5 * (self.nearest + self.farthest)
+
+    @property
+    def approach(self) -> float:
+        """How far before the target the approach by the model ends, output units: what three σ of wander make of it.
+
+        An approach that is as far off again, at twice that, is over too.
+        """
+        return self.steepest * self.nearest
+
+    @property
+    def creep_gain(self) -> float:
+        """Creep per output unit of the error that is left, input units per second and output unit.
+
+        The creep is an integrator behind a lag τ: with a gain of 1 / (2 τ slope) it is damped by 1/√2.
+        """
+        return 0.5 / (self.lag * self.steepest)
+
+    @property
+    def reserve(self) -> float:
+        """What the fine loop can bring back from the middle of where the lock holds, output units."""
+        return abs(self.locked_slope) * (self.farthest - self.step_back)
+
+    @property
+    def creep_offset(self) -> float:
+        """Error at which the creep is slowest, output units: what stepping back takes away."""
+        return -self.locked_slope * self.step_back
+
+    @property
+    def creep_until(self) -> float:
+        """Error at which the creep ends, output units: in the middle of what is left once the actuator stands."""
+        return self.creep_offset + 0.5 * self.reserve
+
+    @property
+    def creep_least(self) -> float:
+        """Slowest creep, input units per second: at the steepest slope it moves on by the reserve, one lag long."""
+        return self.reserve / (self.steepest * self.lag)
+
+    @property
+    def creep_most(self) -> float:
+        """Fastest creep, input units per second: it moves on by an approach, one lag long."""
+        return self.approach / (self.steepest * self.lag)
 
 
 class Latched(Correcting):
@@ -163,7 +195,10 @@ class Latched(Correcting):
             raise ValueError("inverse: expected a model with a reversible part, by which a locked output is moved")
         super().__init__(inverse, state, limits, correction or Latched.correction(Spans.of(inverse.operator)))
         self._parameters = parameters
-        self._poll = self._parameters.arrival.poll
+        # As near to the set-point as the wander lets it come, for two readings, or as long as it takes to rest twice.
+        self._arrival = Arrival(
+            parameters.nearest, hold=2.0 * self._poll, poll=self._poll, patience=2.0 * parameters.rest
+        )
         self._saturated = sorted(inverse.operator.evaluate(inverse.operator.levels[[0, -1]]).tolist())
         self._operator = inverse.operator
         self.extreme: float | None = None
@@ -196,7 +231,8 @@ class Latched(Correcting):
         p = self._parameters
         self.extreme, self.locked, self.tries = None, False, 0
         low, high = self._saturated
-        if low + p.end_margin <= target <= high - p.end_margin:
+        margin = abs(p.creep_offset) + p.reserve
+        if low + margin <= target <= high - margin:
             self._direction = 1 if target > reading.output else -1
             while self.tries < p.tries:
                 self.tries += 1
@@ -219,26 +255,27 @@ class Latched(Correcting):
             """Return the part of the way that is left, output units; negative beyond the target."""
             return direction * (target - reading.output)
 
-        for _ in range(p.approach_corrections):
-            if left(reading) <= p.approach_done * p.approach:
+        for _ in range(self._correction.corrections):
+            if left(reading) <= 2.0 * p.approach:
                 break
             setpoint = self._ahead(target - direction * p.approach - self._estimator.value)
             if setpoint is None:
                 return reading
-            reading = yield from self._arrive(setpoint, p.arrival)
+            reading = yield from self._arrive(setpoint, self._arrival)
             self._estimator.update(reading.output - self._modelled())
 
-        for _ in range(round(p.creep_limit / self._poll)):
+        # So long the slowest creep takes for what is left of an approach.
+        for _ in range(round(p.approach / (p.steepest * p.creep_least) / self._poll)):
             if left(reading) <= p.creep_until:
                 break
             ahead = self._ahead(self._modelled() + direction * left(reading))
             if ahead is None:
                 return reading
-            rate = max(p.creep_least + p.creep_gain * (left(reading) - p.creep_offset), p.creep_least)
-            long = min(abs(ahead - reading.input) / p.creep_horizon, p.creep_fast)
-            rate = max(min(rate, p.creep_most), long)
+            rate = min(max(p.creep_gain * (left(reading) - p.creep_offset), p.creep_least), p.creep_most)
+            # The model may have the target further ahead, as after a turn: it is half way there in half of the rest.
+            rate = max(rate, 2.0 * abs(ahead - reading.input) / p.rest)
             reading = yield self._command(self._setpoint + direction * rate * self._poll, self._poll)
-        if not -p.lock_within <= left(reading) <= p.creep_until:
+        if abs(left(reading) - p.creep_offset) > 2.0 * p.reserve:
             return reading
 
         self.extreme = reading.input
@@ -248,21 +285,23 @@ class Latched(Correcting):
         """Step back and move the locked output to the target."""
         p = self._parameters
         assert self.extreme is not None
-        locked = DisturbanceEstimator(walk_variance=p.walk_variance, reading_variance=p.reading_variance)
+        # Between two readings the locked output moves by what the input wanders unseen.
+        locked = DisturbanceEstimator(walk_variance=(p.locked_slope * p.wander) ** 2, reading_variance=p.noise**2)
         origin = setpoint = self._behind(self.extreme - self._direction * p.step_back)
         slope = reversible_slope(self._operator, origin)
         for move in range(p.fine_moves + 1):
-            for _ in range(max(1, round((p.fine_period if move else p.settle) / self._poll))):
+            for _ in range(max(1, round(p.lag / self._poll))):
                 reading = yield self._command(setpoint, self._poll)
                 # Its output by the slope, had it been at `origin`: no need to wait for the input to settle.
                 locked.update(reading.output - slope * (reading.input - origin))
                 setpoint = self._behind(setpoint)
             error = target - locked.value - slope * (setpoint - origin)
-            if abs(error) > p.lock_within or slope == 0.0:
+            if abs(error) > 2.0 * p.reserve or slope == 0.0:
                 return reading
             if move < p.fine_moves:
-                setpoint = self._behind(setpoint + p.fine_gain * error / slope)
-        self.locked = abs(error) <= p.accept
+                setpoint = self._behind(setpoint + error / slope)
+        # Of an error beyond what the estimate may err by, the lock has been lost.
+        self.locked = abs(error) <= GATE * locked.uncertainty
         return reading
 
     def _behind(self, setpoint: float) -> float:

@@ -36,6 +36,11 @@ from bench.control.overshoot import Overshoot, Passing
 from bench.control.tuning import Spans
 from bench.models import Inverse, InverseStream, Inversion, Operator, Reach, ResponseDynamics, SeenInput, Stream
 
+TO_REST = 10.0
+"""Time constants in which a specimen comes to rest to the sensor's noise.
+
+Derivation: e⁻¹⁰ is 0.005 % of a move, a tenth of the smallest part that a reading of 0.05 % shows.
+"""
 _LOOK = 0.25
 """Time between two readings of an input that settles, s: the peak of one that rings at 2 rad/s is seen to 2 %."""
 _LOOK_AT_PEAK = 0.1

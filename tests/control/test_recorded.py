@@ -281,7 +281,7 @@ def predictive(dynamics, **options):
 
 
 def latched(operator):
-    return Latched(operator.inverse(), LatchParameters.scaled(Spans.of(operator), 8.0))
+    return Latched(operator.inverse(), LatchParameters.of(operator, 8.0))
 
 
 def spans():
@@ -295,7 +295,7 @@ def numbers():
         "following": FollowingParameters.scaled(spans()),
         "predictive": PredictionParameters.scaled(spans(), 0.5),
         "integral": IntegralParameters.scaled(spans(), 8.0),
-        "latched": LatchParameters.scaled(spans(), 8.0),
+        "latched": LatchParameters.of(film(), 8.0),
         "latched, correction": Latched.correction(spans()),
     }
     return {

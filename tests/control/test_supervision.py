@@ -197,7 +197,7 @@ def test_an_open_loop_whose_model_does_not_hold_is_stopped_with_what_to_do():
     for target in TARGETS_WITHIN:
         specimen.reach(controller, target)
     controller, specimen = Supervised(opened(None), LIMITS, rules), Specimen(offset=0.15 * span)
-    with pytest.raises(ConvergenceError, match="the model does not hold .* adaptation=session"):  # noqa: PT012
+    with pytest.raises(ConvergenceError, match=r"the model does not hold .* adaptation=session"):  # noqa: PT012
         for target in TARGETS_WITHIN:
             specimen.reach(controller, target)
 

@@ -27,12 +27,8 @@ WITH_MEMORY = ["open", "closed", "latched", "open-follower", "closed-follower"]
 # Numbers that suit the film, K, 1/m and s; the defaults are in proportion to the ranges of a model.
 CORRECTION = CorrectionParameters(5.0, 3.0, 1.0, Arrival(0.03))
 INTEGRAL = IntegralParameters(0.005, 0.5, 8.0)
-LATCH = LatchParameters(
-    approach=25.0, arrival=Arrival(0.1, hold=0.2), creep_least=0.015, creep_most=0.12, creep_gain=0.003,
-    creep_offset=1.8, creep_fast=0.3, creep_until=3.3, step_back=0.5, nearest=0.08, farthest=1.1, lock_within=4.5,
-    accept=1.5, walk_variance=1e-2, reading_variance=0.14, end_margin=5.0, creep_horizon=4.0, creep_limit=60.0,
-    settle=1.0, fine_period=1.0,
-)  # fmt: skip
+# By hand, where they are not those of the model: wander and noise of the film and its sensor.
+LATCH = LatchParameters(wander=0.03, noise=0.37, steepest=280.0, locked_slope=-4.0, farthest=1.0, rest=8.0)
 NUMBERS = {
     "open": {"wait": 8.0},
     "look-up": {"wait": 8.0},
@@ -476,7 +472,7 @@ class TestLatched:
         model = with_wide_loops(models.film)
         actuator, controller = (
             IdealActuator(model),
-            Latched(PreisachInverse(model), LatchParameters.scaled(Spans.of(model), 8.0)),
+            Latched(PreisachInverse(model), LatchParameters.of(model, 8.0)),
         )
         actuator.disturbance = 20.0
         actuator.reach(controller, target)
@@ -499,7 +495,8 @@ class TestLatched:
     def test_within_a_margin_of_saturation_it_does_not_try_to_lock(self, models, share, tried):
         film = models.film
         low, high = sorted(film.evaluate((film.levels[0], film.levels[-1])).tolist())
-        for target in (low + share * LATCH.end_margin, high - share * LATCH.end_margin):
+        margin = LATCH.creep_offset + LATCH.reserve
+        for target in (low + share * margin, high - share * margin):
             controller = make("latched", models)
             assert (controller.tries, controller.locked, controller.extreme) == (0, False, None)
             controller.aim(target, 0.0, *IdealActuator(film).read())
@@ -535,15 +532,13 @@ class TestLatched:
                 command = controller.update(t, setpoint, 200.0)
         assert controller.doubt.startswith("its lock held at none of the last 3 targets after 10 approaches each")
 
-    def test_the_parameters_keep_the_step_within_the_stretch(self):
-        with pytest.raises(ValueError, match="step_back"):
-            replace(LATCH, step_back=1.5)
-        with pytest.raises(ValueError, match="creep_least"):
-            replace(LATCH, creep_least=0.2)
-        with pytest.raises(ValueError, match="fine_gain"):
-            replace(LATCH, fine_gain=2.0)
-        with pytest.raises(ValueError, match="approach"):
-            replace(LATCH, approach=-1.0)
+    def test_the_parameters_leave_a_stretch_behind_the_extreme(self):
+        with pytest.raises(ValueError, match="farthest"):
+            replace(LATCH, wander=0.4)
+        with pytest.raises(ValueError, match="locked_slope"):
+            replace(LATCH, locked_slope=0.0)
+        with pytest.raises(ValueError, match="noise"):
+            replace(LATCH, noise=-1.0)
 
     def test_needs_a_reversible_part(self):
         levels = uniform_levels(0.0, 1.0, 4)
@@ -639,7 +634,7 @@ class TestTuning:
         "scaled",
         [
             *(each.scaled for each in (CorrectionParameters, FollowingParameters, Arrival)),
-            *(partial(each.scaled, dwell=8.0) for each in (IntegralParameters, LatchParameters)),
+            partial(IntegralParameters.scaled, dwell=8.0),
         ],
     )
     def test_other_units_of_the_same_model_change_nothing_but_the_units(self, scaled):
