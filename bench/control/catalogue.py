@@ -17,7 +17,7 @@ from bench.base import ConfigurationError, DataError, registry
 from bench.control.baselines import IntegralControl, IntegralParameters, LookUp
 from bench.control.following import ClosedLoopFollower, FollowingParameters, IntegralFollower, OpenLoopFollower
 from bench.control.latched import Latched, LatchParameters
-from bench.control.model_filters import AdaptationName, ModelFilter, model_filter
+from bench.control.model_filters import GATE, INPUT_ERROR, AdaptationName, ModelFilter, model_filter
 from bench.control.opposite_output import OppositeOutput
 from bench.control.supervision import Rules, Supervised, SupervisedFollower
 from bench.control.tracking import TO_REST, ClosedLoopInverse, CorrectionParameters, OpenLoopInverse
@@ -31,8 +31,11 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 S = TypeVar("S", Supervised, SupervisedFollower)
 
-_END_OF_PLANE = 0.005
-"""Part of a plane by which its lower end may lie below the set-point that saturates the specimen."""
+_END_OF_PLANE = 2.0 * GATE * INPUT_ERROR
+"""Part of a plane by which its lower end may lie below the set-point that saturates the specimen.
+
+Derivation: both may be readings of one set-point, and each is within `GATE` standard deviations of it.
+"""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -310,8 +313,8 @@ def _correction(setup: ControllerSetup) -> CorrectionParameters:
 
 def _latch_parameters(setup: ControllerSetup) -> LatchParameters:
     inverse: Any = setup.inverse()
+    operator: Any = inverse.opposite.operator if isinstance(inverse, FallingInverse) else inverse.operator
     noise = None if setup.model.dynamics is None else setup.model.dynamics.noise.get("output")
-    operator = inverse.opposite.operator if isinstance(inverse, FallingInverse) else inverse.operator
     return LatchParameters.of(operator, setup.rest, noise)
 
 
@@ -429,7 +432,7 @@ def load_model_for(path: str, *, input_unit: str, output_unit: str) -> ModelFile
 def saturated_below(operator: Operator[Any], value: float) -> bool:
     """Return whether an input brings a specimen of this model to negative saturation from any state.
 
-    To 0.5 % of the plane: where measured inputs set its ends, these are readings of set-points, with their noise.
+    To 0.4 % of the plane: where measured inputs set its ends, these are readings of set-points, with their noise.
     """
     if operator.plane is None:
         return True

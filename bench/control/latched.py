@@ -28,7 +28,7 @@ Direction = Literal[-1, 1]
 _UNLOCKED = 3
 """Targets in a row at which no lock held, after which it is not to be expected.
 
-Derivation: each of them has been approached `tries` times from either side; one may lie where no lock holds.
+Derivation: each of them was approached `tries` times from either side; one may lie where no lock holds.
 """
 _RARE = 3.0
 """Standard deviations beyond which an error of the input is not expected: one in 370, if it is normal.
@@ -54,8 +54,8 @@ class LatchParameters:
     """Mean slope of the output behind a reversal, output units per input unit; not 0."""
     farthest: float
     """Greatest distance behind the extreme that the fine loop may go, input units: farther, hysterons switch back,
-    the slope of the output changes its sign, and the loop would run away. By the model half of the width of a cell: so
-    a quarter of the hysterons of one switch back, and of narrower ones the plane says nothing."""
+    the slope of the output changes its sign, and the loop would run away. By the model half of the width of a cell:
+    so a quarter of the hysterons of one switch back, and of narrower ones the plane says nothing."""
     rest: float
     """Time in which actuator and specimen come to rest, s."""
     tries: int = 10

@@ -15,7 +15,10 @@ from bench.control.tracking import Command, Follower, Trace
 Floats = NDArray[np.float64]
 
 SHORTEST_WAIT = 1e-3
-"""Least time between two commands of a loop that is late, s."""
+"""Least time between two commands of a loop that is late, s.
+
+Derivation: eight bytes, as of a Modbus request, take 0.7 ms at 115 200 Bd; no instrument is asked sooner again.
+"""
 
 
 class ControlTask(Protocol):

@@ -37,22 +37,49 @@ else:
 AdaptationName: TypeAlias = Literal["off", "session", "density"]
 ADAPTATIONS: tuple[AdaptationName, ...] = get_args(AdaptationName)
 
-MODEL_ERROR = 5e-3
-"""Standard deviation of what no estimate explains in one reading, in spans of the output, at the least."""
-WORST, _SHARE = 16.0, 0.03
-"""Most that its variance grows by where readings are surprising, and the weight of each reading in that."""
-INPUT_ERROR = 5e-4
-"""Standard deviation of what the specimen's input differs unseen from the measured one, in spans of the input."""
 GATE = 4.0
-"""Standard deviations beyond which a reading is refused."""
-FORGETTING = 0.01
-"""Standard deviation by which an estimate may change from reading to reading, in parts of that at the beginning."""
-APART = 5e-3
-"""Least distance of the input from that of the last reading taken, in spans: nearer ones say the same once more."""
+"""Standard deviations beyond which a reading is refused.
+
+Derivation: a normal error is beyond them once in 16 000 readings, more than a session has.
+"""
+MODEL_ERROR = 5e-3
+"""Standard deviation of what no estimate explains in one reading, in spans of the output, at the least.
+
+Source: Preisach models of 20 levels leave 0.2 to 0.5 % RMS of the data from which they are identified
+(docs/explanation/measured.md).
+"""
+WORST = GATE**2
+"""Most that its variance grows by where readings are surprising.
+
+Derivation: then even a reading at the gate is no surprise.
+"""
 _LATELY, _LOST = 20, 6
-"""Of so many readings, how many must have been refused for the adaptation to begin anew."""
+"""Of so many readings, how many must have been refused for the adaptation to begin anew.
+
+Derivation: a sensor that jumps in one reading of twenty has six of twenty refused with a probability of 3e-4.
+"""
+_SHARE = 0.03
+"""Weight of each reading in the growth of the variance. Derivation: 1 / 0.03 count, half of a session of 60."""
 _BETTER = 0.5
-"""What the error of the identified model in these must be less than, in errors of the adapted one."""
+"""What the error of the identified model in these must be less than, in errors of the adapted one.
+
+Derivation: by chance the mean squares of six errors each differ by a factor of four in 6 % of cases (F test).
+"""
+INPUT_ERROR = 5e-4
+"""Standard deviation of what the specimen's input differs unseen from the measured one, in spans of the input.
+
+Source: a film on a plate wanders by 0.03 K of 63 K beside the plate's sensor (docs/reference/robustness.md).
+"""
+APART = 10.0 * INPUT_ERROR
+"""Least distance of the input from that of the last reading taken, in spans: nearer ones say the same once more.
+
+Derivation: ten standard deviations of the input, so that its error is a tenth of the difference.
+"""
+FORGETTING = 0.01
+"""Standard deviation by which an estimate may change from reading to reading, in parts of that at the beginning.
+
+Derivation: after 10 000 readings, 22 h at 8 s each, an estimate is as uncertain again as at the beginning.
+"""
 
 
 class Estimate(NamedTuple):

@@ -81,16 +81,33 @@ class NotchLoopParameters:
 
 
 RESERVE = 0.05
-"""Part of the stroke that is left to the loop: a fast step lacks the creep that the slow loops of a model contain."""
+"""Part of the stroke that is left to the loop: a fast step lacks the creep that the slow loops of a model contain.
 
-_JUDGED = 0.05
-"""Least step of the reference that is judged by its overshoot, as a part of the stroke."""
+Source: a ceramic actuator creeps by 1 to 2 % of a step in each decade of time (Devasia, Eleftheriou and Moheimani, "A
+survey of control issues in nanopositioning", IEEE Transactions on Control Systems Technology, 2007, for its size);
+three decades lie between a step and the end of its hold.
+"""
+_JUDGED = RESERVE
+"""Least step of the reference that is judged by its overshoot, as a part of the stroke.
+
+Derivation: a smaller one is no more than the creep of the steps before it may be.
+"""
 _OVERSHOOT = 0.05
-"""Overshoot of a step from which on the loop is not the one that was designed, which has none."""
+"""Overshoot of a step from which on the loop is not the one that was designed, which has none.
+
+Derivation: poles damped by 0.69 overshoot by e^(−π 0.69 / √(1 − 0.69²)), 5 %; those of the notch are damped by 0.7.
+"""
 _LASTING = 0.5e-3
-"""Time for which it lasts then, s; noise does not."""
+"""Time for which it lasts then, s; noise does not.
+
+Derivation: ten samples at 20 kHz; noise that is independent from sample to sample stays on one side for so long once
+in 2¹⁰ samples, and beyond the limit less often.
+"""
 _AT_THE_END = 0.05
-"""Time at the end of the stroke after which the reference counts as out of reach, s."""
+"""Time at the end of the stroke after which the reference counts as out of reach, s.
+
+Derivation: fifteen time constants of an integral of 300 1/s; a step that only passes the end is back by then.
+"""
 
 
 class NotchLoop:

@@ -5,10 +5,17 @@ from __future__ import annotations
 import math
 
 LEAST = 0.01
-"""Overshoot, as a part of a move, below which moves are made at once."""
+"""Overshoot, as a part of a move, below which moves are made at once.
+
+Derivation: of a move of a twentieth of the range it is 0.05 % of that, the tolerance of an arrival.
+"""
 _MOST = 0.6
+"""Greatest overshoot that is believed.
+
+Derivation: e^(−πζ / √(1 − ζ²)) with a damping ζ of 0.16; a loop that is damped less is out of order.
+"""
 _NEW = 0.5
-"""Weight of what the last move showed."""
+"""Weight of what the last move showed. Derivation: with a weight w (2 − w) / w moves count, three."""
 
 
 class Overshoot:

@@ -22,31 +22,46 @@ from scipy.optimize import lsq_linear
 from bench.base import Floats, checks as _checks
 from bench.control import prediction_kernels as kernels
 from bench.control.estimators import DisturbanceEstimator
-from bench.control.model_filters import ModelFilter
+from bench.control.model_filters import INPUT_ERROR, ModelFilter
 from bench.control.tracking import ControllerBase, check_positive
 from bench.control.tuning import Spans
 from bench.models import IdentifiedDynamics, Inverse, Reach
 
 _PARTS = 4
-"""Steps of time in a period."""
-_MOST_PERIODS = 24
-_FEWEST_PERIODS = 6
+"""Steps of time in a period. Derivation: straight between them, a bend within a period is known to 1 / 4²."""
 _TIMES = 4.0
-"""Length of the horizon beyond the delay, in time constants."""
-_VARIED = 1e-3
-"""Difference of a set-point for derivatives, in spans of the input."""
-_BETWEEN = 0.1
-"""Weight of the output's error between the ends of two periods, where the reference counts."""
-_NEAR = 0.25
-"""Longest step of the search, in spans of the input."""
-_POSITION, _RATE = 0.6, 0.2
-"""Parts of the error of the predicted position that its correction takes, and the rate's in a period."""
+"""Length of the horizon beyond the delay, in time constants. Derivation: e⁻⁴, 2 % of a move, lies behind it."""
+_VARIED = 2.0 * INPUT_ERROR
+"""Difference of a set-point for derivatives, in spans of the input.
+
+Derivation: twice what the input differs by unseen; a smaller one sees corners of the memory that the specimen lacks.
+"""
+_POSITION = 0.6
+"""Part α of the error of the predicted position that its correction takes.
+
+Derivation: with the rate's part the noise of the position is halved in variance,
+(2 α² + β (2 − 3 α)) / (α (4 − β − 2 α)) = 0.5.
+"""
+_RATE = _POSITION**2 / (2.0 - _POSITION)
+"""The part β of the rate in a period.
+
+Source: Benedict and Bordner, "Synthesis of an optimal set of radar track-while-scan smoothing equations", IRE
+Transactions on Automatic Control, 1962.
+"""
 _LAGS = 1.2 ** np.arange(-6, 7)
-"""Lags of the response that are tried beside each other, in identified ones."""
+"""Lags of the response that are tried beside each other, in identified ones.
+
+Derivation: quick readings show a lag to a factor of three (docs/reference/predictive-control.md); of a move followed
+with a lag that is 20 % off, 20 % of the lag's part is left.
+"""
 _KEPT = 0.98
-"""Part of the evidence for a lag that is kept from period to period."""
+"""Part of the evidence for a lag that is kept from period to period. Derivation: 1 / (1 − 0.98) periods count, 50."""
 _EVIDENCE = 0.9
-"""Squares of surprise, in those of the present lag, below which another one takes its place."""
+"""Squares of surprise, in those of the present lag, below which another one takes its place.
+
+Derivation: of two lags that do equally well one is ahead by that in 36 % of cases of 50 periods (F test); the wrong
+one of two such costs little, and without a threshold they would take turns.
+"""
 
 
 @dataclass(frozen=True)
@@ -63,6 +78,12 @@ class PredictionParameters:
         Weight of the set-points' second difference beside the output's error, in spans of output and input.
     searches : int
         Steps of the search in a period.
+    fewest, most : int
+        Least and greatest number of periods of the horizon; computing time grows with its square.
+    between : float
+        Weight of the output's error between the ends of two periods, where the reference counts.
+    longest_step : float
+        Longest step of the search, in spans of the input.
     """
 
     walk_variance: float
@@ -70,6 +91,10 @@ class PredictionParameters:
     period: float = 0.5
     smoothness: float = 0.05
     searches: int = 1
+    fewest: int = 6
+    most: int = 24
+    between: float = 0.1
+    longest_step: float = 0.25
 
     def __post_init__(self) -> None:
         check_positive(self)
@@ -149,7 +174,7 @@ class PredictiveFollower(ControllerBase):
             passed = np.array([[math.exp(-w * step), 0.0], [0.0, 0.0]])
         self._steps = np.vstack([passed, np.full(2, actuator.rate)])
         wanted = math.ceil((actuator.delay + _TIMES * (actuator.time_constant + response.lag)) / p.period)
-        self.horizon = min(max(wanted, _FEWEST_PERIODS), _MOST_PERIODS)
+        self.horizon = min(max(wanted, p.fewest), p.most)
         # Which set-point each step of time heeds: first those that were sent before, then those of the plan.
         ends = (np.arange(self.horizon * _PARTS) + 0.5) / _PARTS - actuator.delay / p.period
         self._before = 1 - math.floor(ends[0])
@@ -273,7 +298,7 @@ class PredictiveFollower(ControllerBase):
         ends = period * np.arange(self.horizon + 1)
         times = period / _PARTS * np.arange(1, self.horizon * _PARTS + 1)
         wanted = np.interp(times, ends, references)
-        weights = np.tile(np.append(np.full(_PARTS - 1, _BETWEEN), 1.0), self.horizon)
+        weights = np.tile(np.append(np.full(_PARTS - 1, self._parameters.between), 1.0), self.horizon)
         followed = self._inverse.follow(references[1:], state)
         self._reach = _reach(bool(followed.met[0]), references[1], float(followed.outputs[0]))
         inverses = [np.interp(ends[:-1] + ahead, ends[1:], followed.setpoints) for ahead in self._ahead]
@@ -287,7 +312,7 @@ class PredictiveFollower(ControllerBase):
         left = residuals(plans)
         best = int(np.argmin((left**2).sum(axis=1)))
         plan, error = plans[best], left[best]
-        near, varied = _NEAR * self._spans.input, _VARIED * self._spans.input
+        near, varied = self._parameters.longest_step * self._spans.input, _VARIED * self._spans.input
         for _ in range(self._parameters.searches):
             # On the side to which it moves, where the output has no corner; inwards at a limit.
             signs = np.where(np.diff(plan, prepend=self._setpoint) < 0.0, -1.0, 1.0)

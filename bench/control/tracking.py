@@ -42,21 +42,36 @@ TO_REST = 10.0
 Derivation: e⁻¹⁰ is 0.005 % of a move, a tenth of the smallest part that a reading of 0.05 % shows.
 """
 _LOOK = 0.25
-"""Time between two readings of an input that settles, s: the peak of one that rings at 2 rad/s is seen to 2 %."""
+"""Time between two readings of an input that settles, s.
+
+Derivation: the peak of one that rings at 2 rad/s is within half of it, and seen to 1 − cos 0.25, 3 %.
+"""
 _LOOK_AT_PEAK = 0.1
-"""The same on the way to a peak, s."""
+"""The same on the way to a peak, s. Derivation: as `_LOOK`, to 0.5 %."""
 _STILL = 0.003
-"""Part of a move within one such time below which the input stands still."""
+"""Part of a move within one such time below which the input stands still.
+
+Derivation: about the peak of an overshoot of 0.6 two readings differ by 0.6 (1 − cos 0.1) at 2 rad/s.
+"""
 _LONGEST_PART = 100
-"""Readings after which to go on without a peak."""
+"""Readings after which to go on without a peak. Derivation: 10 s, half a wave at 0.3 rad/s."""
 _SIGNIFICANT = 0.01
-"""Part of the range of set-points that a move must have for its overshoot to be learned."""
+"""Part of the range of set-points that a move must have for its overshoot to be learned.
+
+Derivation: five times `LEAST` of a smaller move is less than the tolerance of an arrival, 0.05 %.
+"""
 _AT_REST = 0.5
-"""What is left of a move when the specimen is at rest, in errors that are close enough."""
+"""What is left of a move when the specimen is at rest, in errors that are close enough.
+
+Derivation: the other half is left to the error of the controller.
+"""
 _ON_TIME = 1e-6
-"""Difference of times that are equal, s."""
-# Part of the output's range within which a clipped answer still counts as met.
+"""Difference of times that are equal, s. Source: rounding of float64: at 10⁹ s numbers are 1.2e-7 s apart."""
 _CLOSE = 1e-9
+"""Part of the output's range within which a clipped answer still counts as met.
+
+Source: rounding of float64: sums of 10⁵ cells err by no more than 10⁵ times 2.2e-16, 2e-11.
+"""
 
 
 @dataclass(frozen=True)

@@ -12,8 +12,11 @@ import numpy as np
 from bench.base import checks as _checks
 from bench.models import Inverse, Reach, Stage, TwoStage, TwoStageState
 
-# Part of an output range within which a target counts as met.
 _TOLERANCE = 1e-10
+"""Part of an output range within which a target counts as met.
+
+Source: rounding of float64: sums of 10⁵ cells err by no more than 10⁵ times 2.2e-16, 2e-11, in each of two stages.
+"""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The bounds of signals: limits of set-points, interlocks and warnings, drawn where the data come near."""
+"""The bounds of signals: limits of set-points, interlocks and warnings."""
 
 from __future__ import annotations
 
@@ -14,12 +14,6 @@ from bench.dashboard.drawing import ALARM, CAUTION, LIMIT, Colour
 from bench.dashboard.rerun_recording import Floats, Ints, RerunRecording, times
 from bench.devices import Signal
 from bench.rig import SETPOINT, Interlock, Level
-
-_NEAR = 1.0
-"""Spans of the data within which a bound is drawn over time; one that is farther away would flatten them."""
-
-_LAG = 0.01
-"""Part of the time shown by which the end of a drawn bound may stay behind the data."""
 
 
 @dataclass(frozen=True)
@@ -89,7 +83,7 @@ def nearest(bounds: Sequence[Bound], values: Sequence[float]) -> Bound | None:
 
 
 class BoundLines:
-    """Draws the bounds of some signals over time, as lines below the entity `path`, once the data are near.
+    """Draws the bounds of some signals over time, as lines below the entity `path`, as far as the data go.
 
     Parameters
     ----------
@@ -105,28 +99,16 @@ class BoundLines:
         self._path, self._factor = path, factor
         # The same for several signals, such as a set-point and its reading, is one line.
         self._bounds = list({(bound.value, bound.colour): bound for bound in bounds}.values())
-        self._low, self._high = math.inf, -math.inf
-        self._since: float | None = None
-        self._drawn: dict[int, float] = {}
 
-    def write(self, recording: RerunRecording, t: Floats, step: Ints, values: Floats) -> None:
-        """Draw what is near to values, shape (times, signals), in the unit of the signals."""
-        if not self._bounds or not np.isfinite(values).any():
-            return
-        since = self._since = float(t[0]) if self._since is None else self._since
-        self._low, self._high = min(self._low, np.nanmin(values)), max(self._high, np.nanmax(values))
-        reach = _NEAR * (self._high - self._low)
+    def draw(self, recording: RerunRecording) -> None:
+        """Write how the lines look."""
         for i, bound in enumerate(self._bounds):
-            path = f"{self._path}/bounds/{i}"
-            if i not in self._drawn:
-                if not self._low - reach <= bound.value <= self._high + reach or reach == 0.0:
-                    continue
-                recording.log(path, rr.SeriesLines(names=bound.kind, colors=bound.colour, widths=1.0))
-                self._line(recording, path, since, 0, bound)
-                self._drawn[i] = since
-            if t[-1] - self._drawn[i] > _LAG * (t[-1] - since):
-                self._line(recording, path, float(t[-1]), int(step[-1]), bound)
-                self._drawn[i] = float(t[-1])
+            look = rr.SeriesLines(names=bound.kind, colors=bound.colour, widths=1.0)
+            recording.log(f"{self._path}/bounds/{i}", look)
 
-    def _line(self, recording: RerunRecording, path: str, t: float, step: int, bound: Bound) -> None:
-        recording.send_vectors(path, times([t], [step]), np.array([[self._factor * bound.value]]))
+    def write(self, recording: RerunRecording, t: Floats, step: Ints) -> None:
+        """Draw the bounds over times, shape (times,), from the first to the last."""
+        ends = [0, -1]
+        for i, bound in enumerate(self._bounds):
+            values = np.full((2, 1), self._factor * bound.value)
+            recording.send_vectors(f"{self._path}/bounds/{i}", times(t[ends], step[ends]), values)

@@ -15,9 +15,15 @@ from bench.record import bins_of, headline_of
 _PATH = "lateness"
 _ROW = 0.04
 _HALF_WIDTH = 0.012
-"""Height of a row, and half the width of a bar, where the longest bar has a length of 1."""
+"""Height of a row, and half the width of a bar, where the longest bar has a length of 1.
+
+Derivation: 25 rows are a square; a bar fills 60 % of its row.
+"""
 _NAMES, _COUNTS, _RAISED = -0.14, 0.08, 0.8
-"""Where the names of the bins stand, the counts beside the ends of their bars, and both above theirs, in rows."""
+"""Where the names of the bins stand, the counts beside the ends of their bars, and both above theirs, in rows.
+
+Derivation: within the view, which is from −0.3 to 1.3 wide; texts hang from their places.
+"""
 
 
 class LatenessPlot:

@@ -18,21 +18,32 @@ from bench.identification import ModelFile
 from bench.record import Event, StepRecord
 
 QUEUED_TICKS = 20_000
-"""Entries waiting for Rerun beyond which telemetry is dropped (about 10 MB)."""
+"""Entries waiting for Rerun beyond which telemetry is dropped. Derivation: about 10 MB, at 0.5 kB an entry."""
 
 QUEUED_ENTRIES = 60_000
-"""Entries waiting for Rerun beyond which steps and events are dropped as well."""
+"""Entries waiting for Rerun beyond which steps and events are dropped as well. Derivation: about 30 MB."""
 
 CHUNK_ROWS = 4096
-"""Most rows at once: the more, the faster a recording loads, but the longer it takes to turn them into columns."""
+"""Most rows at once: the more, the faster a recording loads, but the longer it takes to turn them into columns.
+
+Source: Rerun joins rows to chunks of up to 4096 (`RERUN_CHUNK_MAX_ROWS`).
+"""
 
 _FILE_SECONDS = 300.0
 _PART_OF_RUN = 0.25
-"""Longest time until entries are in the file, s of wall-clock time, and as a part of the run so far."""
+"""Longest time until entries are in the file, s of wall-clock time, and as a part of the run so far.
+
+Derivation: a bench that dies leaves out five minutes or a quarter of a run at most; the journal has all of it.
+"""
 
 _BATCH_ROWS = 200
 _BATCH_SECONDS = 1.0
+"""Entries, and wall-clock time in s, after which Rerun is given what came.
+
+Source: Nielsen, *Usability Engineering*, 1993, section 5.5: what is late by 1 s does not interrupt a thought.
+"""
 _CLOSE_SECONDS = 5.0
+"""Longest wait at the end of a run, s. Derivation: 3 s until a stalled file is given up, and 2 s for the queue."""
 
 
 class Dashboard:

@@ -26,8 +26,12 @@ from bench.models import Operator
 from bench.record import StepRecord
 
 _FIRST = 16
-"""Rows after which the class of the input is judged first; then whenever they are an eighth more."""
+"""Rows after which the class of the input is judged first; then whenever they are an eighth more.
 
+Derivation: an eighth of them is two rows; of fewer each would be judged anew.
+"""
+
+# Source: WCAG 2.2, 1.4.11: each has a contrast of 3 to 1 or more to the nearly black background of the viewer.
 _MODEL: Colour = (150, 110, 190)
 _WITHIN: Colour = (186, 156, 216)
 

@@ -28,15 +28,24 @@ _END = b"RRF2FOOT"
 """In the last bytes of a file that was written to its end."""
 
 _END_BYTES = 32
+"""Source: an .rrd file ends in a frame of 32 bytes with that tag."""
 
 _STALLED_SECONDS = 3.0
-"""Wall-clock time without growth after which a file that is completed is given up, s."""
+"""Wall-clock time without growth after which a file that is completed is given up, s.
+
+Derivation: less than a run waits for the end of its dashboard (`_CLOSE_SECONDS` of `live`).
+"""
 
 _LOOK_SECONDS = 0.05
+"""Wall-clock time between two looks at that, s. Derivation: sixty looks."""
 
 _FLUSH_SECONDS = 0.5
-"""Time after which a viewer has stalled; a twentieth of it is enough to see that it still has."""
+"""Time after which a viewer has stalled; a twentieth of it is enough to see that it still has.
+
+Derivation: half of the time in which the queue is looked at (`_BATCH_SECONDS` of `live`).
+"""
 _PORTS_TRIED = 50
+"""Derivation: one for each bench on a machine, which bears fewer."""
 
 
 class RerunRecording:

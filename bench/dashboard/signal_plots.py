@@ -16,7 +16,11 @@ from bench.devices import Signal
 from bench.rig import SETPOINT
 
 _SETPOINT_PART = 0.45
-"""Part of a device's colour in that of its set-point, whose broad line lies below the measured one."""
+"""Part of a device's colour in that of its set-point, whose broad line lies below the measured one.
+
+Derivation: less than half, so that the measured one stands out.
+"""
+# Source: WCAG 2.2, 1.4.11: each has a contrast of 3 to 1 or more to a nearly black and a nearly white background.
 _PALETTE: tuple[Colour, ...] = (
     (236, 100, 46),
     (58, 132, 232),
@@ -28,7 +32,10 @@ _PALETTE: tuple[Colour, ...] = (
     (128, 146, 44),
 )
 _READING = 1.25
-"""Size of the point of a reading; in a hold that is shorter than a tick there is nothing else."""
+"""Size of the point of a reading; in a hold that is shorter than a tick there is nothing else.
+
+Derivation: less than the width of a line, 1.5, which hides it elsewhere.
+"""
 _QUANTITIES = {
     "°C": "temperature",
     "K": "temperature difference",

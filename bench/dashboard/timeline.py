@@ -13,6 +13,7 @@ from bench.record import Event, StepRecord
 
 _RUNNING = "running"
 _NOT_SETTLED = "not settled"
+# Source: traffic lights: green goes on, amber waits, red is the end; blue is safe.
 _STATES: Mapping[str, Colour] = {
     _RUNNING: (66, 140, 92),
     "paused": (190, 146, 44),
@@ -24,6 +25,7 @@ _STATES: Mapping[str, Colour] = {
     _NOT_SETTLED: (206, 118, 52),
 }
 _STATE_OF_EVENT = {"pause": "paused", "resume": _RUNNING, "interlock": "interlock", "safe-state": "safe"}
+# Source: WCAG 2.2, 1.4.3: white text on each has a contrast of 4.5 to 1 or more.
 _PHASE_COLOURS: tuple[Colour, ...] = (
     (58, 92, 138),
     (52, 116, 122),

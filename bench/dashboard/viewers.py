@@ -17,6 +17,7 @@ from bench.base import ConfigurationError, DataError, WallClock
 from bench.dashboard.rerun_recording import LOOPBACK, free_port
 
 _START_SECONDS = 30.0
+"""Wall-clock time in which a viewer starts, s. Source: CONTRIBUTING, Checks: tens of seconds."""
 
 Viewer = subprocess.Popen[bytes]
 

@@ -89,6 +89,7 @@ class Writer:
         for plot in self._signals:
             for kind, style in plot.styles.items():
                 self.recording.log(f"{kind}/{plot.path}", style)
+            self._bounds[plot.path].draw(self.recording)
         if self._control is not None:
             for name, look in self._control.styles().items():
                 self.recording.log(f"control/{name}", look)
@@ -158,7 +159,7 @@ class Writer:
             self.recording.send_vectors(f"{kind}/{plot.path}", when, plot.series(table))
             self._note(f"{kind}/{plot.path}", table[:, plot.columns])
             if kind == "signals":
-                self._bounds[plot.path].write(self.recording, t, step, table[:, plot.columns])
+                self._bounds[plot.path].write(self.recording, t, step)
         if self._control is not None and kind == "signals":
             for name, series in self._control.series(table).items():
                 self.recording.send_vectors(f"control/{name}", when, series)

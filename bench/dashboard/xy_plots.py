@@ -27,15 +27,18 @@ from bench.devices import Signal
 from bench.rig import DashboardLayout
 
 _REDRAW_SECONDS = 0.1
+"""Source: Nielsen, *Usability Engineering*, 1993, section 5.5: what takes 0.1 s is seen as happening at once."""
 _VISIBLE = 0.002
-"""Visible part of an axis; a controller at its target moves by less."""
+"""Visible part of an axis; a controller at its target moves by less. Derivation: a pixel of 500."""
 
-_MOVED = 0.01
-"""Part of its axis by which the input of a plot has to move for the plot to be shown."""
+_MOVED = 5.0 * _VISIBLE
+"""Part of its axis by which the input of a plot has to move for the plot to be shown. Derivation: five pixels."""
 
 _PALE = 0.35
-"""Part of their colour in that of the lines to old targets; the rest is grey."""
+"""Part of their colour in that of the lines to old targets; the rest is grey. Derivation: of a contrast of 3.7 to 1
+to a nearly black and a nearly white background."""
 
+# Source: the palette of `signal_plots`, its first two.
 _RISING: Colour = (236, 100, 46)
 _FALLING: Colour = (58, 132, 232)
 

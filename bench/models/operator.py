@@ -21,8 +21,10 @@ if TYPE_CHECKING:
 S = TypeVar("S")
 
 # Samples of the operating range by which the defaults look for extrema and for falling parts.
+# Derivation: a smooth extremum between two of 1000 parts is met to 1 / (8 · 1000²), 1e-7 of the curvature's scale.
 _SAMPLES = 1001
 # Part of the range of inputs at its ends whose memory is as good as known.
+# Derivation: of a plane of evenly many hysterons a corner of 1 % holds 1e-4, less than a reading shows.
 _OUTERMOST = 0.01
 
 

@@ -11,7 +11,10 @@ from bench.base import Floats
 from bench.models.operators.preisach import Preisach
 
 _PARTS = 8
-"""Parts of a cell along each axis, which move as one."""
+"""Parts of a cell along each axis, which move as one.
+
+Derivation: what is moved is right to 1/16 of a cell, half of a part.
+"""
 
 
 def transported(levels: Floats, masses: Floats, move: Callable[[Floats, Floats], tuple[Floats, Floats]]) -> Floats:

@@ -16,10 +16,16 @@ import numpy as np
 from bench.base import Floats
 from bench.models.dynamic.linear_parts import FilterState, LinearPart, free_evolution
 
-# Least part of the stationary gain that acts within one step. With less, rounding decides the input.
 _LEAST_EFFECT = 1e-4
-# By how much a mode may grow in one step, for rounding.
+"""Least part of the stationary gain that acts within one step. With less, rounding decides the input.
+
+Derivation: an output that is known to 1e-9 of its range gives the input to 1e-5 of its own.
+"""
 _ROUNDING = 1e-6
+"""By how much a mode may grow in one step, for rounding.
+
+Source: rounding of float64: an eigenvalue of a defective matrix of order two errs by √ε, 1.5e-8.
+"""
 
 
 class _Steps(NamedTuple):

@@ -11,8 +11,11 @@ from bench.models.inverses.inverse import Inversion, NumericalInverse
 from bench.models.operators.elements import ElementState
 from bench.models.reach import Reach
 
-# Part of the output scale within which a target counts as met.
 _TOLERANCE = 2e-13
+"""Part of the output scale within which a target counts as met.
+
+Source: rounding of float64: a sum of 1000 elements errs by no more than 1000 times 2.2e-16.
+"""
 
 
 class Branch(NamedTuple):

@@ -35,12 +35,21 @@ _Plane: TypeAlias = tuple[Floats, float, Floats]
 _Terms: TypeAlias = tuple[Floats, Floats]
 _Ends: TypeAlias = tuple[float, float, float, float, float, float, bool]
 
-# Part of the output scale within which a target counts as met.
 _TOLERANCE = 2e-13
-# Part of the output scale that a search by bisection takes for rounding.
+"""Part of the output scale within which a target counts as met.
+
+Source: rounding of float64: a sum of 1000 numbers errs by no more than 1000 times 2.2e-16.
+"""
 _ROUNDING = 1e-14
-# Pieces into which a numerical inverse divides the way to an end of the range, in search of a crossing.
+"""Part of the output scale that a search by bisection takes for rounding.
+
+Source: rounding of float64: a sum of 1000 numbers typically errs by √1000 times 2.2e-16, 7e-15.
+"""
 _PIECES = 256
+"""Pieces into which a numerical inverse divides the way to an end of the range, in search of a crossing.
+
+Derivation: six for each of 40 levels, as many as a plane has; bisection then finds the crossing to the last digit.
+"""
 
 
 @dataclass(frozen=True)

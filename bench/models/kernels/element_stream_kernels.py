@@ -16,9 +16,11 @@ Floats = NDArray[np.float64]
 Words = NDArray[np.int64]
 
 # Words: addresses of the arrays, the last two of the operator's own, and the number of elements.
+# Derivation: the count is that of the names.
 NUMBERS, ELEMENTS, WEIGHTS, FIRST, SECOND, COUNT = range(6)
 WORD_COUNT = 6
 # Numbers: the present input, the output there, the bias, and those of the operator.
+# Derivation: the count is that of the names, and eleven of the largest operator.
 PRESENT, OUTPUT, BIAS, OWN = range(4)
 NUMBER_COUNT = 14
 

@@ -17,11 +17,13 @@ Corners = tuple[Floats, Floats, int]  # left edges and heights of the pieces, an
 Ends = tuple[float, float, float, float, float, float, bool]
 Place = tuple[int, float, int, float]  # number of pieces, input within the plane, its cell, and the mass up to it
 
+# More segments than there are. Derivation: a quarter of the range of int64, so that sums do not overflow.
 _ALL = 2**62
-# Segments that are walked before a leap, and levels that a target is away for one at once: a smooth reference needs
-# one or two.
+# Segments that are walked before a leap, and levels that a target is away for one at once.
+# Derivation: a leap is a search of some log₂ 200 segments; a smooth reference needs one or two steps.
 _NEAR = 8
 # Tries from which every other one halves the way.
+# Derivation: halves alone find one of 200 levels in eight tries; six that were in vain cost less than that again.
 _INTERPOLATED = 6
 
 

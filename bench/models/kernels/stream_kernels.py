@@ -24,18 +24,20 @@ Floats = NDArray[np.float64]
 Words = NDArray[np.int64]
 
 # Words of a stream of a Preisach operator: addresses of its arrays, their sizes, and its counters.
+# Derivation: the count is that of the names.
 NUMBERS, LEVELS, TABLE, BELOW, BREAKS, QUADRATICS, EXTREMA, PIECES, INDICES = range(9)
 LEVEL_COUNT, BREAK_COUNT, ROOM, EXTREMUM_COUNT, PIECE_COUNT, CELL, SATURATION = range(9, 16)
 NEAREST, WALKED = range(16, 18)
 WORD_COUNT = 18
 # Its numbers. The input as it is and within the plane, the mass up to it, and the output; then of the inverse, see
 # `_inverse_kernels.Ends`, and what it found: set-points (the first is nan where one is enough) and error.
+# Derivation: the count is that of the names.
 INVERSE_STEP, OFFSET, INPUT, PRESENT, MASS, OUTPUT = range(6)
 LOW, HIGH, MINUS, PLUS, TOLERANCE, FALL, FIRST, LAST, ERROR = range(6, 15)
 NUMBER_COUNT = 15
 
 # Words of a stream of plays. The single-valued maps: number of thresholds, -1 for none, and address of thresholds,
-# intercepts and slopes, one behind the other.
+# intercepts and slopes, one behind the other. Derivation: the counts are those of the names.
 PLAY_NUMBERS, THRESHOLDS, WEIGHTS, PLAYS, PLAY_COUNT, BEFORE, BEFORE_COUNT, AFTER, AFTER_COUNT = range(9)
 PLAY_WORD_COUNT = 9
 ORIGIN, BIAS, PLAY_OUTPUT = range(3)

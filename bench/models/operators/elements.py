@@ -22,6 +22,7 @@ ElementState: TypeAlias = tuple[float, ...]
 """The present input, then what each element remembers."""
 
 # Numbers of a block of columns, so that a long sequence does not need them all at once.
+# Derivation: eight MiB of float64, about what the last cache of a processor holds.
 _BLOCK = 2**20
 
 

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from bench.models.inverses.inverse import Inverse, Policy
 
 # Points at which the order of the envelopes is looked at.
+# Derivation: two envelopes that change their order between two points do so over less than 1/400 of the range.
 _SAMPLES = 401
 
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 S = TypeVar("S")
 
 _FIRST_ROOM = 64
-"""Extrema that a stream has room for at first; the room grows."""
+"""Extrema that a stream has room for at first; the room grows. Derivation: those of an oscillation of 32 cycles."""
 
 
 class Stream(Generic[S]):
