@@ -16,7 +16,6 @@ CHANGING = {
 }
 """What is no value but a state."""
 BY_IDENTITY = {
-    "bench.control.adaptation.DensityAdapter",
     "bench.control.approach.Approach",
     "bench.control.predictive._Lag",
     "bench.control.two_stage_inverse.TwoStageInverse",

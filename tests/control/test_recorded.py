@@ -31,7 +31,6 @@ from bench.control import (
     staircase,
     tracking_targets,
 )
-from bench.control.adaptation import DensityAdapter
 from bench.control.baselines import IntegralControl, IntegralParameters, LookUp
 from bench.control.following import ClosedLoopFollower, FollowingParameters, IntegralFollower, OpenLoopFollower
 from bench.control.latched import Latched, LatchParameters
@@ -253,19 +252,6 @@ def stretching(**arguments):
     return {"place": [row[0] for row in rows], "wait": [row[1] for row in rows]}
 
 
-def adapting():
-    levels = uniform_levels(0.0, 10.0, 10)
-    model = Preisach(levels, np.ones(55), 1.0)
-    adapter, rng, rows = DensityAdapter(model), np.random.default_rng(3), []
-    state = model.initial_state()
-    for number in range(60):
-        value = float(rng.uniform(0.0, 10.0))
-        state = state.step(value)
-        adapter = adapter.update(value, None if number % 9 == 4 else 1.2 * model.value(state) + 0.05 * rng.normal())
-        rows.append((adapter.model.bias, adapter.error, adapter.model.value(adapter.state), adapter.noise))
-    return {str(i): [row[i] for row in rows] for i in range(4)} | {"density": adapter.model.density}
-
-
 SECOND = IdentifiedDynamics(ActuatorDynamics(delay=0.2, frequency=2.5, damping=0.6, rate=6.0))
 FIRST = IdentifiedDynamics(ActuatorDynamics(delay=0.7, frequency=3.0, gain=0.98, offset=0.1))
 LAGGING = IdentifiedDynamics(response=ResponseDynamics(lag=1.0, power=2.0))
@@ -367,7 +353,6 @@ SCENES = {
     "notch loop": notched,
     "approach": lambda: stretching(),
     "approach that holds": lambda: stretching(duration=20.0, period=0.7),
-    "adaptation": adapting,
     "overshoots": lambda: {
         "overshoot": [ActuatorDynamics(frequency=2.0, damping=d).overshoot for d in (0.0, 0.2, 0.7, 0.99, 1.0, 1.5)],
         "time": [ActuatorDynamics(frequency=2.0, damping=d).time_constant for d in (0.0, 0.2, 0.7, 1.5)],

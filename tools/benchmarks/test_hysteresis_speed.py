@@ -1,4 +1,4 @@
-"""Forward evaluation, exact inverse and adaptation beside what one would otherwise take. Prints, asserts no time."""
+"""Forward evaluation and exact inverse beside what one would otherwise take. Prints, asserts no time."""
 
 import time
 
@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from bench.control.adaptation import DensityAdapter
 from bench.identification import damped_oscillation
 from bench.models import PrandtlIshlinskii, Preisach, PreisachInverse, ThermalExpansion, uniform_levels
 
@@ -132,51 +131,6 @@ def test_inverse(capsys):
                 f"  M={order:3d}  {sequence * 1e9:6.0f} ns  {random * 1e9:6.0f} ns  {single * 1e6:5.1f} µs"
                 f"  {slow * 1e6:6.1f} µs  x{slow / single:4.0f} (x{slow / sequence:6.0f})  {worst:.0e}"
             )
-
-
-def by_whole_model(operator, state, target, value, output):
-    """Adaptation without tables kept up to date: new model and new inverse from the adapted density."""
-    rows = operator.regressor([state.input, value], state).dense()
-    change = rows[1] - rows[0]
-    cells = operator.density.size
-    error = output - operator.value(state) - change @ operator.coefficients
-    coefficients = operator.coefficients.copy()
-    step = 0.5 * error / (change[:cells] @ change[:cells] + 1.0) * change[:cells]
-    coefficients[:cells] = np.maximum(0.0, coefficients[:cells] + step)
-    other = operator.with_coefficients(coefficients, operator.bias)
-    return other, PreisachInverse(other).invert(state.step(value), target)
-
-
-def test_adaptation(capsys):
-    rows = []
-    for order in (20, 50, 100):
-        operator = film(order)
-        inputs = 54.0 + 12.0 * np.sin(np.arange(2000) / 40.0)
-        outputs = 1.02 * operator.evaluate(inputs) + 0.4 * np.random.default_rng(0).normal(size=inputs.size)
-        pairs = list(zip(inputs.tolist(), outputs.tolist(), strict=True))
-        start = DensityAdapter(operator, noise=0.4).update(*pairs[0])
-
-        def updates(adapter=start, pairs=pairs):
-            for value, output in pairs:
-                adapter = adapter.update(value, output)
-
-        def loop(adapter=start, pairs=pairs):
-            for value, output in pairs:
-                adapter = adapter.update(value, output)
-                adapter.inverse.invert(adapter.state, output)
-
-        def whole(operator=operator, pairs=pairs[:200]):
-            model, state = operator, operator.initial_state()
-            for value, output in pairs:
-                model, _ = by_whole_model(model, state, output, value, output)
-                state = state.step(value)
-
-        rows.append((order, median_of(updates) / 2000, median_of(loop) / 2000, median_of(whole, 3) / 200))
-    with capsys.disabled():
-        print("\nadaptation, per sample: update, update and inverse, the same with model and inverse made anew")
-        for order, update, both, slow in rows:
-            line = f"  M={order:3d}  {update * 1e6:5.1f} µs  {both * 1e6:5.1f} µs"
-            print(f"{line}  {slow * 1e6:7.1f} µs  x{slow / both:.0f}")
 
 
 def by_play_loop(operator, inputs):

@@ -389,12 +389,6 @@ class PreisachInverse(Inverse[MemoryCurve]):
 
     operator: Preisach
 
-    def _retuned(self, operator: Preisach, ends: tuple[float, float, float]) -> PreisachInverse:
-        """Return the inverse of an operator with another nonnegative density on the same levels."""
-        other = object.__new__(PreisachInverse)
-        other.__dict__.update(operator=operator, policy=self.policy, _ends=ends, _fall=self._fall)
-        return other
-
     @cached_property
     def _ends(self) -> tuple[float, float, float]:
         """Outputs at negative and positive saturation, and the tolerance."""

@@ -155,19 +155,6 @@ class Preisach(Operator[MemoryCurve]):
             term = term.with_coefficients(values[cells:].tolist())
         return replace(self, density=values[:cells], bias=bias, reversible=term)
 
-    def _retuned(self, density: Floats, bias: float, table: Floats, below: Floats, offset: float) -> Preisach:
-        """Return the same operator with another density and its tables, all known to be sound and not shared.
-
-        Adaptation makes one at each sample and must not pay for the checks.
-        """
-        other = object.__new__(Preisach)
-        other.__dict__.update(self.__dict__)
-        density.flags.writeable = False
-        other.__dict__.update(
-            density=density, bias=bias, lattice=replace(self.lattice, table=table, below=below, offset=offset)
-        )
-        return other
-
     def cell_areas(self) -> Floats:
         """Return the area of each cell, shape (K,); a diagonal cell has half a square."""
         steps = np.diff(self.levels)
