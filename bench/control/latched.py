@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from bench.control.estimators import DisturbanceEstimator
-from bench.control.model_filters import GATE, INPUT_ERROR
+from bench.control.model_filters import INPUT_ERROR
 from bench.control.tracking import (
     TO_REST,
     Arrival,
@@ -301,7 +301,7 @@ class Latched(Correcting):
             if move < p.fine_moves:
                 setpoint = self._behind(setpoint + error / slope)
         # Of an error beyond what the estimate may err by, the lock has been lost.
-        self.locked = abs(error) <= GATE * locked.uncertainty
+        self.locked = abs(error) <= _RARE * locked.uncertainty
         return reading
 
     def _behind(self, setpoint: float) -> float:
