@@ -152,7 +152,8 @@ class _Supervision:
         elif errors > self._to_allowed * allowed and not (feedback and self._fallback):
             self._give_up(text)
         else:
-            self._warn(f"the {'controller' if feedback else 'model'} leaves an error: {text}")
+            known = ", by which it is not shown to be met" if everything <= allowed else ""
+            self._warn(f"the {'controller' if feedback else 'model'} leaves an error: {text}{known}")
 
     def _warn(self, text: str) -> None:
         """Have something said, once in a run."""
