@@ -180,8 +180,9 @@ class Supervised(_Supervision):
     """A target controller that is given up when it does not converge: a `Reaching`.
 
     It is by the rules; if it sends the actuator to and fro between the ends of its range at one target; or if it says
-    so itself (`doubt`). Targets that cannot be met do not count; one that is missed by more than what is allowed is
-    warned of. Parameters as `_Supervision`; `limits` are the set-points that it may ask for, input units.
+    so itself (`doubt`). Targets that cannot be met do not count; one that is missed by more than what would be within
+    the allowed error is warned of. Parameters as `_Supervision`; `limits` are the set-points that it may ask for,
+    input units.
     """
 
     def __init__(
@@ -234,7 +235,7 @@ class Supervised(_Supervision):
             return
         error = self._output - self._target
         if self.reach is not Reach.MET:
-            if self._rules.feedback and abs(error) > self._rules.allowed:
+            if self._rules.feedback and error**2 > self._within * self._rules.allowed**2:
                 self._warn(f"the target {self._target:.4g} cannot be met within the limits: missed by {error:.3g}")
         elif doubt := getattr(self._controller, "doubt", ""):
             self._give_up(str(doubt))
