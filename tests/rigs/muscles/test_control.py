@@ -633,12 +633,11 @@ def test_a_model_without_dynamics_is_refused_unless_the_rig_file_gives_them(inve
 
 
 def test_what_a_lag_leaves_of_a_move_counts_in_favour_of_an_open_loop(inverse):
-    def holds(lag):
+    def own_error(lag):
         dynamics = IdentifiedDynamics(response=ResponseDynamics(lag, 2.0))
         file = ModelFile("two-stage", inverse.model, dynamics=dynamics)
-        return FORCE_OPEN_LOOP.holds(ControllerSetup(model=file, limits=LIMITS, options={"duration": 20.0}))
+        return FORCE_OPEN_LOOP.own_error(ControllerSetup(model=file, limits=LIMITS, options={"duration": 20.0}))
 
     low, high = inverse.model.first.output_range()
-    assert holds(0.0) == pytest.approx(0.03 * (high - low))
-    left = math.exp(-20.0 / 8.0) * (high - low) / math.sqrt(6.0)
-    assert holds(8.0) == pytest.approx(math.hypot(holds(0.0), left))
+    assert own_error(0.0) == 0.0
+    assert own_error(8.0) == pytest.approx(math.exp(-20.0 / 8.0) * (high - low) / math.sqrt(6.0))
