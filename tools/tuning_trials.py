@@ -31,7 +31,6 @@ from bench.analysis import TargetResults, target_results
 from bench.base import ConvergenceError, DataError, Workers
 from bench.batch import RunSeries, reached_targets, tune
 from bench.batch.tuning.search import cost_of
-from bench.control import TwoStageInverse
 from bench.identification import load_model
 from bench.record import Record
 from bench.rig import load_rig
@@ -45,6 +44,7 @@ from rigs.muscles.identification import (
     read_series,
 )
 from rigs.muscles.tasks import ForceTask, LengthTask, Task
+from rigs.muscles.two_stage_inverse import TwoStageInverse
 
 STEP = 0.01
 """Step of the supply of the muscles, V: a thousandth of its 10 V."""

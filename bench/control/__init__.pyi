@@ -39,13 +39,6 @@ from .model_filters import (
     ADAPTATIONS as ADAPTATIONS,
     AdaptationName as AdaptationName,
 )
-from .notch_loop import (
-    NotchLoop as NotchLoop,
-    NotchLoopParameters as NotchLoopParameters,
-)
-from .play_inverse import (
-    SampledPlayInverse as SampledPlayInverse,
-)
 from .references import (
     AddedSine as AddedSine,
     ApproachedReference as ApproachedReference,
@@ -75,8 +68,4 @@ from .tuning import (
 from .tuning_file import (
     Tuning as Tuning,
     tuning_text as tuning_text,
-)
-from .two_stage_inverse import (
-    TwoStageInverse as TwoStageInverse,
-    TwoStageInversion as TwoStageInversion,
 )

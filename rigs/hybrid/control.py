@@ -24,10 +24,7 @@ from bench.control import (
     ApproachedReference,
     ControllerSetup,
     ControllerSpec,
-    NotchLoop,
-    NotchLoopParameters,
     Reference,
-    SampledPlayInverse,
     Trace,
     check_positive,
 )
@@ -43,6 +40,8 @@ from rigs.hybrid.estimates import (
 )
 from rigs.hybrid.lateness import BEGIN, END, LatenessProbe
 from rigs.hybrid.model import HybridModel
+from rigs.hybrid.notch_loop import NotchLoop, NotchLoopParameters
+from rigs.hybrid.play_inverse import SampledPlayInverse
 
 if TYPE_CHECKING:
     from rigs.hybrid import _kernels as kernels

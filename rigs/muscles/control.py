@@ -34,7 +34,6 @@ from bench.control import (
     ControllerSpec,
     DisturbanceEstimator,
     Trace,
-    TwoStageInverse,
     check_positive,
     saturation,
     tuned,
@@ -43,6 +42,7 @@ from bench.control import (
 from bench.models import IdentifiedDynamics, Reach, ResponseDynamics, TwoStageState, TwoStageStream
 from rigs.muscles.lag import Lag, LagSearch
 from rigs.muscles.tasks import ForceTask, LengthTask, Task
+from rigs.muscles.two_stage_inverse import TwoStageInverse
 
 _READINGS_A_LAG = 5.0
 """Readings in one time constant of the muscle."""

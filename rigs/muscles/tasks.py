@@ -9,8 +9,9 @@ from dataclasses import dataclass
 from typing import ClassVar, Self
 
 from bench.base import DataError, checks as _checks
-from bench.control import TwoStageInverse, TwoStageInversion, check_positive, widened
+from bench.control import check_positive, widened
 from bench.models import TwoStageState, TwoStageStream
+from rigs.muscles.two_stage_inverse import TwoStageInverse, TwoStageInversion
 
 _READING = 1e-3
 """Noise of one reading where it is not known, as a part of the output's range."""

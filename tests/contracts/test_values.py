@@ -18,7 +18,6 @@ CHANGING = {
 BY_IDENTITY = {
     "bench.control.approach.Approach",
     "bench.control.predictive._Lag",
-    "bench.control.two_stage_inverse.TwoStageInverse",
 }
 """What is not compared by its content, such as arrays."""
 

@@ -19,8 +19,6 @@ from bench.control import (
     DisturbanceEstimator,
     DriftEstimator,
     FollowReference,
-    NotchLoop,
-    NotchLoopParameters,
     Rules,
     SmoothMoves,
     Spans,
@@ -48,6 +46,7 @@ from bench.models import (
     ResponseDynamics,
     uniform_levels,
 )
+from rigs.hybrid.notch_loop import NotchLoop, NotchLoopParameters
 
 RECORDED = Path(__file__).with_name("recorded.json")
 KEPT = 12

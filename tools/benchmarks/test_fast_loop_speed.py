@@ -10,8 +10,7 @@ import pytest
 from numba import njit
 
 from bench.base import Interrupts, VirtualClock
-from bench.control import NotchLoopParameters, Trace
-from bench.control.notch_loop import notch
+from bench.control import Trace
 from bench.execution.context import trace_signals
 from bench.execution.engine import Engine
 from bench.execution.station.local import LocalStation
@@ -22,6 +21,7 @@ from bench.rig import Rig, load_rig
 from rigs.hybrid.control import make_fine
 from rigs.hybrid.design import Design
 from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel
+from rigs.hybrid.notch_loop import NotchLoopParameters, notch
 
 pytestmark = pytest.mark.benchmark
 

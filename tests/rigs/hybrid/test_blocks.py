@@ -4,13 +4,14 @@ import numpy as np
 import pytest
 
 from bench.base import ConfigurationError, DeviceError, Interrupts, LimitError, VirtualClock
-from bench.control import NotchLoop, Playback, Trace
+from bench.control import Playback, Trace
 from bench.execution.context import trace_signals
 from bench.execution.engine import Engine
 from bench.execution.station.local import LocalStation
 from bench.protocol import FixedRate, ProtocolParameters, find_protocol, protocol
 from bench.record import FILE_NAME, Journal, Record
 from bench.rig import Rig, load_rig
+from rigs.hybrid.notch_loop import NotchLoop
 
 RATE = 20e3
 DEFLECTION = "displacement_position"

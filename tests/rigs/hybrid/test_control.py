@@ -10,7 +10,7 @@ from cases import cases
 from filterpy.kalman import MerweScaledSigmaPoints, UnscentedKalmanFilter
 
 from bench.base import ConfigurationError, ConvergenceError
-from bench.control import AddedSine, NotchLoopParameters, SmoothMoves, staircase
+from bench.control import AddedSine, SmoothMoves, staircase
 from bench.identification import identify_dynamics
 from bench.rig import load_rig
 from rigs.hybrid.control import (
@@ -24,6 +24,7 @@ from rigs.hybrid.design import Design
 from rigs.hybrid.estimates import Bending, LowPass, ReducedNetwork, UnscentedEstimate
 from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel, identify_pi, identify_polynomial
 from rigs.hybrid.network_identification import identify_network
+from rigs.hybrid.notch_loop import NotchLoopParameters
 from sim_devices.plants.hybrid import HybridCantilever
 from sim_devices.plants.hybrid_parameters import HybridParameters
 

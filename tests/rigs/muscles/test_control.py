@@ -9,7 +9,7 @@ from cases import cases
 from hypothesis import given, strategies as st
 
 from bench.base import ConfigurationError, DataError
-from bench.control import ControllerSetup, ReachTarget, TwoStageInverse
+from bench.control import ControllerSetup, ReachTarget
 from bench.identification import ModelFile, Series, identify_two_stage, voltage_steps
 from bench.models import IdentifiedDynamics, Preisach, Reach, ResponseDynamics, TwoStage, uniform_levels
 from rigs.muscles.control import (
@@ -23,6 +23,7 @@ from rigs.muscles.control import (
 )
 from rigs.muscles.lag import Lag, LagSearch
 from rigs.muscles.tasks import ForceTask, LengthTask
+from rigs.muscles.two_stage_inverse import TwoStageInverse
 from sim_devices.plants.sma import SMAParameters, SMAWire
 
 MILLIMETRE = 1e-3

@@ -8,7 +8,6 @@ import pytest
 from cases import cases
 from hypothesis import given, settings, strategies as st
 
-from bench.control import TwoStageInverse, two_stage_inverse
 from bench.models import (
     DeadZones,
     Linear,
@@ -20,6 +19,8 @@ from bench.models import (
     TwoStage,
     uniform_levels,
 )
+from rigs.muscles import two_stage_inverse
+from rigs.muscles.two_stage_inverse import TwoStageInverse
 
 
 def preisach(low, high, least, greatest, seed, order=20, zeros=0.85):

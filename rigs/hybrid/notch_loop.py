@@ -8,10 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from bench.base import ConvergenceError, Floats, checks as _checks
-from bench.control.play_inverse import SampledPlayInverse
-from bench.control.references import Reference
-from bench.control.tracking import Trace, check_positive
+from bench.control import Reference, Trace, check_positive
 from bench.models import PrandtlIshlinskii
+from rigs.hybrid.play_inverse import SampledPlayInverse
 
 
 def notch(frequency: float, rate: float, zero_damping: float, pole_damping: float = 0.7) -> Floats:

@@ -8,10 +8,9 @@ from cases import cases
 from scipy import signal
 
 from bench.base import ConvergenceError
-from bench.control import NotchLoop, NotchLoopParameters
-from bench.control.notch_loop import notch
 from bench.models import PrandtlIshlinskii
 from rigs.hybrid.model import PUBLISHED_DYNAMICS
+from rigs.hybrid.notch_loop import NotchLoop, NotchLoopParameters, notch
 
 
 def test_notch():

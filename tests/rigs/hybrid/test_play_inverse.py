@@ -7,8 +7,8 @@ import pytest
 from cases import cases
 from hypothesis import given, strategies as st
 
-from bench.control import SampledPlayInverse
 from bench.models import DeadZones, PrandtlIshlinskii
+from rigs.hybrid.play_inverse import SampledPlayInverse
 
 MICRO, NANO = 1e-6, 1e-9
 
