@@ -314,7 +314,7 @@ def _correction(setup: ControllerSetup) -> CorrectionParameters:
 def _latch_parameters(setup: ControllerSetup) -> LatchParameters:
     inverse: Any = setup.inverse()
     operator: Any = inverse.opposite.operator if isinstance(inverse, FallingInverse) else inverse.operator
-    noise = None if setup.model.dynamics is None else setup.model.dynamics.noise.get("output")
+    noise = None if setup.model.dynamics is None else setup.model.dynamics.noise.get("output") or None
     return LatchParameters.of(operator, setup.rest, noise)
 
 

@@ -55,7 +55,8 @@ class LatchParameters:
     farthest: float
     """Greatest distance behind the extreme that the fine loop may go, input units: farther, hysterons switch back,
     the slope of the output changes its sign, and the loop would run away. By the model half of the width of a cell:
-    so a quarter of the hysterons of one switch back, and of narrower ones the plane says nothing."""
+    so a quarter of the hysterons of one switch back, and of narrower ones the plane says nothing. On a plane of many
+    levels it is twice the least distance, which leaves a stretch to the loop."""
     rest: float
     """Time in which actuator and specimen come to rest, s."""
     tries: int = 10
@@ -87,7 +88,8 @@ class LatchParameters:
         steepest = float(np.abs(np.diff(branch)).max() / (values[1] - values[0]))
         locked = float(np.mean([reversible_slope(operator, value) for value in values.tolist()]))
         cell = float(np.diff(operator.levels).min())
-        return cls(INPUT_ERROR * spans.input, noise, steepest, locked, 0.5 * cell, rest)
+        wander = INPUT_ERROR * spans.input
+        return cls(wander, noise, steepest, locked, max(0.5 * cell, 2.0 * _RARE * wander), rest)
 
     @property
     def lag(self) -> float:

@@ -82,9 +82,8 @@ class NotchLoopParameters:
 RESERVE = 0.05
 """Part of the stroke that is left to the loop: a fast step lacks the creep that the slow loops of a model contain.
 
-Source: a ceramic actuator creeps by 1 to 2 % of a step in each decade of time (Devasia, Eleftheriou and Moheimani, "A
-survey of control issues in nanopositioning", IEEE Transactions on Control Systems Technology, 2007, for its size);
-three decades lie between a step and the end of its hold.
+Source: a piezo creeps by 1 to 2 % of a step in each decade of time (Physik Instrumente, *Piezo Technology*); three
+decades lie between a step and the end of its hold.
 """
 _JUDGED = RESERVE
 """Least step of the reference that is judged by its overshoot, as a part of the stroke.
