@@ -23,7 +23,8 @@ from bench.models import PolynomialPlays
 # Turns smaller than this part of the range need not be kept when rows are left out.
 # Source: half of the noise of 1 % that turning points are told from, see `splits`.
 _LEAST_MOVE = 0.005
-# Part of the rows that a memory may take to be known, or all rows are tested. Source: of ten blocks two then remain, one for each of two folds.
+# Part of the rows that a memory may take to be known, or all rows are tested. Source: of ten blocks
+# two then remain, one for each of two folds.
 _KNOWN = 0.25
 # Relative tolerance of shape parameters of a candidate. Source: far below the tie of two scores, 2 %.
 _SHAPE = 1e-5
