@@ -165,7 +165,7 @@ def _print_table(found: SelectedModel) -> None:
 
 def _on_bounded(found: SelectedModel) -> str:
     """Return the rule of a record of one kind of cycle, if it made the choice."""
-    return ", among planes with signs that err at most twice as much" if found.selection.is_bounded else ""
+    return ", among planes with signs that err at most 1.25 times as much" if found.selection.is_bounded else ""
 
 
 def read_measured(

@@ -26,6 +26,8 @@ _LEAST_MOVE = 0.005
 # Part of the rows that a memory may take to be known, or all rows are tested. Source: of ten blocks
 # two then remain, one for each of two folds.
 _KNOWN = 0.25
+# Part of the rows that may be left out of a fit for their memory. Source: as a fold of five leaves out.
+_SKIPPED = 0.2
 # Relative tolerance of shape parameters of a candidate. Source: far below the tie of two scores, 2 %.
 _SHAPE = 1e-5
 
@@ -139,6 +141,11 @@ class Measurements:
     def tested(self) -> Flags:
         """Rows that may be tested, shape (N,)."""
         return np.asarray(self.fitted & (np.arange(self.inputs.size) >= self.known), dtype=bool)
+
+    @property
+    def may_skip(self) -> bool:
+        """Whether first rows of unknown memory may be left out of a fit: a fifth of the rows at most."""
+        return 0 < int(self.fitted[: self.known].sum()) <= _SKIPPED * int(self.fitted.sum())
 
     @property
     def gap(self) -> int:

@@ -120,8 +120,8 @@ def cycle_folds(inputs: Floats, usable: Flags, *, folds: int = FOLDS, gap: int =
 
 
 def has_one_kind(inputs: Floats, usable: Flags) -> bool:
-    """Return whether the input has fewer than two kinds of cycles beside its major loop; see `cycle_folds`."""
-    return _minor(inputs, usable, *_kinds(inputs)).size < 2
+    """Return whether the input has no cycle beside its major loop; see `cycle_folds`."""
+    return not _minor(inputs, usable, *_kinds(inputs)).size
 
 
 def _minor(inputs: Floats, usable: Flags, kind: NDArray[np.int64], amplitudes: Floats) -> NDArray[np.intp]:
