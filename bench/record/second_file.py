@@ -22,6 +22,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Any
 
+from bench.base import parse_json
 from bench.record.rows import IDENTITY, TABLES, Row, meta
 from bench.rig import is_own
 
@@ -177,7 +178,7 @@ def _decoded(line: bytes) -> Row | None:
     try:
         if int(total, 16) != zlib.crc32(content):
             return None
-        found: list[Any] = json.loads(content)
+        found: list[Any] = parse_json(content)
         table, *columns = found
         if table == "files":
             columns[2] = base64.b64decode(columns[2])

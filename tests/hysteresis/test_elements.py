@@ -115,7 +115,7 @@ class TestEachOperator:
             [np.linspace(a, b, pieces + 1)[1:] for a, b in zip([start, *inputs], inputs, strict=False)]
         )
         np.testing.assert_allclose(
-            operator.evaluate(fine)[pieces - 1 :: pieces], operator.evaluate(inputs), atol=1e-9
+            operator.evaluate(fine)[pieces - 1 :: pieces], operator.evaluate(inputs), atol=1e-7
         )
 
     @given(some, values, values)

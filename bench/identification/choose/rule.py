@@ -39,7 +39,7 @@ TIE = 1.02
 smaller by an order; below it, the order of the table is chance."""
 BOUNDED = 1.25
 """Ratio up to which a plane with signs wins on a record of one kind of cycle. Source: measured on major loops of
-three plants, whose plane errs at most 1.02 times as much as the best, and on three measured files, 1.04 to 1.12 times."""
+three plants, whose plane errs at most 1.02 times as much as the best, and on two files, 1.09 and 1.12 times."""
 
 
 @dataclass(frozen=True)
