@@ -120,8 +120,11 @@ def cycle_folds(inputs: Floats, usable: Flags, *, folds: int = FOLDS, gap: int =
 
 
 def has_one_kind(inputs: Floats, usable: Flags) -> bool:
-    """Return whether the input has no cycle beside its major loop; see `cycle_folds`."""
-    return not _minor(inputs, usable, *_kinds(inputs)).size
+    """Return whether the input has no cycle beside its major loop, its first and its last move left out."""
+    turns = turning_points(inputs, _LEAST_MOVE * float(np.ptp(inputs)))
+    rows = np.arange(inputs.size)
+    between = (rows > turns[1]) & (rows <= turns[-2]) if turns.size > 3 else np.ones(rows.size, dtype=bool)
+    return not _minor(inputs, usable & between, *_kinds(inputs)).size
 
 
 def _minor(inputs: Floats, usable: Flags, kind: NDArray[np.int64], amplitudes: Floats) -> NDArray[np.intp]:
