@@ -70,6 +70,8 @@ def begin_session(
     """
     if left_out := model.provenance.get("left_out"):
         yield Caution(f"the controller takes the model of an input that stands still, without {left_out}")
+    if text := model.beyond([parameters.reset, parameters.hottest]).text("limits of the set-points"):
+        yield Note(text)
     if "input-offset" in kinds:
         # A model that cannot be corrected is refused before anything moves.
         model.operator.shifted(0.0)

@@ -12,7 +12,6 @@ from .examined import (
     compare_models as compare_models,
     examine as examine,
     load_models as load_models,
-    outside_of_range as outside_of_range,
     predict as predict,
 )
 from .export.run_export import (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -35,19 +35,16 @@ class BandedPrediction:
         The model's band.
     half_widths : ndarray, shape (N,)
         Half-width at each row, output units.
-    simultaneous : ndarray, shape (N,), or None
-        The same of the band that covers all rows of a stretch at once; None if the file has none.
-    departures : tuple of str
-        In which ways the inputs are not of the class on which the band was calibrated; none if they are.
     unit : str
         Unit of the output.
+    holds_for : str
+        The inputs for which it holds.
     """
 
     band: Band
     half_widths: Floats
-    simultaneous: Floats | None
-    departures: tuple[str, ...]
     unit: str
+    holds_for: str
 
     def columns(self, predicted: Floats) -> list[tuple[str, Floats]]:
         """Return heads and values of the lower and the upper end of the band, shape (N,) each."""
@@ -58,8 +55,8 @@ class BandedPrediction:
 
     @property
     def label(self) -> str:
-        """The band in a figure; marked where the inputs are of another class than that of the calibration."""
-        return f"{100 * self.band.level:g} % prediction band" + (", other class of input" if self.departures else "")
+        """The band in a figure."""
+        return f"{100 * self.band.level:g} % prediction band"
 
     def coverage(self, residuals: Floats) -> float:
         """Return the share of residuals, shape (n,), of the last n rows that lie within the band, 0 to 1."""
@@ -69,18 +66,7 @@ class BandedPrediction:
         """Return the band in a line, with its coverage of measured outputs if their residuals are given."""
         width = f"± {np.median(self.half_widths):.4g} {self.unit}".rstrip()
         covered = "" if residuals is None else f"; covers {100 * self.coverage(residuals):.1f} % of the rows measured"
-        kind = self.band.calibrated_on.kind
-        return f"{100 * self.band.level:g} % band: {width} (median); calibrated on {kind}{covered}"
-
-    def warning(self) -> str:
-        """Return a warning if the inputs are not of the class of the band, else an empty text."""
-        if not self.departures:
-            return ""
-        return (
-            f"this input is of another class than the {self.band.calibrated_on.kind} on which the band was "
-            f"calibrated: {'; '.join(self.departures)}; the band may cover far less than "
-            f"{100 * self.band.level:g} %. Calibrate on inputs like this one: `bench identify --band`"
-        )
+        return f"{100 * self.band.level:g} % band: {width} (median); holds for inputs of {self.holds_for}{covered}"
 
     def rows(self) -> list[tuple[str, str]]:
         """Return what the band is: name and value of each row of a table."""
@@ -88,25 +74,18 @@ class BandedPrediction:
             ("half-width, median", np.median(self.half_widths)),
             ("half-width, largest", self.half_widths.max()),
         ]
-        if self.simultaneous is not None:
-            widths.append((f"half-width for all of {self.band.stretch} rows", np.median(self.simultaneous)))
         return [
             ("level", f"{100.0 * self.band.level:g} %"),
             *((name, f"{value:.4g} {self.unit}".rstrip()) for name, value in widths),
-            ("calibrated on", self.band.calibrated_on.kind),
+            ("holds for inputs", self.holds_for),
         ]
 
     def to_json(self, residuals: Floats | None = None) -> dict[str, Any]:
         """Return the band for programs; `coverage` is None without residuals of measured outputs."""
-        together = self.simultaneous
         return {
             "level": self.band.level,
             "half_width": float(np.median(self.half_widths)),
             "largest_half_width": float(self.half_widths.max()),
-            "simultaneous_half_width": None if together is None else float(np.median(together)),
-            "stretch": self.band.stretch,
-            "calibrated_on": self.band.calibrated_on.kind,
-            "departures": list(self.departures),
             "coverage": None if residuals is None else self.coverage(residuals),
         }
 
@@ -115,7 +94,6 @@ def predict_band(
     model: ModelFile,
     inputs: Floats,
     state: Any = None,  # noqa: ANN401 - each operator has its own
-    times: Floats | None = None,
 ) -> BandedPrediction | None:
     """Return the band of a model's predictions for inputs, shape (N,); None if its file has none.
 
@@ -127,21 +105,12 @@ def predict_band(
         In the unit of the model, finite.
     state : object
         State before the first row; None is the initial one.
-    times : ndarray, shape (N,), or None
-        s, for a model with time.
     """
-    band = model.band
+    band, response = model.band, model.response
     if band is None:
         return None
-    operator = model.response
-    spread = band.spread(operator, inputs, state)
-    return BandedPrediction(
-        band,
-        band.pointwise * spread,
-        None if band.simultaneous is None else band.simultaneous * spread,
-        band.departures(inputs, spread, times),
-        operator.output_unit,
-    )
+    holds_for = model.valid.text(response.input_unit)
+    return BandedPrediction(band, band.half_widths(response, inputs, state), response.output_unit, holds_for)
 
 
 @dataclass(frozen=True)
@@ -201,7 +170,7 @@ def invert_band(
     if model.band is None:
         return None
     if times is not None:
-        outputs = predict_band(model, setpoints, state, times)
+        outputs = predict_band(model, setpoints, state)
         assert outputs is not None
         return BandedTargets(outputs, None)
     both = np.column_stack([passing, setpoints]).ravel()
@@ -211,9 +180,7 @@ def invert_band(
     found = predict_band(model, path, state)
     assert found is not None
     widths = input_half_widths(model.operator, path, found.half_widths, state)[places]
-    together = None if found.simultaneous is None else found.simultaneous[places]
-    at = BandedPrediction(found.band, found.half_widths[places], together, found.departures, found.unit)
-    return BandedTargets(at, widths)
+    return BandedTargets(replace(found, half_widths=found.half_widths[places]), widths)
 
 
 def calibrate(

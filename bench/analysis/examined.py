@@ -16,12 +16,22 @@ from bench.analysis.session_recalibration import Session
 from bench.analysis.tables.dataset import Dataset
 from bench.analysis.tables.starting_state import StartingState, bind_times, foreign_drift, starting_state
 from bench.base import ConfigurationError
-from bench.identification import Comparison, Errors, ModelFile, Recalibration, compare, load_model, measure_errors
+from bench.identification import (
+    Beyond,
+    Comparison,
+    Errors,
+    ModelFile,
+    Recalibration,
+    compare,
+    load_model,
+    measure_errors,
+)
 from bench.models import Operator, TimedSequence
 
 Floats = npt.NDArray[np.float64]
 
-# Fewer rows hardly have first ones; these are a tenth of all, and err so many times more than the others.
+# Derivation: of a hundred rows a tenth is ten, beside which one stray reading does not count; random errors of ninety
+# rows reach 2.6 standard deviations, those of the others three times that by no chance.
 _FEWEST, _FIRST_PART, _MUCH = 100, 10, 3.0
 
 
@@ -43,6 +53,8 @@ class Examined:
         Units of input and output.
     first : int
         First row that counts in errors: those before drive the memory or tell the recalibration.
+    beyond : Beyond
+        How far the inputs lie beyond those that were fitted.
     """
 
     predicted: Floats
@@ -51,6 +63,7 @@ class Examined:
     band: BandedPrediction | None
     units: tuple[str, str]
     first: int
+    beyond: Beyond
 
     @property
     def residuals(self) -> Floats | None:
@@ -63,22 +76,25 @@ class Examined:
         return measure_errors(self.measured[self.first :], self.predicted[self.first :])
 
     def warnings(self) -> list[str]:
-        """Return a sentence if the largest errors stand in the first rows, which follow what nobody recorded."""
+        """Return a sentence each on inputs beyond those fitted, and on errors of what came before the first row."""
+        return [text for text in (self.beyond.text(), self._of_first_rows()) if text]
+
+    def _of_first_rows(self) -> str:
         errors = np.abs(np.empty(0) if self.residuals is None else self.residuals)
         first = errors.size // _FIRST_PART
         if errors.size < _FEWEST or not errors[:first].max() > _MUCH * (largest := float(errors[first:].max())):
-            return []
+            return ""
         last = self.first + int(np.flatnonzero(errors[:first] > largest)[-1]) + 1
         unit = self.units[1]
-        return [
+        return (
             f"the largest errors stand in the first {last} rows ({errors.max():.4g} {unit}".rstrip()
             + f"; {largest:.4g} {unit}".rstrip()
             + f" in the others), where what came before the file still matters: --skip {last} leaves them out"
-        ]
+        )
 
     def to_json(self) -> dict[str, Any]:
-        """Return `recalibration` and `band` for programs, those that there are."""
-        found: dict[str, Any] = {}
+        """Return `beyond` for programs, and `recalibration` and `band`, if there are."""
+        found: dict[str, Any] = {"beyond": self.beyond.to_json()}
         if self.recalibration is not None:
             found["recalibration"] = {**self.recalibration.to_json(), "errors_from_row": self.first + 1}
         if self.band is not None:
@@ -132,8 +148,8 @@ def examine(
         )
     check_finite(model.name, "output", predicted, units[1], inputs, "input", units[0])
     moved = 0.0 if found is None else found.values.get("input-offset", 0.0)
-    band = predict_band(model, inputs + moved, state, times)
-    return Examined(predicted, measured, found, band, units, first)
+    band = predict_band(model, inputs + moved, state)
+    return Examined(predicted, measured, found, band, units, first, model.beyond(inputs + moved, times))
 
 
 def predict(
@@ -164,18 +180,6 @@ def predict(
     """
     start = starting_state(model, initial=initial, continue_memory=continue_memory)
     return bind_times(model, times).evaluate(inputs, start.state)
-
-
-def outside_of_range(model: ModelFile, inputs: Floats) -> str:
-    """Return a warning if inputs leave the range for which the model was identified, else an empty text."""
-    low, high = model.response.input_range
-    outside = np.flatnonzero((inputs < low) | (inputs > high))
-    if outside.size == 0:
-        return ""
-    return (
-        f"{outside.size} of {inputs.size} inputs (first: row {outside[0] + 1}, {inputs[outside[0]]:g}) are outside "
-        f"of {low:g} to {high:g} {model.response.input_unit}, for which the model was identified"
-    )
 
 
 @dataclass(frozen=True)

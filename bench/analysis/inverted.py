@@ -11,16 +11,16 @@ import numpy.typing as npt
 from bench.analysis.predictions import check_finite
 from bench.analysis.tables.starting_state import bind_times, starting_state
 from bench.base import ConfigurationError, DataError
-from bench.identification import ModelFile
+from bench.identification import Beyond, ModelFile
 from bench.models import Policy, Reach, TimedSequence
 
 Floats = npt.NDArray[np.float64]
 
-# Part of the span of all outputs and targets within which a target over time counts as met.
-_TOLERANCE = 1e-9
-# Part of a time step within which two times are the same.
-_SAME_TIME = 1e-9
-# Part of the span of the set-points from which on their alternation is worth a warning.
+# Part of the span of all outputs and targets within which a target over time counts as met, and of a time step within
+# which two times are the same. Derivation: a million times the rounding of one number, less than any sensor tells.
+_TOLERANCE = _SAME_TIME = 1e-9
+# Part of the span of the set-points from which on their alternation is worth a warning. Derivation: half the moves
+# that count as noise of an input (`NOISE` of `bench.identification.validity`).
 _ALTERNATION = 1e-2
 
 
@@ -42,6 +42,8 @@ class InvertedTargets:
         By target: `met`, `too high` or `too low`. What is not met is clamped to the nearest reachable value. Of a
         model with a delay also `too early`, before any set-point has an effect, and `near`, met but for targets
         between the rows.
+    beyond : Beyond
+        How far the set-points lie beyond the inputs that were fitted.
     times : ndarray, shape (N,), or None
         s, of a model with time. Its targets are met without passing another set-point, or not at all.
     delay : float
@@ -55,15 +57,17 @@ class InvertedTargets:
     passing: Floats
     predicted: Floats
     flags: tuple[str, ...]
+    beyond: Beyond
     times: Floats | None = None
     delay: float = 0.0
     held: int = 0
 
     def warnings(self) -> list[str]:
-        """Return what a person should know of set-points over time: targets that are not met, and ringing."""
+        """Return what a person should know: set-points beyond the inputs fitted; over time misses and ringing."""
+        text = self.beyond.text("set-points")
+        found = [text] if text else []
         if self.times is None:
-            return []
-        found = []
+            return found
         missed = [row for row, flag in enumerate(self.flags, 1) if flag not in (Reach.MET.value, NEAR, TOO_EARLY)]
         if self.held:
             found += self._of_delay()
@@ -162,7 +166,7 @@ def _inverted(
     bound = bind_times(model, times)
     if isinstance(bound, TimedSequence):
         try:
-            return _invert_in_time(bound, targets, state, policy)
+            return _invert_in_time(model, bound, targets, state, policy)
         except ValueError as error:
             raise ConfigurationError(f"model {model.name} cannot be inverted: {error}") from None
     if times is not None:
@@ -172,10 +176,17 @@ def _inverted(
     except (ValueError, ArithmeticError) as error:
         raise DataError(f"model {model.name} cannot be inverted: {error}") from None
     flags = tuple(_flags(found.met, targets, found.outputs))
-    return InvertedTargets(targets, found.setpoints, found.saturating, found.outputs, flags)
+    beyond = model.beyond(found.setpoints)
+    return InvertedTargets(targets, found.setpoints, found.saturating, found.outputs, flags, beyond)
 
 
-def _invert_in_time(bound: TimedSequence, targets: Floats, state: Any, policy: Policy) -> InvertedTargets:  # noqa: ANN401 - the model's own
+def _invert_in_time(
+    file: ModelFile,
+    bound: TimedSequence,
+    targets: Floats,
+    state: Any,  # noqa: ANN401 - the model's own
+    policy: Policy,
+) -> InvertedTargets:
     """Return the set-points of a model with time; raises ValueError if it has no inverse, or none at these times."""
     times, delay = bound.times, bound.model.delay
     same = _SAME_TIME * float(np.median(np.diff(times)))
@@ -199,9 +210,8 @@ def _invert_in_time(bound: TimedSequence, targets: Floats, state: Any, policy: P
             elif flags[row] != Reach.MET.value and reached[max(last - 1, 0) : last + 1].all():
                 flags[row] = NEAR
     held = times.size - effective
-    return InvertedTargets(
-        targets, setpoints, np.full(times.size, np.nan), predicted, tuple(flags), times, delay, held
-    )
+    beyond, passing = file.beyond(setpoints, times), np.full(times.size, np.nan)
+    return InvertedTargets(targets, setpoints, passing, predicted, tuple(flags), beyond, times, delay, held)
 
 
 def _are_equal(outputs: Floats, targets: Floats) -> npt.NDArray[np.bool_]:

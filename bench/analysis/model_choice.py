@@ -17,6 +17,7 @@ from bench.analysis.tables.starting_state import bind_times, left_out
 from bench.base import ConfigurationError, DataError
 from bench.identification import (
     ONE_RUN,
+    Beyond,
     Comparison,
     Given,
     Measurements,
@@ -228,15 +229,19 @@ class TestedModel:
         Errors as they are, and after re-zeroing the sensor.
     skip : int
         First rows of another file that are left out, as they depend on its unknown memory.
+    beyond : Beyond
+        How far the inputs of these rows lie beyond those that were fitted.
     """
 
     source: str
     comparison: Comparison
     skip: int
+    beyond: Beyond
 
     def to_json(self) -> dict[str, Any]:
         """Return the errors for programs."""
-        return {"source": self.source, "skipped": self.skip, **self.comparison.to_json()}
+        own = {"source": self.source, "skipped": self.skip, "beyond": self.beyond.to_json()}
+        return own | self.comparison.to_json()
 
 
 def evaluate_on_rows(found: IdentifiedFile, test: str) -> TestedModel:
@@ -253,7 +258,9 @@ def evaluate_on_rows(found: IdentifiedFile, test: str) -> TestedModel:
     residuals = measured - predicted
     offset = float(residuals.mean())
     raw, rezeroed = measure_errors(measured, predicted), measure_errors(measured, predicted + offset)
-    return TestedModel(f"rows {test}", Comparison(raw, rezeroed, offset, residuals), 0)
+    times = None if found.data.times is None else found.data.times[rows]
+    beyond = found.file.beyond(found.inputs[rows], times, first=rows.indices(outputs.size)[0])
+    return TestedModel(f"rows {test}", Comparison(raw, rezeroed, offset, residuals), 0, beyond)
 
 
 def evaluate_on(found: IdentifiedFile, data: Dataset) -> TestedModel:
@@ -261,9 +268,9 @@ def evaluate_on(found: IdentifiedFile, data: Dataset) -> TestedModel:
 
     It starts with an unknown memory: its first rows, until the inputs have overwritten it, are left out.
     """
-    inputs = data.inputs
-    model = bind_times(found.file, data.times if isinstance(found.file.response, TimedModel) else None)
+    inputs, times = data.inputs, data.times if isinstance(found.file.response, TimedModel) else None
+    model = bind_times(found.file, times)
     skip = 0 if isinstance(model, Operator) and model.memoryless else left_out(overwritten_from(inputs), inputs.size)
     states = {"model": found.identification.initial_state}
     compared = compare({"model": model}, inputs, data.outputs, states=states, skip=skip)["model"]
-    return TestedModel(data.name, compared, skip)
+    return TestedModel(data.name, compared, skip, found.file.beyond(inputs, times))

@@ -30,6 +30,7 @@ from bench.identification import (
     ModelFile,
     Regularization,
     Resolution,
+    Validity,
     check_congruency,
     check_options,
     check_return_points,
@@ -165,7 +166,7 @@ class IdentifiedFile:
     @cached_property
     def band(self) -> BandedPrediction | None:
         """The prediction band at the measurements; None if none was calibrated."""
-        return predict_band(self.file, self.inputs, self.identification.initial_state, self.data.times)
+        return predict_band(self.file, self.inputs, self.identification.initial_state)
 
     def predictions(self) -> Predictions:
         """Return the outputs of the model beside the measurements, as the fit has them."""
@@ -203,6 +204,7 @@ class IdentifiedFile:
             "return_points": self.return_points.to_json(),
             "congruency": self.congruency.to_json(),
             "warnings": list(self.warnings),
+            "validity": self.file.valid.to_json(),
             **({"band": {**band.to_json(), "held_out": band.band.held_out}} if (band := self.band) else {}),
             **({"shape": shape} if (shape := _shape(operator)) else {}),
         }
@@ -303,6 +305,10 @@ def identify_model(
     except ValueError as error:
         raise ConfigurationError(f"model {model}: {error}") from None
     counted = fitted & (np.arange(inputs.size) >= found.skip)
+    used = counted if data.weights is None else counted & (data.weights > 0.0)
+    validity = Validity.of_rows(inputs, used, times, found.skip)
+    if isinstance(found.model, Operator) and found.model.memoryless:
+        validity = replace(validity, moves=None)
     if not fitted.all():
         found = replace(found, errors=measure_errors(outputs[counted], (outputs - found.residuals)[counted]))
     warnings += found.warnings
@@ -334,7 +340,7 @@ def identify_model(
     if times is None and (transients := transients or transients_of(data)) is not None:
         dynamics = identify_dynamics(transients, [found.model.evaluate] * len(transients.recordings))
     return IdentifiedFile(
-        ModelFile(model, found.model, memory, provenance, found.initial_state, band, dynamics),
+        ModelFile(model, found.model, memory, provenance, found.initial_state, band, dynamics, validity),
         found,
         tuple(dict.fromkeys(warnings)),
         data,
@@ -461,6 +467,7 @@ def certificate_lines(identified: IdentifiedFile) -> Sequence[tuple[str, str]]:
         ("KKT residual", f"{certificate.kkt_residual:.1e}" + ("" if certificate.converged else " (NOT converged)")),
         ("condition", f"{certificate.condition:.2g}"),
         ("largest uncertainty", "unknown" if largest is None else f"{largest:.2g} (1σ, of a coefficient)"),
+        ("valid for inputs", identified.file.valid.text(operator.input_unit)),
         ("excitation", identified.coverage.summary() if identified.coverage else "no plane to be swept"),
         ("return points", identified.return_points.text),
         ("loops", identified.congruency.text),

@@ -13,7 +13,7 @@ from bench.analysis.band_columns import BandedPrediction, predict_band
 from bench.analysis.tables.data import Quantity
 from bench.analysis.tables.starting_state import bind_times, starting_state
 from bench.base import DataError
-from bench.identification import Errors, ModelFile, measure_errors, parse_model
+from bench.identification import Beyond, Errors, ModelFile, measure_errors, parse_model
 from bench.models import Operator, TimedModel
 from bench.record import Record, Table
 
@@ -38,6 +38,8 @@ class ModelOnRun:
         First readings that count in no error: the same of all models that are compared.
     band : BandedPrediction or None
         Its prediction band, if its file has one.
+    beyond : Beyond
+        How far the readings of the input lie beyond those that were fitted.
     """
 
     file: ModelFile
@@ -47,6 +49,7 @@ class ModelOnRun:
     state: Any
     skip: int
     band: BandedPrediction | None
+    beyond: Beyond
 
     @property
     def unit(self) -> str:
@@ -100,6 +103,7 @@ def apply_models(record: Record, steps: Table, models: Sequence[ModelFile]) -> l
         clock = str(model.provenance.get("time"))
         times = steps[clock if clock in steps.columns else "finished"]
         predicted = bind_times(model, times).evaluate(driven.values, start.state)
-        band = predict_band(model, driven.values, start.state, times)
-        found.append(ModelOnRun(model, driven, response, predicted, start.state, skip, band))
+        band = predict_band(model, driven.values, start.state)
+        beyond = model.beyond(driven.values, times)
+        found.append(ModelOnRun(model, driven, response, predicted, start.state, skip, band, beyond))
     return found

@@ -56,11 +56,8 @@ class Recalibrating:
 
 
 def print_band(found: BandedPrediction, residuals: npt.NDArray[np.float64] | None = None, name: str = "") -> None:
-    """Print a band in a line, with its coverage if there are residuals, and warn where it may not hold."""
-    prefix = f"{name}: " if name else ""
-    print_plain(console, prefix + found.text(residuals))
-    if warning := found.warning():
-        warn(prefix + warning)
+    """Print a band in a line, with its coverage if there are residuals."""
+    print_plain(console, (f"{name}: " if name else "") + found.text(residuals))
 
 
 def print_examined(found: Examined, name: str = "", *, bands: bool = True) -> None:

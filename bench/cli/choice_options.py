@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bench.base import print_plain
-from bench.cli.command_support import console, print_rows
+from bench.cli.command_support import console, print_rows, warn
 from bench.cli.model_options import ModelOptions
 from bench.cli.patience import show_patience
 
@@ -241,6 +241,8 @@ def print_test(found: IdentifiedFile, comparing: Comparing, test: Dataset | None
     unit = found.file.response.output_unit
     raw, rezeroed = tested.comparison.raw, tested.comparison.rezeroed
     skipped = f", first {tested.skip} rows left out" if tested.skip else ""
+    if warning := tested.beyond.text():
+        warn(warning)
     print_rows(
         f"on {tested.source}{skipped}",
         (

@@ -312,7 +312,6 @@ def predict_(
         Predictions,
         examine,
         foreign_drift,
-        outside_of_range,
         read_for,
         starting_state,
     )
@@ -326,8 +325,6 @@ def predict_(
     print_assumptions(file.name, data.assumptions)
     data.check_units(model)
     inputs = data.inputs
-    if warning := outside_of_range(model, inputs):
-        warn(warning)
     if session is None and (warning := foreign_drift(model, inputs)):
         warn(warning)
     start = starting_state(model, inputs, initial=initial, skip=skip, continue_memory=continue_memory)
@@ -458,6 +455,7 @@ def invert(
             **{flag.replace(" ", "_"): count for flag, count in counts.items()},
             "through_saturation": two,
             "largest_residual": float(max(met)) if met else None,
+            "beyond": found.beyond.to_json(),
             "out": str(out),
             **({"band": banded.outputs.to_json()} if banded else {}),
         },

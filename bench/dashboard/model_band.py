@@ -21,15 +21,9 @@ from bench.dashboard.drawing import CAUTION, Colour
 from bench.dashboard.entries import Part, Tick, Ticks, single
 from bench.dashboard.rerun_recording import Floats, RerunRecording, times
 from bench.devices import Settled, Signal
-from bench.identification import Band, ModelFile, input_half_widths
+from bench.identification import Band, ModelFile, Validity, input_half_widths
 from bench.models import Operator
 from bench.record import StepRecord
-
-_FIRST = 16
-"""Rows after which the class of the input is judged first; then whenever they are an eighth more.
-
-Derivation: an eighth of them is two rows; of fewer each would be judged anew.
-"""
 
 # Source: WCAG 2.2, 1.4.11: each has a contrast of 3 to 1 or more to the nearly black background of the viewer.
 _MODEL: Colour = (150, 110, 190)
@@ -55,16 +49,13 @@ class _Row(NamedTuple):
 
 
 class _Standing(NamedTuple):
-    """How it stands at a time: half-width, readings so far, those within the band, departures of the class.
-
-    The latter are None before the class is judged.
-    """
+    """How it stands at a time: half-width, readings so far, those within the band, rows beyond the inputs fitted."""
 
     t: float
     half_width: float
     readings: int
     covered: int
-    departures: tuple[str, ...] | None
+    beyond: int
 
 
 class ModelBand:
@@ -81,6 +72,8 @@ class ModelBand:
         The model.
     band : Band
         Its band.
+    validity : Validity
+        The inputs that were fitted.
     state : object
         Its state at the start of the run.
     drive : int
@@ -99,6 +92,7 @@ class ModelBand:
         name: str,
         operator: Operator[Any],
         band: Band,
+        validity: Validity,
         state: Any,  # noqa: ANN401 - each operator has its own
         *,
         drive: int,
@@ -106,15 +100,12 @@ class ModelBand:
         setpoint: Plotted | None = None,
         reference: int | None = None,
     ) -> None:
-        self._name, self._operator, self._band = name, operator, band
+        self._name, self._operator, self._band, self._validity = name, operator, band, validity
         self._drive, self._response, self._setpoint, self._reference = drive, response, setpoint, reference
         self._plausible = widened(*operator.input_range)
         self._state = self._set_state = state
         self._set, self._set_width = math.nan, math.nan
         self._begun, self._last_reference = reference is None, 0.0
-        self._inputs = self._spreads = np.empty(0)
-        self._judged_at = _FIRST
-        self._departures: tuple[str, ...] | None = None
         self._standings: list[_Standing] = []
         self._drawn: list[tuple[str, list[rr.TimeColumn], Floats]] = []
 
@@ -151,6 +142,7 @@ class ModelBand:
             file.name,
             file.operator,
             file.band,
+            file.valid,
             state,
             drive=drive,
             response=response,
@@ -161,7 +153,7 @@ class ModelBand:
     def draw(self, recording: RerunRecording) -> None:
         """Write how the lines look."""
         level = f"{100.0 * self._band.level:g} %"
-        names = [f"− {level}", f"+ {level}", f"− {level}, other class", f"+ {level}, other class"]
+        names = [f"{sign} {level}{where}" for where in ("", ", beyond the inputs fitted") for sign in "−+"]
         looks: dict[str, Any] = {"colors": [_WITHIN, _WITHIN, CAUTION, CAUTION], "widths": [1.0] * 4}
         if self._setpoint is not None:
             recording.log(f"{self._setpoint.path}/setpoint_band", rr.SeriesLines(names=names, **looks))
@@ -182,19 +174,17 @@ class ModelBand:
             return
         inputs = np.array([row.input for row in rows])
         predicted = self._operator.evaluate(inputs, self._state)
-        spread = self._band.spread(self._operator, inputs, self._state)
+        widths = self._band.half_widths(self._operator, inputs, self._state)
         self._state = self._operator.advance(self._state, inputs)
-        widths = self._band.pointwise * spread
-        verdicts = self._judged(inputs, spread)
-        self._stand(rows, predicted, widths, verdicts)
-        foreign = np.array([verdict != () for verdict in verdicts])
+        beyond = (inputs < self._validity.low) | (inputs > self._validity.high)
+        self._stand(rows, predicted, widths, beyond)
         when = times([row.t for row in rows], [row.step for row in rows])
         about = predicted - np.array([row.reference for row in rows])
-        table = np.column_stack([*_parted(about, widths, foreign), about])
+        table = np.column_stack([*_parted(about, widths, beyond), about])
         self._drawn.append((f"{self._response.path}/band", when, self._response.factor * table))
         if self._setpoint is not None:
             setpoints = np.array([row.setpoint for row in rows])
-            table = np.column_stack(_parted(setpoints, self._setpoint_widths(rows), foreign))
+            table = np.column_stack(_parted(setpoints, self._setpoint_widths(rows), beyond))
             self._drawn.append((f"{self._setpoint.path}/setpoint_band", when, self._setpoint.factor * table))
 
     def write(self, recording: RerunRecording) -> None:
@@ -209,17 +199,16 @@ class ModelBand:
         if place < 0:
             return
         standing = self._standings[place]
-        level, kind = f"{100.0 * self._band.level:g} % band", self._band.calibrated_on.kind
+        level = f"{100.0 * self._band.level:g} % band"
         factor, unit = fitting_prefix(self._operator.output_unit, standing.half_width)
         width = f"± {factor * standing.half_width:.3g} {unit}".rstrip()
-        yield f"{level} of {self._name}, calibrated on {kind}", width
+        yield f"{level} of {self._name}", width
         if standing.readings:
             share = 100.0 * standing.covered / standing.readings
             yield f"of {standing.readings} readings within it", f"{share:.0f} %"
-        if standing.departures is None:
-            yield "whether the input is of its class", "not judged yet:"
-        elif standing.departures:
-            yield f"of the input, the band may cover less: {'; '.join(standing.departures)}", "other class"
+        if standing.beyond:
+            fitted = self._validity.range_text(self._operator.input_unit)
+            yield f"inputs beyond those fitted, {fitted}: the errors there are unknown", f"{standing.beyond}"
 
     def _rows(self, parts: Sequence[Part]) -> Iterator[tuple[_Row, bool]]:
         """Yield the rows of parts, and whether a controller is at work."""
@@ -245,32 +234,18 @@ class ModelBand:
                 row = _Row(t, entry.step, values[self._drive], output, setpoint, self._last_reference, is_reading)
                 yield row, at_work
 
-    def _judged(self, inputs: Floats, spread: Floats) -> list[tuple[str, ...] | None]:
-        """Return for each further row the departures from the class of the calibration that are known there."""
-        first = self._inputs.size
-        self._inputs = np.append(self._inputs, inputs)
-        self._spreads = np.append(self._spreads, spread)
-        verdicts: list[tuple[str, ...] | None] = []
-        while len(verdicts) < inputs.size:
-            count = first + len(verdicts) + 1
-            # Of so many rows, whatever was handed over at once.
-            if count == self._judged_at:
-                self._departures = self._band.departures(self._inputs[:count], self._spreads[:count])
-                self._judged_at = count + max(1, count // 8)
-            verdicts.append(self._departures)
-        return verdicts
-
-    def _stand(
-        self, rows: Sequence[_Row], predicted: Floats, widths: Floats, verdicts: Sequence[tuple[str, ...] | None]
-    ) -> None:
+    def _stand(self, rows: Sequence[_Row], predicted: Floats, widths: Floats, beyond: npt.NDArray[np.bool_]) -> None:
         """Note how it stands at each row; what stood before the last row of the last call is forgotten."""
         del self._standings[:-1]
-        readings, covered = self._standings[-1][2:4] if self._standings else (0, 0)
-        for row, output, width, verdict in zip(rows, predicted.tolist(), widths.tolist(), verdicts, strict=True):
+        readings, covered, count = self._standings[-1][2:5] if self._standings else (0, 0, 0)
+        for row, output, width, is_beyond in zip(
+            rows, predicted.tolist(), widths.tolist(), beyond.tolist(), strict=True
+        ):
+            count += is_beyond
             if row.is_reading and math.isfinite(row.output):
                 readings += 1
                 covered += abs(row.output - output) <= width
-            self._standings.append(_Standing(row.t, width, readings, covered, verdict))
+            self._standings.append(_Standing(row.t, width, readings, covered, count))
 
     def _setpoint_widths(self, rows: Sequence[_Row], *, seen: bool = True) -> Floats:
         """Return the half-width about the set-point of each row, if it is `seen`, and move the memory by them.
@@ -296,6 +271,6 @@ class ModelBand:
         return widths
 
 
-def _parted(middle: Floats, widths: Floats, foreign: npt.NDArray[np.bool_]) -> list[Floats]:
-    """Return lower and upper ends, each shape (N,), where the band is calibrated, then where it is not."""
-    return [np.where(where, middle + sign * widths, np.nan) for where in (~foreign, foreign) for sign in (-1.0, 1.0)]
+def _parted(middle: Floats, widths: Floats, beyond: npt.NDArray[np.bool_]) -> list[Floats]:
+    """Return lower and upper ends, each shape (N,), within the inputs that were fitted, then beyond them."""
+    return [np.where(where, middle + sign * widths, np.nan) for where in (~beyond, beyond) for sign in (-1.0, 1.0)]

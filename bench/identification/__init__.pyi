@@ -1,6 +1,7 @@
 from .bands import (
     Band as Band,
     calibrate_band as calibrate_band,
+    calibrate_band_in_time as calibrate_band_in_time,
     input_half_widths as input_half_widths,
 )
 from .by_name import (
@@ -126,6 +127,7 @@ from .resonance import (
 from .timed.identify_in_time import (
     identify_in_time as identify_in_time,
 )
-from .timed.timed_bands import (
-    calibrate_band_in_time as calibrate_band_in_time,
+from .validity import (
+    Beyond as Beyond,
+    Validity as Validity,
 )

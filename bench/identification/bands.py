@@ -5,9 +5,10 @@ input where there is one near; the input record is never cut, as what is left ou
 Each block is predicted by a fit without it and without a gap on both sides, and gives scores |y - ŷ| / v, where v² is
 the variance of the residuals and of the prediction (`PredictionVariance`). The half-width of the band is q v: q is
 the ⌈(n + 1) level⌉-th of n scores. n is the number of independent ones, as many as the gap goes into the samples
-(Chernozhukov, Wüthrich and Zhu, PMLR 75:732, 2018). A simultaneous band takes the greatest score of each block.
+(Chernozhukov, Wüthrich and Zhu, PMLR 75:732, 2018).
 
-It holds for inputs of the class on which it was calibrated (`ExcitationClass`); elsewhere it may cover far less.
+A band holds for inputs like those of its record, and not beyond the validity of the model (`Validity`). Of a model
+with time each fit without a block is one of the whole model, its times and shape too, and v is that of the residuals.
 """
 
 from __future__ import annotations
@@ -21,23 +22,26 @@ import numpy as np
 
 from bench.base import Floats, checks as _checks, say_share, shares_to
 from bench.identification.branches import turning_points
-from bench.identification.by_name import FitProblem
+from bench.identification.by_name import FitProblem, Identification
 from bench.identification.choose.splits import near
-from bench.identification.design.excitation_class import LEAST_SWING, ExcitationClass
 from bench.identification.fit.cell_layout import Flags, Indices
 from bench.identification.fit.covariance import PredictionVariance, prediction_variance
 from bench.identification.fit.least_squares import Fit
+from bench.identification.timed.identify_in_time import identify_in_time
+from bench.identification.validity import NOISE
 from bench.models import Operator, TimedModel
 
 LEVEL = 0.9
-"""Nominal coverage of a band, unless another is asked for."""
+"""Nominal coverage of a band, unless another is asked for. Derivation: a quantile of it needs nine independent scores
+at least, which a record of a few loops gives."""
 
-_BLOCKS = 20
-_FOLDS = 10
-_FEWEST_ROWS = 5  # in a block
-# Share of the samples that may be worse determined than any of the calibration.
-_OUTSIDE = 0.1
-# Step for the local slope at an input, as part of the operating range.
+# Blocks, and fits without some of them. Derivation: a fit without a tenth of the samples has coefficients about as
+# certain (by 5 %) as one of all; in two blocks the tenth is of two places of the record.
+_BLOCKS, _FOLDS = 20, 10
+# Least rows of a block. Derivation: a branch of fewer has no row between its turning points and a gap on both sides.
+_FEWEST_ROWS = 5
+# Step for the local slope at an input, as part of the operating range. Derivation: far above rounding, and a tenth of
+# the width of a cell of a plane of a hundred levels.
 _STEP = 1e-3
 
 
@@ -51,51 +55,35 @@ class Band:
         Nominal coverage, 0 to 1.
     pointwise : float
         Factor of the half-width at which this share of the samples is covered.
-    simultaneous : float or None
-        Factor at which all samples of a stretch of `stretch` rows are covered with that probability; None if the
-        blocks are too few for it, level / (1 - level) of them at least.
-    stretch : int
-        Rows of a block, mean.
     rows : int
         Samples on which the band was calibrated.
     independent : int
         Number of them that count as independent. Below level / (1 - level) `pointwise` is the greatest score.
-    blocks : int
-        Number of blocks.
     held_out : float
         RMS error of the samples, each predicted by a fit without its block; output units.
-    greatest : float
-        Greatest standard deviation v of the samples, output units.
     variance : PredictionVariance
         Variance of residuals and predictions.
-    calibrated_on : ExcitationClass
-        The class of excitation for which the band holds.
     """
 
     level: float
     pointwise: float
-    simultaneous: float | None
-    stretch: int
     rows: int
     independent: int
-    blocks: int
     held_out: float
-    greatest: float
     variance: PredictionVariance
-    calibrated_on: ExcitationClass
 
-    def spread(
+    def half_widths(
         self,
-        operator: Operator[Any] | TimedModel[Any],
+        model: Operator[Any] | TimedModel[Any],
         inputs: Floats,
         state: Any = None,  # noqa: ANN401 - each operator has its own
     ) -> Floats:
-        """Return v, the standard deviation by which scores are divided, for a sequence of inputs, shape (N,).
+        """Return the half-width of the band about each prediction, shape (N,), output units.
 
         Parameters
         ----------
-        operator : Operator or TimedModel
-            The model to which the band belongs; of one with time v is the same everywhere.
+        model : Operator or TimedModel
+            The model to which the band belongs; of one with time the half-width is the same everywhere.
         inputs : ndarray, shape (N,)
             Input units.
         state : object
@@ -106,73 +94,14 @@ class Band:
         ValueError
             If the inputs are empty or not finite, or the model has fewer coefficients than that of the band.
         """
-        if isinstance(operator, TimedModel):
-            return np.full(inputs.size, self.greatest)
-        variance = self.variance.of(operator.regressor(inputs, state))
-        return np.asarray(np.sqrt(self.variance.residual**2 + variance))
-
-    def half_widths(
-        self,
-        operator: Operator[Any],
-        inputs: Floats,
-        state: Any = None,  # noqa: ANN401 - each operator has its own
-        *,
-        simultaneous: bool = False,
-    ) -> Floats:
-        """Return the half-width of the band about each prediction, shape (N,), output units.
-
-        Parameters
-        ----------
-        operator, inputs, state
-            As `spread`.
-        simultaneous : bool
-            Whether the band covers all samples of a stretch at once, rather than each.
-
-        Raises
-        ------
-        ValueError
-            As `spread`, or if there is no simultaneous band.
-        """
-        factor = self.simultaneous if simultaneous else self.pointwise
-        if factor is None:
-            raise ValueError(
-                f"band: {self.blocks} blocks are too few for a simultaneous band of {100 * self.level:g} %"
-            )
-        return factor * self.spread(operator, inputs, state)
-
-    def departures(self, inputs: Floats, spread: Floats, times: Floats | None = None) -> tuple[str, ...]:
-        """Return in which ways a sequence is not of the class of the calibration; none if the band holds for it.
-
-        Beside those of `ExcitationClass.departures`: more than 10 % of the samples are worse determined by the data
-        of the fit than all samples of the calibration.
-
-        Parameters
-        ----------
-        inputs : ndarray, shape (N,)
-            Input units.
-        spread : ndarray, shape (N,)
-            What `spread` returns for them.
-        times : ndarray, shape (N,), or None
-            s, for a model with time.
-
-        Raises
-        ------
-        ValueError
-            If the inputs are empty or not finite.
-        """
-        found = list(self.calibrated_on.departures(inputs, times))
-        worse = float((spread > 1.001 * self.greatest).mean())
-        if worse > _OUTSIDE:
-            found.append(f"{100 * worse:.0f} % of its rows rest on parts of the model that the data hardly determine")
-        return tuple(found)
+        if isinstance(model, TimedModel):
+            return np.full(inputs.size, self.pointwise * self.variance.residual)
+        variance = self.variance.of(model.regressor(inputs, state))
+        return np.asarray(self.pointwise * np.sqrt(self.variance.residual**2 + variance))
 
     def to_json(self) -> dict[str, Any]:
         """Return the band as a JSON object."""
-        return {
-            **{name: getattr(self, name) for name in _NUMBERS},
-            "variance": self.variance.to_json(),
-            "calibrated_on": self.calibrated_on.to_json(),
-        }
+        return {**{name: getattr(self, name) for name in _NUMBERS}, "variance": self.variance.to_json()}
 
     @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> Band:
@@ -183,35 +112,22 @@ class Band:
         values: dict[str, Any] = {}
         for name, kind in _NUMBERS.items():
             value = _checks.json_field(document, name, "band")
-            if value is None and name == "simultaneous":
-                values[name] = None
-                continue
             values[name] = kind(_checks.number(f"band: {name}", value))
             if values[name] < 0:
                 raise ValueError(f"band: {name}: expected a number >= 0, got {value!r}")
-        if not 0.0 < values["level"] < 1.0:
-            raise ValueError(f"band: level: expected a number between 0 and 1, got {values['level']}")
-        parts = {name: _checks.json_field(document, name, "band") for name in ("variance", "calibrated_on")}
-        for name, part in parts.items():
-            if not isinstance(part, dict):
-                raise ValueError(f"band: {name}: expected an object, got {part!r}")
-        return cls(
-            **values,
-            variance=PredictionVariance.from_json(parts["variance"]),
-            calibrated_on=ExcitationClass.from_json(parts["calibrated_on"]),
-        )
+        _check_level(values["level"])
+        variance = _checks.json_field(document, "variance", "band")
+        if not isinstance(variance, dict):
+            raise ValueError(f"band: variance: expected an object, got {variance!r}")
+        return cls(**values, variance=PredictionVariance.from_json(variance))
 
 
 _NUMBERS: Mapping[str, type[int] | type[float]] = {
     "level": float,
     "pointwise": float,
-    "simultaneous": float,
-    "stretch": int,
     "rows": int,
     "independent": int,
-    "blocks": int,
     "held_out": float,
-    "greatest": float,
 }
 
 
@@ -248,79 +164,117 @@ def calibrate_band(problem: FitProblem, smoothing: float = 0.0, ridge: float = 0
         unknown = _extrapolated(problem, found, other, weights, variance.residual)
         return np.where(unknown, np.nan, _residuals(problem, other))
 
-    calibrated_on = ExcitationClass.of(problem.inputs[used])
-    blocks = LeftOut(problem.inputs, used, _residuals(problem, found), spread, leave_out)
-    return blocks.calibrate(variance, calibrated_on, level)
+    return _calibrated(problem.inputs, used, _residuals(problem, found), spread, leave_out, variance, level)
 
 
-@dataclass(frozen=True, eq=False)
-class LeftOut:
-    """Blocks of a sequence that are left out of fits, whose errors calibrate a band.
+def calibrate_band_in_time(
+    found: Identification[Any],
+    times: Floats,
+    inputs: Floats,
+    outputs: Floats,
+    *,
+    weights: Floats | None = None,
+    level: float = LEVEL,
+    **options: Any,  # noqa: ANN401 - each model names and types its own
+) -> Band:
+    """Return the prediction band of a model with time.
+
+    It costs ten fits.
 
     Parameters
     ----------
-    inputs : ndarray, shape (N,)
-        Input units.
-    used : ndarray of int, shape (n,)
-        The rows that count.
-    residuals : ndarray, shape (N,)
-        Those of the fit to all of them, output units.
-    spread : ndarray, shape (N,)
-        The standard deviation v of each, output units.
-    leave_out : callable
-        Takes which rows are left out, shape (N,), and returns the errors of all by a fit without them, shape (N,),
-        output units; nan where that fit extrapolates.
+    found : Identification
+        What `identify_in_time` returned for the same data and options.
+    times : ndarray, shape (N,)
+        s, strictly increasing.
+    inputs, outputs : ndarray, shape (N,)
+        The measured sequence, in input and output units.
+    weights : ndarray, shape (N,), or None
+        Weight of each sample, those of 0 are not used.
+    level : float
+        Nominal coverage, between 0 and 1.
+    **options
+        Those of the fit, `skip` among them. What it chose is kept.
+
+    Raises
+    ------
+    ValueError
+        If the level is not between 0 and 1, the samples are too few, or a fit without some of them fails.
     """
-
-    inputs: Floats
-    used: Indices
-    residuals: Floats
-    spread: Floats
-    leave_out: Callable[[Flags], Floats]
-
-    def calibrate(self, variance: PredictionVariance, calibrated_on: ExcitationClass, level: float) -> Band:
-        """Return the band; arguments and errors as `Band` and `calibrate_band`."""
-        if not 0.0 < level < 1.0:
-            raise ValueError(f"level: expected a number between 0 and 1, got {level}")
-        used, spread = self.used, self.spread
-        count = min(_BLOCKS, used.size // _FEWEST_ROWS)
-        if count < 2:
-            raise ValueError(f"band: {used.size} samples are too few to leave blocks of them out")
-        turns = turning_points(self.inputs, LEAST_SWING * float(np.ptp(self.inputs)))[1:-1]
-        block = _blocks(self.inputs.size, used, count, turns)
-        lag = _correlation_lag(self.residuals[used], used.size // count // 2)
-        errors = np.full(self.inputs.size, np.nan)
-        for fold in range(min(_FOLDS, count)):
-            left_out = (block >= 0) & (block % _FOLDS == fold)
-            if not left_out.any():
-                continue
-            with_gap = _with_gap(left_out, lag, turns)
-            if np.count_nonzero(~with_gap[used]) < 2:
-                raise ValueError(f"band: {used.size} samples are too few to leave blocks of them out")
-            # What one fit says of itself would hide how many there are.
-            with shares_to(lambda *_: None):
-                errors[left_out] = self.leave_out(with_gap)[left_out]
-            say_share("calibrating the band", (fold + 1) / _FOLDS)
-        scored = np.isfinite(errors)
-        if not scored.any():
-            raise ValueError("band: each block of the samples moves parts of the model that no other moves")
-        scores = np.abs(errors) / np.maximum(spread, 1e-300)
-        independent = max(1, int(np.count_nonzero(scored)) // lag)
-        highest = [float(scores[(block == each) & scored].max()) for each in np.unique(block[scored])]
-        rank = math.ceil((len(highest) + 1) * level)
-        return Band(
-            level=level,
-            pointwise=_quantile(scores[scored], math.ceil((independent + 1) * level) / independent),
-            simultaneous=sorted(highest)[rank - 1] if rank <= len(highest) else None,
-            stretch=used.size // count,
-            rows=int(np.count_nonzero(scored)),
-            independent=independent,
-            blocks=len(highest),
-            held_out=float(np.sqrt(np.mean(errors[scored] ** 2))),
-            greatest=float(spread[used].max()),
-            variance=variance,
-            calibrated_on=calibrated_on,
+    counted = np.ones(inputs.size) if weights is None else weights
+    used = np.flatnonzero(counted > 0.0)
+    used = used[used >= found.skip]
+    freedom = found.certificate.passive + 1.0
+    if used.size <= freedom:
+        raise ValueError(
+            f"band: {used.size} samples on {freedom:.0f} free coefficients leave nothing to judge the fit by; "
+            "take fewer of them or more samples"
         )
+    deviation = float(np.sqrt(np.sum(found.residuals[used] ** 2) / (used.size - freedom)))
+    fixed = options | found.model.structure()
+    if found.regularization is not None:
+        fixed["smoothing"] = found.regularization.smoothing
+
+    def leave_out(left_out: Flags) -> Floats:
+        kept = np.where(left_out, 0.0, counted)
+        return identify_in_time(found.model_name, times, inputs, outputs, weights=kept, **fixed).residuals
+
+    nothing = np.empty(0)
+    variance = PredictionVariance(deviation, 0.0, freedom, 0.0, nothing.astype(np.int64), nothing, nothing[:, None])
+    return _calibrated(inputs, used, found.residuals, np.full(inputs.size, deviation), leave_out, variance, level)
+
+
+def _calibrated(
+    inputs: Floats,
+    used: Indices,
+    residuals: Floats,
+    spread: Floats,
+    leave_out: Callable[[Flags], Floats],
+    variance: PredictionVariance,
+    level: float,
+) -> Band:
+    """Return the band from the residuals of the fit to the samples used, and what a fit without some of them leaves.
+
+    `leave_out` returns nan where such a fit extrapolates; `spread` is v.
+    """
+    _check_level(level)
+    count = min(_BLOCKS, used.size // _FEWEST_ROWS)
+    if count < 2:
+        raise ValueError(f"band: {used.size} samples are too few to leave blocks of them out")
+    turns = turning_points(inputs, NOISE * float(np.ptp(inputs)))[1:-1]
+    block = _blocks(inputs.size, used, count, turns)
+    lag = _correlation_lag(residuals[used], used.size // count // 2)
+    errors = np.full(inputs.size, np.nan)
+    for fold in range(min(_FOLDS, count)):
+        left_out = (block >= 0) & (block % _FOLDS == fold)
+        if not left_out.any():
+            continue
+        with_gap = _with_gap(left_out, lag, turns)
+        if np.count_nonzero(~with_gap[used]) < 2:
+            raise ValueError(f"band: {used.size} samples are too few to leave blocks of them out")
+        # What one fit says of itself would hide how many there are.
+        with shares_to(lambda *_: None):
+            errors[left_out] = leave_out(with_gap)[left_out]
+        say_share("calibrating the band", (fold + 1) / _FOLDS)
+    scored = np.isfinite(errors)
+    if not scored.any():
+        raise ValueError("band: each block of the samples moves parts of the model that no other moves")
+    scores = np.sort((np.abs(errors) / np.maximum(spread, 1e-300))[scored])
+    independent = max(1, scores.size // lag)
+    share = min(math.ceil((independent + 1) * level) / independent, 1.0)
+    return Band(
+        level=level,
+        pointwise=float(scores[math.ceil(share * scores.size) - 1]),
+        rows=scores.size,
+        independent=independent,
+        held_out=float(np.sqrt(np.mean(errors[scored] ** 2))),
+        variance=variance,
+    )
+
+
+def _check_level(level: float) -> None:
+    if not 0.0 < level < 1.0:
+        raise ValueError(f"band: level: expected a number between 0 and 1, got {level}")
 
 
 def input_half_widths(operator: Operator[Any], path: Floats, half_widths: Floats, state: Any = None) -> Floats:  # noqa: ANN401
@@ -355,12 +309,6 @@ def input_half_widths(operator: Operator[Any], path: Floats, half_widths: Floats
 
 def _residuals(problem: FitProblem, found: Fit) -> Floats:
     return problem.outputs - found.bias - problem.regressor.product(found.coefficients)
-
-
-def _quantile(scores: Floats, share: float) -> float:
-    """Return the least score that a share of them does not exceed; the greatest if it is above 1."""
-    ordered = np.sort(scores)
-    return float(ordered[min(math.ceil(min(share, 1.0) * ordered.size), ordered.size) - 1])
 
 
 def _blocks(size: int, used: Indices, count: int, turns: Indices) -> Indices:

@@ -17,6 +17,8 @@ A file of version 2 is an object with these keys:
     Its state before the first row of these data, written alike; may be missing: the model's own initial state.
 `band`
     The prediction band (`Band` of `bench.identification.bands`); left out if there is none.
+`validity`
+    The inputs that were fitted (`bench.identification.Validity`); may be missing: then the range of the model.
 `dynamics`
     Actuator, response and noise as the transients of the data show them (`bench.models.IdentifiedDynamics`): objects
     `actuator`, `response`, `noise` and `uncertainties`, the number `fastest` and the text `source`; left out if not
@@ -35,7 +37,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from bench.base import DataError, json_text, parse_json
+from numpy.typing import ArrayLike
+
+from bench.base import DataError, Floats, json_text, parse_json
+from bench.identification.validity import Beyond, Validity
 from bench.models import IdentifiedDynamics, Operator, TimedModel, model_class, model_from_json
 
 if TYPE_CHECKING:
@@ -55,6 +60,7 @@ _KEYS = {
     "initial",
     "band",
     "dynamics",
+    "validity",
     "provenance",
 }
 _PROVENANCE: Mapping[str, tuple[type | tuple[type, ...], str]] = {
@@ -86,6 +92,8 @@ class ModelFile:
         How far predictions may be from what is measured, if that was calibrated.
     dynamics : IdentifiedDynamics or None
         How actuator and response follow a set-point, and their noise, if that was identified.
+    validity : Validity or None
+        The inputs that were fitted; None in older files.
     """
 
     name: str
@@ -95,6 +103,16 @@ class ModelFile:
     initial: Any = None
     band: Band | None = None
     dynamics: IdentifiedDynamics | None = None
+    validity: Validity | None = None
+
+    @property
+    def valid(self) -> Validity:
+        """The inputs that were fitted; of an older file the range of the model is all that is known of them."""
+        return self.validity or Validity(*self.response.input_range)
+
+    def beyond(self, inputs: ArrayLike, times: Floats | None = None, *, first: int = 0) -> Beyond:
+        """Return how far inputs lie beyond those that were fitted; arguments and errors as `Validity.judge`."""
+        return self.valid.judge(inputs, times, first=first, unit=self.response.input_unit)
 
     @property
     def operator(self) -> Operator[Any]:
@@ -150,6 +168,7 @@ class ModelFile:
             "initial": None if self.initial is None else self.response.state_to_json(self.initial),
             **({} if self.band is None else {"band": self.band.to_json()}),
             **({} if self.dynamics is None else {"dynamics": self.dynamics.to_json()}),
+            **({} if self.validity is None else {"validity": self.validity.to_json()}),
             "provenance": {"bench": importlib.metadata.version("actuator-bench"), **self.provenance},
         }
 
@@ -172,9 +191,7 @@ class ModelFile:
                 f"registered for the kind {self.model.kind!r}; register it in an entry of the group bench.models"
             )
         again = parse_model(parse_json(text), str(path)).to_json()
-        if any(
-            again.get(key) != content.get(key) for key in ("kind", "model", "memory", "initial", "band", "dynamics")
-        ):
+        if any(again.get(key) != content.get(key) for key in _KEYS - {"kept", "provenance", "validity"}):
             raise DataError(
                 f"model file {path} is not written: {reference} does not read what it writes (to_json, from_json)"
             )
@@ -266,12 +283,13 @@ def parse_model(content: object, source: str) -> ModelFile:
         band = None if content.get("band") is None else _read_band(content["band"])
         known = content.get("dynamics")
         dynamics = None if known is None else IdentifiedDynamics.from_json(known)
+        validity = None if content.get("validity") is None else Validity.from_json(content["validity"])
         provenance = dict(content["provenance"])
         for key, (kind, what) in _PROVENANCE.items():
             value = provenance.get(key)
             if value is not None and (isinstance(value, bool) or not isinstance(value, kind)):
                 raise TypeError(f"provenance: expected {what} for {key}, got {value!r}")
-        return ModelFile(name, model, memory, provenance, initial, band, dynamics)
+        return ModelFile(name, model, memory, provenance, initial, band, dynamics, validity)
     except KeyError as error:
         raise DataError(f"model file {source} is damaged: key {error} is missing") from None
     except (ValueError, TypeError, AttributeError, OverflowError) as error:

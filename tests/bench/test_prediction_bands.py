@@ -12,7 +12,7 @@ from bench.identification import load_model
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "identification"))
 
-from other_plants import first_order, measured, random_reversals
+from other_plants import measured, random_reversals
 
 ASKED = ("--input", "u", "--output", "y")
 
@@ -32,7 +32,7 @@ def read(path):
 def files(tmp_path_factory):
     folder, rng = tmp_path_factory.mktemp("measurements"), np.random.default_rng(0)
     found = {}
-    for name, make in (("training", random_reversals), ("same", random_reversals), ("other", first_order)):
+    for name, make in (("training", random_reversals), ("same", random_reversals)):
         inputs = make(rng)
         found[name] = write(folder / f"{name}.csv", inputs, measured("duhem", inputs, rng))
     inputs = random_reversals(rng)
@@ -61,8 +61,7 @@ def model(bench, files, tmp_path):
     )
     assert code == 0
     assert "90 % band: ± " in out
-    assert "calibrated on random reversals" in out
-    assert json.loads(result.read_text())["band"]["departures"] == []
+    assert json.loads(result.read_text())["band"]["half_width"] > 0.0
     return path
 
 
@@ -83,7 +82,6 @@ def test_rows_that_are_not_fitted_calibrate_no_band(bench, files, tmp_path):
     assert code == 0, text
     band = json.loads(path.read_text())["band"]
     assert 0 < band["rows"] <= 600
-    assert band["stretch"] == 30
 
 
 def test_the_file_stays_small_and_is_read_again(model):
@@ -120,15 +118,6 @@ def test_predictions_have_the_band_and_its_coverage(bench, model, files, tmp_pat
     assert 0.8 < covered < 1.0
     assert f"covers {100 * covered:.1f} % of the rows measured" in text
     assert band["half_width"] == pytest.approx(np.median(upper - predicted))
-    assert band["simultaneous_half_width"] > band["half_width"]
-
-
-def test_inputs_of_another_class_are_flagged(bench, model, files, tmp_path):
-    code, _, err = bench("predict", model, files["other"], *ASKED, "--out", tmp_path / "p.csv")
-    assert code == 0
-    assert "this input is of another class than the random reversals on which the band was calibrated" in err
-    assert "first-order reversals from above" in err
-    assert "may cover far less than 90 %" in err
 
 
 def test_inverted_setpoints_have_bands(bench, model, tmp_path):

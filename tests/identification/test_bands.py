@@ -1,11 +1,10 @@
-"""Prediction bands: their coverage on plants of another structure, and where they are flagged."""
+"""Prediction bands: their coverage on plants of another structure."""
 
 import json
-from dataclasses import replace
 
 import numpy as np
 import pytest
-from other_plants import STEP, damped, first_order, measured, random_reversals
+from other_plants import STEP, measured, random_reversals
 
 from bench.identification import Band, calibrate_band, ramps, set_up_problem
 
@@ -20,16 +19,8 @@ def calibrated(model, inputs, outputs, **options):
     return problem.template.with_coefficients(found.coefficients, found.bias), calibrate_band(problem, **options)
 
 
-def coverage(model, band, inputs, outputs, *, simultaneous=False):
-    inside = np.abs(outputs - model.evaluate(inputs)) <= band.half_widths(model, inputs, simultaneous=simultaneous)
-    if not simultaneous:
-        return float(inside.mean())
-    stretches = inside[: inside.size // band.stretch * band.stretch].reshape(-1, band.stretch)
-    return float(stretches.all(axis=1).mean())
-
-
-def departures(band, model, inputs):
-    return band.departures(inputs, band.spread(model, inputs))
+def coverage(model, band, inputs, outputs):
+    return float((np.abs(outputs - model.evaluate(inputs)) <= band.half_widths(model, inputs)).mean())
 
 
 @pytest.mark.parametrize(
@@ -42,33 +33,16 @@ def departures(band, model, inputs):
     ],
 )
 @pytest.mark.slow
-def test_nine_of_ten_are_covered_on_other_inputs_of_the_same_class(plant, model):
-    covered, together, flagged = [], [], 0
+def test_nine_of_ten_are_covered_on_other_inputs_of_one_kind(plant, model):
+    covered = []
     for seed in range(8):
         rng = np.random.default_rng(seed)
         inputs, others = random_reversals(rng), random_reversals(rng)
         found, band = calibrated(model, inputs, measured(plant, inputs, rng))
         outputs = measured(plant, others, rng)
-        flagged += bool(departures(band, found, others))
         covered.append(coverage(found, band, others, outputs))
-        together.append(coverage(found, band, others, outputs, simultaneous=True))
     assert 0.85 <= np.mean(covered) <= 0.95
     assert min(covered) >= 0.7
-    assert flagged <= 2
-    assert np.mean(together) >= 0.8
-
-
-@pytest.mark.parametrize("plant", ["bouc-wen", "duhem"])
-def test_a_band_is_flagged_where_it_covers_less_than_it_says(plant):
-    for seed in range(3):
-        rng = np.random.default_rng(seed)
-        inputs = damped(rng)
-        found, band = calibrated(PREISACH, inputs, measured(plant, inputs, rng))
-        assert band.calibrated_on.kind == "damped oscillations"
-        others = first_order(rng)
-        assert coverage(found, band, others, measured(plant, others, rng)) < 0.85
-        assert any("first-order reversals" in text for text in departures(band, found, others))
-        assert departures(band, found, random_reversals(rng))
 
 
 def test_independent_noise_on_a_line_gives_the_quantile_of_the_noise():
@@ -127,14 +101,9 @@ def test_the_outermost_loop_is_left_out_of_the_scores():
     assert band.held_out < 0.1 * np.ptp(outputs)
 
 
-def test_few_samples():
-    rng = np.random.default_rng(7)
+def test_few_samples_are_refused():
     inputs = ramps([-1.0, 1.0, -0.5, 0.5, 0.0], 0.15)
-    outputs = measured("bouc-wen", inputs, rng)
-    model, band = calibrated(("prandtl-ishlinskii", {"plays": 4}), inputs, outputs)
-    assert band.simultaneous is None
-    with pytest.raises(ValueError, match=r"\d blocks are too few for a simultaneous band of 90 %"):
-        band.half_widths(model, inputs, simultaneous=True)
+    outputs = measured("bouc-wen", inputs, np.random.default_rng(7))
     with pytest.raises(ValueError, match="too few to leave blocks of them out"):
         calibrated(("polynomial", {"degree": 2}), inputs[:9], outputs[:9])
 
@@ -162,8 +131,7 @@ def test_what_is_written_is_read():
     again = Band.from_json(json.loads(json.dumps(band.to_json())))
     assert again.to_json() == band.to_json()
     np.testing.assert_array_equal(again.half_widths(model, inputs), band.half_widths(model, inputs))
-    assert Band.from_json(replace(band, simultaneous=None).to_json()).simultaneous is None
-    for key, value in (("level", 1.5), ("pointwise", -1.0), ("rows", None), ("variance", []), ("calibrated_on", 1)):
+    for key, value in (("level", 1.5), ("pointwise", -1.0), ("rows", None), ("variance", [])):
         with pytest.raises(ValueError, match="band"):
             Band.from_json({**band.to_json(), key: value})
 

@@ -99,7 +99,9 @@ def test_time_stands_in_rows_figures_and_card(bench, tmp_path):
     rates = np.abs(np.diff(drive) / np.diff(1e-3 * times))
     steps = 1e-3 * np.diff(times)
     page = card.read_text(encoding="utf-8")
-    assert f"| rate | {rates.min():.4g} to {rates.max():.4g} V/s" in page
+    slowest, fastest = json.loads(model.read_text(encoding="utf-8"))["validity"]["rates"]
+    assert rates.min() < slowest < fastest < rates.max()
+    assert f"{slowest:.4g} to {fastest:.4g} V/s" in page
     assert (
         f"| sampling rate | {1.0 / np.median(steps):.4g} Hz over {1e-3 * np.ptp(times):.4g} s; uneven steps" in page
     )

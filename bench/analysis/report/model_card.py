@@ -103,7 +103,7 @@ def model_card(
         "Data": _table(("", ""), _data(found, rows, measured, source, digest)),
         "Errors": _table(("error", measured.unit or "output units", "% of the range"), _errors(found)),
         "Certificate": _table(("", ""), certificate_lines(found)),
-        "Limits of validity": _table(("", ""), _limits(found, rows.input, rows.time)),
+        "Limits of validity": _table(("", ""), _limits(found)),
     }
     if (band := found.band) is not None:
         held_out = f"{band.band.held_out:.4g} {band.unit}".rstrip()
@@ -180,32 +180,15 @@ def _compared(table: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
     ]
 
 
-def _limits(found: IdentifiedFile, inputs: Quantity, time: Quantity | None) -> list[tuple[str, str]]:
-    operator = found.file.response
-    # Swings between reversals say which class of inputs the errors hold for.
-    moved = inputs.values[np.append(True, np.diff(inputs.values) != 0.0)]
-    turns = np.flatnonzero(np.diff(np.sign(np.diff(moved)))) + 1
-    swings = np.abs(np.diff(moved[np.concatenate([[0], turns, [moved.size - 1]])]))
-    unit = f" {inputs.unit}" if inputs.unit else ""
-    excitation = (
-        f"{turns.size} reversals, swings of {swings.min():.4g} to {swings.max():.4g}{unit}, "
-        f"median {np.median(swings):.4g}{unit}; the errors hold for inputs of this class"
-    )
+def _limits(found: IdentifiedFile) -> list[tuple[str, str]]:
+    known = found.file.valid
+    rows = f"{known.rows} fitted, {known.skipped} first ones skipped, {known.left_out} others not fitted"
     return [
-        ("input", f"{_between(*operator.input_range, operator.input_unit)}; beyond it the model extrapolates"),
-        ("excitation", excitation),
-        ("rate", _rate(inputs, time)),
+        ("inputs", f"{known.text(found.file.response.input_unit)}; beyond them the errors are unknown"),
+        *([] if found.data.time else [("rates", "no time was read; the errors hold at the rate of these data")]),
+        ("rows", rows),
         ("memory before the first row", _memory(found)),
     ]
-
-
-def _rate(inputs: Quantity, time: Quantity | None) -> str:
-    if time is None:
-        return "no time was read; the errors hold at the rate of these data"
-    speeds = np.abs(np.diff(inputs.values) / np.diff(time.values))
-    speeds = speeds[speeds > 0.0]
-    unit = f"{inputs.unit or 'input units'}/{time.unit}"
-    return f"{speeds.min():.4g} to {speeds.max():.4g} {unit}, median {np.median(speeds):.4g}; the errors hold there"
 
 
 def _sampling(time: Quantity) -> str:

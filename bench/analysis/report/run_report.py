@@ -93,7 +93,13 @@ def report_run(
         compared = [*models_of(record), *_given_with_band(record), *models]
         applied = apply_models(record, steps, compared) if len(steps) else []
         comparison = {
-            each.file.name: {**each.errors.to_json(), "unit": each.unit, "skipped": each.skip} for each in applied
+            each.file.name: {
+                **each.errors.to_json(),
+                "unit": each.unit,
+                "skipped": each.skip,
+                "beyond": each.beyond.to_json(),
+            }
+            for each in applied
         }
         more = _draw_errors(applied, folder, figure_format)
         controlled = str(record.meta.get("controls", ""))
@@ -254,6 +260,9 @@ def _print_comparison(
         cells = format_numbers([entry["max"], entry["rms"]], entry["unit"], _precision(record, outputs[name]))
         table.add_row(name, *cells, f"{entry['rms_percent']:.2f}")
     console.print(table)
+    for each in models:
+        if text := each.beyond.text():
+            print_plain(console, f"{each.file.name}: {text}")
 
 
 def _print_control(

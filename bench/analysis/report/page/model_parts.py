@@ -40,6 +40,7 @@ def models_section(models: Sequence[ModelOnRun], times: Floats, scratch: Path) -
     skip = models[0].skip
     if skip:
         parts.append(PageText(f"Readings 1 to {skip} drive the memory of the models and count in no error."))
+    parts += [PageText(f"{model.file.name}: {text}.") for model in models if (text := model.beyond.text())]
     for i, group in enumerate(_by_signals(models)):
         parts += _fits(group, times, scratch, i)
     parts += [part for model in models for part in _bands(model)]
@@ -55,14 +56,15 @@ def given_section(files: Sequence[tuple[str, ModelFile]], scratch: Path) -> Page
     figures = []
     for i, (parameter, file) in enumerate(files):
         source = file.provenance.get("source") or ", ".join(file.provenance.get("sources", ()))
-        band = "none" if file.band is None else f"{100.0 * file.band.level:g} %, {file.band.calibrated_on.kind}"
-        rows.append((parameter, file.name, file.model.kind, str(source), band))
+        band = "none" if file.band is None else f"{100.0 * file.band.level:g} %"
+        known = "" if file.validity is None else file.validity.text(file.response.input_unit)
+        rows.append((parameter, file.name, file.model.kind, str(source), known, band))
         for k, density in enumerate(file.model.densities()):
             path = scratch / f"given-{i}-{k}.svg"
             plot_densities(path, [density])
             caption = f"Density of {file.name} {density.title}".rstrip()
             figures.append(PageFigure(inlined(path, caption), f"{caption}, as the run was given it."))
-    heads = ("parameter", "model", "kind", "identified from", "prediction band")
+    heads = ("parameter", "model", "kind", "identified from", "valid for inputs", "prediction band")
     return PageSection("Models that the run was given", (PageTable(heads, rows), *figures))
 
 
@@ -130,8 +132,6 @@ def _bands(model: ModelOnRun) -> Iterator[PageTable | PageText]:
     covered = model.band.coverage(model.residuals[model.skip :])
     rows = [*model.band.rows(), ("covers of the readings", f"{100.0 * covered:.1f} %")]
     yield PageTable(("", ""), rows, title=f"prediction band of {model.file.name}")
-    if warning := model.band.warning():
-        yield PageText(f"Warning: {warning}")
 
 
 def _details(model: ModelOnRun, scratch: Path, number: int) -> Iterator[PageFigure | PageTable | PageText]:
