@@ -58,9 +58,10 @@ _OF_ALL = ("initial", "orientation")
 """Options that every model takes, though they are not its own."""
 
 SMOOTHING = (0.0, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
-"""Weights of the roughness penalty that cross-validation tries."""
+"""Weights of the roughness penalty that cross-validation tries. Derivation: decades from no effect to flatness."""
 
-# Coefficients up to which cross-validation that nobody asked for takes seconds.
+# Coefficients up to which cross-validation that nobody asked for takes seconds. Derivation: their normal equations
+# have 0.3 GB, a tenth of what a small computer has.
 _MOST_CROSS_VALIDATED = 6000
 
 

@@ -22,15 +22,19 @@ from bench.identification.fit.scaled_columns import unit_of_penalties
 from bench.models import Regressor
 
 SMOOTHING = tuple((10.0 ** np.arange(-6.0, 2.1)).tolist())
-"""Weights of the roughness penalty that are tried; see `fit`."""
+"""Weights of the roughness penalty that are tried; see `fit`. Derivation: in units of the data's own weight, from the
+square of the rounding of readings of three digits to where the density is flat; decades, as errors tell no less."""
 RIDGE = (0.0, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
-"""Weights of the penalty on the size of the density that are tried; see `fit`."""
+"""Weights of the penalty on the size of the density that are tried; see `fit`. Derivation: none of it, and the
+decades of the roughness up to where the size costs a tenth of what the data weigh."""
 
-# Samples of a block, as far as there are so many: within fewer its neighbours tell all.
+# Samples of a block, as far as there are so many. Derivation: three of four have no neighbour in another block.
 _SHORTEST = 8
-# The weights belong to the density, not to the plane: they are chosen on one of at most this order.
+# The weights belong to the density, not to the plane: they are chosen on one of at most this order. Derivation: it
+# has 300 cells, and 315 factorizations of 9 million operations each take about a second.
 _FINEST = 24
-# Added to the squared norm of each scaled column, so that columns without a penalty may be collinear.
+# Added to the squared norm of each scaled column, so that columns without a penalty may be collinear. Derivation: the
+# rounding of sums of some hundred products.
 _FLOOR = 1e-13
 
 
