@@ -92,8 +92,8 @@ class Beyond:
             if not each.by_chance:
                 fitted = known.moves_text(unit) if kind in ("smaller", "larger") else known.rates_text(unit)
                 said.append(
-                    f"{each.count} of {each.of} moves of the input are {kind} than those fitted, {fitted}: "
-                    f"the farthest {each.farthest:.3g}"
+                    f"{each.count} of {each.of} moves of the input are {kind} than those fitted, {fitted} (as far as "
+                    f"{each.farthest:.3g})"
                 )
         return f"{', and '.join(said)}; the errors there are unknown" if said else ""
 

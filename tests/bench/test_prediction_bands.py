@@ -45,20 +45,8 @@ def files(tmp_path_factory):
 def model(bench, files, tmp_path):
     """A model with a band, and what was printed and written of it."""
     path, result = tmp_path / "model.json", tmp_path / "identified.json"
-    code, out, _ = bench(
-        "identify",
-        files["training"],
-        *ASKED,
-        "--model",
-        "preisach",
-        "--reversible",
-        "linear",
-        "--band",
-        "--out",
-        path,
-        "--json",
-        result,
-    )
+    arguments = ("--model", "preisach", "--reversible", "linear", "--band", "--out", path, "--json", result)
+    code, out, _ = bench("identify", files["training"], *ASKED, *arguments)
     assert code == 0
     assert "90 % band: ± " in out
     assert json.loads(result.read_text())["band"]["half_width"] > 0.0
@@ -179,18 +167,8 @@ def test_a_session_is_recalibrated_and_judged_on_other_rows(bench, model, files,
 
 def test_compare_recalibrates_each_model(bench, model, files, tmp_path):
     result = tmp_path / "c.json"
-    code, out, _ = bench(
-        "compare",
-        model,
-        "--data",
-        files["moved"],
-        "--recalibrate",
-        "offset,gain",
-        "--recalibrate-rows",
-        400,
-        "--json",
-        result,
-    )
+    arguments = ("--recalibrate", "offset,gain", "--recalibrate-rows", 400, "--json", result)
+    code, out, _ = bench("compare", model, "--data", files["moved"], *arguments)
     assert code == 0
     assert "recalibration of model" in out
     entry = json.loads(result.read_text())["model"]

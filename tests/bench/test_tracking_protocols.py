@@ -78,7 +78,7 @@ class TestModelsWithTime:
         for name in ("preisach", "hammerstein"):
             code, out, err = bench(
                 "run", "tracking", *VO2, "--set", f"model={models[name]}", "--set", "controller=open-loop-inverse",
-                "--set", "count=6", "--out", tmp_path,
+                "--set", "count=6", "--set", "hottest=90", "--out", tmp_path,
             )  # fmt: skip
             assert code == 0, err
             said = " ".join((out + err).split())
@@ -87,6 +87,8 @@ class TestModelsWithTime:
             (folder,) = tmp_path.glob(f"*{name}*")
             with Record(folder) as record:
                 found.append(target_results(record, "curvature").summary()["rms"])
+                notes = [event.text for event in record.events()]
+            assert any("lie beyond those fitted, 21 to 84 °C" in note for note in notes)
         assert found[0] == found[1]
 
     def test_one_that_creeps_is_refused(self, bench, models, tmp_path):
