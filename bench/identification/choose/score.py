@@ -26,8 +26,8 @@ _LEAST_MOVE = 0.005
 # Part of the rows that a memory may take to be known, or all rows are tested. Source: of ten blocks
 # two then remain, one for each of two folds.
 _KNOWN = 0.25
-# Part of the rows that may be left out of a fit for their memory. Source: as a fold of five leaves out.
-_SKIPPED = 0.2
+# Part of the rows that may be left out of a fit for their memory. Source: most rows then remain.
+_SKIPPED = 0.5
 # Relative tolerance of shape parameters of a candidate. Source: far below the tie of two scores, 2 %.
 _SHAPE = 1e-5
 
@@ -144,7 +144,7 @@ class Measurements:
 
     @property
     def may_skip(self) -> bool:
-        """Whether first rows of unknown memory may be left out of a fit: a fifth of the rows at most."""
+        """Whether first rows of unknown memory may be left out of a fit: half of the rows at most."""
         return 0 < int(self.fitted[: self.known].sum()) <= _SKIPPED * int(self.fitted.sum())
 
     @property
