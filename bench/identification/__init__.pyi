@@ -88,6 +88,12 @@ from .fit.two_stage_fit import (
     predict_series as predict_series,
     voltage_steps as voltage_steps,
 )
+from .fit.variable_projection import (
+    Evidence as Evidence,
+    Separable as Separable,
+    Stage as Stage,
+    variable_projection as variable_projection,
+)
 from .inspection import (
     check_data as check_data,
 )

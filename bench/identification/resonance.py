@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bench.base import Floats, checks as _checks
+from bench.identification.fit.variable_projection import End, Evidence, Separable, Stage, variable_projection
 from bench.identification.measures import Errors, measure_errors
 
 Complexes: TypeAlias = NDArray[np.complex128]
@@ -28,6 +29,8 @@ _UNKNOWN = 0.25
 # Fewest samples after the step, and range of the search for the delay about the first that differ, in samples.
 _LEAST = 50
 _EARLIER, _LATER = 4, 2
+# A search for the poles and the delay.
+_SEARCH = Stage(1, 1e-14, 400)
 
 
 @dataclass(frozen=True)
@@ -290,8 +293,6 @@ def identify_dynamics(inputs: ArrayLike, outputs: ArrayLike, dt: float) -> Dynam
         If a sequence is wrong, there is not exactly one step, too few samples follow it, no resonance stands out,
         or a pole's relative standard uncertainty exceeds 25 %.
     """
-    from scipy.optimize import least_squares
-
     u, y = _checks.samples("inputs", inputs), _checks.samples("outputs", outputs)
     if y.size != u.size:
         raise ValueError(f"outputs: expected {u.size} values, one for each input, got {y.size}")
@@ -310,41 +311,29 @@ def identify_dynamics(inputs: ArrayLike, outputs: ArrayLike, dt: float) -> Dynam
     def parameters(x: Floats) -> tuple[float, float, float, float]:
         return math.exp(x[0]), math.exp(x[1]), math.exp(x[2]), dt * x[3]
 
-    def residuals(x: Floats) -> Floats:
-        columns = _columns(times, *parameters(x))
-        return y - columns @ np.linalg.lstsq(columns, y)[0]
-
+    model_of = Separable(y, np.ones(y.size), lambda x: _columns(times, *parameters(x)))
     rates = np.geomspace(3.0 / times[-1], math.pi / dt, 40)
     starts = [
         np.array([math.log(rate), math.log(frequency), math.log(min(decay * factor / frequency, 0.5)), late])
         for rate in rates
         for factor in (0.5, 1.0, 2.0)
     ]
-    start = min(starts, key=lambda x: float(np.sum(residuals(x) ** 2)))
+    start = min(starts, key=lambda x: float(np.sum(model_of.residuals(x) ** 2)))
     margin = np.array([math.log(20.0), math.log(1.2), math.log(20.0), 0.5])
-    tries = []
+    tries: list[End] = []
     # The response has a corner where it starts: the cost is smooth in the delay between two samples only.
     for interval in range(max(late - _EARLIER, 0), late + _LATER):
         start[3] = interval + 0.5
         low, high = start - margin, start + margin
         high[2] = min(high[2], math.log(0.9))
-        tries.append(least_squares(residuals, start, bounds=(low, high), xtol=1e-14, ftol=1e-14, gtol=1e-14))
-    x = np.asarray(min(tries, key=lambda each: float(each.cost)).x)
-    columns = _columns(times, *parameters(x))
-    linear: Floats = np.asarray(np.linalg.lstsq(columns, y)[0], dtype=np.float64)
-    model = _assemble(*parameters(x)[:3], linear[1:] / size)
-    rest = y - columns @ linear
-
-    step = 1e-6
-    slopes = [
-        (_columns(times, *parameters(x + e)) - _columns(times, *parameters(x - e))) @ linear / (2.0 * step)
-        for e in step * np.eye(4)
-    ]
-    jacobian = np.column_stack([*slopes, columns])
-    norms = np.linalg.norm(jacobian, axis=0)
-    scaled = jacobian / norms
-    variance = float(rest @ rest) / (y.size - norms.size)
-    deviations = np.sqrt(variance * np.diag(np.linalg.pinv(scaled.T @ scaled))) / norms
+        tries += variable_projection(model_of, [start.copy()], (low, high), stages=[_SEARCH])
+    end = min(tries, key=lambda each: each.cost)
+    x, linear, rest = end.values, model_of.coefficients(end.values), end.residuals
+    model = _assemble(*parameters(x)[:3], linear[:-1] / size)
+    free = np.full(x.size, np.inf)
+    columns = [model_of.slopes(x, -free, free), _columns(times, *parameters(x)), np.ones(y.size)]
+    evidence = Evidence.of(np.column_stack(columns), rest, y.size - x.size - linear.size)
+    deviations = evidence.deviations
     poor = [
         f"{name} (± {100.0 * deviation:.0f} %)"
         for name, deviation in zip(("real_pole", "frequency", "damping"), deviations, strict=False)
@@ -352,36 +341,35 @@ def identify_dynamics(inputs: ArrayLike, outputs: ArrayLike, dt: float) -> Dynam
     ]
     if poor:
         raise ValueError(f"outputs: the step response does not identify {', '.join(poor)}; take a greater step")
-    length = float(np.linalg.norm(rest))
     return DynamicsIdentification(
         model=model,
-        offset=float(linear[0]),
+        offset=float(linear[-1]),
         delay=dt * float(x[3]),
         uncertainties={
             "real_pole": model.real_pole * float(deviations[0]),
             "frequency": model.frequency * float(deviations[1]),
             "damping": model.damping * float(deviations[2]),
-            "gain": float(deviations[5]) / abs(size),
-            "offset": float(deviations[4]),
+            "gain": float(deviations[4]) / abs(size),
+            "offset": float(deviations[-1]),
             "delay": dt * float(deviations[3]),
         },
         residuals=rest,
         errors=measure_errors(y, y - rest),
-        condition=float(np.linalg.cond(scaled)),
-        gradient=float(np.abs(np.delete(scaled, 3, axis=1).T @ rest).max() / length) if length else 0.0,
+        condition=evidence.condition,
+        gradient=float(np.delete(evidence.cosines, 3).max()),
     )
 
 
 def _columns(times: Floats, real_pole: float, frequency: float, damping: float, delay: float) -> Floats:
-    """Return the columns of offset, final value, real mode, and sine of the pair, shape (N, 4).
+    """Return the columns of final value, real mode, and sine of the pair, shape (N, 3).
 
-    The cosine of the pair is in the second and third, so that the response starts from 0.
+    The cosine of the pair is in the first and second, so that the response starts from 0.
     """
     t = np.maximum(times - delay, 0.0)
     envelope = np.exp(-damping * frequency * t)
     phase = frequency * math.sqrt(1.0 - damping**2) * t
     cosine = envelope * np.cos(phase)
-    return np.column_stack([np.ones(t.size), 1.0 - cosine, np.exp(-real_pole * t) - cosine, envelope * np.sin(phase)])
+    return np.column_stack([1.0 - cosine, np.exp(-real_pole * t) - cosine, envelope * np.sin(phase)])
 
 
 def _assemble(real_pole: float, frequency: float, damping: float, amplitudes: Floats) -> ThirdOrder:

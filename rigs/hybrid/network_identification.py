@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bench.base import Floats, checks as _checks
-from bench.identification import Errors, measure_errors
+from bench.identification import Errors, Evidence, Stage, measure_errors, variable_projection
 from rigs.hybrid.design import Design
 from rigs.hybrid.network import NODES, ThermalNetwork
 
@@ -109,8 +109,6 @@ def identify_network(
         nearly rank deficient, a relative standard uncertainty exceeds 25 %, or a parameter ends 20 times away
         from its start.
     """
-    from scipy.optimize import least_squares
-
     i = _checks.samples("currents", currents)
     measured = []
     for name, values in (("base", base), ("tip", tip)):
@@ -135,30 +133,23 @@ def identify_network(
 
     first = np.append(np.zeros(len(free)), target[0].mean())
     reach = np.append(np.full(len(free), _REACH), np.inf)
-    found = least_squares(
-        residuals, first, bounds=(first - reach, first + reach), x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-12
-    )
-    names = (*free, "ambient")
-    jacobian: Floats = np.asarray(found.jac)
-    norms = np.linalg.norm(jacobian, axis=0)
-    if (norms == 0.0).any():
-        lost = [n for n, norm in zip(names, norms, strict=True) if norm == 0.0]
+    search = Stage(1, 1e-12, 100 * first.size)
+    found = variable_projection(residuals, [first], (first - reach, first + reach), stages=[search], central=True)[0]
+    names, fit, logarithms = (*free, "ambient"), found.residuals, found.values
+    evidence = Evidence.of(found.jacobian, fit, fit.size - first.size)
+    deviations, condition = evidence.deviations, evidence.condition
+    if lost := [n for n, deviation in zip(names, deviations, strict=True) if np.isinf(deviation)]:
         raise ValueError(
             f"currents: the temperatures do not depend on {', '.join(lost)}; expected steps of the current"
         )
-    scaled = jacobian / norms
-    condition = float(np.linalg.cond(scaled))
     if condition > _DEPENDENT:
         raise ValueError(
             f"currents: the data do not tell {', '.join(free)} apart (condition {condition:.1e}); hold one of "
             "them, or measure longer and with steps of both signs"
         )
-    fit = np.asarray(found.fun)
-    variance = float(fit @ fit) / (fit.size - len(names))
-    deviations = np.sqrt(variance * np.diag(np.linalg.inv(scaled.T @ scaled))) / norms
     poor = [
         f"{n} (± {100.0 * deviation:.0f} %)"
-        for n, deviation, x in zip(free, deviations, found.x, strict=False)
+        for n, deviation, x in zip(free, deviations, logarithms, strict=False)
         if deviation > _UNKNOWN or abs(x) > 0.999 * _REACH
     ]
     if poor:
@@ -166,18 +157,17 @@ def identify_network(
             f"currents: the data do not identify {', '.join(poor)}; hold it, or measure longer and "
             "with steps of both signs"
         )
-    fitted = network(found.x[:-1])
+    fitted = network(logarithms[:-1])
     rows = fit.reshape(-1, 2)
     uncertainties = {n: float(getattr(fitted, n) * s) for n, s in zip(free, deviations, strict=False)}
     errors = [measure_errors(target[:, k], target[:, k] - rows[:, k]) for k in range(2)]
-    length = float(np.linalg.norm(fit))
     return NetworkIdentification(
         network=fitted,
-        ambient=float(found.x[-1]),
+        ambient=float(logarithms[-1]),
         uncertainties={**uncertainties, "ambient": float(deviations[-1])},
         residuals=rows,
         base=errors[0],
         tip=errors[1],
         condition=condition,
-        gradient=float(np.abs(scaled.T @ fit).max() / length) if length else 0.0,
+        gradient=float(evidence.cosines.max()),
     )

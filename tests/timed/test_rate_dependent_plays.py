@@ -268,16 +268,14 @@ def test_the_slopes_of_the_search_give_the_gradient_of_the_cost(sign):
     t, u = cycles([2, 20, 60, 60], [1.0, 0.6, 0.9, 0.4], 500.0)
     y = sign * activated(t, u) + rng.normal(0.0, 0.01, t.size)
     search = PlaysSearch.of(t, u, y, rng.uniform(0.5, 2.0, t.size), 30, "negative", "auto", plays=8, origin=0.1)
-    lags = np.array([0.004, 0.05])
-    fit, rest = search.at(lags)
+    problem, logarithms, far = search.problem(), np.log([0.004, 0.05]), np.full(2, np.inf)
 
-    def cost(place, factor):
-        moved = lags.copy()
-        moved[place] *= factor
-        return 0.5 * float(np.sum(search.at(moved)[1] ** 2))
+    def cost(moved):
+        return 0.5 * float(np.sum(problem.residuals(moved) ** 2))
 
-    expected = [(cost(k, 1.0 + 1e-4) - cost(k, 1.0 - 1e-4)) / 2e-4 for k in range(2)]
-    np.testing.assert_allclose(search.slopes(lags, fit).T @ rest, expected, rtol=1e-4)
+    expected = [(cost(logarithms + e) - cost(logarithms - e)) / 2e-4 for e in 1e-4 * np.eye(2)]
+    found = problem.jacobian(logarithms, -far, far).T @ problem.residuals(logarithms)
+    np.testing.assert_allclose(found, expected, rtol=1e-4)
 
 
 def test_plays_that_only_rows_left_out_have_moved_stay_at_zero():

@@ -17,6 +17,7 @@ import numpy as np
 
 from bench.analysis.transients.recorded_transients import TransientRecording
 from bench.base import DeferredModule, Floats
+from bench.identification import Evidence, Stage, variable_projection
 from bench.models import ActuatorDynamics
 
 if TYPE_CHECKING:
@@ -36,6 +37,8 @@ _ON_TIME = 1e-9
 """Difference of times that are equal, s."""
 _OVERDAMPED = 3.0
 """Greatest damping of a second-order actuator; its poles are a factor of 34 apart, and one of first order fits."""
+_SEARCH, _STEP = Stage(1, 1e-8, 40), 1e-3
+"""Effort of a search, and its relative differences: rows at which a drive starts to move make the residuals rough."""
 _EARLY = 0.1
 """Time by which a change of the set-point may come before its record says so, s."""
 
@@ -109,8 +112,6 @@ class _Part:
 
 def identify_actuator(recordings: Sequence[TransientRecording], longest: float = LONGEST_PART) -> IdentifiedActuator:
     """Identify the dynamics of the drive of some runs, of each by as long a part, s."""
-    from scipy.optimize import least_squares
-
     parts = [_Part(each, min(longest, float(each.times[-1]))) for each in recordings]
     slow = _time_scale(recordings)
     weights = np.concatenate([part.weights for part in parts])
@@ -152,29 +153,18 @@ def identify_actuator(recordings: Sequence[TransientRecording], longest: float =
     found: list[tuple[float, ActuatorDynamics, dict[str, float]]] = []
     for start in _candidates(slow, recordings):
         names, values = [*start], np.array([v / slow if n == "delay" else math.log(v) for n, v in start.items()])
-        spread = np.empty(0)
-        if names:
-            low = [
-                -_EARLY / slow if name == "delay" else value - 3.0 for name, value in zip(names, values, strict=True)
-            ]
-            highest = {"delay": values[0] + 10.0, "damping": math.log(_OVERDAMPED)}
-            high = [highest.get(name, value + 3.0) for name, value in zip(names, values, strict=True)]
-            solved = least_squares(
-                partial(left_over, names),
-                values,
-                bounds=(low, high),
-                diff_step=[1e-3],
-                max_nfev=40,
-            )
-            values = solved.x
-            jacobian = np.asarray(solved.jac)
-            spread = np.sqrt(np.diag(np.linalg.pinv(jacobian.T @ jacobian)))
+        low = [-_EARLY / slow if name == "delay" else value - 3.0 for name, value in zip(names, values, strict=True)]
+        highest = {"delay": 10.0, "damping": math.log(_OVERDAMPED)}
+        high = [highest.get(name, value + 3.0) for name, value in zip(names, values, strict=True)]
+        bounds = np.array(low), np.array(high)
+        end = variable_projection(partial(left_over, names), [values], bounds, stages=[_SEARCH], step=_STEP)[0]
+        values = end.values
         dynamics = dynamics_of(names, values)
         left, gain, offset = fitted(dynamics)
         score = left.size * math.log(float(left @ left) / left.size) + len(names) * math.log(left.size)
-        sigma = float(np.sqrt(left @ left / left.size))
+        spread = Evidence.of(end.jacobian, left, left.size).deviations
         scales = {name: slow if name == "delay" else float(getattr(dynamics, name)) for name in names}
-        known = {name: sigma * s * scales[name] for name, s in zip(names, spread.tolist(), strict=True)}
+        known = {name: s * scales[name] for name, s in zip(names, spread.tolist(), strict=True)}
         found.append((score, replace(dynamics, gain=gain, offset=offset), known))
     score, dynamics, uncertainties = min(found, key=lambda each: each[0])
     left = fitted(dynamics)[0] / weights

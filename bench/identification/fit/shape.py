@@ -1,9 +1,4 @@
-"""Fit of the shape parameters of an operator by variable projection.
-
-Parameters p on which the output depends nonlinearly are varied by bounded nonlinear least squares. For each p the
-coefficients x and the bias b follow from the constrained linear problem, so that the residual depends on p alone:
-r(p) = y - b(p) - R(p) x(p) (Golub and Pereyra, Inverse Problems 19(2), R1-R26, 2003).
-"""
+"""Fit of the coefficients of an operator, and of its shape parameters by variable projection."""
 
 from __future__ import annotations
 
@@ -15,17 +10,12 @@ import numpy as np
 from bench.base import Floats
 from bench.identification.fit.least_squares import Fit, fit, fit_minimum_norm
 from bench.identification.fit.ridge import fit_ridge
+from bench.identification.fit.variable_projection import variable_projection
 from bench.models import Operator, Regressor
 
-# Relative change of parameters, cost and gradient at which a search ends, and its greatest number of steps: of the
-# searches from several starts, and of the one that goes on from the best of them.
-_COARSE = (1e-3, 30)
-_FINE = (1e-8, 100)
-# Relative step of the differences: a constrained linear fit is exact to about 1e-12.
+# Relative step of the differences. Derivation: the root of 1e-12, to which a constrained linear fit is exact.
 _STEP = 1e-6
-# Searches are begun from so many starts: those that fit best as they are.
-_MOST_SEARCHES = 3
-# Cells of a dense normal matrix: 0.5 GB.
+# Cells of a dense normal matrix. Derivation: 8 B of each pair of them take 0.5 GB.
 _MOST_CELLS = 8001
 
 
@@ -87,9 +77,6 @@ def fit_shape(
     shape = template.shape_parameters()
     if not shape.names:
         return template
-    # Here, as few operators have a shape and it takes a third of a second to load.
-    from scipy.optimize import least_squares
-
     low, high = np.array(shape.low), np.array(shape.high)
     roots = np.sqrt(weights[skip:])
 
@@ -99,19 +86,9 @@ def fit_shape(
         found = fit_operator(constrained, operator, regressor, outputs, weights, skip, smoothing)
         return roots * (outputs - found.bias - regressor.product(found.coefficients))[skip:]
 
-    starts = [np.clip(values, low, high) for values in template.shape_starts()]
-    if len(starts) > _MOST_SEARCHES:
-        costs = [float(np.sum(residuals(values) ** 2)) for values in starts]
-        starts = [starts[k] for k in np.argsort(costs, kind="stable")[:_MOST_SEARCHES]]
-
-    def search(values: Floats, tolerance: float, most: int) -> Any:  # noqa: ANN401 - scipy's result
-        ends: dict[str, Any] = {"ftol": tolerance, "xtol": tolerance, "gtol": tolerance, "diff_step": _STEP}
-        return least_squares(residuals, values, bounds=(low, high), x_scale="jac", max_nfev=most, **ends)
-
-    if len(starts) > 1:
-        # Of equal costs the first is taken, so that the result does not depend on rounding alone.
-        starts = [min((search(values, *_COARSE) for values in starts), key=lambda end: end.cost).x]
-    return template.with_shape(search(starts[0], *_FINE).x.tolist())
+    starts = [np.asarray(values, dtype=np.float64) for values in template.shape_starts()]
+    best = variable_projection(residuals, starts, (low, high), step=_STEP)[0]
+    return template.with_shape(best.values.tolist())
 
 
 def undetermined_shape(operator: Operator[Any]) -> list[str]:

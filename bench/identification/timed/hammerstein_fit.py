@@ -22,10 +22,11 @@ from bench.identification.choose.cross_validation import Fitted, SmoothingTrial,
 from bench.identification.fit.least_squares import Fit, one_thread
 from bench.identification.fit.orientation import NAMES, Orientation, has_orientation
 from bench.identification.fit.regularization import Regularization
+from bench.identification.fit.variable_projection import Evidence, Stage, variable_projection
 from bench.identification.measures import measure_errors
 from bench.identification.options import OptionHelp
 from bench.identification.timed.hammerstein_search import FREE, Found, Search, beside, find_best, search_ends
-from bench.identification.timed.parsimony import check_size, deviations_of
+from bench.identification.timed.parsimony import check_size
 from bench.identification.trust import judge_fit
 from bench.models import Hammerstein, HammersteinState, Regressor, check_sequence
 
@@ -278,8 +279,6 @@ def reshape(search: Search, found: Found, tolerance: float = 1e-10) -> tuple[Sea
     A shape that was found without what follows the operator has taken some of that for hysteresis. Both are varied at
     once: in turns they would creep along the valley in which one stands for the other.
     """
-    from scipy.optimize import least_squares
-
     shape = search.static.template.shape_parameters()
     if not shape.names or search.columns.size > _RESHAPED:
         return search, found
@@ -300,22 +299,14 @@ def reshape(search: Search, found: Found, tolerance: float = 1e-10) -> tuple[Sea
     def residuals(values: Floats) -> Floats:
         return at(values)[2]
 
-    end = least_squares(
-        residuals,
-        np.clip([*shape.values, *found.values], low, high),
-        bounds=(low, high),
-        x_scale="jac",
-        ftol=tolerance,
-        xtol=tolerance,
-        gtol=tolerance,
-        diff_step=np.full(low.size, _STEP_OF_SHAPE),
-        max_nfev=_EVALUATIONS,
-    )
-    static, fitted, rest = at(end.x)
+    start = np.array([*shape.values, *found.values])
+    stages = [Stage(1, tolerance, _EVALUATIONS)]
+    end = variable_projection(residuals, [start], (low, high), stages=stages, step=_STEP_OF_SHAPE)[0]
+    static, fitted, rest = at(end.values)
     cost = float(rest @ rest)
     if not cost < found.cost:
         return search, found
     other = replace(search, static=static, columns=static.regressor.dense())
-    freedom = max(search.times.size - fitted.coefficients.size - end.x.size - 1, 1)
-    deviations = deviations_of(np.asarray(end.jac), cost / freedom)[count:]
-    return other, Found(found.elements, np.asarray(end.x[count:]), fitted, cost, deviations)
+    freedom = search.times.size - fitted.coefficients.size - start.size - 1
+    deviations = Evidence.of(end.jacobian, rest, freedom).deviations[count:]
+    return other, Found(found.elements, end.values[count:], fitted, cost, deviations)

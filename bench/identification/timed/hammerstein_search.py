@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
 from typing import Literal, NamedTuple
@@ -14,7 +14,8 @@ from bench.base import Floats
 from bench.identification.by_name import FitProblem
 from bench.identification.fit.least_squares import Fit, fit, fit_minimum_norm
 from bench.identification.fit.ridge import fit_ridge
-from bench.identification.timed.parsimony import deviations_of, moving
+from bench.identification.fit.variable_projection import Evidence, Separable, Stage, variable_projection
+from bench.identification.timed.parsimony import moving
 from bench.models import LinearPart, Regressor, logarithmic_creep, velocities
 
 EVALUATIONS = 40
@@ -28,7 +29,8 @@ _ROUNDS, _GAIN = 4, 1e-5
 _STARTS = 2
 # Principal columns in the grid that a search starts from.
 _COARSE = 6
-_STEP = 1e-5
+# Relative change at which a search ends.
+_TOLERANCE = 1e-9
 
 
 @dataclass(frozen=True)
@@ -264,24 +266,27 @@ class Found:
     deviations: Floats
 
 
-class _Point(NamedTuple):
-    """Projection at given parameters."""
-
-    key: bytes
-    columns: Floats
-    inverse: Floats
-    weights: Floats
-    rest: Floats
-
-
-class _Projection:
-    """Residuals and Jacobian of variable projection over given columns."""
+class _Responses:
+    """The columns of a search: what follows a basis, and what stands beside it."""
 
     def __init__(self, search: Search, elements: Sequence[str], basis: Floats) -> None:
         self._search, self._elements, self._basis = search, elements, basis
         self._parameters = search.parameters(elements)
-        self._at: _Point | None = None
         self._creep: dict[float, list[Floats]] = {}
+
+    def problem(self) -> Separable:
+        """Return the residuals by the parameters of the elements."""
+        return Separable(self._search.static.outputs, self._search.roots, self._columns, self._combine)
+
+    def _columns(self, values: Floats) -> Floats:
+        follows = self._search.linear(self._parameters, values)
+        return np.column_stack([self._respond(follows.part), self._search.beside(self._elements, follows)])
+
+    def _combine(self, values: Floats, coefficients: Floats) -> Floats:
+        follows, count = self._search.linear(self._parameters, values), self._basis.shape[1]
+        signal = (self._basis @ coefficients[:count])[:, None]
+        others = self._search.beside(self._elements, follows) @ coefficients[count:]
+        return np.asarray(follows.part.respond(self._search.times, signal)[0][:, 0] + others)
 
     def _respond(self, part: LinearPart) -> Floats:
         """Return the filtered basis; responses of the creep, whose times stay, are kept for the last delay."""
@@ -302,76 +307,25 @@ class _Projection:
             result += strength * bank
         return result
 
-    def _solve(self, values: Floats) -> _Point:
-        key = values.tobytes()
-        if self._at is None or self._at.key != key:
-            search = self._search
-            follows = search.linear(self._parameters, values)
-            columns = np.column_stack([
-                self._respond(follows.part),
-                search.beside(self._elements, follows),
-                np.ones(search.times.size),
-            ])  # fmt: skip
-            columns *= search.roots[:, None]
-            norms = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
-            columns /= norms
-            gram = columns.T @ columns
-            # The search only leads to where the constrained fit is then exact.
-            gram.flat[:: gram.shape[0] + 1] += 1e-12
-            inverse = np.linalg.inv(np.linalg.cholesky(gram))
-            target = search.roots * search.static.outputs
-            shares = inverse.T @ (inverse @ (columns.T @ target))
-            self._at = _Point(key, columns, inverse, shares / norms, target - columns @ shares)
-        return self._at
-
-    def residuals(self, values: Floats) -> Floats:
-        return self._solve(values).rest
-
-    def jacobian(self, values: Floats) -> Floats:
-        at, search = self._solve(values), self._search
-        count = self._basis.shape[1]
-        signal = (self._basis @ at.weights[:count])[:, None]
-
-        def model(x: Floats) -> Floats:
-            follows = search.linear(self._parameters, x)
-            others = search.beside(self._elements, follows) @ at.weights[count:-1]
-            return search.roots * (follows.part.respond(search.times, signal)[0][:, 0] + others)
-
-        slopes = []
-        for k, parameter in enumerate(self._parameters):
-            ends = [values.copy(), values.copy()]
-            ends[0][k] = max(values[k] - _STEP, parameter.low)
-            ends[1][k] = min(values[k] + _STEP, parameter.high)
-            slopes.append((model(ends[1]) - model(ends[0])) / (ends[1][k] - ends[0][k]))
-        slope = np.column_stack(slopes)
-        return np.asarray(at.columns @ (at.inverse.T @ (at.inverse @ (at.columns.T @ slope))) - slope)
-
 
 def find_best(search: Search, elements: tuple[str, ...], before: Found | None = None, rounds: int = _ROUNDS) -> Found:
     """Return the parameters of elements that fit best, found from several starts; `before` is a smaller model."""
-    parameters = search.parameters(elements)
-    if not parameters:
-        found = search.fit(elements, np.empty(0))
-        return Found(elements, np.empty(0), found, search.cost(elements, np.empty(0), found), np.empty(0))
+    if not search.parameters(elements):
+        none = np.empty(0)
+        found = search.fit(elements, none)
+        return Found(elements, none, found, search.cost(elements, none, found), none)
     first = find_best(search, ()) if before is None else before
-    trials = [
-        replace(
-            trial, fit=(refit := search.fit(elements, trial.values)), cost=search.cost(elements, trial.values, refit)
-        )
-        for trial in search_ends(search, elements, first, search.principal[:, :FREE])
-    ]
-    best = min(trials, key=lambda trial: trial.cost)
-    values, deviations, found, cost = best.values, best.deviations, best.fit, best.cost
+    trials = search_ends(search, elements, first, search.principal[:, :FREE])
+    best = min((_refitted(search, trial) for trial in trials), key=lambda trial: trial.cost)
     for _ in range(rounds):
-        moved, wider, _ = _search(search, elements, parameters, values, search.basis(found))
-        refit = search.fit(elements, moved)
-        lower = search.cost(elements, moved, refit)
-        gained = cost - lower
+        basis, stage = search.basis(best.fit), Stage(1, _TOLERANCE, EVALUATIONS)
+        moved = _refitted(search, _ends(search, elements, best.fit, basis, [best.values], stage)[0])
+        gained = best.cost - moved.cost
         if gained > 0.0:
-            values, deviations, found, cost = moved, wider, refit, lower
-        if not gained > _GAIN * cost:
+            best = moved
+        if not gained > _GAIN * best.cost:
             break
-    return Found(elements, values, found, cost, deviations)
+    return best
 
 
 def search_ends(
@@ -382,68 +336,48 @@ def search_ends(
     starts: int = _STARTS,
     evaluations: int = EVALUATIONS,
 ) -> list[Found]:
-    """Return the ends of searches over the coefficients of a basis, with their costs and the smaller model's fit."""
-    parameters = search.parameters(elements)
-    if not parameters:
-        none = np.empty(0)
-        cost = float(np.sum(_Projection(search, elements, basis).residuals(none) ** 2))
-        return [Found(elements, none, before.fit, cost, none)]
-    names = [p.name for p in search.parameters(before.elements)]
+    """Return the ends of searches over the coefficients of a basis, with their costs and the smaller model's fit.
+
+    They start from the best few of a grid, judged with the fit of the smaller model and the principal columns.
+    """
+    names = [parameter.name for parameter in search.parameters(before.elements)]
     known = dict(zip(names, before.values.tolist(), strict=True))
-    found = []
-    for start in _starts(search, elements, parameters, known, before.fit)[:starts]:
-        values, deviations, cost = _search(search, elements, parameters, start, basis, evaluations)
-        found.append(Found(elements, values, before.fit, cost, deviations))
-    return found
+    grids = [(known[p.name],) if p.name in known else p.starts for p in search.parameters(elements)]
+    signal = search.columns @ before.fit.coefficients[: search.columns.shape[1]]
+    screen = _Responses(search, elements, np.column_stack([signal, search.principal[:, :_COARSE]])).problem()
+    grid, stage = [np.array(values) for values in product(*grids)], Stage(starts, _TOLERANCE, evaluations)
+    return _ends(search, elements, before.fit, basis, grid, stage, screen)
 
 
-def _starts(
-    search: Search, elements: Sequence[str], parameters: Sequence[_Parameter], known: dict[str, float], before: Fit
-) -> list[Floats]:
-    """Return the best few of a grid, judged with the fit of the smaller model and the principal columns."""
-    grids = [(known[p.name],) if p.name in known else p.starts for p in parameters]
-    signal = search.columns @ before.coefficients[: search.columns.shape[1]]
-    basis = np.column_stack([signal, search.principal[:, :_COARSE]])
-    projection = _Projection(search, elements, basis)
-    grid = [np.array(values) for values in product(*grids)]
-    costs = [float(np.sum(projection.residuals(values) ** 2)) for values in grid]
-    order = np.argsort(costs, kind="stable")
-    chosen: list[Floats] = []
-    for place in order.tolist():
-        # Neighbours end in the same minimum.
-        if all(np.abs(grid[place] - other).max() > 1.0 for other in chosen):
-            chosen.append(grid[place])
-        if len(chosen) == _STARTS:
-            break
-    return chosen
-
-
-def _search(
+def _ends(
     search: Search,
-    elements: Sequence[str],
-    parameters: Sequence[_Parameter],
-    start: Floats,
+    elements: tuple[str, ...],
+    before: Fit,
     basis: Floats,
-    evaluations: int = EVALUATIONS,
-) -> tuple[Floats, Floats, float]:
-    """Return the parameters at the end of a search, their standard deviations, and the cost."""
-    from scipy.optimize import least_squares
-
-    projection = _Projection(search, elements, basis)
-    low, high = (np.array([getattr(p, name) for p in parameters]) for name in ("low", "high"))
-    residuals: Callable[[Floats], Floats] = projection.residuals
-    end = least_squares(
-        residuals,
-        np.clip(start, low, high),
-        jac=projection.jacobian,
-        bounds=(low, high),
-        x_scale="jac",
-        ftol=1e-9,
-        xtol=1e-9,
-        gtol=1e-9,
-        max_nfev=evaluations,
+    starts: Sequence[Floats],
+    stage: Stage,
+    screen: Separable | None = None,
+) -> list[Found]:
+    """Return the ends of searches over the coefficients of a basis, with their costs and the fit before."""
+    parameters = search.parameters(elements)
+    bounds = np.array([p.low for p in parameters]), np.array([p.high for p in parameters])
+    ends = variable_projection(
+        _Responses(search, elements, basis).problem(),
+        starts,
+        bounds,
+        stages=[stage],
+        screen=None if screen is None else screen.residuals,
+        # Neighbours end in the same minimum.
+        apart=1.0,
     )
-    values = np.asarray(end.x)
-    freedom = max(search.times.size - basis.shape[1] - values.size - 1, 1)
-    deviations = deviations_of(np.asarray(end.jac), 2.0 * end.cost / freedom)
-    return values, deviations, 2.0 * float(end.cost)
+    freedom = search.times.size - basis.shape[1] - len(parameters) - 1
+    return [
+        Found(elements, end.values, before, end.cost, Evidence.of(end.jacobian, end.residuals, freedom).deviations)
+        for end in ends
+    ]
+
+
+def _refitted(search: Search, trial: Found) -> Found:
+    """Return parameters with the fit of the operator that belongs to them, and its cost."""
+    found = search.fit(trial.elements, trial.values)
+    return replace(trial, fit=found, cost=search.cost(trial.elements, trial.values, found))

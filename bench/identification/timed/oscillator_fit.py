@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -18,12 +17,14 @@ from numpy.typing import ArrayLike
 from bench.base import Floats
 from bench.identification.by_name import Identification
 from bench.identification.fit.least_squares import Certificate, counted_weights
+from bench.identification.fit.variable_projection import End, Evidence, Stage, variable_projection
 from bench.identification.measures import measure_errors
 from bench.models import BoucWenOscillator, Drive, Interpolation, Start, check_sequence, respond, substeps_for
 
 # Shares of the small-amplitude stiffness that is hysteretic, and loop rate and shape in 1 / (3 RMS output).
 _SHARES, _RATES, _SHAPES = (0.3, 0.6, 0.9), (0.3, 1.0, 3.0), (-1.2, 0.0, 1.2)
-_TRIED = 4
+# Searches with a coarse integration, and the one with the fine.
+_COARSE, _FINE = Stage(4, 1e-10, 12), Stage(1, 1e-10, 100)
 # Substeps of the integration in the end beside those of the first searches.
 _COARSER = 4
 # Least part of the greatest input amplitude that a frequency needs to count in the start.
@@ -55,25 +56,6 @@ class _Simulation:
 
     def residuals(self, values: Floats) -> Floats:
         return self.roots * self.offset(values)[1]
-
-    def jacobian(self, values: Floats) -> Floats:
-        slopes = []
-        for k in range(values.size):
-            step = _STEP * max(abs(values[k]), 1e-3)
-            ends = values.copy(), values.copy()
-            ends[0][k] -= step
-            ends[1][k] += step
-            slopes.append((self.residuals(ends[1]) - self.residuals(ends[0])) / (2.0 * step))
-        return np.column_stack(slopes)
-
-    def search(self, start: Floats, evaluations: int) -> Any:  # noqa: ANN401 - what scipy returns
-        """Return the end of a search by Levenberg and Marquardt's method within a trust region."""
-        from scipy.optimize import least_squares
-
-        return least_squares(
-            self.residuals, start, jac=self.jacobian, x_scale="jac", max_nfev=evaluations,
-            ftol=1e-10, xtol=1e-10, gtol=1e-12,
-        )  # fmt: skip
 
 
 def identify_bouc_wen_oscillator(
@@ -122,7 +104,7 @@ def identify_bouc_wen_oscillator(
     roots = np.sqrt(w)
     linear = linear_start(clock, u, y)
     substeps = substeps_for(np.array([*linear, 0.0, 0.0, 0.0]), clock)
-    ends: dict[Start, tuple[_Simulation, Any]] = {}
+    ends: dict[Start, tuple[_Simulation, End]] = {}
     for start in starts:
         try:
             drives = [
@@ -136,8 +118,8 @@ def identify_bouc_wen_oscillator(
         ends[start] = _fit(drives, y, roots, linear)
     start = min(ends, key=lambda each: ends[each][1].cost)
     simulation, end = ends[start]
-    offset, _ = simulation.offset(end.x)
-    found: list[float] = (end.x * simulation.scales).tolist()
+    offset, _ = simulation.offset(end.values)
+    found: list[float] = (end.values * simulation.scales).tolist()
     mass, damping, stiffness, hysteretic, rate, shape = found
     model = BoucWenOscillator(
         mass=mass,
@@ -153,12 +135,8 @@ def identify_bouc_wen_oscillator(
         output_unit=output_unit,
     )
     predicted = model.evaluate(clock, u, start)
-    jacobian = np.asarray(end.jac)
-    norms = np.maximum(np.linalg.norm(jacobian, axis=0), 1e-300)
-    scaled = jacobian / norms
-    variance: float = 2.0 * float(end.cost) / max(int(np.count_nonzero(roots)) - 7, 1)
-    deviations = np.sqrt(variance * np.diag(np.linalg.pinv(scaled.T @ scaled))) / norms * np.abs(simulation.scales)
-    length = float(np.linalg.norm(end.fun))
+    evidence = Evidence.of(end.jacobian, end.residuals, int(np.count_nonzero(roots)) - 7)
+    deviations = evidence.deviations * np.abs(simulation.scales)
     poor = [
         name
         for name, value, deviation in zip(_NAMES, found, deviations.tolist(), strict=True)
@@ -178,14 +156,14 @@ def identify_bouc_wen_oscillator(
         errors=measure_errors(y[skip:], predicted[skip:]),
         uncertainties=deviations,
         certificate=Certificate(
-            kkt_residual=float(np.abs(scaled.T @ end.fun).max() / length) if length else 0.0,
+            kkt_residual=float(evidence.cosines.max()),
             passive=7,
             active=0,
             exchangeable=0,
-            condition=float(np.linalg.cond(scaled)),
+            condition=evidence.condition,
             swept=np.ones(7, dtype=bool),
-            iterations=int(end.nfev),
-            converged=bool(end.success),
+            iterations=end.evaluations,
+            converged=end.converged,
         ),
         skip=skip,
         initial_state=start,
@@ -193,7 +171,7 @@ def identify_bouc_wen_oscillator(
     )
 
 
-def _fit(drives: Sequence[Drive], outputs: Floats, roots: Floats, linear: Floats) -> tuple[_Simulation, Any]:
+def _fit(drives: Sequence[Drive], outputs: Floats, roots: Floats, linear: Floats) -> tuple[_Simulation, End]:
     """Return the finer simulation and the end of the best search, which starts with the coarser one."""
     size = 3.0 * float(outputs.std())
     mass, damping, stiffness = linear.tolist()
@@ -204,11 +182,8 @@ def _fit(drives: Sequence[Drive], outputs: Floats, roots: Floats, linear: Floats
         np.array([1.0, 0.5, 1.0 - share, share, rate, shape])
         for share, rate, shape in product(_SHARES, _RATES, _SHAPES)
     ]
-    costs = [float(np.sum(coarse.residuals(values) ** 2)) for values in grid]
-    order = np.argsort(costs, kind="stable")[:_TRIED]
-    tries = [coarse.search(grid[place], 12) for place in order.tolist()]
-    best = min(tries, key=lambda each: float(each.cost))
-    return fine, fine.search(np.asarray(best.x), 100)
+    best = variable_projection(coarse.residuals, grid, stages=[_COARSE], step=_STEP, central=True)[0]
+    return fine, variable_projection(fine.residuals, [best.values], stages=[_FINE], step=_STEP, central=True)[0]
 
 
 def check_record(

@@ -1,4 +1,4 @@
-"""What fits of models with time share: size, columns that move, worth of parameters, their standard deviations."""
+"""What fits of models with time share: size, columns that move, worth of parameters."""
 
 from __future__ import annotations
 
@@ -56,11 +56,3 @@ def is_worth(before: float, after: float, parameters: int, used: int, worth: flo
 def chance_of(used: int) -> float:
     """Return by how much a parameter lowers the logarithm of a sum of squares over `used` samples by chance."""
     return 2.0 * math.log(used) / used
-
-
-def deviations_of(slopes: Floats, variance: float) -> Floats:
-    """Return standard deviations of parameters; infinite where the residuals do not depend on one."""
-    # Of the slopes themselves, as the inverse of their products may have negative variances by rounding.
-    variances = variance * np.sum(np.linalg.pinv(slopes) ** 2, axis=1)
-    flat = np.linalg.norm(slopes, axis=0) <= 1e-12 * max(float(np.linalg.norm(slopes)), 1e-300)
-    return np.where(flat, np.inf, np.sqrt(variances))

@@ -21,6 +21,7 @@ from bench.base import Floats
 from bench.identification.by_name import Identification
 from bench.identification.fit.least_squares import Fit, fit
 from bench.identification.fit.orientation import NAMES, Orientation
+from bench.identification.fit.variable_projection import Stage, variable_projection
 from bench.identification.measures import measure_errors
 from bench.identification.timed.oscillator_fit import check_record, linear_start
 from bench.models import (
@@ -39,8 +40,8 @@ Sign = Literal[1, -1]
 
 # Plane beyond the greatest displacement, and its most cells.
 _MARGIN, _MOST_LEVELS = 1.05, 40
-# Evaluations of a search over a few parameters, and relative steps of its slopes.
-_EVALUATIONS, _STEP = 5, 1e-5
+# A search over a few parameters.
+_POLISH = Stage(1, 1e-8, 5)
 # Steps, halvings of one, and the relative gain of the cost at which they end.
 _STEPS, _HALVINGS, _GAIN = 8, 4, 1e-2
 
@@ -255,8 +256,6 @@ def _descend(search: _Search, best: _Trial, sign: Sign) -> _Trial:
 
 def _polish(search: _Search, before: _Trial) -> _Trial:
     """Return the end of a search over m, c, the spring and one factor for the density."""
-    from scipy.optimize import least_squares
-
     model, found = before.model, before.fit
     whole = np.concatenate([model.force.coefficients, [model.damping, model.mass]])
     cells = model.force.density.size
@@ -273,11 +272,9 @@ def _polish(search: _Search, before: _Trial) -> _Trial:
         return np.asarray(roots * (at.rest if np.isfinite(at.cost) else 1e3 * np.ptp(search.outputs)))
 
     start = np.concatenate([[1.0], whole[cells:] / scales])
-    end = least_squares(
-        residuals, start, jac="3-point", diff_step=np.full(start.size, _STEP), x_scale="jac", max_nfev=_EVALUATIONS
-    )
-    after = trial(np.asarray(end.x))
-    return after if after.cost < before.cost and end.x[0] > 0.0 else before
+    end = variable_projection(residuals, [start], stages=[_POLISH], central=True)[0].values
+    after = trial(end)
+    return after if after.cost < before.cost and end[0] > 0.0 else before
 
 
 def _advance(search: _Search, before: _Trial, path: _Path, rest: Floats, sign: Sign) -> _Trial:

@@ -9,6 +9,7 @@ that widens with the logarithm of the rate, as where thermal activation lets it.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Annotated, cast
 
@@ -20,9 +21,10 @@ from bench.identification.by_name import FitProblem, Identification, Initial, se
 from bench.identification.fit.cell_layout import CellLayout
 from bench.identification.fit.least_squares import Fit, fit_cells, one_thread
 from bench.identification.fit.orientation import NAMES, Orientation
+from bench.identification.fit.variable_projection import Evidence, Separable, Stage, variable_projection
 from bench.identification.measures import measure_errors
 from bench.identification.options import OptionHelp
-from bench.identification.timed.parsimony import check_size, deviations_of, is_worth, moving
+from bench.identification.timed.parsimony import check_size, is_worth, moving
 from bench.identification.trust import judge_fit
 from bench.models import PlaysState, PrandtlIshlinskii, RateDependentPlays, Regressor, check_sequence
 
@@ -30,10 +32,8 @@ from bench.models import PlaysState, PrandtlIshlinskii, RateDependentPlays, Regr
 _MOST, _GRID = 3, 9
 # Shortest time constant, in time steps.
 _SHORTEST = 0.1
-# Evaluations of a search, and the relative change of cost and logarithms at which it ends.
-_EVALUATIONS, _TOLERANCE = 12, 1e-6
-# Relative step of its differences.
-_STEP = 1e-5
+# The search.
+_SEARCH = Stage(1, 1e-6, 12)
 # Part of the sum of squares of the outputs that is left by rounding alone.
 _ROUNDED = 1e-24
 # Standard deviation of the logarithm of a time constant from which on the data do not determine it.
@@ -136,37 +136,18 @@ class PlaysSearch:
         found = fit_cells(layout, regressor, problem.outputs, weights=w, skip=problem.skip)
         return replace(found, coefficients=problem.orientation * found.coefficients)
 
-    def at(self, lags: Floats) -> tuple[Fit, Floats]:
-        """Return the fit for given time constants, and its weighted residuals, shape (N - skip,)."""
-        columns = self.columns(lags)
-        found = self.fit_columns(columns)
-        return found, self._weighted(self.static.outputs - found.bias - columns @ found.coefficients)
+    def problem(self) -> Separable:
+        """Return the residuals by the logarithms of time constants."""
+        roots = np.sqrt(self.static.weights)
+        roots[: self.static.skip] = 0.0
 
-    def slopes(self, lags: Floats, found: Fit) -> Floats:
-        """Return the derivatives of the residuals by the logarithms of the time constants, shape (N - skip, J).
+        def respond(values: Floats, coefficients: Floats) -> Floats:
+            model = replace(self.model(np.exp(values)), weights=coefficients)
+            return model.evaluate(self.times, self.static.inputs, self.state(values))
 
-        In the form of Kaufman: without what the free weights can take over.
-        """
-        count = self.template.thresholds.size
-        state = PlaysState(self.state(lags).plays[:count])
-
-        def output(place: int, lag: float) -> Floats:
-            weights = found.coefficients[(1 + place) * count : (2 + place) * count]
-            plays = replace(self.model(np.empty(0)), time_constants=np.full(count, lag), weights=weights, bias=0.0)
-            return plays.evaluate(self.times, self.static.inputs, state)
-
-        change = np.column_stack([
-            self._weighted(output(k, lag * (1.0 + _STEP)) - output(k, lag * (1.0 - _STEP))) / (2.0 * _STEP)
-            for k, lag in enumerate(lags.tolist())
-        ])  # fmt: skip
-        free = self.columns(lags)[:, found.coefficients != 0.0]
-        basis = np.linalg.qr(self._weighted(np.column_stack([free, np.ones(self.times.size)])))[0]
-        return np.asarray(basis @ (basis.T @ change) - change)
-
-    def _weighted(self, values: Floats) -> Floats:
-        """Return rows that count times the roots of their weights; shape (N, ...) becomes (N - skip, ...)."""
-        roots = np.sqrt(self.static.weights[self.static.skip :])
-        return (roots * values[self.static.skip :].T).T
+        return Separable(
+            self.static.outputs, roots, lambda values: self.columns(np.exp(values)), respond, self.fit_columns
+        )
 
     @property
     def bounds(self) -> tuple[float, float]:
@@ -174,50 +155,26 @@ class PlaysSearch:
         step = float(np.median(np.diff(self.times)))
         return math.log(_SHORTEST * step), math.log(float(np.ptp(self.times)))
 
-    def search(self, start: Floats) -> Found:
-        """Return the end of a search from time constants."""
-        from scipy.optimize import least_squares
-
-        low, high = self.bounds
-        fits: dict[bytes, Fit] = {}
-
-        def residuals(values: Floats) -> Floats:
-            fits[values.tobytes()], rest = self.at(np.exp(values))
-            return rest
-
-        def jacobian(values: Floats) -> Floats:
-            return self.slopes(np.exp(values), fits[values.tobytes()])
-
-        end = least_squares(
-            residuals,
-            np.clip(np.log(start), low, high),
-            jac=jacobian,
-            bounds=(low, high),
-            ftol=_TOLERANCE,
-            xtol=_TOLERANCE,
-            gtol=_TOLERANCE,
-            max_nfev=_EVALUATIONS,
-        )
-        lags = np.sort(np.exp(end.x))
-        found, rest = self.at(lags)
-        cost = float(rest @ rest)
-        freedom = max(rest.size - found.certificate.passive - lags.size - 1, 1)
-        deviations = deviations_of(np.asarray(end.jac), cost / freedom)[np.argsort(end.x)]
-        return Found(lags, found, cost, deviations)
+    def search(self, starts: Sequence[Floats]) -> Found:
+        """Return the end of a search from the best of some time constants."""
+        low, high = (np.full(starts[0].size, bound) for bound in self.bounds)
+        logarithms = [np.log(start) for start in starts]
+        end = variable_projection(self.problem(), logarithms, (low, high), stages=[_SEARCH])[0]
+        order = np.argsort(end.values)
+        lags = np.exp(end.values[order])
+        found = self.fit_columns(self.columns(lags))
+        freedom = end.residuals.size - self.static.skip - found.certificate.passive - lags.size - 1
+        deviations = Evidence.of(end.jacobian, end.residuals, freedom).deviations[order]
+        return Found(lags, found, end.cost, deviations)
 
     def more(self, before: Found) -> Found:
         """Return the best fit with one time constant more."""
-        low, high = self.bounds
-        grid = np.exp(np.linspace(low, high, _GRID + 2)[1:-1])
-        starts = [np.append(before.lags, lag) for lag in grid]
-        costs = [float(np.sum(self.at(start)[1] ** 2)) for start in starts]
-        return self.search(starts[int(np.argmin(costs))])
+        grid = np.exp(np.linspace(*self.bounds, _GRID + 2)[1:-1])
+        return self.search([np.append(before.lags, lag) for lag in grid])
 
     def choose(self, count: int | None = None) -> Found:
         """Return the fit with as many time constants as are worth it, or a given number of them."""
-        none = np.empty(0)
-        fitted, rest = self.at(none)
-        found = Found(none, fitted, float(rest @ rest), none)
+        found = self.search([np.empty(0)])
         counted = self.static.weights[self.static.skip :]
         used = max(int(np.count_nonzero(counted)), 1)
         exact = _ROUNDED * float(counted @ self.static.outputs[self.static.skip :] ** 2)
