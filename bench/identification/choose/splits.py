@@ -50,11 +50,6 @@ class Fold:
     trained: Flags
 
 
-def fold_numbers(rows: int, folds: int, blocks: int) -> NDArray[np.int64]:
-    """Return the fold of each row, shape (rows,): rows form successive blocks, and block b is in fold b mod folds."""
-    return np.asarray((np.arange(rows) * blocks // rows) % folds, dtype=np.int64)
-
-
 def near(chosen: Flags, distance: int) -> Flags:
     """Return which rows are chosen, or no further than `distance` rows from one that is, shape (N,)."""
     count = np.concatenate([[0], np.cumsum(chosen)])
@@ -79,7 +74,8 @@ def block_folds(usable: Flags, *, folds: int = FOLDS, blocks: int = BLOCKS, gap:
         Rows on either side of a block that are left out of the fit as well.
     """
     number = np.full(usable.size, -1)
-    number[usable] = fold_numbers(int(usable.sum()), folds, blocks)
+    rows = int(usable.sum())
+    number[usable] = np.arange(rows) * blocks // rows % folds
     return tuple(_fold(number == k, usable, gap) for k in range(folds))
 
 

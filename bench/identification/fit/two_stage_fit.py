@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bench.base import Floats, checks as _checks
-from bench.identification.choose.cross_validation import choose_smoothing
+from bench.identification.choose.cross_validation import compare_smoothing
 from bench.identification.fit.cell_layout import CellLayout, PlanesBeside
 from bench.identification.fit.least_squares import Certificate, Fit, fit_cells
 from bench.identification.measures import Errors, measure_errors
@@ -209,7 +209,7 @@ def identify_two_stage(
         Force during resets, force units.
     smoothing : float or sequence of float
         Weight of the roughness penalty, see `fit`, for both stages. Of several each stage has the greatest of those
-        with the least error, within 2 %, on blocks of its own samples left out; see `choose_smoothing`.
+        with the least error, within 2 %, on blocks of its own samples left out; see `compare_smoothing`.
     units : tuple of str
         Units of voltage, force and length of the default stages, for labels.
 
@@ -501,7 +501,11 @@ def _fit(
     if not isinstance(smoothing, Sequence):
         chosen = smoothing
     elif layout.order:
-        chosen = choose_smoothing(layout, regressor, outputs, weights, smoothing).smoothest.smoothing
+
+        def fit(weight: float, of: Floats) -> Fit:
+            return fit_cells(layout, regressor, outputs, weights=of, smoothing=weight)
+
+        chosen = compare_smoothing(fit, regressor, outputs, weights, smoothing).smoothest.smoothing
     else:
         # Columns that have no place in a plane have no roughness.
         chosen = 0.0

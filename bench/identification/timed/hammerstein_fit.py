@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike
 
 from bench.base import Floats
 from bench.identification.by_name import FitProblem, Identification, Initial, set_up_problem
-from bench.identification.choose.cross_validation import Fitted, SmoothingTrial, compare_smoothing
+from bench.identification.choose.cross_validation import SmoothingTrial, compare_smoothing
 from bench.identification.fit.least_squares import Fit, one_thread
 from bench.identification.fit.orientation import NAMES, Orientation, has_orientation
 from bench.identification.fit.regularization import Regularization
@@ -236,8 +236,8 @@ def _cross_validated(search: Search, found: Found, tried: Sequence[float]) -> Sm
     columns, others = search.responses(found.elements, found.values)
     sign = search.sign(found.fit)
 
-    def fitted(weight: float) -> Fitted:
-        return lambda weights: search.fit_columns(columns, others, weights, sign, weight)
+    def fitted(weight: float, weights: Floats) -> Fit:
+        return search.fit_columns(columns, others, weights, sign, weight)
 
     regressor = Regressor.of_columns(np.column_stack([columns, others]))
     return compare_smoothing(fitted, regressor, search.static.outputs, search.roots**2, tried).best
