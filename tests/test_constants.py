@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ["bench/control", "bench/dashboard", "bench/models"]
+PACKAGES = ["bench/control", "bench/dashboard", "bench/identification", "bench/models", "bench/specimen"]
 WORDS = ("Source:", "Derivation:")
 
 

@@ -9,11 +9,14 @@ from numpy.typing import ArrayLike
 
 from bench.base import Floats, checks as _checks
 
-# Part of the samples that may repeat the one before, and part of the range that one step may take.
+# Part of the samples that may repeat the one before, and part of the range that one step may take. Source: a choice;
+# a sensor that moves all the time repeats a sample only by its resolution.
 _PLATEAU = 0.1
+# Derivation: a branch of fewer than ten rows shows hardly a curve.
 _JUMP = 0.1
 # Part of the samples for which a sensor must stand still, while the input goes through this part of its range; and
-# part of the others that may repeat the one before: coarse readings often do.
+# part of the others that may repeat the one before: coarse readings often do. Derivation: noise of 1 % of the range,
+# which instruments here stay below, moves a reading by less than the first; a fifth of the range is ten times that.
 _STILL, _MOVED, _REPEATED = 0.02, 0.2, 0.1
 
 

@@ -47,6 +47,7 @@ if TYPE_CHECKING:
     from bench.identification.bands import Band
 
 FORMAT = "bench-model"
+# Derivation: counted.
 VERSION = 2
 # A record adds when it kept the model.
 _KEYS = {

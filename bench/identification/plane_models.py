@@ -44,7 +44,8 @@ _Plane: TypeAlias = Annotated[
     tuple[float, float] | None, OptionHelp("ends of the plane, input units", "the range of the inputs")
 ]
 
-# Least slope of the inverse dead zones, as part of that in the middle: forward it is the greatest.
+# Least slope of the inverse dead zones, as part of that in the middle: forward it is the greatest. Derivation:
+# forward it then is at most 50 times that in the middle, which keeps the inverse of the sums finite.
 _LEAST_SLOPE = 0.02
 
 
@@ -247,6 +248,8 @@ def _fit_dead_zones(
     return replace(template, weights=found.coefficients[: plain.shape[1]], after=after)
 
 
+# Source: a choice; each number of levels is twice the one before, up to the 820 cells that some thousand rows
+# determine.
 _STRUCTURES = {"reversible": ("none", "linear"), "levels": (10, 20, 40)}
 
 PREISACH = ModelSpec(

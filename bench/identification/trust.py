@@ -16,19 +16,29 @@ if TYPE_CHECKING:
     from bench.identification.by_name import FitProblem
     from bench.identification.fit.least_squares import Fit
 
-# Fewest samples, and least part of them, that an unknown initial memory must leave.
+# Fewest samples, and least part of them, that an unknown initial memory must leave. Derivation: the standard
+# deviation of ten samples is known to a quarter of it; one part in twenty is a choice.
 _FEWEST, _LEAST_PART = 10, 0.05
+# Fewest free coefficients. Derivation: a loop has two branches that differ, beside its slope.
 _FEWEST_FREE = 3
+# Least explained part of the variance of the outputs. Derivation: below, more is left than is explained.
 _LEAST_EXPLAINED = 0.5
+# Fewest samples for each free coefficient. Derivation: with three, the variance of a prediction at them is a third of
+# that of the noise.
 _SAMPLES_EACH = 3
+# Greatest condition number. Derivation: that of the normal matrix is its square, and 1e-12 the tolerance of a fit.
 _CONDITION = 1e6
-# Times by which the greatest error of the first samples must exceed that of the others.
+# Times by which the greatest error of the first samples must exceed that of the others. Derivation: one normal error
+# exceeds twice the greatest of a hundred others, 2.7 standard deviations, in one of 1e7 cases.
 _FIRST = 2.0
 # Least part of the plane that the inputs must reach, and of their range that the plane must hold: at all, and of a
-# fit that is not good.
+# fit that is not good. Source: a choice; of a plane of which less than half is reached most is unknown, and a fit
+# that is good needs no warning of inputs beyond.
 _PLANE_REACHED, _INPUTS_HELD, _HELD_OF_POOR = 0.5, 0.2, 0.95
 # Of a butterfly the loops on the two halves of the range turn in opposite directions: least ratio of their areas,
 # least area in standard deviations, and the explained part of the variance from which on a fit is good as it is.
+# Derivation: a normal area exceeds five standard deviations by chance in one of 1e6 cases; what a good fit leaves is
+# 7 % of the outputs' standard deviation, √0.005; the ratio is a choice.
 _AREAS, _DEVIATIONS, _GOOD = 0.2, 5.0, 0.995
 
 

@@ -14,17 +14,17 @@ from bench.models import Operator, Preisach
 from bench.rig import RigFile
 
 LEVELS = 20
-"""Intervals of a Preisach plane: those of a model that is given no other number. On it the numbers that a run
+"""Intervals of a Preisach plane. Source: those of a model that is given no other number. On it the numbers that a run
 determines are counted, too: set-points are rounded to its levels, so that the last small moves of a controller are no
 new histories."""
 UNKNOWNS = LEVELS * (LEVELS + 1) // 2 + 1
-"""The density of each of its cells, and a constant."""
+"""Numbers of a plane. Derivation: the density of each of its cells, and a constant."""
 _MODELS: Mapping[str, Mapping[str, Any]] = {"preisach": {"reversible": "linear"}, "preisach-nonmonotonic": {}}
 """Models that are tried, with their options. The density of both is nowhere negative: one of either sign answers
 short reversals at once, and the last moves of a controller are such."""
 _FINE = 4 * LEVELS
-"""Levels of the plane of a twin, four to one of the usual number of a controller. A twin that was as coarse as that
-model would do what it says, and no controller would miss on it."""
+"""Levels of the plane of a twin, four to one of the usual number of a controller. Derivation: a twin that was as
+coarse as that model would do what it says, and no controller would miss on it."""
 _SMOOTHING = tuple((10.0 ** np.arange(-3.0, 0.0)).tolist())
 """Weights of the roughness of a nonnegative density that are tried; see `cross_validate`."""
 

@@ -17,6 +17,7 @@ from bench.protocol import Note, Phase, Reading, Step, find_protocol
 from bench.record import StepRecord
 from bench.rig import RigFile, RoleTable, Slot, Slots
 
+# Derivation: the median of three is right with one that is wrong.
 _FEWEST = 3
 
 

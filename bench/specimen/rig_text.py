@@ -17,7 +17,8 @@ from bench.specimen.tables import DriveTable, NoiseTable, ResponseTable, TwinTab
 from bench.specimen.twin import IdentifiedTwin
 
 _FASTEST_LINE = 100_000_000
-"""Speed of the emulated lines, Bd: their time is part of that of a reading."""
+"""Speed of the emulated lines, Bd: their time is part of that of a reading. Derivation: a line of 100 characters
+takes 10 µs."""
 
 
 def rig_text(twin: IdentifiedTwin, file: RigFile, rig: str, out: Path) -> str:

@@ -12,10 +12,10 @@ from bench.specimen.hysteresis import LEVELS, UNKNOWNS
 from bench.specimen.response import IdentifiedResponse
 
 _ENOUGH = 37
-"""So many numbers say enough: a plane of eight intervals has as many. With fewer, no loop is known that is smaller
-than an eighth of the range."""
+"""So many numbers say enough. Derivation: a plane of eight intervals has as many. With fewer, no loop is known that
+is smaller than an eighth of the range."""
 _POOR = 0.05
-"""Share of the range of the response from which on the error of a model is great. A choice: those of the
+"""Share of the range of the response from which on the error of a model is great. Source: a choice; those of the
 packaged rigs are 0.003 to 0.02, and a constant is off by 0.2 to 0.3."""
 _SWEEP = "a run that sweeps the drive up and down in small increments, such as damped-oscillation"
 _MODEL = "or give a model by --model FILE"

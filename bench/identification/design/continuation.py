@@ -23,12 +23,15 @@ from bench.identification.design.information import (
 from bench.models import MemoryCurve, Operator, Preisach, ThermalExpansion, uniform_levels
 
 _FINEST = 30
-"""Most intervals of the plane for which tails are chosen: a finer one costs time and moves none of them."""
+"""Most intervals of the plane for which tails are chosen: a finer one costs time and moves none of them. Source: a
+choice; a plane of 30 has 465 cells."""
 
+# Derivation: a dense matrix of them takes 8 MB, and its factor 3e8 products for each tail.
 _MOST_COEFFICIENTS = 1000
 
 _REACHES = (2, 3, 5, 8)
-"""How far tails reach from their centres, in steps."""
+"""How far tails reach from their centres, in steps. Source: a choice; each is about 1.6 times the one before, as
+small and large loops count alike."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -21,10 +21,13 @@ from bench.identification.design.excitation import random_validation
 from bench.models import Operator
 
 NOISE = 0.01
-"""Noise of the output as a share of its range, where it is not known."""
+"""Noise of the output as a share of its range, where it is not known. Source: instruments here stay below it."""
 
+# Derivation: steps of half a percent of the range are finer than the levels of a plane of 100.
 _SAMPLES = 201
+# Derivation: an average over them is known to 1 / √2000 of the scatter, 2 %.
 _REVERSALS = 2000
+# Source: a choice; any would do.
 _SEED = 0
 
 

@@ -12,9 +12,11 @@ from bench.models import uniform_levels
 
 Spacing: TypeAlias = Literal["uniform", "quantiles"]
 
-# Share of the levels that are equally spaced: what lies between the reversals is swept too.
+# Share of the levels that are equally spaced: what lies between the reversals is swept too. Source: a choice; both
+# halves count alike.
 _UNIFORM_SHARE = 0.5
-# Least distance of two levels, as part of the mean distance.
+# Least distance of two levels, as part of the mean distance. Source: a choice; closer levels make cells that hardly
+# any input tells apart.
 _LEAST = 0.1
 
 

@@ -9,7 +9,7 @@ from bench.identification.fit.cell_layout import Indices
 from bench.identification.fit.least_squares import one_thread
 from bench.models import Regressor
 
-# Samples whose rows are formed at a time.
+# Samples whose rows are formed at a time. Derivation: of a thousand columns they take 8 MB.
 _ROWS = 1024
 
 

@@ -17,12 +17,15 @@ Orientation: TypeAlias = Literal["auto", "rising", "falling"]
 Sign: TypeAlias = Literal[1, -1]
 
 ORIENTATIONS: tuple[Orientation, ...] = ("auto", "rising", "falling")
+# Derivation: of the coefficients, as these words say.
 SIGNS: dict[Orientation, Sign] = {"rising": 1, "falling": -1}
 NAMES: dict[Sign, Orientation] = {1: "rising", -1: "falling"}
 
 # Correlation of input and output from which on it decides for a model all whose parts rise with the input.
+# Derivation: a rising line then explains half of the variance of the outputs, 0.7².
 _CLEAR = 0.7
-# Part of the variance of the outputs by which a falling model must be better than a rising one.
+# Part of the variance of the outputs by which a falling model must be better than a rising one. Derivation: a
+# thousand times the tolerance of a fit, 1e-12.
 _ROUNDING = 1e-9
 
 

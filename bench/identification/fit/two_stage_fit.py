@@ -40,7 +40,8 @@ Stage: TypeAlias = Operator[Any]
 Smoothing: TypeAlias = float | Sequence[float]
 """Weight of the roughness penalty of `fit`, or several to choose from by the errors on blocks left out."""
 
-# Room beyond the greatest force in a plane of forces: the pretension of a reset lowers u by as much.
+# Room beyond the greatest force in a plane of forces: the pretension of a reset lowers u by as much. Source: a
+# choice; cells that no force reaches stay empty.
 _MARGIN = 0.3
 _KINDS = ("length-voltage", "length-force")
 

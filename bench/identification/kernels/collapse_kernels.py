@@ -11,12 +11,14 @@ Floats = NDArray[np.float64]
 Integers = NDArray[np.int64]
 Rows = NDArray[np.int32]
 
-# Part by which changes may differ from a line: what products and sums round.
+# Part by which changes may differ from a line: what products and sums round. Derivation: some 1e5 of them, of 1e-16
+# each.
 _ROUNDING = 1e-11
-# Degree of the polynomials of the travel that a run consists of.
+# Degree of the polynomials of the travel that a run consists of. Derivation: a cell on the diagonal is a triangle,
+# whose area is quadratic.
 DEGREE = 2
 _NODES = DEGREE + 1
-# What becomes of a run: so many nodes, or its own rows.
+# What becomes of a run: so many nodes, or its own rows. Derivation: no number of nodes is negative.
 _KEPT = -1
 
 

@@ -18,7 +18,8 @@ Rows = NDArray[np.int32]
 Flags = NDArray[np.bool_]
 Columns = tuple[Integers, Rows, Floats]
 
-# Known columns whose products `gram_rows` keeps before it hands them out.
+# Known columns whose products `gram_rows` keeps before it hands them out. Derivation: of a thousand columns they take
+# 0.25 MB.
 _BLOCK = 32
 
 

@@ -17,7 +17,7 @@ Integers = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
 BLOCK = 128
-"""Rows of a block."""
+"""Rows of a block. Derivation: a square of them takes 0.13 MB."""
 
 
 def row_start(row: int) -> int:

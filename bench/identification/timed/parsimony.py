@@ -9,11 +9,13 @@ import numpy as np
 from bench.base import Floats
 
 WORTH = 0.005
-"""Part by which something that nobody asked for must lower the RMS error."""
+"""Part by which something that nobody asked for must lower the RMS error. Source: a choice; a smaller gain shows in
+no printed error of two digits."""
 
-# Greatest regressor, numbers; 400 MB.
+# Greatest regressor, numbers; 400 MB. Source: a choice; ten copies fit into 4 GB.
 _LARGEST = 50_000_000
-# Part of the range of a column that the rows fitted must go through, or its coefficient would be noise.
+# Part of the range of a column that the rows fitted must go through, or its coefficient would be noise. Source: noise
+# of 1 % of the range moves it as much.
 _MOVED = 0.01
 
 
