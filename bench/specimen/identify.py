@@ -21,13 +21,7 @@ from bench.specimen.hysteresis import identify_hysteresis, run_of_model
 from bench.specimen.reading_time import time_readings
 from bench.specimen.response import identify_response
 from bench.specimen.specimen import Dynamics
-from bench.specimen.suitability import (
-    doubts_of_disturbances,
-    doubts_of_histories,
-    doubts_of_model,
-    doubts_of_sweep,
-    raise_if_wrong,
-)
+from bench.specimen.suitability import doubts, raise_if_wrong
 from bench.specimen.twin import IdentifiedTwin, difference
 
 _NODES = 65
@@ -61,13 +55,12 @@ def identify_twin(paths: Sequence[Path], file: RigFile, model: Path | None) -> I
     first = recordings[0]
     units = {signal.name: signal.unit for signal in first.signals}
     source, conversion = _source(recordings, file)
-    warnings: list[str] = []
-    if model is None:
-        swept, determined = run_of_model(recordings)
-        name, operator = identify_hysteresis(swept, file)
-        new = [i for i, r in enumerate(recordings) if r is not swept]
-        warnings += doubts_of_sweep(swept, determined)
+    swept = run_of_model(recordings) if model is None else None
+    if swept is not None:
+        name, operator = identify_hysteresis(swept[0], file)
+        new = [i for i, r in enumerate(recordings) if r is not swept[0]]
     else:
+        assert model is not None
         name, operator = model.name, _load(model, units[first.drive], units[first.response])
         new = [*range(len(recordings))]
     actuator = identify_actuator(recordings)
@@ -80,13 +73,13 @@ def identify_twin(paths: Sequence[Path], file: RigFile, model: Path | None) -> I
     response = identify_response(recordings, actuator.dynamics, operator)
     output = difference(units[first.response])
     raise_if_wrong(recordings, response, name, output)
-    warnings += doubts_of_model(recordings, response, output)
     dynamics = Dynamics(of_drive.step, actuator.dynamics, response.dynamics)
     # A model errs less on the run that it is from than on another history.
-    warnings += doubts_of_histories(other=bool(new))
-    new = new or [*range(len(recordings))]
-    found = identify_disturbances([recordings[i] for i in new], [response.errors[i] for i in new], operator, dynamics)
-    warnings += doubts_of_disturbances(drive=drive_noise is not None, response=found is not None)
+    of = new or [*range(len(recordings))]
+    found = identify_disturbances([recordings[i] for i in of], [response.errors[i] for i in of], operator, dynamics)
+    unknown = [] if drive_noise else ["noise of the drive"]
+    unknown += [] if found else ["noise of the response", "wander", "drift"]
+    warnings = tuple(doubts(recordings, response, output, swept, other=bool(new), unknown=unknown))
     noise, dynamics = found or (Noise(), dynamics)
     drive_noise = drive_noise or Noise()
     return IdentifiedTwin(
@@ -103,7 +96,7 @@ def identify_twin(paths: Sequence[Path], file: RigFile, model: Path | None) -> I
         signals=_signals(recordings, file, dynamics, drive_noise, noise, source, conversion),
         conversion=conversion,
         source=source,
-        warnings=tuple(warnings),
+        warnings=warnings,
     )
 
 

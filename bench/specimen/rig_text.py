@@ -111,8 +111,6 @@ def _devices(twin: IdentifiedTwin, file: RigFile) -> Iterator[str]:
 def _emulation(twin: IdentifiedTwin, file: RigFile) -> Iterator[str]:
     first, found = twin.recordings[0], twin.dynamics
     actuator, response = found.actuator, found.response
-    yield "# What was identified:"
-    yield from (f"#   {name.strip()}: {text}" for name, text in twin.identified())
     whole = {
         "step": found.step,
         "session_offset": twin.offset,

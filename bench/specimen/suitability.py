@@ -51,41 +51,45 @@ def raise_if_wrong(
     )
 
 
-def doubts_of_model(
-    recordings: Sequence[TransientRecording], response: IdentifiedResponse, unit: str
+def doubts(
+    recordings: Sequence[TransientRecording],
+    response: IdentifiedResponse,
+    unit: str,
+    swept: tuple[TransientRecording, int] | None,
+    *,
+    other: bool,
+    unknown: Sequence[str],
 ) -> Iterator[str]:
-    """Yield in a sentence that the error of a model is great, if it is; parameters as of `raise_if_wrong`."""
+    """Yield what the runs do not say, in a sentence each.
+
+    Parameters
+    ----------
+    recordings, response, unit
+        As of `raise_if_wrong`.
+    swept : tuple or None
+        The run that the model is from, and how many numbers it determines, see `run_of_model`; None of a given model.
+    other : bool
+        Whether there is another run, which shows the error of the model on a new history.
+    unknown : sequence of str
+        Disturbances that no readings at rest show.
+    """
+    if swept is not None and swept[1] < _ENOUGH:
+        yield (
+            f"the model is from {swept[0].path.name}, whose readings determine only {swept[1]} of the {UNKNOWNS} "
+            f"numbers of a Preisach plane of {LEVELS} levels, so that other set-points and loops are a guess; add "
+            f"{_SWEEP}, {_MODEL}"
+        )
     height = float(np.ptp(np.concatenate([r.responded[r.is_reading] for r in recordings])))
     if response.rms > _POOR * height:
         yield (
             f"the model is off by {response.rms:.4g} {unit} RMS, {100.0 * response.rms / height:.2g} % of the range "
             f"of the response, {height:.4g} {unit}; add {_SWEEP}, {_MODEL}"
         )
-
-
-def doubts_of_sweep(recording: TransientRecording, count: int) -> Iterator[str]:
-    """Yield in a sentence that a run determines few numbers of a model, if it does; see `run_of_model`."""
-    if count < _ENOUGH:
-        yield (
-            f"the model is from {recording.path.name}, whose readings determine only {count} of the {UNKNOWNS} "
-            f"numbers of a Preisach plane of {LEVELS} levels, so that other set-points and loops are a guess; add "
-            f"{_SWEEP}, {_MODEL}"
-        )
-
-
-def doubts_of_histories(*, other: bool) -> Iterator[str]:
-    """Yield in a sentence that the error of the model on a new history is not known, if there is no other run."""
     if not other:
         yield (
             "the model is from the only run, where it errs less than on another history, so that the twin promises "
             "too small errors; add a run of random-validation"
         )
-
-
-def doubts_of_disturbances(*, drive: bool, response: bool) -> Iterator[str]:
-    """Yield in a sentence which disturbances the twin has none of, if no readings at rest show those of a signal."""
-    unknown = [] if drive else ["noise of the drive"]
-    unknown += [] if response else ["noise of the response", "wander", "drift"]
     if unknown:
         yield (
             f"{', '.join(unknown)}: not known, and taken as 0, as the runs have no two readings at rest one after "

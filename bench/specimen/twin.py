@@ -8,13 +8,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from pydantic import BaseModel
 
 from bench.analysis import IdentifiedActuator, TransientRecording
 from bench.models import Operator
+from bench.specimen.device import TwinSettings
 from bench.specimen.disturbances import Noise
 from bench.specimen.reading_time import ReadingTime
 from bench.specimen.response import IdentifiedResponse
-from bench.specimen.specimen import Dynamics
+from bench.specimen.specimen import Dynamics, Unevenness, Wander
+from bench.specimen.tables import DriveTable, NoiseTable, ResponseTable, TwinTable
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,68 +92,50 @@ class IdentifiedTwin:
         return found
 
     def rows(self) -> list[tuple[str, str]]:
-        """Return what was identified, and the warnings, as (name, text) pairs."""
-        return [*self.identified(), *(("warning", text) for text in self.warnings)]
-
-    def identified(self) -> list[tuple[str, str]]:
-        """Return what was identified, with units and uncertainty, as (name, text) pairs."""
-        first, units = self.recordings[0], self.units
-        drive, response = difference(units[first.drive]), difference(units[first.response])
+        """Return what was identified, as the rig file describes it, and the warnings, as (name, text) pairs."""
+        first, found = self.recordings[0], self.dynamics
+        units = {
+            "input units": difference(self.units[first.drive]),
+            "output units": difference(self.units[first.response]),
+        }
+        order = ("follows at once", "first order", "second order")[found.actuator.order]
         rows = [
-            ("runs", ", ".join(str(r.path.name) for r in self.recordings)),
-            ("model", f"{self.model_name}; error {_number(self.response.rms, response)} RMS over the readings"),
-            *self._actuator(drive, units[first.drive]),
+            ("runs", ", ".join(recording.path.name for recording in self.recordings)),
+            (
+                "model",
+                f"{self.model_name}; error {self.response.rms:.4g} {units['output units']} RMS over the readings",
+            ),
+            ("actuator", f"{order}; leaves {self.actuator.rms:.4g} {units['input units']} RMS"),
         ]
-        if self.steps:
-            rows.append(("steps of the set-points", _number(self.steps, drive)))
-        slow, known = self.response.dynamics, self.response.lag_uncertainty
-        if slow.lag:
-            text = f"{_number(slow.lag, 's', known)}, of the drive to the power {slow.power:g}"
-            rows.append(("lag of the specimen", text))
-        for share, time in zip(slow.shares, slow.times, strict=True):
-            rows.append(("late part", f"{100.0 * share:.2g} % of the response, {time:g} s"))
-        found = self.dynamics
-        for name, noise, unit in (
-            ("noise of the drive", self.noise[0], drive),
-            ("noise of the response", self.noise[1], response),
-        ):
-            text = f"{_number(noise.reading, unit)} of a reading, {_number(noise.quick, unit)} of a quick one"
-            rows.append((name, text))
-        wander = f"{_number(found.wander.deviation, drive)} in {_number(found.wander.time, 's')}"
-        rows.append(("wander of the drive", wander if found.wander.deviation else "none"))
-        uneven = found.unevenness
-        text = f"{_number(uneven.deviation, drive)} of the drive, within {_number(uneven.length, drive)}"
-        rows.append(("unknown to the model", text if uneven.deviation else "nothing"))
-        rows.append(("drift of the response", f"{_number(found.drift, f'{response}/√s')}" if found.drift else "none"))
-        if len(self.recordings) > 1:
-            rows.append(("from run to run", f"{_number(self.offset, response)} of the response"))
         taken = self.reading_time
-        text = "not known, as the protocols of the runs cannot be followed; 0 s taken"
-        if taken is not None:
-            times = ((taken.reading, ""), (taken.quick, "quick"), (taken.setpoint, "of a set-point"))
-            text = ", ".join(f"{_number(each, 's')} {what}".strip() for each, what in times)
-        return [*rows, ("time of a reading", text)]
-
-    def _actuator(self, drive: str, unit: str) -> list[tuple[str, str]]:
-        """Return the rows of the actuator, with the units of a difference of the drive and of the drive."""
-        dynamics, known = self.actuator.dynamics, self.actuator.uncertainties
-        order = ("follows at once", "first order", "second order")[dynamics.order]
-        rows = [
-            ("actuator", f"{order}; leaves {_number(self.actuator.rms, drive)} RMS"),
-            ("  delay", _number(dynamics.delay, "s", known.get("delay"))),
+        parts: list[tuple[str, type[BaseModel], Mapping[str, Any], Mapping[str, float]]] = [
+            ("drive", DriveTable, vars(found.actuator) | {"resolution": self.steps}, self.actuator.uncertainties),
+            ("response", ResponseTable, vars(found.response), {"lag": self.response.lag_uncertainty}),
+            ("drive", NoiseTable, vars(self.noise[0]), {}),
+            ("response", NoiseTable, vars(self.noise[1]), {}),
+            ("wander", Wander, found.wander.model_dump(), {}),
+            ("unevenness", Unevenness, found.unevenness.model_dump(), {}),
+            ("response", TwinTable, {"drift": found.drift, "session_offset": self.offset}, {}),
+            (
+                "lines",
+                TwinSettings,
+                {} if taken is None else {f"{n}_time": each for n, each in vars(taken).items()},
+                {},
+            ),
         ]
-        if dynamics.order == 1:
-            constant, share = 1.0 / dynamics.frequency, known.get("frequency", math.nan) / dynamics.frequency
-            rows.append(("  time constant", _number(constant, "s", constant * share)))
-        if dynamics.order == 2:
-            rows += [
-                ("  natural frequency", _number(dynamics.frequency, "rad/s", known.get("frequency"))),
-                ("  damping", _number(dynamics.damping, "", known.get("damping"))),
-                ("  overshoot", f"{100.0 * dynamics.overshoot:.2g} %"),
-            ]
-        if math.isfinite(dynamics.rate):
-            rows.append(("  fastest change", _number(dynamics.rate, f"{drive}/s", known.get("rate"))))
-        return [*rows, ("  at rest", f"{dynamics.gain:.5g} × set-point {dynamics.offset:+.3g} {unit}")]
+        for part, table, values, spreads in parts:
+            for key, value in values.items():
+                field = table.model_fields[key]
+                if value in (field.default, math.inf):
+                    continue
+                name = f"{part}: {str(field.description).split(';', maxsplit=1)[0]}"
+                for said, unit in units.items():
+                    name = name.replace(said, unit)
+                text = ", ".join(f"{each:.4g}" for each in np.atleast_1d(value))
+                rows.append((name, f"{text} ± {spreads[key]:.2g}" if key in spreads else text))
+        if taken is None:
+            rows.append(("lines", "not known, as the protocols of the runs cannot be followed; 0 s taken"))
+        return [*rows, *(("warning", text) for text in self.warnings)]
 
     def summary(self) -> dict[str, Any]:
         """Return what was identified, for programs."""
@@ -180,7 +165,3 @@ class IdentifiedTwin:
 def difference(unit: str) -> str:
     """Return the unit of differences of a quantity."""
     return unit.replace("°C", "K")
-
-
-def _number(value: float, unit: str, spread: float | None = None) -> str:
-    return f"{value:.4g}{'' if spread is None else f' ± {spread:.2g}'} {unit}".rstrip()
