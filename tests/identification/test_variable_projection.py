@@ -85,6 +85,17 @@ def test_the_best_of_several_starts_wins_within_bounds():
     assert len(variable_projection(residuals, starts, stages=[Stage(3, 1e-8, 50)], apart=2.0)) == 2
 
 
+@cases("central", [False, True])
+def test_a_parameter_of_zero_is_found_as_exactly_as_another(central):
+    def residuals(values):
+        return values[1] * np.exp(values[0] * TIMES) - 2.0
+
+    end = variable_projection(residuals, [np.array([0.1, 1.0])], step=1e-6, central=central)[0]
+    assert end.values == pytest.approx([0.0, 2.0], abs=1e-9)
+    expected = np.column_stack([2.0 * TIMES, np.ones(TIMES.size)])
+    np.testing.assert_allclose(end.jacobian, expected, atol=1e-5)
+
+
 def test_without_parameters_there_is_but_the_linear_problem():
     problem = Separable(TIMES, np.ones(TIMES.size), lambda _: TIMES[:, None])
     end = variable_projection(problem, [np.empty(0)])[0]

@@ -29,7 +29,7 @@ def fit_operator(
     smoothing: float,
     ridge: float = 0.0,
 ) -> Fit:
-    """Return the coefficients of an operator: with its signs if constrained, else free.
+    """Return the coefficients of an operator, with its signs if constrained, and free ones of columns beside its own.
 
     Free coefficients of a density without a penalty are those of the least norm.
     """
@@ -42,7 +42,10 @@ def fit_operator(
             f"levels: penalties on a density of either sign take at most {_MOST_CELLS} cells (126 levels), got "
             f"{regressor.base.size}; give fewer levels, or smoothing 0 and ridge 0"
         )
-    signs = operator.nonnegative() if constrained else False
+    signs = np.zeros(regressor.shape[1], dtype=bool)
+    if constrained:
+        own = operator.nonnegative()
+        signs[: own.size] = own
     penalties = {"smoothing": smoothing, "ridge": ridge}
     return fit(regressor, outputs, nonnegative=signs, weights=weights, skip=skip, **penalties)
 

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple, TypeAlias
+from functools import lru_cache
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
@@ -26,6 +27,9 @@ _STEP = 1e-5
 # Damping of the columns, of unit length, of a linear problem. Derivation: columns that depend on each other but for
 # more than its root, 1e-6, are hardly damped in the first of two rounds, and those by more than 1e-10 in the second.
 _DAMPING = 1e-12
+# Part of its range by which a parameter counts as away from 0, at least. Derivation: times a step of 1e-6 it is far
+# above the rounding of a number, and below a last printed digit.
+_NEAR = 1e-3
 # Part of all slopes up to which a parameter has none. Derivation: outputs that do not depend on it differ by their
 # rounding, 1e-16, over a step of 1e-5, which makes 1e-11 of the outputs; slopes are some tenfold of these.
 _FLAT = 1e-12
@@ -169,14 +173,11 @@ class Separable:
     def slopes(self, values: Floats, low: Floats, high: Floats) -> Floats:
         """Return the change of the weighted outputs with each parameter at fixed coefficients, shape (N, P)."""
         coefficients = self._solve(values).coefficients[:-1]
-        columns = []
-        for k in range(values.size):
-            below, above = values.copy(), values.copy()
-            below[k] = max(values[k] - _STEP, low[k])
-            above[k] = min(values[k] + _STEP, high[k])
-            change = self._respond(above, coefficients) - self._respond(below, coefficients)
-            columns.append(self._roots * change / (above[k] - below[k]))
-        return np.column_stack(columns)
+
+        def respond(moved: Floats) -> Floats:
+            return self._roots * self._respond(moved, coefficients)
+
+        return _differences(respond, values, np.full(values.size, _STEP), low, high, central=True)
 
     def jacobian(self, values: Floats, low: Floats, high: Floats) -> Floats:
         """Return the derivative of the weighted residuals, in the form of Kaufman, shape (N, P)."""
@@ -234,7 +235,7 @@ def variable_projection(
     apart : float
         Of two starts that differ by no more than this in each parameter, the worse is left out.
     step : float
-        Step of the differences of a callable, as part of each parameter.
+        Step of the differences of a callable, as part of each parameter, or of a thousandth of its range.
     central : bool
         Whether these differences are central ones.
     """
@@ -277,22 +278,50 @@ def _search(
     residuals: Residuals = problem.residuals if isinstance(problem, Separable) else problem
     # Free of units, so that the limit of the gradient holds for all outputs.
     unit = max(float(np.linalg.norm(residuals(start))), _LEAST)
-    differences: dict[str, Any] = {"jac": "3-point" if central else "2-point", "diff_step": np.full(start.size, step)}
-    if isinstance(problem, Separable):
-        differences = {"jac": lambda values: problem.jacobian(values, low, high) / unit}
+
+    @lru_cache(maxsize=1)
+    def at(key: bytes) -> Floats:
+        return residuals(np.frombuffer(key)) / unit
+
+    def scaled(values: Floats) -> Floats:
+        return at(values.tobytes())
+
+    def jacobian(values: Floats) -> Floats:
+        if isinstance(problem, Separable):
+            return problem.jacobian(values, low, high) / unit
+        # A parameter near 0 still moves by a part of its range, or of one where there is none.
+        spans = np.where(np.isfinite(high - low), high - low, 1.0)
+        return _differences(scaled, values, step * np.maximum(np.abs(values), _NEAR * spans), low, high, central)
+
     end = least_squares(
-        lambda values: residuals(values) / unit,
+        scaled,
         start,
+        jacobian,
         bounds=(low, high),
         x_scale="jac",
         ftol=stage.tolerance,
         xtol=stage.tolerance,
         gtol=float(np.finfo(np.float64).eps),
         max_nfev=stage.evaluations,
-        **differences,
     )
-    rest, jacobian = unit * np.asarray(end.fun), unit * np.asarray(end.jac)
-    return End(np.asarray(end.x), rest, jacobian, int(end.nfev), bool(end.success))
+    rest, slopes = unit * np.asarray(end.fun), unit * np.asarray(end.jac)
+    return End(np.asarray(end.x), rest, slopes, int(end.nfev), bool(end.success))
+
+
+def _differences(
+    function: Residuals, values: Floats, steps: Floats, low: Floats, high: Floats, central: bool
+) -> Floats:
+    """Return the derivatives of a function by differences within bounds, shape (N, P)."""
+    columns, here = [], None if central else function(values)
+    for k, step in enumerate(steps.tolist()):
+        ends = values.copy(), values.copy()
+        ends[0][k], ends[1][k] = max(values[k] - step, low[k]), min(values[k] + step, high[k])
+        if here is None:
+            columns.append((function(ends[1]) - function(ends[0])) / (ends[1][k] - ends[0][k]))
+        else:
+            end = ends[1] if values[k] + step <= high[k] else ends[0]
+            columns.append((function(end) - here) / (end[k] - values[k]))
+    return np.column_stack(columns)
 
 
 def _orthonormal(columns: Floats) -> tuple[Floats, Floats]:

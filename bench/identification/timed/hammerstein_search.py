@@ -12,8 +12,8 @@ import numpy as np
 
 from bench.base import Floats
 from bench.identification.by_name import FitProblem
-from bench.identification.fit.least_squares import Fit, fit, fit_minimum_norm
-from bench.identification.fit.ridge import fit_ridge
+from bench.identification.fit.least_squares import Fit
+from bench.identification.fit.shape import fit_operator
 from bench.identification.fit.variable_projection import Evidence, Separable, Stage, variable_projection
 from bench.identification.timed.parsimony import moving
 from bench.models import LinearPart, Regressor, logarithmic_creep, velocities
@@ -194,11 +194,15 @@ class Search:
         follows = self.linear(self.parameters(elements), values)
         return follows.part.respond(self.times, self.columns)[0], self.beside(elements, follows)
 
-    def fit(self, elements: Sequence[str], values: Floats) -> Fit:
-        """Return the coefficients for given parameters, of the sign that fits better."""
+    def fitted(self, elements: tuple[str, ...], values: Floats, deviations: Floats) -> Found:
+        """Return parameters with the coefficients that belong to them, of the sign that fits better, and the cost."""
         columns, others = self.responses(elements, values)
-        fits = [self.fit_columns(columns, others, self.static.weights, sign) for sign in self.signs]
-        return min(fits, key=lambda each: self.cost(elements, values, each)) if len(fits) > 1 else fits[0]
+        together, found = np.column_stack([columns, others]), []
+        for sign in self.signs:
+            fitted = self.fit_columns(columns, others, self.static.weights, sign)
+            rest = self.roots * (self.static.outputs - fitted.bias - together @ fitted.coefficients)
+            found.append(Found(elements, values, fitted, float(rest @ rest), deviations))
+        return min(found, key=lambda each: each.cost)
 
     def fit_columns(
         self,
@@ -209,38 +213,17 @@ class Search:
         smoothing: float | None = None,
     ) -> Fit:
         """Return the coefficients of filtered columns, those of the operator of one sign, and those beside them."""
-        problem = self.static
-        smoothing = self.smoothing if smoothing is None else smoothing
-        columns = moving(columns, weights, problem.skip)
+        problem, count = self.static, columns.shape[1]
         cells, constrained = problem.regressor.base.size, problem.spec.constrained
-        turn = sign if constrained else 1
-        regressor = Regressor.of_cells(
-            turn * columns[:, :cells], np.column_stack([turn * columns[:, cells:], others])
-        )
-        if not cells and not (constrained and problem.template.nonnegative().any()):
-            return fit_ridge(regressor, problem.outputs, self.ridge, weights=weights, skip=problem.skip)
-        if not constrained and not smoothing:
-            return fit_minimum_norm(regressor, problem.outputs, weights=weights, skip=problem.skip)
-        found = fit(
-            regressor,
-            problem.outputs,
-            nonnegative=constrained
-            & np.append(problem.template.nonnegative(), np.zeros(others.shape[1], dtype=bool)),
-            weights=weights,
-            skip=problem.skip,
-            smoothing=smoothing,
+        columns = (sign if constrained else 1) * moving(columns, weights, problem.skip)
+        regressor = Regressor.of_cells(columns[:, :cells], np.column_stack([columns[:, cells:], others]))
+        smoothing = self.smoothing if smoothing is None else smoothing
+        found = fit_operator(
+            constrained, problem.template, regressor, problem.outputs, weights, problem.skip, smoothing, self.ridge
         )
         turned = found.coefficients.copy()
-        turned[: columns.shape[1]] *= turn
+        turned[:count] *= sign if constrained else 1
         return replace(found, coefficients=turned)
-
-    def cost(self, elements: Sequence[str], values: Floats, found: Fit) -> float:
-        """Return the weighted sum of squares of a fit."""
-        follows = self.linear(self.parameters(elements), values)
-        count = self.columns.shape[1]
-        response = follows.part.respond(self.times, (self.columns @ found.coefficients[:count])[:, None])[0][:, 0]
-        others = self.beside(elements, follows) @ found.coefficients[count:]
-        return float(np.sum((self.roots * (self.static.outputs - found.bias - response - others)) ** 2))
 
     def sign(self, found: Fit) -> Literal[1, -1]:
         """Return the sign of the operator's coefficients that are constrained."""
@@ -315,15 +298,16 @@ class _Responses:
 def find_best(search: Search, elements: tuple[str, ...], before: Found | None = None, rounds: int = _ROUNDS) -> Found:
     """Return the parameters of elements that fit best, found from several starts; `before` is a smaller model."""
     if not search.parameters(elements):
-        none = np.empty(0)
-        found = search.fit(elements, none)
-        return Found(elements, none, found, search.cost(elements, none, found), none)
+        return search.fitted(elements, np.empty(0), np.empty(0))
     first = find_best(search, ()) if before is None else before
     trials = search_ends(search, elements, first, search.principal[:, :FREE])
-    best = min((_refitted(search, trial) for trial in trials), key=lambda trial: trial.cost)
+    best = min(
+        (search.fitted(elements, trial.values, trial.deviations) for trial in trials), key=lambda trial: trial.cost
+    )
     for _ in range(rounds):
         basis, stage = search.basis(best.fit), Stage(1, _TOLERANCE, EVALUATIONS)
-        moved = _refitted(search, _ends(search, elements, best.fit, basis, [best.values], stage)[0])
+        end = _ends(search, elements, best.fit, basis, [best.values], stage)[0]
+        moved = search.fitted(elements, end.values, end.deviations)
         gained = best.cost - moved.cost
         if gained > 0.0:
             best = moved
@@ -379,9 +363,3 @@ def _ends(
         Found(elements, end.values, before, end.cost, Evidence.of(end.jacobian, end.residuals, freedom).deviations)
         for end in ends
     ]
-
-
-def _refitted(search: Search, trial: Found) -> Found:
-    """Return parameters with the fit of the operator that belongs to them, and its cost."""
-    found = search.fit(trial.elements, trial.values)
-    return replace(trial, fit=found, cost=search.cost(trial.elements, trial.values, found))
