@@ -129,6 +129,8 @@ class IdentifiedTwin:
                 if value in (field.default, math.inf):
                     continue
                 name = f"{part}: {str(field.description).split(';', maxsplit=1)[0]}"
+                if table is NoiseTable:
+                    name += f", {'input' if part == 'drive' else 'output'} units"
                 for said, unit in units.items():
                     name = name.replace(said, unit)
                 text = ", ".join(f"{each:.4g}" for each in np.atleast_1d(value))

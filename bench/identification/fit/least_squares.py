@@ -34,12 +34,10 @@ _ROUNDED = 1e-12
 # A gradient that is zero but for rounding. Derivation: ten times the tolerance, so that what a solution leaves is no
 # reason to go on.
 _LEVEL = 1e-11
-# Columns enter together if their gradient is at least this part of the greatest. Derivation: of columns that hardly
-# depend on each other one lowers the cost by the square of its gradient, here a sixteenth of what the best does. It
-# decides time only: the optimum is unique but for dependent columns.
+# Columns enter together if their gradient is at least this part of the greatest. Derivation: of independent columns
+# one lowers the cost by the square of its gradient, here a sixteenth of what the best does.
 _ENTRY = 0.25
-# ... and with a penalty, which tells neighbours apart, at least this part of that. Derivation: likewise a
-# twenty-fifth.
+# ... and with a penalty, which tells neighbours apart, at least this part of that. Derivation: a twenty-fifth.
 _KEEN = 0.2
 # A smooth fit of at least this order starts from one of half the order. Source: a choice; it decides time only, as
 # the optimum does not depend on the start.
