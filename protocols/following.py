@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.analysis import FOLLOW, read_columns
+from bench.analysis import FOLLOW, ColumnNames, read_dataset
 from bench.control import (
     ControllerSetup,
     FollowReference,
@@ -140,10 +140,6 @@ def _reference(parameters: Parameters, unit: str) -> tuple[np.ndarray, np.ndarra
         return times, modulated_sine(
             times + 0.75 * parameters.period, parameters.low, parameters.high, parameters.period
         )
-    columns = read_columns(Path(parameters.reference), ["time", "reference"], at_least=3)
-    times, values = columns.values["time"], columns.values["reference"]
-    steps = np.diff(times)
-    if np.any(steps <= 0):
-        row = int(np.argmax(steps <= 0)) + 2
-        raise ValueError(f"{parameters.reference}: row {row}, column time: times must increase")
-    return times - times[0], values
+    rows = read_dataset([Path(parameters.reference)], ColumnNames("reference", time="time"), at_least=3)
+    assert rows.times is not None
+    return rows.times - rows.times[0], rows.inputs

@@ -61,6 +61,7 @@ from .errors import (
     WatchdogError as WatchdogError,
 )
 from .extras import (
+    Extra as Extra,
     MissingExtraError as MissingExtraError,
     check_extra as check_extra,
     needed_for as needed_for,

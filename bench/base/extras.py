@@ -9,7 +9,7 @@ from typing import Literal
 
 from bench.base.errors import ConfigurationError
 
-Extra = Literal["cluster", "dashboard", "panel", "report", "spreadsheet"]
+Extra = Literal["cluster", "dashboard", "files", "panel", "report"]
 
 
 class MissingExtraError(ConfigurationError):

@@ -195,7 +195,8 @@ def read_measured(
         data = data if is_other else data.without_time()
     if not comparing.test_files:
         return data, None
-    time = None if data.time is None else data.time.name
+    # Rows that are evenly sampled have no column of times.
+    time = None if data.time is None or reading.interval else data.time.name
     wanted = replace(names, weights=None, time=time, times=())
     if is_sought and several and time is not None:
         wanted = replace(wanted, time=None, times=(time,))

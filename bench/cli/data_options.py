@@ -32,9 +32,17 @@ def _layout(
             help="Table of a file of several: number from 1; name of a sheet or variable; of a run: telemetry.",
         ),
     ] = None,
+    interval: Annotated[
+        str | None,
+        typer.Option(metavar="TIME", help="Time between evenly sampled rows without a column of times: 0.1s, 50ms."),
+    ] = None,
+    time_unit: Annotated[
+        str | None,
+        typer.Option(metavar="UNIT", help="Unit of times whose head has none: d, h, min, s, ms, us or ns."),
+    ] = None,
 ) -> ReadingOptions:
     """Return the options of the layout of a file; its signature is that of the options."""
-    return ReadingOptions(delimiter, decimal, encoding, skip_lines, table)
+    return ReadingOptions(delimiter, decimal, encoding, skip_lines, table, interval, time_unit)
 
 
 ReadingGroup = Annotated[ReadingOptions, _layout]

@@ -19,8 +19,11 @@ EXTRAS = {
     "pyarrow",
     "matplotlib",
     "mpl_toolkits",
-    "openpyxl",
+    "h5py",
+    "matio",
+    "nptdms",
     "pandas",
+    "python_calamine",
 }
 PACKAGES = ("bench", "drivers", "sim_devices", "protocols", "rigs")
 

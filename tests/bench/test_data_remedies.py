@@ -5,31 +5,17 @@ import json
 import numpy as np
 import pytest
 from cases import cases
+from lab_tables import ROWS, U, Y, body, check, matlab, parquet, table, write
 
 from bench.analysis import ReadingOptions, read_columns
 from bench.base import DataError
 
-ROWS = 40
-U = np.round(2.0 + 1.75 * np.sin(0.3 * np.arange(ROWS)), 4)
-Y = np.round(-3.5 + 12.25 * np.cos(0.3 * np.arange(ROWS)), 3)
-LINES = [f"{0.05 * row:.2f},{u:.4f},{y:.3f}\n" for row, (u, y) in enumerate(zip(U, Y, strict=True))]
-BODY = "".join(LINES)
-TABLE = "time,U,y\n" + BODY
-
-
-def write(folder, content, name="data.txt"):
-    path = folder / name
-    path.write_bytes(content.encode() if isinstance(content, str) else content)
-    return path
+LINES = body().splitlines(keepends=True)
+BODY, TABLE = body(), table()
 
 
 def read(folder, content, names=("U", "y"), **options):
     return read_columns(write(folder, content), names, options=ReadingOptions(**options))
-
-
-def check(columns, first="U", second="y"):
-    np.testing.assert_array_equal(columns.values[first], U)
-    np.testing.assert_array_equal(columns.values[second], Y)
 
 
 def refused(folder, content, names=("U", "y"), name="data.txt", **options):
@@ -65,13 +51,13 @@ class TestNamesAndValues:
         assert read(tmp_path, content, ("2",), table="1").values["2"].tolist() == [0.0, 0.05]
 
     def test_a_short_table_of_numbers_above_a_long_one_is_a_table(self, tmp_path):
-        content = "a,b\n1,2\n3,4\n\n" + TABLE
-        said = "2 tables, whose data begin in the lines 2, 6"
+        content = "a,b\n" + "1,2\n" * 10 + "\n" + TABLE
+        said = "2 tables, of rows × columns: 1 from line 2 (10 × 2), 2 from line 14 (40 × 3)"
         assert refused(tmp_path, content, ("1",)) == f"data.txt: has {said}; choose one with --table, 1 to 2"
         message = refused(tmp_path, content)
         assert f"has no column 'U'; it has: a, b (or a number, 1 to 2); the file has {said}: choose" in message
         assert message.endswith("another one with --table, or leave out the lines above it with --skip-lines")
-        for options in ({"table": "2"}, {"skip_lines": 4}):
+        for options in ({"table": "2"}, {"skip_lines": 12}):
             check(read(tmp_path, content, **options))
 
 
@@ -93,7 +79,7 @@ class TestSummaries:
     def test_a_summary_ends_the_table(self, tmp_path, name, names):
         below, lines = SUMMARIES[name]
         columns = read(tmp_path, TABLE + below, names)
-        check(columns, *names[-2:])
+        check(columns, names[-2:])
         assert columns.assumptions == f"comma-separated, {lines} line{'s' * (lines != 1)} below the table left out"
 
     def test_a_text_in_another_column(self, tmp_path):
@@ -110,10 +96,10 @@ class TestSummaries:
         assert "1 line below the table left out" in columns.assumptions
 
     def test_of_a_table_above_another(self, tmp_path):
-        content = TABLE + "Total,600,3\n\n" + TABLE + "Total,600,3\n"
-        assert "has 2 tables, whose data begin in the lines 2, 45;" in refused(tmp_path, content)
-        for table in ("1", "2"):
-            columns = read(tmp_path, content, table=table)
+        content = TABLE + "Total,600,3\n\n" + TABLE.replace("time", "t") + "Total,600,3\n"
+        assert "1 from line 2 (40 × 3), 2 from line 45 (40 × 3);" in refused(tmp_path, content)
+        for chosen in ("1", "2"):
+            columns = read(tmp_path, content, table=chosen)
             check(columns)
             assert "1 line below the table left out" in columns.assumptions
 
@@ -131,7 +117,7 @@ class TestSummaries:
         assert columns.assumptions == "comma-separated"
 
     def test_text_within_the_table_stays_and_is_said(self, tmp_path):
-        columns = read(tmp_path, TABLE.replace("\n1.00,", "\npaused,"))
+        columns = read(tmp_path, TABLE.replace("\n1,", "\npaused,"))
         check(columns)
         assert columns.assumptions == "comma-separated, text in a column of numbers in line 22"
 
@@ -141,18 +127,6 @@ class TestSummaries:
         columns = read(tmp_path, "U,y,state\n" + "".join(f"{u},{y},{state}\n" for u, y, state in values))
         np.testing.assert_array_equal(columns.values["y"], [*Y, *Y])
         assert columns.assumptions == "comma-separated, text in columns of numbers in 30 lines, first in line 52"
-
-    def test_of_a_sheet(self, tmp_path):
-        import openpyxl
-
-        book = openpyxl.Workbook()
-        for row in [["time", "U", "y"], *([0.1, float(u), float(y)] for u, y in zip(U, Y, strict=True))]:
-            book.active.append(row)
-        book.active.append(["Total", 600, 3])
-        book.save(tmp_path / "data.xlsx")
-        columns = read_columns(tmp_path / "data.xlsx", ("U", "y"))
-        check(columns)
-        assert columns.assumptions == "sheet Sheet, 1 row below the table left out"
 
 
 class TestExponents:
@@ -167,7 +141,7 @@ class TestExponents:
     def test_in_quotes_and_without_a_point(self, tmp_path):
         rows = "".join(f'"{u:.8E}","{y:.8E}"\n' for u, y in zip(U, Y, strict=True))
         check(read(tmp_path, "U,y\n" + rows.replace("E", "D")))
-        assert "'1D5' is not a number" in refused(tmp_path, TABLE.replace("\n1.00,", "\n1D5,"), ("time",))
+        assert "'1D5' is not a number" in refused(tmp_path, TABLE.replace("\n1,", "\n1D5,"), ("time",))
 
 
 class TestWhatWouldHelp:
@@ -209,7 +183,7 @@ class TestWhatWouldHelp:
     def test_another_delimiter(self, tmp_path, header, names):
         content = header + BODY.replace(",", ":")
         assert refused(tmp_path, content, names).endswith("if ':' stands between columns, say --delimiter ':'")
-        check(read(tmp_path, content, ("2", "3"), delimiter=":"), "2", "3")
+        check(read(tmp_path, content, ("2", "3"), delimiter=":"), ("2", "3"))
 
     @cases(
         ("encoding", "heads"),
@@ -220,7 +194,7 @@ class TestWhatWouldHelp:
         names = heads.split(",")[1:]
         message = refused(tmp_path, content, names)
         assert f"--encoding {encoding}" in message
-        check(read(tmp_path, content, names, encoding=encoding), *names)
+        check(read(tmp_path, content, names, encoding=encoding), names)
 
     def test_another_encoding_where_no_name_tells_it(self, tmp_path):
         message = refused(tmp_path, ("時間,電圧,変位\n" + BODY).encode("shift_jis"))
@@ -268,7 +242,7 @@ class TestOtherFormats:
     def test_what_is_no_table(self, tmp_path, content, kind, names):
         message = refused(tmp_path, content, names, "file.txt")
         assert message.startswith(
-            f"file.txt: is {kind}, not a table; text, .gz of text, .mat, .xlsx and .parquet are read"
+            f"file.txt: is {kind}, not a table; text, .gz of text, .mat, .h5, .tdms, .parquet and spreadsheets"
         )
 
     def test_an_array_in_a_file_of_json(self, tmp_path):
@@ -283,14 +257,8 @@ class TestOtherFormats:
         assert "with --skip-lines" in refused(tmp_path, content)
         check(read(tmp_path, content, skip_lines=1))
 
-    def test_matlab_and_parquet(self, tmp_path):
-        import pyarrow as pa
-        import pyarrow.parquet as pq
-        from scipy.io import savemat
-
-        broken = np.where(np.arange(ROWS) == 4, np.nan, Y)
-        savemat(tmp_path / "data.mat", {"U": U, "y": broken})
-        pq.write_table(pa.table({"U": U, "y": broken}), tmp_path / "data.parquet")
-        for name in ("data.mat", "data.parquet"):
-            with pytest.raises(DataError, match=r"row 5, column y: .*; no option leaves out a row: save the file"):
-                read_columns(tmp_path / name, ("U", "y"))
+    @cases(("name", "save"), [("d.mat", matlab), ("d.parquet", parquet)])
+    def test_matlab_and_parquet(self, tmp_path, name, save):
+        path = write(tmp_path, save(U=U, y=np.where(np.arange(ROWS) == 4, np.nan, Y)), name)
+        with pytest.raises(DataError, match=r"row 5, column y: .*; no option leaves out a row: save the file"):
+            read_columns(path, ("U", "y"))

@@ -14,7 +14,7 @@ SCRIPT = Path(__file__).with_name("run_without_extras.py")
 RUN = ("run", "creep", "--rig", "vo2", "--clock", "virtual", "--set", "duration=4", "--set", "settling=2")
 IDENTIFY = ("--input", "tec_temperature", "--output", "curvature", "--model", "polynomial", "--degree", "3")
 DASHBOARD, REPORT = "pip install 'actuator-bench[dashboard]'", "pip install 'actuator-bench[report]'"
-SPREADSHEET = "pip install 'actuator-bench[spreadsheet]'"
+FILES = "pip install 'actuator-bench[files]'"
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +88,7 @@ def test_what_needs_no_extra_works(without_extras, folder):
     [
         ("live", "the live view", DASHBOARD),
         ("identify with figures", "a figure", REPORT),
-        ("identify xlsx", "reading a spreadsheet", SPREADSHEET),
+        ("identify xlsx", "reading a spreadsheet", FILES),
         ("identify parquet", "reading a parquet file", REPORT),
         ("compare", "a figure", REPORT),
         ("report", "a figure", REPORT),

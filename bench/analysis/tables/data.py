@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import csv
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import numpy.typing as npt
 
-from bench.analysis.tables.reading.heads import SECONDS
-from bench.analysis.tables.reading.matlab import HDF5, read_matlab
+from bench.analysis.tables.reading.heads import SECONDS, NoColumnError
+from bench.analysis.tables.reading.library_files import HDF5
+from bench.analysis.tables.reading.named_arrays import read_arrays
 from bench.analysis.tables.reading.options import ReadingOptions
-from bench.analysis.tables.reading.parquet import read_parquet
 from bench.analysis.tables.reading.spreadsheet import read_spreadsheet
 from bench.analysis.tables.reading.table import ReadColumns
 from bench.analysis.tables.reading.text import reading_errors
@@ -24,7 +26,10 @@ from bench.record import Record
 FEWEST_ROWS = 10
 """Fewer samples than this identify nothing."""
 
-_OLD_SPREADSHEET = b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1"
+_SPREADSHEETS = b"PK\x03\x04", b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1"
+
+_LIST = re.compile(r",(?![^(\[]*[)\]])")
+"""Between names of columns, of which one may be `A(:,1)`."""
 
 _STEPS, _TELEMETRY = "steps", "telemetry"
 
@@ -82,6 +87,8 @@ class Columns:
         What was assumed about the layout of a file, such as `tab-separated, decimal comma`; empty for a run.
     time : str or None
         Name of the column of times that was looked for and found.
+    elsewhere : mapping of str to (Path, str)
+        File and column of those that were asked for as `FILE:COLUMN`.
     """
 
     source: str
@@ -89,10 +96,15 @@ class Columns:
     units: Mapping[str, str]
     assumptions: str = ""
     time: str | None = None
+    elsewhere: Mapping[str, tuple[Path, str]] = field(default_factory=dict)
 
     def quantity(self, name: str) -> Quantity:
-        """Return a column."""
-        return Quantity(name, self.units[name], self.values[name])
+        """Return a column, by the name that was asked for, without a file before it."""
+        return Quantity(self.own_name(name), self.units[name], self.values[name])
+
+    def own_name(self, name: str) -> str:
+        """Return the name that was asked for without a file before it."""
+        return self.elsewhere[name][1] if name in self.elsewhere else name
 
 
 def read_columns(
@@ -113,7 +125,8 @@ def read_columns(
         default) or what was read while it held and controlled (`telemetry`).
     names : sequence of str
         Columns, as the header has them; a unit at the end, as in `force [N]`, may be left out. Or their numbers,
-        from 1.
+        from 1. Several with commas between them are joined in order, one below the other; `FILE:COLUMN` is that of
+        another file of as many rows, in the present folder or beside this one.
     at_least : int
         Fewest rows that make sense.
     options : ReadingOptions, optional
@@ -136,40 +149,15 @@ def read_columns(
         columns = _from_run(path, names, options.table or _STEPS, at_least, times)
     else:
         try:
-            found = _reader(path)(path, names, options, times)
+            columns = _from_files(path, names, options, times)
         except DataError:
             if not times:
                 raise
             # Of a file that can be read without times their column is at fault.
             read_columns(path, names, at_least=at_least, options=options)
             return read_columns(path, names, at_least=at_least, options=options, times=times[1:])
-        values = dict(zip(found.names, found.values, strict=True))
-        units = dict(zip(found.names, found.units, strict=True))
-        columns = Columns(str(path), values, units, ", ".join(found.notes), (*found.names[len(names) :], None)[0])
     _check_rows(path, len(next(iter(columns.values.values()))), at_least)
     return columns
-
-
-def seconds_of(source: str, column: Quantity) -> Floats:
-    """Return a column of times, shape (N,), in s.
-
-    Raises DataError if its unit is none of time, or the times do not increase: names the row.
-    """
-    name, unit, values = column.name, column.unit, column.values
-    if unit not in SECONDS:
-        raise DataError(
-            f"{source}: column {name} is in {unit}; expected a time in {', '.join(filter(None, SECONDS))}"
-        )
-    times = values * SECONDS[unit]
-    wrong = np.flatnonzero(np.diff(times) <= 0.0)
-    if wrong.size:
-        row = int(wrong[0]) + 2
-        before, after = values[row - 2 : row]
-        raise DataError(
-            f"{source}: column {name} does not increase in row {row} ({after:g} after {before:g}); "
-            "times must be those of one record, in order"
-        )
-    return times
 
 
 def is_run(path: Path) -> bool:
@@ -278,18 +266,76 @@ def _as_text(cell: object) -> object:
 
 
 def _reader(path: Path) -> Callable[[Path, Sequence[str], ReadingOptions, Sequence[str]], ReadColumns]:
-    """Return what reads a kind of file, by its ending or its first bytes."""
+    """Return what reads a kind of file, by its first bytes or its ending."""
     with reading_errors(path), path.open("rb") as file:
-        start = file.read(len(_OLD_SPREADSHEET))
-    if path.suffix.lower() == ".mat" or start.startswith((HDF5, b"MATLAB")):
-        return read_matlab
-    if path.suffix.lower() in (".xlsx", ".xlsm"):
+        start = file.read(8)
+    ending = path.suffix.lower()
+    if ending == ".mat" or start.startswith(b"MATLAB"):
+        return partial(read_arrays, kind="MATLAB")
+    if ending in (".xlsx", ".xlsm", ".xlsb", ".xls", ".ods") or start.startswith(_SPREADSHEETS):
         return read_spreadsheet
-    if start.startswith(b"PAR1"):
-        return read_parquet
-    if start == _OLD_SPREADSHEET or start.startswith(b"PK\x03\x04"):
-        raise DataError(f"{path}: this kind of file is not read; save it as .xlsx or CSV")
-    return read_text
+    kinds = {HDF5: "HDF5", b"TDSm": "TDMS", b"PAR1": "Parquet"}
+    kind = kinds.get(start[:4])
+    return read_text if kind is None else partial(read_arrays, kind=kind)
+
+
+def _from_files(path: Path, names: Sequence[str], options: ReadingOptions, times: Sequence[str]) -> Columns:
+    """Read columns of a file, and of others those that are asked for as `FILE:COLUMN`."""
+    elsewhere = {name: place for name in names if (place := _elsewhere(path, name)) is not None}
+    values: dict[str, Floats] = {}
+    units: dict[str, str] = {}
+    notes: list[str] = []
+    time = None
+    for file in dict.fromkeys([path, *(place[0] for place in elsewhere.values())]):
+        asked = [name for name in names if elsewhere.get(name, (path,))[0] == file]
+        own = [elsewhere[name][1] if name in elsewhere else name for name in asked]
+        if not asked:
+            continue
+        found = _joined(file, own, options, times if file == path else ())
+        for name, column, unit in zip([*asked, *found.names[len(own) :]], found.values, found.units, strict=True):
+            values[name], units[name] = column, unit
+        time = (*found.names[len(own) :], time)[0]
+        notes += [f"{file.name}: "] * (file != path) + [", ".join(found.notes)]
+        if len(found.values[0]) != len(next(iter(values.values()))):
+            sizes = {len(column): name for name, column in values.items()}
+            counts = ", ".join(f"{name} {size}" for size, name in sizes.items())
+            raise DataError(f"{path}: columns differ in length: {counts}")
+    text = ", ".join(filter(None, notes)).replace(": , ", ": ")
+    return Columns(str(path), values, units, text, time, elsewhere)
+
+
+def _elsewhere(path: Path, name: str) -> tuple[Path, str] | None:
+    """Return file and column of `FILE:COLUMN`; None if there is no such file."""
+    file, _, column = name.rpartition(":")
+    if not file or not column:
+        return None
+    return next(((place, column) for place in (Path(file), path.parent / file) if place.is_file()), None)
+
+
+def _joined(path: Path, names: Sequence[str], options: ReadingOptions, times: Sequence[str]) -> ReadColumns:
+    """Read columns of a file; where it has none of the name of a list, its members are joined in order."""
+    reader = _reader(path)
+    try:
+        return reader(path, names, options, times)
+    except NoColumnError:
+        lists = [[part.strip() for part in _LIST.split(name)] for name in names]
+        if all(len(parts) == 1 for parts in lists):
+            raise
+    if len({len(parts) for parts in lists}) > 1:
+        counts = ", ".join(f"{name} {len(parts)}" for name, parts in zip(names, lists, strict=True))
+        raise ConfigurationError(f"{path}: columns that are joined must be as many of each: {counts}")
+    found = reader(path, [part for parts in lists for part in parts], options, ())
+    values: list[Floats] = []
+    units: list[str] = []
+    for parts in lists:
+        end = len(parts)
+        place = len(values) * end
+        if len(set(found.units[place : place + end])) > 1:
+            raise DataError(f"{path}: columns {', '.join(parts)} are joined, but in several units")
+        values.append(np.concatenate(found.values[place : place + end]))
+        units.append(found.units[place])
+    notes = [f"{' and '.join(parts)} joined in order" for parts in lists]
+    return ReadColumns(list(names), values, units, (*found.notes, *notes))
 
 
 def _from_run(path: Path, names: Sequence[str], chosen: str, at_least: int, times: Sequence[str]) -> Columns:

@@ -13,10 +13,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bench.analysis.tables.data import is_run, read_columns, seconds_of
+from bench.analysis.tables.data import is_run, read_columns
 from bench.analysis.tables.dataset import time_names
 from bench.analysis.tables.reading.heads import split_unit
 from bench.analysis.tables.reading.options import ReadingOptions
+from bench.analysis.tables.times import seconds_of
 from bench.base import ConfigurationError, DataError, redacted_command, wall_time
 from bench.devices import Settled, Signal
 from bench.record import FILE_NAME, Event, Journal, StepRecord, current_user, make_folder, version_of
@@ -88,24 +89,31 @@ def import_file(
     wanted = [input_column, output_column, *others]
     if len(set(wanted)) < len(wanted):
         raise ConfigurationError(f"columns {', '.join(wanted)}: one of them is asked for twice")
+    reading = reading or ReadingOptions()
+    interval = reading.seconds_between_rows
+    if interval is not None and time_column:
+        raise ConfigurationError(f"--interval {reading.interval} and --time {time_column} exclude each other")
     asked = [time_column] if time_column else []
-    columns = read_columns(path, [*wanted, *asked], options=reading, times=() if asked else time_names(path))
+    sought = () if asked or interval else time_names(path)
+    columns = read_columns(path, [*wanted, *asked], options=reading, times=sought)
     rows = len(columns.values[input_column])
-    found = None
+    times, remarks = (interval or 1.0) * np.arange(1.0, rows + 1.0), [f"rows are {interval or 1.0:g} s apart"]
     if time := time_column or columns.time:
         try:
-            found = seconds_of(columns.source, columns.quantity(time))
-        except DataError:
+            times, said = seconds_of(columns.source, columns.quantity(time), reading.time_unit)
+            remarks = [*said]
+        except DataError as error:
             # Those that nobody asked for may be of several records.
             if asked:
                 raise
-    times = np.arange(1.0, rows + 1.0) if found is None else found
-    signals = [_signal(name, columns.units[name]) for name in wanted]
-    assumptions = [columns.assumptions, *(["rows are 1 s apart"] if found is None else [])]
+            remarks.append(f"{error}: left out")
+    signals = [_signal(columns.own_name(name), columns.units[name]) for name in wanted]
+    assumptions = [columns.assumptions, *remarks]
     folder = make_folder(out, f"{_word(path.stem)}-{PROTOCOL}")
     meta = _metadata(path, folder.name, title, signals, dict(zip(("input", "output"), wanted, strict=False)), times)
     # A file that is still there needs no row to be durable before the next.
-    journal = Journal(folder / FILE_NAME, signals, meta, {path.name: path.read_bytes()}, flushed=False)
+    files = {file.name: file.read_bytes() for file in (path, *(place[0] for place in columns.elsewhere.values()))}
+    journal = Journal(folder / FILE_NAME, signals, meta, files, flushed=False)
     values = np.column_stack([columns.values[name] for name in wanted])
     journal.event(Event(0.0, "INFO", "phase", f"imported from {path.name}"))
     for text in filter(None, assumptions):

@@ -13,14 +13,29 @@ from bench.base import DataError
 
 _SYMBOL = (
     r"(?:[yzafpnµμumcdhkMGTP]?(?:m|g|s|A|K|mol|cd|V|N|W|J|Pa|Hz|Ω|Ω|[Oo]hm|C|F|T|H|bar|eV|Oe|G|Wb|S|rad|l|L|strain)"
-    r"|°C|ºC|°F|°|º|deg|degC|deg_?C|celsius|rpm|min|h|%|‰|psi|lbf|inch|in|mil|counts?|sec|volts?|a\.u\.|arb\. ?u\.)"
+    r"|°C|ºC|°F|°|º|deg|degC|deg_?C|celsius|rpm|min|h|d|%|‰|psi|lbf|inch|in|mil|counts?|volts?|a\.u\.|arb\. ?u\."
+    r"|[Dd]ays?|[Hh]ours?|hr|[Mm]inutes?|[Ss]ec(?:ond)?s?|msec|Am|emu)"
 )
 _FACTOR = rf"{_SYMBOL}(?:\^?[-−]?[1-9]|[²³]|⁻[¹²³])?"
 _UNIT = rf"(?:1|{_FACTOR})(?:\s?[/*·⋅.]\s?\(?{_FACTOR}\)?|\s{_FACTOR})*|1|-"
-_SPELLINGS = {"degC": "°C", "deg_C": "°C", "ºC": "°C", "celsius": "°C", "º": "°", "sec": "s"}
+_SPELLINGS = {
+    "degC": "°C", "deg_C": "°C", "ºC": "°C", "celsius": "°C", "º": "°", "us": "µs", "msec": "ms", "hr": "h",
+    **dict.fromkeys(("sec", "secs", "second", "seconds"), "s"),
+    **dict.fromkeys(("minute", "minutes"), "min"), **dict.fromkeys(("hour", "hours"), "h"),
+    **dict.fromkeys(("day", "days"), "d"),
+}  # fmt: skip
 
-SECONDS = {"": 1.0, "s": 1.0, "ms": 1e-3, "µs": 1e-6, "μs": 1e-6, "us": 1e-6, "ns": 1e-9, "min": 60.0, "h": 3600.0}
+SECONDS = {"d": 86400.0, "h": 3600.0, "min": 60.0, "s": 1.0, "ms": 1e-3, "µs": 1e-6, "ns": 1e-9}
 """Seconds in each unit that a column of times may have."""
+
+_TIME_HEAD = re.compile(r"(t|\w*time|elapsed|timestamp)[_ ](d|days?|h|hours?|min|s|secs?|ms|us|µs|ns)", re.IGNORECASE)
+"""Head of a column of times whose unit stands behind its name."""
+
+_PER = re.compile(r"(.+?)[ _]([A-Za-zµ]+_per_[A-Za-z0-9]+)")
+"""A head whose unit is spelled out."""
+
+_ADDED = re.compile(r"\s*[(\[][^()\[\]]*[)\]]$")
+"""Brackets behind the name of a column, with a unit that is known or not."""
 
 
 class NoColumnError(DataError):
@@ -68,13 +83,16 @@ def split_unit(head: str) -> tuple[str, str]:
         unit = rest[:-1].strip()
         if (opening == "[" and name.endswith(" ")) or is_unit(unit):
             # As in U / (V).
-            return name.rstrip().removesuffix(" /").rstrip(), _spelled(unit)
+            return name.rstrip().removesuffix(" /").rstrip(), spelled(unit)
     for place in (match.start() for match in re.finditer("/", head)):
         name, unit = head[:place].rstrip(), head[place + 1 :].strip()
         # In `speed m/s` the part before the solidus is a unit too.
         words = name.split()
         if words and is_unit(unit) and (len(words) == 1 or not is_unit(words[-1])):
-            return name, _spelled(unit)
+            return name, spelled(unit)
+    if per := _PER.fullmatch(head):
+        unit = per[2].replace("_per_", "/")
+        return (per[1], spelled(unit)) if is_unit(unit) else (head, "")
     return head, ""
 
 
@@ -99,9 +117,15 @@ def make_heads(texts: Sequence[str], units: Sequence[str] = ()) -> tuple[Head, .
         and any(len(unit) > 1 for _, _, unit in ends)
     ):
         return tuple(
-            Head(head.text, head.text.rpartition("_")[0], _spelled(head.text.rpartition("_")[2])) for head in heads
+            Head(head.text, head.text.rpartition("_")[0], spelled(head.text.rpartition("_")[2])) for head in heads
         )
-    return heads
+    return tuple(_of_time(head) for head in heads)
+
+
+def _of_time(head: Head) -> Head:
+    """Return the head of a column of times with the unit behind its name."""
+    match = None if head.unit else _TIME_HEAD.fullmatch(head.text)
+    return head if match is None else Head(head.text, match[1], spelled(match[2].lower()))
 
 
 def bare_unit(text: str) -> str:
@@ -109,7 +133,7 @@ def bare_unit(text: str) -> str:
     text = text.strip()
     if text[:1] + text[-1:] in ("[]", "()"):
         text = text[1:-1].strip()
-    return "" if text in ("-", "") else _spelled(text)
+    return "" if text in ("-", "") else spelled(text)
 
 
 def find_place(path: Path, heads: Sequence[Head], columns: int, name: str) -> int:
@@ -134,8 +158,13 @@ def find_place(path: Path, heads: Sequence[Head], columns: int, name: str) -> in
         If there are several.
     """
     wanted = _folded(name.strip())
-    exact = [i for i, head in enumerate(heads) if _folded(head.text) == wanted]
-    places = exact or [i for i, head in enumerate(heads) if _folded(head.name) == wanted]
+    texts = [_folded(head.text) for head in heads]
+    places = [i for i, text in enumerate(texts) if text == wanted]
+    places = places or [i for i, head in enumerate(heads) if _folded(head.name) == wanted]
+    if not places:
+        # A unit that is not known as one; the last part of `S.part`.
+        loose = [i for i, text in enumerate(texts) if wanted in (*_without_unit(text), text.rpartition(".")[2])]
+        places = loose if len(loose) == 1 else []
     if len(places) == 1:
         return places[0]
     if len(places) > 1:
@@ -161,16 +190,22 @@ def with_times(
     for name in times:
         with suppress(DataError):
             place = find(name)
-            if (heads[place].unit if place < len(heads) else "") in SECONDS:
+            if (heads[place].unit if place < len(heads) else "") in ("", *SECONDS):
                 return [*names, name]
     return list(names)
 
 
-def _spelled(unit: str) -> str:
+def spelled(unit: str) -> str:
+    """Return a unit as it is spelled here."""
     unit = unit.replace("μ", "µ").replace("Ω", "Ω")
-    unit = _SPELLINGS.get(unit, unit)
+    unit = _SPELLINGS.get(unit, _SPELLINGS.get(unit.lower(), unit))
     # An instrument that has no µ writes u.
     return re.sub(r"\bu(?=(?:m|A|V|s|N|W|F|H|strain)\b)", "µ", unit)
+
+
+def _without_unit(text: str) -> tuple[str, ...]:
+    name, _, last = text.rpartition(" ")
+    return (_ADDED.sub("", text), *((name.rstrip(),) if is_unit(last) else ()))
 
 
 def _folded(text: str) -> str:

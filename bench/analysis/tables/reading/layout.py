@@ -39,11 +39,16 @@ NUMBER = {
 D_EXPONENTS = "exponents with D"
 """Note of such numbers."""
 
+_MOST_LINES_OF_HEADS = 4
+
 _TIME = re.compile(r"\d+[-./:]\d")
 """Begins a date or a time of day."""
 
-_MUCH_LONGER = 5
-"""Factor of rows by which a table is told from names and values above it."""
+MUCH_LONGER = 5
+"""Factor of rows by which a table is told from names and values above it, and from short ones beside it."""
+
+_MOSTLY = 0.8
+"""Share of cells that are numbers in a layout that is preferred to one with more cells, of which fewer are."""
 
 _DELIMITERS = {
     "\t": "tab-separated",
@@ -194,11 +199,11 @@ def find_layout(path: Path, lines: Sequence[str], options: ReadingOptions, first
     DataError
         If the lines can be read in several ways: names the option that decides.
     """
-    found: list[tuple[tuple[int, int, float], Layout]] = []
+    found: list[tuple[tuple[int, bool, int, float], Layout]] = []
     for delimiter in [options.delimiter] if options.delimiter else list(_DELIMITERS):
         assert delimiter is not None
         rows = list(split_rows(lines, delimiter, first))
-        signs: list[tuple[tuple[int, int, float], Layout]] = []
+        signs: list[tuple[tuple[int, bool, int, float], Layout]] = []
         for decimal in [options.decimal] if options.decimal else [".", ","]:
             assert decimal is not None
             header = find_header(rows, decimal, delimiter, in_order=options.table is not None)
@@ -217,9 +222,10 @@ def find_layout(path: Path, lines: Sequence[str], options: ReadingOptions, first
                 delimiter, decimal, header.start, header.heads, header.columns, notes,
                 header.numbers, header.figures, comments,
             )  # fmt: skip
-            signs.append(((header.fit, len(numbers), len(numbers) / len(filled)), layout))
+            share = len(numbers) / len(filled)
+            signs.append(((header.fit, share >= _MOSTLY, len(numbers), share), layout))
         # The decimal sign is the one with which more are numbers, whether or not a header fits.
-        found += sorted(signs, key=lambda entry: -entry[0][1])[:1]
+        found += sorted(signs, key=lambda entry: -entry[0][2])[:1]
     if not found:
         return None
     # Of equals the first: the point before the comma, the stronger delimiter before the weaker.
@@ -235,6 +241,13 @@ def find_layout(path: Path, lines: Sequence[str], options: ReadingOptions, first
             raise DataError(
                 f"{path}: line {cells[0].line}: a comma may stand between columns or be the decimal sign: say "
                 "--delimiter comma, or --decimal comma; where it is both, save the file with another delimiter"
+            )
+    for head in layout.heads:
+        bare = "".join(sign for sign in head.text if sign in "0123456789.,")
+        if bare != head.text and not any(map(str.isalpha, head.text)) and re.fullmatch(r"\d+[.,]\d+", bare):
+            raise DataError(
+                f"{path}: line {layout.start}: {head.text!r} is neither a number nor the head of a column: correct "
+                "it in the file, or leave the line out with --skip-lines"
             )
     return layout
 
@@ -302,11 +315,35 @@ def _find_heads(
         # Numbers with the other decimal sign.
         return Header(start, (), columns, 0, ())
     heads = _matched(texts, columns, delimiter)
+    if len(heads) == 1 < columns and (aligned := _aligned(rows[:begin], columns)):
+        return Header(start, make_heads(aligned), columns, 2, ("heads aligned by blanks",))
     if len(heads) == 1 < columns and begin > 1:
         # A title.
         return Header(start, (), columns, 1, ())
     fit = 2 if len(heads) == columns or (len(heads) > columns and delimiter != " ") else 0
     return Header(start, make_heads(heads, units) if fit else (), columns, fit, tuple(notes))
+
+
+def _aligned(above: Sequence[Row], columns: int) -> list[str]:
+    """Return the heads in the last lines above data, which blanks align; none if they are not as many as columns."""
+    best: list[str] = []
+    spans: list[list[tuple[int, int, str]]] = []
+    for row in reversed(above[-_MOST_LINES_OF_HEADS:]):
+        if len(row.cells) > 1:
+            break
+        found = [(*match.span(), match[0]) for match in re.finditer(r"\S+(?: \S+)*", row.cells[0])]
+        # From the top, so that `Adjusted` stands before `Field` below it.
+        spans = [[each] for each in found] + spans
+        merged: list[list[tuple[int, int, str]]] = []
+        for group in sorted(spans, key=lambda group: group[0][0]):
+            if merged and group[0][0] < max(end for _, end, _ in merged[-1]):
+                merged[-1] += group
+            else:
+                merged.append(list(group))
+        if len(merged) == columns:
+            order = [span for group in spans for span in group]
+            best = [" ".join(span[2] for span in sorted(group, key=order.index)) for group in merged]
+    return best
 
 
 @dataclass(frozen=True)
@@ -342,7 +379,7 @@ def _first_block(rows: Sequence[Row], masks: Sequence[Mask], *, in_order: bool) 
         for block in equals
         if in_order
         or block is longest
-        or block.length * _MUCH_LONGER > longest.length
+        or block.length * MUCH_LONGER > longest.length
         or not _names_and_values(rows, block)
     )
     return chosen.begin, chosen.pattern

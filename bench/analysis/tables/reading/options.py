@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import codecs
+import re
 from dataclasses import dataclass, fields
 from pathlib import Path
 
+from bench.analysis.tables.reading.heads import SECONDS, spelled
 from bench.base import ConfigurationError
 
 _DELIMITERS = {"comma": ",", "semicolon": ";", "tab": "\t", "\\t": "\t", "blank": " ", "blanks": " ", "space": " "}
 _DECIMALS = {"point": ".", "comma": ","}
+
+OF_TIMES = ("interval", "time_unit")
+"""Options that apply to every kind of file."""
+
+
+_INTERVAL = re.compile(r"(\d+\.?\d*(?:e[+-]?\d+)?)\s*([a-zµ]+)")
 
 
 @dataclass(frozen=True)
@@ -29,6 +37,10 @@ class ReadingOptions:
     table : str, optional
         Number of the table in a file of several, from 1; name of a sheet or of a MATLAB variable; of a run `steps` or
         `telemetry`.
+    interval : str, optional
+        Time between rows that are evenly sampled and have no column of times, such as `0.1s` or `50 ms`.
+    time_unit : str, optional
+        Unit of the column of times where its head has none: `d`, `h`, `min`, `s`, `ms`, `us` or `ns`.
 
     Raises
     ------
@@ -41,6 +53,8 @@ class ReadingOptions:
     encoding: str | None = None
     skip_lines: int = 0
     table: str | None = None
+    interval: str | None = None
+    time_unit: str | None = None
 
     def __post_init__(self) -> None:
         delimiter, decimal = self.delimiter, self.decimal
@@ -67,6 +81,20 @@ class ReadingOptions:
             raise ConfigurationError(f"--skip-lines {self.skip_lines}: expected a number of lines ≥ 0")
         if self.table is not None and (not self.table or self.table == "0"):
             raise ConfigurationError(f"--table {self.table!r}: expected a number from 1, or a name")
+        if self.time_unit is not None and spelled(self.time_unit) not in SECONDS:
+            raise ConfigurationError(f"--time-unit {self.time_unit!r}: expected d, h, min, s, ms, us or ns")
+        _ = self.seconds_between_rows
+
+    @property
+    def seconds_between_rows(self) -> float | None:
+        """Time between evenly sampled rows, s; None if it is not given."""
+        if self.interval is None:
+            return None
+        match = _INTERVAL.fullmatch(self.interval.strip())
+        unit = spelled(match[2]) if match else ""
+        if match is None or unit not in SECONDS or float(match[1]) <= 0.0:
+            raise ConfigurationError(f"--interval {self.interval!r}: expected a time > 0 with its unit, such as 0.1s")
+        return float(match[1]) * SECONDS[unit]
 
     def check_only(self, path: Path, kind: str, *allowed: str) -> None:
         """Check that no option is given beside those that a kind of file allows.

@@ -8,9 +8,8 @@ from bench.analysis.tables.reading.heads import NoColumnError
 from bench.analysis.tables.reading.layout import SAMPLE_LINES, Layout, is_comment, is_number
 from bench.analysis.tables.reading.options import ReadingOptions
 from bench.analysis.tables.reading.table import NO_ROW_LEFT_OUT, OTHER_COLUMN
-from bench.analysis.tables.reading.tables import table_starts
+from bench.analysis.tables.reading.tables import list_tables, walk_tables
 from bench.analysis.tables.reading.text import FALLBACK, TextFile
-from bench.base import DataError
 
 _LOOKED_AT = 5 * SAMPLE_LINES
 """Lines in which other tables are looked for."""
@@ -70,7 +69,7 @@ def cell_remedy(cell: str, layout: Layout, place: int, line: int, *, first: bool
 
 def missing_column(
     error: NoColumnError, name: str, file: TextFile, options: ReadingOptions, layout: Layout, lines: Sequence[str]
-) -> DataError:
+) -> NoColumnError:
     """Return the error of a column that a table does not have, with what may help.
 
     Parameters
@@ -93,7 +92,7 @@ def missing_column(
         _other_encoding(name, file, options, layout, lines),
         _other_lines(name, file, options, layout, lines),
     ]
-    return DataError("; ".join([str(error), *filter(None, remedies)]))
+    return NoColumnError("; ".join([str(error), *filter(None, remedies)]))
 
 
 def is_cut_off(lines: Sequence[str]) -> bool:
@@ -142,11 +141,11 @@ def _other_encoding(name: str, file: TextFile, options: ReadingOptions, layout: 
 
 def _other_lines(name: str, file: TextFile, options: ReadingOptions, layout: Layout, lines: Sequence[str]) -> str:
     """Return what helps if the table is not the one that is meant, or its header is not."""
-    number, tables = table_starts(file, options, _LOOKED_AT)
-    if number > 1:
+    tables = list(walk_tables(file, options, _LOOKED_AT))
+    if len(tables) > 1:
         return (
-            f"the file has {tables}: choose another one with --table, or leave out the lines above it with "
-            "--skip-lines"
+            f"the file has {list_tables(tables)}: choose another one with --table, or leave out the lines above it "
+            "with --skip-lines"
         )
     if not layout.numbers and is_cut_off(lines):
         return f"its first {len(lines)} lines have no numbers: leave out the lines above the table with --skip-lines"

@@ -1,113 +1,72 @@
-"""Columns of a spreadsheet (.xlsx)."""
+"""Columns of a spreadsheet (.xlsx, .xls, .xlsb, .ods): each sheet is read as a table of text."""
 
 from __future__ import annotations
 
-import zipfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
 from pathlib import Path
 
-import numpy as np
+from bench.analysis.tables.reading.layout import MUCH_LONGER
+from bench.analysis.tables.reading.library_files import load_contents
+from bench.analysis.tables.reading.options import OF_TIMES, ReadingOptions
+from bench.analysis.tables.reading.table import ReadColumns
+from bench.analysis.tables.reading.text import TextFile
+from bench.analysis.tables.reading.text_table import read_tables
+from bench.base import DataError
 
-from bench.analysis.tables.reading.heads import find_place, with_times
-from bench.analysis.tables.reading.layout import SAMPLE_LINES, Header, Row, count_lines, find_header
-from bench.analysis.tables.reading.moments import moment_in, since_first, with_moments
-from bench.analysis.tables.reading.options import ReadingOptions
-from bench.analysis.tables.reading.summary_rows import TextRows, text_note
-from bench.analysis.tables.reading.table import NO_ROW_LEFT_OUT, OTHER_COLUMN, ReadColumns, finite_number
-from bench.analysis.tables.reading.text import reading_errors
-from bench.base import DataError, needed_for
+_TABS = "tab-separated"
+
+
+@dataclass(frozen=True)
+class _Sheet(TextFile):
+    content: tuple[str, ...] = ()
+
+    def lines(self, start: int = 0, end: int | None = None) -> Iterator[str]:
+        return islice(self.content, start, end)
 
 
 def read_spreadsheet(
     path: Path, names: Sequence[str], options: ReadingOptions, times: Sequence[str] = ()
 ) -> ReadColumns:
-    """Read columns of a sheet: the only one, or the one that `options.table` names or numbers.
+    """Read columns of a sheet: the one long one, or the one that `options.table` names or numbers.
+
+    A table of a sheet of several is chosen by `SHEET:NUMBER`.
 
     Raises
     ------
     DataError
-        If the file cannot be read, a column is missing, or a cell is not a finite number: names sheet and row.
+        If the file cannot be read, a column is missing, or a cell is not a finite number: names sheet and line.
     ConfigurationError
-        If an option does not apply.
-    MissingExtraError
-        If the library for spreadsheets is not installed.
+        If an option does not apply, or the library for spreadsheets is not installed.
     """
-    options.check_only(path, "a spreadsheet", "table", "skip_lines")
-    with needed_for("reading a spreadsheet", "spreadsheet"):
-        import openpyxl
-        from openpyxl.utils.exceptions import InvalidFileException
-    with reading_errors(path), path.open("rb") as file:
-        try:
-            book = openpyxl.load_workbook(file, read_only=True, data_only=True)
-            sheets = {sheet.title: sheet for sheet in book.worksheets}
-            title = _choose(path, list(sheets), options.table)
-            rows = [
-                Row(number, ["" if cell is None else str(cell) for cell in cells])
-                for number, cells in enumerate(sheets[title].iter_rows(values_only=True), start=1)
-            ]
-        except (InvalidFileException, zipfile.BadZipFile, KeyError, ValueError, TypeError, SyntaxError) as error:
-            raise DataError(f"{path} cannot be read as a spreadsheet: {error}") from None
-        finally:
-            if "book" in locals():
-                book.close()
-    for row in rows:
-        while row.cells and not row.cells[-1].strip():
-            row.cells.pop()
-    rows = [row for row in rows if row.line > options.skip_lines and row.cells]
-    header = find_header(rows[:SAMPLE_LINES], ".")
-    if header is None:
-        raise DataError(f"{path}: sheet {title}: has no numbers")
-    names = with_times(names, times, header.heads, lambda name: find_place(path, header.heads, header.columns, name))
-    places = [find_place(path, header.heads, header.columns, name) for name in names]
-    values: list[list[float]] = [[] for _ in names]
-    body, remarks = _without_summary([row for row in rows if row.line > header.start], header, places)
-    moments = with_moments(body[0].cells, places) if body else frozenset()
-    for row in body:
-        remedy = f"; {NO_ROW_LEFT_OUT}: delete row {row.line} of the sheet, or put a number there"
-        for name, place, column in zip(names, places, values, strict=True):
-            said = remedy if place in header.numbers else OTHER_COLUMN
-            cell = row.cells[place].strip() if place < len(row.cells) else ""
-            where = f"{path}: sheet {title}, row {row.line}, column {name}"
-            column.append(moment_in(where, cell) if place in moments else finite_number(where, cell, remedy=said))
-    above = sum(row.line <= header.start for row in rows) - bool(header.heads) - len(header.notes)
-    notes = (
-        f"sheet {title}",
-        *([count_lines(above, "above the header")] if above > 0 else []),
-        *([] if header.heads else ["no header"]),
-        *header.notes,
-        *remarks,
+    options.check_only(path, "a spreadsheet", "table", "skip_lines", *OF_TIMES)
+    sheets, _ = load_contents(path, "spreadsheet")
+    title, table, chosen = _choose(path, sheets, options.table)
+    sheet = _Sheet(
+        Path(f"{path}: sheet {title}"), "utf-8", compressed=False, choice=f"{title}:", content=sheets[title]
     )
-    units = [header.heads[place].unit if place < len(header.heads) else "" for place in places]
-    arrays, units, since = since_first(
-        [np.array(column) for column in values], units, names, [place in moments for place in places]
-    )
-    return ReadColumns(names, arrays, units, (*notes, *since))
+    found = read_tables(sheet, names, replace(options, table=table, delimiter="\t", decimal="."), times)
+    notes = (note for note in found.notes if note not in (_TABS, "one column"))
+    return replace(found, notes=(f"sheet {title}{chosen}", *notes))
 
 
-def _without_summary(
-    rows: Sequence[Row], header: Header, places: Sequence[int]
-) -> tuple[Sequence[Row], Sequence[str]]:
-    """Return the rows without those of a summary at their end, and notes of rows with text."""
-    texts = TextRows(header.figures, ".", places)
-    for row in rows:
-        texts.add(row.line, row.cells)
-    summary = texts.close()
-    return (
-        [row for row in rows if not summary or row.line < summary[0]],
-        [
-            *text_note(texts.within, "row"),
-            *([f"{len(summary)} row{'s' * (len(summary) != 1)} below the table left out"] if summary else []),
-        ],
-    )
-
-
-def _choose(path: Path, titles: Sequence[str], table: str | None) -> str:
+def _choose(path: Path, sheets: Mapping[str, Sequence[str]], table: str | None) -> tuple[str, str | None, str]:
+    """Return the title of a sheet, the number of a table in it, and how the sheet was chosen, for people."""
+    titles = list(sheets)
+    widths = [max((len(row.split("\t")) for row in rows), default=0) for rows in sheets.values()]
+    sizes = zip(sheets.items(), widths, strict=True)
+    listed = ", ".join(f"{title} ({len(rows)} × {width})" for (title, rows), width in sizes)
     if table is None:
-        if len(titles) != 1:
-            raise DataError(f"{path}: has {len(titles)} sheets: {', '.join(titles)}; choose one with --table")
-        return titles[0]
-    if table in titles:
-        return table
-    if table.isdecimal() and int(table) <= len(titles):
-        return titles[int(table) - 1]
-    raise DataError(f"{path}: --table {table}: there is no such sheet; it has: {', '.join(titles)}")
+        longest = max(titles, key=lambda title: len(sheets[title]), default="")
+        others = [len(rows) for title, rows in sheets.items() if title != longest]
+        if not titles or MUCH_LONGER * max(others, default=0) > len(sheets[longest]):
+            raise DataError(f"{path}: has {len(titles)} sheets: {listed}; choose one with --table")
+        return longest, None, f", the longest of {len(titles)}" if others else ""
+    sheet, _, last = table.rpartition(":")
+    for name, number in ((table, None), (sheet, last)):
+        if name in titles:
+            return name, number, ""
+        if name.isdecimal() and int(name) <= len(titles):
+            return titles[int(name) - 1], number, ""
+    raise DataError(f"{path}: --table {table}: there is no such sheet; it has: {listed}")

@@ -76,10 +76,10 @@ class TextRows:
         return []
 
 
-def text_note(lines: Sequence[int], what: str = "line") -> list[str]:
+def text_note(lines: Sequence[int]) -> list[str]:
     """Return a note of lines within a table that have a label; none without any."""
     if not lines:
         return []
     if len(lines) == 1:
-        return [f"text in a column of numbers in {what} {lines[0]}"]
-    return [f"text in columns of numbers in {len(lines)} {what}s, first in {what} {lines[0]}"]
+        return [f"text in a column of numbers in line {lines[0]}"]
+    return [f"text in columns of numbers in {len(lines)} lines, first in line {lines[0]}"]

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator
+import re
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 from bench.analysis.tables.reading.layout import (
+    MUCH_LONGER,
     SAMPLE_CHARACTERS,
     SAMPLE_LINES,
     Layout,
@@ -20,8 +22,11 @@ from bench.analysis.tables.reading.summary_rows import TextRows
 from bench.analysis.tables.reading.text import TextFile
 from bench.base import DataError
 
-_MOST_TABLES = 9
-"""Tables that a message lists."""
+_NAME_AND_VALUE = re.compile(r"\s*[^\W\d][^:=\t,;]*[:=]\s*\S.*")
+"""A line such as `PMax: 19.8`."""
+
+_MOST_LINES_BELOW = 20
+"""Names and values below a table, of which no more are no table."""
 
 
 @dataclass(frozen=True)
@@ -36,11 +41,22 @@ class Ending:
         Number of lines up to what follows the rows of a summary.
     within : tuple of int
         Lines of the table that have a text in a column of numbers.
+    rows : int
+        Number of rows.
     """
 
     end: int | None
     rest: int
     within: tuple[int, ...]
+    rows: int
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table: its layout and its end."""
+
+    layout: Layout
+    ending: Ending
 
 
 def read_sample(file: TextFile, start: int) -> list[str]:
@@ -57,14 +73,30 @@ def read_sample(file: TextFile, start: int) -> list[str]:
     return lines
 
 
-def walk_tables(file: TextFile, options: ReadingOptions, most: int | None = None) -> Iterator[Layout]:
-    """Yield the layouts of the tables, as `--table` counts them; those in the first `most` lines, if given."""
+def walk_tables(file: TextFile, options: ReadingOptions, most: int | None = None) -> Iterator[Table]:
+    """Yield the tables, as `--table` counts them; those in the first `most` lines, if given."""
     options = replace(options, table=options.table or "1")
     layout = find_layout(file.path, read_sample(file, options.skip_lines), options, options.skip_lines)
     while layout is not None:
-        yield layout
         ending = find_end(file, layout, most=most)
+        yield Table(layout, ending)
         layout = None if ending.end is None else _next_layout(file, options, layout, ending.rest)
+
+
+def choose_tables(tables: Sequence[Table]) -> tuple[list[Table], str] | None:
+    """Return the tables that are meant where none was chosen, and a note; None if that is not clear.
+
+    They are the one long table among short ones, with those of equal heads, which are segments of one record.
+    """
+    longest = max(tables, key=lambda table: table.ending.rows)
+    heads = longest.layout.heads
+    equal = [table for table in tables if table is longest or (heads and table.layout.heads == heads)]
+    short = [table for table in tables if table not in equal]
+    if any(table.ending.rows * MUCH_LONGER > longest.ending.rows for table in short):
+        return None
+    if len(equal) > 1:
+        return equal, f"{len(equal)} of {len(tables)} tables, with equal heads, joined in order"
+    return equal, f"the longest of {len(tables)} tables"
 
 
 def find_end(file: TextFile, layout: Layout, asked: Collection[int] = (), most: int | None = None) -> Ending:
@@ -87,29 +119,32 @@ def find_end(file: TextFile, layout: Layout, asked: Collection[int] = (), most: 
     """
     heads = [head.text for head in layout.heads]
     rows = TextRows(layout.figures, layout.decimal, asked)
-    blank, begun, number = 0, False, layout.start
-    apart: int | None = None
+    blank, begun, number, count = 0, False, layout.start, 0
+    apart: tuple[int, int] | None = None
     for number, line in enumerate(file.lines(layout.start, most), start=layout.start):
         if line.isspace():
             blank += 1
             continue
         if is_comment(line, layout.marks):
             if blank and begun:
-                return _ending(rows, number, apart)
+                return _ending(rows, number, apart, count)
             continue
         cells = next((row.cells for row in split_rows([line], layout.delimiter)), [])
         has_numbers = any(is_number(cell, layout.decimal) for cell in cells)
         if begun and cells and not has_numbers and _breaks(cells, blank, layout, heads):
-            return _ending(rows, number, apart)
+            return _ending(rows, number, apart, count)
         labelled = bool(cells) and rows.add(number + 1, cells)
         if begun and blank > 1 and apart is None:
             # A summary, or names and values above another table.
-            apart = number
+            apart = number, count
         if apart is not None and not labelled:
-            return Ending(apart, apart, tuple(rows.within))
+            break
+        count += bool(cells)
         begun = begun or has_numbers
         blank = 0
-    return _ending(rows, None, None, number + 1)
+    else:
+        return _ending(rows, None, None, count, number + 1)
+    return _ending(rows, None, apart, count)
 
 
 def _breaks(cells: list[str], blank: int, layout: Layout, heads: list[str]) -> bool:
@@ -119,51 +154,46 @@ def _breaks(cells: list[str], blank: int, layout: Layout, heads: list[str]) -> b
     return bool(blank) or len(cells) not in (layout.columns, len(heads)) or texts == heads[: len(texts)]
 
 
-def _ending(rows: TextRows, number: int | None, apart: int | None, lines: int = 0) -> Ending:
+def _ending(rows: TextRows, number: int | None, apart: tuple[int, int] | None, count: int, lines: int = 0) -> Ending:
     """Return the end before line `number`, from 0, or of the file, which has so many lines."""
     if apart is not None:
-        return Ending(apart, apart, tuple(rows.within))
+        return Ending(apart[0], apart[0], tuple(rows.within), apart[1])
     summary = rows.close()
     end = summary[0] - 1 if summary else number
-    return Ending(end, lines if number is None else number, tuple(rows.within))
+    return Ending(end, lines if number is None else number, tuple(rows.within), count - len(summary))
 
 
 def _next_layout(file: TextFile, options: ReadingOptions, layout: Layout, start: int) -> Layout | None:
     """Return the layout of the table behind another, preferably with its delimiter and decimal sign."""
-    like = replace(options, delimiter=layout.delimiter, decimal=layout.decimal)
     lines = read_sample(file, start)
-    return find_layout(file.path, lines, like, start) or find_layout(file.path, lines, options, start)
+    filled = [line for line in lines if not line.isspace()]
+    if len(filled) <= _MOST_LINES_BELOW and all(map(_NAME_AND_VALUE.fullmatch, map(str.rstrip, filled))):
+        return None
+    like = find_layout(file.path, lines, replace(options, delimiter=layout.delimiter, decimal=layout.decimal), start)
+    try:
+        other = find_layout(file.path, lines, options, start)
+    except DataError:
+        return like
+    found = [each for each in (like, other) if each is not None]
+    return min(found, key=lambda each: each.start, default=None)
 
 
-def note_rest(file: TextFile, options: ReadingOptions, layout: Layout, ending: Ending) -> tuple[str, ...]:
-    """Return a note of the lines behind a table.
-
-    Raises DataError if they are another table, and none was chosen.
-    """
+def note_rest(file: TextFile, options: ReadingOptions, layout: Layout, ending: Ending) -> tuple[str, ...] | None:
+    """Return a note of the lines behind a table; None if they are another table, and none was chosen."""
     if ending.end is None:
         return ()
     another = _next_layout(file, options, layout, ending.rest) is not None
     if another and options.table is None:
-        starts, many = table_starts(file, options)
-        raise DataError(f"{file.path}: has {many}; choose one with --table, 1 to {starts}")
+        return None
     lines = file.lines(ending.end, ending.rest if another else None)
     rest = sum(not line.isspace() and not is_comment(line, layout.marks) for line in lines)
     return (f"{count_lines(rest, 'below the table')} left out",) if rest else ()
 
 
-def table_starts(file: TextFile, options: ReadingOptions, most: int | None = None) -> tuple[int, str]:
-    """Return the number of tables, and for people also where they begin; see `walk_tables` for `most`."""
-    starts: list[int] = []
-    more = False
-    for layout in walk_tables(file, options, most):
-        more = len(starts) == _MOST_TABLES
-        if more:
-            break
-        starts.append(layout.start + 1)
-    lines = ", ".join(map(str, starts))
-    return len(starts), f"{'at least ' * more}{count_tables(len(starts))}, whose data begin in the lines {lines}"
-
-
-def count_tables(number: int) -> str:
-    """Return a number of tables for people."""
-    return f"{number} table{'s' * (number != 1)}"
+def list_tables(tables: Sequence[Table]) -> str:
+    """Return the number of tables, and the place and size of each, for people."""
+    sizes = [
+        f"{number} from line {table.layout.start + 1} ({table.ending.rows} × {table.layout.columns})"
+        for number, table in enumerate(tables, start=1)
+    ]
+    return f"{len(tables)} table{'s' * (len(tables) != 1)}, of rows × columns: {', '.join(sizes)}"

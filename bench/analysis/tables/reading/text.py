@@ -15,7 +15,7 @@ from typing import BinaryIO, cast
 
 from bench.base import DataError, say_share
 
-WHAT_IS_READ = "text, .gz of text, .mat, .xlsx and .parquet are read"
+WHAT_IS_READ = "text, .gz of text, .mat, .h5, .tdms, .parquet and spreadsheets are read"
 """Kinds of files, for messages."""
 
 FALLBACK = "cp1252"
@@ -41,11 +41,14 @@ class TextFile:
         As Python names it.
     compressed : bool
         Whether it is.
+    choice : str
+        What stands before the number of a table in `--table`.
     """
 
     path: Path
     encoding: str
     compressed: bool
+    choice: str = ""
 
     def lines(self, start: int = 0, end: int | None = None) -> Iterator[str]:
         """Yield lines from number `start` to before `end`, from 0; each ends in a line feed, the last perhaps not.

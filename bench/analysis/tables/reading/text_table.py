@@ -30,7 +30,15 @@ from bench.analysis.tables.reading.options import ReadingOptions
 from bench.analysis.tables.reading.remedies import cell_remedy, is_cut_off, missing_column
 from bench.analysis.tables.reading.summary_rows import is_label, text_note
 from bench.analysis.tables.reading.table import ReadColumns, finite_number
-from bench.analysis.tables.reading.tables import Ending, count_tables, find_end, note_rest, read_sample, walk_tables
+from bench.analysis.tables.reading.tables import (
+    Ending,
+    choose_tables,
+    find_end,
+    list_tables,
+    note_rest,
+    read_sample,
+    walk_tables,
+)
 from bench.analysis.tables.reading.text import TextFile, open_text
 from bench.base import ConfigurationError, DataError
 
@@ -44,6 +52,10 @@ _D_EXPONENT = re.compile(r"(\d*\.\d*)[dD](?=[+-]?\d)")
 
 class _BreakError(Exception):
     """Lines that may not be of the table."""
+
+
+class _SeveralError(Exception):
+    """Another table follows."""
 
 
 def read_text(path: Path, names: Sequence[str], options: ReadingOptions, times: Sequence[str] = ()) -> ReadColumns:
@@ -70,25 +82,85 @@ def read_text(path: Path, names: Sequence[str], options: ReadingOptions, times: 
     if options.table is not None and not options.table.isdecimal():
         raise ConfigurationError(f"--table {options.table!r}: the tables of a text file have numbers, from 1")
     file = open_text(path, options.encoding)
+    check_format(path, read_sample(file, options.skip_lines))
     try:
-        return _read(file, names, options, times)
+        return read_tables(file, names, options, times)
     except csv.Error as error:
         raise DataError(f"{path} cannot be read as a table: {error}") from None
 
 
-def _read(file: TextFile, names: Sequence[str], options: ReadingOptions, times: Sequence[str]) -> ReadColumns:
+def read_tables(file: TextFile, names: Sequence[str], options: ReadingOptions, times: Sequence[str]) -> ReadColumns:
+    """Read columns of the table that is meant, or of those of equal heads, joined; see `read_text`."""
     lines = read_sample(file, options.skip_lines)
-    check_format(file.path, lines)
-    layout = _choose(file, options, lines)
+    layout = _find_table(file, options, lines)
+    try:
+        return _read_table(file, layout, names, options, times, lines)
+    except (NoColumnError, _SeveralError) as error:
+        tables = list(walk_tables(file, options)) if options.table is None else []
+        chosen = choose_tables(tables) if tables else None
+        if chosen is None and isinstance(error, _SeveralError):
+            raise DataError(
+                f"{file.path}: has {list_tables(tables)}; choose one with --table, {file.choice}1 to "
+                f"{file.choice}{len(tables)}"
+            ) from None
+        if chosen is None or (isinstance(error, NoColumnError) and chosen[0][0].layout == layout):
+            raise
+    parts = [_read_table(file, table.layout, names, options, times, lines, table.ending) for table in chosen[0]]
+    first, values = parts[0], zip(*(part.values for part in parts), strict=True)
+    notes = (*first.notes, chosen[1]) if len(tables) > 1 else first.notes
+    return ReadColumns(first.names, [np.concatenate(column) for column in values], first.units, notes)
+
+
+def _find_table(file: TextFile, options: ReadingOptions, lines: Sequence[str]) -> Layout:
+    """Return the layout of the table that is chosen, or of the first.
+
+    Raises DataError if there is no such table.
+    """
+    start = options.skip_lines
+    if options.table is None:
+        layout = find_layout(file.path, lines, options, start)
+    else:
+        tables = list(itertools.islice(walk_tables(file, options), int(options.table)))
+        if len(tables) < int(options.table) > 1:
+            raise DataError(f"{file.path}: --table {int(options.table)}: it has {list_tables(tables)}")
+        layout = tables[-1].layout if tables else None
+    layout = layout or header_only(lines, options, start)
+    if layout is None and is_cut_off(lines):
+        raise DataError(
+            f"{file.path}: has neither a header nor numbers in {len(lines)} lines from line {start + 1}; leave out "
+            "the lines above the table with --skip-lines"
+        )
+    if layout is None:
+        raise DataError(f"{file.path}: is empty; expected a header line with column names, or numbers")
+    return layout
+
+
+def _read_table(
+    file: TextFile,
+    layout: Layout,
+    names: Sequence[str],
+    options: ReadingOptions,
+    times: Sequence[str],
+    lines: Sequence[str],
+    ending: Ending | None = None,
+) -> ReadColumns:
+    """Read columns of a table, of which the end may be known.
+
+    Raises _SeveralError if it is not, other tables follow and none was chosen.
+    """
     names = with_times(names, times, layout.heads, lambda name: _place(file, layout, name))
     places = _find_places(file, names, options, layout, lines)
     body = _Body(file, layout, names, places)
-    after: tuple[str, ...] = ()
+    body.ending = ending
+    after: tuple[str, ...] | None = ()
     try:
         values = body.at_once()
     except (_BreakError, DataError, ValueError):
-        body.ending = find_end(file, layout, places)
-        after = note_rest(file, options, layout, body.ending)
+        if ending is None:
+            body.ending = find_end(file, layout, places)
+            after = note_rest(file, options, layout, body.ending)
+            if after is None:
+                raise _SeveralError from None
         try:
             values = body.at_once()
         except (_BreakError, DataError, ValueError):
@@ -104,35 +176,11 @@ def _read(file: TextFile, names: Sequence[str], options: ReadingOptions, times: 
         *layout.notes,
         *([count_lines(comments, "of comment")] if comments else []),
         *(text_note(body.ending.within) if body.ending else []),
-        *after,
+        *(after or ()),
     )
     units = [layout.heads[place].unit if place < len(layout.heads) else "" for place in places]
     values, units, remarks = since_first(values, units, names, [place in body.moments for place in places])
     return ReadColumns(names, values, units, (*notes, *remarks))
-
-
-def _choose(file: TextFile, options: ReadingOptions, lines: Sequence[str]) -> Layout:
-    """Return the layout of the table that is chosen.
-
-    Raises DataError if there is no such table.
-    """
-    start, table = options.skip_lines, int(options.table or 1)
-    if options.table is None:
-        layout = find_layout(file.path, lines, options, start)
-    else:
-        layouts = list(itertools.islice(walk_tables(file, options), table))
-        if len(layouts) < table > 1:
-            raise DataError(f"{file.path}: --table {table}: it has {count_tables(max(len(layouts), 1))}")
-        layout = layouts[-1] if layouts else None
-    layout = layout or header_only(lines, options, start)
-    if layout is None and is_cut_off(lines):
-        raise DataError(
-            f"{file.path}: has neither a header nor numbers in {len(lines)} lines from line {start + 1}; leave out "
-            "the lines above the table with --skip-lines"
-        )
-    if layout is None:
-        raise DataError(f"{file.path}: is empty; expected a header line with column names, or numbers")
-    return layout
 
 
 def _find_places(

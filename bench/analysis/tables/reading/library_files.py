@@ -1,0 +1,213 @@
+"""Contents of files that libraries read: in a process of its own, which a damaged file may end.
+
+Run as a module with the name of a file it writes the contents, pickled, to its standard output.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import re
+import subprocess
+import sys
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from bench.analysis.tables.reading.text import reading_errors
+from bench.base import ConfigurationError, DataError, Extra, MissingExtraError, check_extra, needed_for
+
+HDF5 = b"\x89HDF"
+
+SECONDS, SECONDS_PER_BYTE = 120.0, 1e-6
+"""Time limit. Derivation: a hundred times what it takes on an idle machine."""
+
+_KINDS: dict[str, tuple[str, str, Extra]] = {
+    "MATLAB": ("a MATLAB file", "scipy", "files"),
+    "HDF5": ("an HDF5 file", "h5py", "files"),
+    "TDMS": ("a TDMS file", "nptdms", "files"),
+    "Parquet": ("a parquet file", "pyarrow", "report"),
+    "spreadsheet": ("a spreadsheet", "python_calamine", "files"),
+}
+"""By kind its words, the library that reads it, and the extra of that."""
+
+_LEFT_OUT = "tables and strings of MATLAB left out, which pip install 'actuator-bench[files]' reads"
+
+
+def load_contents(path: Path, kind: str) -> tuple[Any, tuple[str, ...]]:
+    """Return the contents of a file, and what was assumed.
+
+    Parameters
+    ----------
+    path : Path
+        The file.
+    kind : str
+        `MATLAB`, `HDF5`, `TDMS` or `Parquet`: arrays by name, in mappings where they are grouped, with the unit at
+        the end of a name. `spreadsheet`: lines of cells with tabs between them, by sheet.
+
+    Raises
+    ------
+    DataError
+        If the file cannot be read, ends the process that reads it, or takes too long.
+    MissingExtraError
+        If a library is not installed.
+    """
+    words, library, extra = _KINDS[kind]
+    check_extra(f"reading {words}", library, extra)
+    with reading_errors(path), path.open("rb") as file:
+        limit = SECONDS + SECONDS_PER_BYTE * os.fstat(file.fileno()).st_size
+    try:
+        done = subprocess.run(  # noqa: S603 - our own module
+            [sys.executable, "-W", "ignore", "-m", __name__, kind, str(path)],
+            stdin=subprocess.DEVNULL,
+            capture_output=True,
+            timeout=limit,
+            check=False,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+        )
+        ended = f"the process that read it ended with code {done.returncode}" if done.returncode else ""
+    except subprocess.TimeoutExpired:
+        ended = f"it takes longer than {limit:.0f} s"
+    if ended:
+        raise DataError(f"{path} cannot be read as {words}: {ended}; it may be damaged: save it again, or as CSV")
+    found, notes = pickle.loads(done.stdout)  # noqa: S301 - of our own process
+    if isinstance(found, (DataError, ConfigurationError)):
+        raise found
+    return found, notes
+
+
+def _load(kind: str, path: Path) -> tuple[Any, tuple[str, ...]]:
+    try:
+        with reading_errors(path):
+            found = _LOADERS[kind](path)
+    except (DataError, ConfigurationError) as error:
+        return error, ()
+    # A library that is written in Rust raises what is no Exception.
+    except BaseException as error:
+        return DataError(f"{path} cannot be read as {_KINDS[kind][0]}: {error}"), ()
+    if kind == "spreadsheet":
+        return found, ()
+    notes = (_LEFT_OUT,) if isinstance(found, dict) and found.pop(_LEFT_OUT, None) else ()
+    return _plain(found), notes
+
+
+def _plain(value: Any) -> Any:  # noqa: ANN401
+    """Return arrays of numbers or moments, in mappings; None for what has none."""
+    if hasattr(value, "columns") and hasattr(value, "to_numpy"):
+        value = {str(name): value[name].to_numpy() for name in value.columns}
+    if isinstance(value, Mapping):
+        parts = {str(name): _plain(part) for name, part in value.items()}
+        return {name: part for name, part in parts.items() if part is not None} or None
+    array = np.squeeze(np.asarray(value))
+    if array.dtype.names and array.size == 1:
+        return _plain({name: array[name].item() for name in array.dtype.names})
+    if array.dtype.names:
+        return _plain({name: array[name] for name in array.dtype.names})
+    if array.dtype.kind == "M":
+        return np.atleast_1d(array)
+    return np.atleast_1d(array).astype(np.float64) if array.dtype.kind in "fiub" and array.ndim <= 2 else None
+
+
+def _matlab(path: Path) -> Any:  # noqa: ANN401
+    from scipy.io import loadmat
+    from scipy.io.matlab import MatlabOpaque
+
+    start = path.read_bytes()[:512]
+    # MATLAB 7.3 writes HDF5 behind a head of its own.
+    if HDF5 in start or start[124:126] in (b"\x00\x02", b"\x02\x00"):
+        with needed_for("reading a MATLAB file of version 7.3", "files"):
+            import matio
+        return _of_user(matio.load_from_mat(str(path)))
+    found = loadmat(str(path))
+    if any(isinstance(value, MatlabOpaque) for value in found.values()):
+        try:
+            with needed_for("reading a table of MATLAB", "files"):
+                import matio
+            return _of_user(matio.load_from_mat(str(path)))
+        except MissingExtraError:
+            found = {name: value for name, value in found.items() if not isinstance(value, MatlabOpaque)}
+            return {**_of_user(found), _LEFT_OUT: True}
+    return _of_user(found)
+
+
+def _of_user(found: Mapping[str, Any]) -> dict[str, Any]:
+    return {name: value for name, value in found.items() if not name.startswith("__")}
+
+
+def _hdf5(path: Path) -> Any:  # noqa: ANN401
+    import h5py
+
+    def contents(group: Any) -> dict[str, Any]:  # noqa: ANN401
+        return {
+            _with_unit(name, part.attrs.get("unit", part.attrs.get("units"))): (
+                contents(part) if hasattr(part, "keys") else part[()]
+            )
+            for name, part in group.items()
+        }
+
+    with h5py.File(path, "r") as file:
+        return contents(file)
+
+
+def _tdms(path: Path) -> Any:  # noqa: ANN401
+    from nptdms import TdmsFile
+
+    found: dict[str, Any] = {}
+    for group in TdmsFile.read(path).groups():
+        channels = found.setdefault(group.name, {})
+        for channel in group.channels():
+            channels[_with_unit(channel.name, channel.properties.get("unit_string"))] = channel[:]
+            if channel.properties.get("wf_increment") and len(channel):
+                channels.setdefault("time [s]", channel.time_track())
+    return found
+
+
+def _parquet(path: Path) -> Any:  # noqa: ANN401
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    table = pq.ParquetFile(path, page_checksum_verification=True).read()
+    types, found = pa.types, dict[str, Any]()
+    for name, column in zip(table.column_names, table.columns, strict=True):
+        if types.is_timestamp(column.type):
+            found[name] = column.cast(pa.timestamp("us")).to_numpy()
+        elif (
+            pa.types.is_integer(column.type) or pa.types.is_floating(column.type) or pa.types.is_decimal(column.type)
+        ):
+            found[name] = column.cast(pa.float64()).to_numpy()
+    return found
+
+
+def _sheets(path: Path) -> dict[str, tuple[str, ...]]:
+    from python_calamine import CalamineWorkbook
+
+    with CalamineWorkbook.from_path(path) as book:
+        return {
+            title: tuple(
+                "\t".join(map(_cell, row)) + "\n"
+                for row in book.get_sheet_by_name(title).to_python(skip_empty_area=False)
+            )
+            for title in book.sheet_names
+        }
+
+
+def _cell(cell: object) -> str:
+    if isinstance(cell, float) and cell.is_integer() and abs(cell) < 2**53:
+        return str(int(cell))
+    return re.sub(r'[\s"]+', " ", str(cell))
+
+
+def _with_unit(name: str, unit: object) -> str:
+    text = unit.decode(errors="replace") if isinstance(unit, bytes) else unit
+    return f"{name} [{text}]" if isinstance(text, str) and text.strip() else name
+
+
+_LOADERS = {"MATLAB": _matlab, "HDF5": _hdf5, "TDMS": _tdms, "Parquet": _parquet, "spreadsheet": _sheets}
+
+
+if __name__ == "__main__":
+    # What a library prints must not stand among the contents.
+    output, sys.stdout = sys.stdout.buffer, sys.stderr
+    pickle.dump(_load(sys.argv[1], Path(sys.argv[2])), output, protocol=pickle.HIGHEST_PROTOCOL)
