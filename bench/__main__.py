@@ -3,11 +3,17 @@
 from __future__ import annotations
 
 import sys
+import warnings
 from typing import NoReturn
 
 
 def start() -> NoReturn:
     """Run the command of the command line."""
+    if not sys.warnoptions:
+        # Libraries warn with lines of their sources; what a user can act on is said by the bench. Worker processes
+        # get the same.
+        sys.warnoptions.append("ignore")
+        warnings.simplefilter("ignore")
     try:
         # Loading it takes a while.
         from bench.cli import main
