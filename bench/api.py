@@ -171,7 +171,7 @@ def identify(
     Parameters
     ----------
     source : RunFolder, str or Path
-        A run, or a table of measurements: text, .gz, .mat, .xlsx or .parquet.
+        A run, or a table of measurements: text, .gz, .mat, .h5, .tdms, .parquet or a spreadsheet.
     model : str
         Name of a registered model.
     input, output : str, optional
@@ -180,7 +180,8 @@ def identify(
     **options
         As in `bench.analysis.FitOptions`: `smoothing`, `skip`, `cross_validated`, `initial`, `orientation`, and the
         options of the model; `time_column` for a model with time and `weights_column`; and those of `ReadingOptions`
-        where the layout of a file is not found from it: `delimiter`, `decimal`, `encoding`, `skip_lines`, `table`.
+        where the layout of a file is not found from it: `delimiter`, `decimal`, `encoding`, `skip_lines`, `table`,
+        `interval`, `time_unit`.
 
     Raises
     ------

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.analysis import FOLLOW, ColumnNames, read_dataset
+from bench.analysis import FOLLOW, ColumnNames, read_columns, read_dataset
 from bench.control import (
     ControllerSetup,
     FollowReference,
@@ -140,6 +140,12 @@ def _reference(parameters: Parameters, unit: str) -> tuple[np.ndarray, np.ndarra
         return times, modulated_sine(
             times + 0.75 * parameters.period, parameters.low, parameters.high, parameters.period
         )
+    columns = read_columns(Path(parameters.reference), ["time", "reference"], at_least=3)
+    steps = np.diff(columns.values["time"])
+    if np.any(steps <= 0):
+        row = int(np.argmax(steps <= 0)) + 2
+        raise ValueError(f"{parameters.reference}: row {row}, column time: times must increase")
+    # In s, whatever the unit of the file.
     rows = read_dataset([Path(parameters.reference)], ColumnNames("reference", time="time"), at_least=3)
     assert rows.times is not None
     return rows.times - rows.times[0], rows.inputs

@@ -34,7 +34,7 @@ def compare_(
         typer.Option(
             "--data",
             metavar="FILE",
-            help="For models: table of measurements (text, .gz, .mat, .xlsx, .parquet), or the folder of a run.",
+            help="For models: table of measurements (text, .mat, .xlsx, .h5, .tdms, .parquet), or folder of a run.",
         ),
     ] = None,
     input_column: Annotated[

@@ -34,11 +34,13 @@ def _layout(
     ] = None,
     interval: Annotated[
         str | None,
-        typer.Option(metavar="TIME", help="Time between evenly sampled rows without a column of times: 0.1s, 50ms."),
+        typer.Option(metavar="TIME", help="Rows are this far apart, and no column has times: 0.1s, 50ms."),
     ] = None,
     time_unit: Annotated[
         str | None,
-        typer.Option(metavar="UNIT", help="Unit of times whose head has none: d, h, min, s, ms, us or ns."),
+        typer.Option(
+            metavar="UNIT", help="Times have this unit, which their head does not say: d, h, min, s, ms, us or ns."
+        ),
     ] = None,
 ) -> ReadingOptions:
     """Return the options of the layout of a file; its signature is that of the options."""

@@ -18,10 +18,15 @@ app = typer.Typer()
 @offer_groups
 def import_(
     file: Annotated[
-        Path, typer.Argument(metavar="FILE", help="Table of measurements (text, .gz, .mat, .xlsx, .parquet).")
+        Path,
+        typer.Argument(metavar="FILE", help="Table of measurements (text, .mat, .xlsx, .h5, .tdms, .parquet)."),
     ],
-    input_column: Annotated[str, typer.Option("--input", metavar="COLUMN", help="Column of the input.")],
-    output_column: Annotated[str, typer.Option("--output", metavar="COLUMN", help="Column of the output.")],
+    input_column: Annotated[
+        str, typer.Option("--input", metavar="COLUMN", help="Column of the input, or FILE:COLUMN.")
+    ],
+    output_column: Annotated[
+        str, typer.Option("--output", metavar="COLUMN", help="Column of the output, or FILE:COLUMN.")
+    ],
     others: Annotated[
         list[str] | None, typer.Option("--column", metavar="COLUMN", help="A further column; repeatable.")
     ] = None,
@@ -40,7 +45,7 @@ def import_(
     """Make a run of a file of measurements of another program: each row becomes a reading.
 
     `bench report`, `bench identify`, `bench compare` and `bench export` then take its folder as that of any run. The
-    file is kept in the record. Without times, rows are 1 s apart; the time of day is that of the file.
+    file is kept in the record. Without times or --interval, rows are 1 s apart; the time of day is that of the file.
     """
     from bench.analysis import import_file
 

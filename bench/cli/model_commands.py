@@ -42,7 +42,8 @@ app = typer.Typer()
 DataArgument = Annotated[
     Path,
     typer.Argument(
-        metavar="FILE", help="Table of measurements (text, .gz, .mat, .xlsx, .parquet), or the folder of a run."
+        metavar="FILE",
+        help="Table of measurements (text, .mat, .xlsx, .h5, .tdms, .parquet), or the folder of a run.",
     ),
 ]
 ModelArgument = Annotated[Path, typer.Argument(metavar="model.json", help="A model file.")]
@@ -77,8 +78,15 @@ TimeColumn = Annotated[
 class Fitting:
     """What `bench identify` fits, and how: its options."""
 
-    input_column: Annotated[str, typer.Option("--input", metavar="COLUMN", help="Input column.")]
-    output_column: Annotated[str, typer.Option("--output", metavar="COLUMN", help="Output column.")]
+    input_column: Annotated[
+        str,
+        typer.Option(
+            "--input",
+            metavar="COLUMN",
+            help="Input column. FILE:COLUMN is of a second file; A,B joins columns in order.",
+        ),
+    ]
+    output_column: Annotated[str, typer.Option("--output", metavar="COLUMN", help="Output column, as the input.")]
     model: Annotated[
         str,
         typer.Option(
@@ -201,7 +209,7 @@ def identify_(
         list[Path],
         typer.Argument(
             metavar="FILE...",
-            help="Tables of measurements (text, .gz, .mat, .xlsx, .parquet), or folders of runs; one model of all.",
+            help="Tables of measurements (text, .mat, .xlsx, .h5, .tdms, .parquet), or runs; one model of all.",
         ),
     ],
     fitting: Fitting,
@@ -365,7 +373,8 @@ class PolicyOption(Enum):
 def invert(
     model_path: ModelArgument,
     file: Annotated[
-        Path, typer.Argument(metavar="TARGETS.csv", help="Table of targets (text, .gz, .mat, .xlsx, .parquet).")
+        Path,
+        typer.Argument(metavar="TARGETS.csv", help="Table of targets (text, .mat, .xlsx, .h5, .tdms, .parquet)."),
     ],
     column: Annotated[str, typer.Option("--column", metavar="NAME", help="Column with the targets.")],
     out: Annotated[Path, typer.Option(metavar="FILE.csv", help="File for the set-points.")] = Path("setpoints.csv"),

@@ -47,12 +47,8 @@ def load_contents(path: Path, kind: str) -> tuple[Any, tuple[str, ...]]:
         `MATLAB`, `HDF5`, `TDMS` or `Parquet`: arrays by name, in mappings where they are grouped, with the unit at
         the end of a name. `spreadsheet`: lines of cells with tabs between them, by sheet.
 
-    Raises
-    ------
-    DataError
-        If the file cannot be read, ends the process that reads it, or takes too long.
-    MissingExtraError
-        If a library is not installed.
+    Raises DataError if the file cannot be read, ends the process that reads it, or takes too long; MissingExtraError
+    if a library is not installed.
     """
     words, library, extra = _KINDS[kind]
     check_extra(f"reading {words}", library, extra)
@@ -173,9 +169,7 @@ def _parquet(path: Path) -> Any:  # noqa: ANN401
     for name, column in zip(table.column_names, table.columns, strict=True):
         if types.is_timestamp(column.type):
             found[name] = column.cast(pa.timestamp("us")).to_numpy()
-        elif (
-            pa.types.is_integer(column.type) or pa.types.is_floating(column.type) or pa.types.is_decimal(column.type)
-        ):
+        elif any(is_kind(column.type) for is_kind in (types.is_integer, types.is_floating, types.is_decimal)):
             found[name] = column.cast(pa.float64()).to_numpy()
     return found
 

@@ -25,21 +25,7 @@ _SPELLED = " \t,;|.+-'\"_()[]{}<>"
 
 
 def cell_remedy(cell: str, layout: Layout, place: int, line: int, *, first: bool) -> str:
-    """Return what may help with a cell that is not a finite number.
-
-    Parameters
-    ----------
-    cell : str
-        The cell.
-    layout : Layout
-        That of its table.
-    place : int
-        Index of its column.
-    line : int
-        Its line.
-    first : bool
-        Whether no number stands above it.
-    """
+    """Return what may help with a cell that is not a finite number; `first` if no number stands above it."""
     if place not in layout.numbers and (not cell or is_number(cell, layout.decimal)):
         return OTHER_COLUMN
     if not cell or is_number(cell, layout.decimal):
@@ -70,23 +56,7 @@ def cell_remedy(cell: str, layout: Layout, place: int, line: int, *, first: bool
 def missing_column(
     error: NoColumnError, name: str, file: TextFile, options: ReadingOptions, layout: Layout, lines: Sequence[str]
 ) -> NoColumnError:
-    """Return the error of a column that a table does not have, with what may help.
-
-    Parameters
-    ----------
-    error : NoColumnError
-        The error.
-    name : str
-        The column.
-    file : TextFile
-        The file.
-    options : ReadingOptions
-        What is known of it.
-    layout : Layout
-        That of the table.
-    lines : sequence of str
-        The first lines that are not skipped.
-    """
+    """Return the error of a column that a table, whose first lines are given, does not have, with what may help."""
     remedies = [
         _other_delimiter(options, layout, lines),
         _other_encoding(name, file, options, layout, lines),

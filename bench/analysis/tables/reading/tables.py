@@ -106,16 +106,7 @@ def find_end(file: TextFile, layout: Layout, asked: Collection[int] = (), most: 
     header; before a comment after a blank line; before two blank lines; and before the rows of a summary, unless
     other rows follow.
 
-    Parameters
-    ----------
-    file : TextFile
-        The file.
-    layout : Layout
-        That of the table.
-    asked : collection of int
-        Indices of the columns that are asked for.
-    most : int, optional
-        Number of lines of the file that are looked at.
+    `asked` are the indices of the columns that are asked for; no more than `most` lines are looked at, if given.
     """
     heads = [head.text for head in layout.heads]
     rows = TextRows(layout.figures, layout.decimal, asked)

@@ -59,18 +59,7 @@ class _SeveralError(Exception):
 
 
 def read_text(path: Path, names: Sequence[str], options: ReadingOptions, times: Sequence[str] = ()) -> ReadColumns:
-    """Read columns of a text file.
-
-    Parameters
-    ----------
-    path : Path
-        The file, perhaps compressed by gzip.
-    names : sequence of str
-        Columns by head, head without its unit, or number from 1.
-    options : ReadingOptions
-        What is known of its layout.
-    times : sequence of str
-        The first of these columns that is there, with a unit of time or none, is read too.
+    """Read columns of a text file, perhaps compressed by gzip, and the first of `times` that is there.
 
     Raises
     ------
