@@ -60,7 +60,6 @@ LAYOUTS = {
     "unit row, and a number above": (
         "x-axis,1,2\ntime,U,y\ns,V,µm\n" + body(), "1 line above the header, units from a row", UNITS
     ),
-    "runs of blanks": (table("   "), "separated by blanks"),
     "aligned blanks": ("".join(f"  {line}  \n" for line in table("    ").splitlines()), "separated by blanks"),
     "comma and blank": (table(", "), "comma-separated"),
     "semicolon, decimal comma": (table(";", ","), "semicolon-separated, decimal comma"),
@@ -69,15 +68,9 @@ LAYOUTS = {
     "quoted": ('"time","U","y, mean"\n' + body(form='"{}"'), "comma-separated", {"names": ("U", "y, mean")}),
     "quoted, decimal comma": ('"time","U","y"\n' + body(",", ",", form='"{}"'), "comma-separated, decimal comma"),
     "byte-order mark": (table(heads=WITH_UNITS).encode("utf-8-sig"), "comma-separated", UNITS),
-    "latin-1": (table(";", ",", WITH_UNITS).encode("latin-1"), "cp1252", UNITS),
     "cp1252": (table("\t", heads=("t", "U [V]", "y [°C]")).encode("cp1252"), "cp1252", {"units": ("V", "°C")}),
     "UTF-16": (table("\t", ",", WITH_UNITS).encode("utf-16"), "UTF-16, tab-separated", UNITS),
-    "UTF-16 without a mark": (table(heads=WITH_UNITS).encode("utf-16-le"), "UTF-16-LE", UNITS),
-    "CRLF": (table().replace("\n", "\r\n"), ""),
-    "CR": (table().replace("\n", "\r"), ""),
     "number sign": ("# sample 3\n#2026\n" + table(), "2 lines of comment"),
-    "percent": ("% sample 3, 2 V\n" + table("\t"), "1 line of comment"),
-    "solidi": ("// sample 3\n\n" + table(";"), "1 line of comment"),
     "semicolons": ("; sample 3\n" + table(), "1 line of comment"),
     "comments between": (table().replace("\n0.1,", "\n# paused\n0.1,"), "1 line of comment"),
     "header in a comment": ("# sample 3\n# time U y\n" + body(" "), "header from a comment"),
