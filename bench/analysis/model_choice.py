@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from bench.analysis.model_service import FitOptions, IdentifiedFile
-from bench.analysis.tables.data import FEWEST_ROWS
+from bench.analysis.tables.data import FEWEST_ROWS, check_variation
 from bench.analysis.tables.dataset import Dataset, check_rows, overwritten_from, parse_rows
 from bench.analysis.tables.starting_state import bind_times, left_out
 from bench.base import ConfigurationError, DataError
@@ -192,7 +192,9 @@ def select_model(data: Dataset, models: Sequence[str], given: Given, options: Fi
         check_words(given.initial, given.orientation)
     except ValueError as error:
         raise ConfigurationError(f"--{error}") from None
-    inputs = data.inputs
+    inputs, output = data.inputs, data.output
+    assert output is not None
+    check_variation(data.source, output)
     fitted, _ = data.fitted_rows(options.train, options.skip)
     fitted[: options.skip] = False
     if fitted.sum() < FEWEST_ROWS:
@@ -204,8 +206,7 @@ def select_model(data: Dataset, models: Sequence[str], given: Given, options: Fi
         selection = select(measured, models, given)
     except ValueError as error:
         raise ConfigurationError(f"no model can be fitted: {error}") from None
-    assert data.output is not None
-    return SelectedModel(selection, data.output.unit)
+    return SelectedModel(selection, output.unit)
 
 
 def _check_options(models: Sequence[str], given: Given) -> None:

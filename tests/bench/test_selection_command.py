@@ -262,6 +262,14 @@ def test_wrong_options_are_named(bench, record, options, word):
     assert word in err
 
 
+def test_a_constant_output_is_refused_once(bench, tmp_path):
+    file = tmp_path / "constant.csv"
+    file.write_text("voltage [V],travel [mm]\n" + "".join(f"{row},1\n" for row in range(50)))
+    code, _, err = bench("identify", file, *COLUMNS)
+    assert code == 3
+    assert err.count("travel") == 1
+
+
 def test_a_second_file_in_another_unit_is_refused(bench, record, tmp_path):
     measure(tmp_path / "second.csv", unit="kV")
     code, _, err = bench("identify", record, tmp_path / "second.csv", *COLUMNS, *SOME)
