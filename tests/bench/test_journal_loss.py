@@ -320,8 +320,7 @@ class TestADiskThatTakesNothing:
 class TestRemovedAndDamaged:
     @pytest.mark.parametrize("how", ["folder", "file", "replaced"])
     @pytest.mark.parametrize("waits", [False, True], ids=["whole", "waiting"])
-    def test_one_that_is_gone_is_in_the_second_file(self, journal, tmp_path, other_disk, monkeypatch, how, waits):
-        monkeypatch.setattr(keeping, "_BETWEEN_TRIES", 0.0)
+    def test_one_that_is_gone_is_in_the_second_file(self, journal, tmp_path, other_disk, how, waits):
         count = add(journal, 5)
         if waits:
             with failing("database is locked"):
