@@ -37,6 +37,9 @@ DYNAMICS = ("lag", "creep", "drift", "viscous", "friction")
 TIE = 1.02
 """Ratio of two scores that is no difference. Source: a hundredth of the standard error of a score over five folds is
 smaller by an order; below it, the order of the table is chance."""
+_MOST_IN_TIME = 300
+"""Coefficients of an operator up to which a dynamic stage is tried. Source: a plane of 20 levels has 210, and takes a
+second for each element and 2000 rows; one of 40 levels has 820, and takes seven."""
 BOUNDED = 1.25
 """Ratio up to which a plane with signs wins on a record of one kind of cycle. Source: measured on major loops of
 three plants, whose plane errs at most 1.02 times as much as the best, and on two files, 1.09 and 1.12 times."""
@@ -208,7 +211,7 @@ class _Search:
 
     def dynamics(self, models: Sequence[str]) -> None:
         """Try the best of each model with dynamic elements, one after the other as long as the score falls."""
-        going = self._best(models) if self.measured.times is not None else []
+        going = self._best(models, _MOST_IN_TIME) if self.measured.times is not None else []
         while going:
             batches = []
             for best in going:
@@ -231,8 +234,9 @@ class _Search:
                 self._evaluate("the best once more", [[replace(one, shape=())] for one in others(best.candidate)])
 
     def _other_structures(self, best: Candidate) -> list[Candidate]:
+        most = _MOST_IN_TIME if best.dynamics else None
         made = [replace(best, options=options) for options in self.made[best.model]]
-        return [one for one in made if one != best]
+        return [one for one in made if one != best and self._has_at_most(one, most)]
 
     def _other_memories(self, best: Candidate) -> list[Candidate]:
         """Return a candidate from the initial memories with which it was not tried yet."""
@@ -285,11 +289,18 @@ class _Search:
             text += f" {percent:.2g} %"
         say_share(text, done / count)
 
-    def _best(self, models: Sequence[str]) -> list[Score]:
-        """Return the best candidate of each model that could be evaluated."""
+    def _has_at_most(self, candidate: Candidate, most: int | None) -> bool:
+        """Return whether a candidate has at most so many coefficients; any number if None."""
+        return (
+            most is None or self._template(find_model(candidate.model), candidate.options).coefficients.size <= most
+        )
+
+    def _best(self, models: Sequence[str], most: int | None = None) -> list[Score]:
+        """Return the best candidate of each model that could be evaluated, of so many coefficients at most."""
         found = []
+        usable = [score for score in self.scores if not score.failure and self._has_at_most(score.candidate, most)]
         for model in models:
-            scores = [score for score in self.scores if score.candidate.model == model and not score.failure]
+            scores = [score for score in usable if score.candidate.model == model]
             if scores:
                 found.append(min(scores, key=lambda score: score.error))
         return found

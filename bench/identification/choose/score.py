@@ -29,7 +29,7 @@ _KNOWN = 0.25
 # Part of the rows that may be left out of a fit for their memory. Source: most rows then remain.
 _SKIPPED = 0.5
 # Relative tolerance of shape parameters of a candidate. Source: far below the tie of two scores, 2 %.
-_SHAPE = 1e-5
+_SHAPE = 1e-3
 
 
 @dataclass(frozen=True)
