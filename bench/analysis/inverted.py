@@ -20,7 +20,7 @@ Floats = npt.NDArray[np.float64]
 # which two times are the same. Derivation: a million times the rounding of one number, less than any sensor tells.
 _TOLERANCE = _SAME_TIME = 1e-9
 # Part of the span of the set-points from which on their alternation is worth a warning. Derivation: half the moves
-# that count as noise of an input (`NOISE` of `bench.identification.validity`).
+# that count as noise of an input (`NOISE` of `bench.identification.branches`).
 _ALTERNATION = 1e-2
 
 

@@ -13,7 +13,7 @@ Derivation: a target may be aimed at twice, by a controller and by the one that 
 """
 
 _END = 0.25
-"""What counts as one end of the set-point's range, as a part of it.
+"""Part of the set-point's range that counts as one of its ends.
 
 Derivation: a swing of half of the range is no correction; the other half lies in equal parts at both ends.
 """

@@ -39,7 +39,7 @@ Source: the three-sigma rule (ISO 7870-2, control charts).
 
 @dataclass(frozen=True)
 class LatchParameters:
-    """What the latched controller knows of actuator, specimen and sensor; all its other numbers follow from that.
+    """The numbers of actuator, specimen and sensor from which all others of the latched controller follow.
 
     Each of these can stand in the rig file; what is not there comes from the model.
     """
@@ -302,7 +302,7 @@ class Latched(Correcting):
                 return reading
             if move < p.fine_moves:
                 setpoint = self._behind(setpoint + error / slope)
-        # Of an error beyond what the estimate may err by, the lock has been lost.
+        # The lock is lost when the error exceeds the uncertainty of the estimate.
         self.locked = abs(error) <= _RARE * locked.uncertainty
         return reading
 

@@ -54,14 +54,14 @@ WORST = GATE**2
 Derivation: then even a reading at the gate is no surprise.
 """
 _LATELY, _LOST = 20, 6
-"""Of so many readings, how many must have been refused for the adaptation to begin anew.
+"""Number of last readings, and of those refused among them that begin the adaptation anew.
 
 Derivation: a sensor that jumps in one reading of twenty has six of twenty refused with a probability of 3e-4.
 """
 _SHARE = 0.03
 """Weight of each reading in the growth of the variance. Derivation: 1 / 0.03 count, half of a session of 60."""
 _BETTER = 0.5
-"""What the error of the identified model in these must be less than, in errors of the adapted one.
+"""Ratio of the error of the identified model to that of the adapted one, below which it does so.
 
 Derivation: by chance the mean squares of six errors each differ by a factor of four in 6 % of cases (F test).
 """

@@ -246,7 +246,7 @@ class Supervised(_Supervision):
 class SupervisedFollower(_Supervision):
     """A follower that is given up by the rules: a `Follower`.
 
-    Of a reference that moves, a stretch in which the specimen forgets an error counts as one target. Samples at which
+    On a moving reference, a stretch in which the specimen forgets an error counts as one target. Samples at which
     the reference stands, as on the way to its beginning, or cannot be met, do not count. `stretch` is the number of
     samples in one stretch; other parameters as `_Supervision`.
     """

@@ -61,7 +61,7 @@ _SIGNIFICANT = 0.01
 Derivation: five times `LEAST` of a smaller move is less than the tolerance of an arrival, 0.05 %.
 """
 _AT_REST = 0.5
-"""What is left of a move when the specimen is at rest, in errors that are close enough.
+"""Rest of a move at which the specimen counts as being at rest, in errors that are close enough.
 
 Derivation: the other half is left to the error of the controller.
 """

@@ -21,14 +21,13 @@ from typing import Any
 import numpy as np
 
 from bench.base import Floats, checks as _checks, say_share, shares_to
-from bench.identification.branches import turning_points
+from bench.identification.branches import turns_beyond_noise
 from bench.identification.by_name import FitProblem, Identification
 from bench.identification.choose.splits import near
 from bench.identification.fit.cell_layout import Flags, Indices
 from bench.identification.fit.covariance import PredictionVariance, prediction_variance
 from bench.identification.fit.least_squares import Fit
 from bench.identification.timed.identify_in_time import identify_in_time
-from bench.identification.validity import NOISE
 from bench.models import Operator, TimedModel
 
 LEVEL = 0.9
@@ -241,7 +240,7 @@ def _calibrated(
     count = min(_BLOCKS, used.size // _FEWEST_ROWS)
     if count < 2:
         raise ValueError(f"band: {used.size} samples are too few to leave blocks of them out")
-    turns = turning_points(inputs, NOISE * float(np.ptp(inputs)))[1:-1]
+    turns = turns_beyond_noise(inputs)[1:-1]
     block = _blocks(inputs.size, used, count, turns)
     lag = _correlation_lag(residuals[used], used.size // count // 2)
     errors = np.full(inputs.size, np.nan)

@@ -7,6 +7,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from bench.base import checks as _checks
 
+NOISE = 0.02
+"""Moves of at most this part of the range are noise of a measured input. Derivation: six standard deviations, within
+which some hundred readings lie, of a noise of 0.33 % of the range."""
+
 
 def turning_points(inputs: ArrayLike, least: float = 0.0) -> NDArray[np.int64]:
     """Return the samples at which the input turns, with the first and the last sample.
@@ -32,6 +36,11 @@ def turning_points(inputs: ArrayLike, least: float = 0.0) -> NDArray[np.int64]:
     if least <= 0.0 or turns.size < 3:
         return np.asarray(turns, dtype=np.int64)
     return _without_short_moves(u, turns, least)
+
+
+def turns_beyond_noise(inputs: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the turning points of inputs, shape (N,), without moves of at most `NOISE` of their range."""
+    return turning_points(inputs, NOISE * float(np.ptp(inputs)))
 
 
 def _without_short_moves(u: NDArray[np.float64], turns: NDArray[np.int64], least: float) -> NDArray[np.int64]:

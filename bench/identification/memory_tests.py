@@ -17,12 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bench.base import Floats, checks as _checks
-from bench.identification.branches import turning_points
+from bench.identification.branches import turns_beyond_noise
 
-# Parts of the input range: shortest move that counts; distance within which extrema are the same. Source: noise of 1
-# % of the range, which instruments here stay below, moves a turning point by less than twice that.
-_LEAST_MOVE = 0.02
-# Source: that noise.
+# Part of the input range within which extrema are the same. Source: noise of 1 % of the range, a premise.
 _SAME = 0.01
 # Repetitions that differ by more than this part of the output range, and this many times its noise, violate a test.
 # Derivation: twice that noise; and the difference of two readings has √2 times the noise of one.
@@ -186,7 +183,7 @@ def _noise(y: Floats) -> float:
 
 
 def _moves(u: Floats) -> Iterator[tuple[int, int]]:
-    turns = turning_points(u, _LEAST_MOVE * float(np.ptp(u))).tolist()
+    turns = turns_beyond_noise(u).tolist()
     yield from pairwise(turns)
 
 

@@ -15,11 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from bench.base import Floats, checks as _checks
-from bench.identification.branches import turning_points
-
-NOISE = 0.02
-"""Moves of at most this part of the range are noise of a measured input. Derivation: six standard deviations, within
-which some hundred readings lie, of a noise of 0.33 % of the range."""
+from bench.identification.branches import NOISE, turning_points
 
 _CHANCE = 0.05
 """Probability below which moves beyond those fitted are no chance. Source: the usual level of a test."""

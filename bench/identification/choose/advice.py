@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from bench.identification.branches import turning_points
+from bench.identification.branches import turns_beyond_noise
 from bench.identification.choose.score import Measurements, Score
 
 ONE_RUN = "one-run"
@@ -15,8 +15,6 @@ ONE_RUN = "one-run"
 PLANE = "preisach"
 """The plane with signs, whose answer to other cycles is bounded."""
 
-# Moves of this part of the range reverse the input. Source: noise of 1 % of the range moves a turning point by less.
-_LEAST_MOVE = 0.02
 # Reversals of one closed minor loop within a major one: fewer show no minor loop.
 # Source: two turns of the major loop and two of the minor one.
 _FEWEST_REVERSALS = 4
@@ -37,7 +35,7 @@ class Advice:
     code : str
         For programs: `few-reversals`, `one-kind`, `one-rate`, `one-run` or `other-cycles`.
     text : str
-        What is unknown, in a sentence without a full stop.
+        The unknown, as a sentence without a full stop.
     remedy : str
         What to record instead.
     """
@@ -64,7 +62,7 @@ def advise(measured: Measurements, scores: Sequence[Score], chosen: Score, one_k
     one_kind : bool
         Whether the record has one kind of cycle.
     """
-    turns = turning_points(measured.inputs, _LEAST_MOVE * float(np.ptp(measured.inputs)))
+    turns = turns_beyond_noise(measured.inputs)
     reversals = max(turns.size - 2, 0)
     if reversals < _FEWEST_REVERSALS:
         times = ("never reverses", "reverses once")[reversals] if reversals < 2 else f"reverses {reversals} times"

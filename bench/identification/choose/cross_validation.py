@@ -18,8 +18,8 @@ from bench.identification.fit.orientation import Orientation
 from bench.models import Regressor
 
 EQUAL = 1.02
-"""Ratio of errors that are no difference: of smoothing weights the greatest is taken then. Derivation: the standard
-error of the RMS of 1,000 independent errors is 1 / √2,000 of it, 2 %."""
+"""Ratio of errors that are no difference: the greatest smoothing, or the fewest degrees of freedom, is taken then.
+Derivation: the standard error of the RMS of 1,000 independent errors is 1 / √2,000 of it, 2 %."""
 _BLOCKS = 20
 """Blocks that are dealt out to the folds. Derivation: four in each test four parts of the record."""
 

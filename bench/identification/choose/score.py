@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache, cached_property
 from typing import Any
 
 import numpy as np
@@ -17,14 +18,14 @@ from bench.identification.choose.splits import BLOCKS, GAP, Flags, Fold, block_f
 from bench.identification.fit.least_squares import Fit, one_thread
 from bench.identification.fit.orientation import NAMES, Orientation, has_orientation
 from bench.identification.timed.hammerstein_fit import reshape, set_up_search
-from bench.identification.timed.hammerstein_search import find_best
+from bench.identification.timed.hammerstein_search import Search, find_best
 from bench.models import PolynomialPlays
 
 # Turns smaller than this part of the range need not be kept when rows are left out.
 # Source: half of the noise of 1 % that turning points are told from, see `splits`.
 _LEAST_MOVE = 0.005
-# Part of the rows that a memory may take to be known, or all rows are tested. Source: of ten blocks
-# two then remain, one for each of two folds.
+# Part of the rows that a memory may take to be known, or all rows are tested. Source: a choice; each
+# block of ten then holds a fortieth of the rows at least.
 _KNOWN = 0.25
 # Part of the rows that may be left out of a fit for their memory. Source: most rows then remain.
 _SKIPPED = 0.5
@@ -152,16 +153,18 @@ class Measurements:
         """Rows next to those tested that are not fitted."""
         return round(GAP * int(self.tested.sum()))
 
+    @cached_property
     def blocks(self) -> tuple[Fold, ...]:
-        """Return the folds of contiguous blocks, or of whole runs if several; first rows are in all fits."""
+        """The folds of contiguous blocks, or of whole runs if several; first rows are in all fits."""
         tested = self.tested
         if self.runs is not None and np.unique(self.runs[tested]).size > 1:
             return self._with_first_rows(run_folds(self.runs, tested))
         blocks = max(min(BLOCKS, int(tested.sum()) // 2), 2)
         return self._with_first_rows(block_folds(tested, folds=min(5, blocks), blocks=blocks, gap=self.gap))
 
+    @cached_property
     def cycles(self) -> tuple[Fold, ...]:
-        """Return the folds of whole kinds of cycles; none if there is one kind only."""
+        """The folds of whole kinds of cycles; none if there is one kind only."""
         return self._with_first_rows(cycle_folds(self.inputs, self.tested, gap=self.gap))
 
     def _with_first_rows(self, folds: tuple[Fold, ...]) -> tuple[Fold, ...]:
@@ -222,21 +225,28 @@ class Score:
 
 
 def evaluate(measured: Measurements, candidates: Sequence[Candidate]) -> list[Score]:
-    """Return the scores of candidates; a task that can be sent to a worker process.
+    """Return the scores of candidates.
 
-    Candidates that differ in their penalties alone are set up once. Shape parameters, time constants, the orientation
-    and an estimated memory are found from all rows; coefficients are fitted without each fold.
+    Candidates that differ in their penalties alone are set up once, and so is an operator with several dynamics.
+    Shape parameters, time constants, the orientation and an estimated memory are found from all rows; coefficients
+    are fitted without each fold.
     """
-    folds = measured.blocks(), measured.cycles()
+    folds = measured.blocks, measured.cycles
     scores: list[Score] = []
     fitters: dict[str, _Fitter | str] = {}
+    searches: dict[str, tuple[FitProblem, Search]] = {}
     for candidate in candidates:
         begin = time.process_time()
-        key = repr(replace(candidate, smoothing=None, ridge=None))
+        # The search for what follows an operator depends on its penalties.
+        key = repr(candidate if candidate.dynamics else replace(candidate, smoothing=None, ridge=None))
         try:
             with one_thread():
                 if key not in fitters:
-                    fitters[key] = _set_up(measured, candidate)
+                    fitters[key] = (
+                        _set_up_in_time(measured, candidate, searches)
+                        if candidate.dynamics
+                        else _set_up(measured, candidate)
+                    )
                 fitter = fitters[key]
                 if isinstance(fitter, str):
                     scores.append(Score(candidate, failure=fitter))
@@ -292,8 +302,6 @@ def _score(
 
 def _set_up(measured: Measurements, candidate: Candidate) -> _Fitter:
     weights = measured.fitted.astype(np.float64)
-    if candidate.dynamics:
-        return _set_up_in_time(measured, candidate, weights)
     problem = set_up_problem(
         candidate.model,
         measured.inputs,
@@ -307,9 +315,11 @@ def _set_up(measured: Measurements, candidate: Candidate) -> _Fitter:
         shape=candidate.shape,
     )
     _check_skipped(measured, problem)
+    # Those that are not given are found from all rows.
+    chosen = cache(problem.regularization)
 
     def fit(weights: Floats, one: Candidate) -> Fit:
-        penalties = problem.regularization(one.smoothing, one.ridge)
+        penalties = chosen(one.smoothing, one.ridge)
         return problem.fit(penalties.smoothing, weights, penalties.ridge)
 
     def predict(found: Fit) -> Floats:
@@ -321,22 +331,27 @@ def _set_up(measured: Measurements, candidate: Candidate) -> _Fitter:
     return _Fitter(fit, predict, problem.skip, parameters, orientation, tuple(shape))
 
 
-def _set_up_in_time(measured: Measurements, candidate: Candidate, weights: Floats) -> _Fitter:
+def _set_up_in_time(
+    measured: Measurements, candidate: Candidate, searches: dict[str, tuple[FitProblem, Search]]
+) -> _Fitter:
     assert measured.times is not None
-    problem, search = set_up_search(
-        measured.times,
-        measured.inputs,
-        measured.outputs,
-        weights,
-        0,
-        candidate.initial,
-        candidate.orientation,
-        static=candidate.model,
-        options=candidate.options,
-        smoothing=candidate.smoothing or 0.0,
-        ridge=candidate.ridge or 0.0,
-        shape=candidate.shape,
-    )
+    static = repr(replace(candidate, dynamics=""))
+    if static not in searches:
+        searches[static] = set_up_search(
+            measured.times,
+            measured.inputs,
+            measured.outputs,
+            measured.fitted.astype(np.float64),
+            0,
+            candidate.initial,
+            candidate.orientation,
+            static=candidate.model,
+            options=candidate.options,
+            smoothing=candidate.smoothing or 0.0,
+            ridge=candidate.ridge or 0.0,
+            shape=candidate.shape,
+        )
+    problem, search = searches[static]
     _check_skipped(measured, problem)
     found = find_best(search, tuple(candidate.dynamics.split(",")), rounds=1)
     if not candidate.shape:

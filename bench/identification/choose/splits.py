@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.base import Floats
-from bench.identification.branches import turning_points
+from bench.identification.branches import turns_beyond_noise
 
 Flags = NDArray[np.bool_]
 
@@ -21,16 +21,15 @@ FOLDS, BLOCKS = 5, 10
 """Folds, and contiguous blocks that are dealt out to them. Source: 5 to 10 folds are usual (Hastie, Tibshirani and
 Friedman 2009, section 7.10); two blocks in each test two parts of the record."""
 GAP = 0.01
-"""Part of the rows on either side of a block that is neither fitted nor tested. Source: measured on records of this
-bench, whose residuals are uncorrelated after fewer rows."""
+"""Part of the rows on either side of a block that is neither fitted nor tested. Source: a choice,
+with which a trial on nine files did well."""
 
-# Moves below this part of the range are noise, and turning points closer than the second part are the same.
-# Source: noise of 1 % of the range, which instruments here stay below, moves a turning point by less.
-_LEAST_MOVE, _SAME = 0.02, 0.05
+# Turning points that are closer than this part of the range are the same. Source: a choice, above `NOISE`.
+_SAME = 0.05
 # Branches that span this part of the range form the major loop: what they sweep is swept nowhere else.
 # Source: by `_SAME`, two turning points at the ends of the range.
 _MAJOR = 1.0 - 2.0 * _SAME
-# Part of the rows that must be left to fit. Source: a bootstrap sample holds 0.632 of them; half of that.
+# Part of the rows that must be left to fit. Source: a choice.
 _LEAST_FITTED = 0.3
 
 
@@ -117,7 +116,7 @@ def cycle_folds(inputs: Floats, usable: Flags, *, folds: int = FOLDS, gap: int =
 
 def has_one_kind(inputs: Floats, usable: Flags) -> bool:
     """Return whether the input has no cycle beside its major loop, its first and its last move left out."""
-    turns = turning_points(inputs, _LEAST_MOVE * float(np.ptp(inputs)))
+    turns = turns_beyond_noise(inputs)
     rows = np.arange(inputs.size)
     between = (rows > turns[1]) & (rows <= turns[-2]) if turns.size > 3 else np.ones(rows.size, dtype=bool)
     return not _minor(inputs, usable & between, *_kinds(inputs)).size
@@ -131,7 +130,7 @@ def _minor(inputs: Floats, usable: Flags, kind: NDArray[np.int64], amplitudes: F
 def _kinds(inputs: Floats) -> tuple[NDArray[np.int64], Floats]:
     """Return the kind of cycle of each row, shape (N,), and the amplitude of each kind, input units."""
     span = float(np.ptp(inputs))
-    turns = turning_points(inputs, _LEAST_MOVE * span)
+    turns = turns_beyond_noise(inputs)
     if turns.size < 2:
         return np.zeros(inputs.size, dtype=np.int64), np.zeros(1)
     ends = np.sort(np.column_stack([inputs[turns[:-1]], inputs[turns[1:]]]), axis=1)
