@@ -104,6 +104,7 @@ from .units import (
     format_duration as format_duration,
     format_numbers as format_numbers,
     header_with_unit as header_with_unit,
+    in_unit as in_unit,
     per_square as per_square,
     quantity as quantity,
     unit_registry as unit_registry,

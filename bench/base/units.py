@@ -115,6 +115,29 @@ def check_unit(unit: str) -> str:
     return unit
 
 
+def in_unit(number: float, sent: str, wanted: str) -> float:
+    """Return a number with the unit that an instrument sent, such as `mV`, in another unit.
+
+    `C` is °C where a temperature is wanted.
+
+    Raises
+    ------
+    ValueError
+        If the unit is unknown, is not of the same kind, or may have another prefix: of a text in capitals, `M` may be
+        milli (IEEE 488.2, 7.7.3) and `P` pico.
+    """
+    registry = unit_registry()
+    target = wanted.replace("°C", "degC")
+    try:
+        source = "degC" if target in ("degC", "K") and sent in ("C", "°C") else sent
+        if len(source) > 1 and source.isascii() and source.isupper() and source[0].lower() + source[1:] in registry:
+            raise ValueError(f"may be {source[0].lower() + source[1:]}")
+        found = registry.Quantity(number, source).to(target).magnitude
+    except Exception as error:
+        raise ValueError(f"{sent!r} is no unit that is read as {wanted}: {error}") from None
+    return float(found)
+
+
 def per_square(output_unit: str, input_unit: str, greatest: float) -> tuple[float, str]:
     """Return factor and unit of a density over the square of an input, such as `µm/V²` or `1/(m K²)`.
 

@@ -1,6 +1,4 @@
 from .command_table import (
-    ANY_TEXT as ANY_TEXT,
-    VALUE as VALUE,
     ActuatorTable as ActuatorTable,
     CommandTable as CommandTable,
     Expected as Expected,
@@ -8,11 +6,9 @@ from .command_table import (
     QuantityTable as QuantityTable,
     SetpointTable as SetpointTable,
     TargetTable as TargetTable,
-    Template as Template,
     check_arrival as check_arrival,
     not_empty as not_empty,
     signals_by_query as signals_by_query,
-    template as template,
     written_number as written_number,
 )
 from .device import (
@@ -53,4 +49,10 @@ from .settling import (
     Settled as Settled,
     UntilSteady as UntilSteady,
     durations as durations,
+)
+from .template import (
+    ANY_TEXT as ANY_TEXT,
+    VALUE as VALUE,
+    Template as Template,
+    template as template,
 )

@@ -23,144 +23,23 @@ Python. Messages are templates: a number stands as `{value}`, in a reply any tex
     query = "MEAS:VOLT?"
     unit = "V"
 
-Upper and lower case are the same, and so are one space and several. Sources: IEEE 488.2-1992 (common commands,
-numeric formats), SCPI-99 volume 1, 7.2.1 (9.9E37 is infinity, 9.91E37 not a number) and volume 2, 21.8 (error queue).
+Upper and lower case are the same, and so are one space and several; `bench.devices.template` says how answers are
+read. Sources: IEEE 488.2-1992 (common commands), SCPI-99 volume 2, 21.8 (error queue).
 """
 
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
-from functools import cache, cached_property
-from string import Formatter
-from typing import Annotated
+from collections.abc import Collection, Mapping
+from typing import Annotated, Self
 
-from pydantic import AfterValidator, Field, ValidationInfo, field_validator
+from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
 from bench.base import CheckedTable, check_unit
-
-NUMBER = r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
-"""A decimal number as IEEE 488.2 writes it (NR1, NR2, NR3), as a regular expression."""
-
-VALUE = "value"
-"""The placeholder of a number where there is only one."""
-
-ANY = "any"
-"""The placeholder of any text."""
-
-ANY_TEXT = f"{{{ANY}}}"
-"""The form of a message that may be anything."""
-
-_NOT_A_NUMBER = 9.9e37
-"""From here on a number of SCPI stands for infinity or for no number."""
-
+from bench.devices.template import ANY, ANY_TEXT, UNIT, VALUE, Decimal, Template, template
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
 """Name of a signal, without that of its device."""
-
-
-@dataclass(frozen=True)
-class Template:
-    """A message with placeholders for numbers, and for text that does not matter.
-
-    Parameters
-    ----------
-    text : str
-        The message; a placeholder may carry a format of Python's, as in `VOLT {value:.3f}`.
-
-    Raises
-    ------
-    ValueError
-        If the text is empty, has a placeholder without a name or with a format that is none, or one stands twice.
-    """
-
-    text: str
-
-    def __post_init__(self) -> None:
-        if not self.text.strip():
-            raise ValueError("is empty; expected a message to or from the instrument")
-        if len(set(self.names)) < len(self.names):
-            raise ValueError("each number may stand once only")
-        names = [name for _, name, _ in self._parts]
-        for i, (text, name, _) in enumerate(self._parts):
-            if i > 0 and name not in (None, ANY) and names[i - 1] not in (None, ANY) and not text:
-                raise ValueError("text or a space is expected between two numbers")
-        try:
-            self.fill(dict.fromkeys(self.names, 0.5))
-        except (ValueError, IndexError, KeyError, TypeError, AttributeError) as error:
-            raise ValueError(
-                f"a number cannot be written so: {error}; expected a format such as {{value:.3f}}"
-            ) from None
-
-    @cached_property
-    def _parts(self) -> tuple[tuple[str, str | None, str], ...]:
-        """Literal text, the name of the placeholder after it, and its format."""
-        try:
-            parts = [(text, name, spec or "") for text, name, spec, _ in Formatter().parse(self.text.strip())]
-        except ValueError as error:
-            raise ValueError(f"{error}; a brace of the message itself is doubled: {{{{ or }}}}") from None
-        for _, name, _ in parts:
-            if name is not None and not name.isidentifier():
-                raise ValueError(f"{{{name}}} is no placeholder; expected a name such as {{value}}")
-        return tuple(parts)
-
-    @property
-    def names(self) -> tuple[str, ...]:
-        """Names of the numbers, in their order."""
-        return tuple(name for _, name, _ in self._parts if name is not None and name != ANY)
-
-    def check(self, allowed: Iterable[str], needed: Iterable[str] = ()) -> None:
-        """Raise `ValueError` for a placeholder that is not allowed, or one that is missing."""
-        known = set(allowed)
-        found = [name for _, name, _ in self._parts if name is not None]
-        shown = ", ".join(f"{{{name}}}" for name in sorted(known)) or "none"
-        for name in found:
-            if name not in known:
-                raise ValueError(f"{{{name}}} is no placeholder here; allowed: {shown}")
-        for name in needed:
-            if name not in found:
-                raise ValueError(f"the placeholder {{{name}}} is missing, which stands for the number")
-
-    def fill(self, values: Mapping[str, float], any_text: str = "") -> str:
-        """Return the message with these numbers; numbers without a format are written as `+1.23456789E+00`."""
-        written = []
-        for text, name, spec in self._parts:
-            written.append(text)
-            if name is not None:
-                written.append(any_text if name == ANY else format(values[name], spec or "+.8E"))
-        return "".join(written)
-
-    @cached_property
-    def _pattern(self) -> re.Pattern[str]:
-        parts = []
-        previous: str | None = None
-        for text, name, _ in self._parts:
-            parts.append(r"\s+".join(re.escape(piece) for piece in re.split(r"\s+", text)))
-            if name is not None:
-                # After any text, a number is not the end of a longer one.
-                begin = r"(?<![0-9.+-])" if previous == ANY and not text else ""
-                parts.append(".*" if name == ANY else rf"\s*{begin}(?P<{name}>{NUMBER})\s*")
-            previous = name
-        return re.compile("".join(parts), re.IGNORECASE | re.DOTALL)
-
-    def match(self, message: str) -> dict[str, float] | None:
-        """Return the numbers of a message by name, or None if it is not of this form or a number is none."""
-        found = self._pattern.fullmatch(message.strip())
-        if found is None:
-            return None
-        numbers = {name: float(text) for name, text in found.groupdict().items()}
-        for number in numbers.values():
-            if abs(number) >= _NOT_A_NUMBER:
-                return None
-        return numbers
-
-
-@cache
-def template(text: str) -> Template:
-    """Return the template of a text, made once; raises as `Template`."""
-    return Template(text)
 
 
 def _message(text: str) -> str:
@@ -240,6 +119,13 @@ LimitPair = Annotated[tuple[float, float], AfterValidator(_range)]
 """A lower and a higher limit."""
 
 
+def _with_unit_or_scale(text: str, info: ValidationInfo) -> Template:
+    form = Template(text)
+    if form.has_units and info.data.get("scale", 1.0) != 1.0:
+        raise ValueError("the instrument sends the unit, so that scale is not needed; leave one of them out")
+    return form
+
+
 class QuantityTable(CheckedTable):
     """A quantity that an instrument of the rig file measures: its unit, and which readings of it are good."""
 
@@ -260,14 +146,15 @@ class SignalTable(QuantityTable):
     query: Message = Field(description="question for the value, such as MEAS:VOLT?")
     reply: str = Field(
         default="{value}",
-        description="form of the answer: {value} is the number, {any} is any text; signals with the same query have "
-        "the same reply, in which each number stands by the name of its signal",
+        description="form of the answer: {value} is the number, {unit} its unit, {any} is any text; signals with the "
+        "same query have the same reply, in which each number stands by the name of its signal",
     )
 
     @field_validator("reply")
     @classmethod
-    def _is_template(cls, text: str) -> str:
-        if not Template(text).names:
+    def _is_template(cls, text: str, info: ValidationInfo) -> str:
+        form = _with_unit_or_scale(text, info)
+        if not form.names:
             raise ValueError("has no placeholder for the number; expected {value}, or the name of the signal")
         return text
 
@@ -311,7 +198,9 @@ class SetpointTable(TargetTable):
         description="message that sets it, with {value} and its format, such as VOLT {value:.3f}"
     )
     query: OptionalMessage = Field(default="", description="question that reads it back, such as VOLT?")
-    reply: str = Field(default="{value}", description="form of the answer, with {value}; {any} is any text")
+    reply: str = Field(
+        default="{value}", description="form of the answer, with {value}; {unit} is its unit, {any} is any text"
+    )
     range_queries: tuple[Message, Message] | None = Field(
         default=None,
         description="questions for the lowest and the highest set-point that the instrument takes, such as "
@@ -320,8 +209,8 @@ class SetpointTable(TargetTable):
 
     @field_validator("reply")
     @classmethod
-    def _is_template(cls, text: str) -> str:
-        Template(text).check({VALUE, ANY}, {VALUE})
+    def _is_template(cls, text: str, info: ValidationInfo) -> str:
+        _with_unit_or_scale(text, info).check({VALUE, UNIT, ANY}, {VALUE})
         return text
 
     @field_validator("command")
@@ -395,7 +284,28 @@ class CommandTable(CheckedTable):
     read_terminator: Annotated[str, AfterValidator(_terminator)] = Field(default="\n", description="end of an answer")
     encoding: Annotated[str, AfterValidator(_encoding)] = Field(default="ascii", description="encoding of messages")
     delay: float = Field(default=0.0, ge=0, le=10, description="least time from one message to the next, s")
+    decimal: Decimal | None = Field(
+        default=None,
+        description='decimal sign of its numbers, sent and received: "." or ","; if not given it is the point, and '
+        "an answer in which a comma may be one is an error",
+    )
     signals: dict[Name, SignalTable] = Field(min_length=1, description="what it measures, one table a signal")
+
+    def form(self, text: str) -> Template:
+        """Return a message as a template, with the decimal sign of the instrument."""
+        return template(text, self.decimal)
+
+    @model_validator(mode="after")
+    def _reads_what_it_writes(self) -> Self:
+        for key, text in self._forms():
+            try:
+                self.form(text)
+            except ValueError as error:
+                raise ValueError(f"{key} = {text!r}, decimal = {self.decimal!r}: {error}") from None
+        return self
+
+    def _forms(self) -> list[tuple[str, str]]:
+        return [(f"signals.{name}.reply", signal.reply) for name, signal in self.signals.items()]
 
     @field_validator("signals")
     @classmethod
@@ -410,7 +320,7 @@ class CommandTable(CheckedTable):
                     )
             needed = {VALUE} if len(text) == 1 and VALUE in Template(first.reply).names else set(text)
             try:
-                Template(first.reply).check({ANY, *needed}, needed)
+                Template(first.reply).check({ANY, UNIT, *needed}, needed)
             except ValueError as error:
                 raise ValueError(f"{text[0]}.reply = {first.reply!r}: {error}") from None
         return signals
@@ -435,6 +345,10 @@ class ActuatorTable(CommandTable):
     def _arrives_at_a_signal(cls, setpoint: SetpointTable, info: ValidationInfo) -> SetpointTable:
         check_arrival(setpoint, info.data.get("signals", {}))
         return setpoint
+
+    def _forms(self) -> list[tuple[str, str]]:
+        messages = [("setpoint.command", self.setpoint.command), ("setpoint.reply", self.setpoint.reply)]
+        return [*super()._forms(), *messages]
 
 
 def check_arrival(target: TargetTable, signals: Collection[str]) -> None:

@@ -22,7 +22,6 @@ from bench.devices import (
     Limits,
     SetpointTable,
     Signal,
-    Template,
     VoltageSupply,
     signals_by_query,
     template,
@@ -59,7 +58,7 @@ class _MeasuringLine(TextLine, TableLine):
     def identify(self, resends: int) -> Identity:
         settings = self._settings
         if not settings.identity_query:
-            return Identity("unknown", "text instrument", settings.port, "unknown")
+            return Identity("unknown", "text instrument", "unknown", "unknown")
         answer, _ = self.ask(settings.identity_query, template(ANY_TEXT), resends)
         if template(settings.identity).match(answer) is None:
             raise DeviceConnectionError(
@@ -82,9 +81,11 @@ class _MeasuringLine(TextLine, TableLine):
 
     def quantities(self, names: Iterable[str]) -> dict[str, float]:
         tables = {name: self._settings.signals[name] for name in names}
+        units = {name: table.unit for name, table in self._settings.signals.items()}
         values = {}
         for query, sharing in signals_by_query(tables).items():
-            _, numbers = self.ask(query, template(tables[sharing[0]].reply))
+            first = tables[sharing[0]]
+            _, numbers = self.ask(query, self._settings.form(first.reply), units={**units, VALUE: first.unit})
             for name in sharing:
                 values[name] = numbers.get(name, numbers.get(VALUE, math.nan)) * tables[name].scale
         return {name: values[name] for name in tables}
@@ -97,7 +98,7 @@ class _SwitchingLine(_MeasuringLine, SwitchedLine):
         SwitchedLine.__init__(self, name, settings.signals, settings.setpoint)
         TextLine.__init__(self, name, settings, clock)
         self._table, self._output = settings.setpoint, settings.output
-        self._command = template(self._table.command)
+        self._command = settings.form(self._table.command)
         self.off_changes_setpoint = any(self._command.match(message) for message in self._output.off)
         # Its messages and one question.
         self.safe_within = settings.timeout + (len(self._output.off) + 2) * (settings.delay + _MESSAGE_TIME)
@@ -106,7 +107,7 @@ class _SwitchingLine(_MeasuringLine, SwitchedLine):
         super().start()
         table = self._table
         if table.range_queries is not None:
-            ends = [self._ask_number(query, template("{value}")) for query in table.range_queries]
+            ends = [self._ask_number(query, "{value}") for query in table.range_queries]
             low, high = min(ends), max(ends)
             if not low <= table.limits[0] < table.limits[1] <= high:
                 raise ConfigurationError(
@@ -124,7 +125,7 @@ class _SwitchingLine(_MeasuringLine, SwitchedLine):
         return written_number(self._command, value / self._table.scale) * self._table.scale
 
     def read_setpoint(self) -> float | None:
-        return self._ask_number(self._table.query, template(self._table.reply)) if self._table.query else None
+        return self._ask_number(self._table.query, self._table.reply) if self._table.query else None
 
     def prepare(self) -> None:
         self.set_up()
@@ -170,8 +171,8 @@ class _SwitchingLine(_MeasuringLine, SwitchedLine):
         if self._settings.identity_query:
             self.ask(self._settings.identity_query, template(ANY_TEXT), 0)
 
-    def _ask_number(self, query: str, form: Template) -> float:
-        _, numbers = self.ask(query, form)
+    def _ask_number(self, query: str, reply: str) -> float:
+        _, numbers = self.ask(query, self._settings.form(reply), units={VALUE: self._table.unit})
         return numbers[VALUE] * self._table.scale
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import re
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 
 from bench.base import Clock, DeviceConnectionError, DeviceError
@@ -16,7 +17,8 @@ _MOST_ERRORS = 32
 _MOST_STRAY = 64
 """Late answers that are passed over before the line counts as lost."""
 
-_NO_ERROR = template("{value}{any}")
+_NO_ERROR = re.compile(r"[-+]?0+(?:\.0*)?(?![0-9.])")
+"""The number 0 at the beginning of an answer."""
 
 
 class LineTable(TextLineSettings, CommandTable):
@@ -74,23 +76,26 @@ class TextLine:
         if self._delay:
             self._free_at = self._clock.now() + self._delay
 
-    def ask(self, question: str, form: Template, resends: int = RESENDS) -> tuple[str, dict[str, float]]:
-        """Return the answer to a question, and the numbers in it by name.
+    def ask(
+        self, question: str, form: Template, resends: int = RESENDS, *, units: Mapping[str, str] | None = None
+    ) -> tuple[str, dict[str, float]]:
+        """Return the answer to a question, and the numbers in it by name, in these units if they come with one.
 
         Raises
         ------
         DeviceConnectionError
             If no answer comes.
         DeviceError
-            If the last answer is not of that form, or says that the number is infinite or none.
+            If the last answer is not of that form, is not clear, or says that the number is infinite or none.
         """
+        units = units or {}
         answer: str | None = None
         for attempt in range(1 + resends):
             self.repeats += attempt > 0
             if not self._in_step and not self._catch_up():
                 continue
             answer = self._exchange(question)
-            numbers = None if answer is None else form.match(answer)
+            numbers = None if answer is None else form.match(answer, units)
             if answer is not None and numbers is not None:
                 return answer, numbers
             self._in_step = False
@@ -100,9 +105,8 @@ class TextLine:
                 f"no answer to {question!r} within {self._settings.timeout:g} s at {self._settings.port}, after "
                 f"{1 + resends} request{'s' if resends else ''}; check power, cable, address, speed and terminators",
             )
-        raise DeviceError(
-            self._device, f"answered {answer!r} to {question!r}, expected {form.text!r}; is it out of its range?"
-        )
+        advice = form.doubt(answer, units) or "is it out of its range?"
+        raise DeviceError(self._device, f"answered {answer!r} to {question!r}, expected {form.text!r}; {advice}")
 
     def errors(self) -> list[str]:
         """Read the queue of errors until it is empty; return them, oldest first. Empty if there is no such queue."""
@@ -121,8 +125,7 @@ class TextLine:
     def _is_no_error(self, answer: str) -> bool:
         if self._settings.no_error:
             return template(self._settings.no_error).match(answer) is not None
-        numbers = _NO_ERROR.match(answer)
-        return numbers is not None and numbers["value"] == 0.0
+        return _NO_ERROR.match(answer) is not None
 
     @contextmanager
     def _noticing_loss(self) -> Iterator[None]:

@@ -156,7 +156,7 @@ class EmulatedTextInstrument(EmulatedInstrument):
             self._heard[message] = known
         if known is None and isinstance(self.table, ActuatorTable):
             # Of many spaces, a pattern tries every division.
-            numbers = template(self.table.setpoint.command).match(normal)
+            numbers = self.table.form(self.table.setpoint.command).match(normal)
             return None if numbers is None else partial(self._set, numbers[VALUE])
         return known
 
@@ -178,11 +178,11 @@ class EmulatedTextInstrument(EmulatedInstrument):
             named += [(message, _nothing) for message in (*output.on, *output.off)]
             named += [(setpoint.query, self._answer_setpoint), (output.query, self._answer_output)]
             for query, limit in zip(setpoint.range_queries or (), setpoint.limits, strict=False):
-                named.append((query, partial(template("{value}").fill, {VALUE: limit / setpoint.scale})))
+                named.append((query, partial(table.form("{value}").fill, {VALUE: limit / setpoint.scale})))
         for query, names in signals_by_query(table.signals).items():
             named.append((query, partial(self._answer_signals, names)))
         named += [
-            (table.identity_query, partial(template(table.identity).fill, {}, "emulated")),
+            (table.identity_query, self._answer_identity),
             (table.error_query, self._answer_error),
             (table.completion_query, _complete),
             *((message, _nothing) for message in table.setup),
@@ -196,7 +196,7 @@ class EmulatedTextInstrument(EmulatedInstrument):
     def _switch(self, message: str, on: bool) -> None:
         table = self.table
         assert isinstance(table, ActuatorTable)
-        numbers = template(table.setpoint.command).match(message)
+        numbers = table.form(table.setpoint.command).match(message)
         if numbers is not None:
             self._set(numbers[VALUE])
         if on or table.output.on:
@@ -223,7 +223,8 @@ class EmulatedTextInstrument(EmulatedInstrument):
     def _answer_setpoint(self) -> str:
         table = self.table
         assert isinstance(table, ActuatorTable)
-        return template(table.setpoint.reply).fill({VALUE: self._level / table.setpoint.scale})
+        setpoint = table.setpoint
+        return table.form(setpoint.reply).fill({VALUE: self._level / setpoint.scale}, units={VALUE: setpoint.unit})
 
     def _answer_output(self) -> str:
         table = self.table
@@ -257,7 +258,17 @@ class EmulatedTextInstrument(EmulatedInstrument):
         tables = self.table.signals
         values = {name: self._reading(name) / tables[name].scale for name in names}
         values[VALUE] = values[names[0]]
-        return template(tables[names[0]].reply).fill(values)
+        units = {VALUE: tables[names[0]].unit, **{name: tables[name].unit for name in names}}
+        return self.table.form(tables[names[0]].reply).fill(values, units=units)
+
+    def _answer_identity(self) -> str:
+        """Answer with the form of the table; model and serial number (IEEE 488.2, 10.14) are those of its keys."""
+        fields = template(self.table.identity).fill({}, "emulated").split(",")
+        for place, key in ((1, "model"), (2, "serial_number")):
+            if wanted := getattr(self.table, key, ""):
+                fields += ["emulated"] * (place + 1 - len(fields))
+                fields[place] = wanted
+        return ",".join(fields)
 
     def _answer_error(self) -> str:
         if self.errors:

@@ -1,72 +1,10 @@
-"""The messages of a text instrument: templates, and what is wrong with a table of the rig file."""
-
-import math
-import re
+"""What is wrong with the table of a text instrument."""
 
 import pytest
 from cases import cases
-from hypothesis import given, strategies as st
 
 from bench.base import ConfigurationError
-from bench.devices import Template, written_number
 from bench.rig import load_rig
-
-finite = st.floats(-1e30, 1e30)
-
-
-@cases(
-    ("form", "message", "numbers"),
-    [
-        ("{value}", " +1.50E+00 ", {"value": 1.5}),
-        ("{value}", ".5", {"value": 0.5}),
-        ("{value}{any}", "-1.5NDCV,+0.0SECS", {"value": -1.5}),
-        ("{any}{value}", "VDC 12.25", {"value": 12.25}),
-        ("{any},{value}", "a,b,3e2", {"value": 300.0}),
-        ("VOLT {value:.3f} V", "volt   5.00  v", {"value": 5.0}),
-        ("{a};{b}", "1 ; 2", {"a": 1.0, "b": 2.0}),
-        ("CH1:{value}", "CH1:-5", {"value": -5.0}),
-        ("{value}", "OL", None),
-        ("{value}", "", None),
-        ("{value}", "1,2", None),
-        ("{value}", "٣", None),
-        ("{value}", "1e999", None),
-        ("{value}", "9.9E37", None),
-        ("{value}", "-9.9E+37", None),
-        ("{value}", "9.91E37", None),
-        ("{value}", "nan", None),
-        ("EXAMPLE,{any}", "EXAMPLE,PS,1,2", {}),
-        ("EXAMPLE,{any}", "OTHER,PS,1,2", None),
-    ],
-)
-def test_a_reply_is_read_as_its_form_says(form, message, numbers):
-    assert Template(form).match(message) == numbers
-
-
-@given(value=finite, before=st.text("ABC ,;:", max_size=5), after=st.text("V ,;", max_size=5))
-def test_what_was_written_is_read_back(value, before, after):
-    form = Template(f"{before}{{value:.10e}}{after}")
-    (found,) = form.match(form.fill({"value": value})).values()
-    assert math.isclose(found, value, rel_tol=1e-9, abs_tol=1e-300)
-
-
-@given(message=st.text(max_size=200), form=st.sampled_from(["{value}", "{value}{any}", "{any}{value}", "A {a},{b}"]))
-def test_any_answer_is_a_number_or_none(message, form):
-    numbers = Template(form).match(message)
-    assert numbers is None or all(math.isfinite(number) for number in numbers.values())
-    if numbers is None and form == "{value}":
-        text = message.strip()
-        assert not re.fullmatch(r"[-+]?[0-9]{1,9}(\.[0-9]{1,9})?([eE][-+]?[0-9])?", text)
-
-
-@given(value=finite)
-def test_a_number_in_any_notation_of_the_standard_is_read(value):
-    for text in (f"{value:.6E}", f"{value:+.6E}", f"{value:.3f}", f"{value:.0f}", repr(value)):
-        assert Template("{value}").match(text) == {"value": float(text)}
-
-
-def test_a_command_rounds_to_its_digits():
-    assert written_number(Template("VOLT {value:.1f}"), 1.26) == 1.3
-
 
 RIG = """
 [rig]
@@ -118,6 +56,14 @@ WRONG = {
         "signals",
         "voltage and current have the same query 'MEAS:VOLT?'",
     ),
+    "signals.voltage.reply={unit}{value}": ("signals.voltage.reply", "{unit} is expected directly behind the number"),
+    "signals.voltage.reply={value}5": ("signals.voltage.reply", "has no number that can be told"),
+    "signals.voltage.reply={any}5{value}": ("signals.voltage.reply", "has no number that can be told"),
+    'signals.voltage={query = "V?", unit = "V", scale = 1e-3, reply = "{value}{unit}"}': (
+        "signals.voltage.reply",
+        "scale is not needed",
+    ),
+    "decimal=;": ("decimal = ';'",),
     "identity={value}": ("identity = '{value}'", "allowed: {any}"),
     "write_terminator= ": ("write_terminator",),
     "encoding=utf-16": ("encoding = 'utf-16'", "extends ASCII"),
@@ -189,3 +135,13 @@ def test_two_instruments_do_not_share_an_emulated_port(tmp_path):
     (tmp_path / "rig.toml").write_text(f"{RIG}\n[devices.other]{second}")
     with pytest.raises(ConfigurationError, match="supply and other have the same port emulated://supply"):
         load_rig(str(tmp_path / "rig.toml"))
+
+
+def test_with_a_decimal_comma_no_comma_separates_numbers(tmp_path):
+    both = 'query = "BOTH?"\nreply = "{voltage:.1f},{current:.1f}"\nunit = "V"'
+    signals = f"[devices.supply.signals.voltage]\n{both}\n[devices.supply.signals.current]\n{both}"
+    begin, rest = RIG.split("[devices.supply.signals.voltage]")
+    (tmp_path / "rig.toml").write_text(begin + signals + rest.partition('unit = "V"')[2])
+    load_rig(str(tmp_path / "rig.toml"))
+    with pytest.raises(ConfigurationError, match=r"signals\.voltage\.reply = .*, decimal = ',': .* has no number"):
+        load_rig(str(tmp_path / "rig.toml"), {"devices.supply.decimal": ","})

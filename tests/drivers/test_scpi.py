@@ -464,6 +464,45 @@ class TestContract(ActuatorContract):
         return lambda: lab.instrument.output
 
 
+COMMA = {
+    "decimal": ",",
+    "signals": {
+        "voltage": {"query": "MEAS:VOLT?", "unit": "V", "reply": "{value:.6f} {unit}"},
+        "current": {"query": "MEAS:CURR?", "unit": "A", "reply": "I={value:.6e}{unit};{any}"},
+    },
+    "setpoint": {**SUPPLY["setpoint"], "reply": "{value:.4f}{unit}", "range_queries": ["VOLT? MIN", "VOLT? MAX"]},
+}
+"""What an instrument with a decimal comma, and units with prefixes, has instead."""
+
+
+class TestContractWithCommasAndUnits(TestContract):
+    @pytest.fixture
+    def lab(self, stack):
+        return Laboratory(stack, **COMMA)
+
+
+def test_numbers_and_units_are_those_of_the_instrument_both_ways(stack):
+    lab = Laboratory(stack, **COMMA)
+    answers = []
+    lab.answer = lambda data, usual: answers.append(usual(data)) or answers[-1]
+    device = lab.connect()
+    device.set(0.25).wait()
+    assert "VOLT 0,250" in lab.requests
+    assert device.glance() == {"supply_voltage": pytest.approx(0.25), "supply_current": pytest.approx(0.25)}
+    assert b"250,0000mV\n" in answers
+    assert b"250,000000 mV\n" in answers
+    assert b"I=2,500000e+02mA;\n" in answers
+
+
+def test_a_number_that_is_not_clear_is_refused_and_names_the_key(stack):
+    signals = {"voltage": {"query": "MEAS:VOLT?", "unit": "V", "reply": "{value},{any}"}}
+    lab = Laboratory(stack, signals=signals)
+    device = lab.connect()
+    lab.answer = lambda data, usual: b"2,215E+01\n" if b"MEAS:VOLT" in data else usual(data)
+    with pytest.raises(DeviceError, match=r"answered '2,215E\+01' .* set the key decimal"):
+        device.glance()
+
+
 # What is asked, and how often
 
 
