@@ -96,6 +96,7 @@ class LineDevice(Device, Generic[SettingsT, LineT]):
         try:
             device = cls(name, settings, clock, line)
             device._identity = device._identify()
+            device._check_identity()
             start(device)
         except BaseException:
             line.close()
@@ -111,6 +112,24 @@ class LineDevice(Device, Generic[SettingsT, LineT]):
 
     @abstractmethod
     def _start(self) -> None: ...
+
+    def _check_identity(self) -> None:
+        """Raise `DeviceConnectionError` unless model and serial number are those of the settings, to the letter."""
+        found, settings = self._identity, self._settings
+        if settings.serial_number and not found.tells_serial_number:
+            raise DeviceConnectionError(
+                self.name,
+                f"is {found.maker} {found.model}, which does not tell its serial number; leave out the key "
+                f"serial_number = {settings.serial_number!r}",
+            )
+        for key, value, wanted in (
+            ("model", found.model, settings.model),
+            ("serial number", found.serial_number, settings.serial_number),
+        ):
+            if wanted and value.strip() != wanted.strip():
+                raise DeviceConnectionError(
+                    self.name, f"is {found}, expected {key} {wanted.strip()}; the ports may be swapped"
+                )
 
     @property
     def identity(self) -> Identity:

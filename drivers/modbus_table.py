@@ -103,7 +103,7 @@ class SensorSettings(RtuSettings):
     identity: RegisterValue | None = Field(
         default=None, description="register that says which instrument it is, and its value; not checked if not given"
     )
-    serial_number: int | None = Field(
+    serial_number_at: int | None = Field(
         default=None, ge=0, le=0xFFFF, description="first of two registers with the serial number, if there are any"
     )
     setup: tuple[RegisterValue, ...] = Field(
@@ -149,9 +149,11 @@ class _MeasuringLine(RtuLine, TableLine):
                     raise self._other(f"has {found:g} in register 0x{wanted.at:04X}, expected {wanted.value}")
                 model = f"{model} {wanted.value}"
             number = (
-                "unknown" if keys.serial_number is None else f"{self._identifying(keys.serial_number, 'U32'):.0f}"
+                "unknown"
+                if keys.serial_number_at is None
+                else f"{self._identifying(keys.serial_number_at, 'U32'):.0f}"
             )
-            if keys.identity is None and keys.serial_number is None:
+            if keys.identity is None and keys.serial_number_at is None:
                 # So that something has answered at least.
                 self.quantities(list(keys.signals)[:1])
         return Identity("unknown", model, number, "unknown")

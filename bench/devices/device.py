@@ -24,6 +24,7 @@ so a bluesky RunEngine can drive them; nothing of bluesky is imported here.
 from __future__ import annotations
 
 import math
+import re
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -36,6 +37,9 @@ from pydantic import Field, model_validator
 
 from bench.base import CheckedTable, Clock, ConfigurationError, DeviceConnectionError, DeviceError, LimitError
 
+_NO_SERIAL_NUMBER = re.compile(r"(|0+|none|unknown|id \d+)", re.IGNORECASE)
+"""Serial numbers that tell no instrument from another: missing ones, and the address on a bus in the place of one."""
+
 
 @dataclass(frozen=True)
 class Identity:
@@ -45,6 +49,11 @@ class Identity:
     model: str
     serial_number: str
     firmware: str
+
+    @property
+    def tells_serial_number(self) -> bool:
+        """Whether the serial number tells the instrument from others of its kind."""
+        return not _NO_SERIAL_NUMBER.fullmatch(self.serial_number.strip())
 
     def __str__(self) -> str:
         """Return the identity on one line."""
@@ -313,6 +322,14 @@ class DriverSettings(CheckedTable):
     moves nothing. An unknown key is an error.
     """
 
+    serial_number: str = Field(
+        default="",
+        coerce_numbers_to_str=True,
+        description="serial number of the instrument, as it says it itself; another instrument is refused",
+    )
+    model: str = Field(
+        default="", description="model of the instrument, as it says it itself; another one is refused"
+    )
     calibrated: date | None = Field(default=None, description="day of the last calibration, such as 2026-03-01")
     calibration_due: date | None = Field(default=None, description="day from which a new calibration is due")
 

@@ -26,7 +26,7 @@ from sim_devices.wire.modbus_rtu import ModbusRtuServer
 class Heater(
     ModbusActuator,
     identity={"at": 0x00, "value": 1410},
-    serial_number=0x01,
+    serial_number_at=0x01,
     setup=[{"at": 0x30, "value": 5}],
     output={"at": 0x21},
 ):

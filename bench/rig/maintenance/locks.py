@@ -53,8 +53,6 @@ _WRITING = 0.1
 _LOCKED_BYTE = 1 << 30  # on Windows a locked byte cannot be read, so it lies beyond the text
 _VISA_SOCKET = re.compile(r"TCPIP\d*::(?P<host>[^:]+|\[.+\])::(?P<port>\d+)::SOCKET", re.IGNORECASE)
 _VISA_SERIAL = re.compile(r"ASRL(?P<node>.+?)(::INSTR)?", re.IGNORECASE)
-_BUS_ADDRESS = re.compile(r"(|0+|none|unknown|id \d+)", re.IGNORECASE)
-"""Serial numbers that tell no instrument from another: missing ones, and the address on a bus in the place of one."""
 
 
 class NoLockError(Exception):
@@ -148,9 +146,8 @@ class Locks:
 
         Raises ConfigurationError if another process, or another bench of this one, holds it.
         """
-        number = identity.serial_number.strip()
-        if not _BUS_ADDRESS.fullmatch(number):
-            what = f"{identity.maker} {identity.model}, serial number {number}"
+        if identity.tells_serial_number:
+            what = f"{identity.maker} {identity.model}, serial number {identity.serial_number.strip()}"
             self._take({_path(f"instrument {what}".lower()): what}, f"rig {self._holder.rig}")
 
     def take_folder(self, folder: Path) -> None:
