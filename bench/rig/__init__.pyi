@@ -97,5 +97,7 @@ from .slots import (
 )
 from .start_checks import (
     check_start as check_start,
+    lines_of as lines_of,
+    longest_away as longest_away,
     overdue_calibrations as overdue_calibrations,
 )

@@ -10,13 +10,39 @@ from collections.abc import Iterable, Mapping
 from datetime import date
 
 from bench.base import ConfigurationError
-from bench.devices import Actuator, DeviceDescription
+from bench.devices import Actuator, Device, DeviceDescription, DriverSettings
 from bench.rig.description import RigDescription
 from bench.rig.file import RigFile
 from bench.rig.interlocks.config import SETPOINT, Interlock, Level
+from bench.rig.maintenance.locks import line_names, port_of
 
 SHARE_OF_WATCHDOG = 0.4
 """Longest silence of the host on purpose, as a share of the shortest watchdog: one late answer may double it."""
+
+
+SHARE_AWAY = 0.6
+"""Share of its watchdog's time for which an instrument may be out of reach."""
+
+
+def lines_of(file: RigFile) -> dict[str, str]:
+    """Return the line of each device of a rig, by the name that its lock has; one without a port has its own."""
+    ports = {entry.name: port_of(entry.settings) for entry in file.devices}
+    # The port itself where it is not locked: `emulated://NAME`, which may be served elsewhere.
+    return {name: next(iter(line_names(port)), port or name) for name, port in ports.items()}
+
+
+def longest_away(file: RigFile, devices: Mapping[str, Device | DeviceDescription]) -> dict[str, float]:
+    """Return for how long the line of each device may be away, s; taken while all lines are there.
+
+    It is `[safety] reconnect` of the rig file, or 0.6 of the shortest watchdog on the line: an actuator that shares
+    it is out of reach as well, and the rest of the rig is not left on after its watchdog has expired.
+    """
+    lines = lines_of(file)
+    longest = dict.fromkeys(lines.values(), file.safety.reconnect)
+    for name, line in lines.items():
+        if watchdog := devices[name].watchdog:
+            longest[line] = min(longest[line], SHARE_AWAY * watchdog)
+    return {name: longest[line] for name, line in lines.items()}
 
 
 def check_start(
@@ -39,7 +65,8 @@ def check_start(
     Returns
     -------
     tuple of str
-        Warnings: what is accepted only since an operator is present (`safety.unattended = false`).
+        Warnings: a key that has not its full effect, and what is accepted only since an operator is present
+        (`safety.unattended = false`).
 
     Raises
     ------
@@ -56,7 +83,8 @@ def check_start(
         wrong.extend(f"{problem}, or safety.unattended = false if an operator is present" for problem in unguarded)
     if wrong:
         raise ConfigurationError("\n".join(f"{file.path}: {problem}" for problem in wrong))
-    return tuple(f"{file.path}: {problem}; accepted, as safety.unattended = false" for problem in unguarded)
+    accepted = (f"{problem}; accepted, as safety.unattended = false" for problem in unguarded)
+    return tuple(f"{file.path}: {warning}" for warning in (*_shortened(rig), *accepted))
 
 
 def overdue_calibrations(file: RigFile, today: date) -> tuple[str, ...]:
@@ -89,6 +117,20 @@ def _wrong_intervals(
             yield f"devices.{device}: a measurement takes {longest:.3g} s, but {why}"
 
 
+def _shortened(rig: RigDescription) -> Iterable[str]:
+    """Say for which lines `safety.reconnect` is longer than a watchdog allows, if the file gives it."""
+    safety = rig.file.safety
+    if "reconnect" not in safety.model_fields_set:
+        return
+    for name, longest in longest_away(rig.file, rig.devices).items():
+        watchdog = rig.devices[name].watchdog
+        if watchdog and longest < safety.reconnect and longest == SHARE_AWAY * watchdog:
+            yield (
+                f"safety.reconnect = {safety.reconnect:g}: the line of {name} may be lost for {longest:g} s at most, "
+                f"{SHARE_AWAY:g} of its watchdog of {watchdog:g} s"
+            )
+
+
 def _wrong_interlock(interlock: Interlock, rig: RigDescription) -> Iterable[str]:
     units = {name: signal.unit for name, signal in rig.by_name.items()}
     for key, signal in (("signal", interlock.signal), ("minus", interlock.minus)):
@@ -118,6 +160,7 @@ def _wrong_interlock(interlock: Interlock, rig: RigDescription) -> Iterable[str]
 
 
 def _unguarded(rig: RigDescription) -> Iterable[str]:
+    with_key = {entry.name for entry in rig.file.devices if has_watchdog_key(entry.settings)}
     ending = [each for each in rig.file.interlocks if each.level in (Level.SAFE, Level.HOLD) and each.limits_values]
     for device in rig.devices.values():
         if not _heats(device):
@@ -125,7 +168,7 @@ def _unguarded(rig: RigDescription) -> Iterable[str]:
         if not device.watchdog:
             yield (
                 f"devices.{device.name}: it heats and has no watchdog, so that it goes on when its host is gone; "
-                "expected a watchdog"
+                f"expected {'its key watchdog' if device.name in with_key else 'a driver that has one'}"
             )
         measured = {signal.name for signal in device.signals}
         if not any(
@@ -135,6 +178,11 @@ def _unguarded(rig: RigDescription) -> Iterable[str]:
                 f"devices.{device.name}: it heats, and no interlock of level safe or hold limits it; expected one on "
                 f"{', '.join(sorted(measured))} or a signal derived from them, or with setpoint = {device.name!r}"
             )
+
+
+def has_watchdog_key(settings: DriverSettings) -> bool:
+    """Return whether the driver of a device has a watchdog that the rig file can set."""
+    return "watchdog" in type(settings).model_fields
 
 
 def _heats(device: DeviceDescription) -> bool:

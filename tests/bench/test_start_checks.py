@@ -1,6 +1,7 @@
 import json
 from dataclasses import replace
 from datetime import date
+from pathlib import Path
 
 import pytest
 from cases import cases
@@ -17,6 +18,9 @@ from bench.rig import (
     overdue_calibrations,
     packaged_rigs,
 )
+
+
+SUPPLY = Path(__file__).parents[2] / "examples" / "bench-supply.toml"
 
 
 class Heater(TECAmplifier):
@@ -72,10 +76,14 @@ def check(tmp_path):
     return check
 
 
-def refused(check, *interlocks, **keys):
+def refused_of(call):
     with pytest.raises(ConfigurationError) as caught:
-        check(*interlocks, **keys)
-    lines = str(caught.value).splitlines()
+        call()
+    return str(caught.value).splitlines()
+
+
+def refused(check, *interlocks, **keys):
+    lines = refused_of(lambda: check(*interlocks, **keys))
     assert all(line.startswith("mine.toml: ") for line in lines)
     return [line.removeprefix("mine.toml: ") for line in lines]
 
@@ -109,7 +117,25 @@ class TestIntervals:
         assert check(devices=devices, interval=60.0) == ()
 
 
+def test_a_key_that_a_watchdog_cuts_short_is_said_with_the_time_that_counts(check):
+    devices = [TEC, replace(PSD, watchdog=None)]
+    (warning,) = check(HOT, devices=devices, reconnect=10.0)
+    assert warning.startswith("mine.toml: safety.reconnect = 10: the line of tec may be lost for 3 s at most")
+    assert warning.endswith("watchdog of 5 s")
+    assert check(HOT, devices=devices, reconnect=3.0) == check(HOT, devices=devices) == ()
+
+
 class TestADeviceThatHeats:
+    def test_no_key_is_advised_that_the_driver_does_not_have(self, check, tmp_path):
+        (tmp_path / "bench-supply.toml").write_text(SUPPLY.read_text())
+        file = load_rig(str(tmp_path / "bench-supply.toml"))
+        with Rig(file, VirtualClock(), 0) as rig:
+            (problem,) = refused_of(lambda: check_start(rig.description, interval=0.2, interval_key="safety.rate"))
+        assert "devices.supply: it heats and has no watchdog" in problem
+        assert "expected a driver that has one" in problem
+        (problem,) = refused(check, HOT, devices=[replace(TEC, watchdog=None)])
+        assert "expected its key watchdog" in problem
+
     @pytest.mark.parametrize("watchdog", [None, 0.0])
     def test_without_a_watchdog(self, check, watchdog):
         devices = [replace(TEC, watchdog=watchdog)]

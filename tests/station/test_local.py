@@ -14,8 +14,7 @@ from bench.base import (
     VirtualClock,
 )
 from bench.execution.station.local import LocalStation
-from bench.execution.station.reconnection import lines_of, longest_away
-from bench.rig import Look, Rig, load_rig
+from bench.rig import Look, Rig, lines_of, load_rig, longest_away
 
 
 class Later(VirtualClock):
@@ -107,7 +106,7 @@ class TestReconnection:
         station, tec, rig = vo2(safety__reconnect="60")
         tec.unplug()
         since = station.clock.now()
-        with pytest.raises(DeviceConnectionError):
+        with pytest.raises(DeviceConnectionError, match="it was not back within 3 s"):
             station.look(Look.GLANCE)
         assert station.clock.now() - since < rig.devices["tec"].watchdog
 

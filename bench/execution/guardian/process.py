@@ -36,9 +36,9 @@ from bench.execution.guardian.rescuer import TRY_FOR, Rescuer
 from bench.execution.notify import WITHIN, Notifier
 from bench.execution.station.core import StationCore
 from bench.execution.station.interface import News, masked, news_of
-from bench.execution.station.reconnection import TRIES, lines_of, longest_away
+from bench.execution.station.reconnection import TRIES
 from bench.record import END, FAILED, Event
-from bench.rig import SAFE as IS_SAFE, AttachedClock, InterlockWatch, Look, Rig
+from bench.rig import SAFE as IS_SAFE, AttachedClock, InterlockWatch, Look, Rig, lines_of, longest_away
 
 _SAFE_WITHIN = 3.0
 """Time for the safe state of all devices, s; those that have not answered then are reported as unsafe."""

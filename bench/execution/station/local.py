@@ -12,8 +12,8 @@ from bench.base import ConfigurationError, DeviceConnectionError, DeviceError
 from bench.devices import Floats, Status
 from bench.execution.station.core import StationCore
 from bench.execution.station.interface import Arrivals, News, Station, masked, news_of
-from bench.execution.station.reconnection import TRIES, longest_away, reconnect
-from bench.rig import InterlockFinding, InterlockWatch, Look, Rig, make_safe, raise_if_unsafe
+from bench.execution.station.reconnection import TRIES, reconnect
+from bench.rig import InterlockFinding, InterlockWatch, Look, Rig, longest_away, make_safe, raise_if_unsafe
 
 _T = TypeVar("_T")
 

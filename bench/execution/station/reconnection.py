@@ -2,41 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 from bench.base import Clock, DeviceConnectionError
 from bench.devices import Device
-from bench.rig import RigFile, line_names, port_of
 
 TRIES = 3
 """How often all devices are read at most, when a line is lost and comes back while they are read."""
 
 _INTERVAL = 0.2
 """Time between two attempts, s."""
-
-_SHARE_OF_WATCHDOG = 0.6
-"""Share of its watchdog's time for which an instrument may be out of reach."""
-
-
-def lines_of(file: RigFile) -> dict[str, str]:
-    """Return the line of each device of a rig, by the name that its lock has; one without a port has its own."""
-    ports = {entry.name: port_of(entry.settings) for entry in file.devices}
-    # The port itself where it is not locked: `emulated://NAME`, which may be served elsewhere.
-    return {name: next(iter(line_names(port)), port or name) for name, port in ports.items()}
-
-
-def longest_away(file: RigFile, devices: Mapping[str, Device]) -> dict[str, float]:
-    """Return for how long the line of each device may be away, s; taken while all lines are there.
-
-    It is `[safety] reconnect` of the rig file, or 0.6 of the shortest watchdog on the line: an actuator that shares
-    it is out of reach as well, and the rest of the rig is not left on after its watchdog has expired.
-    """
-    lines = lines_of(file)
-    longest = dict.fromkeys(lines.values(), file.safety.reconnect)
-    for name, line in lines.items():
-        if watchdog := devices[name].watchdog:
-            longest[line] = min(longest[line], _SHARE_OF_WATCHDOG * watchdog)
-    return {name: longest[line] for name, line in lines.items()}
 
 
 def reconnect(
@@ -65,7 +40,7 @@ def reconnect(
     Raises
     ------
     DeviceConnectionError
-        What it failed with, if the line is not back in time.
+        What it failed with, if the line is not back in time; it says how long that was.
     DeviceError
         If the instrument is not as it was left, or its driver cannot open the line again.
     """
@@ -76,7 +51,10 @@ def reconnect(
         try:
             device.reconnect()
         except DeviceConnectionError:
-            if clock.now() - start >= longest or given_up() or clock.interrupted():
+            if clock.now() - start >= longest:
+                text = str(lost).removeprefix(f"{lost.device}: ")
+                raise DeviceConnectionError(lost.device, f"{text}; it was not back within {longest:g} s") from None
+            if given_up() or clock.interrupted():
                 raise lost from None
             clock.sleep(_INTERVAL)
         else:

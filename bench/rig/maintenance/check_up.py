@@ -15,7 +15,7 @@ from bench.rig.file import RigFile
 from bench.rig.maintenance.opening import Workplace
 from bench.rig.maintenance.safe_state import SAFE, make_safe
 from bench.rig.slots import RoleTable, reading_of
-from bench.rig.start_checks import SHARE_OF_WATCHDOG
+from bench.rig.start_checks import SHARE_OF_WATCHDOG, has_watchdog_key
 
 GLANCES, MEASUREMENTS = 20, 5
 """How many of each are taken for noise and time."""
@@ -249,9 +249,13 @@ def _watchdog(device: Actuator, file: RigFile) -> list[CheckFinding]:
     if watchdog is None:
         if not device.heats:
             return [CheckFinding("watchdog", "none")]
-        return [
-            CheckFinding("watchdog", "none, and its output heats", f"set the key watchdog of devices.{device.name}")
-        ]
+        (settings,) = (entry.settings for entry in file.devices if entry.name == device.name)
+        advice = (
+            f"set the key watchdog of devices.{device.name}"
+            if has_watchdog_key(settings)
+            else "its driver has none: let the protection of the instrument limit it, and stay with the rig"
+        )
+        return [CheckFinding("watchdog", "none, and its output heats", advice)]
     text = f"{watchdog:g} s"
     if period > SHARE_OF_WATCHDOG * watchdog:
         return [
