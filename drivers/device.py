@@ -277,6 +277,11 @@ def refuse_hiding(device: type, name: str, kind: type) -> None:
             raise TypeError(f"{device.__name__}.{name}: {base.__name__} has this name already; choose another")
 
 
+def other_answer(heard: bytes) -> str:
+    """Return what to say of bytes that came and are no answer of this kind of instrument; nothing if none came."""
+    return f"; another instrument answers there, or at another speed: {bytes(heard[:40])!r}" if heard else ""
+
+
 def attempt(*steps: Callable[[], object]) -> list[DeviceError]:
     """Take every step, also after one that fails; return the failures."""
     failures = []

@@ -233,7 +233,19 @@ def crc16(data: bytes) -> bytes:
 
 
 class NoReplyError(OSError):
-    """No good reply came; the line itself works."""
+    """No good reply came; the line itself works.
+
+    Parameters
+    ----------
+    message : str
+        What came instead.
+    heard : bytes
+        What came, if it does not begin as a reply of the instrument does.
+    """
+
+    def __init__(self, message: str, heard: bytes = b"") -> None:
+        super().__init__(message)
+        self.heard = heard
 
 
 class UnexpectedReplyError(NoReplyError):
@@ -322,13 +334,16 @@ class RtuClient(_PortClient):
             received = self._fill(received, length)
             reply, received = received[:length], received[length:]
             if len(reply) < length or reply[0] != self._unit or crc16(reply[:-2]) != reply[-2:]:
-                raise NoReplyError(f"{len(reply)} bytes that are no good reply")
+                raise NoReplyError(f"{len(reply)} bytes that are no good reply", self._foreign(reply))
             if is_reply_to(request, expected, reply):
                 return reply
             stray = reply
         if stray:
             raise UnexpectedReplyError(request, expected, stray[1], len(stray) - 3)
-        raise NoReplyError(f"{len(received)} bytes that are no good reply")
+        raise NoReplyError(f"{len(received)} bytes that are no good reply", self._foreign(received))
+
+    def _foreign(self, received: bytes) -> bytes:
+        return b"" if received[:1] == bytes((self._unit,)) else received
 
     def _fill(self, received: bytes, size: int) -> bytes:
         """Wait until so many bytes are there, for the timeout at most; return what is there."""

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, Generic, Literal, Self, TypeVar, overload
 from pydantic import Field
 
 from bench.base import Clock, DeferredModule, DeviceConnectionError, DeviceError
-from drivers.device import refuse_hiding
+from drivers.device import other_answer, refuse_hiding
 from drivers.modbus import (
     EMULATED,
     READ,
@@ -236,6 +236,7 @@ class RtuLine:
             f"no good reply within {settings.timeout:g} s",
             "address",
             settings.address,
+            other_answer(problem.heard) if problem else "",
             resends=self._resends,
             speed=f"{settings.baudrate} Bd, parity {settings.parity}, mode RTU{self.set_at}",
         ) from problem

@@ -150,10 +150,11 @@ class SerialClient(PymodbusClient):
         self._line.expect(request, expected)
         try:
             return super().request(request, expected)
-        except NoReplyError:
+        except NoReplyError as error:
             if (stray := self._line.stray) is not None:
                 raise UnexpectedReplyError(request, expected, stray[1], len(stray) - 3) from None
-            raise
+            heard = self._line.heard
+            raise NoReplyError(str(error), b"" if heard[:1] == bytes((self._unit,)) else heard) from error
 
     def settle(self, silence: float) -> None:
         """Discard what comes until nothing has come for `silence` seconds; raises `OSError` if that does not end."""
@@ -179,6 +180,7 @@ class _BlockingClient(ModbusSerialClient):
         self.socket: Any = open_port(device, settings, parity=parity)
         # Of the present request, from `expect` and `send` on.
         self._received: int
+        self.heard = b""
         self._request: bytes
         self._expected: int
         self.stray: bytes | None = None
@@ -195,7 +197,7 @@ class _BlockingClient(ModbusSerialClient):
         """Send a request, and discard what came before it."""
         with self._line_errors():
             self._discard()
-            self._received = 0
+            self._received, self.heard = 0, b""
             sent: int = self.socket.write(request)
         return sent
 
@@ -215,6 +217,7 @@ class _BlockingClient(ModbusSerialClient):
             if len(reply) == SHORTEST_REPLY and (missing := reply_length(reply) - SHORTEST_REPLY) > 0:
                 reply += self.socket.read(missing)
         self._received += len(reply)
+        self.heard += reply
         return reply
 
     def _is_stray(self, frame: bytes) -> bool:

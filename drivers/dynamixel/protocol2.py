@@ -14,6 +14,7 @@ import serial
 from pydantic import Field
 
 from bench.base import Clock
+from drivers.device import other_answer
 from drivers.serial_line import RESENDS, SerialSettings, forget_received, lost_line, no_answer, open_port, patience_of
 
 PING, READ, WRITE, REBOOT = 0x01, 0x02, 0x03, 0x08
@@ -84,6 +85,7 @@ class ServoLine:
         self._settings = settings
         self._clock = clock
         self._received = bytearray()
+        self._heard = b""
         self._heads: dict[int, bytes] = {}
         self._quiet_at = -math.inf
         self._silence = f"no answer within {settings.timeout:g} s"
@@ -134,6 +136,7 @@ class ServoLine:
                     self.repeats += 1
                     self._expect_late()
                 self._received.clear()
+                self._heard = b""
                 forget_received(self._port)
                 self._port.write(request)
                 problem, answer = self._answer(length)
@@ -147,7 +150,8 @@ class ServoLine:
             self._expect_late()
         except (serial.SerialException, OSError) as error:
             raise lost_line(self._device, self._settings, error) from None
-        raise no_answer(self._device, self._settings, problem, "id", self._settings.id)
+        found = "" if _HEADER in self._heard else other_answer(self._heard)
+        raise no_answer(self._device, self._settings, problem, "id", self._settings.id, found)
 
     def _expect_late(self) -> None:
         """Take note that an answer to what is sent now may come late."""
@@ -164,6 +168,7 @@ class ServoLine:
             if whole and not data[8] & ~_ALERT and crc(data[:-2]) == data[-2] | data[-1] << 8:
                 return "", data[8:-2]
             self._received += data
+            self._heard += data
             ended = len(data) < expected
         return self._search_answer(length, ended)
 
@@ -224,6 +229,7 @@ class ServoLine:
                 return b"" if received else None
             chunk = self._port.read(missing)
             received += chunk
+            self._heard += chunk
             read += len(chunk)
             ended = len(chunk) < missing
         return b""

@@ -17,6 +17,7 @@ import serial
 from pydantic import Field
 
 from bench.base import DeviceError
+from drivers.device import other_answer
 from drivers.serial_line import RESENDS, SerialSettings, forget_received, lost_line, no_answer, open_port
 
 _MOST_STALE_ANSWERS = 8
@@ -88,6 +89,7 @@ class TECLine:
         self._most_resends = RESENDS
         self.repeats = 0
         self._received = bytearray()
+        self._strange = b""
         self._silence = f"no answer within {settings.timeout:g} s"
         self._port = open_port(device, settings)
         # An emulated line hands the answer over with the request.
@@ -139,6 +141,7 @@ class TECLine:
         body = f"{self._begin}{sequence:04X}{request}".encode("ascii")
         end = b"%04X\r" % crc_hqx(body, 0)
         frame, head = body + end, b"!" + body[1:7]
+        self._strange = b""
         if resends > self._most_resends:
             resends = self._most_resends
         try:
@@ -165,7 +168,8 @@ class TECLine:
                     forget_received(self._port)
         except (serial.SerialException, OSError) as error:
             raise lost_line(self._device, self._settings, error) from None
-        raise no_answer(self._device, self._settings, problem, "address", self._settings.address, resends=resends)
+        found, address = other_answer(self._strange), self._settings.address
+        raise no_answer(self._device, self._settings, problem, "address", address, found, resends=resends)
 
     def _write_and_look(self, frame: bytes) -> bytes:
         """Send a frame; return what has come already."""
@@ -178,10 +182,14 @@ class TECLine:
         for _ in range(_MOST_STALE_ANSWERS):
             answer = self._read_answer(_ACKNOWLEDGE_LENGTH + digits)
             if answer is None:
+                if b"!" not in self._received:
+                    self._strange += self._received
                 return self._silence, b""
             if (begin := answer.rfind(b"!")) > 0:
                 answer = answer[begin:]
             if not answer.startswith(head):
+                if not answer.startswith(b"!"):
+                    self._strange += answer
                 continue
             content, received_crc = answer[7:-4], answer[-4:]
             # An acknowledge carries the CRC of the request.

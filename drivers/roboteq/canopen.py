@@ -21,6 +21,7 @@ import serial
 from pydantic import Field
 
 from bench.base import Clock, DeferredModule, DeviceConnectionError, DeviceError
+from drivers.device import other_answer
 from drivers.serial_line import RESENDS, SerialSettings, lost_line, no_answer
 
 if TYPE_CHECKING:
@@ -351,7 +352,7 @@ class NodeLine:
             self._quiet_at = sent_at + _LATEST * self._adapter.patience
         except (can.CanError, serial.SerialException, OSError) as error:
             raise self._lost(error) from None
-        raise self._silence(adapter.refusals - refusals)
+        raise self._silence(adapter.refusals - refusals, adapter.strange)
 
     def _hear(self) -> None:
         """Take note of what has come, which answers nothing."""
@@ -400,11 +401,12 @@ class NodeLine:
     def _lost(self, error: BaseException) -> DeviceConnectionError:
         return lost_line(self._device, self._settings, _cause(error))
 
-    def _silence(self, refusals: int) -> DeviceConnectionError:
+    def _silence(self, refusals: int, strange: bytes) -> DeviceConnectionError:
         settings = self._settings
         found = f"; heard of node {', '.join(map(str, sorted(self._heard)))} instead" if self._heard else ""
         if refusals:
             found += f"; the adapter reports an error ({refusals} BEL)"
+        found += other_answer(strange)
         problem, speed = f"no answer within {settings.timeout:g} s", f"{settings.bitrate} bit/s"
         return no_answer(self._device, settings, problem, "node", settings.node, found, speed)
 

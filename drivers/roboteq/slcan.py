@@ -19,6 +19,8 @@ from drivers.serial_line import SerialSettings, patience_of, patient
 _MOST_READS = 4096
 _LONGEST_LINE = 64
 _ACKNOWLEDGEMENTS = frozenset((b"z\r", b"z\rz\r", b"\r"))
+_BEGINNINGS = b"tTrRzZVNF"
+"""How lines of an adapter begin. Source: LAWICEL CAN232 manual V3, commands."""
 
 
 class SlcanAdapter(slcanBus):
@@ -32,6 +34,8 @@ class SlcanAdapter(slcanBus):
     ----------
     refusals : int
         How often the adapter has answered with BEL since it was opened.
+    strange : bytes
+        What came last that is no line of an adapter.
     transmit : callable
         Sends a line, which has its end.
     """
@@ -40,6 +44,7 @@ class SlcanAdapter(slcanBus):
 
     def __init__(self, settings: SerialSettings, bitrate: int) -> None:
         self.refusals = 0
+        self.strange = b""
         self._lines: deque[bytes] = deque()
         self._rest = b""
         try:
@@ -114,6 +119,7 @@ class SlcanAdapter(slcanBus):
         *lines, rest = text.split(b"\r")
         self._rest = rest if len(rest) <= _LONGEST_LINE else b""
         self._lines.extend([line for line in lines if line[:1] == b"t"])
+        self.strange = next((line for line in lines if line[:1] not in _BEGINNINGS), self.strange)
 
     def _abandon(self) -> None:
         port = getattr(self, "serialPortOrig", None)

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 
 from bench.base import Clock, DeviceConnectionError, DeviceError
 from bench.devices import ANY_TEXT, CommandTable, Template, template
+from drivers.device import other_answer
 from drivers.scpi.transport import TextLineSettings, open_transport
 from drivers.serial_line import RESENDS
 
@@ -103,7 +104,8 @@ class TextLine:
             raise DeviceConnectionError(
                 self._device,
                 f"no answer to {question!r} within {self._settings.timeout:g} s at {self._settings.port}, after "
-                f"{1 + resends} request{'s' if resends else ''}; check power, cable, address, speed and terminators",
+                f"{1 + resends} request{'s' if resends else ''}{other_answer(self._transport.unfinished)}; "
+                "check power, cable, address, speed and terminators",
             )
         advice = form.doubt(answer, units) or "is it out of its range?"
         raise DeviceError(self._device, f"answered {answer!r} to {question!r}, expected {form.text!r}; {advice}")

@@ -54,7 +54,14 @@ class Transport(Protocol):
     """A line on which messages go out, and answers come in order.
 
     Each method raises `DeviceConnectionError` when the line is lost.
+
+    Attributes
+    ----------
+    unfinished : bytes
+        What came since the last answer without a terminator.
     """
+
+    unfinished: bytes
 
     def write(self, message: bytes) -> None:
         """Send a message with its terminator."""
@@ -83,6 +90,7 @@ class SerialTransport:
 
     def __init__(self, device: str, settings: TextLineSettings, terminator: bytes) -> None:
         self._device, self._settings, self._terminator = device, settings, terminator
+        self.unfinished = b""
         url = settings.port
         if url.startswith(TCP):
             url = f"socket://{url.removeprefix(TCP)}"
@@ -110,7 +118,11 @@ class SerialTransport:
             answer: bytes = self._port.read_until(self._terminator, LONGEST_ANSWER)
         except OSError as error:
             raise lost_line(self._device, self._settings, error) from None
-        return answer.removesuffix(self._terminator) if answer.endswith(self._terminator) else None
+        if answer.endswith(self._terminator):
+            self.unfinished = b""
+            return answer.removesuffix(self._terminator)
+        self.unfinished = answer or self.unfinished
+        return None
 
     def discard(self) -> None:
         """Forget what was received."""
@@ -131,6 +143,7 @@ class VisaTransport:
         import pyvisa
 
         self._device, self._settings, self._terminator = device, settings, terminator
+        self.unfinished = b""
         self._errors = (pyvisa.errors.Error, OSError)
         self._timed_out = pyvisa.constants.StatusCode.error_timeout
         self._discard_buffer = pyvisa.constants.BufferOperation.discard_read_buffer

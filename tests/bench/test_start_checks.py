@@ -19,7 +19,6 @@ from bench.rig import (
     packaged_rigs,
 )
 
-
 SUPPLY = Path(__file__).parents[2] / "examples" / "bench-supply.toml"
 
 

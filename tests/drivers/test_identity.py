@@ -6,6 +6,8 @@ import pytest
 
 from bench.base import ConfigurationError, DeviceConnectionError, VirtualClock
 from bench.rig import Rig, load_rig
+from sim_devices import protocol_emulated
+from sim_devices.wire import WireServer
 
 EXAMPLE = str(Path(__file__).parents[2] / "examples" / "bench-supply.toml")
 RIGS = ["vo2", "sma", "hybrid", EXAMPLE]
@@ -54,6 +56,36 @@ def test_every_driver_knows_its_instrument_or_says_that_it_cannot(name):
             else:
                 with pytest.raises(DeviceConnectionError, match="does not tell its serial number"):
                     connect(serial_number="1")
+
+
+class Stranger(WireServer):
+    """Another instrument, which has an answer of its own to everything."""
+
+    def __init__(self, answer):
+        self.answer = answer
+
+    def receive(self, data):  # noqa: ARG002
+        return self.answer
+
+
+@pytest.mark.parametrize(
+    ("name", "device"),
+    [("vo2", "tec"), ("sma", "load_cell"), ("sma", "stage"), ("sma", "supply"), (EXAMPLE, "supply")],
+)
+def test_another_instrument_that_answers_in_its_own_way_is_no_silence(name, device):
+    (entry,) = (entry for entry in load_rig(name).devices if entry.name == device)
+    clock = VirtualClock()
+    for answer in (b"ERR 12\r", b""):
+        settings = entry.settings.model_copy(
+            update={"port": protocol_emulated.register("stranger", Stranger(answer), clock)}
+        )
+        try:
+            with pytest.raises(DeviceConnectionError) as raised:
+                entry.driver.connect(device, settings, clock)
+        finally:
+            protocol_emulated.unregister("stranger")
+        assert ("another instrument answers there" in str(raised.value)) == bool(answer)
+        assert not answer or "ERR" in str(raised.value)
 
 
 @pytest.fixture

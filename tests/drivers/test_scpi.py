@@ -627,7 +627,7 @@ def test_so_many_late_answers_are_passed_over(lab, strays, is_good):
 def test_an_instrument_without_an_identity_comes_into_step_by_silence(stack):
     lab = Laboratory(stack, identity_query="", identity="{any}")
     device = lab.connect()
-    assert str(device.identity) == "unknown text instrument, serial number emulated://scpi-test, firmware unknown"
+    assert str(device.identity) == "unknown text instrument, serial number unknown, firmware unknown"
     answers = [b""]
     lab.answer = lambda data, usual: answers.pop(0) if answers else usual(data)
     begin = lab.clock.now()
