@@ -50,7 +50,7 @@ from .settling import (
     UntilSteady as UntilSteady,
     durations as durations,
 )
-from .template import (
+from .templates import (
     ANY_TEXT as ANY_TEXT,
     VALUE as VALUE,
     Template as Template,

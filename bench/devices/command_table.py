@@ -23,7 +23,7 @@ Python. Messages are templates: a number stands as `{value}`, in a reply any tex
     query = "MEAS:VOLT?"
     unit = "V"
 
-Upper and lower case are the same, and so are one space and several; `bench.devices.template` says how answers are
+Upper and lower case are the same, and so are one space and several; `bench.devices.templates` says how answers are
 read. Sources: IEEE 488.2-1992 (common commands), SCPI-99 volume 2, 21.8 (error queue).
 """
 
@@ -36,7 +36,7 @@ from typing import Annotated, Self
 from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
 from bench.base import CheckedTable, check_unit
-from bench.devices.template import ANY, ANY_TEXT, UNIT, VALUE, Decimal, Template, template
+from bench.devices.templates import ANY, ANY_TEXT, UNIT, VALUE, Decimal, Template, template
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
 """Name of a signal, without that of its device."""
