@@ -15,7 +15,7 @@ from bench.rig.file import RigFile
 from bench.rig.maintenance.opening import Workplace
 from bench.rig.maintenance.safe_state import SAFE, make_safe
 from bench.rig.slots import RoleTable, reading_of
-from bench.rig.start_checks import SHARE_OF_WATCHDOG, has_watchdog_key
+from bench.rig.start_checks import SHARE_AWAY, SHARE_OF_WATCHDOG, has_watchdog_key
 
 GLANCES, MEASUREMENTS = 20, 5
 """How many of each are taken for noise and time."""
@@ -265,7 +265,8 @@ def _watchdog(device: Actuator, file: RigFile) -> list[CheckFinding]:
                 f"let telemetry.period be {SHARE_OF_WATCHDOG * watchdog:g} s at most, or lengthen the watchdog",
             )
         ]
-    return [CheckFinding("watchdog", text)]
+    longest = min(file.safety.reconnect, SHARE_AWAY * watchdog)
+    return [CheckFinding("watchdog", f"{text}; its line may be lost for {longest:g} s")]
 
 
 def _times(file: RigFile, devices: Mapping[str, Device], ticks: Mapping[str, float]) -> list[CheckFinding]:
