@@ -187,3 +187,9 @@ def test_with_units_and_either_sign_what_was_written_is_read_back(value, sign):
     form = template("{value:.9e} {unit};{any}", sign)
     found = form.match(form.fill({"value": value}, "5,5", {"value": "V"}), {"value": "V"})
     assert found == {"value": pytest.approx(value, rel=1e-8, abs=1e-17)}
+
+
+def test_any_text_never_takes_a_part_of_a_unit():
+    assert template("{value}{unit}{any}").match("5 m/s;x", {"value": "m/s"}) == {"value": 5.0}
+    for rest in ("2", "^2", "*s"):
+        assert template("{value}{unit}{any}").match(f"5 m/s{rest}", {"value": "m/s"}) is None
