@@ -3,6 +3,7 @@
 import contextlib
 import io
 import os
+import re
 import subprocess
 import sys
 from dataclasses import dataclass
@@ -14,6 +15,13 @@ in_a_process = False
 
 READING = ("list", "predict", "runs", "run", "campaign")
 """Commands that may be carried out twice."""
+
+
+CODES = (*range(11), 130)
+"""Exit codes that the documents name."""
+
+_OF_A_LIBRARY = re.compile(r"\.py:\d+: \w*Warning|^Exception ignored", re.MULTILINE)
+"""What Python prints of a warning, or of an exception that nobody takes."""
 
 
 @dataclass(frozen=True)
@@ -64,8 +72,10 @@ def checked(ended: Ended) -> Ended:
     """Return how a command ended; raise UnclearError if that is a traceback, or an error that says nothing."""
     if "Traceback" in ended.err or "Traceback" in ended.out:
         raise UnclearError(ended.err[-2000:])
-    if ended.code < 0 or (ended.code and not (ended.err + ended.out).strip()):
-        raise UnclearError(f"exit code {ended.code} without a message")
+    if _OF_A_LIBRARY.search(ended.err + ended.out):
+        raise UnclearError(f"a warning of a library is printed: {ended.err[-2000:]}")
+    if ended.code not in CODES or (ended.code and not (ended.err + ended.out).strip()):
+        raise UnclearError(f"exit code {ended.code}, or without a message: {ended.err[-500:]}")
     if controls := {
         sign for sign in ended.out + ended.err if (sign < " " and sign not in "\n\t") or sign in "\x7f\u202e\u2066"
     }:

@@ -6,7 +6,8 @@ import json
 import random
 import re
 import shutil
-from collections.abc import Sequence
+import warnings
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from datetime import datetime
 from pathlib import Path
@@ -21,7 +22,8 @@ from bench.record import Record
 HEAD = ("t", "u", "y")
 NUMBERS = [(0.5 * i, 1.0 + i + 0.125 * (i % 7), 1000.0 - 3.0625 * i - 0.25 * (i % 5)) for i in range(30)]
 
-_LEFT_OUT = re.compile(r"(\d+) (?:line|row)s? (?:of comment|above the header|below the table)")
+_LEFT_OUT = re.compile(r"(\d+) (?:line|row)s? (?:of comment|above the header|below the table|of the others)")
+_TABLES = re.compile(r"of (\d+) tables")
 
 Cells = Sequence[str]
 
@@ -33,23 +35,29 @@ def text_of(delimiter: str, decimal: str, quoted: bool = False) -> str:
     return "".join(delimiter.join(f"{mark}{cell}{mark}" for cell in row) + "\n" for row in rows)
 
 
+_PREAMBLE = "LabVIEW Measurement\t\nSeparator\tTab\n***End_of_Header***\t\n\t\nX0\t0,0\t0,0\nDelta_X\t0,5\t0,5\n"
+_SECTIONS = "[Header]\n; made by a bench\nINFO,4.2,MASS\n[Data]\n"
+
 LAYOUTS = {
-    ",": text_of(",", "."), "\t": text_of("\t", "."), ";": text_of(";", ","), " ": text_of(" ", "."),
-    '"': text_of(",", ".", quoted=True), "|": text_of("|", "."),
+    # name: (delimiter, decimal sign, text)
+    "comma": (",", ".", text_of(",", ".")), "tab": ("\t", ".", text_of("\t", ".")),
+    "semicolon": (";", ",", text_of(";", ",")), "blank": (" ", ".", text_of(" ", ".")),
+    "quoted": (",", ".", text_of(",", ".", quoted=True)), "bar": ("|", ".", text_of("|", ".")),
+    "lvm": ("\t", ",", _PREAMBLE + text_of("\t", ",")), "sections": (",", ".", _SECTIONS + text_of(",", ".")),
+    "unit row": (";", ",", text_of(";", ",").replace("\n", "\ns;V;N\n", 1)),
 }  # fmt: skip
 
 
 def try_text(folder: Path, rng: random.Random) -> str:
     """Import a mutated text."""
-    name = rng.choice(list(LAYOUTS))
-    text = LAYOUTS[name]
+    delimiter, decimal, text = LAYOUTS[rng.choice(list(LAYOUTS))]
     if rng.random() < 0.2:
         text = "# of a bench\n" + text
     content = mutated_lines(text, rng) if rng.random() < 0.75 else mutated_bytes(text.encode(), rng)
     if rng.random() < 0.2:
         again = rng.random() < 0.3
         content = mutated_lines(content.decode("latin-1") or "\n", rng) if again else content
-    file = folder / rng.choice(("m.csv", "m.txt", "m.tsv", "m.dat", "m"))
+    file = folder / rng.choice(("m.csv", "m.txt", "m.tsv", "m.dat", "m.lvm", "m"))
     if rng.random() < 0.1:
         packed = gzip.compress(content, mtime=0)
         file = folder / "m.csv.gz"
@@ -57,8 +65,7 @@ def try_text(folder: Path, rng: random.Random) -> str:
         # What is damaged is refused by its checksum.
     else:
         file.write_bytes(content)
-    delimiter = {'"': ","}.get(name, name)
-    return check(folder, file, cells_of(content, delimiter), "," if name == ";" else ".")
+    return check(folder, file, cells_of(content, delimiter), decimal)
 
 
 def cells_of(content: bytes, delimiter: str) -> list[Cells]:
@@ -93,7 +100,10 @@ def check(folder: Path, file: Path, rows: Sequence[Cells], decimal: str = ".") -
     shutil.rmtree(out)
     if said["rows"] != len(read):
         return f"{said['rows']} rows are said, {len(read)} are in the journal"
-    left_out = sum(int(number) for number in _LEFT_OUT.findall(json.dumps(said)))
+    text = json.dumps(said)
+    left_out = sum(int(number) for number in _LEFT_OUT.findall(text)) + ("units from a row" in text)
+    # Each further table may have a header of its own.
+    left_out += sum(int(number) - 1 for number in _TABLES.findall(text))
     numbers = [numbers for cells in rows if (numbers := _numbers(cells, decimal)) is not None]
     # The header is the only line that is neither a row nor reported.
     if len(rows) - 1 > len(read) + left_out:
@@ -104,6 +114,9 @@ def check(folder: Path, file: Path, rows: Sequence[Cells], decimal: str = ".") -
     for row in read.tolist():
         if not any(row == list(other) for other in rest):
             return f"the row {row} is read, which is not in the file at its place: {said}"
+    # What is read may still be of a size at which numerical libraries warn.
+    names = "--input", "u", "--output", "y", "--model", "polynomial-plays"
+    call("identify", file, *names, "--out", folder / "model.json")
     return ""
 
 
@@ -171,16 +184,14 @@ def try_spreadsheet(folder: Path, rng: random.Random) -> str:
     return check(folder, file, [row for row in cells if any(row)])
 
 
-def try_matlab(folder: Path, rng: random.Random) -> str:
-    """Import a mutated MATLAB file."""
-    from scipy.io import savemat
+def _numbers_by_name() -> dict[str, Any]:
+    return {name: np.array(values) for name, values in zip(HEAD, zip(*NUMBERS, strict=True), strict=True)}
 
-    columns: dict[str, Any] = {
-        name: np.array(values) for name, values in zip(HEAD, zip(*NUMBERS, strict=True), strict=True)
-    }
+
+def _is_changed(columns: dict[str, Any], rng: random.Random) -> bool:
+    """Change one of the columns at random; return whether it was, and not left to a mutation of bytes."""
     name = rng.choice(HEAD)
     column = columns[name]
-    damaged = False
     match rng.randrange(9):
         case 0:
             column[rng.randrange(column.size)] = rng.choice((np.nan, np.inf, 1e308, -0.0))
@@ -195,21 +206,70 @@ def try_matlab(folder: Path, rng: random.Random) -> str:
         case 5:
             del columns[name]
         case _:
-            damaged = True
-    content = io.BytesIO()
-    savemat(content, columns, do_compression=rng.random() < 0.5, format=rng.choice(("4", "5")) if damaged else "5")
-    data = content.getvalue()
-    file = folder / "m.mat"
-    file.write_bytes(mutated_bytes(data, rng) if damaged else data)
+            return False
+    return True
+
+
+def _try_arrays(folder: Path, rng: random.Random, name: str, save: Callable[[Path, dict[str, Any]], None]) -> str:
+    """Import a mutated file of named arrays, which `save` writes if it can hold them."""
+    columns = _numbers_by_name()
+    changed = _is_changed(columns, rng)
+    file = folder / name
+    try:
+        save(file, columns)
+    except (TypeError, ValueError, NotImplementedError):
+        if changed:
+            return ""
+        raise
+    if not changed:
+        file.write_bytes(mutated_bytes(file.read_bytes(), rng))
     # Nothing tells a number that is damaged from another one: only the number of rows.
-    rows = [
-        HEAD,
-        *(
-            [str(float(v) if isinstance(v, bool) else v) for v in row]
-            for row in zip(*(_flat(columns[each]) for each in HEAD if each in columns), strict=False)
-        ),
-    ]
-    return count_only(folder, file, len(rows) - 1) if damaged or len(columns) < 3 else check(folder, file, rows)
+    taken = (_flat(columns[each]) for each in HEAD if each in columns)
+    rows = [HEAD, *([str(float(v) if isinstance(v, bool) else v) for v in row] for row in zip(*taken, strict=False))]
+    if not changed or len(columns) < len(HEAD):
+        return count_only(folder, file, len(rows) - 1)
+    return check(folder, file, rows)
+
+
+def try_matlab(folder: Path, rng: random.Random) -> str:
+    """Import a mutated MATLAB file, of version 4, 5 or 7.3."""
+    from scipy.io import savemat
+
+    def save(path: Path, columns: dict[str, Any]) -> None:
+        version = rng.choice(("4", "5", "5", "7.3"))
+        if version != "7.3":
+            savemat(path, columns, do_compression=version == "5" and rng.random() < 0.5, format=version)
+            return
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            import matio
+
+            matio.save_to_mat(str(path), columns, version="v7.3")
+
+    return _try_arrays(folder, rng, "m.mat", save)
+
+
+def try_hdf5(folder: Path, rng: random.Random) -> str:
+    """Import a mutated HDF5 file."""
+    import h5py
+
+    def save(path: Path, columns: dict[str, Any]) -> None:
+        with h5py.File(path, "w") as file:
+            for name, values in columns.items():
+                file[name] = values
+
+    return _try_arrays(folder, rng, "m.h5", save)
+
+
+def try_tdms(folder: Path, rng: random.Random) -> str:
+    """Import a mutated TDMS file."""
+    from nptdms import ChannelObject, TdmsWriter
+
+    def save(path: Path, columns: dict[str, Any]) -> None:
+        with TdmsWriter(str(path)) as file:
+            file.write_segment([ChannelObject("run", name, np.asarray(values)) for name, values in columns.items()])
+
+    return _try_arrays(folder, rng, "m.tdms", save)
 
 
 def _flat(values: Any) -> list[Any]:
@@ -293,4 +353,7 @@ def try_parquet(folder: Path, rng: random.Random) -> str:
     return check(folder, file, rows)
 
 
-KINDS = {"text": try_text, "spreadsheet": try_spreadsheet, "matlab": try_matlab, "parquet": try_parquet}
+KINDS = {
+    "text": try_text, "spreadsheet": try_spreadsheet, "matlab": try_matlab, "hdf5": try_hdf5, "tdms": try_tdms,
+    "parquet": try_parquet,
+}  # fmt: skip

@@ -109,7 +109,6 @@ from .session_recalibration import (
     session_rows as session_rows,
 )
 from .tables.data import (
-    FEWEST_ROWS as FEWEST_ROWS,
     Quantity as Quantity,
     read_columns as read_columns,
     write_csv as write_csv,
@@ -130,6 +129,9 @@ from .tables.imported import (
 )
 from .tables.reading.options import (
     ReadingOptions as ReadingOptions,
+)
+from .tables.reading.table import (
+    FEWEST_ROWS as FEWEST_ROWS,
 )
 from .tables.starting_state import (
     foreign_drift as foreign_drift,

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from bench.analysis.model_service import FitOptions, IdentifiedFile
-from bench.analysis.tables.data import FEWEST_ROWS, check_variation
+from bench.analysis.tables.data import check_variation
 from bench.analysis.tables.dataset import Dataset, check_rows, overwritten_from, parse_rows
+from bench.analysis.tables.reading.table import FEWEST_ROWS
 from bench.analysis.tables.starting_state import bind_times, left_out
 from bench.base import ConfigurationError, DataError
 from bench.identification import (

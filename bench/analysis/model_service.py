@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any
@@ -63,6 +63,13 @@ SMOOTHING = (0.0, 1e-4, 1e-3, 1e-2, 1e-1, 1.0)
 # Coefficients up to which cross-validation that nobody asked for takes seconds. Derivation: their normal equations
 # have 0.3 GB, a tenth of what a small computer has.
 _MOST_CROSS_VALIDATED = 6000
+
+
+# Part of the time between rows below which a time of a model is implausible. Derivation: the next row finds nothing
+# left of it, and a step of the input cannot be that sharp.
+_SHORTEST = 1e-3
+
+_UNIT_OF_TIMES = "; the rows do not show it, unless the unit of their times is wrong (--time-unit)"
 
 
 @dataclass(frozen=True)
@@ -230,6 +237,18 @@ def check_template(model: str, inputs: Floats, options: Mapping[str, Any]) -> No
     spec.template(inputs, **own)
 
 
+def _implausible_times(model: TimedModel[Any], times: Floats) -> Iterator[str]:
+    """Yield warnings of the times of a model that rows at these times cannot show."""
+    interval, duration = float(np.median(np.diff(times))), float(np.ptp(times))
+    for name, (value, unit) in model.parameters().items():
+        if unit != "s":
+            continue
+        if value < _SHORTEST * interval:
+            yield f"{name}: {value:.3g} s is under a thousandth of the {interval:.3g} s between rows{_UNIT_OF_TIMES}"
+        elif value > duration:
+            yield f"{name}: {value:.3g} s is longer than the record, which lasts {duration:.3g} s{_UNIT_OF_TIMES}"
+
+
 def identify_model(
     data: Dataset, model: str, options: FitOptions | None = None, transients: Transients | None = None
 ) -> IdentifiedFile:
@@ -312,7 +331,7 @@ def identify_model(
         validity = replace(validity, moves=None)
     if not fitted.all():
         found = replace(found, errors=measure_errors(outputs[counted], (outputs - found.residuals)[counted]))
-    warnings += found.warnings
+    warnings += (*found.warnings, *(() if times is None else _implausible_times(found.model, times)))
     tests = check_return_points(inputs, outputs), check_congruency(inputs, outputs)
     if times is None:
         # A model with time takes neither for granted.

@@ -23,9 +23,6 @@ from bench.analysis.tables.reading.text_table import read_text
 from bench.base import ConfigurationError, DataError, header_with_unit
 from bench.record import Record
 
-FEWEST_ROWS = 10
-"""Fewer samples than this identify nothing."""
-
 _SPREADSHEETS = b"PK\x03\x04", b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1"
 
 _LIST = re.compile(r",(?![^(\[]*[)\]])")

@@ -13,15 +13,10 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from bench.analysis.tables.data import (
-    FEWEST_ROWS,
-    Quantity,
-    check_excitation,
-    is_run,
-    read_columns,
-)
+from bench.analysis.tables.data import Quantity, check_excitation, is_run, read_columns
 from bench.analysis.tables.reading.options import ReadingOptions
-from bench.analysis.tables.times import seconds_of
+from bench.analysis.tables.reading.table import FEWEST_ROWS
+from bench.analysis.tables.times import rows_in_time, seconds_of
 from bench.base import ConfigurationError, DataError
 from bench.identification import ModelFile
 from bench.models import PolynomialPlays, TimedModel
@@ -36,6 +31,9 @@ _FEWEST_SORTED, _TRAVELS, _MEAN_JUMP = 30, 5.0, 0.03
 
 Derivation: one sweep travels once, and noise of 2 % adds 2 % a row; branches are some 10 % apart.
 """
+
+_LARGEST = 1e150
+"""Size of a value that is fitted. Derivation: sums of squares of a thousand million such values are finite."""
 
 NO_TIMES = "none"
 """Stands for a column of times where a file's own is to be left out."""
@@ -210,6 +208,13 @@ def read_dataset(
     def joined(name: str | None) -> Quantity | None:
         if name is None:
             return None
+        for path, each in zip(paths, found, strict=True):
+            beyond = np.flatnonzero(np.abs(each.values[name]) > _LARGEST)
+            if beyond.size:
+                raise DataError(
+                    f"{path}: row {beyond[0] + 1}, column {name}: {each.values[name][beyond[0]]:g} is beyond "
+                    f"±{_LARGEST:g}; correct it in the file, or choose another unit"
+                )
         values = [each.values[name] for each in found]
         return Quantity(
             first.own_name(name), first.units[name], values[0] if len(values) == 1 else np.concatenate(values)
@@ -223,8 +228,13 @@ def read_dataset(
         remarks.append(f"rows {interval:g} s apart")
     elif time is not None and not is_run(paths[0]):
         try:
-            seconds, said = seconds_of(first.source, time, reading.time_unit)
+            others = [column.values for column in (driven, measured, weights) if column is not None]
+            kept, seconds, said = rows_in_time(first.source, time, others, reading.time_unit)
             time, remarks = Quantity(time.name, "s", seconds), [*said]
+            driven = replace(driven, values=driven.values[kept])
+            measured, weights = (
+                column and replace(column, values=column.values[kept]) for column in (measured, weights)
+            )
         except DataError:
             # Those that nobody asked for are at fault where they are used.
             if names.time is not None:

@@ -17,7 +17,7 @@ from bench.analysis.tables.data import is_run, read_columns
 from bench.analysis.tables.dataset import time_names
 from bench.analysis.tables.reading.heads import split_unit
 from bench.analysis.tables.reading.options import ReadingOptions
-from bench.analysis.tables.times import seconds_of
+from bench.analysis.tables.times import rows_in_time
 from bench.base import ConfigurationError, DataError, redacted_command, wall_time
 from bench.devices import Settled, Signal
 from bench.record import FILE_NAME, Event, Journal, StepRecord, current_user, make_folder, version_of
@@ -97,10 +97,12 @@ def import_file(
     sought = () if asked or interval else time_names(path)
     columns = read_columns(path, [*wanted, *asked], options=reading, times=sought)
     rows = len(columns.values[input_column])
+    kept = np.ones(rows, dtype=bool)
     times, remarks = (interval or 1.0) * np.arange(1.0, rows + 1.0), [f"rows are {interval or 1.0:g} s apart"]
     if time := time_column or columns.time:
         try:
-            times, said = seconds_of(columns.source, columns.quantity(time), reading.time_unit)
+            others = [columns.values[name] for name in wanted]
+            kept, times, said = rows_in_time(columns.source, columns.quantity(time), others, reading.time_unit)
             remarks = [*said]
         except DataError as error:
             # Those that nobody asked for may be of several records.
@@ -114,7 +116,7 @@ def import_file(
     # A file that is still there needs no row to be durable before the next.
     files = {file.name: file.read_bytes() for file in (path, *(place[0] for place in columns.elsewhere.values()))}
     journal = Journal(folder / FILE_NAME, signals, meta, files, flushed=False)
-    values = np.column_stack([columns.values[name] for name in wanted])
+    values = np.column_stack([columns.values[name][kept] for name in wanted])
     journal.event(Event(0.0, "INFO", "phase", f"imported from {path.name}"))
     for text in filter(None, assumptions):
         journal.event(Event(0.0, "INFO", "note", text))
@@ -124,7 +126,7 @@ def import_file(
         journal.step(StepRecord(i, t - lasted, t, PROTOCOL, "", Settled.UNRECORDED, {}, tuple(row)))
     journal.finish(status="completed", reason="", finished=float(elapsed[-1]), safe_state={})
     journal.close()
-    return ImportedRun(folder, rows, ", ".join(filter(None, assumptions)))
+    return ImportedRun(folder, times.size, ", ".join(filter(None, assumptions)))
 
 
 def _signal(column: str, unit: str) -> Signal:

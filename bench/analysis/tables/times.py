@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import replace
+
 import numpy as np
 import numpy.typing as npt
 
@@ -10,6 +13,7 @@ from bench.analysis.tables.reading.heads import SECONDS, spelled
 from bench.base import ConfigurationError, DataError
 
 Floats = npt.NDArray[np.float64]
+Flags = npt.NDArray[np.bool_]
 
 _DAYS = {"Excel": (20_000.0, 80_000.0), "MATLAB": (700_000.0, 800_000.0)}
 """Days that Excel counts from 1900 and MATLAB from the year 0. Derivation: years 1954 to 2119, 1916 to 2190."""
@@ -22,6 +26,38 @@ _LONGEST_STEP = 1e-3
 
 _LONG_BEFORE = 100.0
 """Factor of the span of a record by which its first stamp shows that times count from before it."""
+
+
+_EVEN = "where rows are evenly sampled, leave the column out and say --interval TIME, such as 0.1s"
+"""Remedy for times that cannot be those of a record."""
+
+
+def rows_in_time(
+    source: str, column: Quantity, others: Sequence[Floats], unit: str | None = None
+) -> tuple[Flags, Floats, tuple[str, ...]]:
+    """Return which rows of a record are kept, their times in s, and what was assumed.
+
+    A row with the time and the values of the row before was written twice, and is left out. If any row with the
+    time of the row before has values of its own, the clock is coarser than the sampling: `seconds_of` spreads them.
+
+    Parameters
+    ----------
+    source, column, unit
+        As `seconds_of`, which says what is raised.
+    others : sequence of ndarray, shape (N,) each
+        The other columns.
+    """
+    values = column.values
+    repeated = np.zeros(values.size, dtype=bool)
+    repeated[1:] = np.diff(values) == 0.0
+    same = [np.diff(other)[repeated[1:]] == 0.0 for other in others]
+    count = int(repeated.sum())
+    if count and values.size - count > 1 and all(map(np.all, same)):
+        kept = ~repeated
+        seconds, notes = seconds_of(source, replace(column, values=values[kept]), unit)
+        rows = f"{count} row{'s' * (count != 1)}"
+        return kept, seconds, (*notes, f"{rows} equal to the row before in time and values left out")
+    return np.ones(values.size, dtype=bool), *seconds_of(source, column, unit)
 
 
 def seconds_of(source: str, column: Quantity, unit: str | None = None) -> tuple[Floats, tuple[str, ...]]:
@@ -58,7 +94,7 @@ def seconds_of(source: str, column: Quantity, unit: str | None = None) -> tuple[
         before, after = values[row - 2 : row]
         raise DataError(
             f"{source}: column {name} does not increase in row {row} ({after:g} after {before:g}); "
-            "times must be those of one record, in order"
+            f"times must be those of one record, in order; {_EVEN}"
         )
     notes: list[str] = []
     found = given or own
@@ -100,7 +136,9 @@ def _spread(source: str, name: str, times: Floats) -> tuple[Floats, int]:
     if times.size < 2 or not repeated:
         return times, 0
     if starts.size == 1:
-        raise DataError(f"{source}: column {name} does not increase: it is {times[0]:g} in all {times.size} rows")
+        raise DataError(
+            f"{source}: column {name} does not increase: it is {times[0]:g} in all {times.size} rows; {_EVEN}"
+        )
     step = (times[-1] - times[starts[-2]]) / (starts[-1] - starts[-2])
     end = times[-1] + step * (times.size - starts[-1])
     rows = np.arange(times.size)

@@ -50,7 +50,7 @@ MUCH_LONGER = 5
 _MOSTLY = 0.8
 """Share of cells that are numbers in a layout that is preferred to one with more cells, of which fewer are."""
 
-_DELIMITERS = {
+DELIMITERS = {
     "\t": "tab-separated",
     ";": "semicolon-separated",
     "|": "separated by |",
@@ -128,6 +128,11 @@ class Header:
     figures: tuple[int, ...] = ()
 
 
+def delimited(delimiter: str) -> str:
+    """Return how columns are separated, for people."""
+    return DELIMITERS.get(delimiter, f"separated by {delimiter!r}")
+
+
 def comment_marks(delimiter: str) -> tuple[str, ...]:
     """Return the marks of comments where a character delimits."""
     return tuple(mark for mark in COMMENT_MARKS if mark != delimiter)
@@ -200,7 +205,7 @@ def find_layout(path: Path, lines: Sequence[str], options: ReadingOptions, first
         If the lines can be read in several ways: names the option that decides.
     """
     found: list[tuple[tuple[int, bool, int, float], Layout]] = []
-    for delimiter in [options.delimiter] if options.delimiter else list(_DELIMITERS):
+    for delimiter in [options.delimiter] if options.delimiter else list(DELIMITERS):
         assert delimiter is not None
         rows = list(split_rows(lines, delimiter, first))
         signs: list[tuple[tuple[int, bool, int, float], Layout]] = []
@@ -430,7 +435,7 @@ def _notes(above: Sequence[str], comments: int, header: Header, delimiter: str, 
     used += "units from a row" in header.notes and "header from a comment" not in header.notes
     others = sum(not line.isspace() for line in above) - comments - used
     return (
-        "one column" if header.columns == 1 else _DELIMITERS.get(delimiter, f"separated by {delimiter!r}"),
+        "one column" if header.columns == 1 else delimited(delimiter),
         *(["decimal comma"] if decimal == "," else []),
         *([count_lines(others, "above the header")] if others > 0 else []),
         *(["no header"] if header.fit == 1 and not header.heads else []),

@@ -13,13 +13,10 @@ from bench.analysis.tables.reading.heads import NoColumnError, find_place, make_
 from bench.analysis.tables.reading.library_files import load_contents
 from bench.analysis.tables.reading.moments import since_first
 from bench.analysis.tables.reading.options import OF_TIMES, ReadingOptions
-from bench.analysis.tables.reading.table import NO_ROW_LEFT_OUT, ReadColumns
+from bench.analysis.tables.reading.table import FEWEST_ROWS, NO_ROW_LEFT_OUT, ReadColumns
 from bench.base import DataError
 
 Array = npt.NDArray[Any]
-
-_FEWEST_ROWS = 10
-"""A matrix with fewer rows, and no fewer columns, has a quantity in each row: so few samples identify nothing."""
 
 
 def read_arrays(
@@ -101,7 +98,7 @@ def _columns(name: str, value: Any, turned: list[str], *, short: bool) -> Iterat
             yield from _columns(part if short else f"{name}.{part}", inner, turned, short=alone)
     elif value.ndim == 1:
         yield name, value
-    elif value.shape[0] < _FEWEST_ROWS <= value.shape[1]:
+    elif value.shape[0] < FEWEST_ROWS <= value.shape[1]:
         turned.append(f"{name}: {value.shape[0]} × {value.shape[1]}, its rows read as columns")
         for index, row in enumerate(value, start=1):
             yield f"{name}({index},:)", row

@@ -2,28 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
-from itertools import islice
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
-from bench.analysis.tables.reading.layout import MUCH_LONGER
+from bench.analysis.tables.reading.layout import MUCH_LONGER, delimited
 from bench.analysis.tables.reading.library_files import load_contents
 from bench.analysis.tables.reading.options import OF_TIMES, ReadingOptions
 from bench.analysis.tables.reading.table import ReadColumns
-from bench.analysis.tables.reading.text import TextFile
+from bench.analysis.tables.reading.text import TextLines
 from bench.analysis.tables.reading.text_table import read_tables
 from bench.base import DataError
 
-_TABS = "tab-separated"
-
-
-@dataclass(frozen=True)
-class _Sheet(TextFile):
-    content: tuple[str, ...] = ()
-
-    def lines(self, start: int = 0, end: int | None = None) -> Iterator[str]:
-        return islice(self.content, start, end)
+_TABS = delimited("\t")
 
 
 def read_spreadsheet(
@@ -43,7 +34,7 @@ def read_spreadsheet(
     options.check_only(path, "a spreadsheet", "table", "skip_lines", *OF_TIMES)
     sheets, _ = load_contents(path, "spreadsheet")
     title, table, chosen = _choose(path, sheets, options.table)
-    sheet = _Sheet(
+    sheet = TextLines(
         Path(f"{path}: sheet {title}"), "utf-8", compressed=False, choice=f"{title}:", content=sheets[title]
     )
     found = read_tables(sheet, names, replace(options, table=table, delimiter="\t", decimal="."), times)

@@ -11,6 +11,9 @@ import numpy.typing as npt
 from bench.analysis.tables.reading.layout import is_number
 from bench.base import DataError
 
+FEWEST_ROWS = 10
+"""Fewer samples than this identify nothing."""
+
 NO_ROW_LEFT_OUT = "no option leaves out a row"
 """Begins the remedy for a cell that is not a finite number."""
 

@@ -94,9 +94,10 @@ def choose_tables(tables: Sequence[Table]) -> tuple[list[Table], str] | None:
     short = [table for table in tables if table not in equal]
     if any(table.ending.rows * MUCH_LONGER > longest.ending.rows for table in short):
         return None
-    if len(equal) > 1:
-        return equal, f"{len(equal)} of {len(tables)} tables, with equal heads, joined in order"
-    return equal, f"the longest of {len(tables)} tables"
+    many = f"{len(equal)} of {len(tables)} tables, with equal heads, joined in order"
+    note = many if len(equal) > 1 else f"the longest of {len(tables)} tables"
+    rest = sum(table.ending.rows for table in short)
+    return equal, f"{note}, {count_lines(rest, 'of the others')} left out" if rest else note
 
 
 def find_end(file: TextFile, layout: Layout, asked: Collection[int] = (), most: int | None = None) -> Ending:

@@ -69,6 +69,17 @@ class TextFile:
                 say_share("reading", place.tell() / size)
 
 
+@dataclass(frozen=True)
+class TextLines(TextFile):
+    """The same, of lines that are read already."""
+
+    content: tuple[str, ...] = ()
+
+    def lines(self, start: int = 0, end: int | None = None) -> Iterator[str]:
+        """Yield lines from number `start` to before `end`, from 0."""
+        return islice(self.content, start, end)
+
+
 @contextmanager
 def reading_errors(path: Path) -> Iterator[None]:
     """Make the errors of reading a file a DataError that names it."""

@@ -6,6 +6,7 @@ import csv
 import itertools
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from bench.analysis.tables.reading.layout import (
     Layout,
     closes_its_quotes,
     count_lines,
+    delimited,
     find_layout,
     header_only,
     is_comment,
@@ -40,6 +42,7 @@ from bench.analysis.tables.reading.tables import (
     walk_tables,
 )
 from bench.analysis.tables.reading.text import TextFile, open_text
+from bench.analysis.tables.reading.turned_rows import turn_rows
 from bench.base import ConfigurationError, DataError
 
 Floats = npt.NDArray[np.float64]
@@ -80,6 +83,10 @@ def read_text(path: Path, names: Sequence[str], options: ReadingOptions, times: 
 
 def read_tables(file: TextFile, names: Sequence[str], options: ReadingOptions, times: Sequence[str]) -> ReadColumns:
     """Read columns of the table that is meant, or of those of equal heads, joined; see `read_text`."""
+    if turned := turn_rows(file, options):
+        file, options, notes = turned
+        found = read_tables(file, names, options, times)
+        return replace(found, notes=(*notes, *(note for note in found.notes if note != delimited("\t"))))
     lines = read_sample(file, options.skip_lines)
     layout = _find_table(file, options, lines)
     try:
