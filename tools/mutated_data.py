@@ -22,8 +22,9 @@ from bench.record import Record
 HEAD = ("t", "u", "y")
 NUMBERS = [(0.5 * i, 1.0 + i + 0.125 * (i % 7), 1000.0 - 3.0625 * i - 0.25 * (i % 5)) for i in range(30)]
 
-_LEFT_OUT = re.compile(r"(\d+) (?:line|row)s? (?:of comment|above the header|below the table|of the others)")
-_TABLES = re.compile(r"of (\d+) tables")
+_LEFT_OUT = re.compile(
+    r"(\d+) (?:line|row)s? (?:of comment|above the header|below the table|beside them|equal to the row before)"
+)
 
 Cells = Sequence[str]
 
@@ -72,7 +73,7 @@ def cells_of(content: bytes, delimiter: str) -> list[Cells]:
     """Return the cells of the lines that are not blank, read with as few rules as possible."""
     encodings = ["utf-8-sig", "cp1252", "latin-1"]
     if content.startswith((b"\xff\xfe", b"\xfe\xff")):
-        encodings.insert(0, "utf-16")
+        encodings.insert(0, "utf-32" if b"\0\0" in content[:4] else "utf-16")
     elif b"\0" in content[:4000]:
         encodings.insert(0, "utf-16-le" if content[1:2] == b"\0" else "utf-16-be")
     for encoding in encodings:
@@ -102,8 +103,6 @@ def check(folder: Path, file: Path, rows: Sequence[Cells], decimal: str = ".") -
         return f"{said['rows']} rows are said, {len(read)} are in the journal"
     text = json.dumps(said)
     left_out = sum(int(number) for number in _LEFT_OUT.findall(text)) + ("units from a row" in text)
-    # Each further table may have a header of its own.
-    left_out += sum(int(number) - 1 for number in _TABLES.findall(text))
     numbers = [numbers for cells in rows if (numbers := _numbers(cells, decimal)) is not None]
     # The header is the only line that is neither a row nor reported.
     if len(rows) - 1 > len(read) + left_out:

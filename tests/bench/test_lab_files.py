@@ -102,11 +102,11 @@ LAYOUTS = {
     "names and values below": (table("\t") + "\nPMax: 19.8\nPr: 7.1\n", "2 lines below the table left out"),
     "segments of LabVIEW": (
         LABVIEW + SEGMENT + body("\t", ",", HALVES[0]) + "\t\nX0\t0,0\t0\t\n" + SEGMENT + body("\t", ",", HALVES[1]),
-        "2 of 3 tables, with equal heads, joined in order", {"time": "X_Value"},
+        "2 of 3 tables, of equal columns, joined in order, 5 lines beside them left out", {"time": "X_Value"},
     ),
     "header again": (
         "time,U,y\n" + body(columns=HALVES[0]) + "time,U,y\n" + body(columns=HALVES[1]),
-        "2 of 2 tables, with equal heads, joined in order",
+        "2 of 2 tables, of equal columns, joined in order",
     ),
     "like tables": (
         table() + "\nU,x\n" + body(columns=(Y, U)), r"1 from line 2 \(40 × 3\), 2 from line 44 \(40 × 2\);",

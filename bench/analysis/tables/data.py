@@ -23,6 +23,9 @@ from bench.analysis.tables.reading.text_table import read_text
 from bench.base import ConfigurationError, DataError, header_with_unit
 from bench.record import Record
 
+_OVERLOAD = 9.9e37
+"""What instruments write for an overload, and more for no number. Source: SCPI 1999, volume 1, section 7.2.1."""
+
 _SPREADSHEETS = b"PK\x03\x04", b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1"
 
 _LIST = re.compile(r",(?![^(\[]*[)\]])")
@@ -134,9 +137,9 @@ def read_columns(
     Raises
     ------
     DataError
-        If the file cannot be read or can be read in several ways, a column is missing, a cell is empty, not a number
-        or not finite, or rows are too few: names row and column, and the option that may help. Rows count from 1
-        below the header.
+        If the file cannot be read or can be read in several ways, a column is missing, a cell is empty, not a number,
+        not finite or an overload, or rows are too few: names row and column, and the option that may help. Rows count
+        from 1 below the header.
     ConfigurationError
         If an option does not apply.
     """
@@ -154,6 +157,13 @@ def read_columns(
             read_columns(path, names, at_least=at_least, options=options)
             return read_columns(path, names, at_least=at_least, options=options, times=times[1:])
     _check_rows(path, len(next(iter(columns.values.values()))), at_least)
+    for name, values in columns.values.items():
+        beyond = np.flatnonzero(np.abs(values) >= _OVERLOAD)
+        if beyond.size:
+            raise DataError(
+                f"{path}: row {beyond[0] + 1}, column {name}: {values[beyond[0]]:g} is what instruments write for an "
+                "overload or a missing value; delete the row from the file, or put a number there"
+            )
     return columns
 
 

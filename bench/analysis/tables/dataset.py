@@ -32,9 +32,6 @@ _FEWEST_SORTED, _TRAVELS, _MEAN_JUMP = 30, 5.0, 0.03
 Derivation: one sweep travels once, and noise of 2 % adds 2 % a row; branches are some 10 % apart.
 """
 
-_LARGEST = 1e150
-"""Size of a value that is fitted. Derivation: sums of squares of a thousand million such values are finite."""
-
 NO_TIMES = "none"
 """Stands for a column of times where a file's own is to be left out."""
 
@@ -208,13 +205,6 @@ def read_dataset(
     def joined(name: str | None) -> Quantity | None:
         if name is None:
             return None
-        for path, each in zip(paths, found, strict=True):
-            beyond = np.flatnonzero(np.abs(each.values[name]) > _LARGEST)
-            if beyond.size:
-                raise DataError(
-                    f"{path}: row {beyond[0] + 1}, column {name}: {each.values[name][beyond[0]]:g} is beyond "
-                    f"±{_LARGEST:g}; correct it in the file, or choose another unit"
-                )
         values = [each.values[name] for each in found]
         return Quantity(
             first.own_name(name), first.units[name], values[0] if len(values) == 1 else np.concatenate(values)

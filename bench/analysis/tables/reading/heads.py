@@ -13,13 +13,14 @@ from bench.base import DataError
 
 _SYMBOL = (
     r"(?:[yzafpnµμumcdhkMGTP]?(?:m|g|s|A|K|mol|cd|V|N|W|J|Pa|Hz|Ω|Ω|[Oo]hm|C|F|T|H|bar|eV|Oe|G|Wb|S|rad|l|L|strain)"
-    r"|°C|ºC|°F|°|º|deg|degC|deg_?C|celsius|rpm|min|h|d|%|‰|psi|lbf|inch|in|mil|counts?|volts?|a\.u\.|arb\. ?u\."
-    r"|[Dd]ays?|[Hh]ours?|hr|[Mm]inutes?|[Ss]ec(?:ond)?s?|msec|Am|emu)"
+    r"|°C|ºC|°F|°|º|deg|degC|deg_?C|celsius|rpm|min|h|d|%|‰|psi|lbf|inch|in|mil|counts?|a\.u\.|arb\. ?u\."
+    r"|[Vv]olts?|VOLT|[Dd]ays?|[Hh]ours?|hr|[Mm]inutes?|[Ss]ec(?:ond)?s?|msec|Am|emu)"
 )
 _FACTOR = rf"{_SYMBOL}(?:\^?[-−]?[1-9]|[²³]|⁻[¹²³])?"
 _UNIT = rf"(?:1|{_FACTOR})(?:\s?[/*·⋅.]\s?\(?{_FACTOR}\)?|\s{_FACTOR})*|1|-"
 _SPELLINGS = {
     "degC": "°C", "deg_C": "°C", "ºC": "°C", "celsius": "°C", "º": "°", "us": "µs", "msec": "ms", "hr": "h",
+    **dict.fromkeys(("volt", "volts"), "V"),
     **dict.fromkeys(("sec", "secs", "second", "seconds"), "s"),
     **dict.fromkeys(("minute", "minutes"), "min"), **dict.fromkeys(("hour", "hours"), "h"),
     **dict.fromkeys(("day", "days"), "d"),
@@ -31,11 +32,13 @@ SECONDS = {"d": 86400.0, "h": 3600.0, "min": 60.0, "s": 1.0, "ms": 1e-3, "µs": 
 _TIME_HEAD = re.compile(r"(t|\w*time|elapsed|timestamp)[_ ](d|days?|h|hours?|min|s|secs?|ms|us|µs|ns)", re.IGNORECASE)
 """Head of a column of times whose unit stands behind its name."""
 
-_PER = re.compile(r"(.+?)[ _]([A-Za-zµ]+_per_[A-Za-z0-9]+)")
-"""A head whose unit is spelled out."""
+_BEHIND = re.compile(r"(.+?)(?:[ _](?=\w+_per_)|, | in )(\S+)")
+"""A head whose unit is spelled out, or stands behind a comma or an `in`."""
 
-_ADDED = re.compile(r"\s*[(\[][^()\[\]]*[)\]]$")
-"""Brackets behind the name of a column, with a unit that is known or not."""
+_BRACKETS = "[]", "()", "<>", "{}"
+
+_ADDED = re.compile(r"\s*[(\[<{][^()\[\]<>{}]*[)\]>}]$|\s*(?:,| in) \S+$")
+"""What stands behind the name of a column, with a unit that is known or not."""
 
 
 class NoColumnError(DataError):
@@ -76,7 +79,7 @@ def split_unit(head: str) -> tuple[str, str]:
     What stands in brackets after a blank is a unit; elsewhere only what is known to be one.
     """
     head = head.strip()
-    for opening, closing in ("[]", "()"):
+    for opening, closing in _BRACKETS:
         name, bracket, rest = head.rpartition(opening)
         if not (bracket and rest.endswith(closing) and name.strip()):
             continue
@@ -90,10 +93,9 @@ def split_unit(head: str) -> tuple[str, str]:
         words = name.split()
         if words and is_unit(unit) and (len(words) == 1 or not is_unit(words[-1])):
             return name, spelled(unit)
-    if per := _PER.fullmatch(head):
-        unit = per[2].replace("_per_", "/")
-        return (per[1], spelled(unit)) if is_unit(unit) else (head, "")
-    return head, ""
+    behind = _BEHIND.fullmatch(head)
+    unit = behind[2].replace("_per_", "/") if behind else ""
+    return (behind[1], spelled(unit)) if behind and is_unit(unit) else (head, "")
 
 
 def make_heads(texts: Sequence[str], units: Sequence[str] = ()) -> tuple[Head, ...]:
@@ -131,7 +133,7 @@ def _of_time(head: Head) -> Head:
 def bare_unit(text: str) -> str:
     """Return a unit of a unit row without its brackets; a dash is no unit."""
     text = text.strip()
-    if text[:1] + text[-1:] in ("[]", "()"):
+    if text[:1] + text[-1:] in _BRACKETS:
         text = text[1:-1].strip()
     return "" if text in ("-", "") else spelled(text)
 

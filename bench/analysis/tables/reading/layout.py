@@ -11,7 +11,7 @@ from itertools import groupby
 from pathlib import Path
 from typing import TypeAlias
 
-from bench.analysis.tables.reading.heads import Head, is_unit, make_heads
+from bench.analysis.tables.reading.heads import Head, bare_unit, is_unit, make_heads
 from bench.analysis.tables.reading.options import ReadingOptions
 from bench.base import DataError
 
@@ -306,13 +306,16 @@ def _find_heads(
     start = rows[begin - 1].line
     texts, units = rows[begin - 1].cells, list[str]()
     notes: list[str] = []
-    above = rows[begin - 2].cells if begin > 1 and not any(masks[begin - 2]) else []
+    # As of two channels, heads may be numbers but for the first.
+    above = rows[begin - 2].cells if begin > 1 and masks[begin - 2][0] is False else []
     highest = rows[begin - 3].cells if above and begin > 2 and not any(masks[begin - 3]) else []
     if highest and _unit_row(above) and len(highest) >= len(above) > 1:
         # Names, units and remarks, as Origin writes them.
         texts, units = highest, above
         notes.append("units from a row")
-    elif above and _unit_row(texts) and len(_matched(above, columns, delimiter)) >= len(texts):
+    elif (
+        above and _unit_row(_over_numbers(texts, pattern)) and len(_matched(above, columns, delimiter)) >= len(texts)
+    ):
         texts, units = above, texts
         notes.append("units from a row")
     other = "," if decimal == "." else "."
@@ -323,8 +326,9 @@ def _find_heads(
     if len(heads) == 1 < columns and (aligned := _aligned(rows[:begin], columns)):
         return Header(start, make_heads(aligned), columns, 2, ("heads aligned by blanks",))
     if len(heads) == 1 < columns and begin > 1:
-        # A title.
-        return Header(start, (), columns, 1, ())
+        # A title, perhaps between the heads and the data.
+        found = _find_heads(rows, masks, begin - 1, pattern, decimal, delimiter) if len(above) == columns else None
+        return replace(found, start=start) if found else Header(start, (), columns, 1, ())
     fit = 2 if len(heads) == columns or (len(heads) > columns and delimiter != " ") else 0
     return Header(start, make_heads(heads, units) if fit else (), columns, fit, tuple(notes))
 
@@ -409,9 +413,16 @@ def _matched(texts: Sequence[str], columns: int, delimiter: str) -> list[str]:
     return joined
 
 
+def _over_numbers(cells: Sequence[str], pattern: Mask) -> Sequence[str]:
+    """Return the cells above columns of numbers; all where those above the others cannot be told."""
+    if len(cells) != len(pattern):
+        return cells
+    return [cell for cell, is_number in zip(cells, pattern, strict=True) if is_number]
+
+
 def _unit_row(cells: Sequence[str]) -> bool:
     filled = [cell.strip() for cell in cells if cell.strip()]
-    return all(is_unit(cell) or (cell[0] + cell[-1] in ("[]", "()") and is_unit(cell[1:-1])) for cell in filled)
+    return all(is_unit(cell) or is_unit(bare_unit(cell)) for cell in filled)
 
 
 def _header_in_comment(lines: Sequence[str], first: int, header: Header, delimiter: str) -> Header:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 
 import numpy as np
@@ -13,12 +14,17 @@ from bench.base import DataError
 
 Floats = npt.NDArray[np.float64]
 
-_CLOCK = re.compile(r"(\d+):([0-5]\d):([0-5]\d(?:[.,]\d+)?)")
-"""Hours, which may be more than 24, minutes and seconds."""
+_CLOCK = re.compile(r"(?:(\d+):([0-5]\d):([0-5]\d(?:[.,]\d+)?)|([0-5]?\d):([0-5]\d[.,]\d+))")
+"""Hours, which may be more than 24, minutes and seconds; or minutes and seconds with a fraction."""
+
+_FORMATS = "%d.%m.%Y %H:%M:%S", "%Y/%m/%d %H:%M:%S", "%d-%b-%Y %H:%M:%S", "%m/%d/%Y %I:%M:%S %p", "%I:%M:%S %p"
+"""Moments not written as in ISO 8601: German, Japanese, of MATLAB, American. A fraction is taken off first."""
+
+_FRACTION = re.compile(r"(?<=:\d\d)[.,]\d+")
 
 
 def seconds_of(cell: str) -> float | None:
-    """Return a date with a time of day (ISO 8601) or hours, minutes and seconds in s; None if it is neither.
+    """Return a date with a time of day or a time alone in s; None if it is neither.
 
     Dates count from 1970 in universal time; those without a zone are taken as such.
     """
@@ -26,13 +32,24 @@ def seconds_of(cell: str) -> float | None:
     if ":" not in cell:
         return None
     if found := _CLOCK.fullmatch(cell):
-        hours, minutes, seconds = found.groups()
+        hours, minutes, seconds = found.groups()[:3] if found[1] else (0, *found.groups()[3:])
         return 3600.0 * int(hours) + 60.0 * int(minutes) + float(seconds.replace(",", "."))
     try:
         moment = datetime.fromisoformat(cell)
     except ValueError:
-        return None
+        return _otherwise(cell)
     return (moment if moment.tzinfo else moment.replace(tzinfo=UTC)).timestamp()
+
+
+def _otherwise(cell: str) -> float | None:
+    """Return a moment that is not written as in ISO 8601, as `seconds_of`."""
+    fraction = _FRACTION.search(cell)
+    whole = _FRACTION.sub("", cell)
+    for form in _FORMATS:
+        with suppress(ValueError):
+            seconds = datetime.strptime(f"{whole} +0000", f"{form} %z").timestamp()
+            return seconds + (float(fraction[0].replace(",", ".")) if fraction else 0.0)
+    return None
 
 
 def moment_in(where: str, cell: str) -> float:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 
-from bench.analysis.tables.reading.heads import NoColumnError
+from bench.analysis.tables.reading.heads import NoColumnError, is_unit
 from bench.analysis.tables.reading.layout import SAMPLE_LINES, Layout, is_comment, is_number
 from bench.analysis.tables.reading.options import ReadingOptions
 from bench.analysis.tables.reading.table import NO_ROW_LEFT_OUT, OTHER_COLUMN
@@ -20,6 +21,9 @@ _ENCODINGS = (
 )  # fmt: skip
 """Those that are tried for a name that is not found."""
 
+_UNIT_BEHIND = re.compile(r"[^\d.,]+$")
+"""What may be a unit behind a number."""
+
 _SPELLED = " \t,;|.+-'\"_()[]{}<>"
 """What delimits by itself, or stands within a number or a name."""
 
@@ -33,8 +37,12 @@ def cell_remedy(cell: str, layout: Layout, place: int, line: int, *, first: bool
     other = "," if layout.decimal == "." else "."
     if is_number(cell, other):
         return f"; if its decimal sign is a {'comma' if other == ',' else 'point'}, say --decimal {other}"
+    if is_number(cell.strip("'"), layout.decimal):
+        return "; its quotation marks are not those of tables: replace ' by \" in the file"
     if any(is_number(cell.replace(sign, ""), layout.decimal) for sign in ",.'’ \xa0\u202f" if sign in cell):
-        return "; separators of thousands are not read"
+        return "; separators of thousands are not read: save the file without them"
+    if (unit := _UNIT_BEHIND.search(cell)) and is_number(cell[: unit.start()], layout.decimal) and is_unit(unit[0]):
+        return f"; save the file without the unit {unit[0].strip()!r} in its cells"
     if cell.startswith("−") and is_number(cell[1:], layout.decimal):
         return "; its minus sign is not that of numbers: replace '−' by '-' in the file"
     mark = _delimiting_mark([cell]) if layout.columns == 1 else None

@@ -83,21 +83,33 @@ def walk_tables(file: TextFile, options: ReadingOptions, most: int | None = None
         layout = None if ending.end is None else _next_layout(file, options, layout, ending.rest)
 
 
-def choose_tables(tables: Sequence[Table]) -> tuple[list[Table], str] | None:
+def choose_tables(file: TextFile, tables: Sequence[Table]) -> tuple[list[Table], str] | None:
     """Return the tables that are meant where none was chosen, and a note; None if that is not clear.
 
-    They are the one long table among short ones, with those of equal heads, which are segments of one record.
+    They are the one long table among short ones, with those of equal heads, or of none below the same columns, which
+    are segments of one record.
     """
     longest = max(tables, key=lambda table: table.ending.rows)
-    heads = longest.layout.heads
-    equal = [table for table in tables if table is longest or (heads and table.layout.heads == heads)]
+    heads = next((table.layout.heads for table in tables if _is_like(table, longest) and table.layout.heads), ())
+    equal = [table for table in tables if table is longest or (heads and _is_like(table, longest))]
     short = [table for table in tables if table not in equal]
     if any(table.ending.rows * MUCH_LONGER > longest.ending.rows for table in short):
         return None
-    many = f"{len(equal)} of {len(tables)} tables, with equal heads, joined in order"
+    first = equal[0].layout
+    others = sum(1 for _ in split_rows(file.lines(first.start), first.delimiter))
+    others -= sum(table.ending.rows for table in equal)
+    others += sum(table.ending.rows for table in short if table.layout.start < first.start)
+    many = f"{len(equal)} of {len(tables)} tables, of equal columns, joined in order"
     note = many if len(equal) > 1 else f"the longest of {len(tables)} tables"
-    rest = sum(table.ending.rows for table in short)
-    return equal, f"{note}, {count_lines(rest, 'of the others')} left out" if rest else note
+    chosen = [replace(table, layout=replace(table.layout, heads=heads)) for table in equal]
+    return chosen, f"{note}, {count_lines(others, 'beside them')} left out" if others else note
+
+
+def _is_like(table: Table, other: Table) -> bool:
+    """Return whether a table may be a segment of the record of another."""
+    one, two = table.layout, other.layout
+    same = (one.numbers, one.delimiter, one.decimal) == (two.numbers, two.delimiter, two.decimal)
+    return same and (not one.heads or not two.heads or one.heads == two.heads)
 
 
 def find_end(file: TextFile, layout: Layout, asked: Collection[int] = (), most: int | None = None) -> Ending:

@@ -30,6 +30,7 @@ from bench.analysis.tables.reading.layout import (
 from bench.analysis.tables.reading.moments import moment_in, since_first, with_moments
 from bench.analysis.tables.reading.options import ReadingOptions
 from bench.analysis.tables.reading.remedies import cell_remedy, is_cut_off, missing_column
+from bench.analysis.tables.reading.reshaped import StampedFile, split_stamps, turn_rows
 from bench.analysis.tables.reading.summary_rows import is_label, text_note
 from bench.analysis.tables.reading.table import ReadColumns, finite_number
 from bench.analysis.tables.reading.tables import (
@@ -42,7 +43,6 @@ from bench.analysis.tables.reading.tables import (
     walk_tables,
 )
 from bench.analysis.tables.reading.text import TextFile, open_text
-from bench.analysis.tables.reading.turned_rows import turn_rows
 from bench.base import ConfigurationError, DataError
 
 Floats = npt.NDArray[np.float64]
@@ -73,10 +73,12 @@ def read_text(path: Path, names: Sequence[str], options: ReadingOptions, times: 
     """
     if options.table is not None and not options.table.isdecimal():
         raise ConfigurationError(f"--table {options.table!r}: the tables of a text file have numbers, from 1")
-    file = open_text(path, options.encoding)
+    file = split_stamps(open_text(path, options.encoding), options)
     check_format(path, read_sample(file, options.skip_lines))
     try:
-        return read_tables(file, names, options, times)
+        found = read_tables(file, names, options, times)
+        stamped = ("times of day before ->",) if isinstance(file, StampedFile) else ()
+        return replace(found, notes=(*stamped, *found.notes))
     except csv.Error as error:
         raise DataError(f"{path} cannot be read as a table: {error}") from None
 
@@ -93,7 +95,7 @@ def read_tables(file: TextFile, names: Sequence[str], options: ReadingOptions, t
         return _read_table(file, layout, names, options, times, lines)
     except (NoColumnError, _SeveralError) as error:
         tables = list(walk_tables(file, options)) if options.table is None else []
-        chosen = choose_tables(tables) if tables else None
+        chosen = choose_tables(file, tables) if tables else None
         if chosen is None and isinstance(error, _SeveralError):
             raise DataError(
                 f"{file.path}: has {list_tables(tables)}; choose one with --table, {file.choice}1 to "

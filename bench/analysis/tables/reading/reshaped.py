@@ -1,17 +1,45 @@
-"""Tables of text with a quantity in each row: they are turned before they are read."""
+"""Text that is brought into the form of a table before it is read."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from itertools import islice
 
-from bench.analysis.tables.reading.layout import DELIMITERS, delimited, is_number, split_rows
+from bench.analysis.tables.reading.layout import DELIMITERS, delimited, find_layout, is_number, split_rows
 from bench.analysis.tables.reading.options import ReadingOptions
 from bench.analysis.tables.reading.table import FEWEST_ROWS
+from bench.analysis.tables.reading.tables import read_sample
 from bench.analysis.tables.reading.text import TextFile, TextLines
 
 _MOST_TEXTS = 2
 """Cells before the numbers of a row: a name and a unit."""
+
+
+_STAMP = re.compile(r"\s*(\d{1,2}:\d\d:\d\d(?:[.,]\d+)?) -> ?")
+"""What the monitor of a serial line writes before what it receives."""
+
+
+@dataclass(frozen=True)
+class StampedFile(TextFile):
+    """A text file whose lines begin with a time of day and an arrow, which are read as a column of their own."""
+
+    delimiter: str = ","
+
+    def lines(self, start: int = 0, end: int | None = None) -> Iterator[str]:
+        """Yield lines as `TextFile.lines`."""
+        return (_STAMP.sub(rf"\1{self.delimiter}", line) for line in super().lines(start, end))
+
+
+def split_stamps(file: TextFile, options: ReadingOptions) -> TextFile:
+    """Return a file with its stamps in a column of their own, if it has any."""
+    lines = read_sample(file, options.skip_lines)
+    if not lines or not all(map(_STAMP.match, lines)):
+        return file
+    layout = find_layout(file.path, [_STAMP.sub("", line) for line in lines], options, options.skip_lines)
+    delimiter = "\t" if layout is None else layout.delimiter
+    return StampedFile(file.path, file.encoding, file.compressed, file.choice, delimiter)
 
 
 def turn_rows(file: TextFile, options: ReadingOptions) -> tuple[TextFile, ReadingOptions, tuple[str, ...]] | None:
