@@ -16,6 +16,7 @@ from lab_tables import (
     hdf5,
     later_matlab,
     matlab,
+    number,
     parquet,
     rows,
     sheets,
@@ -42,6 +43,7 @@ LABVIEW = "LabVIEW Measurement\t\nVersion\t2\n***End_of_Header***\t\n\t\nX0\t0,0
 SEGMENT = "***End_of_Header***\t\t\t\nX_Value\tU\ty\tComment\n"
 HALVES = [[column[part] for column in (TIME, U, Y)] for part in (slice(20), slice(20, None))]
 BRANCHES = [column for half in HALVES for column in half[1:]]
+ROW = body().splitlines(keepends=True)[20]
 ORDER = np.argsort(np.round(U, 1), kind="stable")
 
 
@@ -164,6 +166,78 @@ LAYOUTS = {
     "a mark of direction below": (
         body(";", ",", (U, Y)) + "1,5;\u200f(19,5\n", "is not a number", {"names": ("1", "2"), **NOT}
     ),
+    "rows of texts": (
+        "".join(f"{name},{body(columns=[column]).strip()}\n".replace("\n", ",").rstrip(",") + "\n"
+                for name, column in (("t,s", TIME), ("U,V", U), ("y,um", Y))),
+        "comma-separated, 3 × 40, its rows read as columns, units from a row", {"time": "t", **UNITS},
+    ),
+    "rows of numbers": (
+        "".join(body(columns=[column]).replace("\n", "  ") + "\n" for column in (TIME, U, Y)),
+        "separated by blanks, 3 × 40, its rows read as columns", {"names": ("2", "3"), "time": "1"},
+    ),
+    "rows of numbers, decimal comma": (
+        "".join(body(";", ",", [column]).replace("\n", ";") + "\n" for column in (TIME, U, Y)),
+        "semicolon-separated, 3 × 40, its rows read as columns, decimal comma", {"names": ("2", "3"), "time": "1"},
+    ),
+    "rows written twice": (
+        table().replace(ROW, ROW + ROW), "1 row equal to the row before", TIMED
+    ),
+    "segments behind blank lines": (
+        table().replace("\n0.5,", "\n\n\n0.5,"), "2 of 2 tables, of equal columns, joined in order", TIMED
+    ),
+    "segments behind titles": (
+        "time,U,y\nCycle 1,,\n" + body(columns=HALVES[0]) + "Cycle 2,,\n" + body(columns=HALVES[1]),
+        "2 of 2 tables, of equal columns, joined in order, 1 line beside them left out", TIMED,
+    ),
+    "a serial monitor": (
+        timed([f"{clock[:-3]} -> " for clock in CLOCK])[9:].replace(" -> ,", " -> "),
+        "times of day before ->, comma-separated", {"names": ("2", "3"), "time": "1"},
+    ),
+    "German moments": (
+        timed([f"{moment:%d.%m.%Y %T.%f}" for moment in MOMENTS]), "dates and times", {"near": 1e-6, **TIMED}
+    ),
+    "German moments, decimal comma": (
+        "time;U;y\n" + "".join(
+            f"{moment:%d.%m.%Y %T},{moment:%f};{number(u, ',')};{number(y, ',')}\n"
+            for moment, u, y in zip(MOMENTS, U, Y, strict=True)
+        ),
+        "decimal comma, time: dates and times", {"near": 1e-6, **TIMED},
+    ),
+    "American moments": (
+        timed([f"{moment:%m/%d/%Y %I:%M:%S.%f %p}" for moment in MOMENTS]), "dates and times", TIMED
+    ),
+    "times of day past midnight": (
+        timed([f"{moment + timedelta(seconds=59):%T.%f}" for moment in MOMENTS]), "dates and times", TIMED
+    ),
+    "minutes and seconds": (timed([f"10:{time:06.3f}" for time in TIME]), "dates and times", TIMED),
+    "units in any brackets": (table(";", heads=("t <s>", "U {V}", "y <um>")), "", UNITS),
+    "units behind a comma": ('"t, s","U, V","y in um"\n' + body(), "", UNITS),
+    "columns that are numbers": (
+        "x-axis,1,2\nsecond,Volt,Volt\n" + body(), "units from a row",
+        {"names": ("1", "2"), "time": "x-axis", "units": ("V", "V")},
+    ),
+    "units beside a label": (
+        "names,time,U,y\nunits,s,V,µm\nvalues," + body().replace("\n", "\n,"), "units from a row", {**TIMED, **UNITS}
+    ),
+    "names above types": (
+        '"TOA5","x","7","1"\n"time","U","y"\n"TS","mV","Deg C"\n"","Smp","Avg"\n' + body(), "heads from line 2"
+    ),
+    "a head too few": (
+        "U y\n" + body(" "), "does not fit the 3 columns below it, .* by number", {"by": ("2", "3")}
+    ),
+    "UTF-32": (table().encode("utf-32"), "UTF-32"),
+    "an overload": (table().replace(f",{Y[7]:g}\n", ",9.9E37\n"), "row 8, column y: 9.9e.37 is what", NOT),
+    "thousands": (table(";", ",").replace("\n0,5;", "\n1.000,5;"), "is not a number", {**TIMED, **NOT}),
+    "text with the ending of a spreadsheet": (table("\t"), "tab-separated", {"file": "d.xls"}),
+    "text with the ending of MATLAB": (body("  "), "separated by blanks", {"names": ("2", "3"), "file": "d.mat"}),
+    **{
+        f"a cell {cell!r}": (
+            table(";").replace(f";{Y[7]:g}\n", f";{cell}\n"), "line 9, row 8, column y: .* not a number", NOT
+        )
+        for cell in (
+            "OVERLOAD", "#N/A", "--", "1.#INF", "1,5", "1.5V", "5%", "(1.5)", "1_000", "１２", "1\xa0000", "'1'",
+        )
+    },
     "a sheet": (
         sheets(run=[["Sample 3"], [], ["time", "U", "y"], ["s", "V", "µm"], *rows()[1:], ["Total", 600, 3]]),
         "sheet run, 1 line above the header, units from a row, 1 line below the table left out",
@@ -196,6 +270,14 @@ LAYOUTS = {
         matlab(d=np.vstack([TIME, U, Y])), "d: 3 × 40, its rows read as columns",
         {"file": "d.mat", "names": ("2", "3"), "time": "1"},
     ),
+    "records of MATLAB": (
+        matlab(a=np.array([*zip(U, Y, strict=True)], dtype=[("U", float), ("y", float)])), "MATLAB", {"file": "d.mat"}
+    ),
+    "cells of MATLAB": (
+        matlab(c=np.array([[u, y] for u, y in zip(U, Y, strict=True)], dtype=object)), "MATLAB",
+        {"file": "d.mat", "names": ("c(:,1)", "c(:,2)")},
+    ),
+    "no numbers of MATLAB": (matlab(note="x"), "has no vector, matrix or table of numbers", {"file": "d.mat", **NOT}),
     "structures of MATLAB": (
         matlab(a={"U": U, "y": Y}, b={"U": Y, "y": U}), r"no column 'U'; it has: a\.U",
         {"file": "d.mat", "by": ("U", "y"), "table": "a"},

@@ -273,13 +273,13 @@ def _as_text(cell: object) -> object:
 
 
 def _reader(path: Path) -> Callable[[Path, Sequence[str], ReadingOptions, Sequence[str]], ReadColumns]:
-    """Return what reads a kind of file, by its first bytes or its ending."""
+    """Return what reads a kind of file, by its first bytes."""
     with reading_errors(path), path.open("rb") as file:
-        start = file.read(8)
-    ending = path.suffix.lower()
-    if ending == ".mat" or start.startswith(b"MATLAB"):
+        start = file.read(512)
+    # Text may have the ending of a spreadsheet, or of MATLAB, whose version 4 has numbers of four bytes first.
+    if start.startswith(b"MATLAB") or (path.suffix.lower() == ".mat" and b"\0" in start):
         return partial(read_arrays, kind="MATLAB")
-    if ending in (".xlsx", ".xlsm", ".xlsb", ".xls", ".ods") or start.startswith(_SPREADSHEETS):
+    if start.startswith(_SPREADSHEETS):
         return read_spreadsheet
     kinds = {HDF5: "HDF5", b"TDSm": "TDMS", b"PAR1": "Parquet"}
     kind = kinds.get(start[:4])

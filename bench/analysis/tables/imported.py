@@ -101,8 +101,8 @@ def import_file(
     times, remarks = (interval or 1.0) * np.arange(1.0, rows + 1.0), [f"rows are {interval or 1.0:g} s apart"]
     if time := time_column or columns.time:
         try:
-            others = [columns.values[name] for name in wanted]
-            kept, times, said = rows_in_time(columns.source, columns.quantity(time), others, reading.time_unit)
+            beside = [columns.values[name] for name in wanted]
+            kept, times, said = rows_in_time(columns.source, columns.quantity(time), beside, reading.time_unit)
             remarks = [*said]
         except DataError as error:
             # Those that nobody asked for may be of several records.

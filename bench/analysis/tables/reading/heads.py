@@ -35,7 +35,7 @@ _TIME_HEAD = re.compile(r"(t|\w*time|elapsed|timestamp)[_ ](d|days?|h|hours?|min
 _BEHIND = re.compile(r"(.+?)(?:[ _](?=\w+_per_)|, | in )(\S+)")
 """A head whose unit is spelled out, or stands behind a comma or an `in`."""
 
-_BRACKETS = "[]", "()", "<>", "{}"
+_BRACKETS = ("[", "]"), ("(", ")"), ("<", ">"), ("{", "}")
 
 _ADDED = re.compile(r"\s*[(\[<{][^()\[\]<>{}]*[)\]>}]$|\s*(?:,| in) \S+$")
 """What stands behind the name of a column, with a unit that is known or not."""
@@ -133,7 +133,7 @@ def _of_time(head: Head) -> Head:
 def bare_unit(text: str) -> str:
     """Return a unit of a unit row without its brackets; a dash is no unit."""
     text = text.strip()
-    if text[:1] + text[-1:] in _BRACKETS:
+    if (text[:1], text[-1:]) in _BRACKETS:
         text = text[1:-1].strip()
     return "" if text in ("-", "") else spelled(text)
 

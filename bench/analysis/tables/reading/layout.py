@@ -270,6 +270,18 @@ def header_only(lines: Sequence[str], options: ReadingOptions, first: int = 0) -
     return Layout(best, options.decimal or ".", row.line, make_heads(row.cells), len(row.cells), ())
 
 
+def other_heads(above: Sequence[Row], layout: Layout) -> Iterator[Layout]:
+    """Yield a layout with the heads of each row of texts right above the data, from the lowest.
+
+    Some programs write remarks, types or lines between the names and the data.
+    """
+    for row in reversed(above):
+        if any(is_number(cell, layout.decimal) for cell in row.cells):
+            return
+        if len(row.cells) == layout.columns > 1:
+            yield replace(layout, heads=make_heads(row.cells), notes=(*layout.notes, f"heads from line {row.line}"))
+
+
 def find_header(rows: Sequence[Row], decimal: str, delimiter: str = ",", *, in_order: bool = False) -> Header | None:
     """Find where the data begin, and the heads and units above them; None if no row has a number.
 

@@ -15,8 +15,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
-from bench.analysis.tables.reading.text import reading_errors
+from bench.analysis.tables.reading.text import WHAT_IS_READ, reading_errors
 from bench.base import ConfigurationError, DataError, Extra, MissingExtraError, check_extra, needed_for
 
 HDF5 = b"\x89HDF"
@@ -82,7 +83,7 @@ def _load(kind: str, path: Path) -> tuple[Any, tuple[str, ...]]:
         return error, ()
     # A library that is written in Rust raises what is no Exception.
     except BaseException as error:
-        return DataError(f"{path} cannot be read as {_KINDS[kind][0]}: {error}"), ()
+        return DataError(f"{path} cannot be read as {_KINDS[kind][0]}: {error}; {WHAT_IS_READ}"), ()
     if kind == "spreadsheet":
         return found, ()
     notes = (_LEFT_OUT,) if isinstance(found, dict) and found.pop(_LEFT_OUT, None) else ()
@@ -101,9 +102,19 @@ def _plain(value: Any) -> Any:  # noqa: ANN401
         return _plain({name: array[name].item() for name in array.dtype.names})
     if array.dtype.names:
         return _plain({name: array[name] for name in array.dtype.names})
+    if array.dtype == object and array.size > 1:
+        return _of_cells(array)
     if array.dtype.kind == "M":
         return np.atleast_1d(array)
     return np.atleast_1d(array).astype(np.float64) if array.dtype.kind in "fiub" and array.ndim <= 2 else None
+
+
+def _of_cells(array: npt.NDArray[Any]) -> Any:  # noqa: ANN401
+    """Return the numbers of cells as an array; if there are others, the arrays in them by their number."""
+    parts = [_plain(cell) for cell in array.flat]
+    if all(isinstance(part, np.ndarray) and part.size == 1 for part in parts):
+        return np.reshape(np.concatenate(parts), array.shape)
+    return {str(number): part for number, part in enumerate(parts, start=1) if part is not None} or None
 
 
 def _matlab(path: Path) -> Any:  # noqa: ANN401

@@ -14,6 +14,9 @@ from bench.base import DataError
 
 Floats = npt.NDArray[np.float64]
 
+_DAY = 86400.0
+"""Seconds of a day."""
+
 _CLOCK = re.compile(r"(?:(\d+):([0-5]\d):([0-5]\d(?:[.,]\d+)?)|([0-5]?\d):([0-5]\d[.,]\d+))")
 """Hours, which may be more than 24, minutes and seconds; or minutes and seconds with a fraction."""
 
@@ -32,7 +35,7 @@ def seconds_of(cell: str) -> float | None:
     if ":" not in cell:
         return None
     if found := _CLOCK.fullmatch(cell):
-        hours, minutes, seconds = found.groups()[:3] if found[1] else (0, *found.groups()[3:])
+        hours, minutes, seconds = found.groups()[:3] if found[1] else ("0", *found.groups()[3:])
         return 3600.0 * int(hours) + 60.0 * int(minutes) + float(seconds.replace(",", "."))
     try:
         moment = datetime.fromisoformat(cell)
@@ -47,9 +50,17 @@ def _otherwise(cell: str) -> float | None:
     whole = _FRACTION.sub("", cell)
     for form in _FORMATS:
         with suppress(ValueError):
-            seconds = datetime.strptime(f"{whole} +0000", f"{form} %z").timestamp()
+            moment = datetime.strptime(f"{whole} +0000", f"{form} %z")
+            seconds = moment.timestamp() if "%d" in form else moment.timestamp() % _DAY
             return seconds + (float(fraction[0].replace(",", ".")) if fraction else 0.0)
     return None
+
+
+def _past_midnight(times: Floats) -> Floats:
+    """Return times of day, s, which go on where they fall back by more than half a day."""
+    if not times.size or times.max() >= _DAY:
+        return times
+    return times + _DAY * np.cumsum(np.diff(times, prepend=times[0]) < -_DAY / 2.0)
 
 
 def moment_in(where: str, cell: str) -> float:
@@ -71,7 +82,7 @@ def since_first(
     """Return columns, shape (N,) each, with those of dates and times in s since the first row; units, and notes."""
     pairs = list(zip(values, are_moments, strict=True))
     return (
-        [column - column[:1] if is_moment else column for column, is_moment in pairs],
+        [_past_midnight(column) - column[:1] if is_moment else column for column, is_moment in pairs],
         ["s" if is_moment else unit for unit, is_moment in zip(units, are_moments, strict=True)],
         [
             f"{name}: dates and times, in s since the first row"

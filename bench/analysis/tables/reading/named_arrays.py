@@ -39,6 +39,8 @@ def read_arrays(
     contents, remarks = load_contents(path, kind)
     turned: list[str] = []
     found = _choose(path, contents or {}, options.table, turned)
+    if not found:
+        raise DataError(f"{path}: has no vector, matrix or table of numbers")
     heads = make_heads(list(found))
     arrays = list(found.values())
     names = with_times(names, times, heads, lambda name: find_place(path, heads, len(heads), name))

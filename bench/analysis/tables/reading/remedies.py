@@ -36,7 +36,8 @@ def cell_remedy(cell: str, layout: Layout, place: int, line: int, *, first: bool
         return f"; {NO_ROW_LEFT_OUT}: delete line {line} from the file, or put a number there"
     other = "," if layout.decimal == "." else "."
     if is_number(cell, other):
-        return f"; if its decimal sign is a {'comma' if other == ',' else 'point'}, say --decimal {other}"
+        sign = "comma" if other == "," else "point"
+        return f"; if its decimal sign is a {sign}, say --decimal {other}; in a spreadsheet make it a number"
     if is_number(cell.strip("'"), layout.decimal):
         return "; its quotation marks are not those of tables: replace ' by \" in the file"
     if any(is_number(cell.replace(sign, ""), layout.decimal) for sign in ",.'’ \xa0\u202f" if sign in cell):

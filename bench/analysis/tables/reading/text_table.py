@@ -25,6 +25,7 @@ from bench.analysis.tables.reading.layout import (
     header_only,
     is_comment,
     is_number,
+    other_heads,
     split_rows,
 )
 from bench.analysis.tables.reading.moments import moment_in, since_first, with_moments
@@ -147,7 +148,7 @@ def _read_table(
     Raises _SeveralError if it is not, other tables follow and none was chosen.
     """
     names = with_times(names, times, layout.heads, lambda name: _place(file, layout, name))
-    places = _find_places(file, names, options, layout, lines)
+    layout, places = _find_places(file, names, options, layout, lines)
     body = _Body(file, layout, names, places)
     body.ending = ending
     after: tuple[str, ...] | None = ()
@@ -183,18 +184,25 @@ def _read_table(
 
 def _find_places(
     file: TextFile, names: Sequence[str], options: ReadingOptions, layout: Layout, lines: Sequence[str]
-) -> list[int]:
-    """Return the indices of the columns that are asked for.
+) -> tuple[Layout, list[int]]:
+    """Return the indices of the columns that are asked for, and the layout whose heads have them.
 
     Raises DataError that says what may help if there is no such column.
     """
-    places: list[int] = []
-    for name in names:
-        try:
-            places.append(_place(file, layout, name))
-        except NoColumnError as error:
-            raise missing_column(error, name, file, options, layout, lines) from None
-    return places
+    missing: tuple[NoColumnError, str] | None = None
+    above = split_rows(lines[: layout.start - options.skip_lines], layout.delimiter, options.skip_lines)
+    for other in (layout, *other_heads(list(above), layout)):
+        places: list[int] = []
+        for name in names:
+            try:
+                places.append(_place(file, other, name))
+            except NoColumnError as error:
+                missing = missing or (error, name)
+                break
+        else:
+            return other, places
+    assert missing is not None
+    raise missing_column(*missing, file, options, layout, lines)
 
 
 class _Body:
