@@ -84,7 +84,7 @@ def cells_of(content: bytes, delimiter: str) -> list[Cells]:
         break
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
     split = [line.split(None if delimiter == " " else delimiter) for line in lines if line.strip(" \t\ufeff")]
-    return [[cell.strip(' "\t\ufeff') for cell in line] for line in split]
+    return [[cell.strip().strip('"\ufeff').strip() for cell in line] for line in split]
 
 
 def check(folder: Path, file: Path, rows: Sequence[Cells], decimal: str = ".") -> str:

@@ -73,12 +73,20 @@ def test_a_traceback_is_noticed(tmp_path, monkeypatch):
     def fail(*_, **__):
         raise RuntimeError("a defect")
 
-    monkeypatch.setattr("bench.analysis.tables.imported.read_columns", fail)
+    monkeypatch.setattr("bench.analysis.tables.imported.read_dataset", fail)
     assert any("a defect" in wrong for wrong in damaged("text", tmp_path))
 
 
 @pytest.mark.parametrize(
-    ("code", "out", "err"), [(2, "", ""), (0, "", "Traceback"), (0, "\x1b[2J", ""), (-11, "", "x")]
+    ("code", "out", "err"),
+    [
+        (2, "", ""),
+        (0, "", "Traceback"),
+        (0, "\x1b[2J", ""),
+        (-11, "", "x"),
+        (77, "", "x"),
+        (0, "", "/lib/a.py:3: RuntimeWarning: overflow"),
+    ],
 )
 def test_an_unclear_end_of_a_command_is_noticed(code, out, err):
     with pytest.raises(commands.UnclearError):

@@ -288,7 +288,7 @@ def _reader(path: Path) -> Callable[[Path, Sequence[str], ReadingOptions, Sequen
 
 def _from_files(path: Path, names: Sequence[str], options: ReadingOptions, times: Sequence[str]) -> Columns:
     """Read columns of a file, and of others those that are asked for as `FILE:COLUMN`."""
-    elsewhere = {name: place for name in names if (place := _elsewhere(path, name)) is not None}
+    elsewhere = {name: place for name in names if (place := find_elsewhere(path, name)) is not None}
     values: dict[str, Floats] = {}
     units: dict[str, str] = {}
     notes: list[str] = []
@@ -311,7 +311,7 @@ def _from_files(path: Path, names: Sequence[str], options: ReadingOptions, times
     return Columns(str(path), values, units, text, time, elsewhere)
 
 
-def _elsewhere(path: Path, name: str) -> tuple[Path, str] | None:
+def find_elsewhere(path: Path, name: str) -> tuple[Path, str] | None:
     """Return file and column of `FILE:COLUMN`; None if there is no such file."""
     file, _, column = name.rpartition(":")
     if not file or not column:

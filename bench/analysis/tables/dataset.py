@@ -51,6 +51,8 @@ class ColumnNames:
         The measured output, when each row was taken, and the weight of each row in a fit, >= 0.
     times : tuple of str
         Columns of times of which the first that there is serves, where `time` is not given.
+    others : tuple of str
+        Further columns.
     """
 
     input: str
@@ -58,6 +60,7 @@ class ColumnNames:
     time: str | None = None
     weights: str | None = None
     times: tuple[str, ...] = ()
+    others: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,6 +83,8 @@ class Dataset:
         First row of each file.
     assumptions : str
         What was assumed about the layout of the files; empty for a run.
+    others : tuple of Quantity
+        The further columns, shape (N,) each.
     """
 
     paths: tuple[Path, ...]
@@ -90,6 +95,7 @@ class Dataset:
     weights: Floats | None = None
     starts: tuple[int, ...] = (0,)
     assumptions: str = ""
+    others: tuple[Quantity, ...] = ()
 
     @property
     def name(self) -> str:
@@ -190,7 +196,7 @@ def read_dataset(
     interval = reading.seconds_between_rows
     if interval is not None and (names.time is not None or len(paths) > 1):
         raise ConfigurationError("--interval: expected one file, without --time")
-    wanted = [name for name in (names.input, names.output, names.weights, names.time) if name]
+    wanted = [name for name in (names.input, names.output, names.weights, names.time, *names.others) if name]
     sought = () if names.time or interval else names.times
     found = [read_columns(path, wanted, at_least=at_least, options=reading, times=sought) for path in paths]
     first = found[0]
@@ -202,33 +208,26 @@ def read_dataset(
                     f"{first.units[name] or 'no unit'}"
                 )
 
-    def joined(name: str | None) -> Quantity | None:
-        if name is None:
-            return None
-        values = [each.values[name] for each in found]
-        return Quantity(
-            first.own_name(name), first.units[name], values[0] if len(values) == 1 else np.concatenate(values)
-        )
-
-    driven, weights, measured = joined(names.input), joined(names.weights), joined(names.output)
-    assert driven is not None
-    time, remarks = joined(names.time or first.time), list[str]()
+    columns = {
+        name: Quantity(first.own_name(name), first.units[name], np.concatenate([each.values[name] for each in found]))
+        for name in (*wanted, *([first.time] if first.time else []))
+    }
+    time, remarks = columns.get(names.time or first.time or ""), list[str]()
     if interval is not None:
-        time = Quantity("time", "s", interval * np.arange(driven.values.size, dtype=np.float64))
+        time = Quantity("time", "s", interval * np.arange(columns[names.input].values.size, dtype=np.float64))
         remarks.append(f"rows {interval:g} s apart")
     elif time is not None and not is_run(paths[0]):
         try:
-            others = [column.values for column in (driven, measured, weights) if column is not None]
-            kept, seconds, said = rows_in_time(first.source, time, others, reading.time_unit)
+            values = [column.values for column in columns.values()]
+            kept, seconds, said = rows_in_time(first.source, time, values, reading.time_unit)
             time, remarks = Quantity(time.name, "s", seconds), [*said]
-            driven = replace(driven, values=driven.values[kept])
-            measured, weights = (
-                column and replace(column, values=column.values[kept]) for column in (measured, weights)
-            )
+            columns = {name: replace(column, values=column.values[kept]) for name, column in columns.items()}
         except DataError:
             # Those that nobody asked for are at fault where they are used.
             if names.time is not None:
                 raise
+    driven, measured, weights = (columns.get(name or "") for name in (names.input, names.output, names.weights))
+    assert driven is not None
     if not is_run(paths[0]) and measured is not None and _is_sorted(driven.values, measured.values):
         remarks.append("sorted by its input: the order of measurement is lost")
     starts = np.cumsum([0, *(each.values[names.input].size for each in found[:-1])])
@@ -243,6 +242,7 @@ def read_dataset(
         None if weights is None else weights.values,
         tuple(starts.tolist()),
         ", ".join(filter(None, ["; ".join(notes) if several else first.assumptions, *remarks])),
+        tuple(columns[name] for name in names.others),
     )
 
 

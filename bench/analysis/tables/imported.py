@@ -13,11 +13,10 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bench.analysis.tables.data import is_run, read_columns
-from bench.analysis.tables.dataset import time_names
+from bench.analysis.tables.data import find_elsewhere, is_run
+from bench.analysis.tables.dataset import ColumnNames, read_dataset, time_names
 from bench.analysis.tables.reading.heads import split_unit
 from bench.analysis.tables.reading.options import ReadingOptions
-from bench.analysis.tables.times import rows_in_time
 from bench.base import ConfigurationError, DataError, redacted_command, wall_time
 from bench.devices import Settled, Signal
 from bench.record import FILE_NAME, Event, Journal, StepRecord, current_user, make_folder, version_of
@@ -89,34 +88,27 @@ def import_file(
     wanted = [input_column, output_column, *others]
     if len(set(wanted)) < len(wanted):
         raise ConfigurationError(f"columns {', '.join(wanted)}: one of them is asked for twice")
-    reading = reading or ReadingOptions()
-    interval = reading.seconds_between_rows
-    if interval is not None and time_column:
-        raise ConfigurationError(f"--interval {reading.interval} and --time {time_column} exclude each other")
-    asked = [time_column] if time_column else []
-    sought = () if asked or interval else time_names(path)
-    columns = read_columns(path, [*wanted, *asked], options=reading, times=sought)
-    rows = len(columns.values[input_column])
-    kept = np.ones(rows, dtype=bool)
-    times, remarks = (interval or 1.0) * np.arange(1.0, rows + 1.0), [f"rows are {interval or 1.0:g} s apart"]
-    if time := time_column or columns.time:
-        try:
-            beside = [columns.values[name] for name in wanted]
-            kept, times, said = rows_in_time(columns.source, columns.quantity(time), beside, reading.time_unit)
-            remarks = [*said]
-        except DataError as error:
-            # Those that nobody asked for may be of several records.
-            if asked:
-                raise
-            remarks.append(f"{error}: left out")
-    signals = [_signal(columns.own_name(name), columns.units[name]) for name in wanted]
-    assumptions = [columns.assumptions, *remarks]
+    sought = () if time_column else time_names(path)
+    names = ColumnNames(input_column, output_column, time=time_column, times=sought, others=tuple(others))
+    data = read_dataset([path], names, reading)
+    assert data.output is not None
+    remark = "rows are 1 s apart" if data.time is None else ""
+    try:
+        times = data.times
+    except DataError as error:
+        # Those that nobody asked for may be of several records.
+        times, remark = None, f"{error}: left out, rows are 1 s apart"
+    times = np.arange(1.0, data.inputs.size + 1.0) if times is None else times
+    quantities = data.input, data.output, *data.others
+    signals = [_signal(quantity.name, quantity.unit) for quantity in quantities]
+    assumptions = [data.assumptions, remark]
     folder = make_folder(out, f"{_word(path.stem)}-{PROTOCOL}")
     meta = _metadata(path, folder.name, title, signals, dict(zip(("input", "output"), wanted, strict=False)), times)
     # A file that is still there needs no row to be durable before the next.
-    files = {file.name: file.read_bytes() for file in (path, *(place[0] for place in columns.elsewhere.values()))}
+    places = [path, *(place[0] for name in wanted if (place := find_elsewhere(path, name)))]
+    files = {file.name: file.read_bytes() for file in places}
     journal = Journal(folder / FILE_NAME, signals, meta, files, flushed=False)
-    values = np.column_stack([columns.values[name][kept] for name in wanted])
+    values = np.column_stack([quantity.values for quantity in quantities])
     journal.event(Event(0.0, "INFO", "phase", f"imported from {path.name}"))
     for text in filter(None, assumptions):
         journal.event(Event(0.0, "INFO", "note", text))
