@@ -64,6 +64,18 @@ def test_few_samples_are_warned_of(bench, tmp_path):
     assert "61 samples are few for 210 coefficients" in re.sub(r"\s+", " ", err)
 
 
+def test_a_time_constant_beyond_the_record_is_warned_of(bench, tmp_path):
+    times = 0.1 * np.arange(200)
+    inputs = np.sin(2.0 * times)
+    # A lag of 200 s, in a record of 20 s.
+    data = write(tmp_path / "d.csv", inputs, np.cumsum(inputs + 1.0) * 0.1 / 200.0)
+    options = ["--interval", "0.1s", "--static", "polynomial-plays", "--dynamics"]
+    for dynamics, is_warned in (("lag", True), ("none", False)):
+        code, _, err = bench("identify", data, *COLUMNS, "--model", "hammerstein", *options, dynamics)
+        warned = re.search(r"warning: time constant: \S+ s is longer than the record, which lasts 19.9 s", err)
+        assert (code, warned is not None) == (0, is_warned)
+
+
 def test_a_constant_output_is_refused(bench, tmp_path):
     data = write(tmp_path / "d.csv", loops(100)[0], np.full(100, 2.5))
     for model in ("preisach", "prandtl-ishlinskii", "preisach-signed", "polynomial"):

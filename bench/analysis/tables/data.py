@@ -199,9 +199,14 @@ def check_excitation(source: str, column: Quantity) -> list[str]:
 def check_variation(source: str, column: Quantity) -> None:
     """Check that a column varies.
 
-    Raises DataError if it is constant.
+    Raises DataError if it is constant, or varies by so little that the square is 0.
     """
     values = column.values
+    if 0.0 < np.ptp(values) < 1.0 / _OVERLOAD:
+        raise DataError(
+            f"{source}: column {column.name} varies by {np.ptp(values):g} only, too little to compute with; "
+            f"save it in a smaller unit, so that it varies by {1.0 / _OVERLOAD:.0e} at least"
+        )
     if np.ptp(values) == 0.0:
         raise DataError(
             f"{source}: column {column.name} is {values[0]:g} in all {values.size} rows, so nothing can be identified"
