@@ -110,6 +110,9 @@ LAYOUTS = {
         "time,U,y\n" + body(columns=HALVES[0]) + "time,U,y\n" + body(columns=HALVES[1]),
         "2 of 2 tables, of equal columns, joined in order",
     ),
+    "a short table without heads below": (
+        table() + "\nCalibration\n1,2,3\n4,5,6\n", "the longest of 2 tables, 3 lines beside them left out"
+    ),
     "like tables": (
         table() + "\nU,x\n" + body(columns=(Y, U)), r"1 from line 2 \(40 × 3\), 2 from line 44 \(40 × 2\);",
         {"by": ("U", "y"), "table": "1"},
@@ -207,7 +210,7 @@ LAYOUTS = {
         timed([f"{moment:%m/%d/%Y %I:%M:%S.%f %p}" for moment in MOMENTS]), "dates and times", TIMED
     ),
     "times of day past midnight": (
-        timed([f"{moment + timedelta(seconds=59):%T.%f}" for moment in MOMENTS]), "dates and times", TIMED
+        timed([f"{moment + timedelta(seconds=59):%T.%f}" for moment in MOMENTS]), "first row, past midnight", TIMED
     ),
     "minutes and seconds": (timed([f"10:{time:06.3f}" for time in TIME]), "dates and times", TIMED),
     "units in any brackets": (table(";", heads=("t <s>", "U {V}", "y <um>")), "", UNITS),

@@ -58,9 +58,8 @@ def _otherwise(cell: str) -> float | None:
 
 def _past_midnight(times: Floats) -> Floats:
     """Return times of day, s, which go on where they fall back by more than half a day."""
-    if not times.size or times.max() >= _DAY:
-        return times
-    return times + _DAY * np.cumsum(np.diff(times, prepend=times[0]) < -_DAY / 2.0)
+    falls = np.diff(times, prepend=times[:1]) < -_DAY / 2.0
+    return times + _DAY * np.cumsum(falls) if falls.any() and times.max() < _DAY else times
 
 
 def moment_in(where: str, cell: str) -> float:
@@ -77,16 +76,22 @@ def with_moments(cells: Sequence[str], places: Collection[int]) -> frozenset[int
 
 
 def since_first(
-    values: Sequence[Floats], units: Sequence[str], names: Sequence[str], are_moments: Sequence[bool]
+    values: Sequence[Floats],
+    units: Sequence[str],
+    names: Sequence[str],
+    are_moments: Sequence[bool],
+    *,
+    may_be_clocks: bool = False,
 ) -> tuple[list[Floats], list[str], list[str]]:
-    """Return columns, shape (N,) each, with those of dates and times in s since the first row; units, and notes."""
-    pairs = list(zip(values, are_moments, strict=True))
-    return (
-        [_past_midnight(column) - column[:1] if is_moment else column for column, is_moment in pairs],
-        ["s" if is_moment else unit for unit, is_moment in zip(units, are_moments, strict=True)],
-        [
-            f"{name}: dates and times, in s since the first row"
-            for name, is_moment in zip(names, are_moments, strict=True)
-            if is_moment
-        ],
-    )
+    """Return columns, shape (N,) each, with those of dates and times in s since the first row; units, and notes.
+
+    Those that may be times of day, without a date, go on past midnight.
+    """
+    columns, notes = [*values], list[str]()
+    for place, name in enumerate(names):
+        if are_moments[place]:
+            times = _past_midnight(values[place]) if may_be_clocks else values[place]
+            columns[place] = times - times[:1]
+            midnight = ", past midnight" if times is not values[place] else ""
+            notes.append(f"{name}: dates and times, in s since the first row{midnight}")
+    return columns, ["s" if is_moment else unit for unit, is_moment in zip(units, are_moments, strict=True)], notes

@@ -86,14 +86,20 @@ def walk_tables(file: TextFile, options: ReadingOptions, most: int | None = None
 def choose_tables(file: TextFile, tables: Sequence[Table]) -> tuple[list[Table], str] | None:
     """Return the tables that are meant where none was chosen, and a note; None if that is not clear.
 
-    They are the one long table among short ones, with those of equal heads, or of none below the same columns, which
-    are segments of one record.
+    They are the one long table among short ones, with those of equal heads, which are segments of one record, and so
+    are long ones of as many columns without heads.
     """
     longest = max(tables, key=lambda table: table.ending.rows)
     heads = next((table.layout.heads for table in tables if _is_like(table, longest) and table.layout.heads), ())
-    equal = [table for table in tables if table is longest or (heads and _is_like(table, longest))]
+    few = longest.ending.rows / MUCH_LONGER
+    equal = [
+        table
+        for table in tables
+        if table is longest
+        or (heads and _is_like(table, longest) and (table.layout.heads or table.ending.rows > few))
+    ]
     short = [table for table in tables if table not in equal]
-    if any(table.ending.rows * MUCH_LONGER > longest.ending.rows for table in short):
+    if any(table.ending.rows > few for table in short):
         return None
     first = equal[0].layout
     others = sum(1 for _ in split_rows(file.lines(first.start), first.delimiter))

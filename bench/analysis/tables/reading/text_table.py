@@ -178,7 +178,9 @@ def _read_table(
         *(after or ()),
     )
     units = [layout.heads[place].unit if place < len(layout.heads) else "" for place in places]
-    values, units, remarks = since_first(values, units, names, [place in body.moments for place in places])
+    values, units, remarks = since_first(
+        values, units, names, [place in body.moments for place in places], may_be_clocks=True
+    )
     return ReadColumns(names, values, units, (*notes, *remarks))
 
 
