@@ -310,6 +310,7 @@ LAYOUTS = {
         )
     },
 }  # fmt: skip
+pytestmark = pytest.mark.usefixtures("warm_popen")
 OPTIONS = ("table", "skip_lines", "interval", "time_unit")
 
 

@@ -10,6 +10,7 @@ import pickle
 import re
 import subprocess
 import sys
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -57,7 +58,7 @@ def load_contents(path: Path, kind: str) -> tuple[Any, tuple[str, ...]]:
         limit = SECONDS + SECONDS_PER_BYTE * os.fstat(file.fileno()).st_size
     try:
         done = subprocess.run(  # noqa: S603 - our own module
-            [sys.executable, "-W", "ignore", "-m", __name__, kind, str(path)],
+            [sys.executable, "-m", __name__, kind, str(path)],
             stdin=subprocess.DEVNULL,
             capture_output=True,
             timeout=limit,
@@ -214,5 +215,6 @@ _LOADERS = {"MATLAB": _matlab, "HDF5": _hdf5, "TDMS": _tdms, "Parquet": _parquet
 
 if __name__ == "__main__":
     # What a library prints must not stand among the contents.
+    warnings.simplefilter("ignore")
     output, sys.stdout = sys.stdout.buffer, sys.stderr
     pickle.dump(_load(sys.argv[1], Path(sys.argv[2])), output, protocol=pickle.HIGHEST_PROTOCOL)
