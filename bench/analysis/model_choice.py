@@ -17,7 +17,6 @@ from bench.analysis.tables.reading.table import FEWEST_ROWS
 from bench.analysis.tables.starting_state import bind_times, left_out
 from bench.base import ConfigurationError, DataError
 from bench.identification import (
-    ONE_RUN,
     Beyond,
     Comparison,
     Given,
@@ -29,21 +28,22 @@ from bench.identification import (
     compared_models,
     measure_errors,
     model_options,
+    once,
     select,
 )
 from bench.models import Operator, TimedModel, find_model, identifiable_models, timed_models
 
-MOST_ROWS = 2000
-"""Rows by which models are compared: of more, evenly chosen ones; the chosen model is fitted to all. Source: the RMS
-of 2000 errors has a relative standard error of 1.6 %, below the tie of two scores."""
-
 ALL = "all"
 """Name that stands for the models that are compared if none is named."""
 
+# Codes of advice whose remedies a comparison tries: settings and models of other structure, and of those with time.
+_TRIED = ("few-free", "unexplained", "few-samples", "condition", "initial-memory", "more-cells", "congruency")
+_TRIED_IN_TIME = ("return-point-memory",)
+
 COLUMNS = (
     "model", "options", "orientation", "initial", "smoothing", "ridge", "free", "training_rms", "score",
-    "score_percent", "held_out_rms", "held_out_spread", "held_out_percent", "units_rms", "units_percent", "seconds",
-    "note",
+    "score_percent", "held_out_rms", "held_out_spread", "held_out_percent", "units_rms", "units_percent", "rows",
+    "seconds", "note",
 )  # fmt: skip
 """Columns of the table."""
 
@@ -112,6 +112,7 @@ class SelectedModel:
             100.0 * score.blocks_rms / span,
             score.cycles_rms,
             100.0 * score.cycles_rms / span,
+            score.rows,
             score.seconds,
             note,
         )
@@ -124,16 +125,23 @@ class SelectedModel:
     def to_json(self) -> dict[str, Any]:
         """Return the choice for programs."""
         selection = self.selection
-        advice = [vars(advice) for advice in selection.advice]
         return {
-            "gap": selection.gap, "rows": selection.rows, "unit": self.unit, "advice": advice, "table": self.rows()
-        }  # fmt: skip
+            "gap": selection.gap,
+            "rows": selection.rows,
+            "of": selection.of,
+            "unit": self.unit,
+            "blocks_rms": selection.on_blocks,
+            "another_run_rms": selection.on_runs if np.isfinite(selection.on_runs) else None,
+            "advice": [vars(advice) for advice in selection.advice],
+            "table": self.rows(),
+        }
 
     def record_in(self, found: IdentifiedFile) -> IdentifiedFile:
-        """Return an identified model with the table in its provenance, and the warnings before its own."""
+        """Return an identified model with the table in its provenance, and without remedies that were tried."""
         file = replace(found.file, provenance={**found.file.provenance, "selection": self.to_json()})
-        advice = [str(advice) for advice in self.selection.advice if advice.code != ONE_RUN]
-        return replace(found, file=file, warnings=(*advice, *found.warnings))
+        tried = {*_TRIED, *(_TRIED_IN_TIME if self.selection.has_times else ())}
+        own = [replace(one, remedy="") if one.code in tried else one for one in found.advice]
+        return replace(found, file=file, advice=once((*self.selection.advice, *own)))
 
     def save(self, path: Path) -> None:
         """Write the table as CSV.
@@ -203,7 +211,7 @@ def select_model(data: Dataset, models: Sequence[str], given: Given, options: Fi
     _check_options(models, given)
     runs = np.searchsorted(data.starts, np.arange(inputs.size), side="right") if len(data.starts) > 1 else None
     try:
-        measured = Measurements.of(inputs, data.outputs, fitted, data.times, runs).thinned(MOST_ROWS)
+        measured = Measurements.of(inputs, data.outputs, fitted, data.times, runs)
         selection = select(measured, models, given)
     except ValueError as error:
         raise ConfigurationError(f"no model can be fitted: {error}") from None

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property
 from typing import Any
 
@@ -23,6 +23,8 @@ from bench.analysis.transients.transient_dynamics import (
 )
 from bench.base import ConfigurationError
 from bench.identification import (
+    ONE_RUN,
+    Advice,
     CrossValidation,
     Errors,
     Identification,
@@ -31,6 +33,7 @@ from bench.identification import (
     Regularization,
     Resolution,
     Validity,
+    advise_on_record,
     check_congruency,
     check_options,
     check_return_points,
@@ -39,6 +42,7 @@ from bench.identification import (
     identify_in_time,
     measure_errors,
     model_options,
+    once,
     resolve,
 )
 from bench.models import (
@@ -122,8 +126,8 @@ class IdentifiedFile:
         The model, ready to be saved.
     identification : Identification
         The fit behind it.
-    warnings : tuple of str
-        What is odd about the data, though usable.
+    advice : tuple of Advice
+        What the data cannot decide, and what is odd about them and the fit, each once.
     data : Dataset
         The measurements.
     return_points, congruency : MemoryTest
@@ -141,7 +145,7 @@ class IdentifiedFile:
 
     file: ModelFile
     identification: Identification[Any]
-    warnings: tuple[str, ...]
+    advice: tuple[Advice, ...]
     data: Dataset
     return_points: MemoryTest
     congruency: MemoryTest
@@ -153,6 +157,11 @@ class IdentifiedFile:
     def __repr__(self) -> str:
         """Return what a person should know of the fit."""
         return "\n".join([self.file.name, *(f"  {name:20} {text}" for name, text in certificate_lines(self))])
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The advice as sentences, but for what holds for every record of one run."""
+        return tuple(str(each) for each in self.advice if each.code != ONE_RUN)
 
     @property
     def inputs(self) -> Floats:
@@ -212,6 +221,7 @@ class IdentifiedFile:
             "return_points": self.return_points.to_json(),
             "congruency": self.congruency.to_json(),
             "warnings": list(self.warnings),
+            "advice": [asdict(each) for each in self.advice],
             "validity": self.file.valid.to_json(),
             **({"band": {**band.to_json(), "held_out": band.band.held_out}} if (band := self.band) else {}),
             **({"shape": shape} if (shape := _shape(operator)) else {}),
@@ -237,16 +247,18 @@ def check_template(model: str, inputs: Floats, options: Mapping[str, Any]) -> No
     spec.template(inputs, **own)
 
 
-def _implausible_times(model: TimedModel[Any], times: Floats) -> Iterator[str]:
+def _implausible_times(model: TimedModel[Any], times: Floats) -> Iterator[Advice]:
     """Yield warnings of the times of a model that rows at these times cannot show."""
     interval, duration = float(np.median(np.diff(times))), float(np.ptp(times))
     for name, (value, unit) in model.parameters().items():
         if unit != "s":
             continue
         if value < _SHORTEST * interval:
-            yield f"{name}: {value:.3g} s is under a thousandth of the {interval:.3g} s between rows{_UNIT_OF_TIMES}"
+            text = f"{name}: {value:.3g} s is under a thousandth of the {interval:.3g} s between rows{_UNIT_OF_TIMES}"
+            yield Advice(f"{name}-short", text)
         elif value > duration:
-            yield f"{name}: {value:.3g} s is longer than the record, which lasts {duration:.3g} s{_UNIT_OF_TIMES}"
+            text = f"{name}: {value:.3g} s is longer than the record, which lasts {duration:.3g} s{_UNIT_OF_TIMES}"
+            yield Advice(f"{name}-long", text)
 
 
 def identify_model(
@@ -278,7 +290,7 @@ def identify_model(
     if options.levels_to_try:
         own["levels"] = options.levels_to_try[0]
     _check_model(model, data, options, own)
-    fitted, warnings = data.fitted_rows(options.train, options.skip)
+    fitted, advice = data.fitted_rows(options.train, options.skip)
     inputs, outputs, times, measured = data.inputs, data.outputs, data.times, data.output
     assert measured is not None
     check_variation(data.source, measured)
@@ -299,10 +311,8 @@ def identify_model(
         else:
             if _is_undetermined(model, data, options, own, int(fitted[options.skip :].sum())):
                 options = replace(options, cross_validated=True)
-                warnings += (
-                    "there are more cells of the density than samples: smoothness decides between them, by "
-                    "cross-validation; --smoothing gives its weight",
-                )
+                text = "there are more cells of the density than samples: smoothness decides between them, by "
+                advice += (Advice("more-cells", f"{text}cross-validation", "--smoothing gives its weight"),)
             if options.cross_validated or options.levels_to_try:
                 trials = _cross_validate(model, data, options, own)
                 options = replace(options, smoothing=trials.best.smoothing, ridge=options.ridge or 0.0)
@@ -331,11 +341,15 @@ def identify_model(
         validity = replace(validity, moves=None)
     if not fitted.all():
         found = replace(found, errors=measure_errors(outputs[counted], (outputs - found.residuals)[counted]))
-    warnings += (*found.warnings, *(() if times is None else _implausible_times(found.model, times)))
+    advice = (*advise_on_record(inputs, times, max(len(data.starts), 1), counted), *advice, *found.advice)
+    if times is not None:
+        advice = (*advice, *_implausible_times(found.model, times))
     tests = check_return_points(inputs, outputs), check_congruency(inputs, outputs)
     if times is None:
         # A model with time takes neither for granted.
-        warnings += tuple(test.text for test in tests if test.holds is False)
+        advice += tuple(
+            Advice(test.name.replace(" ", "-"), test.text, test.remedy) for test in tests if not test.agrees
+        )
     resolution: Resolution | None = None
     if coverage is not None:
         regressor = found.model.regressor(inputs, found.initial_state)
@@ -362,7 +376,7 @@ def identify_model(
     return IdentifiedFile(
         ModelFile(model, found.model, memory, provenance, found.initial_state, band, dynamics, validity),
         found,
-        tuple(dict.fromkeys(warnings)),
+        once(advice),
         data,
         *tests,
         coverage,
@@ -469,6 +483,8 @@ def certificate_lines(identified: IdentifiedFile) -> Sequence[tuple[str, str]]:
     found, operator = identified.identification, identified.file.response
     unit = f" {operator.output_unit}" if operator.output_unit else ""
     errors, certificate, largest = found.errors, found.certificate, _largest(found.uncertainties)
+    whose = "operator " if isinstance(operator, TimedModel) else ""
+    tests = ("return points", identified.return_points), ("loops", identified.congruency)
     rows = identified.inputs.size - found.skip
     partly = f"{identified.fitted} fitted of {rows}"
     if isinstance(operator, TimedModel):
@@ -483,14 +499,13 @@ def certificate_lines(identified: IdentifiedFile) -> Sequence[tuple[str, str]]:
         *([] if identified.fitted is None else _error_lines(identified.all_errors, unit, " of all rows")),
         *_uniqueness(found, identified.resolution),
         *([("penalties", found.regularization.summary(unit))] if found.regularization else []),
-        *([("orientation", f"{found.orientation} with the input")] if found.orientation else []),
+        *([("orientation", f"{whose}{found.orientation} with the input")] if found.orientation else []),
         ("KKT residual", f"{certificate.kkt_residual:.1e}" + ("" if certificate.converged else " (NOT converged)")),
         ("condition", f"{certificate.condition:.2g}"),
         ("largest uncertainty", "unknown" if largest is None else f"{largest:.2g} (1σ, of a coefficient)"),
         ("valid for inputs", identified.file.valid.text(operator.input_unit)),
         ("excitation", identified.coverage.summary() if identified.coverage else "no plane to be swept"),
-        ("return points", identified.return_points.text),
-        ("loops", identified.congruency.text),
+        *[(name, test.text) for name, test in tests if test.agrees],
     )
 
 

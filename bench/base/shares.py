@@ -15,12 +15,24 @@ _listener: ContextVar[Listener | None] = ContextVar("listener", default=None)
 
 @contextmanager
 def shares_to(listener: Listener) -> Iterator[None]:
-    """Give the shares that are said within this block to a listener, in the thread that computes."""
-    before = _listener.set(listener)
+    """Give the shares that are said within this block to a listener, in the thread that computes.
+
+    What the listener says itself goes to the one before.
+    """
+    before = _listener.get()
+
+    def told(what: str, share: float) -> None:
+        token = _listener.set(before)
+        try:
+            listener(what, share)
+        finally:
+            _listener.reset(token)
+
+    token = _listener.set(told)
     try:
         yield
     finally:
-        _listener.reset(before)
+        _listener.reset(token)
 
 
 def say_share(what: str, share: float) -> None:

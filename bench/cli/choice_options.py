@@ -12,7 +12,6 @@ import typer
 from bench.base import print_plain
 from bench.cli.command_support import console, print_rows, warn
 from bench.cli.model_options import ModelOptions
-from bench.cli.patience import show_patience
 
 if TYPE_CHECKING:
     from bench.analysis import (
@@ -72,10 +71,8 @@ def is_comparison(model: str) -> bool:
     return model == ALL or "," in model
 
 
-def choose_model(
-    data: Dataset, model: str, options: ModelOptions, fit: FitOptions, comparing: Comparing
-) -> SelectedModel:
-    """Compare models on measurements, and print the table.
+def choose_model(data: Dataset, model: str, options: ModelOptions, fit: FitOptions) -> SelectedModel:
+    """Compare models on measurements.
 
     Parameters
     ----------
@@ -87,8 +84,6 @@ def choose_model(
         Options of models that are given.
     fit : FitOptions
         How they are fitted, as far as it is given.
-    comparing : Comparing
-        The options of the comparison.
 
     Raises
     ------
@@ -96,7 +91,7 @@ def choose_model(
         If none can be fitted.
     """
     from bench.analysis import named_models, select_model
-    from bench.identification import ONE_RUN, Given
+    from bench.identification import Given
 
     orientation = fit.own["orientation"]
     given = Given(
@@ -106,30 +101,31 @@ def choose_model(
         smoothing=fit.smoothing,
         ridge=fit.ridge,
     )
-    with show_patience(f"{data.name}"):
-        found = select_model(data, named_models(model), given, fit)
+    return select_model(data, named_models(model), given, fit)
+
+
+def print_choice(found: SelectedModel, comparing: Comparing) -> None:
+    """Print the table of a comparison, and write all of it if there is a file for it."""
     _print_table(found)
     _print_line(_on_times(found))
-    for advice in found.selection.advice:
-        if advice.code == ONE_RUN:
-            _print_line(str(advice))
     if comparing.table_out is not None:
         found.save(comparing.table_out)
         print_plain(console, f"table: {comparing.table_out}")
-    return found
 
 
 def _print_table(found: SelectedModel) -> None:
     """Print the best models, a line each; cells are never cut off."""
     selection = found.selection
-    unit = found.unit or "units"
+    unit, of_runs = found.unit or "units", selection.on_runs > 0.0
+    left_out = "runs" if of_runs else "blocks"
     heads = [
-        ("", "", "deg. of", "training", "score", "% of", "blocks", "other", "CPU"),
-        ("", "model", "freedom", unit, unit, "range", unit, f"cycles, {unit}", "s"),
+        ("", "", "deg. of", "training", "score", "% of", left_out, "other", "", "CPU"),
+        ("", "model", "freedom", unit, unit, "range", unit, f"cycles, {unit}", "rows", "s"),
     ]
     usable = [score for score in selection.scores if not score.failure]
+    decided = [score for score in usable if score.rows > selection.rows]
     shown = usable[:_SHOWN]
-    shown += [score for score in (selection.chosen,) if score not in shown]
+    shown += [score for score in (selection.chosen, *decided) if score not in shown]
     rows = [
         (
             "*" if score is selection.chosen else "",
@@ -140,6 +136,7 @@ def _print_table(found: SelectedModel) -> None:
             f"{100.0 * score.error / selection.span:.3g}",
             f"{score.blocks_rms:.3g}",
             f"{score.cycles_rms:.3g}" if score.cycles else "-",
+            str(score.rows),
             f"{score.seconds:.1f}",
         )
         for score in shown
@@ -157,10 +154,15 @@ def _print_table(found: SelectedModel) -> None:
     _print_line("* chosen: the fewest degrees of freedom within 2 % of the least score" + _on_bounded(found))
     if more > 0:
         _print_line(f"{more} more were tried; --table-out FILE.csv writes all")
-    _print_line(
-        f"left out: contiguous blocks of the {selection.rows} rows compared, with gaps of {selection.gap}, or whole "
-        "files; and whole kinds of cycles"
-    )
+    if decided:
+        _print_line(
+            f"compared were {selection.rows} of {selection.of} rows; the best of two models were then scored on all "
+            "rows, and one of these was chosen"
+        )
+    blocks = f"contiguous blocks of the {selection.rows} rows compared, with gaps of {selection.gap},"
+    _print_line(f"left out: {'whole files' if of_runs else blocks} and whole kinds of cycles")
+    errors = f"error of the chosen model: {selection.on_blocks:.3g} {unit} on blocks"
+    _print_line(f"{errors}, {selection.on_runs:.3g} {unit} on another run" if of_runs else errors)
 
 
 def _on_bounded(found: SelectedModel) -> str:
@@ -225,7 +227,8 @@ def _describe(one: Candidate) -> str:
     own = dict(one.options)
     parts = [f"{one.model} with {one.dynamics.replace(',', ' and ')}" if one.dynamics else one.model]
     parts += [value if isinstance(value, str) else f"{name} {value}" for name, value in own.items() if value]
-    parts.append(one.orientation if one.orientation == "falling" else "")
+    falling = "operator falling" if one.dynamics else "falling"
+    parts.append(falling if one.orientation == "falling" else "")
     parts.append(f"start {one.initial}" if one.initial else "")
     parts.append(f"smooth {one.smoothing:g}" if one.smoothing else "")
     parts.append(f"ridge {one.ridge:g}" if one.ridge else "")

@@ -15,6 +15,7 @@ from bench.cli.choice_options import (
     Comparing,
     choose_model,
     is_comparison,
+    print_choice,
     print_test,
     read_measured,
 )
@@ -227,6 +228,7 @@ def identify_(
     `--table telemetry` takes those within its steps, as of a fast loop.
     """
     from bench.analysis import ColumnNames, certificate_lines, identify_model
+    from bench.identification import ONE_RUN
 
     out = outputs.out
     check_outputs(**vars(outputs), read=[*files, *comparing.test_files])
@@ -239,11 +241,11 @@ def identify_(
     with show_patience(patience):
         data, test = read_measured(files, names, model, comparing, reading)
     selected = None
-    if is_comparison(model):
-        selected = choose_model(data, model, options, fit, comparing)
-        model, fit = selected.model, selected.settings(fit)
-        data = data if selected.is_timed else data.without_time()
     with show_patience(patience):
+        if is_comparison(model):
+            selected = choose_model(data, model, options, fit)
+            model, fit = selected.model, selected.settings(fit)
+            data = data if selected.is_timed else data.without_time()
         found = identify_model(data, model, fit)
     if selected is not None:
         found = selected.record_in(found)
@@ -251,12 +253,17 @@ def identify_(
     if out is not None:
         found.file.save(out)
     print_assumptions(data.name, data.assumptions)
+    if selected is not None:
+        print_choice(selected, comparing)
     if found.trials is not None:
         console.print(f"cross-validation, errors in {found.file.response.output_unit or 'output units'}:")
         console.print(found.trials.table(), highlight=False, markup=False)
     for warning in found.warnings:
         warn(warning)
     print_rows(f"{model} from {data.name}", certificate_lines(found))
+    for advice in found.advice:
+        if advice.code == ONE_RUN:
+            print_plain(console, str(advice))
     if found.band is not None:
         print_band(found.band)
     if out is not None:

@@ -1,3 +1,9 @@
+from .advice import (
+    ONE_RUN as ONE_RUN,
+    Advice as Advice,
+    advise_on_record as advise_on_record,
+    once as once,
+)
 from .bands import (
     Band as Band,
     calibrate_band as calibrate_band,
@@ -10,10 +16,6 @@ from .by_name import (
     check_words as check_words,
     identify as identify,
     set_up_problem as set_up_problem,
-)
-from .choose.advice import (
-    ONE_RUN as ONE_RUN,
-    Advice as Advice,
 )
 from .choose.cross_validation import (
     CrossValidation as CrossValidation,

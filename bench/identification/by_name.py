@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bench.base import Floats, checks as _checks
+from bench.identification.advice import Advice
 from bench.identification.fit.least_squares import Certificate, Fit, counted_weights
 from bench.identification.fit.orientation import (
     NAMES,
@@ -56,7 +57,7 @@ class Identification(Generic[M]):
         Number of first samples left out of the cost.
     initial_state : object
         State before the first sample from which the model was fitted.
-    warnings : tuple of str
+    advice : tuple of Advice
         What is odd about the data or not covered by them, and why the fit should not be trusted; see `judge_fit`.
     regularization : Regularization or None
         The penalties of a density of either sign; None for other models, and without penalties.
@@ -72,9 +73,14 @@ class Identification(Generic[M]):
     certificate: Certificate
     skip: int
     initial_state: Any = None
-    warnings: tuple[str, ...] = ()
+    advice: tuple[Advice, ...] = ()
     regularization: Regularization | None = None
     orientation: Orientation | None = None
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The advice as sentences with their remedies."""
+        return tuple(map(str, self.advice))
 
 
 def identify(
@@ -155,7 +161,7 @@ def identify(
         certificate=solution.certificate,
         skip=problem.skip,
         initial_state=problem.state,
-        warnings=(*problem.warnings(), *doubts),
+        advice=(*problem.advice(), *doubts),
         regularization=penalties if is_penalised else None,
         orientation=NAMES[problem.orientation] if has_orientation(problem.spec, problem.template) else None,
     )
@@ -221,12 +227,12 @@ class FitProblem:
         errors = (self.outputs - fit.bias - self.regressor.product(fit.coefficients))[self.skip :]
         return float(self.weights[self.skip :] @ errors**2)
 
-    def warnings(self) -> tuple[str, ...]:
+    def advice(self) -> tuple[Advice, ...]:
         """Return what is odd about the data or not covered by them."""
         found = check_data(self.inputs, self.outputs)
         coverage = self.template.coverage(self.inputs, self.state)
         if coverage is not None and coverage.never.size:
-            found.append(coverage.summary())
+            found.append(Advice("coverage", coverage.summary()))
         found += undetermined_shape(self.template)
         return tuple(found)
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bench.base import Floats, checks as _checks
+from bench.identification.advice import FEW_REVERSALS, Advice
 
 # Part of the samples that may repeat the one before, and part of the range that one step may take. Source: a choice;
 # a sensor that moves all the time repeats a sample only by its resolution.
@@ -22,8 +23,8 @@ _STILL, _MOVED, _REPEATED = 0.02, 0.2, 0.1
 
 def check_data(
     inputs: ArrayLike, outputs: ArrayLike | None = None, *, plane: tuple[float, float] | None = None
-) -> list[str]:
-    """Return what is odd about a measured sequence, in sentences; none if nothing is.
+) -> list[Advice]:
+    """Return what is odd about a measured sequence; nothing if it is as usual.
 
     Looked for are plateaus (inputs repeated, which add weight but no information), branches in one direction that
     are missing or made in one jump, a plane whose ends the inputs never reach, outputs that do not change, and
@@ -49,25 +50,23 @@ def check_data(
         raise ValueError(f"outputs: expected {u.size} values, one for each input, got {y.size}")
     span = float(np.ptp(u))
     if span == 0.0:
-        return [f"the input is {u[0]:g} throughout, so nothing can be identified"]
+        return [Advice("constant-input", f"the input is {u[0]:g} throughout, so nothing can be identified")]
     found = _plateaus(u, y) + _branches(u, span)
     if plane is not None:
         low, high = _checks.increasing("plane", plane).tolist()
         for end, missed, word in ((low, u.min() > low, "low"), (high, u.max() < high, "high")):
             if missed:
                 reached = u.min() if word == "low" else u.max()
-                found.append(
-                    f"the inputs never reach the {word} end of the plane ({reached:g} instead of {end:g}): "
-                    "the cells beyond are not identified"
-                )
+                text = f"the inputs never reach the {word} end of the plane ({reached:g} instead of {end:g}): "
+                found.append(Advice(f"{word}-end", f"{text}the cells beyond are not identified"))
     if y is not None and np.ptp(y) == 0.0:
-        found.append(f"the output is {y[0]:g} throughout")
+        found.append(Advice("constant-output", f"the output is {y[0]:g} throughout"))
     elif y is not None:
         found += _frozen(u, y, span)
     return found
 
 
-def _frozen(u: Floats, y: Floats, span: float) -> list[str]:
+def _frozen(u: Floats, y: Floats, span: float) -> list[Advice]:
     """Return whether outputs that otherwise change from sample to sample stand still while the input moves."""
     same = np.diff(y) == 0.0
     edges = np.flatnonzero(np.diff(np.concatenate([[False], same, [False]]).astype(np.int8)))
@@ -83,14 +82,14 @@ def _frozen(u: Floats, y: Floats, span: float) -> list[str]:
         or elsewhere > _REPEATED * (y.size - (stop - start))
     ):
         return []
-    return [
+    text = (
         f"the output stands still at {y[start]:g} from row {start} to row {stop}, while the input moves by "
-        f"{np.ptp(u[start : stop + 1]):g}, and changes from row to row elsewhere: look at the sensor, and fit the "
-        "other rows with --train"
-    ]
+        f"{np.ptp(u[start : stop + 1]):g}, and changes from row to row elsewhere"
+    )
+    return [Advice("frozen-output", text, "look at the sensor, and fit the other rows with --train")]
 
 
-def _plateaus(u: Floats, y: Floats | None) -> list[str]:
+def _plateaus(u: Floats, y: Floats | None) -> list[Advice]:
     same = np.diff(u) == 0.0
     repeated = int(same.sum())
     if repeated <= _PLATEAU * u.size:
@@ -98,10 +97,10 @@ def _plateaus(u: Floats, y: Floats | None) -> list[str]:
     text = f"{repeated} of {u.size} inputs repeat the one before: plateaus add weight but no information"
     if y is not None:
         text += f" (the output changes by up to {np.abs(np.diff(y))[same].max():g} on them)"
-    return [text]
+    return [Advice("plateaus", text)]
 
 
-def _branches(u: Floats, span: float) -> list[str]:
+def _branches(u: Floats, span: float) -> list[Advice]:
     """Return whether branches in one direction are jumps while those in the other are made in steps."""
     steps = np.diff(u[np.append(True, np.diff(u) != 0.0)])
     turns = np.flatnonzero(np.diff(np.sign(steps)) != 0.0) + 1
@@ -116,10 +115,8 @@ def _branches(u: Floats, span: float) -> list[str]:
         jumps = sum(1 for _, count in runs[word] if count == 1)
         stepped = sum(1 for _, count in runs[other] if count > 1)
         if not runs[word]:
-            found.append(f"there is no {word} branch")
+            found.append(Advice(FEW_REVERSALS, f"there is no {word} branch"))
         elif stepped and jumps > 0.5 * len(runs[word]):
-            found.append(
-                f"{jumps} of {len(runs[word])} {word} branches are one jump, while the {other} ones are made in "
-                f"steps: {word} branches seem to be missing"
-            )
+            text = f"{jumps} of {len(runs[word])} {word} branches are one jump, while the {other} ones are made in "
+            found.append(Advice(f"{word}-jumps", f"{text}steps: {word} branches seem to be missing"))
     return found

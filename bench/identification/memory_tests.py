@@ -53,6 +53,8 @@ class MemoryTest:
         Number of extrema or of branches that were compared.
     text : str
         The verdict as a sentence.
+    remedy : str
+        What to try if the data do not agree with it.
     """
 
     name: str
@@ -61,6 +63,12 @@ class MemoryTest:
     percent: float
     compared: int
     text: str
+    remedy: str = ""
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the data do not contradict it."""
+        return self.holds is not False
 
     def to_json(self) -> dict[str, Any]:
         """Return the verdict for programs."""
@@ -113,9 +121,10 @@ def check_return_points(inputs: ArrayLike, outputs: ArrayLike) -> MemoryTest:
         how = f"differs by {rms:.3g} from visit to visit" if ratchet is None else f"ratchets by {ratchet:.3g} a visit"
         text = (
             f"no {name}: {extrema}, the output {how} ({percent:.2g} % of the range): a Preisach-type model may not "
-            "be used; look for drift or creep, or fit a model with time"
+            "be used"
         )
-    return MemoryTest(name, is_small, rms, percent, len(visited), text)
+    remedy = "look for drift or creep, or fit a model with time"
+    return MemoryTest(name, is_small, rms, percent, len(visited), text, remedy)
 
 
 def check_congruency(inputs: ArrayLike, outputs: ArrayLike) -> MemoryTest:
@@ -143,11 +152,9 @@ def check_congruency(inputs: ArrayLike, outputs: ArrayLike) -> MemoryTest:
     if is_small:
         text = f"{name}: {pairs} agree within {percent:.2g} % of the range"
     else:
-        text = (
-            f"no {name}: {pairs} differ by {percent:.2g} % of the range, which no Preisach-type model follows; "
-            "compare it with models of other structure by --model all"
-        )
-    return MemoryTest(name, is_small, rms, percent, len(differences), text)
+        text = f"no {name}: {pairs} differ by {percent:.2g} % of the range, which no Preisach-type model follows"
+    remedy = "compare it with models of other structure by --model all"
+    return MemoryTest(name, is_small, rms, percent, len(differences), text, remedy)
 
 
 def _untested(name: str, reason: str) -> MemoryTest:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from bench.base import Floats
+from bench.identification.advice import Advice
 from bench.models import Operator
 
 if TYPE_CHECKING:
@@ -84,8 +85,10 @@ def _too_few(samples: int, left: int, estimable: bool) -> str:
     )
 
 
-def judge_fit(problem: FitProblem, found: Fit, errors: Floats, *, initial: str | None, smoothing: float) -> list[str]:
-    """Return why a fit should not be trusted, a sentence and a remedy each; nothing if there is no reason.
+def judge_fit(
+    problem: FitProblem, found: Fit, errors: Floats, *, initial: str | None, smoothing: float
+) -> list[Advice]:
+    """Return why a fit should not be trusted; nothing if there is no reason.
 
     Parameters
     ----------
@@ -117,49 +120,56 @@ def judge_fit(problem: FitProblem, found: Fit, errors: Floats, *, initial: str |
     ]
 
 
-def _free(found: Fit, signed: bool) -> list[str]:
+def _free(found: Fit, signed: bool) -> list[Advice]:
     free, count = found.certificate.passive, found.coefficients.size
     if free >= min(_FEWEST_FREE, count):
         return []
     remedy = "a larger record" if signed else "--orientation auto, --reversible polynomial or --model preisach-signed"
-    return [f"free coefficients: only {free} of {count}, so that the model hardly answers to its input; try {remedy}"]
+    text = f"free coefficients: only {free} of {count}, so that the model hardly answers to its input"
+    return [Advice("few-free", text, f"try {remedy}")]
 
 
-def _explained(explained: float, template: Operator[Any], signed: bool) -> list[str]:
+def _explained(explained: float, template: Operator[Any], signed: bool) -> list[Advice]:
     if explained >= _LEAST_EXPLAINED:
         return []
     if template.memoryless:
         remedy = "a model with memory, such as --model preisach"
     elif signed:
-        remedy = "--reversible polynomial, more levels, or whether the output depends on this input at all"
+        remedy = "--reversible polynomial, or more levels"
     else:
         remedy = "--model preisach-signed, for outputs that rise and fall, or --reversible polynomial"
-    return [f"the model explains {max(explained, 0.0):.0%} of the variance of the output (R² < 0.5); try {remedy}"]
+    text = (
+        f"the model explains {max(explained, 0.0):.0%} of the variance of the output (R² < 0.5), which may not "
+        "depend on this input at all"
+    )
+    return [Advice("unexplained", text, f"try {remedy}")]
 
 
-def _samples(samples: int, found: Fit, smoothing: float) -> list[str]:
+def _samples(samples: int, found: Fit, smoothing: float) -> list[Advice]:
     free, count = found.certificate.passive, found.coefficients.size
     # With smoothing more coefficients are free than the data have to determine.
     if samples >= count and (smoothing or samples >= _SAMPLES_EACH * free):
         return []
     remedy = "fewer --levels" if smoothing else "fewer --levels, --smoothing or --cross-validate"
-    return [
+    text = (
         f"{samples} samples are few for {count} coefficients, {free} of them free: on other inputs the errors will "
-        f"be larger than these; use {remedy}"
-    ]
+    )
+    return [Advice("few-samples", f"{text}be larger than these", f"use {remedy}")]
 
 
-def _condition(found: Fit) -> list[str]:
+def _condition(found: Fit) -> list[Advice]:
     condition = found.certificate.condition
     if condition <= _CONDITION:
         return []
+    text = f"the condition is {condition:.1g} (> 1e6), so that the coefficients follow the noise"
     return [
-        f"the condition is {condition:.1g} (> 1e6): the coefficients follow the noise, and outputs for other inputs "
-        "may be far off; use fewer --levels or --smoothing"
+        Advice(
+            "condition", f"{text}, and outputs for other inputs may be far off", "use fewer --levels or --smoothing"
+        )
     ]
 
 
-def _first(problem: FitProblem, errors: Floats, initial: str | None) -> list[str]:
+def _first(problem: FitProblem, errors: Floats, initial: str | None) -> list[Advice]:
     """Return whether the samples that the initial memory reaches are much worse than the others."""
     if problem.template.memoryless or initial == "skip":
         return []
@@ -170,14 +180,14 @@ def _first(problem: FitProblem, errors: Floats, initial: str | None) -> list[str
     estimable = problem.spec.estimate_state is not None and initial != "estimate"
     span = float(np.ptp(problem.outputs)) / 100.0
     last = problem.skip + int(np.flatnonzero(reached > others.max())[-1]) + 1
-    return [
+    text = (
         f"the largest errors stand in the first {last} samples, which the initial memory reaches "
-        f"({reached.max() / span:.2g} % of the range; {others.max() / span:.2g} % where it does not): try "
-        f"--initial {'estimate or skip' if estimable else 'skip'}"
-    ]
+        f"({reached.max() / span:.2g} % of the range; {others.max() / span:.2g} % where it does not)"
+    )
+    return [Advice("initial-memory", text, f"try --initial {'estimate or skip' if estimable else 'skip'}")]
 
 
-def _plane(problem: FitProblem, explained: float) -> list[str]:
+def _plane(problem: FitProblem, explained: float) -> list[Advice]:
     """Return whether inputs and plane do not match; a plane within the inputs is none if its fit is good."""
     plane = problem.template.plane
     if plane is None:
@@ -188,23 +198,20 @@ def _plane(problem: FitProblem, explained: float) -> list[str]:
     if shared >= _PLANE_REACHED * (plane[1] - plane[0]) and shared >= held * (greatest - least):
         return []
     unit = f" {problem.template.input_unit}".rstrip()
-    return [
-        f"the plane from {plane[0]:g} to {plane[1]:g}{unit} does not match the inputs, {least:g} to "
-        f"{greatest:g}{unit}; give --plane {least:g} {greatest:g}, or leave it out"
-    ]
+    ends = f"{plane[0]:g} to {plane[1]:g}{unit}"
+    text = f"the plane from {ends} does not match the inputs, {least:g} to {greatest:g}{unit}"
+    return [Advice("plane", text, f"give --plane {least:g} {greatest:g}, or leave it out")]
 
 
-def _unit(template: Operator[Any]) -> list[str]:
+def _unit(template: Operator[Any]) -> list[Advice]:
     unit = template.input_unit.strip()
     if not unit or not template.input_units or unit in template.input_units:
         return []
-    return [
-        f"the reversible part of this model is for an input in {template.input_units[0]}; this one is in {unit}: use "
-        "--model preisach --reversible polynomial"
-    ]
+    text = f"the reversible part of this model is for an input in {template.input_units[0]}; this one is in {unit}"
+    return [Advice("unit", text, "use --model preisach --reversible polynomial")]
 
 
-def _butterfly(problem: FitProblem, errors: Floats) -> list[str]:
+def _butterfly(problem: FitProblem, errors: Floats) -> list[Advice]:
     """Return whether the loops over the lower and the upper half of the inputs turn in opposite directions."""
     u, y = problem.inputs[problem.skip :], problem.outputs[problem.skip :]
     middle = 0.5 * float(u.min() + u.max())
@@ -221,7 +228,7 @@ def _butterfly(problem: FitProblem, errors: Floats) -> list[str]:
     clear = all(abs(area) > floor for area, floor in zip(areas, floors, strict=True))
     if areas[0] * areas[1] >= 0.0 or small < _AREAS * large or not clear:
         return []
-    return [
+    text = (
         "the loops over the low and the high inputs turn in opposite directions (a butterfly), which coefficients of "
-        "one sign cannot give; use --model preisach-signed"
-    ]
+    )
+    return [Advice("butterfly", f"{text}one sign cannot give", "use --model preisach-signed")]

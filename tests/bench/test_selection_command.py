@@ -146,7 +146,7 @@ def test_fewer_samples_than_cells_are_smoothed_by_cross_validation(bench, tmp_pa
             "--test", tmp_path / "long.csv", *smoothing, "--json", result,
         )  # fmt: skip
         assert code == 0, err
-        assert ("by cross-validation; --smoothing" in " ".join(err.split())) is not bool(smoothing)
+        assert ("by cross-validation: --smoothing" in " ".join(err.split())) is not bool(smoothing)
         errors[smoothing] = json.loads(result.read_text())["test"]["raw"]["rms"]
     assert errors[()] < errors["--smoothing", "0"]
 
@@ -370,3 +370,18 @@ def test_each_row_of_the_table_is_one_line_with_a_time(bench, record):
     assert sum(row.startswith("*") for row in rows) == 1
     for row in rows:
         assert float(row.split()[-1]) >= 0.0
+
+
+def test_half_a_loop_is_doubted_once_and_nothing_is_proposed_that_was_tried(bench, tmp_path):
+    inputs = np.linspace(1.0, -1.0, 46)
+    rows = [f"{u},{np.tanh(3.0 * u + 0.5)}" for u in inputs.tolist()]
+    (tmp_path / "half.csv").write_text("\n".join(["u,y", *rows]) + "\n")
+    result = tmp_path / "result.json"
+    code, _, err = bench("identify", tmp_path / "half.csv", "--input", "u", "--output", "y", "--json", result)
+    assert code == 0, err
+    advice = json.loads(result.read_text())["advice"]
+    codes = [one["code"] for one in advice]
+    assert len(set(codes)) == len(codes)
+    assert {"few-reversals", "one-run"} <= set(codes)
+    assert "branch" not in err
+    assert not [one for one in advice if "--levels" in one["remedy"] or "--model" in one["remedy"]]

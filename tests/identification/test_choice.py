@@ -165,3 +165,36 @@ def test_one_speed_is_said():
 
 def test_models_of_one_input_are_compared_by_default():
     assert {"preisach", "polynomial-plays", "bouc-wen", "duhem", "polynomial"} == set(compared_models())
+
+
+def test_of_many_rows_the_best_of_two_models_are_scored_on_all():
+    inputs = random_reversals(np.random.default_rng(1), 5000, 40)
+    outputs = settled(PLANTS["duhem"], inputs) + 0.01 * np.random.default_rng(2).standard_normal(5000)
+    found = select(Measurements.of(inputs, outputs), ("polynomial", "polynomial-plays"))
+    decided = [score for score in found.scores if score.rows > found.rows]
+    assert found.rows <= 2000 < found.of
+    assert {score.candidate.model for score in decided} == {"polynomial", "polynomial-plays"}
+    assert {score.rows for score in decided} == {found.of}
+    assert any(score is found.chosen for score in decided)
+
+
+def test_a_response_that_rings_is_followed_by_a_resonance():
+    times = 0.01 * np.arange(800)
+    inputs = np.repeat(np.random.default_rng(5).uniform(-1.0, 1.0, 20), 40)
+    position, speed, outputs = 0.0, 0.0, np.empty(800)
+    for row, target in enumerate(inputs):
+        for _ in range(50):
+            speed += 2e-4 * (100.0 * (target - position) - 3.0 * speed)
+            position += 2e-4 * speed
+        outputs[row] = position
+    found = select(Measurements.of(inputs, outputs, times=times), ("polynomial",))
+    assert "resonance" in found.chosen.candidate.dynamics
+
+
+def test_the_error_on_another_run_stands_beside_that_on_blocks():
+    inputs = np.tile(damped(200, 10), 3)
+    runs = np.repeat([1, 2, 3], 200)
+    found = select(Measurements.of(inputs, (1.0 + 0.1 * runs) * inputs, runs=runs), ("polynomial",))
+    assert found.on_runs > 1.2 * found.on_blocks > 0.0
+    alone = select(Measurements.of(inputs, inputs), ("polynomial",))
+    assert np.isnan(alone.on_runs)

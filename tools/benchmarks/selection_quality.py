@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.analysis.model_choice import MOST_ROWS
 from bench.identification import Candidate, Measurements, compared_models, identify, identify_in_time, select
 
 sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "identification"))
@@ -189,7 +188,7 @@ def choose(one: Case) -> Outcome:
     """Choose a model for a case, and find the best of all candidates that were tried."""
     measured = Measurements.of(one.inputs, one.outputs, times=one.times)
     begin = time.process_time()
-    found = select(measured.thinned(MOST_ROWS), compared_models())
+    found = select(measured, compared_models())
     seconds = time.process_time() - begin
     tried = [found.chosen.candidate, *(score.candidate for score in found.scores if not score.failure)]
     errors = [one.error(candidate) for candidate in tried]

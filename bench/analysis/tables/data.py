@@ -36,9 +36,6 @@ _STEPS, _TELEMETRY = "steps", "telemetry"
 _FORMULAS = ("=", "+", "-", "@", "\t", "\r")
 """What a text begins with that a spreadsheet takes for a formula."""
 
-_LONGEST_PLATEAU = 0.5
-"""Share of the samples that may repeat the one before without a word."""
-
 Floats = npt.NDArray[np.float64]
 
 
@@ -175,25 +172,6 @@ def is_run(path: Path) -> bool:
 def _check_rows(path: Path, rows: int, at_least: int, otherwise: str = "") -> None:
     if rows < at_least:
         raise DataError(f"{path}: has {rows} rows of data; at least {at_least} are needed{otherwise}")
-
-
-def check_excitation(source: str, column: Quantity) -> list[str]:
-    """Check that a column can serve as the input of an identification; return what is odd about it, though usable.
-
-    Raises
-    ------
-    DataError
-        If it is constant.
-    """
-    check_variation(source, column)
-    values = column.values
-    repeated = int(np.count_nonzero(np.diff(values) == 0.0))
-    if repeated > _LONGEST_PLATEAU * values.size:
-        return [
-            f"column {column.name}: {repeated} of {values.size} rows repeat the row before; "
-            "plateaus add weight but no information"
-        ]
-    return []
 
 
 def check_variation(source: str, column: Quantity) -> None:

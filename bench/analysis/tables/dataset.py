@@ -13,12 +13,12 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from bench.analysis.tables.data import Quantity, check_excitation, is_run, read_columns
+from bench.analysis.tables.data import Quantity, check_variation, is_run, read_columns
 from bench.analysis.tables.reading.options import ReadingOptions
 from bench.analysis.tables.reading.table import FEWEST_ROWS
 from bench.analysis.tables.times import rows_in_time, seconds_of
 from bench.base import ConfigurationError, DataError
-from bench.identification import ModelFile
+from bench.identification import Advice, ModelFile
 from bench.models import PolynomialPlays, TimedModel
 
 Floats = npt.NDArray[np.float64]
@@ -134,7 +134,7 @@ class Dataset:
         if self.output is not None:
             check_unit(model.response.output_unit, self.output)
 
-    def fitted_rows(self, rows: slice | None = None, skip: int = 0) -> tuple[Flags, tuple[str, ...]]:
+    def fitted_rows(self, rows: slice | None = None, skip: int = 0) -> tuple[Flags, tuple[Advice, ...]]:
         """Return which rows are fitted, shape (N,), and what is odd about the measurements, though usable.
 
         Each further file starts with a memory of its own, which nobody knows: its rows are fitted from where its
@@ -163,19 +163,21 @@ class Dataset:
         check_rows("--train", rows, inputs.size)
         chosen = np.zeros(inputs.size, dtype=bool)
         chosen[slice(None) if rows is None else rows] = True
-        warnings = []
+        advice = []
         for start, stop in pairwise((*self.starts[1:], inputs.size)):
             until = overwritten_from(inputs[start:stop])
             if until > (stop - start) // 2:
-                warnings.append(
+                text = (
                     f"the file of rows {start} to {stop - 1} overwrites its unknown memory only at row "
-                    f"{start + until}: its start is taken as if it followed the end of the file before"
+                    f"{start + until}: its start is taken as if it followed the file before"
                 )
+                advice.append(Advice("file-memory", text))
             else:
                 chosen[start : start + until] = False
         if not chosen.any():
             raise ConfigurationError(f"--train leaves none of {inputs.size} rows")
-        return chosen, (*check_excitation(self.source, self.input), *warnings)
+        check_variation(self.source, self.input)
+        return chosen, tuple(advice)
 
 
 def read_dataset(

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.base import Floats
+from bench.base import Floats, say_share
 from bench.identification.branches import turning_points
 from bench.identification.by_name import FitProblem, Initial, set_up_problem
 from bench.identification.choose.splits import BLOCKS, GAP, Flags, Fold, block_folds, cycle_folds, run_folds
@@ -31,6 +31,10 @@ _KNOWN = 0.25
 _SKIPPED = 0.5
 # Relative tolerance of shape parameters of a candidate. Source: far below the tie of two scores, 2 %.
 _SHAPE = 1e-3
+
+
+SCORING = "scoring"
+"""Stage of which `evaluate` says the share that is done."""
 
 
 @dataclass(frozen=True)
@@ -139,6 +143,11 @@ class Measurements:
         )
 
     @property
+    def run_count(self) -> int:
+        """Number of runs."""
+        return 1 if self.runs is None else np.unique(self.runs).size
+
+    @property
     def tested(self) -> Flags:
         """Rows that may be tested, shape (N,)."""
         return np.asarray(self.fitted & (np.arange(self.inputs.size) >= self.known), dtype=bool)
@@ -186,6 +195,8 @@ class Score:
         RMS error of the rows fitted, mean over the folds, output units.
     freedom : float
         Degrees of freedom of the fit, mean over the folds: effective coefficients and nonlinear parameters.
+    rows : int
+        Rows that were tested.
     seconds : float
         CPU time, s.
     failure : str
@@ -197,6 +208,7 @@ class Score:
     cycles: tuple[float, ...] = ()
     training: float = float("nan")
     freedom: float = float("nan")
+    rows: int = 0
     seconds: float = 0.0
     failure: str = ""
 
@@ -251,7 +263,7 @@ def evaluate(measured: Measurements, candidates: Sequence[Candidate]) -> list[Sc
                 if isinstance(fitter, str):
                     scores.append(Score(candidate, failure=fitter))
                     continue
-                scores.append(_score(measured, candidate, fitter, folds, begin))
+                scores.append(_score(measured, candidate, fitter, folds, begin, (len(scores), len(candidates))))
         # A model of another package must not end the comparison of the others.
         except Exception as error:
             text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
@@ -278,15 +290,18 @@ def _score(
     fitter: _Fitter,
     folds: tuple[tuple[Fold, ...], tuple[Fold, ...]],
     begin: float,
+    place: tuple[int, int],
 ) -> Score:
     errors: tuple[list[float], list[float]] = ([], [])
-    training, freedom = [], []
+    training: list[float] = []
+    freedom: list[float] = []
     for found, part in zip(errors, folds, strict=True):
         for fold in part:
             weights = fold.trained.astype(np.float64)
             fit = fitter.fit(weights, candidate)
             squares = (measured.outputs - fitter.predict(fit)) ** 2
             found.append(float(squares[fold.tested].mean()))
+            say_share(SCORING, (place[0] + len(training) / sum(map(len, folds))) / place[1])
             weights[: fitter.skip] = 0.0
             training.append(float(np.sqrt(weights @ squares / weights.sum())))
             freedom.append(fit.certificate.effective + fitter.parameters)
@@ -296,6 +311,7 @@ def _score(
         tuple(errors[1]),
         float(np.mean(training)),
         float(np.mean(freedom)),
+        int(measured.tested.sum()),
         time.process_time() - begin,
     )
 

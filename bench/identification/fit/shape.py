@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from bench.base import Floats
+from bench.identification.advice import Advice
 from bench.identification.fit.least_squares import Fit, fit, fit_minimum_norm
 from bench.identification.fit.ridge import fit_ridge
 from bench.identification.fit.variable_projection import variable_projection
@@ -94,12 +95,15 @@ def fit_shape(
     return template.with_shape(best.values.tolist())
 
 
-def undetermined_shape(operator: Operator[Any]) -> list[str]:
-    """Return a warning for each fitted shape parameter that has run to the upper end of its range."""
+def undetermined_shape(operator: Operator[Any]) -> list[Advice]:
+    """Return advice on each fitted shape parameter that has run to the upper end of its range."""
     shape = operator.shape_parameters()
     return [
-        f"{name} = {value:.4g} is at the end of its range: the data do not determine it; measure loops of several "
-        "amplitudes, or take another model"
+        Advice(
+            f"{name}-range",
+            f"{name} = {value:.4g} is at the end of its range: the data do not determine it",
+            "measure loops of several amplitudes, or take another model",
+        )
         for name, value, high in zip(shape.names, shape.values, shape.high, strict=True)
         if value >= high - 1e-6 * abs(high)
     ]

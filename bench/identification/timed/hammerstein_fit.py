@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bench.base import Floats
+from bench.identification.advice import Advice
 from bench.identification.by_name import FitProblem, Identification, Initial, set_up_problem
 from bench.identification.choose.cross_validation import SmoothingTrial, compare_smoothing
 from bench.identification.fit.least_squares import Fit, one_thread
@@ -124,7 +125,7 @@ def identify_hammerstein(
         smoothing=tried[len(tried) // 2],
         ridge=ridge,
     )
-    warnings = list(problem.warnings())
+    advice = list(problem.advice())
     penalties = Regularization(tried[0], 0.0) if any(tried) else None
     with one_thread():
         search, found = choose_elements(search) if chosen is None else reshape(search, find_best(search, chosen))
@@ -138,12 +139,13 @@ def identify_hammerstein(
     for parameter, value, deviation in zip(parameters, found.values, found.deviations, strict=True):
         # A delay or creep of 0 is an answer; a time at its bound is not.
         if parameter.name in ("lag", "frequency", "damping", "drift", "friction") and not deviation < 1.0:
-            warnings.append(
-                f"the data do not determine the {parameter.name} of the linear part; leave it out with --dynamics, "
-                "or give data with faster and slower inputs"
-            )
+            text = f"the data do not determine the {parameter.name} of the linear part"
+            remedy = "record faster and slower inputs, or leave it out with --dynamics"
+            advice.append(Advice("dynamics-unknown", text, remedy))
         elif parameter.name == "delay" and value > 0.99 * parameter.high:
-            warnings.append("the delay is the longest that is tried; check the columns of time and output")
+            advice.append(
+                Advice("long-delay", "the delay is the longest that is tried", "check the columns of time and output")
+            )
     follows = search.linear(parameters, found.values)
     count = search.columns.shape[1]
     strengths = dict(zip(beside(found.elements), found.fit.coefficients[count:].tolist(), strict=True))
@@ -160,7 +162,7 @@ def identify_hammerstein(
     state = HammersteinState(problem.state)
     predicted = model.evaluate(moments, sequence, state)
     residuals = measured - predicted
-    warnings += judge_fit(problem, found.fit, residuals, initial=initial, smoothing=search.smoothing)
+    advice += judge_fit(problem, found.fit, residuals, initial=initial, smoothing=search.smoothing)
     return Identification(
         model_name="hammerstein",
         model=model,
@@ -170,7 +172,7 @@ def identify_hammerstein(
         certificate=found.fit.certificate,
         skip=problem.skip,
         initial_state=state,
-        warnings=tuple(warnings),
+        advice=tuple(advice),
         regularization=penalties,
         orientation=NAMES[search.sign(found.fit)] if has_orientation(problem.spec, problem.template) else None,
     )
@@ -188,6 +190,11 @@ def _elements(text: str) -> tuple[str, ...]:
         if len(group & set(names)) > 1:
             raise ValueError(f"dynamics: expected one of {' and '.join(sorted(group))}, got both")
     return tuple(dict.fromkeys(names))
+
+
+def with_element(elements: Sequence[str], element: str) -> tuple[str, ...]:
+    """Return elements with one more, in place of what cannot stand beside it."""
+    return (*(name for name in elements if not any({name, element} <= group for group in _EXCLUSIVE)), element)
 
 
 def set_up_search(
@@ -262,9 +269,8 @@ def choose_elements(search: Search) -> tuple[Search, Found]:
     while found.cost > 0.0:
         trials = []
         for element in among:
-            kept = tuple(name for name in found.elements if not any({name, element} <= group for group in _EXCLUSIVE))
             if element not in found.elements:
-                elements = (*kept, element)
+                elements = with_element(found.elements, element)
                 trials += search_ends(search, elements, found, search.principal[:, :FREE], starts=1, evaluations=_FEW)
         # Only the most promising is worth the constrained fit.
         least = min(trials, key=criterion)

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bench.base import Floats
+from bench.identification.advice import Advice
 from bench.identification.by_name import Identification
 from bench.identification.fit.least_squares import Certificate, counted_weights
 from bench.identification.fit.variable_projection import End, Evidence, Stage, variable_projection
@@ -150,13 +151,13 @@ def identify_bouc_wen_oscillator(
         for name, value, deviation in zip(_NAMES, found, deviations.tolist(), strict=True)
         if not deviation < _UNKNOWN * abs(value)
     ]
-    warnings = []
+    advice = []
     if poor:
-        warnings.append(
-            f"the data do not determine {', '.join(poor)}; give a record with a greater amplitude, or with several"
-        )
+        remedy = "give a record with a greater amplitude, or with several"
+        advice.append(Advice("parameters-unknown", f"the data do not determine {', '.join(poor)}", remedy))
     if substeps_for(model.vector, clock) > 1.5 * substeps:
-        warnings.append("the time step is long for the oscillation that was found; sample faster")
+        text = "the time step is long for the oscillation that was found"
+        advice.append(Advice("long-step", text, "sample faster"))
     return Identification(
         model_name="bouc-wen-oscillator",
         model=model,
@@ -175,7 +176,7 @@ def identify_bouc_wen_oscillator(
         ),
         skip=skip,
         initial_state=start,
-        warnings=tuple(warnings),
+        advice=tuple(advice),
     )
 
 

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bench.base import Floats
+from bench.identification.advice import Advice
 from bench.identification.by_name import Identification
 from bench.identification.fit.least_squares import Fit, fit
 from bench.identification.fit.orientation import NAMES, Orientation
@@ -212,17 +213,13 @@ def identify_preisach_oscillator(
             "bouc-wen-oscillator"
         )
     predicted = trial.model.evaluate(clock, u, search.start)
-    warnings = []
+    advice = []
     if trial.model.least_slope < 0.0:
-        warnings.append(
-            "the restoring force falls on a part of its loop, where the response to another input may jump; give "
-            "fewer --levels, or take bouc-wen-oscillator"
-        )
+        text = "the restoring force falls on a part of its loop, where the response to another input may jump"
+        advice.append(Advice("falling-force", text, "give fewer --levels, or take bouc-wen-oscillator"))
     if 3 * trial.fit.certificate.passive > np.count_nonzero(w):
-        warnings.append(
-            f"{np.count_nonzero(w)} samples are few for {trial.fit.certificate.passive} free coefficients; give "
-            "fewer --levels or a longer record"
-        )
+        text = f"{np.count_nonzero(w)} samples are few for {trial.fit.certificate.passive} free coefficients"
+        advice.append(Advice("few-samples", text, "give fewer --levels or a longer record"))
     return Identification(
         model_name="preisach-oscillator",
         model=trial.model,
@@ -232,7 +229,7 @@ def identify_preisach_oscillator(
         certificate=trial.fit.certificate,
         skip=skip,
         initial_state=search.start,
-        warnings=tuple(warnings),
+        advice=tuple(advice),
         orientation=NAMES[sign],
     )
 

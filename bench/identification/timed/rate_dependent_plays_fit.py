@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bench.base import Floats
+from bench.identification.advice import Advice
 from bench.identification.by_name import FitProblem, Identification, Initial, set_up_problem
 from bench.identification.fit.cell_layout import CellLayout
 from bench.identification.fit.least_squares import Fit, fit_cells, one_thread
@@ -249,16 +250,14 @@ def identify_rate_dependent_plays(
     search = PlaysSearch.of(moments, sequence, measured, weights, skip, initial, orientation, **options, **units)
     with one_thread():
         found = search.choose(time_constants)
-    warnings = list(search.static.warnings())
+    advice = list(search.static.advice())
     if not (found.deviations < _UNKNOWN).all():
-        warnings.append(
-            "the data do not determine every time constant; give fewer (--option time_constants=NUMBER), or data "
-            "with faster and slower inputs"
-        )
+        remedy = "record faster and slower inputs, or give fewer (--option time_constants=NUMBER)"
+        advice.append(Advice("dynamics-unknown", "the data do not determine every time constant", remedy))
     model, state, first = search.model(found.lags, found.fit), search.state(found.lags), search.static.skip
     predicted = model.evaluate(moments, sequence, state)
     residuals = measured - predicted
-    warnings += judge_fit(search.static, found.fit, residuals, initial=initial, smoothing=0.0)
+    advice += judge_fit(search.static, found.fit, residuals, initial=initial, smoothing=0.0)
     return Identification(
         model_name=model.kind,
         model=model,
@@ -268,6 +267,6 @@ def identify_rate_dependent_plays(
         certificate=found.fit.certificate,
         skip=first,
         initial_state=state,
-        warnings=tuple(warnings),
+        advice=tuple(advice),
         orientation=NAMES[search.static.orientation],
     )
