@@ -20,6 +20,9 @@ from bench.identification.branches import NOISE, turning_points
 _CHANCE = 0.05
 """Probability below which moves beyond those fitted are no chance. Source: the usual level of a test."""
 
+_ROUNDING = 1e-9
+"""Part of an input that is rounding. Source: files have nine digits or more; no sensor tells less."""
+
 Kind: TypeAlias = Literal["smaller", "larger", "slower", "faster"]
 
 
@@ -195,15 +198,16 @@ class Validity:
         """
         values = _checks.samples("inputs", inputs)
         distances = np.maximum(self.low - values, values - self.high)
-        lengths, rates = _moves(values, times, NOISE * (self.high - self.low))
         span = self.high - self.low
         lengths, rates = _moves(values, times, NOISE * span)
         moves = {
             **self._compared(("smaller", "larger"), self.moves, lengths, span),
             **self._compared(("slower", "faster"), self.rates, rates),
         }
-        rows = np.flatnonzero(distances > 0.0) + first + 1
-        return Beyond(self, values.size, rows, float(max(distances.max(), 0.0)), moves, unit)
+        # Inputs that were computed reach the ends of the range to rounding only.
+        distances[distances <= _ROUNDING * max(abs(self.low), abs(self.high))] = 0.0
+        rows = np.flatnonzero(distances) + first + 1
+        return Beyond(self, values.size, rows, float(distances.max()), moves, unit)
 
     def text(self, unit: str) -> str:
         """Return range, moves and rates, as far as they are known, in a line."""

@@ -94,3 +94,8 @@ def test_what_is_written_is_read():
     for key, value in (("low", "x"), ("low", 20.0), ("moves", [2.0]), ("rates", [2.0, 1.0]), ("rows", None)):
         with pytest.raises(ValueError, match="validity"):
             Validity.from_json({**known.to_json(), key: value})
+
+
+def test_an_input_beyond_the_range_by_rounding_is_within_it():
+    beyond = of(LOOPS).judge(np.array([0.0, 10.0 * (1.0 + 1e-14), 5.0]))
+    assert (beyond.rows.size, beyond.distance, beyond.text()) == (0, 0.0, "")
