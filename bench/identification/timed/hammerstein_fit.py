@@ -8,7 +8,6 @@ leaves free, in turns with that fit, from several starts.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Annotated, Any, Literal
@@ -27,7 +26,7 @@ from bench.identification.fit.variable_projection import Evidence, Stage, variab
 from bench.identification.measures import measure_errors
 from bench.identification.options import OptionHelp
 from bench.identification.timed.hammerstein_search import FREE, Found, Search, beside, find_best, search_ends
-from bench.identification.timed.parsimony import check_size
+from bench.identification.timed.parsimony import check_size, schwarz
 from bench.identification.trust import judge_fit
 from bench.models import Hammerstein, HammersteinState, Regressor, check_sequence
 
@@ -260,8 +259,7 @@ def choose_elements(search: Search) -> tuple[Search, Found]:
     used = max(int(np.count_nonzero(search.roots)), 1)
 
     def criterion(trial: Found) -> float:
-        parameters = trial.values.size + len(beside(trial.elements))
-        return used * math.log(max(trial.cost, 1e-300)) + parameters * math.log(used)
+        return schwarz(trial.cost, trial.values.size + len(beside(trial.elements)), used)
 
     found = find_best(search, ())
     shortest, longest = search.creep_span

@@ -1,4 +1,4 @@
-"""What fits of models with time share: size, columns that move, worth of parameters."""
+"""What fits of models with time share: size, columns that move, and the criterion by which parts are added."""
 
 from __future__ import annotations
 
@@ -7,10 +7,6 @@ import math
 import numpy as np
 
 from bench.base import Floats
-
-WORTH = 0.005
-"""Part by which something that nobody asked for must lower the RMS error. Source: a choice; a smaller gain shows in
-no printed error of two digits."""
 
 # Greatest regressor, numbers; 400 MB. Source: a choice; ten copies fit into 4 GB.
 _LARGEST = 50_000_000
@@ -37,24 +33,16 @@ def moving(columns: Floats, weights: Floats, skip: int) -> Floats:
     return np.where(np.ptp(fitted, axis=0) >= _MOVED * np.ptp(columns, axis=0), columns, 0.0)
 
 
-def is_worth(before: float, after: float, parameters: int, used: int, worth: float = WORTH) -> bool:
-    """Return whether parameters lower a sum of squares by more than they would by chance.
+def schwarz(cost: float, parameters: int, used: int) -> float:
+    """Return the criterion of Schwarz (Annals of Statistics 6, 461, 1978): the model of the least is taken.
 
     Parameters
     ----------
-    before, after : float
-        The sums of squares, > 0 and >= 0.
+    cost : float
+        Sum of squares over the samples, >= 0.
     parameters : int
-        How many more there are.
+        How many the model has, less those that all models have.
     used : int
         Number of samples that count.
-    worth : float
-        Least part by which they must lower the RMS error, too.
     """
-    gain = math.log(max(before, 1e-300)) - math.log(max(after, 1e-300))
-    return gain > max(-2.0 * math.log1p(-worth), parameters * chance_of(used))
-
-
-def chance_of(used: int) -> float:
-    """Return by how much a parameter lowers the logarithm of a sum of squares over `used` samples by chance."""
-    return 2.0 * math.log(used) / used
+    return used * math.log(max(cost, 1e-300)) + parameters * math.log(used)

@@ -25,7 +25,7 @@ from bench.identification.fit.orientation import NAMES, Orientation
 from bench.identification.fit.variable_projection import Evidence, Separable, Stage, variable_projection
 from bench.identification.measures import measure_errors
 from bench.identification.options import OptionHelp
-from bench.identification.timed.parsimony import check_size, is_worth, moving
+from bench.identification.timed.parsimony import check_size, moving, schwarz
 from bench.identification.trust import judge_fit
 from bench.models import PlaysState, PrandtlIshlinskii, RateDependentPlays, Regressor, check_sequence
 
@@ -189,7 +189,7 @@ class PlaysSearch:
                 break
             more = self.more(found)
             added = 1 + max(more.fit.certificate.passive - found.fit.certificate.passive, 0)
-            if count is None and not is_worth(found.cost, more.cost, added, used):
+            if count is None and schwarz(more.cost, added, used) >= schwarz(found.cost, 0, used):
                 break
             found = more
         return found
@@ -232,8 +232,7 @@ def identify_rate_dependent_plays(
     origin : float
         Where the plays stand at first, input units.
     time_constants : int or None
-        Their number, 0 to 3. None adds one after the other as long as it lowers the RMS error by 0.5 %, and more than
-        its parameters would by chance.
+        Their number, 0 to 3. None adds one after the other as long as it lowers the criterion of Schwarz.
     input_unit, output_unit : str
         Units, for labels.
 
