@@ -42,8 +42,8 @@ def watchdog_field(default: float, longest: float, effect: str) -> Any:  # noqa:
 class Line(Protocol):
     """A connection to an instrument.
 
-    One that knows them has two attributes more: `lost`, whether it failed and has to be opened again, and `repeats`,
-    the number of requests that were repeated.
+    One that knows them has attributes more: `lost`, whether it failed and has to be opened again; `repeats`, the
+    number of requests that were repeated; and `port`, which counts the `requests` if it is shared.
     """
 
     def close(self) -> None:
@@ -68,6 +68,7 @@ class LineDevice(Device, Generic[SettingsT, LineT]):
 
     _identity: Identity
     _earlier_repeats = 0
+    _earlier_requests = 0
     _closed = False
 
     def __init__(self, name: str, settings: SettingsT, clock: Clock, line: LineT) -> None:
@@ -169,10 +170,10 @@ class LineDevice(Device, Generic[SettingsT, LineT]):
 
     def _renew_line(self) -> None:
         """Close the line, and open another to the same address."""
-        repeats = self.repeats
+        repeats, requests = self.repeats, self.requests
         self._line.close()
         self._line = self._open_line(self.name, self._settings, self._clock)
-        self._earlier_repeats, self._closed = repeats, False
+        self._earlier_repeats, self._earlier_requests, self._closed = repeats, requests, False
 
     def _begin(self) -> None:
         """Open the line again if it was lost."""
@@ -183,6 +184,11 @@ class LineDevice(Device, Generic[SettingsT, LineT]):
     def repeats(self) -> int:
         """Number of requests that were repeated since the device was connected, as their answers were lost."""
         return self._earlier_repeats + getattr(self._line, "repeats", 0)
+
+    @property
+    def requests(self) -> int:
+        """Number of messages sent since the device was connected, on a line that it shares; 0 on one of its own."""
+        return self._earlier_requests + getattr(getattr(self._line, "port", None), "requests", 0)
 
     def _check_unchanged(self) -> None:
         """Raise `DeviceError` unless the instrument is as the driver left it: not restarted, without an error."""

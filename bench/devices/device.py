@@ -320,7 +320,19 @@ class DriverSettings(CheckedTable):
     A driver class carries its extension as `Settings`, and opens its instrument by the class method
     `connect(name, settings, clock)`, which checks that the right instrument answers, configures it and
     moves nothing. An unknown key is an error.
+
+    One whose instrument may share a line with others has a field `line`, and says what has to be checked of it.
+
+    Attributes
+    ----------
+    address_key : str
+        Key of the address that tells the instrument from others on its line; empty if it needs a line of its own.
+    keys_of_line : frozenset of str
+        Keys that have one value for all devices of a line.
     """
+
+    address_key: ClassVar[str] = ""
+    keys_of_line: ClassVar[frozenset[str]] = frozenset()
 
     serial_number: str = Field(
         default="",
@@ -332,6 +344,11 @@ class DriverSettings(CheckedTable):
     )
     calibrated: date | None = Field(default=None, description="day of the last calibration, such as 2026-03-01")
     calibration_due: date | None = Field(default=None, description="day from which a new calibration is due")
+
+    @property
+    def longest_turn(self) -> float:
+        """Longest time that a request and its repetitions keep the line while nothing answers, s."""
+        return 0.0
 
     @model_validator(mode="after")
     def _dates_in_order(self) -> Self:
@@ -436,6 +453,11 @@ class Device(ABC):
     @property
     def repeats(self) -> int:
         """Number of requests that were repeated since the device was connected, as their answers were lost."""
+        return 0
+
+    @property
+    def requests(self) -> int:
+        """Number of messages sent since the device was connected, on a line that it shares; 0 on one of its own."""
         return 0
 
     def self_check(self) -> tuple[CheckFinding, ...]:

@@ -63,7 +63,9 @@ from .maintenance.clearing import (
     recover as recover,
 )
 from .maintenance.locks import (
+    ECHO as ECHO,
     EMULATED as EMULATED,
+    JOIN as JOIN,
     Holder as Holder,
     Locks as Locks,
     is_in_use as is_in_use,
@@ -87,6 +89,10 @@ from .maintenance.safe_state import (
 )
 from .rehearsal_rig import (
     twin_of as twin_of,
+)
+from .shared_lines import (
+    BLIND as BLIND,
+    LONGEST_TURN as LONGEST_TURN,
 )
 from .slots import (
     RoleTable as RoleTable,

@@ -155,19 +155,77 @@ def test_a_line_that_stays_away_is_given_up():
     assert bench.news == []
 
 
-def test_the_devices_of_a_lost_line_are_not_waited_for_one_after_another():
-    devices = {"a": Instrument("a", attempts=1000), "b": Instrument("b", attempts=1000), "c": Instrument("c")}
-    bench = Bench({"a": "line", "b": "line", "c": "other"}, longest=1.0, devices=devices)
-    for name in ("a", "b", "c"):
+def test_the_devices_of_a_lost_line_are_waited_for_at_the_same_time():
+    clock = VirtualClock()
+    devices = {name: Instrument(name, attempts=1000) for name in ("a", "b")} | {"c": Instrument("c")}
+    for device in devices.values():
+        device.on_attempt = lambda: clock.sleep(0.3)
+    bench = Bench({"a": "line", "b": "line", "c": "other"}, longest=3.0, devices=devices, clock=clock)
+    for name in devices:
         bench.submit(BENCH, name, devices[name].measure)
     said = {result.device: result for result in (bench.result() for _ in devices)}
-    assert str(said["b"].error).startswith("b: was not asked, as its line is lost (a: does not answer; ")
-    assert (devices["a"].tried, devices["b"].tried) == (6, 0)
+    for name in ("a", "b"):
+        assert str(said[name].error) == f"{name}: does not answer; it was not back within 3 s"
+    assert abs(devices["a"].tried - devices["b"].tried) <= 1
+    assert clock.now() < 2 * 3.0
     assert said["c"].value == {"c": 1.0}
-    # The safe state opens a line of its own.
+    # Those that were given up are not waited for again, but for the safe state, which opens a line of its own.
     devices["b"].attempts = 0
+    bench.submit(BENCH, "b", devices["b"].measure)
+    assert "not asked" in str(bench.result().error)
     bench.submit(SAFE, "b", devices["b"].measure)
     assert bench.result().value == {"b": 1.0}
+
+
+def test_a_device_that_is_away_delays_its_neighbours_by_one_attempt():
+    clock = VirtualClock()
+    devices = {"a": Instrument("a", attempts=20), "b": Instrument("b")}
+    bench = Bench({"a": "line", "b": "line"}, longest=60.0, devices=devices, clock=clock)
+
+    def attempt():
+        bench.submit(LOOK, "b", lambda: devices["a"].tried)
+        clock.sleep(0.7)
+
+    devices["a"].on_attempt = attempt
+    bench.submit(BENCH, "a", devices["a"].measure)
+    bench.submit(BENCH, "a", lambda: "waited")
+    found = [bench.result() for _ in range(20 + 2)]
+    # After each attempt the neighbour was looked at, before the next one.
+    assert [each.value for each in found if each.device == "b"] == [*range(1, 21)]
+    assert [(each.value, each.was_away) for each in found if each.device == "a"] == [
+        ({"a": 1.0}, True),
+        ("waited", True),
+    ]
+    assert bench.threads.late["b"] == pytest.approx(0.7)
+    ((name, seconds, _),) = bench.news
+    assert name == "a"
+    assert seconds == pytest.approx(20 * 0.7 + 19 * 0.2, abs=0.5)
+
+
+def test_the_safe_state_of_a_neighbour_and_of_a_device_that_is_away_come_at_once():
+    devices = {"a": Instrument("a", attempts=10**9), "b": Instrument("b")}
+    bench = Bench({"a": "line", "b": "line"}, longest=1e9, devices=devices)
+    bench.submit(BENCH, "a", devices["a"].measure)
+    for name in devices:
+        bench.submit(SAFE, name, devices[name].safe)
+        assert (bench.result().device, bench.news) == (name, [])
+    bench.threads.end()
+    assert isinstance(bench.result().error, DeviceConnectionError)
+
+
+def test_those_that_answer_are_made_safe_before_one_that_is_away(gate):
+    devices = {"a": Instrument("a", attempts=10**9), "b": Instrument("b")}
+    bench = Bench({"a": "line", "b": "line"}, longest=1e9, devices=devices)
+    bench.submit(BENCH, "a", devices["a"].measure)
+    # The line of both is busy once "a" is known to be away.
+    started = threading.Event()
+    devices["a"].on_attempt = lambda: (started.set(), gate.wait(LONG))
+    assert started.wait(LONG)
+    for name in devices:
+        bench.submit(SAFE, name, devices[name].safe)
+    bench.threads.end()
+    gate.set()
+    assert [result.device for result in (bench.result() for _ in range(3)) if result.error is None] == ["b", "a"]
 
 
 def test_another_instrument_or_a_restart_is_not_tried_again():

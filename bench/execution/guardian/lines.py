@@ -1,21 +1,32 @@
-"""One thread a line: several instruments are asked at the same time, and one that hangs delays no other."""
+"""One thread a line: several instruments are asked at the same time, and one that hangs delays no other.
+
+The devices of a line are asked in turn. While one of them is away, the others are served between two attempts to
+reach it, and what it was asked waits for it.
+"""
 
 from __future__ import annotations
 
 import itertools
 import queue
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Any
 
 from bench.base import Clock, DeviceConnectionError
 from bench.devices import Device
-from bench.execution.station.reconnection import reconnect
+from bench.execution.station.reconnection import Absence
 
 SAFE, BENCH, LOOK = range(3)
 """Priorities of calls that wait for their line: the safe state, requests of the bench, looks at the interlocks."""
+
+_NAP = 0.02
+"""Time after which the calls of a line are looked at again while one of its devices is away, s."""
+
+
+class NotAskedError(DeviceConnectionError):
+    """A device was not asked, as the run has ended or the device is lost."""
 
 
 @dataclass(frozen=True)
@@ -31,10 +42,20 @@ class Result:
 @dataclass(order=True)
 class _Call:
     priority: int
+    is_away: bool
     number: int
     device: str = field(compare=False)
+    since: float = field(compare=False)
     call: Callable[[], Any] = field(compare=False)
     done: Callable[[Result], None] = field(compare=False)
+
+
+@dataclass
+class _Away:
+    """A device that is away, and the calls that wait for it."""
+
+    absence: Absence
+    waiting: list[_Call]
 
 
 class LineThreads:
@@ -52,6 +73,11 @@ class LineThreads:
         Returns for how long the line of a device may be away, s.
     notify : callable
         Called in the thread of a line with the name of a device whose line was away, for how long (s), and why.
+
+    Attributes
+    ----------
+    late : dict of str to float
+        Longest time for which a call has waited for its turn, by device, s.
     """
 
     def __init__(
@@ -67,7 +93,8 @@ class LineThreads:
         self._longest = longest
         self._notify = notify
         self._ending = threading.Event()
-        self._lines = lines
+        self.late = dict.fromkeys(devices, 0.0)
+        self._away: dict[str, _Away] = {}
         self._lost: dict[str, str] = {}
         self._numbers = itertools.count()
         queues: dict[str, queue.PriorityQueue[_Call]] = {line: queue.PriorityQueue() for line in lines.values()}
@@ -77,45 +104,115 @@ class LineThreads:
 
     def submit(self, priority: int, device: str, call: Callable[[], Any], done: Callable[[Result], None]) -> None:
         """Have something done on the line of a device; `done` is called in its thread."""
-        self._queues[device].put(_Call(priority, next(self._numbers), device, call, done))
+        # The safe state of those that answer does not wait for one that is silent.
+        is_away = device in self._away or device in self._lost
+        self._queues[device].put(_Call(priority, is_away, next(self._numbers), device, self._clock.now(), call, done))
 
     def end(self) -> None:
         """Wait for no line any more: what still waits is dropped but for the safe state."""
         self._ending.set()
 
     def _work(self, calls: queue.PriorityQueue[_Call]) -> None:
+        away: list[str] = []
         while True:
-            call = calls.get()
-            try:
-                result = self._carry(call)
-            # An error of a driver, of whatever kind, is the answer to its call; the thread goes on.
-            except BaseException as error:
-                result = Result(call.device, None, error, was_away=False)
-            # The thread is needed for the safe state, whatever becomes of an answer.
-            with suppress(Exception):
-                call.done(result)
+            call = self._next(calls, away)
+            if call is not None:
+                self._serve(call, away)
+            if away:
+                # One attempt at most between two calls, each device in its turn.
+                device = min(away, key=self._due)
+                if self._due(device) <= self._clock.now() or self._ending.is_set():
+                    self._try_again(device, away)
 
-    def _carry(self, call: _Call) -> Result:
-        if call.priority != SAFE and self._ending.is_set():
-            raise DeviceConnectionError(call.device, "was not asked, as the run has ended")
-        line = self._lines[call.device]
-        if call.priority != SAFE and line in self._lost:
-            # That ends the run: each device of a lost line would take as long again to say so.
-            raise DeviceConnectionError(call.device, f"was not asked, as its line is lost ({self._lost[line]})")
+    def _due(self, device: str) -> float:
+        return self._away[device].absence.due
+
+    def _next(self, calls: queue.PriorityQueue[_Call], away: Sequence[str]) -> _Call | None:
+        """Return the next call; None after a while if a device has to be looked after."""
+        if not away:
+            return calls.get()
+        with suppress(queue.Empty):
+            return calls.get_nowait()
+        next_attempt = min(map(self._due, away))
+        self._clock.sleep_until(min(next_attempt, self._clock.now() + _NAP))
+        return None
+
+    def _serve(self, call: _Call, away: list[str]) -> None:
+        """Carry a call out, or let it wait for its device."""
+        device = call.device
+        self.late[device] = max(self.late[device], self._clock.now() - call.since)
         try:
-            return Result(call.device, call.call(), None, was_away=False)
+            if call.priority != SAFE:
+                if self._ending.is_set():
+                    raise NotAskedError(device, "was not asked, as the run has ended")
+                if device in self._lost:
+                    raise NotAskedError(device, f"was not asked, as it is lost ({self._lost[device]})")
+                if device in away:
+                    self._away[device].waiting.append(call)
+                    return
+            result = Result(device, call.call(), None, was_away=False)
         except DeviceConnectionError as lost:
             # The safe state opens a line of its own.
-            if call.priority == SAFE or self._ending.is_set():
-                raise
-            device = self._devices[call.device]
-            try:
-                seconds = reconnect(device, lost, self._clock, self._longest(call.device), self._ending.is_set)
-            except DeviceConnectionError as gone:
-                self._lost[line] = str(gone)
-                raise
-            self._notify(call.device, seconds, str(lost))
-            # A set-point that waited for its line may not be sent after the end.
+            if call.priority == SAFE or self._ending.is_set() or device in self._lost:
+                result = Result(device, None, lost, was_away=False)
+            else:
+                self._miss(call, lost, away)
+                return
+        # An error of a driver, of whatever kind, is the answer to its call; the thread goes on.
+        except BaseException as error:
+            result = Result(device, None, error, was_away=False)
+        _answer(call, result)
+
+    def _miss(self, call: _Call, lost: DeviceConnectionError, away: list[str]) -> None:
+        """Look for the device of a call that has failed."""
+        device = call.device
+        try:
+            absence = Absence(self._devices[device], lost, self._clock, self._longest(device))
+        except BaseException as error:
+            self._give_up(device, [call], error)
+        else:
+            self._away[device] = _Away(absence, [call])
+            away.append(device)
+
+    def _try_again(self, device: str, away: list[str]) -> None:
+        """Try to reach a device; if it is back, carry out what has waited for it."""
+        absence, waiting = self._away[device].absence, self._away[device].waiting
+        try:
             if self._ending.is_set():
-                raise
-            return Result(call.device, call.call(), None, was_away=True)
+                raise absence.lost
+            seconds = absence.try_again()
+        except BaseException as error:
+            self._return(device, away)
+            self._give_up(device, waiting, error)
+            return
+        if seconds is None:
+            return
+        self._return(device, away)
+        with suppress(Exception):
+            self._notify(device, seconds, str(absence.lost))
+        for call in waiting:
+            try:
+                # A set-point that waited for its line may not be sent after the end.
+                if self._ending.is_set():
+                    raise absence.lost
+                result = Result(device, call.call(), None, was_away=True)
+            except BaseException as error:
+                result = Result(device, None, error, was_away=False)
+            _answer(call, result)
+
+    def _return(self, device: str, away: list[str]) -> None:
+        away.remove(device)
+        del self._away[device]
+
+    def _give_up(self, device: str, waiting: Iterable[_Call], error: BaseException) -> None:
+        """Answer what has waited for a device with an error."""
+        if isinstance(error, DeviceConnectionError):
+            self._lost[device] = str(error)
+        for call in waiting:
+            _answer(call, Result(device, None, error, was_away=False))
+
+
+def _answer(call: _Call, result: Result) -> None:
+    # The thread is needed for the safe state, whatever becomes of an answer.
+    with suppress(Exception):
+        call.done(result)

@@ -30,24 +30,21 @@ from bench.base import ENDING, STACKS, BenchError, Clock, ConfigurationError, De
 from bench.devices import Status
 from bench.execution.guardian.black_box import BlackBox
 from bench.execution.guardian.channel import LONGEST_ANSWER, STILL_AT_IT, Channel, ChannelError, Message, to_message
-from bench.execution.guardian.lines import BENCH, LOOK, SAFE, LineThreads, Result
+from bench.execution.guardian.lines import BENCH, LOOK, SAFE, LineThreads, NotAskedError, Result
 from bench.execution.guardian.parent import SIGKILL, ParentProcess
 from bench.execution.guardian.rescuer import TRY_FOR, Rescuer
 from bench.execution.notify import WITHIN, Notifier
 from bench.execution.station.core import StationCore
-from bench.execution.station.interface import News, masked, news_of
+from bench.execution.station.interface import News, counted, news_of
 from bench.execution.station.reconnection import TRIES
 from bench.record import END, FAILED, Event
-from bench.rig import SAFE as IS_SAFE, AttachedClock, InterlockWatch, Look, Rig, lines_of, longest_away
+from bench.rig import BLIND, SAFE as IS_SAFE, AttachedClock, InterlockWatch, Look, Rig, lines_of, longest_away
 
 _SAFE_WITHIN = 3.0
 """Time for the safe state of all devices, s; those that have not answered then are reported as unsafe."""
 
 _TRY_AGAIN = 1.0
 """Time after which a device that is not safe is tried again, s."""
-
-_BLIND = 2.0
-"""Time for which what the interlocks need may not be seen, s; a request that is carried out counts as seen."""
 
 _COMES_BACK = 3.0
 """Time that a bench which was late has to come back and end its run itself, s: as long as the safe state may take."""
@@ -218,7 +215,7 @@ class Guardian:
             if (taken := now - self._requested) > LONGEST_ANSWER + self._rig.file.safety.reconnect:
                 self._core.trip(GuardianError(f"a request was not carried out within {taken:.0f} s"))
         for name, seen in self._seen_at.items():
-            if now - seen > _BLIND + self._longest_away(name):
+            if now - seen > BLIND + self._longest_away(name):
                 self._core.trip(DeviceError(name, f"could not be looked at for {now - seen:.1f} s; see its line"))
         if self._core.over:
             self._keep_safe(now)
@@ -473,7 +470,7 @@ class Guardian:
 
     def _longest_away(self, name: str) -> float:
         longest = self._line_may_be_away[name]
-        return min(longest, _BLIND) if name in self._seen_at else longest
+        return min(longest, BLIND) if name in self._seen_at else longest
 
     def _line_was_away(self, name: str, seconds: float, why: str) -> None:
         text = f"{name}: line lost for {seconds:.1f} s: {why}"
@@ -531,7 +528,7 @@ class Guardian:
 
     def _report_safe(self) -> None:
         self._safe = self._states()
-        self._news += masked(self._rig.devices.values())
+        self._news += counted(self._rig.devices.values(), self._lines.late)
 
     def _states(self) -> dict[str, str]:
         return {name: self._unsafe.get(name, IS_SAFE) for name in self._rig.devices}
@@ -647,7 +644,8 @@ class Guardian:
             return
         if result.error is not None:
             # At once: what the others say does not matter any more, and one of them may take long.
-            job.error = result.error
+            cause = self._core.cause
+            job.error = cause if cause is not None and isinstance(result.error, NotAskedError) else result.error
             job.failed(job.error)
             return
         job.waiting.discard(result.device)

@@ -10,6 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
 from bench.base import Clock
 from bench.devices import Device, Floats
@@ -51,13 +52,29 @@ class Arrivals:
     error: Exception | None
 
 
-def masked(devices: Iterable[Device]) -> list[News]:
-    """Return how many requests had to be repeated, of each device that needed it."""
-    return [
-        News("INFO", "line", f"{device.name}: {device.repeats} requests were repeated, as their answers were lost")
-        for device in devices
-        if device.repeats
-    ]
+def counted(devices: Iterable[Device], late: Mapping[str, float] = MappingProxyType({})) -> list[News]:
+    """Return how often devices on shared lines were asked, and of any other how many requests had to be repeated.
+
+    Parameters
+    ----------
+    devices : iterable of Device
+        The devices.
+    late : mapping of str to float, optional
+        Longest time for which each has waited for its turn, s.
+    """
+    news = []
+    for device in devices:
+        repeats = device.repeats
+        if device.requests:
+            turn = f"; {late[device.name]:.2f} s late at most" if device.name in late else ""
+            news.append(
+                News("INFO", "requests", f"{device.name}: {device.requests} requests, {repeats} repeated{turn}")
+            )
+        elif repeats:
+            news.append(
+                News("INFO", "requests", f"{device.name}: {repeats} requests repeated, as their answers were lost")
+            )
+    return news
 
 
 def news_of(findings: Iterable[InterlockFinding]) -> list[News]:

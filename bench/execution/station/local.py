@@ -11,8 +11,8 @@ from typing import NoReturn, TypeVar
 from bench.base import ConfigurationError, DeviceConnectionError, DeviceError
 from bench.devices import Floats, Status
 from bench.execution.station.core import StationCore
-from bench.execution.station.interface import Arrivals, News, Station, masked, news_of
-from bench.execution.station.reconnection import TRIES, reconnect
+from bench.execution.station.interface import Arrivals, News, Station, counted, news_of
+from bench.execution.station.reconnection import TRIES, Absence
 from bench.rig import InterlockFinding, InterlockWatch, Look, Rig, longest_away, make_safe, raise_if_unsafe
 
 _T = TypeVar("_T")
@@ -201,7 +201,7 @@ class LocalStation(Station):
         self._core.end()
         if self._safe is None:
             self._safe = self._made_safe()
-            self._news += masked(self._rig.devices.values())
+            self._news += counted(self._rig.devices.values())
         return self._safe
 
     def close(self) -> None:
@@ -239,20 +239,21 @@ class LocalStation(Station):
         raise type(error)(error.device, f"{text} ({causes} just before)") from error
 
     def _reconnect(self, name: str, error: DeviceConnectionError) -> None:
-        device, longest = self._rig.devices[name], self._longest_away[name]
-        seconds = reconnect(device, error, self.clock, longest, lambda: self._feed_others(name))
+        absence = Absence(self._rig.devices[name], error, self.clock, self._longest_away[name])
+        while (seconds := absence.try_again()) is None:
+            self._feed_others(name)
+            self.clock.sleep_until(absence.due)
         self._lost.add(name)
         self._news.append(News("WARN", "line", f"{name}: line lost for {seconds:.1f} s: {error}"))
 
-    def _feed_others(self, name: str) -> bool:
-        """Keep the watchdogs of other instruments from expiring; return False, as the run has not ended."""
+    def _feed_others(self, name: str) -> None:
+        """Keep the watchdogs of other instruments from expiring."""
         for other, device in self._rig.actuators.items():
             # That of a servo only stops a motion, so it declares none.
             if other != name:
                 # What is wrong with it the next reading finds.
                 with suppress(DeviceError):
                     device.glance()
-        return False
 
     def _note(self, findings: tuple[InterlockFinding, ...]) -> None:
         if findings:

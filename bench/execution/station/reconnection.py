@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 from bench.base import Clock, DeviceConnectionError
 from bench.devices import Device
 
@@ -14,10 +12,8 @@ _INTERVAL = 0.2
 """Time between two attempts, s."""
 
 
-def reconnect(
-    device: Device, lost: DeviceConnectionError, clock: Clock, longest: float, given_up: Callable[[], bool]
-) -> float:
-    """Open the line of a device again, by one attempt after another.
+class Absence:
+    """A device that does not answer, whose line is opened again by one attempt after another.
 
     Parameters
     ----------
@@ -28,34 +24,51 @@ def reconnect(
     clock : Clock
         The clock of the run.
     longest : float
-        How long the line may be away, s; see `longest_away`.
-    given_up : callable
-        Called between two attempts; returns whether the run has ended meanwhile.
+        How long it may be away, s; see `longest_away`.
 
-    Returns
-    -------
-    float
-        How long the line was away, s.
+    Attributes
+    ----------
+    lost : DeviceConnectionError
+        What the request failed with.
+    due : float
+        Instant of the next attempt, s.
 
     Raises
     ------
     DeviceConnectionError
-        What it failed with, if the line is not back in time; it says how long that was.
-    DeviceError
-        If the instrument is not as it was left, or its driver cannot open the line again.
+        What it failed with, if its driver cannot open its line again.
     """
-    if type(device).reconnect is Device.reconnect:
-        raise lost
-    start = clock.now()
-    while True:
+
+    def __init__(self, device: Device, lost: DeviceConnectionError, clock: Clock, longest: float) -> None:
+        if type(device).reconnect is Device.reconnect:
+            raise lost
+        self.lost = lost
+        self._device = device
+        self._clock = clock
+        self._longest = longest
+        self._since = self.due = clock.now()
+
+    def try_again(self) -> float | None:
+        """Try once to reach it; return how long it was away, s, or None if it still is.
+
+        Raises
+        ------
+        DeviceConnectionError
+            What the request failed with, if it has been away for too long, or the run was interrupted.
+        DeviceError
+            If the instrument is not as it was left.
+        """
         try:
-            device.reconnect()
+            self._device.reconnect()
         except DeviceConnectionError:
-            if clock.now() - start >= longest:
-                text = str(lost).removeprefix(f"{lost.device}: ")
-                raise DeviceConnectionError(lost.device, f"{text}; it was not back within {longest:g} s") from None
-            if given_up() or clock.interrupted():
-                raise lost from None
-            clock.sleep(_INTERVAL)
-        else:
-            return clock.now() - start
+            now = self._clock.now()
+            if now - self._since >= self._longest:
+                text = str(self.lost).removeprefix(f"{self.lost.device}: ")
+                raise DeviceConnectionError(
+                    self.lost.device, f"{text}; it was not back within {self._longest:g} s"
+                ) from None
+            if self._clock.interrupted():
+                raise self.lost from None
+            self.due = now + _INTERVAL
+            return None
+        return self._clock.now() - self._since

@@ -34,6 +34,12 @@ from bench.devices import DriverSettings, Identity
 EMULATED = "emulated://"
 """Scheme of the lines to instruments of an emulated laboratory; in this process they need no lock."""
 
+JOIN = "+"
+"""Between the names of instruments that are emulated on one line: `emulated://a+b`."""
+
+ECHO = "echo"
+"""Among these names, that of an adapter which hands back what is sent: `emulated://echo+a`."""
+
 FOLDER_VARIABLE = "ACTUATOR_BENCH_LOCKS"
 """Variable of the environment that names another folder of the locks, for a container that has none of them."""
 

@@ -26,6 +26,7 @@ from bench.analysis.report.page.run_parts import (
     phases_section,
     published_section,
     repeat_section,
+    requests_section,
     safe_state_text,
     signal_labels,
     signals_table,
@@ -97,6 +98,8 @@ def run_page(
         ]
         if (late := _lateness_section(record, scratch)) is not None:
             sections.append(late)
+        if (asked := requests_section(events)) is not None:
+            sections.append(asked)
         sections += [events_section(events), repeat_section(record)]
     return Page(
         title=str(meta["rig_title"]),

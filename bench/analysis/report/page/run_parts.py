@@ -269,6 +269,17 @@ def events_section(events: Sequence[Event]) -> PageSection:
     return PageSection("Events", (PageTable(("t / s", "level", "kind", "what happened"), rows, note=note),))
 
 
+def requests_section(events: Sequence[Event]) -> PageSection | None:
+    """Return how the devices on shared lines were asked, and what had to be repeated; None if nothing is known."""
+    rows = [
+        (device, what)
+        for each in events
+        if each.kind == "requests"
+        for device, _, what in [each.text.partition(": ")]
+    ]
+    return PageSection("Requests", (PageTable(("device", "requests"), rows),)) if rows else None
+
+
 def published_section(published: Sequence[Published], result: Mapping[str, Any]) -> PageSection:
     """Return what papers state beside the same of the run."""
     rows = []
