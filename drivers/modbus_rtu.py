@@ -8,7 +8,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from typing import TYPE_CHECKING, Any, Generic, Literal, Self, TypeVar, overload
+from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Self, TypeVar, overload
 
 from pydantic import Field
 
@@ -23,7 +23,7 @@ from drivers.modbus import (
     UnexpectedReplyError,
     exception_text,
 )
-from drivers.serial_line import RESENDS, SerialSettings, lost_line, no_answer, open_port
+from drivers.serial_line import RESENDS, SerialSettings, claim, lost_line, no_answer, open_port
 
 if TYPE_CHECKING:
     from drivers import pymodbus_client
@@ -50,6 +50,8 @@ _FAST_PAUSE = 1.75e-3  # s
 class RtuSettings(SerialSettings):
     """Where an instrument is that speaks Modbus RTU; the settings of its driver extend it."""
 
+    address_key: ClassVar[str] = "address"
+
     address: int = Field(default=1, ge=1, le=247, description="Modbus address, 1 to 247")
     baudrate: int = Field(default=9600, ge=300, le=4000000, description="speed of the line, Bd")
     parity: Literal["N", "E", "O"] = Field(default="N", description="parity: N for none, E for even, O for odd")
@@ -65,6 +67,11 @@ class RtuSettings(SerialSettings):
         le=1.0,
         description="silence before a request, s: 0 to 1; unless given, 3.5 characters, or 1.75 ms above 19200 Bd",
     )
+
+    @property
+    def longest_turn(self) -> float:
+        """Longest time that a request and its repetitions keep the line while nothing answers, s."""
+        return super().longest_turn + RESENDS * _QUIET * self.timeout
 
 
 def pack_number(kind: Kind, value: float) -> bytes:
@@ -137,11 +144,12 @@ class RtuLine:
         self.lost = False
         self.longest_silence = 0.0
         self.repeats = 0
+        self.port = open_port(name, settings, parity=settings.parity)
         self._client: RtuClient | pymodbus_client.SerialClient
         if settings.port.startswith(EMULATED):
-            self._client = RtuClient(open_port(name, settings), settings.address)
+            self._client = RtuClient(self.port, settings.address)
         else:
-            self._client = pymodbus_client.SerialClient(name, settings, settings.address, settings.parity)
+            self._client = pymodbus_client.SerialClient(self.port, settings, settings.address, settings.parity)
 
     def close(self) -> None:
         """Release the line."""
@@ -194,8 +202,8 @@ class RtuLine:
         """Set one register at once, also on a line that is out of step; whether it was is not looked at."""
         self._in_step = False
         if self._is_open and not self.lost:
-            self._clock.sleep_until(self._silent_since + self._pause)
             with suppress(OSError, RefusedError):
+                self._keep_pause()
                 self._client.write_one(address, value)
 
     def _ordered(self, data: bytes) -> bytes:
@@ -242,8 +250,7 @@ class RtuLine:
         ) from problem
 
     def _once(self, request: Callable[[], T]) -> T:
-        if self._pause:
-            self._clock.sleep_until(self._silent_since + self._pause)
+        self._keep_pause()
         sent_at = self._clock.now()
         try:
             reply = request()
@@ -256,6 +263,13 @@ class RtuLine:
             raise
         self._note_answer()
         return reply
+
+    def _keep_pause(self) -> None:
+        """Wait until the line has been silent for long enough, also since the turn of a neighbour."""
+        if self._pause:
+            if claim(self.port):
+                self._silent_since = self._clock.now()
+            self._clock.sleep_until(self._silent_since + self._pause)
 
     def _note_answer(self) -> None:
         now = self._clock.now()

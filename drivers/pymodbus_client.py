@@ -22,7 +22,7 @@ from drivers.modbus import (
     is_reply_to,
     reply_length,
 )
-from drivers.serial_line import MOST_STRAY, SerialSettings, open_port, settle_line
+from drivers.serial_line import MOST_STRAY, SerialSettings, settle_line
 
 
 class _Request(ModbusPDU):
@@ -125,21 +125,18 @@ class SerialClient(PymodbusClient):
 
     Parameters
     ----------
+    port : serial.SerialBase
+        The open port.
     settings : SerialSettings
-        Port, speed and timeout.
+        Its address, speed and timeout.
     unit : int
         Address of the instrument, 1 to 247.
     parity : str
         N, E or O.
-
-    Raises
-    ------
-    DeviceConnectionError
-        If the port cannot be opened.
     """
 
-    def __init__(self, device: str, settings: SerialSettings, unit: int, parity: str) -> None:
-        self._line = _BlockingClient(device, settings, parity)
+    def __init__(self, port: Any, settings: SerialSettings, unit: int, parity: str) -> None:  # noqa: ANN401
+        self._line = _BlockingClient(port, settings, parity)
         super().__init__(self._line, unit)
 
     def request(self, request: bytes, expected: int) -> bytes:
@@ -172,12 +169,12 @@ class _BlockingClient(ModbusSerialClient):
     exactly that, be it a serial port, a pseudo-terminal, a socket or an emulated line.
     """
 
-    def __init__(self, device: str, settings: SerialSettings, parity: str) -> None:
+    def __init__(self, port: Any, settings: SerialSettings, parity: str) -> None:  # noqa: ANN401
         # Sending again is left to the caller, which lets late replies pass first.
         super().__init__(
             settings.port, baudrate=settings.baudrate, parity=parity, timeout=settings.timeout, retries=0
         )
-        self.socket: Any = open_port(device, settings, parity=parity)
+        self.socket: Any = port
         # Of the present request, from `expect` and `send` on.
         self._received: int
         self.heard = b""

@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import serial
 from pydantic import Field
 
 from bench.base import DeviceConnectionError, slowness
 from bench.devices import DriverSettings
-from bench.rig import EMULATED
+from bench.rig import EMULATED, LONGEST_TURN
 
 RESENDS = 2
 """How often a request that brought no good answer is sent again."""
@@ -32,6 +33,11 @@ _BUSY = 1.5
 class SerialSettings(DriverSettings):
     """Where an instrument on a serial line is; the settings of its driver extend it."""
 
+    keys_of_line: ClassVar[frozenset[str]] = frozenset(
+        ("port", "baudrate", "parity", "stop_bits", "flow_control", "echo", "bitrate")
+    )
+
+    line: str = Field(default="", description="name of the line that it shares, of a table [lines.NAME]")
     port: str = Field(
         min_length=1, description="line as pyserial opens it: /dev/ttyUSB0, socket://host:port or emulated://NAME"
     )
@@ -39,6 +45,12 @@ class SerialSettings(DriverSettings):
     timeout: float = Field(
         default=0.1, gt=0.0, le=10.0, description="wait for an answer, s; a request is sent three times at most"
     )
+    echo: bool = Field(default=False, description="whether the adapter hands back what is sent, as on two wires")
+
+    @property
+    def longest_turn(self) -> float:
+        """Longest time that a request and its repetitions keep the line while nothing answers, s."""
+        return (1 + RESENDS) * self.timeout
 
 
 MOST_STRAY = 4096
@@ -124,6 +136,9 @@ def patient(port: Any, settings: SerialSettings, measure: Callable[[], float] = 
         return port
     watchdog = getattr(settings, "watchdog", 0.0)
     longest = _SHARE_OF_WATCHDOG * watchdog / (1 + RESENDS) if watchdog else _LONGEST_WITHOUT_WATCHDOG
+    if settings.line:
+        # Its neighbours wait with it.
+        longest = min(longest, LONGEST_TURN * settings.timeout / settings.longest_turn)
     return PatientPort(port, longest, measure)
 
 
@@ -132,10 +147,238 @@ def patience_of(port: Any, settings: SerialSettings) -> float:  # noqa: ANN401 -
     return float(getattr(port, "patience", settings.timeout))
 
 
+class OpenPort:
+    """A port that is open, with what the devices on it have in common.
+
+    Parameters
+    ----------
+    port : object
+        The open port, or the adapter on it.
+    close : callable
+        Closes it.
+    address : str, optional
+        Address of a port that is shared.
+
+    Attributes
+    ----------
+    user : Share or None
+        Whose request was the last.
+    is_lost : bool
+        Whether it failed, so that each device has to open it again.
+    answers : bool or None
+        Whether anything has come since a device last opened it; None if nothing was waited for.
+    """
+
+    def __init__(self, port: Any, close: Callable[[], object], address: str = "") -> None:  # noqa: ANN401
+        self.port = port
+        self.devices: set[str] = set()
+        self.user: Share | None = None
+        self.is_lost = False
+        self.answers: bool | None = None
+        self._close = close
+        self._address = address
+
+    def give_up(self) -> None:
+        """Close it, for all devices."""
+        self.is_lost = True
+        if _shared.get(self._address) is self:
+            del _shared[self._address]
+        with suppress(Exception):
+            self._close()
+
+
+_shared: dict[str, OpenPort] = {}
+"""The ports of this process that several devices share, by address. One thread asks all devices of a port."""
+
+
+def shared_port(address: str, device: str, open_it: Callable[[], tuple[Any, Callable[[], object]]]) -> OpenPort:
+    """Return the port at an address that devices share; `open_it` opens it, and returns it and what closes it.
+
+    It is opened again if it failed, or if nothing has answered there since a device last opened it.
+
+    Raises `DeviceConnectionError` if the device has it open already, as of another rig.
+    """
+    shared = _shared.get(address)
+    if shared is not None and device in shared.devices:
+        raise DeviceConnectionError(device, f"cannot open {address}: this program has opened it already")
+    if shared is not None and shared.answers is False:
+        # Perhaps it is the adapter that is silent.
+        shared.give_up()
+    if shared is None or shared.is_lost:
+        shared = _shared[address] = OpenPort(*open_it(), address)
+    shared.answers = None
+    return shared
+
+
+class Share:
+    """What one device has of an open port. When the port fails, all its devices lose their line.
+
+    Attributes
+    ----------
+    requests : int
+        How many messages were sent.
+    """
+
+    def __init__(self, shared: OpenPort, device: str) -> None:
+        self._shared = shared
+        self._device = device
+        self._is_open = True
+        self.requests = 0
+        shared.devices.add(device)
+
+    @property
+    def is_open(self) -> bool:
+        """Whether it can be used."""
+        return self._is_open and not self._shared.is_lost
+
+    def close(self) -> None:
+        """Leave the port, which is closed with its last device; may be called again."""
+        if self._is_open:
+            self._is_open = False
+            self._shared.devices.discard(self._device)
+            if not self._shared.devices:
+                self._shared.give_up()
+
+    def _take_turn(self) -> None:
+        self._shared.user = self
+
+    @contextmanager
+    def _in_turn(self) -> Iterator[None]:
+        """Make it this device's turn; raise `serial.SerialException` if the port was lost, or fails."""
+        if not self._is_open:
+            raise serial.PortNotOpenError
+        if self._shared.is_lost:
+            raise serial.SerialException("the port was lost")
+        try:
+            if self._shared.user is not self:
+                self._take_turn()
+            yield
+        except OSError:
+            self._shared.give_up()
+            raise
+        except Exception as error:  # pyserial passes on that of termios, which is no OSError
+            self._shared.give_up()
+            raise OSError(str(error)) from error
+
+    def _note(self, received: object) -> None:
+        """Note whether what was waited for has come."""
+        self._shared.answers = self._shared.answers or bool(received)
+
+
+class LinePort(Share):
+    """A port as one of the devices that share it has it, or the port of an adapter that echoes.
+
+    When it is another device's turn, what the line has received before is forgotten: a late answer to a neighbour.
+    The echo of a request is read before its answer. If it is not what was sent, others were sending as well: then
+    what comes is discarded, as an answer that is lost, and the request is repeated by whoever has sent it.
+
+    Parameters
+    ----------
+    shared : OpenPort
+        The open port.
+    settings : SerialSettings
+        Those of the device.
+    """
+
+    def __init__(self, shared: OpenPort, device: str, settings: SerialSettings) -> None:
+        super().__init__(shared, device)
+        self._settings = settings
+        self._port = patient(shared.port, settings)
+        self._timeout: float = settings.timeout
+        self._has_collided = False
+
+    def claim(self) -> bool:
+        """Take the port for this device; return whether it was another's turn before."""
+        is_another = self._shared.user is not self
+        with self._in_turn():
+            return is_another
+
+    @property
+    def timeout(self) -> float:
+        """Wait for an answer on an idle computer, s."""
+        return self._timeout
+
+    @timeout.setter
+    def timeout(self, seconds: float) -> None:
+        self._timeout = seconds
+        if self._shared.user is self and self.is_open:
+            self._port.timeout = seconds
+
+    @property
+    def patience(self) -> float:
+        """How long an answer is waited for at present, s."""
+        return patience_of(self._port, self._settings)
+
+    @property
+    def in_waiting(self) -> int:
+        """Number of bytes that can be read at once."""
+        with self._in_turn():
+            return int(self._port.in_waiting)
+
+    def write(self, data: bytes) -> int:
+        """Send a message, and read its echo."""
+        with self._in_turn():
+            self.requests += 1
+            if self._settings.echo:
+                # What is late would be taken for a part of the echo.
+                forget_received(self._port)
+            count: int = self._port.write(data)
+            self._has_collided = self._settings.echo and self._port.read(len(data)) != data
+            return count
+
+    def read(self, size: int = 1) -> bytes:
+        """Return so many bytes; fewer only after the wait."""
+        with self._in_turn():
+            return self._awaited(self._port.read(size))
+
+    def read_until(self, expected: bytes, size: int) -> bytes:
+        """Return what comes up to an end, or so many bytes; another only after the wait."""
+        with self._in_turn():
+            return self._awaited(self._port.read_until(expected, size))
+
+    def read_all(self) -> bytes:
+        """Return what was received; nothing is waited for."""
+        with self._in_turn():
+            received: bytes = self._port.read_all()
+            return self._awaited(received) if received else b""
+
+    def exchange(self, data: bytes) -> bytes:
+        """Send a message; return what has come already."""
+        self.write(data)
+        return self.read_all()
+
+    def ask(self, data: bytes) -> bytes:
+        """Forget what was received, send a message, and return what has come already."""
+        self.reset_input_buffer()
+        return self.exchange(data)
+
+    def reset_input_buffer(self) -> None:
+        """Forget what was received and not read."""
+        with self._in_turn():
+            forget_received(self._port)
+
+    def _awaited(self, received: bytes) -> bytes:
+        self._note(received)
+        return b"" if self._has_collided else received
+
+    def _take_turn(self) -> None:
+        port = self._shared.port
+        forget_received(port)
+        if port.timeout != self._timeout:
+            port.timeout = self._timeout
+        super()._take_turn()
+
+
+def claim(port: Any) -> bool:  # noqa: ANN401 - pyserial is untyped
+    """Take a port for its device; return whether it was the turn of another device before."""
+    return isinstance(port, LinePort) and port.claim()
+
+
 def open_port(device: str, settings: SerialSettings, **options: object) -> Any:  # noqa: ANN401 - pyserial is untyped
     """Open a serial port that no other process holds; `options` are pyserial's beside speed and timeouts.
 
-    It waits longer for answers while the computer is busy, see `PatientPort`.
+    It waits longer for answers while the computer is busy, see `PatientPort`. One that devices of this process share,
+    as their settings name a `line`, is opened once, see `LinePort`.
 
     A port is held by a lock of the system that ends with the process (`flock`; on Windows the port itself). So it
     keeps out every program that asks for the lock as well, pseudo-terminals included, and leaves nothing behind.
@@ -143,8 +386,20 @@ def open_port(device: str, settings: SerialSettings, **options: object) -> Any: 
     Raises `DeviceConnectionError` if the port cannot be opened; it names the process that holds it where the system
     tells.
     """
+    if settings.line:
+
+        def open_it() -> tuple[Any, Callable[[], object]]:
+            port = _opened(device, settings, options)
+            return port, port.close
+
+        return LinePort(shared_port(settings.port, device, open_it), device, settings)
+    port = _opened(device, settings, options)
+    return LinePort(OpenPort(port, port.close), device, settings) if settings.echo else patient(port, settings)
+
+
+def _opened(device: str, settings: SerialSettings, options: Mapping[str, object]) -> Any:  # noqa: ANN401
     try:
-        port = serial.serial_for_url(
+        return serial.serial_for_url(
             settings.port,
             baudrate=settings.baudrate,
             timeout=settings.timeout,
@@ -156,7 +411,6 @@ def open_port(device: str, settings: SerialSettings, **options: object) -> Any: 
         if getattr(error, "errno", None) in _HELD:
             raise DeviceConnectionError(device, f"cannot open {settings.port}: {_use_of(settings.port)}") from None
         raise DeviceConnectionError(device, f"cannot open {settings.port}: {error}") from None
-    return patient(port, settings)
 
 
 def _use_of(port: str) -> str:
@@ -167,7 +421,7 @@ def _use_of(port: str) -> str:
         locks = (line.split() for line in Path("/proc/locks").read_text().splitlines())
         process = int(next(words[4] for words in locks if words[1] == "FLOCK" and words[5] == place))
         if process == os.getpid():
-            return "this program has opened it already; give each device a port of its own"
+            return "this program has opened it already; devices share it by a table [lines.NAME] of the rig file"
         name = f"process {process} ({Path(f'/proc/{process}/comm').read_text().strip()})"
     except (OSError, StopIteration, IndexError, ValueError):
         name = "another process"
@@ -222,5 +476,6 @@ def no_answer(
     return DeviceConnectionError(
         device,
         f"{problem} at {settings.port}, {node} {number}, after {1 + resends} request{'s' if resends else ''}{found}; "
-        f"check power, cable, {node} and speed ({speed or f'{settings.baudrate} Bd'})",
+        f"check power, cable, {node} and speed ({speed or f'{settings.baudrate} Bd'})"
+        f"{', and the key echo' if settings.echo else ''}",
     )

@@ -17,8 +17,10 @@ import serial
 from serial.serialutil import PortNotOpenError, SerialBase, SerialException
 
 from bench.base import Clock
+from bench.rig import ECHO, JOIN
 from sim_devices.wire import Connection, Stream, TcpServer, WireServer
 from sim_devices.wire.modbus_tcp import FramingError
+from sim_devices.wire.shared import joined
 
 _SCHEME = "emulated://"
 _BITS_PER_BYTE = 10  # 8N1: a start and a stop bit
@@ -59,9 +61,19 @@ def register(name: str, server: WireServer | TcpServer, clock: Clock) -> str:
 
 def unregister(address: str) -> None:
     """Take an instrument off its address; ports that are open to it go dead, as if it were unplugged."""
-    socket = _sockets.pop(address.removeprefix(_SCHEME), None)
-    if socket is not None:
-        socket.taken = False
+    name = address.removeprefix(_SCHEME)
+    # With it go the lines that it shares with others.
+    for each in [each for each in _sockets if each == name or name in each.split(JOIN)]:
+        _sockets.pop(each).taken = False
+
+
+def _join(name: str) -> None:
+    """Put instruments that have addresses of their own on one line, at an address as `emulated://a+b`."""
+    try:
+        server = joined(name, {each: socket.server for each, socket in _sockets.items()})
+    except ValueError as error:
+        raise SerialException(str(error)) from None
+    _sockets[name] = _Socket(server, next(_sockets[each].clock for each in name.split(JOIN) if each != ECHO))
 
 
 def serial_class_for_url(url: str) -> tuple[str, type[Serial]]:
@@ -83,6 +95,8 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
         if self.is_open:
             raise SerialException("Port is already open.")
         self._name = str(self.portstr).removeprefix(_SCHEME)
+        if JOIN in self._name and self._name not in _sockets:
+            _join(self._name)
         if self._name not in _sockets:
             known = ", ".join(_SCHEME + other for other in sorted(_sockets)) or "none"
             raise SerialException(f"no emulated instrument at {_SCHEME}{self._name}; there are: {known}")

@@ -29,7 +29,7 @@ from pydantic import Field, InstanceOf, field_validator
 
 from bench.base import Clock
 from bench.devices import ActuatorTable, CommandTable, DriverSettings
-from bench.rig import Expression, LaboratorySettings
+from bench.rig import JOIN, Expression, LaboratorySettings
 from sim_devices.instruments.scpi import EmulatedTextInstrument, Meter
 from sim_devices.laboratory import EmulatedLaboratory
 from sim_devices.plants.lag_network import Lag, LagNetwork
@@ -73,7 +73,10 @@ class SCPILaboratorySettings(LaboratorySettings):
         for name, (port, _) in found.items():
             others = [other for other, (same, _) in found.items() if same == port and other != name]
             if others:
-                raise ValueError(f"{name} and {others[0]} have the same port {_SCHEME}{port}; each needs its own")
+                raise ValueError(
+                    f"{name} and {others[0]} have the same port {_SCHEME}{port}; each needs its own, or all of a "
+                    f"line one that joins the names of its devices, such as {_SCHEME}{name}{JOIN}{others[0]}"
+                )
         return devices
 
     @field_validator("signals")
@@ -91,7 +94,9 @@ def tables(devices: Mapping[str, DriverSettings]) -> dict[str, tuple[str, Comman
     for name, settings in devices.items():
         port = getattr(settings, "port", "")
         if isinstance(settings, CommandTable) and port.startswith(_SCHEME):
-            found[name] = (port.removeprefix(_SCHEME), settings)
+            instrument = port.removeprefix(_SCHEME)
+            # On a shared line each instrument has the name of its device.
+            found[name] = (name if name in instrument.split(JOIN) else instrument, settings)
     return found
 
 

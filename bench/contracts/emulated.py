@@ -11,7 +11,7 @@ import pytest
 
 from bench.base import Clock, VirtualClock
 from bench.devices import Device
-from bench.rig import Rig, load_rig
+from bench.rig import EMULATED, JOIN, Rig, load_rig
 
 
 class OnEmulatedRig:
@@ -58,7 +58,9 @@ class OnEmulatedRig:
         """Return the emulated instrument of the device."""
         (settings,) = (entry.settings for entry in rig.file.devices if entry.name == self.device_name)
         laboratory: Any = rig.laboratory
-        return laboratory.instruments[getattr(settings, "port", "").removeprefix("emulated://")]
+        port = getattr(settings, "port", "").removeprefix(EMULATED)
+        # On a shared line the instrument has the name of its device.
+        return laboratory.instruments[self.device_name if JOIN in port else port]
 
     @pytest.fixture
     def restart(self, twin: Any) -> Callable[[], object]:  # noqa: ANN401 - of any class

@@ -14,6 +14,10 @@ A rig file is TOML::
     port = "/dev/ttyUSB0"                          # all other keys are the driver's own
     ...
 
+    [lines.bus]                                    # optional: a serial line that several devices share
+    port = "/dev/ttyUSB1"                          # its keys count for each device with line = "bus"
+    ...
+
     [roles.drive]                                  # what protocols ask for; see `bench.rig.slots`
     device = "plate"
     ...
@@ -52,7 +56,7 @@ A rig file is TOML::
     ...
 
 Unknown keys are errors. A port `emulated://NAME` is wired to the instrument of that name in the emulated
-laboratory; any other port is the real one.
+laboratory, `emulated://NAME+NAME` to several on one line; any other port is the real one.
 
 A rig file is code: reading it imports the modules that it names. They are those of the bench, those of packages that
 register a part (`bench.base.registry`), and those in the folder of the rig file; any other is refused.
@@ -76,7 +80,8 @@ from bench.rig.calibration import read_calibration
 from bench.rig.derived import DerivedSignal
 from bench.rig.interlocks.config import Interlock
 from bench.rig.layout import DashboardLayout
-from bench.rig.maintenance.locks import EMULATED
+from bench.rig.maintenance.locks import ECHO, EMULATED, JOIN
+from bench.rig.shared_lines import with_line, wrong_lines
 from bench.rig.slots import RoleTable
 
 
@@ -123,6 +128,7 @@ class SafetyTable(CheckedTable):
 class _RigFileContent(CheckedTable):
     rig: RigTable
     devices: dict[str, dict[str, Any]] = Field(min_length=1, description="one table a device")
+    lines: dict[str, dict[str, Any]] = Field(default_factory=dict, description="one table a line that devices share")
     roles: dict[str, RoleTable] = Field(default_factory=dict, description="one table a role")
     protocols: dict[str, dict[str, Any]] = Field(default_factory=dict, description="parameters by protocol")
     derived: dict[str, dict[str, Any]] = Field(default_factory=dict, description="one table a derived signal")
@@ -202,6 +208,11 @@ class DeviceEntry:
         if not isinstance(port, str) or not port.startswith(EMULATED):
             return self.settings
         name = port.removeprefix(EMULATED)
+        own = {**ports, ECHO: EMULATED + ECHO}
+        if name not in ports and all(own.get(each, "").startswith(EMULATED) for each in name.split(JOIN)):
+            # Instruments of this process on one line.
+            joined = JOIN.join(own[each].removeprefix(EMULATED) for each in name.split(JOIN))
+            return self.settings.model_copy(update={"port": EMULATED + joined})
         if name not in ports:
             known = ", ".join(EMULATED + other for other in ports) or "none: the rig has no [emulation]"
             raise ConfigurationError(
@@ -444,10 +455,13 @@ def _validate(path: str, text: str, content: Mapping[str, Any]) -> RigFile:
         raise ConfigurationError("\n".join(f"{path}: {line}" for line in problems(error, _RigFileContent))) from None
     found: list[str] = []
     entries: list[DeviceEntry] = []
-    for device, table in tables.devices.items():
+    for device, own in tables.devices.items():
+        table = with_line(device, own, tables.lines, found)
         loaded = _load_part("devices", table, f"devices.{device}.", "driver", DriverSettings, "connect", found)
         if loaded is not None:
             entries.append(DeviceEntry(device, *loaded))
+    # What is missing would be said twice.
+    found += [] if found else wrong_lines(entries, tables.lines)
     for i, device in enumerate(order := tables.safety.order):
         if device not in tables.devices or device in order[:i]:
             found.append(

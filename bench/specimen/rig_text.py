@@ -58,7 +58,7 @@ def rig_text(twin: IdentifiedTwin, file: RigFile, rig: str, out: Path) -> str:
 def _left_out(file: RigFile) -> list[str]:
     """Return the keys of the rig that its twin does not have."""
     named = ["rig.twin"] if "twin" in file.content["rig"] else []
-    return [key for key in ("devices", "emulation") if key in file.content] + named
+    return [key for key in ("devices", "lines", "emulation") if key in file.content] + named
 
 
 def _base(rig: str, out: Path) -> str:

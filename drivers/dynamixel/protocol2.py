@@ -9,6 +9,7 @@ import math
 import struct
 from collections.abc import Callable, Mapping
 from functools import lru_cache, partial
+from typing import ClassVar
 
 import serial
 from pydantic import Field
@@ -46,10 +47,17 @@ STATUS_ERRORS: Mapping[int, str] = {
 class ServoLineSettings(SerialSettings):
     """Rig-file settings of the line to a Dynamixel."""
 
+    address_key: ClassVar[str] = "id"
+
     id: int = Field(default=1, ge=0, le=252, description="id on the bus, 0 to 252")
     baudrate: int = Field(
         default=57600, ge=9600, le=4_500_000, description="speed of the line, Bd, as set in the servo (register 8)"
     )
+
+    @property
+    def longest_turn(self) -> float:
+        """Longest time that a request and its repetitions keep the line while nothing answers, s."""
+        return super().longest_turn + _LATEST * self.timeout
 
 
 class RefusedError(Exception):
@@ -91,11 +99,11 @@ class ServoLine:
         self._silence = f"no answer within {settings.timeout:g} s"
         self.alert = self.answered = self.urgent = False
         self.repeats = 0
-        self._port = open_port(device, settings)
+        self.port = open_port(device, settings)
 
     def close(self) -> None:
         """Release the line."""
-        self._port.close()
+        self.port.close()
 
     def reading(self, address: int, length: int) -> Callable[[], bytes]:
         """Return a function that reads bytes of the control table; its errors are those of `ask`."""
@@ -120,7 +128,7 @@ class ServoLine:
     def tell(self, instruction: int, parameters: bytes) -> None:
         """Send an instruction that may or may not be answered; raises `DeviceConnectionError` if the line is lost."""
         try:
-            self._port.write(frame(self._settings.id, instruction, parameters))
+            self.port.write(frame(self._settings.id, instruction, parameters))
             self._expect_late()
         except (serial.SerialException, OSError) as error:
             raise lost_line(self._device, self._settings, error) from None
@@ -137,8 +145,8 @@ class ServoLine:
                     self._expect_late()
                 self._received.clear()
                 self._heard = b""
-                forget_received(self._port)
-                self._port.write(request)
+                forget_received(self.port)
+                self.port.write(request)
                 problem, answer = self._answer(length)
                 if problem == "":
                     self.answered = True
@@ -155,7 +163,7 @@ class ServoLine:
 
     def _expect_late(self) -> None:
         """Take note that an answer to what is sent now may come late."""
-        self._quiet_at = self._clock.now() + _LATEST * patience_of(self._port, self._settings)
+        self._quiet_at = self._clock.now() + _LATEST * patience_of(self.port, self._settings)
 
     def _answer(self, length: int) -> tuple[str, bytes]:
         """Return what is wrong with the answer, if anything; its error byte and its content."""
@@ -163,7 +171,7 @@ class ServoLine:
         if not self._received:
             # As a rule the answer comes whole, and nothing else does.
             expected = _SHORTEST_ANSWER + length
-            data = self._port.read(expected)
+            data = self.port.read(expected)
             whole = len(data) == expected and data.startswith(self._answer_head(length))
             if whole and not data[8] & ~_ALERT and crc(data[:-2]) == data[-2] | data[-1] << 8:
                 return "", data[8:-2]
@@ -227,7 +235,7 @@ class ServoLine:
                 missing = end - len(received)
             if ended:
                 return b"" if received else None
-            chunk = self._port.read(missing)
+            chunk = self.port.read(missing)
             received += chunk
             self._heard += chunk
             read += len(chunk)

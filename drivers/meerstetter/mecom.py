@@ -11,7 +11,7 @@ from binascii import crc_hqx
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import lru_cache
-from typing import NamedTuple
+from typing import ClassVar, NamedTuple
 
 import serial
 from pydantic import Field
@@ -43,6 +43,8 @@ SERVER_ERRORS: Mapping[int, str] = {
 
 class TECLineSettings(SerialSettings):
     """Rig-file settings of the line to a Meerstetter TEC controller."""
+
+    address_key: ClassVar[str] = "address"
 
     address: int = Field(default=1, ge=1, le=254, description="device address (parameter 2051), 1 to 254")
     baudrate: int = Field(default=57600, ge=4800, le=1_000_000, description="speed of the line, Bd")
@@ -91,13 +93,13 @@ class TECLine:
         self._received = bytearray()
         self._strange = b""
         self._silence = f"no answer within {settings.timeout:g} s"
-        self._port = open_port(device, settings)
+        self.port = open_port(device, settings)
         # An emulated line hands the answer over with the request.
-        self._swap: Callable[[bytes], bytes] = getattr(self._port, "exchange", self._write_and_look)
+        self._swap: Callable[[bytes], bytes] = getattr(self.port, "exchange", self._write_and_look)
 
     def close(self) -> None:
         """Release the line."""
-        self._port.close()
+        self.port.close()
 
     def follow(self, line: TECLine) -> None:
         """Go on counting where another line to the device has ended, as an answer to it may still come."""
@@ -106,7 +108,7 @@ class TECLine:
     @contextmanager
     def in_haste(self) -> Iterator[None]:
         """Wait 0.2 s at most for an answer, and send a request twice at most."""
-        patience = self._port.timeout
+        patience = self.port.timeout
         self._most_resends = _HASTY_RESENDS
         try:
             self._wait_for(min(patience, _HASTE))
@@ -118,7 +120,7 @@ class TECLine:
     def _wait_for(self, patience: float) -> None:
         # pyserial sets an open port up anew, and a lost one says that it is lost at the next request.
         with suppress(serial.SerialException, OSError):
-            self._port.timeout = self._port.write_timeout = patience
+            self.port.timeout = self.port.write_timeout = patience
 
     def ask(self, request: str, digits: int) -> str:
         """Send a query; return the `digits` characters of its answer.
@@ -165,7 +167,7 @@ class TECLine:
                 if problem != self._silence:
                     # All else that has come belongs to the damage; after silence, a late answer may come.
                     self._received.clear()
-                    forget_received(self._port)
+                    forget_received(self.port)
         except (serial.SerialException, OSError) as error:
             raise lost_line(self._device, self._settings, error) from None
         found, address = other_answer(self._strange), self._settings.address
@@ -173,8 +175,8 @@ class TECLine:
 
     def _write_and_look(self, frame: bytes) -> bytes:
         """Send a frame; return what has come already."""
-        self._port.write(frame)
-        come: bytes = self._port.read_all()
+        self.port.write(frame)
+        come: bytes = self.port.read_all()
         return come
 
     def _answer(self, head: bytes, crc: bytes, digits: int) -> tuple[str, bytes]:
@@ -213,7 +215,7 @@ class TECLine:
                 missing = _ERROR_LENGTH - len(received)
             else:
                 missing = max(length - len(received), 1)
-            chunk = self._port.read(missing)
+            chunk = self.port.read(missing)
             received += chunk
             if len(chunk) < missing and b"\r" not in chunk:
                 # What came is kept: the rest of a slow answer may still follow.

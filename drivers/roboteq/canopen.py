@@ -15,7 +15,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import serial
 from pydantic import Field
@@ -94,7 +94,15 @@ class NodeSettings(SerialSettings):
     bitrate: Literal[125_000, 500_000] = Field(
         default=125_000, description="speed of the CAN bus, bit/s: 125000 as delivered, or 500000"
     )
+    address_key: ClassVar[str] = "node"
+    keys_of_line: ClassVar[frozenset[str]] = SerialSettings.keys_of_line | {"timeout"}
+
     node: int = Field(default=1, ge=1, le=126, description="CANopen node of the controller, 1 to 126")
+
+    @property
+    def longest_turn(self) -> float:
+        """Longest time that a request and its repetitions keep the line while nothing answers, s."""
+        return super().longest_turn + _LATEST * self.timeout
 
 
 @dataclass(frozen=True)
@@ -135,6 +143,8 @@ class NodeLine:
         How many requests were sent again.
     answered : bool
         Whether the node has answered since the line was opened.
+    port : SlcanAdapter or NodePort
+        The adapter.
     restarted : bool
         Whether the node has reported a restart since this was last set to false.
     urgent : bool
@@ -156,7 +166,7 @@ class NodeLine:
         self.repeats = 0
         self.answered = self.restarted = self.urgent = False
         try:
-            self._adapter = slcan.SlcanAdapter(settings, settings.bitrate)
+            self.port = self._adapter = slcan.open_adapter(device, settings, settings.bitrate, settings.node)
         except (can.CanError, serial.SerialException, OSError, ValueError) as error:
             raise DeviceConnectionError(device, f"cannot open {settings.port}: {_cause(error)}") from None
         self._heard_at = clock.now()

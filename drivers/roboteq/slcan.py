@@ -1,6 +1,8 @@
 """An slcan adapter on a serial line: python-can opens and closes its channel; frames pass as lines of text.
 
-Source: LAWICEL CAN232 manual V3.
+Several nodes share an adapter: it is opened once, and a frame goes to the node whose number ends its identifier.
+
+Sources: LAWICEL CAN232 manual V3; CiA 301, 7.3.5, for the identifiers of a node.
 """
 
 from __future__ import annotations
@@ -14,10 +16,11 @@ import serial
 from can import CanError
 from can.interfaces.slcan import slcanBus
 
-from drivers.serial_line import SerialSettings, patience_of, patient
+from drivers.serial_line import OpenPort, SerialSettings, Share, patience_of, patient, shared_port
 
 _MOST_READS = 4096
 _LONGEST_LINE = 64
+_NODE = 0x7F  # bits of an identifier that are the number of its node
 _ACKNOWLEDGEMENTS = frozenset((b"z\r", b"z\rz\r", b"\r"))
 _BEGINNINGS = b"tTrRzZVNF"
 """How lines of an adapter begin. Source: LAWICEL CAN232 manual V3, commands."""
@@ -38,6 +41,8 @@ class SlcanAdapter(slcanBus):
         What came last that is no line of an adapter.
     transmit : callable
         Sends a line, which has its end.
+    inboxes : dict of int to deque
+        The lines that have come for each node of several that share it.
     """
 
     transmit: Callable[[bytes], object]
@@ -45,6 +50,7 @@ class SlcanAdapter(slcanBus):
     def __init__(self, settings: SerialSettings, bitrate: int) -> None:
         self.refusals = 0
         self.strange = b""
+        self.inboxes: dict[int, deque[bytes]] = {}
         self._lines: deque[bytes] = deque()
         self._rest = b""
         try:
@@ -56,6 +62,7 @@ class SlcanAdapter(slcanBus):
                 timeout=settings.timeout,
             )
             self.serialPortOrig.write_timeout = settings.timeout
+            # An echo is a frame of the host's, which is nobody's here.
             self._port = patient(self.serialPortOrig, settings)
             self._settings = settings
             self.transmit = self._port.write
@@ -125,3 +132,84 @@ class SlcanAdapter(slcanBus):
         port = getattr(self, "serialPortOrig", None)
         if port is not None:
             port.close()
+
+
+class NodePort(Share):
+    """An adapter as one of the nodes behind it has it; it is used like the adapter itself."""
+
+    def __init__(self, shared: OpenPort, device: str, node: int) -> None:
+        super().__init__(shared, device)
+        self._adapter: SlcanAdapter = shared.port
+        self._inboxes = self._adapter.inboxes
+        self._inbox: deque[bytes] = deque(maxlen=_MOST_READS)
+        self._inboxes[node] = self._inbox
+
+    @property
+    def refusals(self) -> int:
+        """How often the adapter has answered with BEL since it was opened."""
+        return self._adapter.refusals
+
+    @property
+    def strange(self) -> bytes:
+        """What came last that is no line of an adapter."""
+        return self._adapter.strange
+
+    @property
+    def patience(self) -> float:
+        """How long an answer is waited for at present, s."""
+        return self._adapter.patience
+
+    def transmit(self, line: bytes) -> None:
+        """Send a line, which has its end."""
+        with self._in_turn():
+            self.requests += 1
+            self._adapter.transmit(line)
+
+    def line(self) -> bytes | None:
+        """Return the next line with a standard data frame, empty if it is another node's; None after silence."""
+        if self._inbox:
+            return self._inbox.popleft()
+        with self._in_turn():
+            line = self._adapter.line()
+        self._note(line)
+        if line is None:
+            return None
+        self._deliver(line)
+        return self._inbox.popleft() if self._inbox else b""
+
+    def lines(self) -> list[bytes]:
+        """Return the lines with a standard data frame of this node that have arrived."""
+        with self._in_turn():
+            for line in self._adapter.lines():
+                self._deliver(line)
+        found = [*self._inbox]
+        self._inbox.clear()
+        return found
+
+    def matched(self, pattern: re.Pattern[bytes]) -> tuple[bytes, ...]:
+        """Return the groups of all that has arrived, if it has this form; none otherwise, and `line` returns it."""
+        if self._inbox:
+            return ()
+        with self._in_turn():
+            return self._adapter.matched(pattern)
+
+    def release(self) -> None:
+        """Leave the adapter, in any state; its channel is closed with the last node."""
+        self.close()
+
+    def _deliver(self, line: bytes) -> None:
+        # A damaged line, and what a node sends that is none of the rig, is nobody's.
+        with suppress(ValueError, KeyError):
+            self._inboxes[int(line[1:4], 16) & _NODE].append(line)
+
+
+def open_adapter(device: str, settings: SerialSettings, bitrate: int, node: int) -> SlcanAdapter | NodePort:
+    """Open the adapter of a node, or join those that share it; raises what python-can and pyserial raise."""
+    if not settings.line:
+        return SlcanAdapter(settings, bitrate)
+
+    def open_it() -> tuple[SlcanAdapter, Callable[[], object]]:
+        adapter = SlcanAdapter(settings, bitrate)
+        return adapter, adapter.release
+
+    return NodePort(shared_port(settings.port, device, open_it), device, node)

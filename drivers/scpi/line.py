@@ -41,6 +41,8 @@ class TextLine:
         Whether the line itself failed, so that it has to be opened again.
     repeats : int
         Number of questions that were repeated.
+    port : Any
+        The port, None of VISA.
 
     Raises
     ------
@@ -58,6 +60,7 @@ class TextLine:
         self.repeats = 0
         self._end, self._encoding, self._delay = settings.write_terminator, settings.encoding, settings.delay
         self._transport = open_transport(device, settings, settings.read_terminator.encode(settings.encoding))
+        self.port = getattr(self._transport, "port", None)
 
     def close(self) -> None:
         """Release the line."""
@@ -100,6 +103,8 @@ class TextLine:
             if answer is not None and numbers is not None:
                 return answer, numbers
             self._in_step = False
+        with self._noticing_loss():
+            self._transport.leave()
         if answer is None:
             raise DeviceConnectionError(
                 self._device,

@@ -4,15 +4,20 @@ from __future__ import annotations
 
 import importlib.util
 from contextlib import suppress
-from typing import Annotated, Any, Literal, Protocol
+from typing import Annotated, Any, ClassVar, Literal, Protocol, Self
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, model_validator
 
 from bench.base import DeviceConnectionError
-from drivers.serial_line import SerialSettings, forget_received, lost_line, open_port
+from drivers.serial_line import RESENDS, SerialSettings, forget_received, lost_line, open_port, settle_line
 
 TCP = "tcp://"
 VISA = "visa://"
+
+LATEST = 3.0
+"""Time-outs after a question by which even a late answer has come."""
+
+_ADDRESS = "{address}"
 
 LONGEST_ANSWER = 1024
 """Bytes after which an answer without an end is none."""
@@ -28,9 +33,25 @@ def _port(port: str) -> str:
     return port
 
 
+def _addressed(value: Any, address: str) -> Any:  # noqa: ANN401 - any TOML
+    """Return a value of a rig file with the address in the place of its placeholder in every text."""
+    if isinstance(value, dict):
+        return {key: _addressed(each, address) for key, each in value.items()}
+    if isinstance(value, list | tuple):
+        return type(value)(_addressed(each, address) for each in value)
+    return value.replace(_ADDRESS, address) if isinstance(value, str) else value
+
+
 class TextLineSettings(SerialSettings):
     """Where a text instrument is."""
 
+    address_key: ClassVar[str] = "address"
+
+    address: str = Field(
+        default="",
+        coerce_numbers_to_str=True,
+        description="address on a line that it shares; {address} in a message or a form stands for it",
+    )
     port: Annotated[str, AfterValidator(_port)] = Field(
         min_length=1,
         description="address: a serial port (/dev/ttyUSB0, COM3), tcp://HOST:PORT, visa://RESOURCE such as "
@@ -48,6 +69,30 @@ class TextLineSettings(SerialSettings):
     visa_library: str = Field(
         default="", description="library of a visa:// address, such as @py; the one that pyvisa finds if empty"
     )
+
+    @model_validator(mode="before")
+    @classmethod
+    def _with_address(cls, content: Any) -> Any:  # noqa: ANN401 - any TOML
+        if not isinstance(content, dict):
+            return content
+        address = content.get("address")
+        if address is None and _addressed(content, "") != content:
+            raise ValueError(f"{_ADDRESS} stands in its messages, so the key address is needed")
+        return content if address is None else _addressed(content, str(address))
+
+    @model_validator(mode="after")
+    def _shares_no_resource(self) -> Self:
+        if self.line and self.port.startswith(VISA):
+            raise ValueError(f"line = {self.line!r}: a VISA resource cannot be shared; expected a serial port")
+        return self
+
+    @property
+    def longest_turn(self) -> float:
+        """Longest time that a question and its repetitions keep the line while nothing answers, s.
+
+        Before each repetition the line has to be silent for a time-out, and at the end until no late answer can come.
+        """
+        return (1 + 2 * RESENDS + LATEST - 1) * self.timeout
 
 
 class Transport(Protocol):
@@ -72,6 +117,9 @@ class Transport(Protocol):
     def discard(self) -> None:
         """Forget what was received."""
 
+    def leave(self) -> None:
+        """Wait until no late answer can come, so that a neighbour on the line does not take it for its own."""
+
     def close(self) -> None:
         """Release the line."""
 
@@ -95,7 +143,7 @@ class SerialTransport:
         if url.startswith(TCP):
             url = f"socket://{url.removeprefix(TCP)}"
         flow = settings.flow_control
-        self._port = open_port(
+        self.port = open_port(
             device,
             settings.model_copy(update={"port": url}),
             parity=settings.parity,
@@ -108,14 +156,14 @@ class SerialTransport:
     def write(self, message: bytes) -> None:
         """Send a message with its terminator."""
         try:
-            self._port.write(message)
+            self.port.write(message)
         except OSError as error:  # pyserial's errors among them
             raise lost_line(self._device, self._settings, error) from None
 
     def read(self) -> bytes | None:
         """Return the next answer without its terminator, or None when none has come within the time-out."""
         try:
-            answer: bytes = self._port.read_until(self._terminator, LONGEST_ANSWER)
+            answer: bytes = self.port.read_until(self._terminator, LONGEST_ANSWER)
         except OSError as error:
             raise lost_line(self._device, self._settings, error) from None
         if answer.endswith(self._terminator):
@@ -127,13 +175,21 @@ class SerialTransport:
     def discard(self) -> None:
         """Forget what was received."""
         try:
-            forget_received(self._port)
+            forget_received(self.port)
         except OSError as error:
             raise lost_line(self._device, self._settings, error) from None
 
+    def leave(self) -> None:
+        """Wait until no late answer can come, so that a neighbour on the line does not take it for its own."""
+        if self._settings.line:
+            try:
+                settle_line(self.port, (LATEST - 1) * self._settings.timeout)
+            except OSError as error:
+                raise lost_line(self._device, self._settings, error) from None
+
     def close(self) -> None:
         """Release the line."""
-        self._port.close()
+        self.port.close()
 
 
 class VisaTransport:
@@ -201,6 +257,9 @@ class VisaTransport:
         # Not every interface of every library has it; the question for the identity comes after a time-out anyway.
         with suppress(*self._errors, NotImplementedError):
             self._resource.flush(self._discard_buffer)
+
+    def leave(self) -> None:
+        """Do nothing: a VISA resource is not shared."""
 
     def close(self) -> None:
         """Release the line."""

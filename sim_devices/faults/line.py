@@ -345,6 +345,7 @@ class FaultySerial(FaultyStream, WireServer):
     def __init__(self, server: WireServer, line: FaultyLine) -> None:
         super().__init__(server, line)
         self.protocol = server.protocol
+        self.hears_others = server.hears_others
         line.streams.append(self)
 
 

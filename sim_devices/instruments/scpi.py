@@ -141,7 +141,9 @@ class EmulatedTextInstrument(EmulatedInstrument):
     def _obey_one(self, message: str) -> str | None:
         act = self._action(message)
         if act is None:
-            self.report(UNDEFINED_HEADER)
+            # On a line that it shares, it is meant for another one, or another one has sent it.
+            if not getattr(self.table, "line", ""):
+                self.report(UNDEFINED_HEADER)
             return None
         return act()
 

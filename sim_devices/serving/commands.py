@@ -7,7 +7,7 @@ import os
 import secrets
 import socket
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -21,7 +21,6 @@ from bench.cli import STANDARD_OUTPUT, JsonOption, console, parse_assignments, p
 if TYPE_CHECKING:
     # Imported by the functions, as `bench --help` imports this module for its help text.
     from bench.rig import RigFile
-    from sim_devices.laboratory import EmulatedLaboratory
     from sim_devices.serving.endpoints import Listener
     from sim_devices.serving.served import ServedLaboratory
 
@@ -77,7 +76,7 @@ def emulate(
     from bench.rig import load_rig
     from sim_devices.serving.clock import make_served_clock
     from sim_devices.serving.control import ControlSocket
-    from sim_devices.serving.served import ServedLaboratory, Serving
+    from sim_devices.serving.served import ServedLaboratory, Serving, servers_by_line
     from sim_devices.serving.server import Server
     from sim_devices.serving.state_log import StateLog
 
@@ -95,7 +94,8 @@ def emulate(
             file.name: file.laboratory(file.laboratory_settings, each, seed)  # type: ignore[misc]  # checked above
             for file, each in zip(files, clocks, strict=True)
         }
-        serving = Serving(host, tcp, _check_ports(given_ports, laboratories), baud_time)
+        lines = {file.name: servers_by_line(file, laboratories[file.name]) for file in files}
+        serving = Serving(host, tcp, _check_ports(given_ports, lines), baud_time)
         served = []
         for file, each in zip(files, clocks, strict=True):
             served.append(ServedLaboratory(file, laboratories[file.name], each, serving))
@@ -142,9 +142,9 @@ def _check_rigs(files: Sequence[RigFile]) -> None:
             raise ConfigurationError(f"rig {file.name} is named twice; serve it again by a process of its own")
 
 
-def _check_ports(ports: Mapping[str, int | float], laboratories: Mapping[str, EmulatedLaboratory]) -> dict[str, int]:
+def _check_ports(ports: Mapping[str, int | float], lines: Mapping[str, Iterable[str]]) -> dict[str, int]:
     """Return TCP ports by `RIG.NAME`."""
-    full = [f"{rig}.{name}" for rig, laboratory in laboratories.items() for name in laboratory.servers]
+    full = [f"{rig}.{name}" for rig, names in lines.items() for name in names]
     found: dict[str, int] = {}
     for name, number in ports.items():
         meant = [each for each in full if name in (each, each.partition(".")[2])]

@@ -190,8 +190,8 @@ class ControlSocket:
             case requests.Operate(task=task, value=value):
                 served.laboratory.operate(task, value)
             case requests.LineRequest(instrument=instrument):
-                if instrument not in served.lines:
-                    known = ", ".join(served.lines)
+                if instrument not in served.laboratory.lines:
+                    known = ", ".join(served.laboratory.lines)
                     raise ConfigurationError(f"rig {served.name} has no instrument {instrument!r}; it has: {known}")
                 if isinstance(request, requests.PlugIn):
                     served.laboratory.mend(instrument)
@@ -220,7 +220,7 @@ class ControlSocket:
             },
             "rigs": {
                 served.name: {
-                    "instruments": [*served.lines],
+                    "instruments": [*served.laboratory.lines],
                     "faults": {name: fault.to_json() for name, fault in served.laboratory.faults.items()},
                 }
                 for served in self._laboratories

@@ -9,13 +9,14 @@ from dataclasses import dataclass
 from typing import Any
 
 from bench.base import ConfigurationError
-from bench.rig import RigFile
+from bench.rig import JOIN, RigFile
 from sim_devices.faults.line import Cable
 from sim_devices.laboratory import EmulatedLaboratory, TrueValue
 from sim_devices.serving.clock import LONGEST_STEP, ServedClock
 from sim_devices.serving.endpoints import HAS_PSEUDO_TERMINALS, Listener, PseudoTerminal
 from sim_devices.serving.lines import Line, Watched
 from sim_devices.wire import TcpServer, WireServer
+from sim_devices.wire.shared import joined
 
 _SCHEME = "emulated://"
 
@@ -65,9 +66,10 @@ class ServedLaboratory:
         self.name = file.name
         self.laboratory = laboratory
         self.clock = clock
+        servers = servers_by_line(file, laboratory)
         self._devices = {
             name: [entry.name for entry in file.devices if getattr(entry.settings, "port", "") == _SCHEME + name]
-            for name in laboratory.servers
+            for name in servers
         }
         speeds = {
             getattr(entry.settings, "port", ""): float(speed)
@@ -77,7 +79,7 @@ class ServedLaboratory:
         self.lines: dict[str, Line] = {}
         self._protocols: dict[str, str] = {}
         with ExitStack() as opened:
-            for name, server in laboratory.servers.items():
+            for name, server in servers.items():
                 speed = speeds.get(_SCHEME + name, math.inf) if serving.baud_time else math.inf
                 self.lines[name] = self._open(name, server, speed, serving)
                 opened.callback(self.lines[name].close)
@@ -138,8 +140,26 @@ class ServedLaboratory:
         except OSError as error:
             where = f"port {port} of {serving.host}" if port else serving.host if on_tcp else "a pseudo-terminal"
             raise ConfigurationError(f"{self.name}: {name} cannot be served at {where}: {error.strerror}") from None
-        faults = self.laboratory.lines[name]
-        return Line(name, server, end, self.clock, speed, lambda: faults.cable is Cable.CUT)
+        faults = self.laboratory.lines.get(name)
+        return Line(name, server, end, self.clock, speed, lambda: faults is not None and faults.cable is Cable.CUT)
+
+
+def servers_by_line(file: RigFile, laboratory: EmulatedLaboratory) -> dict[str, WireServer | TcpServer]:
+    """Return what is at the end of each line of a rig; instruments that share one are at `a+b` only.
+
+    Raises ConfigurationError if an instrument of a shared line is not there, or has no serial line.
+    """
+    servers = dict(laboratory.servers)
+    ports = dict.fromkeys(str(getattr(entry.settings, "port", "")) for entry in file.devices)
+    shared = [port.removeprefix(_SCHEME) for port in ports if port.startswith(_SCHEME) and JOIN in port]
+    for name in shared:
+        try:
+            servers[name] = joined(name, laboratory.servers)
+        except ValueError as error:
+            raise ConfigurationError(f"{file.path}: {error}") from None
+        for each in name.split(JOIN):
+            servers.pop(each, None)
+    return servers
 
 
 def one_of(laboratories: Sequence[ServedLaboratory], rig: str | None) -> ServedLaboratory:

@@ -62,7 +62,15 @@ class Answering:
 
 
 class WireServer(Answering, ABC):
-    """The serial side of an emulated instrument."""
+    """The serial side of an emulated instrument.
+
+    Attributes
+    ----------
+    hears_others : bool
+        Whether it is on the line itself, so that on a shared one it hears what others send.
+    """
+
+    hears_others: bool = True
 
     @abstractmethod
     def receive(self, data: bytes) -> bytes:

@@ -62,6 +62,8 @@ class CanopenSlcanServer(WireServer):
     """The serial side of an slcan adapter with one emulated controller on its bus."""
 
     has_addresses = True
+    # Its bus is behind the adapter, whose lines are those of the host.
+    hears_others = False
 
     def __init__(self, device: EmulatedRoboteq) -> None:
         self._device = device

@@ -130,6 +130,13 @@ class ModbusRtuServer(WireServer):
             if self._is_request(data):
                 self._learn(data)
                 return self._serve(data)
+            if (
+                data[:1] not in (bytes((self._address,)), b"\0")
+                and len(data) >= _SHORTEST_FRAME
+                and crc16(data) == b"\0\0"
+            ):
+                # A whole frame of somebody else on the line, which the pauses around it set apart.
+                return b""
         self._received += data
         replies = bytearray()
         received = memoryview(bytes(self._received))

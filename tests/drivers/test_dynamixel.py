@@ -798,7 +798,7 @@ def test_answer_that_comes_after_its_resend_is_not_taken_for_the_next(script, se
     script.instead = [b"", b"", b""]
     with pytest.raises(DeviceConnectionError):
         servo.measure()
-    servo._line._port._received += late
+    servo._line.port._received += late
     assert servo.torque_enabled is False
 
 

@@ -24,7 +24,7 @@ from drivers.modbus import (
     write_request,
 )
 from drivers.pymodbus_client import SerialClient
-from drivers.serial_line import MOST_STRAY, SerialSettings, settle_line
+from drivers.serial_line import MOST_STRAY, SerialSettings, open_port, settle_line
 from sim_devices.protocol_emulated import register, unregister
 from sim_devices.wire import WireServer
 
@@ -208,7 +208,7 @@ def client(request, plug, clock):
         else:
             plug(server)
             settings = SerialSettings(port="emulated://modbus", baudrate=1_000_000, timeout=0.2)
-            made.append(SerialClient("load", settings, 1, "N"))
+            made.append(SerialClient(open_port("load", settings), settings, 1, "N"))
         return made[-1]
 
     yield client
@@ -319,8 +319,8 @@ def test_a_line_that_was_closed_stays_closed(client, clock):
 
 def test_pymodbus_waits_as_long_as_it_is_told(plug, clock):
     plug(Answers())
-    made = SerialClient("load", SerialSettings(port="emulated://modbus", baudrate=9600, timeout=0.2), 1, "E")
-    assert made._line.socket.parity == "E"
+    settings = SerialSettings(port="emulated://modbus", baudrate=9600, timeout=0.2)
+    made = SerialClient(open_port("load", settings), settings, 1, "E")
     made.wait_for(0.7)
     assert made._line.comm_params.timeout_connect == 0.7
     made.close()

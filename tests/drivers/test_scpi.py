@@ -666,7 +666,7 @@ def test_a_line_that_is_lost_is_opened_again_by_the_next_call(lab):
     assert device._line is not before
     device.close()
     assert not device._line.lost
-    assert not device._line._transport._port.is_open
+    assert not device._line._transport.port.is_open
 
 
 def test_lost_while_reading(lab):
@@ -730,7 +730,7 @@ def test_addresses(port, right):
     ],
 )
 def test_a_serial_port_is_set_up_as_the_rig_file_says(stack, changes, options):
-    port = Laboratory(stack, **changes).connect()._line._transport._port
+    port = Laboratory(stack, **changes).connect()._line._transport.port
     assert {key: getattr(port, key) for key in options} == options
 
 
