@@ -22,7 +22,7 @@ from typer.main import get_command
 from bench.base import registry
 from bench.cli import Catalogue, app
 from bench.record import rows
-from bench.rig import DashboardLayout, Interlock, RigTable, RoleTable, SafetyTable, TelemetryTable
+from bench.rig import LONGEST_TURN, DashboardLayout, Interlock, RigTable, RoleTable, SafetyTable, TelemetryTable
 
 _COLUMNS = {
     "meta": "Facts about the run, one a row, as JSON: protocol, parameters, rig, seed, versions, outcome.",
@@ -124,6 +124,11 @@ def rig_file() -> Iterator[str]:
     for head, model in tables:
         yield f"## `{head}`\n"
         yield from _fields(model)
+    yield "## `[lines.NAME]`\n"
+    yield 'A serial line that several devices share: those with `line = "NAME"`. Its keys are keys of their drivers,'
+    yield "and count for each of them; a key may not stand in both tables. Each device has an address of its own, and"
+    yield "what concerns the port (speed, parity, echo) is the same for all. A silent device may keep its line for"
+    yield f"{LONGEST_TURN:g} s at most, which bounds its `timeout` ([how-to](../../how-to/share-a-line.md)).\n"
     yield "The keys of `[devices.NAME]` are those of its driver ([instruments](instruments.md)), the keys of"
     yield "`[emulation]` those of its laboratory ([laboratories](laboratories.md)), and those of `[protocols.NAME]`"
     yield "the parameters of a protocol ([protocols](protocols.md))."
