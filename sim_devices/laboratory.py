@@ -11,11 +11,11 @@ from typing import ClassVar
 
 import numpy as np
 
-from bench.base import Clock, ConfigurationError
+from bench.base import Clock, ConfigurationError, VirtualClock
 from bench.rig import LaboratorySettings, ScheduledFault
 from sim_devices import protocol_emulated
 from sim_devices.faults.calendar import Calendar
-from sim_devices.faults.fault import Fault, FaultEvent
+from sim_devices.faults.fault import Fault, FaultEvent, Quantity
 from sim_devices.faults.instrument import instrument_faults
 from sim_devices.faults.line import AnswerFault, FaultyLine, FaultySerial, FaultyTcpServer
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC
@@ -119,6 +119,10 @@ class EmulatedLaboratory:
         self.lines: dict[str, FaultyLine] = {}
         self._servers: dict[str, FaultySerial | FaultyTcpServer] = {}
         every = dict(faults)
+        if isinstance(clock, VirtualClock):
+            # Others have a time of day of their own.
+            forward = Quantity(3600.0, "s", -1e9, 1e9, "by which it is set forward, or back")
+            every["clock-step"] = Fault("the time of day is set", clock.set_time_of_day, {"seconds": forward})
         for number, (name, server) in enumerate(servers.items()):
             # A stream of its own for each line: a fault of one must not change what happens on another.
             rng = np.random.default_rng((seed, _STREAM, number))

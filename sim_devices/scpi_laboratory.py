@@ -31,7 +31,7 @@ from bench.base import Clock
 from bench.devices import ActuatorTable, CommandTable, DriverSettings
 from bench.rig import JOIN, Expression, LaboratorySettings
 from sim_devices.instruments.scpi import EmulatedTextInstrument, Meter
-from sim_devices.laboratory import EmulatedLaboratory
+from sim_devices.laboratory import EmulatedLaboratory, TrueValue
 from sim_devices.plants.lag_network import Lag, LagNetwork
 from sim_devices.wire.text import TextServer
 from sim_devices.world import World
@@ -170,3 +170,15 @@ class SCPILaboratory(EmulatedLaboratory):
         super().__init__(
             "laboratory of text instruments", servers, clock, world=world, instruments=instruments, seed=seed
         )
+        self._units: dict[str, str] = {}
+        for device, (_, table) in found.items():
+            self._units |= {f"{device}_{name}": signal.unit for name, signal in table.signals.items()}
+            if isinstance(table, ActuatorTable):
+                self._units[f"{device}_output"] = table.setpoint.unit
+
+    def truth(self) -> dict[str, TrueValue]:
+        """Return the quantities behind the signals, and what the outputs deliver, by name."""
+        return {
+            name: TrueValue(self.plant.value(name), unit, is_output=name.endswith("_output"))
+            for name, unit in self._units.items()
+        }

@@ -42,15 +42,15 @@ from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
 
-from matrix import HERE, RIGS, _safe
 from rich.console import Console
 
 from bench.base import BenchError, IncompleteRecordWarning
 from bench.execution import Run, carry_out
-from bench.protocol import find_protocol
 from bench.record import FILE_NAME, Journal, Record, recover
 from bench.record.store import Store
+from sim_devices.torture.running import Bed, Task
 
+RIGS = ("vo2", "sma", "hybrid")
 FAULTS = ("full", "crowded", "freed", "eio", "removed", "file", "read-only", "locked", "page")
 MOUNTED = {"full", "crowded", "freed", "read-only"}
 AT = {"page": 9}
@@ -201,15 +201,11 @@ def run_cell(rig, fault, clock):
 
 
 def _judge(cell, injector, clock, base):
-    rig = cell.rig
-    run = Run(
-        protocol=find_protocol(f"{HERE / 'excursions.py'}:excursion-{rig}"), settings={}, seed=0, clock=clock,
-        rig=str(HERE / f"{rig}-observed.toml"), folder=injector.folder / "runs", recording=False,
-    )  # fmt: skip
+    bed = Bed.of(Task(cell.rig, {}))
+    run = Run(bed.protocol, {}, cell.rig, injector.folder / "runs", clock=clock, recording=False, rig_file=bed.file)
     result = carry_out(run, Console(file=io.StringIO(), width=200))
     outcome = result.outcome
-    (laboratory,) = sys.modules["observed"].latest
-    safe = _safe(laboratory, rig)
+    safe = bed.safe()
     code = 0 if outcome.error is None else outcome.error.exit_code if isinstance(outcome.error, BenchError) else 1
     cell.ended, cell.reason = f"{outcome.status} ({code})", outcome.reason
     cell.told, cell.steps = injector.told, outcome.steps

@@ -23,14 +23,12 @@ from rich.console import Console
 
 import bench.execution.context
 from bench.execution import Run, carry_out
-from bench.protocol import find_protocol
 from bench.record import Journal, Record
+from sim_devices.torture.excursion import COUNT as STEPS
+from sim_devices.torture.running import Bed, Task
 
-HERE = Path(__file__).parent
 RIGS = ("vo2", "sma", "hybrid")
 CLOCKS = ("virtual", "x20")
-STEPS = 16
-"""Steps of an excursion."""
 LONGEST_DELAY = 0.03
 LONGEST = 120.0
 """Wall-clock time after which a run hangs, s."""
@@ -86,10 +84,8 @@ def _run(rig, clock, folder, writer):
             os.write(writer, b"e")
 
     bench.execution.context.Journal = Telling
-    run = Run(
-        protocol=find_protocol(f"{HERE / 'excursions.py'}:excursion-{rig}"), settings={}, seed=0, clock=clock,
-        rig=rig, folder=folder, recording=False,
-    )  # fmt: skip
+    bed = Bed.of(Task(rig, {}))
+    run = Run(bed.protocol, {}, rig, folder, clock=clock, recording=False)
     carry_out(run, Console(file=io.StringIO(), width=200))
 
 

@@ -253,6 +253,7 @@ class VirtualClock(Clock):
         super().__init__()
         self.epoch = VIRTUAL_EPOCH
         self._now = 0.0
+        self._parted = 0.0
 
     def now(self) -> float:
         """Return laboratory seconds since the clock was made."""
@@ -262,6 +263,15 @@ class VirtualClock(Clock):
         """Go on where that time ended: without a process there was no laboratory in which it could pass."""
         self.epoch = epoch
         self._now = last
+
+    def set_time_of_day(self, seconds: float) -> None:
+        """Set the time of day forward by so many seconds, or back, as `parting` then says."""
+        self._parted += seconds
+
+    def parting(self) -> float:
+        """Return by how many seconds the time of day was set since the last call."""
+        parted, self._parted = self._parted, 0.0
+        return parted
 
     def sleep(self, seconds: float) -> None:
         """Jump ahead."""

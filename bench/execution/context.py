@@ -131,6 +131,8 @@ class Run:
         died; see `bench.execution.notify`.
     changes : tuple of ParameterChange
         Parameters that are changed on the way, as in the run that is repeated.
+    rig_file : RigFile, optional
+        The rig, if it was read already; it is taken in the place of the one that `rig` and `overrides` name.
     """
 
     protocol: ProtocolDefinition
@@ -149,6 +151,7 @@ class Run:
     rehearse: bool = True
     notify: tuple[str, ...] = ()
     changes: tuple[ParameterChange, ...] = ()
+    rig_file: RigFile | None = None
 
 
 class RunContext(ExitStack):
@@ -413,7 +416,7 @@ def _asked(run: Run, attachment: Attachment | None, rig: RigFile) -> dict[str, A
 def _read(run: Run) -> tuple[RigFile, ProtocolParameters, ProtocolParameters]:
     """Return the rig file, the parameters as they are stated, and with the paths of files that can be read."""
     original = run.original
-    rig_file = (original and original.rig) or load_rig(run.rig, run.overrides)
+    rig_file = run.rig_file or (original and original.rig) or load_rig(run.rig, run.overrides)
     defaults = rig_file.protocols.get(run.protocol.name)
     stated = run.protocol.parse(run.settings, rig_file.roles, defaults, path=rig_file.path)
     return rig_file, stated, original.readable(run.protocol, stated) if original else stated

@@ -427,6 +427,7 @@ class MuscleLaboratory(EmulatedLaboratory):
                 "the position sensor loses its supply",
                 partial(setattr, self.magnet, "supply_volts", 0.0),
                 undo=partial(setattr, self.magnet, "supply_volts", self.magnet.supply_volts),
+                lies=True,
             ),
             "servo-overload": Fault("the servo trips and lets go", partial(self.servo.trip, HardwareError.OVERLOAD)),
             "broken-load-cell": self._force_sensor.faults()["force.out-of-range"],

@@ -113,11 +113,13 @@ class VO2Laboratory(EmulatedLaboratory):
                     self._displace,
                     {"metres": Quantity(20e-6, "m", -1e-3, 1e-3, "deflection that is added")},
                     undo=partial(self._displace, 0.0),
+                    lies=True,
                 ),
                 "spot-off-the-psd": Fault(
                     "the laser spot is beyond the end of the PSD",
                     partial(self._displace, 1.0),
                     undo=partial(self._displace, 0.0),
+                    lies=True,
                 ),
                 "cantilever-stuck": Fault(
                     "the cantilever stands still, as if it touched something", self._stick, undo=self._come_loose

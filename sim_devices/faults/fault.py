@@ -54,12 +54,15 @@ class Fault:
         What can be chosen.
     undo : callable, optional
         Make it end; without it the fault happens at an instant, and takes no duration.
+    lies : bool
+        Whether a value is wrong and nothing shows it: what is recorded then is as it was measured.
     """
 
     summary: str
     begin: Callable[..., None]
     values: Mapping[str, Quantity] = field(default_factory=dict)
     undo: Callable[[], None] | None = None
+    lies: bool = False
 
     def chosen(self, name: str, values: Mapping[str, float], duration: float | None) -> dict[str, float]:
         """Return the values with which it begins: those given, and the defaults of the others.

@@ -28,6 +28,13 @@ class Freezable(Protocol):
         """Undo `freeze`."""
 
 
+@runtime_checkable
+class Exchangeable(PowerCycled, Protocol):
+    """An instrument that has a serial number."""
+
+    serial_number: int
+
+
 def instrument_faults(name: str, instrument: object, line: FaultyLine) -> dict[str, Fault]:
     """Return what any instrument of this kind can suffer, by `INSTRUMENT.FAULT`."""
     found: dict[str, Fault] = {}
@@ -40,9 +47,19 @@ def instrument_faults(name: str, instrument: object, line: FaultyLine) -> dict[s
             partial(_lose_power, instrument, line),
             undo=partial(_regain_power, instrument, line),
         )
+    if isinstance(instrument, Exchangeable):
+        number = instrument.serial_number
+        found[f"{name}.exchange"] = Fault(
+            f"another instrument of its kind, with the next serial number, stands in the place of {name}",
+            partial(_exchange, instrument, line, number + 1),
+            undo=partial(_exchange, instrument, line, number),
+        )
     if isinstance(instrument, Freezable):
         found[f"{name}.freeze"] = Fault(
-            f"{name} answers and obeys, but what it measures stands still", instrument.freeze, undo=instrument.thaw
+            f"{name} answers and obeys, but what it measures stands still",
+            instrument.freeze,
+            undo=instrument.thaw,
+            lies=True,
         )
     return found
 
@@ -50,6 +67,11 @@ def instrument_faults(name: str, instrument: object, line: FaultyLine) -> dict[s
 def _restart(instrument: PowerCycled, line: FaultyLine) -> None:
     instrument.power_cycle()
     line.restart()
+
+
+def _exchange(instrument: Exchangeable, line: FaultyLine, serial_number: int) -> None:
+    instrument.serial_number = serial_number
+    _restart(instrument, line)
 
 
 def _lose_power(instrument: PowerCycled, line: FaultyLine) -> None:

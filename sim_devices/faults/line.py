@@ -61,6 +61,7 @@ class _Disturbance:
 
 
 DROP, CORRUPT, READDRESS, DOUBLE, DELAY = "drop", "corrupt", "readdress", "double", "delay"
+HALVE, GARBAGE, COMMA, SECOND_CLIENT = "halve", "garbage", "comma", "second-client"
 
 _SUMMARIES = {
     DROP: "answers of {} are lost; it has acted all the same",
@@ -68,10 +69,18 @@ _SUMMARIES = {
     READDRESS: "answers of {} come as from another address",
     DOUBLE: "answers of {} come twice",
     DELAY: "answers of {} come late",
+    HALVE: "answers of {} come in two pieces",
+    GARBAGE: "random bytes come before answers of {}",
+    COMMA: "answers of {} have a comma in the place of each decimal point",
+    SECOND_CLIENT: "another program uses the line of {}: an answer to it comes first, or in the place of one",
 }
+_MOST_GARBAGE = 8  # bytes
 _COUNT = Quantity(0, "", 0, 1e9, "number of answers; 0 for all of the duration, or one where there is none")
 _PROBABILITY = Quantity(1.0, "", 1e-6, 1.0, "probability with which an answer is disturbed")
-_DELAY = Quantity(0.25, "s", 0.0, 3600.0, "time by which an answer is late")
+_SECONDS = {
+    DELAY: Quantity(0.25, "s", 0.0, 3600.0, "time by which an answer is late"),
+    HALVE: Quantity(0.02, "s", 0.0, 3600.0, "time between the two pieces"),
+}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,6 +147,9 @@ class FaultyLine:
         self._rng = rng
         self._ended = ended
         self._disturbances: dict[str, _Disturbance] = {}
+        self._former = b""
+        """Answer before the last one."""
+        self._last = b""
         self.streams: list[FaultyStream] = []
 
     def faults(self) -> dict[str, Fault]:
@@ -155,19 +167,27 @@ class FaultyLine:
             for kind, (cable, summary) in states.items()
         }
         for kind, summary in _SUMMARIES.items():
-            if kind == READDRESS and not self._server.has_addresses:
+            if not self._is_possible(kind):
                 continue
             values = {"count": _COUNT, "probability": _PROBABILITY}
-            if kind == DELAY:
-                values["seconds"] = _DELAY
+            if kind in _SECONDS:
+                values["seconds"] = _SECONDS[kind]
             found[f"{name}.{kind}"] = AnswerFault(
                 summary=summary.format(name),
                 begin=partial(self.disturb, kind),
                 values=values,
                 undo=partial(self.leave_alone, kind),
                 disturbed=partial(self.disturbed, kind),
+                # A line of text has no check sum.
+                lies=kind == CORRUPT and self._server.is_text,
             )
         return found
+
+    def _is_possible(self, kind: str) -> bool:
+        if kind in (GARBAGE, SECOND_CLIENT):
+            # TCP has a check of its own, and a connection for each client.
+            return not isinstance(self._server, TcpServer)
+        return {READDRESS: self._server.has_addresses, COMMA: self._server.is_text}.get(kind, True)
 
     def watch(self) -> None:
         """Look at all bytes from now on."""
@@ -233,13 +253,28 @@ class FaultyLine:
             return [*sent, (0.0, answer[: len(answer) // 2])]
         hit = [(kind, seconds) for kind in _SUMMARIES if (seconds := self._meets(kind)) is not None]
         kinds = dict(hit)
+        self._former, self._last = self._last, answer
         if DROP in kinds:
             return sent
+        before = b""
+        if GARBAGE in kinds:
+            before = self._rng.bytes(int(self._rng.integers(1, _MOST_GARBAGE + 1)))
+        if SECOND_CLIENT in kinds:
+            before += self._former
+            if self._rng.random() < 0.5:
+                return [*sent, (0.0, before)]
+        if COMMA in kinds:
+            answer = answer.replace(b".", b",")
         if READDRESS in kinds:
             answer = self._server.readdressed(answer)
         if CORRUPT in kinds:
             answer = self._server.corrupted(answer, self._rng)
-        return sent + [(kinds.get(DELAY, 0.0), answer)] * (2 if DOUBLE in kinds else 1)
+        delay, answer = kinds.get(DELAY, 0.0), before + answer
+        pieces = [(delay, answer)]
+        if HALVE in kinds:
+            half = len(answer) // 2
+            pieces = [(delay, answer[:half]), (delay + kinds[HALVE], answer[half:])]
+        return sent + pieces * (2 if DOUBLE in kinds else 1)
 
     def _meets(self, kind: str) -> float | None:
         """Return the seconds of a disturbance that meets this answer, None if it does not."""

@@ -72,16 +72,13 @@ class FaultySensor:
         slope = Quantity(2.0 * scale / 3600.0, f"{unit}/s", -size, size, "drift")
         place = Quantity(self._beyond, unit, -size, size, "what it sees")
         return {
-            f"{name}.stuck": Fault(f"the sensor of {name} stands still", self._stick, undo=self._come_loose),
-            f"{name}.noisy": Fault(
-                f"the sensor of {name} is noisy", self._be_noisy, {"rms": noise}, undo=self._be_quiet
-            ),
-            f"{name}.drifting": Fault(
-                f"the sensor of {name} drifts", self._drift, {"slope": slope}, undo=self._stop_drifting
-            ),
-            f"{name}.out-of-range": Fault(
-                f"the sensor of {name} sees a value out of its range", self._leave, {"value": place}, self._return
-            ),
+            f"{name}.{kind}": Fault(f"the sensor of {name} {summary}", begin, values, undo, lies=True)
+            for kind, summary, begin, values, undo in (
+                ("stuck", "stands still", self._stick, {}, self._come_loose),
+                ("noisy", "is noisy", self._be_noisy, {"rms": noise}, self._be_quiet),
+                ("drifting", "drifts", self._drift, {"slope": slope}, self._stop_drifting),
+                ("out-of-range", "sees a value out of its range", self._leave, {"value": place}, self._return),
+            )
         }
 
     def _disturbed(self) -> float:

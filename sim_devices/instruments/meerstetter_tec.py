@@ -132,18 +132,18 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
     ) -> None:
         super().__init__(name, world, rng)
         self._load = load
-        self._identity = Identity(
-            "Meerstetter Engineering", f"TEC-{_DEVICE_TYPE}", str(serial_number), f"{firmware / 100:.2f}"
-        )
+        self._firmware = firmware
+        self.serial_number = serial_number
         self._saved = {
             _key(number, instance): stored(row, row.default)
             for number, row in PARAMETERS.items()
             for instance in range(1, row.instances + 1)
         }
         self._values = dict(self._saved)
-        self._values |= {100: _DEVICE_TYPE, 101: _HARDWARE_VERSION, 102: serial_number, 103: firmware}
+        self._values |= {100: _DEVICE_TYPE, 101: _HARDWARE_VERSION, 103: firmware}
         self._readings: dict[int, Callable[..., Any]] = {
             104: lambda: self._status,
+            102: lambda: self.serial_number,
             105: lambda: self._error,
             106: lambda: self._error_instance,
             107: lambda: self._error_parameter,
@@ -271,6 +271,12 @@ class EmulatedTEC(FreezingReadings, EmulatedInstrument, TECAmplifier):
             self._announce(self._restart_due)
 
     # Faults.
+
+    @property
+    def identity(self) -> Identity:
+        """Maker, model, serial number and firmware."""
+        firmware = f"{self._firmware / 100:.2f}"
+        return Identity("Meerstetter Engineering", f"TEC-{_DEVICE_TYPE}", str(self.serial_number), firmware)
 
     def power_cycle(self) -> None:
         """Switch the supply off and on again: what is in RAM is lost, what is in the flash stays."""

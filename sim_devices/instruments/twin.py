@@ -115,6 +115,7 @@ class TwinServer(WireServer):
     """The line of a twin's device: a request and an answer a line of text."""
 
     protocol = "lines of text"
+    is_text = True
 
     def __init__(self, instrument: EmulatedTwin) -> None:
         self._instrument = instrument

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
 def emulated_rig() -> Iterator[Callable[..., EmulatedRig]]:
     """Serve emulated rigs until the end of the test: `rig = emulated_rig("vo2")`.
 
-    Options are those of `sim_devices.serving.process.serve`: `clock`, `seed`, `tcp`, `baud_time`, `overrides`.
+    Options are those of `sim_devices.serving.process.serve`: `clock`, `seed`, `tcp`, `baud_time`, `overrides`,
+    `faults`.
     """
     # Every run of pytest imports this module; only tests that use the fixture pay for the rest.
     from sim_devices.serving.process import serve

@@ -14,11 +14,12 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 from bench.base import BenchError, ConfigurationError, Stopwatch
 from bench.rig import ControlClient, Endpoint, read_endpoints
@@ -70,6 +71,7 @@ def serve(
     tcp: bool = False,
     baud_time: bool = False,
     overrides: Mapping[str, str] | None = None,
+    faults: Sequence[Mapping[str, Any]] = (),
 ) -> Iterator[EmulatedRig]:
     """Serve an emulated rig from a process of its own until the block is left.
 
@@ -89,11 +91,13 @@ def serve(
         Whether bytes take the time of the line's speed.
     overrides : mapping of str to str, optional
         Values of the rig file to replace, by dotted key.
+    faults : sequence of mappings
+        Faults at instants from now on, with the keys of a schedule: `{"at": 2.0, "fault": "tec.drop"}`.
 
     Raises
     ------
     ConfigurationError
-        If the rig cannot be served; the message is that of `bench emulate`.
+        If the rig cannot be served, or has no such fault; the message is that of `bench emulate`.
     """
     with ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="bench-emulate-")))
@@ -114,6 +118,8 @@ def serve(
         control = ControlClient(endpoints.control)
         stack.callback(_stop, control)
         control.request("end-with-connection")
+        if faults:
+            control.request("schedule", faults=[*map(dict, faults)])
         yield EmulatedRig(served.rig, served.instruments, control, endpoints_file)
 
 

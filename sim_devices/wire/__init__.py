@@ -42,10 +42,13 @@ class Answering:
         Name of what is spoken on the line, for people.
     has_addresses : bool
         Whether an answer says whose it is, or which request it belongs to.
+    is_text : bool
+        Whether numbers are written with a decimal point.
     """
 
     protocol: str = "serial"
     has_addresses: bool = False
+    is_text: bool = False
 
     def answer_begins(self, sent: bytes) -> int:  # noqa: ARG002
         """Return where, in what is sent upon a request, the instrument's own answer begins: after an adapter's."""

@@ -19,6 +19,7 @@ class LineServer(WireServer):
     """
 
     protocol = "lines of text"
+    is_text = True
     end: ClassVar[bytes] = b"\n"
     _received = b""
 
@@ -38,6 +39,7 @@ class TextServer(WireServer):
     """The line of an emulated text instrument, with the terminators and the encoding of its table."""
 
     protocol = "lines of text"
+    is_text = True
 
     def __init__(self, instrument: EmulatedTextInstrument) -> None:
         self._instrument = instrument

@@ -43,10 +43,17 @@ def test_a_run_whose_journal_stays_locked_has_a_code_of_its_own(bench, monkeypat
         raise sqlite3.OperationalError("database is locked")
 
     monkeypatch.setattr(Store, "write", locked)
+    (tmp_path / "warm.py").write_text(
+        "from bench.protocol import *\n\n"
+        "@protocol(needs=('tec',))\n"
+        "def warm(parameters: ProtocolParameters):\n"
+        "    '''Warm the plate.'''\n"
+        "    for celsius in range(30, 46):\n"
+        "        yield Step({'tec': float(celsius)}, Dwell(2.0))\n"
+    )
     code, _, err = bench(
-        "run", f"{TOOLS / 'excursions.py'}:excursion-vo2", "--rig", "vo2", "--clock", "virtual",
-        "--out", tmp_path / "runs",
-    )  # fmt: skip
+        "run", tmp_path / "warm.py", "--rig", "vo2", "--clock", "virtual", "--out", tmp_path / "runs"
+    )
     assert code == 8
     assert "database is locked" in err
     assert "bench recover-journal" in err
