@@ -92,6 +92,23 @@ class LineDevice(Device, Generic[SettingsT, LineT]):
         return cls._open(name, settings, clock, cls._start)
 
     @classmethod
+    def identify_at(cls, name: str, settings: SettingsT, clock: Clock) -> Identity:
+        """Return which instrument answers at the line of the settings; it is only asked, and the line is released.
+
+        Raises
+        ------
+        DeviceConnectionError
+            If the line cannot be opened, nothing answers, or another kind of instrument does.
+        DeviceError
+            If it reports an error.
+        """
+        line = cls._open_line(name, settings, clock)
+        try:
+            return cls(name, settings, clock, line)._identify()
+        finally:
+            line.close()
+
+    @classmethod
     def _open(cls, name: str, settings: SettingsT, clock: Clock, start: Callable[[Self], None]) -> Self:
         line = cls._open_line(name, settings, clock)
         try:

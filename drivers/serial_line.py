@@ -413,18 +413,23 @@ def _opened(device: str, settings: SerialSettings, options: Mapping[str, object]
         raise DeviceConnectionError(device, f"cannot open {settings.port}: {error}") from None
 
 
-def _use_of(port: str) -> str:
-    """Return which process holds the lock of a port, as far as Linux says so, and what to do."""
-    try:
+def holder_of(port: str) -> tuple[int, str] | None:
+    """Return number and name of the process that holds the lock of a port, as far as Linux says so."""
+    with suppress(OSError, StopIteration, IndexError, ValueError):
         node = Path(port).stat()
         place = f"{os.major(node.st_dev):02x}:{os.minor(node.st_dev):02x}:{node.st_ino}"
         locks = (line.split() for line in Path("/proc/locks").read_text().splitlines())
         process = int(next(words[4] for words in locks if words[1] == "FLOCK" and words[5] == place))
-        if process == os.getpid():
-            return "this program has opened it already; devices share it by a table [lines.NAME] of the rig file"
-        name = f"process {process} ({Path(f'/proc/{process}/comm').read_text().strip()})"
-    except (OSError, StopIteration, IndexError, ValueError):
-        name = "another process"
+        return process, Path(f"/proc/{process}/comm").read_text().strip()
+    return None
+
+
+def _use_of(port: str) -> str:
+    """Return which process holds the lock of a port, and what to do."""
+    holder = holder_of(port)
+    if holder is not None and holder[0] == os.getpid():
+        return "this program has opened it already; devices share it by a table [lines.NAME] of the rig file"
+    name = "another process" if holder is None else f"process {holder[0]} ({holder[1]})"
     return f"it is in use by {name}; end that program first"
 
 

@@ -39,11 +39,14 @@ class TrueValue:
         Its unit; empty of a switch or a share.
     is_output : bool
         Whether an instrument sets it, so that each change of it is logged.
+    behind : str
+        The output that has to be on for this one to drive anything; empty if it does by itself.
     """
 
     value: float
     unit: str = ""
     is_output: bool = False
+    behind: str = ""
 
 
 def tec_faults(tec: EmulatedTEC) -> dict[str, Fault]:

@@ -266,7 +266,7 @@ class HybridLaboratory(EmulatedLaboratory):
             "tec_voltage": TrueValue(plant.tec_voltage, "V"),
             "tec_output": TrueValue(self.tec.status is DeviceStatus.RUN, is_output=True),
             "piezo_voltage": TrueValue(plant.piezo_voltage, "V"),
-            "amplifier_command": TrueValue(self.t7.tdac_volts(0), "V", is_output=True),
+            "amplifier_command": TrueValue(self.t7.tdac_volts(0), "V", is_output=True, behind="amplifier_enable"),
             "amplifier_enable": TrueValue(self.t7.dio_level(ENABLE_LINE, pulled_down=True), is_output=True),
         }
 

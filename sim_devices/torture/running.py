@@ -41,6 +41,8 @@ _WATCHDOG_MARGIN = 5.0
 """Time after which the watchdogs have made every output safe, beyond the longest of them, s."""
 _LONGEST = 300.0
 """Wall-clock time after which a run hangs, s."""
+_REFERENCES = 3
+"""Runs without a fault at least, from which the noise of each signal is known."""
 _LEAST_SHARE = 0.01
 """Of the range, below which an excursion is of no use."""
 _NEAR = 0.01
@@ -156,7 +158,7 @@ class Bed:
         for signal, (low, high) in self._limits().items():
             if (source := reference.sources.get(signal)) is None:
                 continue
-            margin = source.tolerance + _NEAR * max(abs(low), abs(high))
+            margin = reference.tolerances[signal] + _NEAR * max(abs(low), abs(high))
             for instant, values in self.observed.seen:
                 value = source.scale * values[source.name] + source.offset
                 if not low - margin <= value <= high + margin:
@@ -231,7 +233,7 @@ def reference_of(task: Task, seed: int) -> Reference:
             raise BenchError(f"seed {seed}: the run without a fault ended: {outcome.reason}")
         (journal,) = Path(folder).glob("*/")
         with Record(journal) as record:
-            return Reference.of(record, bed.observed, outcome.laboratory_seconds)
+            return Reference.of(record, bed.observed, outcome.laboratory_seconds, bed.file.derived)
 
 
 def torture(task: Task, fault: str, seed: int, reference: Reference) -> Cell:
@@ -296,8 +298,11 @@ def cells(
 ) -> Iterator[Cell]:
     """Yield each run as it is judged, in the order of faults and seeds; one that hangs is one of its failures."""
     with Workers(processes, console, f"torture {task.rig}", kernels=kernels) as workers:
-        waiting = [workers.submit_as(f"no fault {seed}", reference_of, task, seed) for seed in range(seeds)]
-        references = [each.result() for each in waiting]
+        waiting = [
+            workers.submit_as(f"no fault {seed}", reference_of, task, seed) for seed in range(max(seeds, _REFERENCES))
+        ]
+        found = [each.result() for each in waiting]
+        references = [each.widened(found) for each in found]
         pending = [
             (name, seed, workers.submit_as(f"{name} {seed}", torture, task, name, seed, references[seed]))
             for name in faults

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import math
 from bisect import bisect_left, bisect_right
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import pairwise
-from statistics import median
 from typing import Any
 
 import numpy as np
@@ -26,6 +25,9 @@ _YOUNG = 0.2
 _WIDER = 2.0
 """Tolerance over the largest deviation without a fault. Derivation: of some 50 readings that is 2.3 standard
 deviations of noise; twice as far is one reading in 200 000."""
+_DEVIATIONS = 7.5
+"""Tolerance over the median deviation from the true value. Derivation: the median of noise is 0.67 standard
+deviations, so it is 5 of them."""
 _DIGITS = 1e-6
 """Rounding, as a part of the largest value. Derivation: instruments send single precision, 6e-8, or six digits."""
 _EXPLAINED = 0.2
@@ -67,10 +69,15 @@ class Observed:
         self.laboratory.at(now + _PERIOD, self._look)
 
     def outputs(self) -> dict[str, float]:
-        """Return the outputs of the instruments as they are now, by name."""
+        """Return what the outputs of the instruments drive now, by name."""
         if self.laboratory.world is not None:
             self.laboratory.world.advance()
-        return {name: float(each.value) for name, each in self.laboratory.truth().items() if each.is_output}
+        truth = self.laboratory.truth()
+        return {
+            name: float(each.value) if not each.behind or truth[each.behind].value else 0.0
+            for name, each in truth.items()
+            if each.is_output
+        }
 
     def units(self) -> dict[str, str]:
         """Return the units of the true values by name."""
@@ -102,12 +109,11 @@ def rows_of(record: Record) -> Rows:
 
 @dataclass(frozen=True)
 class Source:
-    """The true value that a signal shows: `scale * NAME + offset`, within a tolerance, in the unit of the signal."""
+    """The true value that a signal shows: `scale * NAME + offset`, in the unit of the signal."""
 
     name: str
     scale: float
     offset: float
-    tolerance: float
 
     def range(self, observed: Observed, instant: float, age: float) -> tuple[float, float]:
         """Return what the signal would be since `age` s before an instant, without noise."""
@@ -122,50 +128,59 @@ class Reference:
     Attributes
     ----------
     envelopes : mapping of str to list of (float, float)
-        By signal, what it was during each step and the one before, with its noise.
+        By signal, what it was during each step and the one before.
     sources : mapping of str to Source
         By signal, the true value that it shows, if there is one.
+    tolerances : mapping of str to float
+        By signal, how far noise and instrument may bring it off.
     seconds : float
         Laboratory time of the run.
     """
 
     envelopes: Mapping[str, Sequence[tuple[float, float]]]
     sources: Mapping[str, Source]
+    tolerances: Mapping[str, float]
     seconds: float
 
     @classmethod
-    def of(cls, record: Record, observed: Observed, seconds: float) -> Reference:
-        """Return the reference of a run without a fault."""
+    def of(cls, record: Record, observed: Observed, seconds: float, derived: Collection[str] = ()) -> Reference:
+        """Return the reference of a run without a fault; derived signals are as true as what they come from."""
         rows, units = rows_of(record), observed.units()
-        envelopes, sources = {}, {}
+        envelopes, sources, tolerances = {}, {}, {}
         for signal in record.signals:
-            if signal.name.endswith("_setpoint"):
-                # What was sent; nothing measures it.
+            if signal.name.endswith("_setpoint") or signal.name in derived:
+                # What was sent, nothing measures.
                 continue
             seen = [(step, instant, values[signal.name]) for step, instant, values in rows]
-            source = _source(signal.unit, seen, observed, units)
-            if source is not None:
-                sources[signal.name] = source
-            margin = source.tolerance if source else _WIDER * _scatter(seen)
+            tolerances[signal.name] = _WIDER * _scatter(seen)
+            if (found := _source(signal.unit, seen, observed, units)) is not None:
+                tolerances[signal.name], sources[signal.name] = found
             steps = 1 + max(step for step, _, _ in seen)
             holds = [[v for step, _, v in seen if number - 1 <= step <= number] for number in range(steps)]
-            envelopes[signal.name] = [(min(hold) - margin, max(hold) + margin) for hold in holds]
-        return cls(envelopes, sources, seconds)
+            envelopes[signal.name] = [(min(hold), max(hold)) for hold in holds]
+        return cls(envelopes, sources, tolerances, seconds)
+
+    def widened(self, others: Iterable[Reference]) -> Reference:
+        """Return it with the largest tolerances of several: what is rare need not have happened in this one."""
+        return replace(
+            self, tolerances={name: max(each.tolerances[name] for each in others) for name in self.tolerances}
+        )
 
     def lie(self, record: Record, observed: Observed, said: str) -> str:
         """Return the first recorded value that is not true, of a signal that `said` does not name; else nothing."""
         for step, instant, values in rows_of(record):
             for signal, holds in self.envelopes.items():
-                value = values[signal]
+                value, tolerance = values[signal], self.tolerances[signal]
                 low, high = holds[min(step, len(holds) - 1)]
-                if low <= value <= high or math.isnan(value) or signal in said:
+                if low - tolerance <= value <= high + tolerance or math.isnan(value) or signal in said:
                     continue
-                source = self.sources.get(signal)
-                if source is not None:
+                if (source := self.sources.get(signal)) is not None:
                     low, high = source.range(observed, instant, _AGE)
-                    low, high = low - source.tolerance, high + source.tolerance
-                if not low <= value <= high:
-                    return f"{signal} = {value:.6g} at {instant:.2f} s, truly {low:.6g} to {high:.6g}"
+                if not low - tolerance <= value <= high + tolerance:
+                    return (
+                        f"{signal} = {value:.6g} at {instant:.2f} s, truly {low:.6g} to {high:.6g}, "
+                        f"give or take {tolerance:.2g}"
+                    )
         return ""
 
 
@@ -177,28 +192,28 @@ def _scatter(seen: Sequence[tuple[int, float, float]]) -> float:
 
 def _source(
     unit: str, seen: Sequence[tuple[int, float, float]], observed: Observed, units: Mapping[str, str]
-) -> Source | None:
-    """Return the true value that a signal shows best; None if none does."""
-    scatter = _scatter(seen)
+) -> tuple[float, Source] | None:
+    """Return the true value that a signal shows best, after its tolerance; None if none does."""
     values = np.array([value for _, _, value in seen])
+    scatter, steps = _scatter(seen), np.diff(np.unique(values))
+    least = max(_DIGITS * float(np.abs(values).max()), float(steps.min()) / 2 if steps.size else 0.0)
     found = []
     for name, other in units.items():
-        true = np.array([float(np.mean(observed.span(name, instant, _YOUNG))) for _, instant, _ in seen])
-        lines = [(1.0, median(values - true))] if other == unit else []
-        if np.ptp(true) > 0:
-            scale, offset = np.polyfit(true, values, 1)
-            lines.append((float(scale), float(offset)))
-        for number, (scale, offset) in enumerate(lines):
-            source = Source(name, scale, float(offset), 0.0)
-            worst = 0.0
-            for _, instant, value in seen:
-                low, high = source.range(observed, instant, _YOUNG)
-                worst = max(worst, low - value, value - high)
-            is_plain = other == unit and number == 0
+        spans = np.array([observed.span(name, instant, _YOUNG) for _, instant, _ in seen])
+        true, motion = spans.mean(axis=1), np.ptp(spans, axis=1)
+        # When a moving one was read is not known well.
+        still = motion <= np.median(motion)
+        lines = [(True, 1.0, float(np.median((values - true)[still])))] if other == unit else []
+        if np.ptp(true[still]) > 0:
+            slope, start = np.polyfit(true[still], values[still], 1)
+            lines.append((False, float(slope), float(start)))
+        for is_plain, scale, offset in lines:
+            noise = _DEVIATIONS * float(np.median(np.abs(values - scale * true - offset)[still]))
+            low, high = np.sort(scale * spans + offset, axis=1).T
+            worst = float(np.max(np.maximum(low - values, values - high)))
             # One that hardly moves shows the quantity of its unit, with noise.
             if worst <= max(_EXPLAINED * np.ptp(values), scatter if is_plain else 0.0):
-                found.append(
-                    (not is_plain, replace(source, tolerance=_WIDER * worst + _DIGITS * float(np.abs(values).max())))
-                )
-    # A fitted scale may be closer by chance.
-    return min(found, key=lambda each: (each[0], each[1].tolerance))[1] if found else None
+                tolerance = max(_WIDER * worst, noise, least)
+                # A fitted scale may be closer by chance.
+                found.append((tolerance if is_plain else 2.0 * tolerance, tolerance, Source(name, scale, offset)))
+    return min(found, key=lambda each: each[0])[1:] if found else None

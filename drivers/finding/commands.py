@@ -1,0 +1,105 @@
+"""The command `bench find`."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.markup import escape
+from rich.table import Table
+
+from bench.base import ConfigurationError, show_table
+from bench.cli import JsonOption, console, parse_assignments, write_json
+
+
+def find(
+    rig: Annotated[
+        str | None,
+        typer.Argument(metavar="[RIG]", help="Rig whose devices are looked for; without it ports are listed."),
+    ] = None,
+    further: Annotated[
+        list[str] | None,
+        typer.Option("--port", metavar="PATH", help="A port that the system does not list; repeatable."),
+    ] = None,
+    hosts: Annotated[
+        list[str] | None, typer.Option("--host", help="Address of a T7 beyond the local network; repeatable.")
+    ] = None,
+    write: Annotated[
+        bool,
+        typer.Option("--write", help="Write port and serial_number of each device that was found into the rig file."),
+    ] = False,
+    attach: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Endpoints file of `bench emulate --json`: look at the ports that are served."
+        ),
+    ] = None,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--override", metavar="KEY=VALUE", help="Replace a value of the rig file; repeatable."),
+    ] = None,
+    json_file: JsonOption = None,
+) -> None:
+    """List serial ports and LabJack T7s, and find out which device of a rig is at which of them.
+
+    At each port that nobody holds the devices of the rig are asked for in turn, each in its own dialect, and for
+    nothing but its identity: nothing is configured and nothing moves. Where nothing answers, other speeds and
+    parities are tried. Equal instruments are told apart by the key serial_number.
+
+    Exit codes: 0 every device was found, or there is no rig; 1 some were not, or are interchangeable; 2 the rig file
+    is wrong.
+    """
+    from bench.rig import load_rig, read_endpoints
+    from drivers.finding.places import answers, askable, keys_of, placements
+    from drivers.finding.ports import ports
+
+    served: list[str] = []
+    if attach is not None:
+        rigs = read_endpoints(attach).served.values()
+        served = [each.port for one in rigs for each in one.instruments.values()]
+    known = ports([*(further or []), *served], hosts or [], search=not served)
+    table = Table("port", "description", "USB serial number", "remark", box=None, padding=(0, 2))
+    for each in known:
+        table.add_row(*map(escape, (each.name, each.description, each.serial_number, each.problem)))
+    show_table(console, table)
+    if rig is None:
+        write_json(json_file, {"ports": [asdict(each) for each in known], "devices": {}})
+        return
+    if write and not rig.endswith(".toml"):
+        raise ConfigurationError(f"--write: {rig} is a packaged rig; copy its file, and give the path of the copy")
+    file = load_rig(rig, parse_assignments("--override", overrides or []))
+    placed = placements(file, answers(file, known), known)
+    table = Table("device", "port", "instrument", "remark", box=None, padding=(0, 2))
+    for one in placed:
+        port, identity = ("–", "–") if one.answer is None else (one.answer.port.name, str(one.answer.identity))
+        table.add_row(*map(escape, (one.device, port, identity, one.remark)))
+    console.print()
+    show_table(console, table)
+    if write:
+        keys = {
+            one.device: keys_of(entry, one.answer)
+            for one, entry in zip(placed, askable(file), strict=True)
+            if one.answer
+        }
+        _write(Path(rig), keys)
+    write_json(
+        json_file, {"ports": [asdict(each) for each in known], "devices": {one.device: asdict(one) for one in placed}}
+    )
+    if not all(one.is_settled for one in placed):
+        sys.exit(1)
+
+
+def _write(path: Path, keys: Mapping[str, Mapping[str, Any]]) -> None:
+    """Write keys of devices into a rig file, whose comments stay."""
+    import tomlkit
+
+    document: Any = tomlkit.parse(path.read_text(encoding="utf-8"))
+    devices = document.setdefault("devices", tomlkit.table(is_super_table=True))
+    for device, values in keys.items():
+        devices.setdefault(device, tomlkit.table()).update(values)
+    path.write_text(tomlkit.dumps(document), encoding="utf-8")
+    console.print(f"written: {path}", highlight=False)

@@ -1,0 +1,208 @@
+"""Who is at which port: each device of a rig is asked for in its own dialect, and nothing but its identity."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from itertools import product
+from typing import Any
+
+from pydantic import ValidationError
+
+from bench.base import BenchError, WallClock
+from bench.devices import DriverSettings, Identity
+from bench.rig import DeviceEntry, RigFile, port_of
+from drivers.device import LineDevice
+from drivers.finding.ports import Port
+from drivers.labjack_t7.device import T7Device
+
+_HASTE, _HASTE_IN_NETWORK = 0.15, 0.5
+"""Longest wait for an answer, s. Derivation: 100 bytes at 9600 Bd take 0.1 s, and a USB adapter 16 ms."""
+_SPEEDS = (9600, 19200, 38400, 57600, 115200, 1000000)
+"""Tried where nothing answers, Bd: what instruments are delivered with."""
+_PARITIES = ("N", "E")
+
+
+@dataclass(frozen=True)
+class Answer:
+    """A device that answered at a port, with other settings than those of the rig file if need be."""
+
+    device: str
+    port: Port
+    identity: Identity
+    changed: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Placement:
+    """Where a device is.
+
+    Attributes
+    ----------
+    device : str
+        Its name.
+    answer : Answer or None
+        Who answers, and where; None if it was not found, or is not told from another one.
+    remark : str
+        What is to be known or done; empty if it is where the rig file says.
+    is_settled : bool
+        Whether it was found.
+    """
+
+    device: str
+    answer: Answer | None
+    remark: str
+
+    @property
+    def is_settled(self) -> bool:
+        """Whether it is known where it is."""
+        return self.answer is not None
+
+
+def askable(file: RigFile) -> list[DeviceEntry]:
+    """Return the devices of a rig that have a line of their own."""
+    return [each for each in file.devices if issubclass(each.driver, LineDevice) and hasattr(each.settings, "port")]
+
+
+def answers(file: RigFile, ports: Sequence[Port]) -> list[Answer]:
+    """Ask at every port, all at the same time, for each device of a rig in turn.
+
+    Ports at which nothing answers are asked with other speeds and parities for the devices that were not found.
+    """
+    entries = askable(file)
+    open_ports = [port for port in ports if not port.problem]
+    if not open_ports:
+        return []
+    with ThreadPoolExecutor(len(open_ports)) as pool:
+        found = [each for some in pool.map(lambda port: [*_asked(entries, port)], open_ports) for each in some]
+        lost = [entry for entry in entries if entry.name not in {each.device for each in found}]
+        silent = [port for port in open_ports if port not in [each.port for each in found] and not port.in_network]
+        more = pool.map(lambda port: [*_asked(lost, port, others=True)], silent)
+        return found + [each for some in more for each in some]
+
+
+def _asked(entries: Iterable[DeviceEntry], port: Port, *, others: bool = False) -> Iterator[Answer]:
+    heard: list[DeviceEntry] = []
+    for entry in sorted(entries, key=lambda each: port_of(each.settings) not in (port.address, port.link)):
+        if port.in_network != (issubclass(entry.driver, T7Device) or port_of(entry.settings).startswith("tcp://")):
+            continue
+        # A line has one dialect: its equals, and those that share the line.
+        if heard and not any(_may_share(entry, other) for other in heard):
+            continue
+        for changed in _others(entry.settings) if others else [{}]:
+            identity = _identity(entry, port, changed)
+            if identity is not None:
+                heard.append(entry)
+                yield Answer(entry.name, port, identity, changed)
+                break
+
+
+def _may_share(one: DeviceEntry, other: DeviceEntry) -> bool:
+    return (
+        one.driver is other.driver
+        or port_of(one.settings) == port_of(other.settings)
+        or (issubclass(one.driver, T7Device) and issubclass(other.driver, T7Device))
+    )
+
+
+def _others(settings: DriverSettings) -> Iterator[dict[str, Any]]:
+    """Yield what a line may be set to otherwise: an adapter's echo, speed and parity."""
+    known = settings.model_dump()
+    choices = {"echo": (False, True), "parity": _PARITIES, "baudrate": _SPEEDS}
+    keys = [key for key in choices if key in known]
+    for values in product(*(choices[key] for key in keys)):
+        changed = {key: value for key, value in zip(keys, values, strict=True) if value != known[key]}
+        if changed:
+            yield changed
+
+
+def _identity(entry: DeviceEntry, port: Port, changed: Mapping[str, Any]) -> Identity | None:
+    haste = _HASTE_IN_NETWORK if port.in_network else _HASTE
+    update = {"port": port.address, **changed}
+    if (timeout := getattr(entry.settings, "timeout", None)) is not None:
+        update["timeout"] = min(timeout, haste)
+    try:
+        settings = entry.settings.model_copy(update=update)
+        identity: Identity = entry.driver.identify_at(entry.name, settings, WallClock())
+    except (BenchError, ValidationError, OSError, ValueError):
+        return None
+    return identity
+
+
+def placements(file: RigFile, found: Sequence[Answer], ports: Sequence[Port]) -> list[Placement]:
+    """Return where each device is, in the order of the rig file.
+
+    Devices with one address in the rig file share a line and are placed together. Instruments that answer alike are
+    told apart by `serial_number`; what the others leave over is taken for the last one.
+    """
+    links = {port.link: port.address for port in ports if port.link}
+    lines: dict[str, list[DeviceEntry]] = {}
+    for entry in askable(file):
+        line = port_of(entry.settings)
+        lines.setdefault(links.get(line, line), []).append(entry)
+    heard = {(each.device, each.port.address): each for each in found}
+    fitting = {
+        line: {
+            address
+            for _, address in heard
+            if all((answer := heard.get((each.name, address))) and _fits(each, answer) for each in group)
+        }
+        for line, group in lines.items()
+    }
+    left, placed = dict(fitting), dict[str, str]()
+    while single := [
+        line
+        for line, where in left.items()
+        if len(where) == 1 and not any(other == where for name, other in left.items() if name != line)
+    ]:
+        (placed[single[0]],) = left.pop(single[0])
+        left = {line: where - {placed[single[0]]} for line, where in left.items()}
+    result = {}
+    for line, group in lines.items():
+        for entry in group:
+            if line not in placed:
+                alike = [
+                    each.name for other in left if other != line and left[other] & left[line] for each in lines[other]
+                ]
+                own = [each for each in found if each.device == entry.name]
+                result[entry.name] = Placement(entry.name, None, _unplaced(entry, own, fitting[line], alike))
+                continue
+            answer = heard[entry.name, placed[line]]
+            remarks = [f"answers with {key} = {value}" for key, value in answer.changed.items()]
+            if placed[line] != line:
+                others = ", ".join(each.name for each in lines.get(placed[line], ()))
+                remarks.insert(0, f"answers at the port of {others}" if others else f"the rig file says {line}")
+            result[entry.name] = Placement(entry.name, answer, "; ".join(remarks))
+    return [result[each.name] for each in askable(file)]
+
+
+def _fits(entry: DeviceEntry, answer: Answer) -> bool:
+    return _wanted(entry) in ("", answer.identity.serial_number.strip())
+
+
+def _wanted(entry: DeviceEntry) -> str:
+    """Return the serial number that the rig file says; empty if it says none."""
+    number = getattr(entry.settings, "serial_number", "")
+    return number.strip() if isinstance(number, str) else ""
+
+
+def _unplaced(entry: DeviceEntry, own: Sequence[Answer], fitting: Collection[str], alike: Sequence[str]) -> str:
+    """Return why a device has no place; `own` are its answers, `alike` the devices that it may be taken for."""
+    if not own:
+        return "nothing answers as it would: check power, cable, address and speed"
+    heard = " and ".join(f"{each.identity.serial_number} at {each.port.name}" for each in own)
+    if not all(_fits(entry, each) for each in own) and not fitting:
+        return f"another instrument answers, serial number {heard}; the rig file says {_wanted(entry)}"
+    if not fitting or not alike:
+        return f"not told from others; serial numbers: {heard}"
+    return f"interchangeable with {', '.join(alike)}: write serial_number into the rig file; there are {heard}"
+
+
+def keys_of(entry: DeviceEntry, answer: Answer) -> dict[str, Any]:
+    """Return what a rig file has to say of a device that was found."""
+    keys = {"port": answer.port.name, **answer.changed}
+    field_of_key = type(entry.settings).model_fields.get("serial_number")
+    if field_of_key is not None and field_of_key.annotation is str:
+        keys["serial_number"] = answer.identity.serial_number
+    return keys
