@@ -23,6 +23,7 @@ from bench.rig import EMULATED, Rig, RigDescription, RigFile, TelemetryTable, lo
 from sim_devices.laboratory import EmulatedLaboratory
 from sim_devices.torture.excursion import COUNT, DWELL, excursion, setpoints
 from sim_devices.torture.truth import Observed, Reference
+from sim_devices.transducers.specimens import SensorSettings
 
 CHECKS = ("ends", "safe", "limits", "names", "rows", "true")
 PASSED = ("ok", ".", "w")
@@ -113,6 +114,9 @@ class Bed:
             )
         if not file.in_process:
             raise ConfigurationError(f"rig {file.name} has devices that are not emulated; expected ports {EMULATED}…")
+        if issubclass(file.laboratory.Settings, SensorSettings):
+            # What is compared with the truth is what faults do, not what a sensor is off by.
+            file = load_rig(task.rig, {"emulation.sensors": "ideal", **task.overrides})
         observed = Observed(file.laboratory)
         period = min(file.telemetry.period, _PERIOD)
         file = replace(file, laboratory=observed, telemetry=TelemetryTable(period=period))

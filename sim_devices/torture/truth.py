@@ -16,10 +16,12 @@ from bench.base import Clock, VirtualClock
 from bench.record import Record
 from sim_devices.laboratory import EmulatedLaboratory
 
-_PERIOD = 0.05
-"""Laboratory time between two looks at the truth, s."""
+_PERIOD = 0.02
+"""Laboratory time between two looks at the truth, s: a cantilever rings with some 30 Hz."""
 _AGE = 1.5
 """Age that a value may have when it is recorded, s: other devices are asked first, three times if need be."""
+_BURST = 0.05
+"""How much later a value may be, s: an emulated burst of conversions is answered as soon as it is asked for."""
 _YOUNG = 0.2
 """The same where every answer comes at once, s."""
 _WIDER = 2.0
@@ -86,7 +88,8 @@ class Observed:
     def span(self, source: str, instant: float, age: float) -> tuple[float, float]:
         """Return the least and the largest that a true value was since `age` s before an instant."""
         first = max(bisect_left(self.seen, instant - age, key=_time) - 1, 0)
-        values = [values[source] for _, values in self.seen[first : bisect_right(self.seen, instant, key=_time) + 1]]
+        end = bisect_right(self.seen, instant + _BURST, key=_time) + 1
+        values = [values[source] for _, values in self.seen[first:end]]
         return min(values), max(values)
 
 
@@ -128,7 +131,7 @@ class Reference:
     Attributes
     ----------
     envelopes : mapping of str to list of (float, float)
-        By signal, what it was during each step and the one before.
+        By signal, what it was during each step and the one before; all along where no true value explains it.
     sources : mapping of str to Source
         By signal, the true value that it shows, if there is one.
     tolerances : mapping of str to float
@@ -157,6 +160,10 @@ class Reference:
                 tolerances[signal.name], sources[signal.name] = found
             steps = 1 + max(step for step, _, _ in seen)
             holds = [[v for step, _, v in seen if number - 1 <= step <= number] for number in range(steps)]
+            if found is None and units:
+                # Such as a velocity, which is seldom seen: what it is anywhere, of either sign.
+                most = max(abs(v) for _, _, v in seen)
+                holds = [[-most, most]] * steps
             envelopes[signal.name] = [(min(hold), max(hold)) for hold in holds]
         return cls(envelopes, sources, tolerances, seconds)
 
@@ -214,6 +221,6 @@ def _source(
             # One that hardly moves shows the quantity of its unit, with noise.
             if worst <= max(_EXPLAINED * np.ptp(values), scatter if is_plain else 0.0):
                 tolerance = max(_WIDER * worst, noise, least)
-                # A fitted scale may be closer by chance.
-                found.append((tolerance if is_plain else 2.0 * tolerance, tolerance, Source(name, scale, offset)))
-    return min(found, key=lambda each: each[0])[1:] if found else None
+                found.append((not is_plain, tolerance, Source(name, scale, offset)))
+    # A fitted scale may be closer by chance.
+    return min(found, key=lambda each: each[:2])[1:] if found else None

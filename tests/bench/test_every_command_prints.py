@@ -46,6 +46,8 @@ COMMANDS = {
     "new": ["rig", "bench-of-mine"],
     "reproduce": ["vo2", "--workers", "0"],
     "emulate": ["no-rig"],
+    "find": ["no-rig"],
+    "torture": ["no-rig"],
     "identify-hybrid": ["missing"],
     "identify-muscle": ["missing"],
 }

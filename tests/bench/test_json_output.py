@@ -29,6 +29,8 @@ COMMANDS = [
     ["twin", "RUN", "--rig", "vo2", "--out", "new.toml"],
     ["recover-journal", "RUN"],
     ["emulate", "vo2"],
+    ["find"],
+    ["torture", "vo2"],
 ]
 
 needs_full = pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full, a disk that is always full")

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 from contextlib import ExitStack, contextmanager
+from pathlib import Path
 
 import pytest
 from cases import cases
@@ -400,6 +401,21 @@ class TestDoctor:
         code, findings = self.findings(bench, tmp_path, "vo2", *options)
         assert code == 1
         assert "does not follow" in findings["tec", "exercise"]["text"]
+
+    @cases(
+        ("override", "subject", "words"),
+        [
+            ("emulation.signals.supply_voltage.expression=0.5 * supply_output", "scale", "50% of the way"),
+            ("interlocks=[{signal='supply_voltage', high=0.5}]", "interlock", "outside of -inf to 0.5"),
+        ],
+    )
+    def test_an_actuator_that_arrives_elsewhere(self, bench, tmp_path, override, subject, words):
+        rig = Path(__file__).parents[2] / "examples/bench-supply.toml"
+        # That it heats without a watchdog is found anyway.
+        assert [*self.findings(bench, tmp_path, rig, "--exercise")[1]] == [("supply", "watchdog")]
+        code, findings = self.findings(bench, tmp_path, rig, "--exercise", "--override", override)
+        assert code == 1
+        assert words in findings["supply", subject]["text"]
 
     @pytest.mark.slow
     def test_a_device_that_is_gone_keeps_no_other_from_being_checked(self, bench, served, tmp_path):

@@ -26,6 +26,7 @@ LONG = {
     "add-a-controller",
     "campaign",
     "describe-an-instrument",
+    "first-day",
     "hybrid",
     "identify-from-a-file",
     "resume-a-run",

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import date
 from functools import partial
+from itertools import pairwise
 
 from bench.base import BenchError, Clock, DeviceConnectionError, DeviceError, wall_time
 from bench.devices import Actuator, CheckFinding, Device, DeviceDescription, DriverSettings, Limits, Status
 from bench.rig.file import RigFile
+from bench.rig.interlocks.config import Interlock
 from bench.rig.maintenance.opening import Workplace
 from bench.rig.maintenance.safe_state import SAFE, make_safe
 from bench.rig.slots import RoleTable, reading_of
@@ -114,7 +116,7 @@ def check_up(place: Workplace, exercise: bool, keep_on: Callable[[], None]) -> l
         if exercise:
             for name, role in _exercised(place.file.roles, devices).items():
                 if name not in failed:
-                    of(name, partial(_exercise, devices, name, role, place.clock, keep_on))
+                    of(name, partial(_exercise, devices, name, role, place, keep_on))
     finally:
         for name, state in make_safe(devices.values()).items():
             if state != SAFE:
@@ -310,10 +312,10 @@ def exercise_setpoint(role: RoleTable, limits: Limits) -> float:
 
 
 def _exercise(
-    devices: Mapping[str, Device], name: str, role: RoleTable, clock: Clock, keep_on: Callable[[], None]
+    devices: Mapping[str, Device], name: str, role: RoleTable, place: Workplace, keep_on: Callable[[], None]
 ) -> list[CheckFinding]:
-    """Set an actuator near its rest, see that its reading follows, and make it safe again."""
-    device = devices[name]
+    """Set an actuator near its rest, see how its reading follows, and make it safe again."""
+    device, clock = devices[name], place.clock
     assert isinstance(device, Actuator)
     signal = _reading(role, devices)
     source = next((each for each in devices.values() if signal in (s.name for s in each.signals)), None)
@@ -324,28 +326,63 @@ def _exercise(
     begin, target = quick[-1][signal], exercise_setpoint(role, device.limits)
     near = max(_SIGNIFICANT * noise, _NEAR * abs(target - begin))
     start, value = clock.now(), begin
+    seen: list[dict[str, float]] = []
     try:
         status = device.set(target)
         while abs(value - target) > near and clock.now() - start < _PATIENCE and not _has_failed(status):
             keep_on()
             clock.sleep(_LOOK)
             # Also what feeds a watchdog.
-            device.glance()
-            value = source.glance()[signal]
-        problem = status.exception()
+            seen.append(device.glance() | source.glance())
+            value = seen[-1][signal]
+        problem, seconds = status.exception(), clock.now() - start
+        live, _ = _repeat(source.glance, GLANCES, clock)
     finally:
         device.safe()
     text = (
-        f"{signal} went from {begin:.6g} to {value:.6g} within {clock.now() - start:.2g} s of setting "
+        f"{signal} went from {begin:.6g} to {value:.6g} within {seconds:.2g} s of setting "
         f"{target:g} {device.limits.unit}"
     )
     if problem is not None:
         return [CheckFinding("exercise", f"{text}: {problem}", "see that the output is connected and not blocked")]
     moved, way = value - begin, target - begin
-    if abs(way) <= near or (moved * way > 0 and abs(moved) > _SIGNIFICANT * noise):
-        return [CheckFinding("exercise", text)]
+    follows = abs(way) <= near or (moved * way > 0 and abs(moved) > _SIGNIFICANT * noise)
     advice = "see that the output is connected, and the sensor on it"
-    return [CheckFinding("exercise", f"{text}, so it does not follow", advice)]
+    findings = [
+        CheckFinding("exercise", text)
+        if follows
+        else CheckFinding("exercise", f"{text}, so it does not follow", advice)
+    ]
+    unit = next(each.unit for each in source.signals if each.name == signal)
+    if follows and unit == device.limits.unit and abs(value - target) > near:
+        advice = "compare its scale, calibration and limits with the rig file, or wait longer: it may be slow"
+        findings.append(CheckFinding("scale", f"{moved / way:.0%} of the way after {seconds:.0f} s", advice))
+    # Not while it is on its way.
+    if abs(value - target) <= near and (on := _spread(live, signal)) > _MUCH_NOISE * max(noise, near / _SIGNIFICANT):
+        advice = f"look for a ground loop between {name} and {source.name}, and for a shield that is open"
+        findings.append(
+            CheckFinding("noise", f"{signal} varies by {on:.2g} while {name} is on, {noise:.2g} before", advice)
+        )
+    return findings + _beyond(place.file.interlocks, seen)
+
+
+def _spread(readings: list[dict[str, float]], signal: str) -> float:
+    """Return by how much quick readings of a signal differ from one to the next, as a standard deviation."""
+    values = [each[signal] for each in readings]
+    return deviation([b - a for a, b in pairwise(values)]) / math.sqrt(2)
+
+
+def _beyond(locks: Iterable[Interlock], seen: Sequence[Mapping[str, float]]) -> list[CheckFinding]:
+    """Return the interlocks that a run would have tripped during an exercise."""
+    found = []
+    for lock in locks:
+        values = [values[lock.signal] for values in seen if lock.signal in values and not lock.minus]
+        if beyond := [value for value in values if not lock.low <= value <= lock.high]:
+            text = f"{lock.signal} was {beyond[0]:.6g} meanwhile, outside of {lock.low:g} to {lock.high:g}"
+            found.append(
+                CheckFinding("interlock", text, "find out why, or correct the interlock, before a run trips it")
+            )
+    return found
 
 
 def _has_failed(status: Status) -> bool:
