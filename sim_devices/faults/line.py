@@ -178,8 +178,8 @@ class FaultyLine:
                 values=values,
                 undo=partial(self.leave_alone, kind),
                 disturbed=partial(self.disturbed, kind),
-                # A line of text has no check sum.
-                lies=kind == CORRUPT and self._server.is_text,
+                # A line of text has no check sum, and does not say which question it answers.
+                lies=kind in (CORRUPT, SECOND_CLIENT) and self._server.is_text,
             )
         return found
 
