@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
@@ -80,12 +80,8 @@ def find(
     console.print()
     show_table(console, table)
     if write:
-        keys = {
-            one.device: keys_of(entry, one.answer)
-            for one, entry in zip(placed, askable(file), strict=True)
-            if one.answer
-        }
-        _write(Path(rig), keys)
+        found = zip(placed, askable(file), strict=True)
+        _write(Path(rig), [keys_of(entry, one.answer) for one, entry in found if one.answer])
     write_json(
         json_file, {"ports": [asdict(each) for each in known], "devices": {one.device: asdict(one) for one in placed}}
     )
@@ -93,13 +89,15 @@ def find(
         sys.exit(1)
 
 
-def _write(path: Path, keys: Mapping[str, Mapping[str, Any]]) -> None:
-    """Write keys of devices into a rig file, whose comments stay."""
+def _write(path: Path, found: Iterable[Mapping[tuple[str, str], Mapping[str, Any]]]) -> None:
+    """Write keys of tables into a rig file, whose comments stay."""
     import tomlkit
 
     document: Any = tomlkit.parse(path.read_text(encoding="utf-8"))
-    devices = document.setdefault("devices", tomlkit.table(is_super_table=True))
-    for device, values in keys.items():
-        devices.setdefault(device, tomlkit.table()).update(values)
+    for tables in found:
+        for (kind, name), keys in tables.items():
+            if keys:
+                tables_of_kind = document.setdefault(kind, tomlkit.table(is_super_table=True))
+                tables_of_kind.setdefault(name, tomlkit.table()).update(keys)
     path.write_text(tomlkit.dumps(document), encoding="utf-8")
     console.print(f"written: {path}", highlight=False)

@@ -182,9 +182,7 @@ def _fits(entry: DeviceEntry, answer: Answer) -> bool:
 
 
 def _wanted(entry: DeviceEntry) -> str:
-    """Return the serial number that the rig file says; empty if it says none."""
-    number = getattr(entry.settings, "serial_number", "")
-    return number.strip() if isinstance(number, str) else ""
+    return entry.settings.serial_number.strip()
 
 
 def _unplaced(entry: DeviceEntry, own: Sequence[Answer], fitting: Collection[str], alike: Sequence[str]) -> str:
@@ -199,10 +197,16 @@ def _unplaced(entry: DeviceEntry, own: Sequence[Answer], fitting: Collection[str
     return f"interchangeable with {', '.join(alike)}: write serial_number into the rig file; there are {heard}"
 
 
-def keys_of(entry: DeviceEntry, answer: Answer) -> dict[str, Any]:
-    """Return what a rig file has to say of a device that was found."""
-    keys = {"port": answer.port.name, **answer.changed}
-    field_of_key = type(entry.settings).model_fields.get("serial_number")
-    if field_of_key is not None and field_of_key.annotation is str:
-        keys["serial_number"] = answer.identity.serial_number
-    return keys
+def keys_of(entry: DeviceEntry, answer: Answer) -> dict[tuple[str, str], dict[str, Any]]:
+    """Return what a rig file has to say of a device that was found, by its tables, such as `("devices", "stage")`.
+
+    The port of a line that it shares, and its speed, stand in the table of the line.
+    """
+    of_line = {"port": answer.port.name, **answer.changed}
+    of_device = {}
+    if answer.identity.tells_serial_number:
+        of_device["serial_number"] = answer.identity.serial_number.strip()
+    line = getattr(entry.settings, "line", "")
+    if isinstance(line, str) and line:
+        return {("lines", line): of_line, ("devices", entry.name): of_device}
+    return {("devices", entry.name): of_line | of_device}

@@ -1,10 +1,8 @@
-"""A desk of eight emulated instruments, two TEC controllers and two T7s among them, and its drivers."""
+"""A desk of eight emulated instruments, two TEC controllers and two T7s among them."""
 
 from pathlib import Path
 
 from bench.rig import load_rig
-from drivers.labjack_t7 import T7PositionSensor, T7Switch
-from drivers.meerstetter import MeerstetterTEC
 from sim_devices.laboratory import EmulatedLaboratory
 
 
@@ -32,18 +30,3 @@ class DeskLaboratory(EmulatedLaboratory):
 
     def truth(self):
         return {f"{name}_{key}": value for name, part in self.parts.items() for key, value in part.truth().items()}
-
-
-class TEC(MeerstetterTEC):
-    class Settings(MeerstetterTEC.Settings):
-        serial_number: str = ""
-
-
-class PSD(T7PositionSensor):
-    class Settings(T7PositionSensor.Settings):
-        serial_number: str = ""
-
-
-class Fan(T7Switch):
-    class Settings(T7Switch.Settings):
-        serial_number: str = ""

@@ -4,6 +4,7 @@ import json
 import os
 import random
 import threading
+import tomllib
 import tty
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from drivers.finding.ports import Port, ports
 from sim_devices.serving.process import serve
 
 DESK = Path(__file__).with_name("desk.toml")
+SHARED = Path(__file__).parents[2] / "examples" / "shared-line.toml"
 
 
 @pytest.fixture(scope="module")
@@ -108,6 +110,20 @@ def test_what_is_found_is_written_with_the_comments_kept(desk, bench, tmp_path):
     assert "packaged rig" in err
 
 
+def test_instruments_on_a_shared_line_are_found_and_their_port_is_that_of_the_line(bench, tmp_path):
+    with serve(str(SHARED), clock="x1") as rig:
+        mine = tmp_path / "mine.toml"
+        mine.write_text(f'extends = {json.dumps(str(SHARED))}\nwithout = ["emulation"]\n')
+        (port,) = {each.port for each in rig.instruments.values()}
+        endpoints = json.loads(rig.endpoints_file.read_text())
+        (tmp_path / "ports.json").write_text(json.dumps(endpoints | {"rig": "mine"}))
+        code, out, err = bench("find", mine, "--attach", tmp_path / "ports.json", "--write")
+        assert code == 0, out + err
+    written = load_rig(str(mine))
+    assert {each.settings.port for each in written.devices} == {port}
+    assert tomllib.loads(mine.read_text())["lines"]["bus"]["port"] == port
+
+
 @pytest.mark.slow
 def test_an_instrument_at_another_speed_is_found(desk, tmp_path):
     file, rig = desk
@@ -159,9 +175,10 @@ def test_a_port_that_is_held_is_named_and_not_asked(desk, bench):
     assert port in out
 
 
-@pytest.mark.skipif(os.geteuid() == 0, reason="root may open every port")
-def test_a_missing_permission_says_what_to_do(tmp_path):
+def test_a_missing_permission_says_what_to_do(tmp_path, monkeypatch):
     node = tmp_path / "port"
-    node.touch(mode=0o000)
+    node.touch()
+    # Root may open every port.
+    monkeypatch.setattr(os, "access", lambda *_: False)
     (found,) = [each for each in ports([str(node)]) if each.address == str(node)]
     assert "usermod -aG" in found.problem
