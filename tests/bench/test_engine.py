@@ -1,6 +1,5 @@
 import math
 import sqlite3
-import sys
 import threading
 from dataclasses import replace
 
@@ -36,7 +35,6 @@ from bench.protocol import (
     Dwell,
     Note,
     ParameterChange,
-    Phase,
     Prompt,
     ProtocolParameters,
     Step,
@@ -152,21 +150,11 @@ class TestCompleted:
         assert instants == [start + tick * 0.1 for start in (0.0, 1.0, 2.0) for tick in range(1, 10)]
         assert [tick[1] for tick in b.watcher.ticks] == [0] * 9 + [1] * 9 + [2] * 9
 
-    @pytest.mark.parametrize(("period", "dwell"), [(0.7, 2.1), (0.1, 0.3), (0.3, 0.9), (0.1, 0.6), (0.05, 0.35)])
+    @pytest.mark.parametrize(("period", "dwell"), [(0.7, 2.1), (0.3, 0.9), (0.05, 0.35), (0.5, 0.4), (0.5, 0.0)])
     def test_no_tick_a_rounding_error_before_the_reading(self, bench, period, dwell):
         b = bench(("period = 0.5", f"period = {period}"))
         b.run(stairs, Stairs(count=5, dwell=dwell))
-        assert len(b.watcher.ticks) == 5 * (round(dwell / period) - 1)
-
-    def test_a_hold_shorter_than_a_period_has_no_tick(self, bench):
-        b = bench()
-        assert b.run(stairs, Stairs(dwell=0.4)).steps == 4
-        assert b.watcher.ticks == []
-
-    def test_no_dwell_at_all(self, bench):
-        b = bench()
-        outcome = b.run(stairs, Stairs(dwell=0.0, count=10, increment=1.0))
-        assert (outcome.status, outcome.steps, outcome.laboratory_seconds) == ("completed", 10, 0.0)
+        assert len(b.watcher.ticks) == 5 * max(round(dwell / period) - 1, 0)
 
     def test_readings_reach_the_protocol(self, bench):
         seen = []
@@ -182,15 +170,6 @@ class TestCompleted:
         assert seen[0]["tec_setpoint"] == seen[1]["tec_setpoint"] == 30.0
         assert seen[1]["probe_temperature"] == pytest.approx(30.0, abs=0.02)
         assert b.tec.sent == [30.0]
-
-    def test_nothing_to_do(self, bench):
-        def idle(parameters):
-            yield Phase("none")
-
-        b = bench()
-        outcome = b.run(define(idle))
-        assert (outcome.status, outcome.steps) == ("completed", 0)
-        b.assert_safe()
 
     def test_the_same_seed_gives_the_same_tables(self, bench):
         tables = []
@@ -234,65 +213,23 @@ class TestWrongSetpoints:
         assert b.tec.sent == [30.0]
         b.assert_safe()
 
-    def test_none_is_sent_when_another_is_wrong(self, bench):
-        def two(parameters):
-            yield Step({"tec": 30.0, "absent": 3.0}, Dwell(1.0))
+    @cases(
+        ("step", "name"),
+        [
+            (Step({"tec": 30.0, "absent": 3.0}, Dwell(1.0)), "absent"),
+            (Step({"tec": 30.0, "probe": 30.0}, Dwell(1.0)), "probe"),
+            (Step({"tec": 30.0}, UntilSteady("skin", drift=1.0, noise=1.0, timeout=9.0)), "skin"),
+        ],
+    )
+    def test_none_is_sent_when_another_name_is_wrong(self, bench, step, name):
+        def wrong(parameters):
+            yield step
 
         b = bench()
-        outcome = b.run(define(two))
+        outcome = b.run(define(wrong))
         assert isinstance(outcome.error, ConfigurationError)
-        assert "absent" in outcome.reason
-        assert "there are: tec" in outcome.reason
+        assert name in outcome.reason
         assert b.tec.sent == []
-
-    def test_a_sensor_takes_no_setpoint(self, bench):
-        def wrong(parameters):
-            yield Step({"probe": 30.0}, Dwell(1.0))
-
-        assert "probe is not a device that takes a set-point" in bench().run(define(wrong)).reason
-
-    def test_an_unknown_signal_to_settle_is_found_before_anything_is_sent(self, bench):
-        b = bench()
-        outcome = b.run(settle, Settle(signal="prob_temperature"))
-        assert isinstance(outcome.error, ConfigurationError)
-        assert "prob_temperature" in outcome.reason
-        assert b.tec.sent == []
-
-
-class TestBeforeMoving:
-    @pytest.fixture
-    def rig(self, rig_file):
-        with Rig(load_rig(rig_file()), VirtualClock(), 1) as rig:
-            yield rig
-            assert rig.devices["tec"].calls == []
-
-    def test_right(self, rig):
-        check_before_moving(rig.description, stairs, plan(stairs, Stairs()))
-
-    def test_setpoints_outside_of_the_limits(self, rig):
-        with pytest.raises(ConfigurationError) as caught:
-            check_before_moving(rig.description, stairs, plan(stairs, Stairs(count=30)))
-        assert "stairs would set tec to between 30 and 175 °C; rig heater allows 10 to 95 °C" in str(caught.value)
-
-    def test_a_device_that_cannot_be_set(self, rig):
-        def wrong(parameters):
-            yield Step({"probe": 30.0}, Dwell(1.0))
-
-        with pytest.raises(ConfigurationError, match="wrong sets probe, which rig heater cannot set"):
-            check_before_moving(rig.description, define(wrong), plan(define(wrong), Nothing()))
-
-    def test_needs(self, rig):
-        @protocol(needs=("tec", "curvature", "servo"))
-        def wanting(parameters: Nothing):
-            """Want."""
-            yield Note("x")
-
-        with pytest.raises(ConfigurationError, match="needs curvature, servo, which rig heater does not have"):
-            check_before_moving(rig.description, wanting, plan(wanting, Nothing()))
-
-    def test_a_signal_that_is_not_there(self, rig):
-        with pytest.raises(ConfigurationError, match="prob_temperature"):
-            check_before_moving(rig.description, settle, plan(settle, Settle(signal="prob_temperature")))
 
 
 class TestFaults:
@@ -372,19 +309,22 @@ class TestFaults:
             assert event.kind == "safe-state"
             assert event.text.startswith("tec: ")
 
-    @pytest.mark.parametrize("kind", [KeyboardInterrupt, SystemExit, GeneratorExit])
-    def test_what_is_no_exception_ends_the_run_and_its_record(self, bench, kind):
+    @cases(
+        ("kind", "status"),
+        [(KeyError, "failed"), (KeyboardInterrupt, "aborted"), (SystemExit, "aborted"), (GeneratorExit, "aborted")],
+    )
+    def test_whatever_a_protocol_raises_ends_the_run_and_its_record(self, bench, kind, status):
         def go(parameters):
             yield Step({"tec": 30.0}, Dwell(1.0))
             raise kind
 
         b = bench()
         outcome = b.run(define(go))
-        assert (outcome.status, outcome.steps) == ("aborted", 1)
+        assert (outcome.status, outcome.steps) == (status, 1)
         assert kind.__name__ in outcome.reason
         b.assert_safe()
         with b.record() as run:
-            assert (run.status, run.meta["safe_state"]) == ("aborted", {"tec": "safe", "probe": "safe"})
+            assert (run.status, run.meta["safe_state"]) == (status, {"tec": "safe", "probe": "safe"})
 
     @pytest.mark.parametrize("how", ["removed", "replaced"])
     def test_a_journal_that_is_gone_ends_the_run(self, bench, how):
@@ -402,17 +342,6 @@ class TestFaults:
         outcome = b.run(define(go))
         assert outcome.status == "failed"
         assert f"{path} was {how} while the run went on" in outcome.reason
-        b.assert_safe()
-
-    def test_a_protocol_that_raises(self, bench):
-        def go(parameters):
-            yield Step({"tec": 30.0}, Dwell(1.0))
-            raise KeyError("tec_temprature")
-
-        b = bench()
-        outcome = b.run(define(go))
-        assert (outcome.status, outcome.steps) == ("failed", 1)
-        assert outcome.reason == "KeyError: 'tec_temprature'"
         b.assert_safe()
 
     @pytest.mark.parametrize("nonsense", [None, 42, "tec", {"tec": 30.0}, Step])
@@ -611,19 +540,13 @@ class TestControl:
             assert set(ticks[TRACES[0].name][1:]) == {50.0}
             assert run.steps()[TRACES[0].name].tolist() == [50.0]
 
-    def test_beyond_its_limits_nothing_is_sent(self, bench):
+    @cases("target", [300.0, math.nan])
+    def test_beyond_its_limits_nothing_is_sent(self, bench, target):
         b = bench()
-        outcome = b.run(control(Integrator(300.0)))
+        outcome = b.run(control(Integrator(target)))
         assert isinstance(outcome.error, LimitError)
-        assert "beyond 15 to 80" in outcome.reason
         assert b.tec.sent == []
         b.assert_safe()
-
-    def test_a_controller_that_loses_itself(self, bench):
-        b = bench()
-        outcome = b.run(control(Integrator(math.nan)))
-        assert isinstance(outcome.error, LimitError)
-        assert b.tec.sent == []
 
     def test_times_out(self, bench):
         b = bench()
@@ -655,13 +578,6 @@ class TestControl:
         assert "stands at 50 °C" in outcome.reason
         b.assert_safe()
 
-    @pytest.mark.timeout(60)
-    @pytest.mark.parametrize("wait", [0.0, -1.0, math.nan])
-    def test_one_that_does_not_wait_is_stopped(self, bench, wait):
-        b = bench()
-        assert b.run(control(Integrator(50.0, wait=wait, tolerance=0.0))).status == "failed"
-        b.assert_safe()
-
     @pytest.mark.parametrize("key", ["actuator", "drive", "response"])
     def test_what_is_not_there_is_named(self, bench, key):
         b = bench()
@@ -675,54 +591,22 @@ class TestControl:
         assert isinstance(b.run(control(Integrator(50.0))).error, InterlockError)
         b.assert_safe()
 
-    def test_limits_are_checked_before_anything_moves(self, rig_file):
-        with Rig(load_rig(rig_file()), VirtualClock(), 1) as rig:
-            check_before_moving(
-                rig.description, control(Integrator(50.0)), plan(control(Integrator(50.0)), Nothing())
-            )
-            with pytest.raises(ConfigurationError, match="rig heater allows 10 to 95 °C"):
-                check_before_moving(
-                    rig.description,
-                    control(Integrator(50.0), limits=(15.0, 100.0)),
-                    plan(control(Integrator(50.0), limits=(15.0, 100.0)), Nothing()),
-                )
-            with pytest.raises(ConfigurationError, match="absent"):
-                check_before_moving(
-                    rig.description,
-                    control(Integrator(50.0), response="absent"),
-                    plan(control(Integrator(50.0), response="absent"), Nothing()),
-                )
-
     @cases("keys", [{"limits": (2.0, 1.0)}, {"limits": (math.nan, 1.0)}, {"timeout": 0.0}, {"timeout": math.nan}])
     def test_nonsense_is_refused(self, keys):
         with pytest.raises(ConfigurationError, match="Control: expected finite limits"):
             plan(control(Integrator(50.0), **keys), Nothing())
 
-    @pytest.mark.timeout(60)
-    def test_a_protocol_that_controls_for_ever_has_no_plan(self, monkeypatch):
-        monkeypatch.setattr(sys.modules["bench.protocol.planning"], "LONGEST", 10_000)
 
-        def endless(parameters):
-            message = next(control(Integrator(50.0)).generator(parameters))
-            while True:
-                yield message
-
-        with pytest.raises(ConfigurationError, match="endless does not end"):
-            plan(define(endless), Nothing())
+PROMPT = {
+    "text": "Turn the plate to 33 °C", "task": "turn", "value": 33.0, "settle": Dwell(20.0),
+    "signal": "probe_temperature", "low": 32.5, "high": 33.5,
+}  # fmt: skip
 
 
-def prompt(task="turn", value=33.0):
+def prompt(**keys):
     def go(parameters):
         yield Step({"tec": 30.0}, Dwell(2.0))
-        reading = yield Prompt(
-            text="Turn the plate to 33 °C",
-            task=task,
-            value=value,
-            settle=Dwell(20.0),
-            signal="probe_temperature",
-            low=32.5,
-            high=33.5,
-        )
+        reading = yield Prompt(**{**PROMPT, **keys})
         assert reading["probe_temperature"] == pytest.approx(33.0, abs=0.1)
 
     return define(go)
@@ -792,34 +676,48 @@ class TestPrompt:
         b.assert_safe()
 
     def test_the_dry_run_counts_them(self):
-        expected = plan(prompt_without_reading, Nothing())
+        steady = UntilSteady("tec_temperature", drift=0.02, noise=0.01, timeout=60.0, minimum=5.0)
+        expected = plan(of(Prompt(**{**PROMPT, "settle": steady})), Nothing())
         assert (expected.prompts, expected.steps, expected.seconds, expected.at_most) == (1, 1, 5.0, 60.0)
         assert expected.watched == {"probe_temperature", "tec_temperature"}
 
-    def test_an_unknown_signal_is_found_before_anything_moves(self, rig_file):
-        def go(parameters):
-            yield Prompt(text="Do it", task="turn", value=1.0, settle=Dwell(1.0), signal="no_such", low=0.0, high=1.0)
-
-        definition = define(go)
-        with (
-            Rig(load_rig(rig_file()), VirtualClock(), 1) as rig,
-            pytest.raises(ConfigurationError, match="no_such"),
-        ):
-            check_before_moving(rig.description, definition, plan(definition, Nothing()))
-
     def test_an_empty_range(self):
         with pytest.raises(ValueError, match="low < high"):
-            Prompt(
-                text="Do it", task="turn", value=1.0, settle=Dwell(1.0), signal="probe_temperature", low=2.0, high=2.0
-            )
+            Prompt(**{**PROMPT, "low": 33.5})
 
 
-def go_and_ask(parameters):
-    settle = UntilSteady("tec_temperature", drift=0.02, noise=0.01, timeout=60.0, minimum=5.0)
-    yield Prompt(text="Do it", task="turn", value=1.0, settle=settle, signal="probe_temperature", low=0.0, high=1.0)
+def of(message, needs=("tec",)):
+    def go(parameters):
+        yield message
+
+    go.__annotations__ = {"parameters": Nothing}
+    go.__doc__ = "A protocol."
+    return protocol(needs=needs)(go)
 
 
-prompt_without_reading = define(go_and_ask)
+@cases(
+    ("definition", "parameters", "wrong"),
+    [
+        (stairs, Stairs(), None),
+        (stairs, Stairs(count=30), "30 and 175 °C; rig heater allows 10 to 95 °C"),
+        (settle, Settle(signal="prob_temperature"), "prob_temperature"),
+        (of(Step({"probe": 30.0}, Dwell(1.0))), Nothing(), "probe"),
+        (of(Note("x"), ("tec", "curvature", "servo")), Nothing(), "curvature, servo"),
+        (of(Prompt(**{**PROMPT, "signal": "no_such"})), Nothing(), "no_such"),
+        (control(Integrator(50.0)), Nothing(), None),
+        (control(Integrator(50.0), limits=(15.0, 100.0)), Nothing(), "rig heater allows 10 to 95 °C"),
+        (control(Integrator(50.0), response="absent"), Nothing(), "absent"),
+    ],
+)
+def test_what_a_rig_lacks_or_forbids_is_found_before_anything_moves(rig_file, definition, parameters, wrong):
+    with Rig(load_rig(rig_file()), VirtualClock(), 1) as rig:
+        planned = plan(definition, parameters)
+        if wrong is None:
+            check_before_moving(rig.description, definition, planned)
+        else:
+            with pytest.raises(ConfigurationError, match=wrong):
+                check_before_moving(rig.description, definition, planned)
+        assert rig.devices["tec"].calls == []
 
 
 class TestInterrupted:
@@ -1072,42 +970,28 @@ class TestInterrupted:
             for name, column in table.items():
                 assert np.array_equal(column, other[name], equal_nan=True), name
 
-    def test_a_suspension_of_the_machine_is_recorded(self, bench):
-        suspended = [0.0]
-        wall = WallClock()
-        clock = WallClock(wall.now, lambda: wall.now() + suspended[0], lambda: wall.timestamp() + suspended[0])
+    @cases(
+        ("seconds", "is_suspended", "said"),
+        [(3600.0, True, "for 3600 s"), (3600.0, False, "forward by 3600.0 s"), (-7.5, False, "back by 7.5 s")],
+    )
+    def test_a_suspension_of_the_machine_and_a_time_of_day_that_was_set_are_recorded(
+        self, bench, seconds, is_suspended, said
+    ):
+        off, wall = [0.0], WallClock()
+        booted = (lambda: wall.now() + off[0]) if is_suspended else wall.now
 
-        def sleeper(parameters):
+        def late(parameters):
             yield Step({"tec": 30.0}, Dwell(0.05))
-            suspended[0] = 3600.0
+            off[0] = seconds
             yield Step({"tec": 31.0}, Dwell(0.05))
             yield Step({"tec": 32.0}, Dwell(0.05))
 
-        self.b = b = bench(clock=clock)
-        assert b.run(define(sleeper)).status == "completed"
+        self.b = b = bench(clock=WallClock(wall.now, booted, lambda: wall.timestamp() + off[0]))
+        assert b.run(define(late)).status == "completed"
         with b.record() as run:
-            (event,) = (event for event in run.events() if event.kind == "suspended")
-            assert event.level == "WARN"
-            assert "suspended for 3600 s" in event.text
-            assert not [event for event in run.events() if event.kind == "clock"]
-
-    @pytest.mark.parametrize("seconds", [3600.0, -7.5])
-    def test_a_time_of_day_that_was_set_is_recorded(self, bench, seconds):
-        set_by = [0.0]
-        wall = WallClock()
-
-        def setter(parameters):
-            yield Step({"tec": 30.0}, Dwell(0.05))
-            set_by[0] = seconds
-            yield Step({"tec": 31.0}, Dwell(0.05))
-            yield Step({"tec": 32.0}, Dwell(0.05))
-
-        self.b = b = bench(clock=WallClock(wall.now, wall.now, lambda: wall.timestamp() + set_by[0]))
-        assert b.run(define(setter)).status == "completed"
-        with b.record() as run:
-            (event,) = (event for event in run.events() if event.kind == "clock")
-            assert event.level == "WARN"
-            assert f"{'forward' if seconds > 0 else 'back'} by {abs(seconds):.1f} s" in event.text
+            (event,) = (event for event in run.events() if event.kind in {"suspended", "clock"})
+            assert (event.kind, event.level) == ("suspended" if is_suspended else "clock", "WARN")
+            assert said in event.text
             # Laboratory time goes on as before.
             assert np.all(np.diff(run.steps()["finished"]) < 60.0)
             assert np.all(np.diff(run.steps()["finished"]) > 0.0)

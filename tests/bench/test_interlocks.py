@@ -25,12 +25,15 @@ class TestInterlock:
     @cases(
         "keys",
         [
+            {},
             {"low": 2.0, "high": 1.0},
             {"low": 1.0, "high": 1.0},
             {"low": math.nan},
             {"high": math.nan},
-            {"seconds": -1.0},
-            {"seconds": 1e6},
+            {"high": 1.0, "seconds": -1.0},
+            {"high": 1.0, "seconds": 1e6},
+            {"high": 1.0, "seconds": math.nan},
+            {"high": 1.0, "warn": 0.51},
             {"hgih": 3.0},
             {"high": 5.0, "resume_high": 6.0},
             {"high": 5.0, "resume_low": 4.0},
@@ -57,25 +60,6 @@ class TestInterlock:
         with pytest.raises(ValidationError):
             Interlock(signal="sink", **keys)
 
-    @pytest.mark.parametrize(
-        ("key", "least", "below", "greatest", "above"),
-        [
-            ("seconds", 0.0, -1e-9, 3600.0, 3600.1),
-            ("warn", 0.0, -1e-9, 0.5, 0.51),
-            ("stale", 1e-9, 0.0, 86400.0, 86400.1),
-        ],
-    )
-    def test_what_its_numbers_may_be(self, key, least, below, greatest, above):
-        for number in (least, 0.5 * (least + greatest), greatest):
-            assert getattr(Interlock(signal="sink", high=1.0, **{key: number}), key) == number
-        for number in (below, above, math.nan, True):
-            with pytest.raises(ValidationError):
-                Interlock(signal="sink", high=1.0, **{key: number})
-
-    def test_one_that_watches_nothing_is_refused(self):
-        with pytest.raises(ValidationError, match="low or high"):
-            Interlock(signal="sink")
-
 
 class TestWatch:
     def test_within_its_range_ends_included(self):
@@ -95,28 +79,9 @@ class TestWatch:
     def test_one_sided(self):
         guard = watch(Interlock(signal="force", high=5.0))
         guard.check(0.0, {"force": -1e9})
-        with pytest.raises(InterlockError, match=r"force = 5\.1 N"):
-            guard.check(1.0, {"force": 5.1})
-
-    def test_nan_counts_as_outside_even_of_one_sided(self):
-        with pytest.raises(InterlockError):
-            watch(Interlock(signal="force", high=5.0)).check(0.0, {"force": math.nan})
-
-    def test_waits_its_seconds(self):
-        guard = watch(Interlock(signal="sink", high=60.0, seconds=5.0))
-        guard.check(100.0, {"sink": 61.0})
-        guard.check(104.9, {"sink": math.nan})
-        with pytest.raises(InterlockError, match=r"for 5\.0 s"):
-            guard.check(105.0, {"sink": 61.0})
-
-    def test_recovery_in_between_starts_anew(self):
-        guard = watch(Interlock(signal="sink", high=60.0, seconds=5.0))
-        guard.check(0.0, {"sink": 61.0})
-        guard.check(4.0, {"sink": 60.0})
-        guard.check(4.5, {"sink": 61.0})
-        guard.check(9.4, {"sink": 61.0})
-        with pytest.raises(InterlockError):
-            guard.check(9.5, {"sink": 61.0})
+        for outside in (5.1, math.nan):
+            with pytest.raises(InterlockError):
+                watch(Interlock(signal="force", high=5.0)).check(0.0, {"force": outside})
 
     def test_each_interlock_has_its_own_time(self):
         guard = watch(
@@ -238,11 +203,6 @@ class TestDue:
 
 
 class TestResume:
-    def test_outside_until_it_is_back_beyond_the_threshold(self):
-        guard = watch(Interlock(signal="sink", high=60.0, resume_high=55.0, level="warn"))
-        course = [(0.0, 60.0), (1.0, 60.1), (2.0, 55.1), (3.0, 60.1), (4.0, 55.0), (5.0, 59.9), (6.0, 61.0)]
-        assert looks(guard, course) == [(1.0, "warn", False), (4.0, "warn", True), (6.0, "warn", False)]
-
     def test_noise_at_the_limit_does_not_keep_it_from_acting(self):
         noisy = [(0.5 * k, 60.0 + (-0.2, 0.3)[k % 2]) for k in range(40)]
         assert looks(watch(Interlock(signal="sink", high=60.0, seconds=5.0)), noisy) == []
@@ -360,13 +320,6 @@ class TestSettle:
         assert looks(self.guard(), course) == [(11.0, "safe", False)]
         course = [(0.0, 20.0, 25.0), (1.0, 61.0, 30.0), (10.9, 61.0, 30.0), (11.0, 61.0, 30.0)]
         assert looks(self.guard(), course) == [(11.0, "safe", False)]
-
-    def test_without_a_change_it_acts_at_once(self):
-        assert looks(self.guard(), [(0.0, 61.0, 25.0)]) == [(0.0, "safe", False)]
-
-    def test_a_loop_that_changes_it_all_the_time_puts_it_off_for_twice_the_time_at_most(self):
-        course = [(0.5 * k, 61.0 if k > 2 else 20.0, 25.0 + k) for k in range(100)]
-        assert looks(self.guard(), course) == [(20.5, "safe", False)]
 
     def test_another_device_does_not_count(self):
         guard = self.guard(setpoint="supply")
@@ -518,11 +471,6 @@ class TestStale:
         zeros = [(float(k), -0.0 if k % 50 == 49 else 0.0) for k in range(500)]
         assert looks(watch(Interlock(signal="sink", stale=60.0)), zeros) == []
 
-    def test_it_is_over_with_the_next_other_reading(self):
-        guard = watch(Interlock(signal="sink", stale=2.0, level="warn"))
-        course = [(0.0, 1.0), (1.0, 1.0), (2.0, 1.0), (3.0, 1.0), (4.0, 1.5), (5.0, 1.5), (6.0, 1.5)]
-        assert looks(guard, course) == [(2.0, "warn", False), (4.0, "warn", True), (6.0, "warn", False)]
-
     @given(st.lists(st.tuples(st.sampled_from([0.5, 1.0, 2.5]), st.sampled_from([1.0, 1.0, 1.0, 2.0])), max_size=40))
     def test_as_seen_from_the_whole_history(self, course):
         instants = [sum(dt for dt, _ in course[: k + 1]) for k in range(len(course))]
@@ -557,21 +505,6 @@ class TestStuck:
     def test_one_that_follows_late_enough(self):
         course = [(0.0, 20.0, 20.0), (2.0, 20.0, 30.0), (11.0, 21.0, 30.0), (40.0, 21.0, 30.0)]
         assert looks(self.guard(), course) == []
-
-    def test_one_that_had_followed_before_the_look(self):
-        assert looks(self.guard(), [(0.0, 20.0, 20.0), (2.0, 30.0, 30.0), (60.0, 30.0, 30.0)]) == []
-
-    def test_small_moves_add_up(self):
-        course = [(float(k), 20.0, 20.0 + 0.5 * k) for k in range(40)]
-        assert looks(self.guard(), course) == [(20.0, "safe", False)]
-
-    def test_a_setpoint_that_returns_asks_for_nothing(self):
-        course = [(0.0, 20.0, 20.0), (2.0, 20.0, 30.0), (11.0, 20.0, 21.0), (60.0, 20.0, 21.0)]
-        assert looks(self.guard(), course) == []
-
-    def test_it_is_over_when_it_follows(self):
-        course = [(0.0, 20.0, 20.0), (2.0, 20.0, 30.0), (12.0, 20.0, 30.0), (15.0, 21.5, 30.0)]
-        assert looks(self.guard(level="warn"), course) == [(12.0, "warn", False), (15.0, "warn", True)]
 
     @given(st.lists(st.tuples(st.sampled_from([0.5, 2.0, 30.0]), st.floats(-50.0, 50.0)), max_size=40))
     def test_a_signal_that_follows_never_acts(self, course):

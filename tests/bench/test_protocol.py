@@ -109,10 +109,6 @@ class TestParse:
             ramp.parse({"low": "1000", "cuont": "3"})
         assert len(str(caught.value).splitlines()) == 3
 
-    def test_parameters_cannot_be_changed(self):
-        with pytest.raises(ValueError, match="frozen"):
-            ramp.parse({"needed": "1"}).low = 3.0
-
     @given(st.dictionaries(st.text(max_size=8), st.text(max_size=8), max_size=4))
     def test_any_text_gives_parameters_or_a_configuration_error(self, settings):
         try:
@@ -198,9 +194,6 @@ class TestMessages:
     def test_until_steady_refuses(self, keys):
         with pytest.raises(ValueError, match="UntilSteady"):
             UntilSteady("a", **{"drift": 1.0, "noise": 1.0, "timeout": 10.0, **keys})
-
-    def test_reading_by_signal(self):
-        assert Reading(0, 1.0, True, {"a": 3.0})["a"] == 3.0
 
 
 class TestPlan:
@@ -306,33 +299,16 @@ class TestPlan:
 
         assert not plan(define(go), Nothing()).complete
 
-    def test_nothing_to_do(self):
-        def idle(parameters):
-            yield Phase("none")
-
-        assert plan(define(idle), Nothing()).steps == 0
-
-    def test_a_protocol_that_never_ends_is_refused(self, monkeypatch):
-        assert sys.modules["bench.protocol.planning"].LONGEST == 1_000_000
-        monkeypatch.setattr(sys.modules["bench.protocol.planning"], "LONGEST", 10_000)
+    @cases("message", [lambda: Step({}, Dwell(0.0)), lambda: Note("still here"), lambda: fast_loop()])
+    def test_a_protocol_that_never_ends_is_refused(self, monkeypatch, message):
+        monkeypatch.setattr(sys.modules["bench.protocol.planning"], "LONGEST", 1_000)
 
         def endless(parameters):
             while True:
-                yield Step({}, Dwell(0.0))
+                yield message()
 
-        with pytest.raises(ConfigurationError, match="endless does not end within 10000 steps"):
+        with pytest.raises(ConfigurationError, match="endless does not end within 1000"):
             plan(define(endless), Nothing())
-
-    @pytest.mark.timeout(60)
-    def test_a_protocol_that_talks_for_ever_is_refused(self, monkeypatch):
-        monkeypatch.setattr(sys.modules["bench.protocol.planning"], "LONGEST", 10_000)
-
-        def chatter(parameters):
-            while True:
-                yield Note("still here")
-
-        with pytest.raises(ConfigurationError, match="chatter does not end"):
-            plan(define(chatter), Nothing())
 
     def test_parameters_that_do_not_fit_together(self):
         def broken(parameters):
@@ -566,21 +542,13 @@ class TestPackaged:
         assert 2 * 60.0 <= expected.seconds <= expected.at_most < math.inf
         assert expected.extremes["tec"] == (25.0, 80.0)
 
-    @pytest.mark.parametrize("settling", ["60", "3600"])
+    @cases("settling", ["60", "3600"])
     def test_creep_that_settles_too_long(self, vo2, settling):
         definition = find_protocol("creep")
         with pytest.raises(
             ConfigurationError, match=f"settling = {settling} s is not allowed with interval = 0.5 s and dur"
         ):
             vo2.plan(definition, {"settling": settling})
-
-    def test_creep_that_settles_almost_as_long_as_it_watches(self, vo2):
-        definition = find_protocol("creep")
-        settings = {"settling": "59.9"}
-        try:
-            assert vo2.plan(definition, settings).extremes["tec"][1] == 80.0
-        except ConfigurationError as error:
-            assert "settling" in str(error)  # noqa: PT017 - either way is right
 
     @pytest.mark.parametrize("name", ["creep", "damped-oscillation", "random-validation"])
     @given(data=st.data())
@@ -657,18 +625,6 @@ class TestFixedRate:
             yield fast_loop(controller=Untouched())
 
         assert plan(define(go), Nothing()).steps == 1
-
-    @pytest.mark.timeout(60)
-    def test_a_protocol_that_loops_for_ever_is_refused(self, monkeypatch):
-        monkeypatch.setattr(sys.modules["bench.protocol.planning"], "LONGEST", 10_000)
-
-        def endless(parameters):
-            message = fast_loop()
-            while True:
-                yield message
-
-        with pytest.raises(ConfigurationError, match="endless does not end within 10000 steps"):
-            plan(define(endless), Nothing())
 
     @cases(
         "keys",
