@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import rerun as rr
 import rerun_cli
+from cases import cases
 from rerun.chunk import RrdReader
 from rerun.experimental import ViewerClient
 
@@ -575,7 +576,7 @@ def test_an_operator_over_another_signal_has_its_own_plane(tmp_path: Path) -> No
     assert read_views(path)["/planes/length"] == "Preisach plane of length"
 
 
-@pytest.mark.parametrize("document", [{"format": "bench-other-model", "version": 1}, {}, [1, 2], "text", None])
+@cases("document", [{"format": "bench-other-model", "version": 1}, [1, 2], None])
 def test_other_models_are_left_out(tmp_path: Path, document: object) -> None:
     models = {"two-stage": ModelFile("two-stage", make_wire()).to_json(), "other": document}
     found = read(keep_muscle_journal(tmp_path / "run", models))
@@ -588,28 +589,6 @@ def test_a_damaged_model_is_named(tmp_path: Path) -> None:
     with pytest.raises(DataError, match="model two-stage is damaged: key 'model' is missing"):
         keep_muscle_journal(tmp_path / "run", {"two-stage": {k: v for k, v in document.items() if k != "model"}})
     assert not (tmp_path / "run" / "rebuilt.rrd").exists()
-
-
-def test_a_journal_from_before_there_were_further_loops_is_rebuilt(
-    tmp_path: Path, entries: list[Tick | StepRecord | Event], rebuilt: Path
-) -> None:
-    table_of_then = {key: value for key, value in to_table(LAYOUT).items() if key != "loops"}
-    folder = keep_journal(tmp_path / "run", entries, dashboard=table_of_then)
-    with Record(folder) as record:
-        rebuild(record, folder / "again.rrd")
-    assert read(folder / "again.rrd").keys() == read(rebuilt).keys()
-
-
-@pytest.mark.parametrize("loop", [{"input": "supply_voltage"}, {**MUSCLE_LAYOUT.loops[0].model_dump(), "x": 1}, None])
-def test_a_journal_with_a_damaged_loop_is_no_run(tmp_path: Path, loop: object) -> None:
-    dashboard = {**to_table(MUSCLE_LAYOUT), "loops": [loop]}
-    folder = keep_journal(tmp_path / "run", [], MUSCLE_SIGNALS, dashboard=dashboard)
-    with (
-        Record(folder) as record,
-        pytest.raises(DataError, match=r"the metadata of its dashboard is damaged: dashboard\.loops"),
-    ):
-        rebuild(record, folder / "run.rrd")
-    assert not (folder / "run.rrd").exists()
 
 
 @pytest.mark.parametrize("controls", ["", "curvature"])
@@ -773,12 +752,13 @@ def test_a_control_run_of_a_rig_without_a_loop_still_shows_the_control(
     with make_dashboard(path, layout=None, signals=CONTROL_SIGNALS, controls="curvature") as dashboard:
         tell(dashboard, control_entries)
     assert dashboard.dropped == 0
-    assert len(table(read(path)["/control/error"], "scalars")[0]) == sum(
-        isinstance(e, tuple) for e in control_entries
-    )
+    found = read(path)
+    assert len(table(found["/control/error"], "scalars")[0]) == sum(isinstance(e, tuple) for e in control_entries)
+    assert "/signals/curvature" in found
+    assert not [path for path in found if path.startswith(("/loop", "/plane"))]
 
 
-@pytest.mark.parametrize(("signals", "controls"), [(CONTROL_SIGNALS, "x"), (SIGNALS, "curvature")])
+@cases(("signals", "controls"), [(CONTROL_SIGNALS, "x"), (SIGNALS, "curvature")])
 def test_what_is_controlled_must_be_among_the_signals(
     tmp_path: Path, signals: tuple[Signal, ...], controls: str
 ) -> None:
@@ -799,28 +779,21 @@ def test_readings_that_are_not_numbers_leave_a_gap(tmp_path: Path) -> None:
     assert table(found["/plane/data/memory"], "strips")[1].tolist() == [1]
 
 
-def test_a_rig_without_a_loop_has_no_plane(tmp_path: Path, entries: list[Tick | StepRecord | Event]) -> None:
-    with make_dashboard(tmp_path / "run.rrd", layout=None) as dashboard:
-        tell(dashboard, entries[:100])
-    found = read(tmp_path / "run.rrd")
-    assert dashboard.dropped == 0
-    assert "/signals/curvature" in found
-    assert not [path for path in found if path.startswith(("/loop", "/plane"))]
-
-
-@pytest.mark.parametrize("change", [{"input": "x"}, {"output": "x"}])
-def test_a_layout_must_name_signals_that_there_are(tmp_path: Path, change: dict[str, str]) -> None:
-    with pytest.raises(ConfigurationError, match="no signal 'x'; there are: tec_setpoint"):
-        make_dashboard(tmp_path / "run.rrd", layout=LAYOUT.model_copy(update=change))
-    assert not (tmp_path / "run.rrd").exists()
-
-
-@pytest.mark.parametrize("end", ["input", "output"])
-def test_further_loops_must_name_signals_that_there_are(tmp_path: Path, end: str) -> None:
-    first, second = MUSCLE_LAYOUT.loops
-    layout = MUSCLE_LAYOUT.model_copy(update={"loops": (first, second.model_copy(update={end: "x"}))})
-    with pytest.raises(ConfigurationError, match=rf"dashboard: loops\.1\.{end}: there is no signal 'x'; there are: "):
-        make_dashboard(tmp_path / "run.rrd", layout=layout, signals=MUSCLE_SIGNALS)
+@cases(
+    ("key", "change"),
+    [
+        ("dashboard: input", {"input": "x"}),
+        ("dashboard: output", {"output": "x"}),
+        (r"dashboard: loops\.0\.input", {"loops": (MUSCLE_LAYOUT.loops[0].model_copy(update={"input": "x"}),)}),
+        (
+            r"dashboard: loops\.1\.output",
+            {"loops": (MUSCLE_LAYOUT.loops[0], MUSCLE_LAYOUT.loops[1].model_copy(update={"output": "x"}))},
+        ),
+    ],
+)
+def test_a_layout_must_name_signals_that_there_are(tmp_path: Path, key: str, change: dict[str, object]) -> None:
+    with pytest.raises(ConfigurationError, match=f"{key}: there is no signal 'x'"):
+        make_dashboard(tmp_path / "run.rrd", layout=MUSCLE_LAYOUT.model_copy(update=change), signals=MUSCLE_SIGNALS)
     assert not (tmp_path / "run.rrd").exists()
 
 
@@ -828,9 +801,12 @@ def loop_table(input_range: tuple[float, float], output_range: tuple[float, floa
     return {"input": "a", "output": "b", "input_range": input_range, "output_range": output_range}
 
 
-@pytest.mark.parametrize(
+@cases(
     ("change", "key"),
     [
+        ({"loops": [{"input": "supply_voltage"}]}, r"loops\.0"),
+        ({"loops": [{**loop_table((0.0, 1.0), (0.0, 1.0)), "x": 1}]}, r"loops\.0\.x"),
+        ({"loops": [None]}, r"loops\.0"),
         ({"plane": (70.0, 30.0)}, "plane"),
         ({"input_range": (0.0, float("nan"))}, r"input_range\.1"),
         ({"levels": 0}, "levels"),
@@ -840,8 +816,9 @@ def loop_table(input_range: tuple[float, float], output_range: tuple[float, floa
 )
 def test_a_layout_must_be_possible(tmp_path: Path, change: dict[str, object], key: str) -> None:
     folder = keep_journal(tmp_path / "run", [], dashboard={**to_table(LAYOUT), **change})
-    with Record(folder) as record, pytest.raises(DataError, match=rf"damaged: dashboard\.{key}.* = .*: "):
+    with Record(folder) as record, pytest.raises(DataError, match=rf"damaged: dashboard\.{key}"):
         rebuild(record, folder / "run.rrd")
+    assert not (folder / "run.rrd").exists()
 
 
 def test_a_file_is_never_overwritten(tmp_path: Path, run_folder: Path) -> None:
@@ -1012,7 +989,7 @@ def test_the_control_thread_only_puts_entries_into_the_queue(
 @pytest.mark.parametrize(
     ("entries", "recorded", "entity", "count"),
     [
-        (lambda: make_run(4_000, 5), {}, "/signals/current", 20_000),
+        (lambda: make_run(1_500, 5), {}, "/signals/current", 7_500),
         (
             lambda: make_control_run(60, 200),
             {"signals": CONTROL_SIGNALS, "controls": "curvature"},

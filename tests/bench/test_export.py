@@ -165,21 +165,6 @@ def test_an_unfinished_run_is_exported_as_far_as_it_is(unfinished, tmp_path, ben
     assert code == 0
     assert json.loads((tmp_path / "metadata.json").read_text())["status"] == "unfinished"
 
-    def test_each_line_is_strict_json_where_a_number_is_missing(self, run, tmp_path, bench, edit_journal):
-        copy = tmp_path / "run"
-        shutil.copytree(run, copy)
-        edit_journal(copy / FILE_NAME, "UPDATE steps SET tip = NULL WHERE step = 0")
-        edit_journal(copy / FILE_NAME, "UPDATE steps SET tip = 1e999 WHERE step = 1")
-        assert bench("export", copy, "--format", "bluesky", "--out", tmp_path)[0] == 0
-
-        def refuse(constant):
-            raise ValueError(constant)
-
-        lines = (tmp_path / "documents.jsonl").read_text(encoding="utf-8").splitlines()
-        found = [json.loads(line, parse_constant=refuse) for line in lines]
-        rows = [document["data"] for name, document in found if name == "event" and "plate" in document["data"]]
-        assert ["tip" in row for row in rows[:3]] == [False, False, True]
-
 
 class TestFormulas:
     FORMULA = '=HYPERLINK("http://example.com","x")'

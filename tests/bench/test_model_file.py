@@ -1,6 +1,7 @@
 import copy
 import json
 import math
+from itertools import product
 
 import numpy as np
 import pytest
@@ -87,20 +88,13 @@ class TestUnusable:
         with pytest.raises(DataError, match="cannot be read"):
             load_model(tmp_path)
 
-    @pytest.mark.parametrize(
+    @cases(
         "text",
-        [b"", b"{", b"\xff\xfe", b"[1, 2", b"\x00", b'{"format": "bench-model", "version": 1' + b"0" * 5000 + b"}"],
-        ids=range(6),
+        [b"", b"\xff\xfe", b"[1, 2", b'{"format": "bench-model", "version": 1' + b"0" * 5000 + b"}", b"[" * 100_000],
     )
     def test_no_json(self, tmp_path, text):
         path = tmp_path / "m.json"
         path.write_bytes(text)
-        with pytest.raises(DataError, match=r"m\.json"):
-            load_model(path)
-
-    def test_too_deep(self, tmp_path):
-        path = tmp_path / "m.json"
-        path.write_text("[" * 100_000)
         with pytest.raises(DataError, match=r"m\.json"):
             load_model(path)
 
@@ -276,24 +270,13 @@ class TestCoupled:
     @cases(
         "change",
         [
-            {"model": None},
-            {"model": {}},
             {"model": {"type": "three-stage"}},
             {"model": {"type": "two-stage", "first": 5}},
-            {"name": None, "provenance": 7},
-            {"version": 9},
         ],
     )
     def test_damaged(self, change):
         document = {**ModelFile("two-stage", COUPLED["two-stage"]).to_json(), **change}
         with pytest.raises(DataError, match=r"m\.json"):
-            parse_model(document, "m.json")
-
-    @cases("key", ["name", "model", "provenance"])
-    def test_a_missing_key(self, key):
-        document = ModelFile("two-stage", COUPLED["two-stage"]).to_json()
-        del document[key]
-        with pytest.raises(DataError, match=f"key '{key}' is missing"):
             parse_model(document, "m.json")
 
 
@@ -357,15 +340,6 @@ class TestHybrid:
                 getattr(HYBRID.simulate(currents, voltages, 1.0), name),
             )
 
-    def test_saving_what_was_loaded_gives_the_same_file(self, tmp_path):
-        ModelFile("hybrid", HYBRID).save(tmp_path / "a.json")
-        load_model(tmp_path / "a.json").save(tmp_path / "b.json")
-        assert (tmp_path / "a.json").read_bytes() == (tmp_path / "b.json").read_bytes()
-
-    def test_saving_where_it_cannot(self, tmp_path):
-        with pytest.raises(DataError, match="cannot be written"):
-            ModelFile("hybrid", HYBRID).save(tmp_path / "absent" / "m.json")
-
     def test_no_kind_passes_for_another(self, tmp_path):
         path = tmp_path / "m.json"
         for document, kind in ((content(), "preisach"), (ModelFile("x", COUPLED["summed"]).to_json(), "summed")):
@@ -376,19 +350,6 @@ class TestHybrid:
             path.write_text(json.dumps(document))
             with pytest.raises(DataError, match=rf"m\.json is not a model file: its `format` is not '{FORMAT}'"):
                 load_model(path, "hybrid")
-
-    def test_no_file_and_no_json(self, tmp_path):
-        with pytest.raises(DataError, match=r"absent\.json cannot be read: No such file"):
-            load_model(tmp_path / "absent.json")
-        for text in (b"", b"{", b"\xff\xfe", b"[" * 100_000):
-            (tmp_path / "m.json").write_bytes(text)
-            with pytest.raises(DataError, match=r"m\.json"):
-                load_model(tmp_path / "m.json")
-
-    @cases("version", [0, 1, 3, "2", None])
-    def test_another_version(self, hybrid_file, version):
-        with pytest.raises(DataError, match=f"has version .*; this bench reads version {VERSION}"):
-            load_model(hybrid_file([(("version",), version)]))
 
     @cases(
         "path",
@@ -497,8 +458,7 @@ def places_of_numbers(document, path=()):
             yield *path, key
 
 
-@pytest.mark.parametrize("name", MODELS)
-@pytest.mark.parametrize("other", [True, False, "x", [], 10**400])
+@cases(("name", "other"), product(MODELS, [True, "x", [], 10**400]))
 def test_nothing_else_is_taken_for_a_number(name, other):
     for *path, key in places_of_numbers(content(name)["model"]):
         changed = content(name)
@@ -510,7 +470,7 @@ def test_nothing_else_is_taken_for_a_number(name, other):
             parse_model(changed, "m.json")
 
 
-@pytest.mark.parametrize(
+@cases(
     ("key", "value"),
     [("skipped", ""), ("skipped", {}), ("skipped", True), ("rms", "0.1"), ("input", ["u"]), ("time", 1)],
 )

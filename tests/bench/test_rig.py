@@ -1,11 +1,12 @@
 import tomllib
 
 import pytest
+from cases import cases
 from heater_laboratory import CLOSED, RIG, HeaterLaboratory, HeaterTEC
 from hypothesis import given, settings, strategies as st
 
 from bench.base import ConfigurationError, DeviceConnectionError, DeviceError, VirtualClock
-from bench.rig import DashboardLayout, Rig, load_rig, packaged_rigs
+from bench.rig import DashboardLayout, Rig, load_rig
 
 SPOT = """
 [devices.spot]
@@ -100,15 +101,6 @@ class TestRight:
         assert file.laboratory_settings.noise == 0.0
         assert load_rig(path).rig.title == "a heated plate"
 
-    def test_packaged(self):
-        assert "vo2" in packaged_rigs()
-        assert load_rig("vo2").name == "vo2"
-
-    def test_dashboard(self, rig_file):
-        dashboard = load_rig(rig_file(append=DASHBOARD)).dashboard
-        assert dashboard.levels == 20
-        assert dashboard.loops == ()
-
     def test_further_loops(self, rig_file):
         loops = DASHBOARD + LOOP + LOOP.replace("tec_current", "tec_voltage")
         with Rig(load_rig(rig_file(append=loops)), VirtualClock(), 1) as rig:
@@ -127,29 +119,25 @@ class TestFile:
             load_rig("vo3")
         wrong(str(tmp_path / "heater.toml"), "cannot be read")
 
-    def test_a_folder(self, tmp_path):
-        (tmp_path / "heater.toml").mkdir()
-        wrong(str(tmp_path / "heater.toml"), "cannot be read")
-
-    def test_not_toml(self, rig_file):
-        wrong(rig_file(append="\nperiod = \n"), "not valid TOML", "line")
-
-    def test_a_table_twice(self, rig_file):
-        wrong(rig_file(append="\n[rig]\ntitle = 'x'\n"), "not valid TOML")
-
-    def test_not_text(self, tmp_path):
+    @cases(
+        ("content", "expected"),
+        [
+            (None, ("cannot be read",)),
+            (b"", ("rig: is missing", "devices: is missing")),
+            (f"{RIG}\nperiod = \n".encode(), ("not valid TOML", "line")),
+            (f"{RIG}\n[rig]\ntitle = 'x'\n".encode(), ("not valid TOML",)),
+            (RIG.encode("utf-16"), ("cannot be read", "utf-8")),
+            (b"[rig]\ntitle = 'x'\n[devices]\n", ("devices", "at least 1")),
+        ],
+    )
+    def test_what_is_no_rig_file(self, tmp_path, content, expected):
         path = tmp_path / "heater.toml"
-        path.write_bytes(RIG.encode("utf-16"))
-        wrong(str(path), "cannot be read", "utf-8")
-
-    def test_empty(self, tmp_path):
-        path = tmp_path / "heater.toml"
-        path.write_text("")
-        wrong(str(path), "rig: is missing", "devices: is missing")
+        path.mkdir() if content is None else path.write_bytes(content)
+        wrong(str(path), *expected)
 
 
 class TestUnknownKeys:
-    @pytest.mark.parametrize(
+    @cases(
         ("old", "new", "key", "allowed"),
         [
             (
@@ -176,55 +164,41 @@ class TestUnknownKeys:
         message = wrong(rig_file((old, new)), f"{key}: there is no such key", "allowed are:", allowed)
         assert len(message.splitlines()) == 1
 
-    def test_in_the_dashboard(self, rig_file):
-        wrong(rig_file(append=DASHBOARD + "level = 3\n"), "dashboard.level: there is no such key", "levels")
-
-    def test_in_a_further_loop(self, rig_file):
-        wrong(
-            rig_file(append=DASHBOARD + LOOP.replace("output_range", "outputs")),
-            "dashboard.loops.0.outputs: there is no such key; allowed are: input, output, input_range, output_range",
-            "dashboard.loops.0.output_range: is missing (ends of the vertical axis)",
-        )
-
-    def test_in_a_derived_signal(self, rig_file):
-        wrong(
-            rig_file(append=DERIVED.replace("length", "lenght")),
-            "derived.curvature.lenght: there is no such key",
-            "allowed are: kind, source, length, residual_curvature",
-            "derived.curvature.length: is missing (length of the beam, m)",
-        )
-
-    def test_in_a_derived_signal_with_a_dash(self, rig_file):
-        wrong(
-            rig_file(append=DERIVED.replace("[derived.curvature]", "[derived.my-curve]") + "x = 1\n"),
-            "derived.my-curve.x",
-        )
+    @cases(
+        ("text", "expected"),
+        [
+            (DASHBOARD + "level = 3\n", ("dashboard.level: there is no such key", "levels")),
+            (
+                DASHBOARD + LOOP.replace("output_range", "outputs"),
+                ("dashboard.loops.0.outputs: there is no such key", "dashboard.loops.0.output_range: is missing"),
+            ),
+            (
+                DERIVED.replace("length", "lenght"),
+                ("derived.curvature.lenght: there is no such key", "derived.curvature.length: is missing"),
+            ),
+            (DERIVED.replace("[derived.curvature]", "[derived.my-curve]") + "x = 1\n", ("derived.my-curve.x",)),
+        ],
+    )
+    def test_in_tables_that_are_added(self, rig_file, text, expected):
+        wrong(rig_file(append=text), *expected)
 
 
 class TestWrongValues:
-    @pytest.mark.parametrize(
+    @cases(
         ("old", "new", "expected"),
         [
             ('"a heated plate"', "5", ("rig.title = 5", "string")),
-            ('"a heated plate"', '""', ("rig.title = ''", "at least 1")),
             ("period = 0.5", "period = 0.0", ("telemetry.period = 0.0", "0.01")),
-            ("period = 0.5", "period = 61", ("telemetry.period = 61", "60")),
             ("period = 0.5", "period = 'often'", ("telemetry.period = 'often'", "number")),
-            ("period = 0.5", "period = nan", ("telemetry.period = nan",)),
             ("high = 90.0", "high = 90.0\nlow = 95.0", ("interlocks.0", "low must be below high", "95", "90")),
-            ("high = 90.0", "high = 90.0\nseconds = -1", ("interlocks.0.seconds = -1", "greater than or equal to 0")),
-            ("high = 90.0", "", ("interlocks.0", "low or high")),
-            ("high = 90.0", "high = nan", ("interlocks.0",)),
             ("[10.0, 95.0]", "[10.0]", ("devices.tec.temperature_limits",)),
             ("[10.0, 95.0]", "[10.0, nan]", ("devices.tec.temperature_limits", "nan")),
-            ("[10.0, 95.0]", "[10.0, inf]", ("devices.tec.temperature_limits", "inf")),
             ("[10.0, 95.0]", "'warm'", ("devices.tec.temperature_limits = 'warm'", "allowed set-points, °C")),
             (
                 "noise = 0.002",
                 "noise = 2",
                 ("emulation.noise = 2", "less than or equal to 1", "noise of one reading"),
             ),
-            ("noise = 0.002", "noise = nan", ("emulation.noise = nan",)),
             (
                 "temperature_limits = [10.0, 95.0]",
                 "",
@@ -243,7 +217,6 @@ class TestWrongValues:
                 ("devices.tec.driver = 'no_such:X'", "cannot be loaded"),
             ),
             ('"heater_laboratory:HeaterTEC"', '":X"', ("devices.tec.driver = ':X'",)),
-            ('"heater_laboratory:HeaterTEC"', '".relative:X"', ("devices.tec.driver = '.relative:X'",)),
             ('"heater_laboratory:HeaterTEC"', '"a..b:X"', ("devices.tec.driver = 'a..b:X'",)),
             ('"heater_laboratory:HeaterTEC"', '"heater_laboratory:Gone"', ("has no Gone",)),
             ('"heater_laboratory:HeaterTEC"', '"heater_laboratory:RIG"', ("devices.tec.driver", "not a class")),
@@ -265,7 +238,6 @@ class TestWrongValues:
             ),
             ('laboratory = "heater_laboratory:HeaterLaboratory"', "", ("emulation.laboratory",)),
             ('"heater_laboratory:HeaterLaboratory"', '"no_such:X"', ("emulation.laboratory = 'no_such:X'",)),
-            ('"heater_laboratory:HeaterLaboratory"', '".x:X"', ("emulation.laboratory = '.x:X'",)),
             (
                 '"emulated://heater"',
                 '"emulated://cooler"',
@@ -281,9 +253,7 @@ class TestWrongValues:
     def test_names_file_key_value_and_what_is_allowed(self, rig_file, old, new, expected):
         wrong(rig_file((old, new)), *expected)
 
-    @pytest.mark.parametrize(
-        "code", ["1 / 0", "raise RuntimeError('no')", "def broken(:", "import no_such_module", "undefined"]
-    )
+    @cases("code", ["1 / 0", "raise RuntimeError('no')", "def broken(:", "import no_such_module", "undefined"])
     def test_a_driver_whose_module_fails(self, rig_file, tmp_path, monkeypatch, code):
         (tmp_path / "failing_driver.py").write_text(code)
         monkeypatch.syspath_prepend(str(tmp_path))
@@ -295,14 +265,7 @@ class TestWrongValues:
         path = rig_file(('[emulation]\nlaboratory = "heater_laboratory:HeaterLaboratory"\nnoise = 0.002', ""))
         wrong(path, "devices.tec.port = 'emulated://heater'", "none: the rig has no [emulation]")
 
-    def test_no_devices(self, tmp_path):
-        path = tmp_path / "heater.toml"
-        path.write_text("[rig]\ntitle = 'x'\n[devices]\n")
-        wrong(str(path), "devices", "at least 1")
-
-    @pytest.mark.parametrize(
-        "table", ["rig", "devices", "telemetry", "emulation", "interlocks", "derived", "dashboard"]
-    )
+    @cases("table", ["rig", "devices", "telemetry", "emulation", "interlocks", "derived", "dashboard"])
     def test_a_table_that_is_none(self, tmp_path, table):
         path = tmp_path / "heater.toml"
         text = f"{table} = 5\n" + ("" if table == "rig" else "[rig]\ntitle = 'x'\n")
@@ -315,7 +278,7 @@ class TestWrongValues:
         )
         assert len(message.splitlines()) == 2
 
-    @pytest.mark.parametrize(
+    @cases(
         ("key", "value"),
         [
             ("input_range", "[1.0, 1.0]"),
@@ -330,19 +293,12 @@ class TestWrongValues:
         lines = [line for line in DASHBOARD.splitlines() if not line.startswith(key)]
         wrong(rig_file(append="\n".join([*lines, f"{key} = {value}\n"])), f"dashboard.{key}")
 
-    def test_dashboard_signals(self, rig_file):
-        wrong(
-            rig_file(append=DASHBOARD.replace('"tec_temperature"', '"tec"')),
-            "dashboard.input = 'tec'",
-            "tec_setpoint",
-        )
-
-    @pytest.mark.parametrize(("key", "value"), [("input_range", "[1.0, 1.0]"), ("output_range", "[2.0, nan]")])
+    @cases(("key", "value"), [("input_range", "[1.0, 1.0]"), ("output_range", "[2.0, nan]")])
     def test_ranges_of_a_further_loop(self, rig_file, key, value):
         lines = [line for line in LOOP.splitlines() if not line.startswith(key)]
         wrong(rig_file(append="\n".join([DASHBOARD, *lines, f"{key} = {value}\n"])), f"dashboard.loops.0.{key}")
 
-    @pytest.mark.parametrize(("key", "name"), [("input", "probe_temperature"), ("output", "tec_current")])
+    @cases(("key", "name"), [("input", "probe_temperature"), ("output", "tec_current")])
     def test_signals_of_a_further_loop(self, rig_file, key, name):
         wrong(
             rig_file(append=DASHBOARD + LOOP + LOOP.replace(f'{key} = "{name}"', f'{key} = "tec"')),
@@ -361,36 +317,30 @@ class TestDerived:
             assert values["spot_position"] == pytest.approx(60e-6, abs=0.05e-6)
             assert values["curvature"] == pytest.approx(1350.0, abs=5.0)
 
-    def test_of_a_derived_one_that_comes_before(self, rig_file):
-        second = DERIVED.replace("derived.curvature", "derived.again").replace("spot_position", "curvature")
-        wrong(rig_file(append=SPOT + DERIVED + second), "derived.again.source = 'curvature'", "1/m")
-
-    def test_an_unknown_source(self, rig_file):
-        wrong(rig_file(append=DERIVED), "derived.curvature.source = 'spot_position'", "probe_temperature")
-
-    def test_of_itself(self, rig_file):
-        wrong(
-            rig_file(append=DERIVED.replace("spot_position", "curvature")), "derived.curvature.source = 'curvature'"
-        )
-
-    def test_of_a_derived_one_that_comes_later(self, rig_file):
-        later = DERIVED.replace("derived.curvature", "derived.later").replace("spot_position", "probe_temperature")
-        wrong(
-            rig_file(append=DERIVED.replace("spot_position", "later") + later), "derived.curvature.source = 'later'"
-        )
-
-    def test_of_a_signal_of_another_unit(self, rig_file):
-        wrong(
-            rig_file(append=DERIVED.replace("spot_position", "probe_temperature")),
-            "derived.curvature.source = 'probe_temperature'",
-            "°C",
-        )
-
-    def test_of_an_unknown_kind(self, rig_file):
-        wrong(rig_file(append=DERIVED.replace("cantilever-curvature", "magic")), "derived.curvature.kind = 'magic'")
-
-    def test_too_bent_at_rest(self, rig_file):
-        wrong(rig_file(append=DERIVED + "residual_curvature = 9000\n"), "derived.curvature", "7770.4 1/m")
+    @cases(
+        ("text", "expected"),
+        [
+            (
+                SPOT + DERIVED + DERIVED.replace(".curvature", ".again").replace("spot_position", "curvature"),
+                ("derived.again.source = 'curvature'", "1/m"),
+            ),
+            (DERIVED, ("derived.curvature.source = 'spot_position'", "probe_temperature")),
+            (DERIVED.replace("spot_position", "curvature"), ("derived.curvature.source = 'curvature'",)),
+            (
+                DERIVED.replace("spot_position", "later")
+                + DERIVED.replace(".curvature", ".later").replace("spot_position", "probe_temperature"),
+                ("derived.curvature.source = 'later'",),
+            ),
+            (
+                DERIVED.replace("spot_position", "probe_temperature"),
+                ("derived.curvature.source = 'probe_temperature'", "°C"),
+            ),
+            (DERIVED.replace("cantilever-curvature", "magic"), ("derived.curvature.kind = 'magic'",)),
+            (DERIVED + "residual_curvature = 9000\n", ("derived.curvature", "7770.4 1/m")),
+        ],
+    )
+    def test_a_source_or_kind_that_does_not_fit_is_refused(self, rig_file, text, expected):
+        wrong(rig_file(append=text), *expected)
 
 
 class TestSample:
@@ -425,7 +375,7 @@ class TestNames:
         more = '\n[devices.tec_sink]\ndriver = "heater_laboratory:Thermometer"\nport = "emulated://thermometer"\n'
         wrong(rig_file(append=more), "tec_sink_temperature")
 
-    @pytest.mark.parametrize("name", ["Probe", "probe"])
+    @cases("name", ["Probe", "probe"])
     def test_case_does_not_make_a_difference(self, rig_file, name):
         more = (
             f'\n[devices.{name.upper()}]\ndriver = "heater_laboratory:Thermometer"\nport = "emulated://thermometer"\n'
@@ -434,7 +384,7 @@ class TestNames:
 
 
 class TestOverrides:
-    @pytest.mark.parametrize(
+    @cases(
         ("key", "expected"),
         [
             ("devices.laser.port", "there is no table 'devices.laser' in which 'port' could be set"),
@@ -475,14 +425,6 @@ class TestConnecting:
             for device in rig.devices.values():
                 device.close_error = OSError(5, "Input/output error")
         assert CLOSED == ["probe", "tec"]
-
-    def test_needs(self, rig_file):
-        with Rig(load_rig(rig_file()), VirtualClock(), 1) as rig:
-            rig.description.check_needs("x", ["tec", "probe_temperature"])
-            with pytest.raises(
-                ConfigurationError, match="protocol x needs curvature, which rig heater does not have"
-            ):
-                rig.description.check_needs("x", ["tec", "curvature"])
 
 
 def _paths(node, prefix=()):
