@@ -175,9 +175,6 @@ class TestLimits:
         with pytest.raises(ValueError, match="expected low ≤ high"):
             Limits(low, high, "V")
 
-    def test_says_its_unit(self):
-        assert str(Limits(-10.0, 95.0, "°C")) == "-10 to 95 °C"
-
 
 class TestSetpoints:
     @pytest.mark.parametrize("value", [9.999, 95.001, math.nan, math.inf, -math.inf])
@@ -314,12 +311,3 @@ class TestBlueskyByStructure:
                 assert key["shape"] == []
                 assert device.identity.serial_number in key["source"]
                 assert reading[signal.name]["timestamp"] == rig.clock.epoch.timestamp() + 3.0
-
-
-def test_identity_on_one_line():
-    identity = Identity("Meerstetter", "TEC-1091", "42", "5.10")
-    assert str(identity) == "Meerstetter TEC-1091, serial number 42, firmware 5.10"
-
-
-def test_signal_shows_three_digits_unless_told():
-    assert Signal("a", "m", "position").precision == 3

@@ -236,17 +236,6 @@ class TestProcesses:
             assert run.meta["safe_state"] == {"tec": "safe", "probe": "safe"}
             return len(run.steps())
 
-    def test_runs_to_its_end(self, start):
-        process = start("stairs", "dwell=0.5", clock="virtual")
-        assert process.end() == 0, process.output
-        assert sorted(process.safe_devices()) == ["probe", "tec"]
-        with process.record() as run:
-            assert run.status == "completed"
-            assert run.meta["protocol"] == "stairs"
-            assert run.meta["devices"]["tec"] == "Test Heater, serial number 1, firmware 1.0"
-            assert run.meta["parameters"]["dwell"] == 0.5
-            assert run.meta["plan"]["steps"] == len(run.steps()) == 4
-
     def test_ctrl_c_once_without_a_terminal_ends_at_the_next_step(self, start):
         process = start("stairs", "dwell=0.5", "count=1000", "increment=0.05")
         process.until("step 0 at")

@@ -11,6 +11,7 @@ from contextlib import closing
 
 import numpy as np
 import pytest
+from cases import cases
 
 from bench.base import ConfigurationError, DataError, IncompleteRecordWarning
 from bench.devices import Settled, Signal
@@ -151,7 +152,7 @@ class TestSecondFile:
         journal.close()
 
 
-@pytest.mark.parametrize("table", ["meta", "signals", "steps", "telemetry", "events", "files"])
+@cases("table", ["meta", "signals", "steps", "telemetry", "events", "files"])
 def test_a_row_whose_checksum_does_not_fit_is_told_and_left_out(tmp_path, table):
     journal = Journal(tmp_path / FILE_NAME, SIGNALS, {"rig": "vo2"}, {"a.txt": b"a", "b.txt": b"b"})
     for number in range(4):

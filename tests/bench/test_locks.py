@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from cases import cases
 
 from bench.base import ConfigurationError
 from bench.devices import Identity
@@ -83,7 +84,7 @@ class TestNames:
         monkeypatch.chdir(tmp_path)
         assert line_names("./ttyUSB0") == line_names("ttyUSB0") == line_names(node)
 
-    @pytest.mark.parametrize(
+    @cases(
         "other",
         [
             "socket://127.0.0.1:502",
@@ -106,7 +107,7 @@ class TestNames:
             pytest.skip("the name of this computer has no address")
         assert set(line_names(f"tcp://{socket.gethostname()}:502")) & set(line_names("tcp://127.0.0.1:502"))
 
-    @pytest.mark.parametrize("other", ["tcp://127.0.0.1:503", "tcp://192.0.2.7:502", "/dev/ttyUSB0", "COM3"])
+    @cases("other", ["tcp://127.0.0.1:503", "tcp://192.0.2.7:502", "/dev/ttyUSB0", "COM3"])
     def test_other_lines_have_other_names(self, other):
         assert not set(line_names("tcp://127.0.0.1:502")) & set(line_names(other))
 

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cases import cases
 
 from bench.identification import check_options, load_model, model_options
 from bench.identification.branches import turning_points
@@ -110,7 +111,7 @@ def test_the_weight_of_a_row(bench, table):
     assert plain.evaluate(np.linspace(0.0, 5.0, 50))[-1] != pytest.approx(5.0, abs=0.5)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("options", "words"),
     [
         (["--model", "prandtl-ishlinskii", "--levels", "20"], ["there is no levels", "plays (15)", "dead_zones (0)"]),

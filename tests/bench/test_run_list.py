@@ -91,7 +91,7 @@ def test_a_run_that_goes_on_is_told_from_one_that_died(bench, runs, tmp_path):
     assert found == []
 
 
-@pytest.mark.parametrize(
+@cases(
     ("options", "expected"),
     [
         (["--where", "increment=7.50"], {"hotter"}),
@@ -210,7 +210,7 @@ def test_the_name_of_a_folder_is_short_and_fits_every_file_system():
 
 
 class TestWhatIsAskedFor:
-    @pytest.mark.parametrize(
+    @cases(
         ("option", "value", "said"),
         [
             ("--status", "nonsense", "'completed', 'aborted', 'failed', 'running', 'unfinished', 'damaged'"),

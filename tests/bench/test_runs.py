@@ -1,9 +1,9 @@
 import io
 import signal
-import sqlite3
 import threading
 
 import pytest
+from cases import cases
 from heater_laboratory import CLOSED, HeaterLaboratory, HeaterTEC
 from heater_protocols import Stairs, settle, stairs
 from rich.console import Console
@@ -87,18 +87,7 @@ class TestCarryOut:
         folders = {carry_out(make(), console).folder for _ in range(3)}
         assert len(folders) == 3
 
-    def test_the_same_seed_gives_the_same_readings(self, make, console):
-        tables = []
-        for _ in range(2):
-            folder = carry_out(make(seed=3), console).folder
-            db = sqlite3.connect(folder / "journal.sqlite")
-            tables.append(
-                [db.execute(f"SELECT * FROM {name}").fetchall() for name in ("steps", "telemetry", "events")]
-            )
-            db.close()
-        assert tables[0] == tables[1]
-
-    @pytest.mark.parametrize(
+    @cases(
         ("keys", "expected"),
         [
             ({"settings": {"count": 100}}, "rig heater allows 10 to 95 °C"),
@@ -253,7 +242,7 @@ class Screen:
 
 
 class TestQuestion:
-    @pytest.mark.parametrize(
+    @cases(
         ("typed", "answer"),
         [
             ("r\n", "resume"),
