@@ -3,7 +3,7 @@
 The goals of a study leave room; a controller could lose most of its accuracy and still meet them. The numbers
 recorded are those of seed 0 with the settings `SHORT`:
 
-    python tests/regression_bands.py vo2
+    python -P tests/regression_bands.py vo2
 """
 
 import json
@@ -17,8 +17,22 @@ BAND = 1.5
 RECORDED_SEED = 0
 SHORT = {
     "vo2": ("tracking.count=20", "following.duration=400"),
-    "sma": ("length-control.count=10", "force-control.count=10"),
-    "muscles": ("length-voltage.points=19", "length-verification.points=9", "length-force.points=8"),
+    "sma": (
+        "length-voltage.points=19",
+        "length-verification.points=9",
+        "length-force.points=8",
+        "length-control.count=10",
+        "force-control.count=10",
+    ),
+    "muscles": (
+        "length-voltage.points=19",
+        "length-verification.points=9",
+        "length-force.points=8",
+        "length-voltage.dwell=30",
+        "length-verification.dwell=30",
+        "length-force.dwell=30",
+        "force-voltage.dwell=30",
+    ),
     "hybrid": ("hybrid-control.positions=90e-6, -120e-6",),
 }
 """Settings with which a study takes less time: fewer targets, points and moves."""
