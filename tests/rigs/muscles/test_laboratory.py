@@ -334,13 +334,8 @@ class TestSettings:
         ("key", "value", "words"),
         [
             ("battery_voltage", "0", "greater than 0"),
-            ("supply_watchdog", "66", "less than or equal to 65"),
-            ("drum_radius", "-1e-3", "greater than 0"),
-            ("drum_zero_counts", "4096", "less than or equal to 4095"),
             ("rest_position", "0.05", "less than or equal to 0.035"),
-            ("force_noise", "-0.1", "greater than or equal to 0"),
             ("fault", "fire", "'missing-heartbeat'"),
-            ("fault_time", "-1", "greater than or equal to 0"),
             ("temperature", "20", "there is no such key"),
         ],
     )
