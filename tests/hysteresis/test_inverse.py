@@ -85,7 +85,7 @@ def test_random_states_against_a_dense_scan(make):
     # Coarse and fine planes, most of whose cells are empty.
     inverses = [PreisachInverse(make(order)) for order in (5, 12, 20, 50)]
     compared = 0
-    for i in range(320):
+    for i in range(160):
         inverse = inverses[i % len(inverses)]
         operator = inverse.operator
         state = random_state(rng, *operator.input_range)
@@ -113,7 +113,7 @@ def test_random_states_against_a_dense_scan(make):
                 travel = abs(found.setpoints[0] - state.input)
                 assert travel <= min(distances) + 1e-6
                 compared += travel >= min(distances) - 1e-6
-    assert compared > 290
+    assert compared > 145
 
 
 @settings(max_examples=200)
