@@ -261,17 +261,6 @@ class TestProcesses:
         process.send(getattr(signal, name))
         assert self.assert_aborted(process, name) == 0
 
-    def test_an_ignored_hangup_is_survived(self, start):
-        def ignore():
-            signal.signal(signal.SIGHUP, signal.SIG_IGN)
-
-        process = start("stairs", "dwell=0.3", preexec_fn=ignore)
-        process.until("step 0 at")
-        process.send(signal.SIGHUP)
-        assert process.end() == 0, process.output
-        with process.record() as run:
-            assert run.status == "completed"
-
     def test_killed_it_leaves_what_was_finished(self, start):
         process = start("stairs", "dwell=0.02", "count=2000", "increment=0.02")
         process.until("step 20 at")
@@ -291,18 +280,6 @@ class TestProcesses:
         os.write(process.terminal, b"\x03")
         process.until("PAUSED for")
         return process
-
-    def test_at_a_terminal_pause_and_resume(self, start):
-        process = self.paused(start, "stairs", "dwell=0.3", "count=100", "increment=0.1")
-        os.write(process.terminal, b"what\nset dwell=0\nr\n")
-        process.until("OUTCOME completed 100 True")
-        assert process.end() == 0, process.output
-        assert "please answer r" in process.output
-
-    def test_at_a_terminal_pause_and_end(self, start):
-        process = self.paused(start, "stairs", "dwell=0.3", "count=500", "increment=0.1")
-        os.write(process.terminal, b"a\n")
-        self.assert_aborted(process, "by the operator at a pause")
 
     def test_at_a_terminal_ctrl_c_twice(self, start):
         # The question is left open while the process ends.

