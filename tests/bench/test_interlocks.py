@@ -321,6 +321,14 @@ class TestSettle:
         course = [(0.0, 20.0, 25.0), (1.0, 61.0, 30.0), (10.9, 61.0, 30.0), (11.0, 61.0, 30.0)]
         assert looks(self.guard(), course) == [(11.0, "safe", False)]
 
+    @cases("setpoint", [25.0, math.nan])
+    def test_without_a_change_it_acts_at_once(self, setpoint):
+        assert looks(self.guard(), [(0.0, 20.0, setpoint), (20.0, 61.0, setpoint)]) == [(20.0, "safe", False)]
+
+    def test_a_loop_that_changes_it_all_the_time_puts_it_off_for_twice_the_time_at_most(self):
+        course = [(0.5 * k, 61.0 if k > 2 else 20.0, 25.0 + k) for k in range(100)]
+        assert looks(self.guard(), course) == [(20.5, "safe", False)]
+
     def test_another_device_does_not_count(self):
         guard = self.guard(setpoint="supply")
         assert looks(guard, [(0.0, 20.0, 25.0), (1.0, 61.0, 30.0)]) == [(1.0, "safe", False)]

@@ -7,7 +7,15 @@ import pytest
 from cases import cases
 from hypothesis import given, strategies as st
 
-from bench.control import AddedSine, SmoothMoves, fastest_slope, modulated_sine, staircase, tracking_targets
+from bench.control import (
+    AddedSine,
+    ApproachedReference,
+    SmoothMoves,
+    fastest_slope,
+    modulated_sine,
+    staircase,
+    tracking_targets,
+)
 from bench.models import Preisach, PreisachInverse, QuadraticTerm, uniform_levels
 
 MICRO, NANO = 1e-6, 1e-9
@@ -150,6 +158,17 @@ def test_staircase_and_sine():
     assert [sine(t) for t in times] == pytest.approx(expected, abs=1e-15)
     assert sine(0.0) == stairs(0.0)
     assert abs(sine(0.01) - stairs(0.01)) < 1e-3 * NANO
+
+
+@cases(("output", "is_near"), [(3.1, True), (5.0, False)])
+def test_a_reference_that_begins_elsewhere_is_put_off_until_it_is_approached(output, is_near):
+    reference = ApproachedReference(lambda t: 3.0 + math.sin(t), 0.5, 2.0)
+    reference.begin(output)
+    assert (reference.delay == 0.0) is is_near
+    assert reference(0.0) == (3.0 if is_near else output)
+    assert reference(reference.delay) == 3.0
+    assert reference(reference.delay + 1.0) == pytest.approx(3.0 + math.sin(1.0))
+    assert (reference.from_here is reference) is not is_near
 
 
 @cases(
