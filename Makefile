@@ -43,7 +43,7 @@ demo-sma demo-muscles demo-hybrid: demo-%: $(DEMO)
 # Under a minute: numbers, contracts and drivers.
 test-quick: lint
 	$(PYTEST) --hypothesis-profile=brief -m 'not benchmark and not seeds and not slow' \
-		tests/hysteresis tests/identification tests/control tests/contracts tests/drivers
+		tests/unit/models tests/unit/identification tests/unit/control tests/contract tests/wire/drivers
 
 # Everything, with a short run of each study.
 test: preflight tests check
@@ -53,7 +53,7 @@ test-all: preflight all-tests check
 
 # What the tests cannot install themselves, said before anything else.
 preflight:
-	@$(PYTHON) tests/programs.py
+	@$(PYTHON) tests/support/programs.py
 
 check: lint types
 
@@ -67,7 +67,7 @@ types: lint
 
 # Compiled once, before the workers of the tests would each do it.
 kernels: $(BASE)
-	$(BIN)/python -P tests/kernels.py
+	$(BIN)/python -P tests/support/kernels.py
 
 # So are the modules of the tests, with what pytest makes of their assertions; what is wrong with one of them is said
 # when the tests run.

@@ -26,10 +26,14 @@ import protocols  # noqa: F401
 import rigs  # noqa: F401
 import sim_devices  # noqa: F401
 
-sys.path.append(str(Path(__file__).parent))
+sys.path.append(str(Path(__file__).parent / "support"))
+from places import SUPPORT
 from programs import PROGRAMS, how_to_install, missing
 from regression_bands import RECORDED_SEED, beyond_the_bands, options_of
 from warm_popen import WarmPopen
+
+# Modules of asserts that tests share.
+pytest.register_assert_rewrite("emulated_bench", "short_runs")
 
 # Before numpy is loaded, and for the processes of the tests too: two workers, each with a thread of BLAS a core,
 # wait for one another, and a product of small matrices takes ten times as long.
@@ -250,7 +254,7 @@ def warm_start(tmp_path_factory):
             end = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
             held = os.open(pipe, os.O_WRONLY)
             path.unlink(missing_ok=True)
-            command = [sys.executable, "-P", str(Path(__file__).with_name("warm_start.py")), str(path)]
+            command = [sys.executable, "-P", str(SUPPORT / "warm_start.py"), str(path)]
             # Returns when the process is ready.
             subprocess.run(command, stdin=end, check=True)
             os.close(end)
@@ -292,7 +296,7 @@ def warm_commands(warm_start, tmp_path_factory):
     folder = tmp_path_factory.mktemp("commands")
     if warm_start is not None:
         for name in ("bench", "python"):
-            command = [sys.executable, "-SE", str(Path(__file__).with_name("warm_client.py")), str(warm_start), name]
+            command = [sys.executable, "-SE", str(SUPPORT / "warm_client.py"), str(warm_start), name]
             (folder / name).write_text(f'#!/bin/sh\nexec {shlex.join(command)} "$@"\n')
             (folder / name).chmod(0o755)
     return folder
@@ -406,3 +410,21 @@ def edit_journal():
                 db.executemany(f"UPDATE {table} SET checksum = ? WHERE {key} = ?", renewed)
 
     return edit
+
+
+@pytest.fixture
+def rig_file(tmp_path):
+    """Write a rig file: the heater's, with replacements and an appendix."""
+
+    # Rig files of these tests name their drivers as `heater_laboratory:HeaterTEC`.
+    from heater_laboratory import RIG
+
+    def write(*replacements, append="", text=RIG):
+        for old, new in replacements:
+            assert old in text, old
+            text = text.replace(old, new)
+        path = tmp_path / "heater.toml"
+        path.write_text(text + append, encoding="utf-8")
+        return str(path)
+
+    return write

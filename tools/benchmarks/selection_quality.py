@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from bench.identification import Candidate, Measurements, compared_models, identify, identify_in_time, select
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "identification"))
+sys.path.insert(0, str(Path(__file__).parents[2] / "tests" / "support"))
 
 from hysteretic_plants import PLANTS, butterfly, damped, random_reversals, settled, through
 

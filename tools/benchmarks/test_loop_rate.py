@@ -17,7 +17,7 @@ from bench.record import Record, lateness_lines
 from bench.rig import read_endpoints
 from sim_devices.serving.process import serve
 
-sys.path.append(str(Path(__file__).parents[2] / "tests" / "bench"))
+sys.path.append(str(Path(__file__).parents[2] / "tests" / "support"))
 
 from following_supplies import hardware_of, rig_of, supplies
 

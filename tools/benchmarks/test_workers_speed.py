@@ -7,7 +7,7 @@ import pytest
 
 from bench.base import Stopwatch, Workers, available_cores
 
-sys.path.append(str(Path(__file__).parents[2] / "tests" / "bench"))
+sys.path.append(str(Path(__file__).parents[2] / "tests" / "support"))
 import worker_tasks
 
 RUNS_A_CORE = 4

@@ -1,6 +1,0 @@
-"""Hypothesis without deadlines: the first call of a compiled loop loads it."""
-
-from hypothesis import settings
-
-settings.register_profile("compiled", deadline=None)
-settings.load_profile("compiled")

@@ -1,0 +1,88 @@
+"""Bands of the studies' errors: none may be half as much again as what was recorded.
+
+The goals of a study leave room; a controller could lose most of its accuracy and still meet them. The numbers
+recorded are those of seed 0 with the settings `SHORT`:
+
+    python -P tests/support/regression_bands.py vo2
+"""
+
+import json
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+RECORDED = Path(__file__).parents[1] / "golden" / "recorded"
+ERRORS = {"rms", "max", "median", "average", "settling", "seconds"}
+BAND = 1.5
+RECORDED_SEED = 0
+SHORT = {
+    "vo2": ("tracking.count=20", "following.duration=400"),
+    "sma": (
+        "length-voltage.points=19",
+        "length-verification.points=9",
+        "length-force.points=8",
+        "length-control.count=10",
+        "force-control.count=10",
+    ),
+    "muscles": (
+        "length-voltage.points=19",
+        "length-verification.points=9",
+        "length-force.points=8",
+        "length-voltage.dwell=30",
+        "length-verification.dwell=30",
+        "length-force.dwell=30",
+        "force-voltage.dwell=30",
+    ),
+    "hybrid": ("hybrid-control.positions=90e-6, -120e-6",),
+}
+"""Settings with which a study takes less time: fewer targets, points and moves."""
+
+
+def options_of(study):
+    """Return the options of `bench reproduce` for the short study."""
+    return [text for setting in SHORT[study] for text in ("--set", setting)]
+
+
+def errors_of(result):
+    """Return the errors among the numbers of a study by their dotted names."""
+    # Imported late: most tests do not need it.
+    from bench.batch.campaign.tasks import flat_numbers
+
+    return {
+        name: value
+        for name, (value, _) in flat_numbers(result)
+        if ERRORS & set(name.rpartition(".")[2].split("_")) and not name.endswith("_seconds")
+    }
+
+
+def beyond_the_bands(study, result):
+    """Return a line for each error that is missing, or beyond its band."""
+    found, recorded = errors_of(result), json.loads((RECORDED / f"{study}.json").read_text(encoding="utf-8"))
+    return [
+        f"{name}: {found.get(name)}, recorded {value:g}"
+        for name, value in recorded.items()
+        if name not in found or not found[name] <= BAND * value
+    ]
+
+
+def record(study, result):
+    """Write the errors of a result."""
+    rounded = {name: float(f"{value:.3g}") for name, value in errors_of(result).items() if value}
+    RECORDED.mkdir(exist_ok=True)
+    (RECORDED / f"{study}.json").write_text(json.dumps(rounded, indent=1) + "\n", encoding="utf-8")
+    print(f"{len(rounded)} errors in {RECORDED / study}.json")
+
+
+if __name__ == "__main__":
+    from bench.cli import main
+
+    (study,) = sys.argv[1:]
+    with TemporaryDirectory() as folder:
+        file = Path(folder) / "result.json"
+        command = ["reproduce", study, "--seed", RECORDED_SEED, *options_of(study), "--out", folder, "--json", file]
+        try:
+            main([str(argument) for argument in command])
+        except SystemExit as stopped:
+            if stopped.code:
+                raise
+        record(study, json.loads(file.read_text(encoding="utf-8")))

@@ -1,0 +1,109 @@
+"""The scripts that put tables of campaigns into pages know every table and every change of the campaign files."""
+
+import importlib
+import sys
+from pathlib import Path
+
+import pytest
+
+from bench.batch import read_campaign
+from bench.batch.campaign.file import axes, dotted
+
+ROOT = Path(__file__).parents[3]
+ROBUSTNESS = read_campaign(ROOT / "examples" / "campaign-robustness.toml")
+CONTROLLED = {table.name: table for table in ROBUSTNESS.runs if "model" in table.parameters}
+
+
+@pytest.fixture(scope="module")
+def of_docs():
+    sys.path.insert(0, str(ROOT / "docs"))
+    try:
+        yield importlib.import_module
+    finally:
+        sys.path.remove(str(ROOT / "docs"))
+
+
+@pytest.fixture(scope="module")
+def renewal(of_docs):
+    return of_docs("renew_controllers")
+
+
+def row(status="completed", reason="", rms="2e-6", **more):
+    return {"status": status, "reason": reason, "tracking_rms [m]": rms} | more
+
+
+@pytest.fixture
+def shown(renewal):
+    return renewal.Shown("tracking_rms", "µm", 1e-6, "emulation.plant", "as identified")
+
+
+def test_each_table_of_the_campaign_is_on_the_page(renewal):
+    names = {name.partition(" ")[0] for name in renewal.ROBUSTNESS}
+    assert names == set(CONTROLLED)
+    page = (ROOT / "docs" / "reference" / "robustness.md").read_text(encoding="utf-8")
+    for name, shown in renewal.ROBUSTNESS.items():
+        assert f"<!-- table {name} -->\n| {shown.unit} |" in page, name
+
+
+@pytest.mark.parametrize("name", CONTROLLED)
+def test_each_change_has_a_title_of_its_own(renewal, name):
+    shown = renewal.ROBUSTNESS[name]
+    changes = axes(dotted(CONTROLLED[name].overrides))[shown.varies]
+    titles = [renewal.title(change, shown.nominal) for change in map(_inline, changes)]
+    assert titles[0] == shown.nominal
+    assert len({*titles}) == len(titles)
+
+
+def _inline(change):
+    return change if isinstance(change, str) else "{" + ", ".join(f"{k} = {v}" for k, v in change.items()) + "}"
+
+
+@pytest.mark.parametrize(
+    ("runs", "cell"),
+    [
+        ([row(rms="3e-6"), row(), row(rms="1e-6")], "2 / 3"),
+        ([row(), row(status="failed", reason="no", rms="9")], "2 / 2, 1 stopped"),
+        ([row(reason="errs"), row(reason="errs")], "2 / 2, warned"),
+        ([row(status="failed", reason="no")], "stopped"),
+    ],
+)
+def test_a_cell_has_median_and_worst_and_how_runs_ended(renewal, shown, runs, cell):
+    runs = [{**run, "emulation.plant": "{}", "controller": "latched"} for run in runs]
+    assert renewal.table(shown, runs) == f"| µm | latched |\n| --- | --- |\n| as identified | {cell} |"
+
+
+def test_a_change_beyond_twice_the_nominal_error_is_named_unless_each_run_says_so_itself(renewal, shown):
+    def runs(*changed):
+        nominal = {**row(), "controller": "latched", "emulation.plant": "{}"}
+        return [
+            nominal,
+            *({**each, "controller": "latched", "emulation.plant": '{"friction" = 0.7}'} for each in changed),
+        ]
+
+    stopped = row(status="failed", reason="no", rms="9")
+    assert renewal.silent(shown, runs(row(rms="5e-6"), row(rms="5e-6", reason="errs"))) == ["latched, friction × 2"]
+    for within in ([row(rms="3.9e-6")], [row(rms="5e-6", reason="errs")], [stopped], [row(), row(), row(rms="9e-6")]):
+        assert renewal.silent(shown, runs(*within)) == []
+
+
+def test_followers_have_a_row_for_each_rig_and_reference(renewal):
+    runs = [
+        {
+            "controller": controller, "rig": rig, "period [s]": period, "status": "completed", "reason": "",
+            "following_rms [m]": "1.5e-8",
+        }
+        for controller in ("closed-loop-inverse", "predictive")
+        for rig, period in (("hybrid", "6.0"), ("sma", ""))
+    ]  # fmt: skip
+    assert renewal.following(runs).splitlines()[2:] == [
+        "| `hybrid`, nm | sine, 6 s | 15 / 15 | 15 / 15 |",
+        "| `sma`, µm | file | 0.015 / 0.015 | 0.015 / 0.015 |",
+    ]
+
+
+def test_the_table_of_the_choice_keeps_what_was_before(of_docs):
+    renewal = of_docs("renew_selection")
+    outcome = renewal.Outcome
+    found = [outcome("duhem", error, "duhem", 1.0, 3.0, ("one-run", "one-kind"), 9.0) for error in (1.1, 2.5, 1.3)]
+    made = renewal.row(["duhem", "mixed", "0.11", "", "", ""], found)
+    assert made == "| duhem | mixed | 0.11 | 1.30 | 1.00 | one-kind |"
