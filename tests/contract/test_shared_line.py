@@ -30,7 +30,7 @@ _CALLS = "measure", "glance", "set", "safe", "stop", "reconnect"
 class Beside(OnEmulatedRig):
     """A device whose neighbour on the line is asked before each of its calls, and whose line can be cut."""
 
-    rig_file = "../lines/buses.toml"
+    rig_file = "../system/lines/buses.toml"
     neighbour_name = ""
     points = ()
     within = 0.0

@@ -26,9 +26,14 @@ COMMANDS = {
 }
 
 
+def swing(i, late):
+    """Return a sine that decays, of which nothing has to be advised."""
+    return math.exp(-0.01 * i) * math.sin(0.2 * i - late)
+
+
 @pytest.fixture
 def folder(tmp_path):
-    rows = (f"{math.sin(0.1 * i):.4f},{math.sin(0.1 * i - 0.3):.4f}" for i in range(200))
+    rows = (f"{swing(i, 0.0):.4f},{swing(i, 0.3):.4f}" for i in range(200))
     (tmp_path / "m.csv").write_text("\n".join(["u,y", *rows, ""]))
     return tmp_path
 

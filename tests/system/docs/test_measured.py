@@ -10,7 +10,7 @@ from cases import cases
 ROOT = Path(__file__).parents[3]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 MEASURED = (ROOT / "docs" / "explanation" / "measured.md").read_text(encoding="utf-8")
-RECORDED = ROOT / "tests" / "reproduce" / "recorded"
+RECORDED = ROOT / "tests" / "golden" / "recorded"
 RANGE = re.compile(r"([\d.]+)(?: \(([\d.]+)–([\d.]+)\))?$")
 SHOWN = re.compile(r"(?:^|/ )([\d.]+)(?: \(([\d.]+)\))?")
 
