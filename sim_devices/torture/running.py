@@ -19,7 +19,7 @@ from bench.devices import Actuator
 from bench.execution import Run, carry_out
 from bench.protocol import ProtocolDefinition
 from bench.record import Record
-from bench.rig import EMULATED, Rig, RigDescription, RigFile, TelemetryTable, load_rig
+from bench.rig import EMULATED, JOIN, Rig, RigDescription, RigFile, TelemetryTable, load_rig
 from sim_devices.laboratory import EmulatedLaboratory
 from sim_devices.torture.excursion import COUNT, DWELL, excursion, setpoints
 from sim_devices.torture.truth import Observed, Reference
@@ -134,8 +134,14 @@ class Bed:
 
     def devices_at(self, fault: str) -> list[str]:
         """Return the devices at the instrument at fault; none of a fault of the plant."""
-        port = f"{EMULATED}{fault.rpartition('.')[0]}"
-        return [each.name for each in self.file.devices if getattr(each.settings, "port", "") == port]
+        instrument = fault.rpartition(".")[0]
+        on_line = [
+            each.name
+            for each in self.file.devices
+            if instrument in str(getattr(each.settings, "port", "")).removeprefix(EMULATED).split(JOIN)
+        ]
+        # An instrument on a line that several share has the name of its device.
+        return [name for name in on_line if name == instrument] or on_line
 
     def named(self, fault: str, status: str, reason: str) -> str:
         """Judge whether a message names what is at fault."""
