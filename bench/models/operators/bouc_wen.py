@@ -21,9 +21,8 @@ class BoucWen(ElementOperator):
     dz/du = 1 - (beta sgn(z du) + gamma) |z / scale|^exponent (Bouc 1967; Wen 1976; Ikhouane and Rodellar, Systems
     with Hysteresis, 2007, chapter 2). The form z' = A u' - β |u'| |z|^(n-1) z - γ u' |z|^n is its multiple:
     hysteretic = A, β = A beta / (A scale)^n, γ likewise. For an exponent of 1 the solution is exact from one input to
-    the next, otherwise it is integrated to about 1e-12 of the scale; |z| is kept below 1e6 of it. The
-    hysteretic part leads the input where it is positive, as friction does, and lags where it is negative, as an
-    actuator does.
+    the next, otherwise it is integrated to about 1e-8 of the scale; |z| is kept below 1e6 of it. The hysteretic part
+    leads the input where it is positive, as friction does, and lags where it is negative, as an actuator does.
 
     Parameters
     ----------

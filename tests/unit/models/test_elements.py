@@ -181,6 +181,14 @@ class TestEachOperator:
 
 
 class TestAgainstDifferentialEquations:
+    @cases("exponent", [1.2, 1.7, 2.5])
+    def test_a_move_over_zero_is_that_of_its_pieces(self, exponent):
+        # The slope of z has a kink there.
+        operator = bouc_wen(exponent)
+        moves = [operator.present_input(operator.initial_state()), *np.random.default_rng(0).uniform(*RANGE, 200)]
+        pieces = np.concatenate([np.linspace(a, b, 65)[1:] for a, b in pairwise(moves)])
+        np.testing.assert_allclose(operator.evaluate(pieces)[63::64], operator.evaluate(moves[1:]), atol=2e-8)
+
     @cases(("exponent", "beta", "gamma"), [(1.0, 1.5, 0.5), (1.0, 0.4, -1.1), (1.7, 4.0, 2.0), (3.0, 30.0, 10.0)])
     def test_bouc_wen(self, exponent, beta, gamma):
         operator = bouc_wen(exponent, beta, gamma)
