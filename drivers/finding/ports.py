@@ -94,10 +94,10 @@ def problem(address: str) -> str:
     if not node.exists():
         return ""
     if not os.access(node, os.R_OK | os.W_OK):
-        group = "its group"
+        group = "dialout"
         with suppress(KeyError, OSError, NotImplementedError):
-            group = f"the group {node.group()}"
-        return f"no permission: sudo usermod -aG {group.rpartition(' ')[2]} {getpass.getuser()}, then log in again"
+            group = node.group()
+        return f"no permission: sudo usermod -aG {group} {getpass.getuser()}, then log in again"
     if (holder := holder_of(address)) is not None:
         return f"in use by process {holder[0]} ({holder[1]})"
     return ""
