@@ -20,6 +20,7 @@ from bench.execution import Run, carry_out
 from bench.protocol import ProtocolDefinition
 from bench.record import Record
 from bench.rig import EMULATED, JOIN, Rig, RigDescription, RigFile, TelemetryTable, load_rig
+from sim_devices.faults.fault import Fault
 from sim_devices.laboratory import EmulatedLaboratory
 from sim_devices.torture.excursion import COUNT, DWELL, excursion, setpoints
 from sim_devices.torture.truth import Observed, Reference
@@ -124,6 +125,11 @@ class Bed:
             description = rig.description
         return cls(file, description, observed, excursion(setpoints(description, task.share)), observed.outputs())
 
+    @property
+    def faults(self) -> Mapping[str, Fault]:
+        """What can go wrong in its laboratory, by name."""
+        return self.observed.laboratory.faults
+
     def run(self, seed: int, folder: Path, faults: Path | None = None) -> Any:  # noqa: ANN401 - a private class
         """Carry the excursion out; return its outcome."""
         run = Run(
@@ -160,7 +166,7 @@ class Bed:
         if not on():
             return "ok"
         longest = max((device.watchdog or 0.0 for device in self.description.devices.values()), default=0.0)
-        self.observed.laboratory._clock.sleep(longest + _WATCHDOG_MARGIN)
+        self.observed.clock.sleep(longest + _WATCHDOG_MARGIN)
         return f"on for ever: {', '.join(still)}" if (still := on()) else "w"
 
     def within_limits(self, reference: Reference) -> str:
@@ -203,15 +209,11 @@ def faults_of(task: Task, device: str | None, word: str) -> list[str]:
     known = [each.name for each in bed.file.devices]
     if device is not None and device not in known:
         raise ConfigurationError(f"--device {device}: there is no such device; there are: {', '.join(known)}")
-    names = [*_laboratory(bed).faults]
+    names = [*bed.faults]
     found = [name for name in names if word in name and (device is None or device in bed.devices_at(name))]
     if not found:
         raise ConfigurationError(f"--fault {word}: no fault has this in its name; there are: {', '.join(names)}")
     return found
-
-
-def _laboratory(bed: Bed) -> EmulatedLaboratory:
-    return bed.observed(bed.file.laboratory_settings, VirtualClock(), 0)
 
 
 def largest_excursion(task: Task) -> Task:
@@ -255,9 +257,8 @@ def torture(task: Task, fault: str, seed: int, reference: Reference) -> Cell:
         faulthandler.cancel_dump_traceback_later()
 
 
-def entry(bed: Bed, name: str, seed: int) -> dict[str, Any]:
+def entry(name: str, fault: Fault, seed: int) -> dict[str, Any]:
     """Return the entry of the schedule: at an instant by the seed, with an end if the fault may have one."""
-    fault = _laboratory(bed).faults[name]
     part = zlib.crc32(f"{name} {seed}".encode()) / 2**32
     found: dict[str, Any] = {"at": round(_FIRST + (_LAST - _FIRST) * part, 3), "fault": name}
     values = {}
@@ -272,11 +273,11 @@ def entry(bed: Bed, name: str, seed: int) -> dict[str, Any]:
 
 
 def _torture(bed: Bed, name: str, seed: int, reference: Reference) -> Cell:
-    lies = _laboratory(bed).faults[name].lies
+    fault = bed.faults[name]
     results = dict.fromkeys(CHECKS, "ok")
     with TemporaryDirectory(prefix="bench-torture-") as folder:
         schedule = Path(folder) / "faults.jsonl"
-        schedule.write_text(json_text(entry(bed, name, seed)) + "\n")
+        schedule.write_text(json_text(entry(name, fault, seed)) + "\n")
         outcome = None
         try:
             outcome = bed.run(seed, Path(folder), schedule)
@@ -298,7 +299,7 @@ def _torture(bed: Bed, name: str, seed: int, reference: Reference) -> Cell:
                     results["rows"] = f"{steps} steps of {outcome.steps}"
                 elif record.status != status:
                     results["rows"] = f"journal says {record.status}"
-                results["true"] = "." if lies else reference.lie(record, bed.observed, reason) or "ok"
+                results["true"] = "." if fault.lies else reference.lie(record, bed.observed, reason) or "ok"
     results["names"] = bed.named(name, status, reason)
     return Cell(", ".join(bed.devices_at(name)), name, seed, status, reason, results)
 

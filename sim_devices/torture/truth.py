@@ -48,9 +48,12 @@ class Observed:
         The one that was made last.
     seen : list of (float, dict)
         Instants (s) and true values.
+    clock : Clock
+        The clock of that laboratory.
     """
 
     laboratory: EmulatedLaboratory
+    clock: Clock
 
     def __init__(self, kind: Any) -> None:  # noqa: ANN401 - a laboratory with Settings of its own
         self._kind = kind
@@ -59,14 +62,14 @@ class Observed:
     def __call__(self, settings: Any, clock: Clock, seed: int) -> EmulatedLaboratory:  # noqa: ANN401
         """Make the laboratory."""
         self.laboratory = self._kind(settings, clock, seed)
-        self._clock = clock
+        self.clock = clock
         self.seen.clear()
         self._look()
         return self.laboratory
 
     def _look(self) -> None:
         world = self.laboratory.world
-        now = self._clock.now() if world is None else world.time
+        now = self.clock.now() if world is None else world.time
         self.seen.append((now, {name: float(each.value) for name, each in self.laboratory.truth().items()}))
         self.laboratory.at(now + _PERIOD, self._look)
 
