@@ -54,7 +54,7 @@ ROBUSTNESS = {
     "beam-step": Shown("loop_true_hold_rms", "nm", 1e-9, SENSOR, "ideal"),
     "beam-step-plants": Shown("loop_true_hold_rms", "nm", 1e-9, PLANT, "as identified"),
 }
-"""Tables of docs/reference/robustness.md, by the table of the campaign file."""
+"""Tables by the table of the campaign file; docs/reference/robustness.md shows some of them."""
 CHANGES = {
     "loop_damping": "plate damped by {} (overshoot of 9 %)",
     "session_offset": "film {} K warmer",

@@ -1,13 +1,13 @@
 """Measure what the default of `bench identify` reaches, and put the table into docs/reference/model-selection.md.
 
-`python docs/renew_selection.py` measures three records of each kind; `--seeds 0` one. The column *before* stays as it
-is in the page.
+`python docs/renew_selection.py` measures three records of each kind; `--seeds 0` one.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from statistics import median
 
@@ -15,36 +15,32 @@ from renew_measured import put
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools" / "benchmarks"))
 
-from selection_quality import CASES, Outcome, case, choose
+from selection_quality import CASES, KINDS, Outcome, case, choose
 
 PAGE = Path(__file__).parents[1] / "docs" / "reference" / "model-selection.md"
+PLANTS = list(dict.fromkeys(plant for plant, _ in CASES))
 
 
-def row(cells: list[str], found: list[Outcome]) -> str:
-    """Return a row of the table: plant, record and the column before, with what was measured."""
-    now, least = (f"{median(getattr(each, name) for each in found):.2f}" for name in ("error", "least"))
-    codes = dict.fromkeys(code for each in found for code in each.advice if code != "one-run")
-    return f"| {' | '.join([*cells[:3], now, least, ' '.join(codes)])} |"
-
-
-def renewed(page: str, seeds: list[int]) -> str:
-    """Return the table of a page with the records of seeds measured."""
-    lines = page.partition("<!-- table synthetic -->")[2].partition("<!-- end -->")[0].strip().splitlines()
-    made = lines[:2]
-    for line in lines[2:]:
-        cells = [cell.strip() for cell in line.strip().strip("|").split("|")]
-        assert (cells[0], cells[1]) in CASES
-        made.append(row(cells, [choose(case(cells[1], cells[0], seed)) for seed in seeds]))
-        print(made[-1], flush=True)
-    return "\n".join(made)
+def row(kind: str, found: Mapping[str, list[Outcome]]) -> str:
+    """Return a row of the table: a kind of record, the median error of each plant, and the codes of advice."""
+    errors = [f"{median(each.error for each in found[plant]):.2f}" if plant in found else "–" for plant in PLANTS]
+    codes = dict.fromkeys(code for runs in found.values() for each in runs for code in each.advice)
+    return f"| {' | '.join([kind, *errors, ' '.join(code for code in codes if code != 'one-run')])} |"
 
 
 def main() -> None:
     """Measure the cases, print them, and renew the page."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--seeds", type=int, nargs="*", default=[0, 1, 2])
-    given = parser.parse_args()
-    put(PAGE, {"synthetic": renewed(PAGE.read_text(encoding="utf-8"), given.seeds)})
+    seeds = parser.parse_args().seeds
+    heads = ["record", *PLANTS, "advice"]
+    rows = [f"| {' | '.join(heads)} |", f"| {' | '.join(['---'] * len(heads))} |"]
+    for kind in KINDS:
+        plants = [plant for plant in PLANTS if (plant, kind) in CASES]
+        found = {plant: [choose(case(kind, plant, seed)) for seed in seeds] for plant in plants}
+        rows.append(row(kind, found))
+        print(rows[-1], flush=True)
+    put(PAGE, {"synthetic": "\n".join(rows)})
 
 
 if __name__ == "__main__":

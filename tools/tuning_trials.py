@@ -4,7 +4,7 @@
 
 Each rig is characterized once. Each controller is tuned for the model, and brings its output to its targets in
 sessions whose noise and targets the tuning has not seen: with the constants by hand (`by_hand`), with the numbers of
-model and rig file, and with those of the tuning file. The table, for docs/reference/tuning.md, has for each of the
+model and rig file, and with those of the tuning file. The table has for each of the
 three median and worst of the RMS error over the sessions, and the mean time at a target; then in how many sessions
 the cost of `bench tune` is less with the tuning file than by hand, and what supply and sensor of a muscle leave. Of a
 controller that is given up it has at which target. Exits with 1 if tuned numbers cost more than those by hand in most

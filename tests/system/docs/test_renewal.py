@@ -37,12 +37,13 @@ def shown(renewal):
     return renewal.Shown("tracking_rms", "µm", 1e-6, "emulation.plant", "as identified")
 
 
-def test_each_table_of_the_campaign_is_on_the_page(renewal):
-    names = {name.partition(" ")[0] for name in renewal.ROBUSTNESS}
-    assert names == set(CONTROLLED)
+def test_the_tables_of_the_page_are_those_of_the_campaign(renewal, of_docs):
+    assert {name.partition(" ")[0] for name in renewal.ROBUSTNESS} == set(CONTROLLED)
     page = (ROOT / "docs" / "reference" / "robustness.md").read_text(encoding="utf-8")
-    for name, shown in renewal.ROBUSTNESS.items():
-        assert f"<!-- table {name} -->\n| {shown.unit} |" in page, name
+    shown = of_docs("renew_measured").MARKS.findall(page)
+    assert len(shown) > 5
+    for name in shown:
+        assert f"<!-- table {name} -->\n| {renewal.ROBUSTNESS[name].unit} |" in page, name
 
 
 @pytest.mark.parametrize("name", CONTROLLED)
@@ -101,9 +102,12 @@ def test_followers_have_a_row_for_each_rig_and_reference(renewal):
     ]
 
 
-def test_the_table_of_the_choice_keeps_what_was_before(of_docs):
+def test_the_table_of_the_choice_has_a_row_for_each_record_and_a_column_for_each_plant(of_docs):
     renewal = of_docs("renew_selection")
     outcome = renewal.Outcome
     found = [outcome("duhem", error, "duhem", 1.0, 3.0, ("one-run", "one-kind"), 9.0) for error in (1.1, 2.5, 1.3)]
-    made = renewal.row(["duhem", "mixed", "0.11", "", "", ""], found)
-    assert made == "| duhem | mixed | 0.11 | 1.30 | 1.00 | one-kind |"
+    assert renewal.row("mixed", {"duhem": found}) == "| mixed | – | 1.30 | – | – | one-kind |"
+    rows = renewal.PAGE.read_text(encoding="utf-8").partition("<!-- table synthetic -->\n")[2].splitlines()
+    assert rows[0] == f"| record | {' | '.join(renewal.PLANTS)} | advice |"
+    kinds = [line.split(" | ")[0].removeprefix("| ") for line in rows[2 : rows.index("<!-- end -->")]]
+    assert kinds == list(renewal.KINDS)
