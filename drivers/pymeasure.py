@@ -3,7 +3,7 @@
     [devices.smu]
     driver = "pymeasure"                            # or "pymeasure-sensor", for one that only measures
     instrument = "pymeasure.instruments.keithley:Keithley2400"
-    address = "GPIB0::24::INSTR"                    # a VISA resource
+    port = "GPIB0::24::INSTR"                       # a VISA resource, or a line of pyserial
     before_on = ["compliance_current = 0.1"]        # assignments and calls, in this order
     on = ["enable_source()"]
     safe = ["source_voltage = 0", "disable_source()"]
@@ -156,11 +156,15 @@ class SensorSettings(DriverSettings):
     instrument: Annotated[str, AfterValidator(_instrument)] = Field(
         description="class of the instrument, such as pymeasure.instruments.keithley:Keithley2400"
     )
-    address: str | int = Field(
-        description="VISA resource, such as GPIB0::24::INSTR or TCPIP0::192.0.2.5::5025::SOCKET"
+    port: str = Field(
+        min_length=1,
+        description="VISA resource, such as GPIB0::24::INSTR, or URL of pyserial, such as socket://192.0.2.5:5025 or "
+        "emulated://NAME",
     )
     options: dict[str, Any] = Field(
-        default_factory=dict, description='keyword arguments of the class, such as { visa_library = "@py" }'
+        default_factory=dict,
+        description='keyword arguments of the class, such as { visa_library = "@py" }; with an URL those of '
+        "its port, and read_termination and write_termination",
     )
     identity: Expected = Field(
         default=ANY_TEXT, description="form of the identity, such as KEITHLEY INSTRUMENTS INC.,MODEL 2400,{any}"
@@ -223,10 +227,14 @@ class _MeasuringLine(TableLine):
         self._settings = settings
         # Each class and each adapter fails in a way of its own.
         try:
-            self.instrument = instrument_class(settings.instrument)(settings.address, **settings.options)
+            kind = instrument_class(settings.instrument)
+            if "://" in settings.port:
+                self.instrument = kind(_serial_adapter(settings.port, **settings.options))
+            else:
+                self.instrument = kind(settings.port, **settings.options)
         except Exception as error:
             raise DeviceConnectionError(
-                device, f"cannot open {settings.address}: {type(error).__name__}: {error}"
+                device, f"cannot open {settings.port}: {type(error).__name__}: {error}"
             ) from None
 
     def identify(self, resends: int) -> Identity:  # noqa: ARG002 - the library does not repeat
@@ -236,7 +244,7 @@ class _MeasuringLine(TableLine):
         answer = str(self.get("id")).strip()
         if template(settings.identity).match(answer) is None:
             raise DeviceConnectionError(
-                self._device, f"{settings.address} is {answer!r}, expected {settings.identity!r}; check the address"
+                self._device, f"{settings.port} is {answer!r}, expected {settings.identity!r}; check the port"
             )
         return identity_of(answer)
 
@@ -248,7 +256,10 @@ class _MeasuringLine(TableLine):
         return {name: self.number(tables[name].property) * tables[name].scale for name in names}
 
     def errors(self) -> list[str]:
-        return [str(error) for error in self.get("check_errors")() or ()] if self._settings.check_errors else []
+        if not self._settings.check_errors:
+            return []
+        with self._errors("check_errors()"):
+            return [str(error) for error in self.instrument.check_errors() or ()]
 
     def shut_down(self) -> None:
         if self._settings.shutdown:
@@ -293,6 +304,23 @@ class _MeasuringLine(TableLine):
             kind = DeviceConnectionError if _is_of_the_line(error) else DeviceError
             self.lost = self.lost or kind is DeviceConnectionError
             raise kind(self._device, f"{doing}: {type(error).__name__}: {error}") from None
+
+
+def _serial_adapter(
+    url: str, *, read_termination: str = "\n", write_termination: str = "\n", timeout: float = 1.0, **options: object
+) -> object:
+    """Return PyMeasure's adapter on a line of pyserial; an answer that does not come is an error of the line."""
+    import serial
+    from pymeasure.adapters import SerialAdapter
+
+    class Adapter(SerialAdapter):  # type: ignore[misc]
+        def _read(self, **kwargs: object) -> str:
+            answer = self._read_bytes(-1, break_on_termchar=True, **kwargs)
+            if not answer.endswith(read_termination.encode()):
+                raise serial.SerialException(f"no answer within {timeout:g} s")
+            return str(answer.decode().removesuffix(read_termination))
+
+    return Adapter(serial.serial_for_url(url, timeout=timeout, **options), write_termination, read_termination)
 
 
 def _is_of_the_line(error: Exception) -> bool:

@@ -13,6 +13,13 @@
     time_constant = 20.0
     initial = 22.0
 
+A device whose driver has no messages in the rig file, such as one of PyMeasure, is emulated by a table of its own,
+with the keys of a text instrument and the signals of the device::
+
+    [emulation.instruments.smu]
+    identity = "KEITHLEY INSTRUMENTS INC.,MODEL 2400,{any}"
+    signals.current = { query = "READ?", unit = "A" }
+
 An expression may name every signal, and `NAME_output`, which is what the output of an instrument delivers: its
 set-point when it is on, 0 when it is off. A signal without an expression follows the output of its instrument, if it
 has the same unit.
@@ -22,10 +29,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from functools import partial
-from typing import ClassVar
+from typing import Annotated, ClassVar
 
 import numpy as np
-from pydantic import Field, InstanceOf, field_validator
+from pydantic import Discriminator, Field, InstanceOf, Tag, ValidationInfo, field_validator
 
 from bench.base import Clock
 from bench.devices import ActuatorTable, CommandTable, DriverSettings
@@ -56,9 +63,21 @@ class PhysicsTable(LaboratorySettings):
     resolution: float = Field(default=0.0, ge=0, description="last digit of a reading, in the unit of the signal")
 
 
+def _kind(table: object) -> str:
+    return "actuator" if isinstance(table, Mapping) and "setpoint" in table else "sensor"
+
+
+InstrumentTable = Annotated[
+    Annotated[ActuatorTable, Tag("actuator")] | Annotated[CommandTable, Tag("sensor")], Discriminator(_kind)
+]
+
+
 class SCPILaboratorySettings(LaboratorySettings):
     """What `[emulation]` says of a laboratory of text instruments."""
 
+    instruments: dict[str, InstrumentTable] = Field(
+        default_factory=dict, description="messages of the devices whose drivers have none in the rig file"
+    )
     devices: dict[str, InstanceOf[DriverSettings]] = Field(
         default_factory=dict, description="the devices of the rig file, which the bench fills in"
     )
@@ -68,8 +87,10 @@ class SCPILaboratorySettings(LaboratorySettings):
 
     @field_validator("devices")
     @classmethod
-    def _have_ports_of_their_own(cls, devices: dict[str, DriverSettings]) -> dict[str, DriverSettings]:
-        found = tables(devices)
+    def _have_ports_of_their_own(
+        cls, devices: dict[str, DriverSettings], info: ValidationInfo
+    ) -> dict[str, DriverSettings]:
+        found = tables(devices, info.data.get("instruments", {}))
         for name, (port, _) in found.items():
             others = [other for other, (same, _) in found.items() if same == port and other != name]
             if others:
@@ -81,22 +102,30 @@ class SCPILaboratorySettings(LaboratorySettings):
 
     @field_validator("signals")
     @classmethod
-    def _come_about(cls, signals: dict[str, PhysicsTable], info: object) -> dict[str, PhysicsTable]:
-        devices = getattr(info, "data", {}).get("devices")
-        if devices is not None:
-            network(tables(devices), signals)
+    def _come_about(cls, signals: dict[str, PhysicsTable], info: ValidationInfo) -> dict[str, PhysicsTable]:
+        devices, instruments = info.data.get("devices"), info.data.get("instruments")
+        if devices is not None and instruments is not None:
+            network(tables(devices, instruments), signals)
         return signals
 
 
-def tables(devices: Mapping[str, DriverSettings]) -> dict[str, tuple[str, CommandTable]]:
-    """Return the name of the emulated port and the table of each text instrument among devices, by device."""
+def tables(
+    devices: Mapping[str, DriverSettings], instruments: Mapping[str, CommandTable]
+) -> dict[str, tuple[str, CommandTable]]:
+    """Return the name of the emulated port and the table of each text instrument, by device.
+
+    Raises ValueError if a table of `instruments` belongs to no device.
+    """
     found: dict[str, tuple[str, CommandTable]] = {}
     for name, settings in devices.items():
+        table = settings if isinstance(settings, CommandTable) else instruments.get(name)
         port = getattr(settings, "port", "")
-        if isinstance(settings, CommandTable) and port.startswith(_SCHEME):
+        if table is not None and port.startswith(_SCHEME):
             instrument = port.removeprefix(_SCHEME)
             # On a shared line each instrument has the name of its device.
-            found[name] = (name if name in instrument.split(JOIN) else instrument, settings)
+            found[name] = (name if name in instrument.split(JOIN) else instrument, table)
+    for name in instruments.keys() - found.keys():
+        raise ValueError(f"{name}: there is no such device on a port {_SCHEME}NAME; {_listed(devices)}")
     return found
 
 
@@ -153,7 +182,7 @@ class SCPILaboratory(EmulatedLaboratory):
     Settings: ClassVar[type[LaboratorySettings]] = SCPILaboratorySettings
 
     def __init__(self, settings: SCPILaboratorySettings, clock: Clock, seed: int) -> None:
-        found = tables(settings.devices)
+        found = tables(settings.devices, settings.instruments)
         self.plant = network(found, settings.signals)
         world = World(self.plant, clock)
         generators = np.random.default_rng(seed).spawn(len(found))

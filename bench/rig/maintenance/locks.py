@@ -211,9 +211,9 @@ def _is_held(path: Path) -> bool:
 
 
 def port_of(settings: DriverSettings) -> str:
-    """Return the address of a device in its settings, `port` or `address`; empty if they have none."""
-    addresses = (getattr(settings, key, None) for key in ("port", "address"))
-    return next((address for address in addresses if isinstance(address, str)), "")
+    """Return the port of a device in its settings; empty if they have none."""
+    port = getattr(settings, "port", "")
+    return port if isinstance(port, str) else ""
 
 
 def line_names(port: str) -> tuple[str, ...]:

@@ -12,7 +12,9 @@ from bench.base import ConfigurationError
 from bench.record import Record
 from sim_devices.torture.running import Bed, Task, faults_of, largest_excursion, reference_of, torture
 
-SUPPLY = str(Path(__file__).parents[3] / "examples/bench-supply.toml")
+EXAMPLES = Path(__file__).parents[3] / "examples"
+SUPPLY = str(EXAMPLES / "bench-supply.toml")
+PYMEASURE = str(EXAMPLES / "pymeasure-supply.toml")
 OVERRIDES = {"vo2": {"devices.tec.current_limit": "1.0"}}
 
 
@@ -44,6 +46,8 @@ def cell(rig, fault, seed=1):
         ("hybrid", "amplifier-trips"),
         ("hybrid", "displacement.out-of-range"),
         (SUPPLY, "meter.comma"),
+        (PYMEASURE, "supply.cut"),
+        (PYMEASURE, "supply.power-cycle"),
         ("sma", "load_cell.exchange"),
     ],
 )

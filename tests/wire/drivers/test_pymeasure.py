@@ -50,7 +50,7 @@ def expected_protocol(exchange):
 
 def on_protocol(instrument, kind=Adapter, table=TABLE):
     """Return the adapter of an instrument that PyMeasure itself has made."""
-    settings, clock = kind.Settings(address="none", **table), VirtualClock()
+    settings, clock = kind.Settings(port="none", **table), VirtualClock()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("drivers.pymeasure.instrument_class", lambda _: lambda _: instrument)
         line = kind.Line("supply", settings, clock)
@@ -187,7 +187,7 @@ def connect(instrument, clock, tcp_port):
     with tcp_port(TextServer(instrument)) as port:
         address = f"TCPIP0::127.0.0.1::{port}::SOCKET"
         options = {"visa_library": "@py", "write_termination": "\n", "timeout": 20_000}
-        settings = Adapter.Settings(address=address, options=options, check_errors=True, **TABLE)
+        settings = Adapter.Settings(port=address, options=options, check_errors=True, **TABLE)
         yield lambda: Adapter.connect("supply", settings, clock)
 
 
@@ -328,7 +328,7 @@ title = "one supply"
 [devices.supply]
 driver = "pymeasure"
 instrument = "pymeasure.instruments.keithley:Keithley2260B"
-address = "GPIB0::5::INSTR"
+port = "GPIB0::5::INSTR"
 safe = ["output_enabled = False"]
 
 [devices.supply.setpoint]
@@ -378,7 +378,7 @@ def test_without_the_library_one_message_says_what_to_install(tmp_path, monkeypa
 def test_an_address_without_an_instrument_is_a_connection_error():
     with socket.create_server(("127.0.0.1", 0)) as listener:
         address = f"TCPIP0::127.0.0.1::{listener.getsockname()[1]}::SOCKET"
-    settings = Adapter.Settings(address=address, options={"visa_library": "@py"}, **TABLE)
+    settings = Adapter.Settings(port=address, options={"visa_library": "@py"}, **TABLE)
     with pytest.raises(DeviceConnectionError, match=r"^supply: (cannot open|reading id)"):
         Adapter.connect("supply", settings, VirtualClock())
 
@@ -439,7 +439,7 @@ def instruments(monkeypatch):
 
         return make
 
-    settings = Adapter.Settings(address="none", **TABLE)
+    settings = Adapter.Settings(port="none", **TABLE)
     monkeypatch.setattr("drivers.pymeasure.instrument_class", of_reference)
     opened.connect = lambda **changes: Adapter.connect("supply", settings.model_copy(update=changes), VirtualClock())
     return opened
