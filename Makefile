@@ -34,11 +34,11 @@ install = { test -x $(UV) && $(UV) pip install --quiet --python $(BIN)/python --
 
 # The emulated VO2 laboratory: characterization, identification, validation and tracking, on the virtual clock.
 demo: $(DEMO) $(KERNELS)
-	$(BIN)/bench reproduce vo2 --out recordings
+	$(BIN)/bench study vo2 --out recordings
 
 # The other laboratories likewise.
 demo-sma demo-muscles demo-hybrid: demo-%: $(DEMO)
-	$(BIN)/bench reproduce $* --out recordings
+	$(BIN)/bench study $* --out recordings
 
 # Under a minute: numbers, contracts and drivers.
 test-quick: lint
@@ -107,14 +107,14 @@ busy-study: $(SETUP)
 
 # The studies with the seeds 0 to 9: median, worst and spread of each number.
 studies: $(SETUP)
-	$(BIN)/bench campaign examples/campaign-studies.toml --out recordings/studies
+	$(BIN)/bench study examples/campaign-studies.toml --out recordings/studies
 
 # Each fault of each rig with five seeds, and a table of what passed. The TEC controller of vo2 keeps a higher limit in
 # its flash memory than the rig file sets: a restart must not bring it back.
 fault-matrix: $(SETUP)
-	$(BIN)/bench torture vo2 --override devices.tec.current_limit=1.0
-	$(BIN)/bench torture sma
-	$(BIN)/bench torture hybrid
+	$(BIN)/bench rig torture vo2 --override devices.tec.current_limit=1.0
+	$(BIN)/bench rig torture sma
+	$(BIN)/bench rig torture hybrid
 
 # Disks that are full, fail or are slow, journals that are locked, removed or overwritten, on each rig.
 journal-faults: $(SETUP)
@@ -166,7 +166,7 @@ $(SETUP): $(DEMO)
 	$(call install,'actuator-bench[dev]')
 	touch $@
 
-# Once, beside the second half of the installation; afterwards `bench reproduce` compiles what has changed.
+# Once, beside the second half of the installation; afterwards `bench study` compiles what has changed.
 $(KERNELS): $(BASE)
 	@$(BIN)/python -P -c "from rich.console import Console; from bench.batch import prepare; prepare('vo2', Console())"
 	touch $@

@@ -23,6 +23,11 @@ __all__ = ["identify", "invert", "load", "open_rig", "predict", "report", "run"]
 
 
 def __getattr__(name: str) -> Any:  # noqa: ANN401 - any of the names above
+    if name == "__version__":
+        # Reading it takes a while.
+        from importlib.metadata import version
+
+        return version("actuator-bench")
     if name not in __all__:
         raise AttributeError(f"module 'bench' has no attribute {name!r}")
     from bench import api

@@ -20,7 +20,7 @@ from pydantic_core import PydanticUndefined
 from typer.main import get_command
 
 from bench.base import registry
-from bench.cli import Catalogue, app
+from bench.cli import EXIT_CODES, Catalogue, app
 from bench.record import rows
 from bench.rig import LONGEST_TURN, DashboardLayout, Interlock, RigTable, RoleTable, SafetyTable, TelemetryTable
 
@@ -65,13 +65,13 @@ def commands() -> Iterator[str]:
     group = get_command(app)
     yield "# Commands\n"
     yield "The texts are those of `bench COMMAND --help`.\n"
-    yield f"{getattr(group, 'epilog', '') or ''}\n"
+    yield f"{EXIT_CODES}\n"
     yield from _commands(group, "bench")
 
 
 def _commands(group: Any, path: str) -> Iterator[str]:  # noqa: ANN401 - the types of click are a private part of typer
     context = group.make_context(path, [], resilient_parsing=True)
-    for name in group.list_commands(context):
+    for name in dict.fromkeys([*group.own, *group.list_commands(context)]):
         command = group.get_command(context, name)
         full = f"{path} {name}"
         yield f"## {full}\n"

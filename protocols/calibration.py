@@ -47,7 +47,7 @@ class BlockParameters(CommonParameters):
 def calibration_load(parameters: WeightParameters, slots: Slots) -> Messages:
     """Read a load cell under dead weights that an operator hangs on it.
 
-    `bench calibrate` makes a calibration of the run: its reference are the weights.
+    `bench rig calibrate` makes a calibration of the run: its reference are the weights.
     """
     if min(parameters.weights) < 0.0:
         weights = ", ".join(f"{weight:g}" for weight in parameters.weights)
@@ -59,7 +59,7 @@ def calibration_load(parameters: WeightParameters, slots: Slots) -> Messages:
 def calibration_position(parameters: BlockParameters, slots: Slots) -> Messages:
     """Read a position sensor with gauge blocks that an operator puts under it.
 
-    `bench calibrate` makes a calibration of the run: its reference are the blocks.
+    `bench rig calibrate` makes a calibration of the run: its reference are the blocks.
     """
     yield from _compare(slots["gauge"], parameters.positions, parameters.tolerance, parameters)
 

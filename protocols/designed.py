@@ -26,7 +26,7 @@ def covering(parameters: Parameters, slots: Slots) -> Messages:
     Loops that shrink level by level: each cell of the plane is told apart from all others by the difference of two
     readings. One set-point a level is enough to determine a model of as many levels; twice as many levels, two
     set-points each, average noise as the damped oscillation does for a model of 20 levels, in half its time.
-    `bench design` shows what each sequence costs.
+    `bench model design` shows what each sequence costs.
     """
     sequence = covering_sequence(*_grid(parameters, slots), per_cell=parameters.per_cell)
     yield from _carry_out(parameters, slots, sequence)

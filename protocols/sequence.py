@@ -17,7 +17,7 @@ _LONGEST_DWELL = 86400.0
 class Parameters(SweepParameters):
     """What can be set."""
 
-    setpoints: str = parameter(..., unit="", help="file with the set-points, as `bench design` writes it", file=True)
+    setpoints: str = parameter(..., unit="", help="file with the set-points, as of `bench model design`", file=True)
     column: str = parameter("input", unit="", help="column of the set-points")
     dwells: str = parameter(
         "dwell", unit="", help="column of the dwell at each set-point, s; empty for `dwell` at all of them"
@@ -26,7 +26,7 @@ class Parameters(SweepParameters):
 
 @protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD, views=LOOP)
 def sequence(parameters: Parameters, slots: Slots) -> Messages:
-    """Measure along a sequence of set-points from a file, such as one of `bench design`.
+    """Measure along a sequence of set-points from a file, such as one of `bench model design`.
 
     One reading at each set-point after its dwell. The run begins by resetting the memory to negative saturation at
     `low`. A file with a value outside of `low` to `high`, in another unit or without a dwell is refused before

@@ -366,7 +366,7 @@ def reproduce(bench, tmp_path):
         result, before = tmp_path / "result.json", loaded()
         # One worker: the tests themselves go on beside each other.
         code, out, err = bench(
-            "reproduce", study, "--seed", seed, "--workers", 1, "--out", tmp_path, "--json", result,
+            "study", study, "--seed", seed, "--workers", 1, "--out", tmp_path, "--json", result,
             *(options_of(study) if is_short else ()),
         )  # fmt: skip
         assert code == 0

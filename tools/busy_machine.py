@@ -142,7 +142,7 @@ def _study(name: str, folder: Path, environment: Mapping[str, str], *prefix: str
     """Carry a study out; return its numbers."""
     folder.mkdir()
     result = folder / "result.json"
-    command = [*prefix, sys.executable, "-m", "bench", "reproduce", name, "--out", str(folder), "--json", str(result)]
+    command = [*prefix, sys.executable, "-m", "bench", "study", name, "--out", str(folder), "--json", str(result)]
     begin = time.monotonic()
     with (folder / "output.txt").open("w") as output:
         done = subprocess.run(command, stdout=output, stderr=output, env=os.environ | environment, check=False)

@@ -13,7 +13,7 @@ in_a_process = False
 """Whether the next commands are carried out in a process of their own as well, and have to end alike."""
 
 
-READING = ("list", "predict", "runs", "run", "campaign")
+READING = ("list", "predict", "runs", "run", "study")
 """Commands that may be carried out twice."""
 
 

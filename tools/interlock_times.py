@@ -6,7 +6,7 @@ prints a table: for each interlock of each rig, while the protocol holds and whi
 was off in time, and the median and longest time from when the interlock had to act until then. That is the instant at
 which the signal crosses its limit, in the plant's true state or by an injected fault, and the interlock's `seconds`
 (`stale`, `within`) later. A look at 5 Hz and 0.1 s for the safe state are allowed after it. All times are those of
-the laboratory, which `bench emulate` serves at the speed of the wall clock.
+the laboratory, which `bench rig emulate` serves at the speed of the wall clock.
 
 Limits and times of an interlock are replaced where it would not act within seconds, or a device would report an error
 of its own first; what it asks for stays of its kind.

@@ -17,7 +17,7 @@ The runs are in process on a paced clock; Linux, and for the first three and rea
 ended     status and exit code of the run
 told      steps that the journal had acknowledged
 journal   steps that the journal has, read as it is; - if it is not readable
-after     steps that are readable after `bench recover-journal`
+after     steps that are readable after `bench runs repair`
 verdict   ok if nothing that was acknowledged is missing or, of damaged pages, unreported, `completed` stands for all
           steps, and every output is off
 

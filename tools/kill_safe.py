@@ -3,8 +3,8 @@
     python tools/kill_safe.py [--rig RIG]... [--trial NAME]... [--times N] [--busy N]
 
 prints a table: for each rig and trial, how often every output became safe within its declared time, and the median
-and longest time it took. The instruments are served by `bench emulate` in another process, and the bench runs as on
-hardware.
+and longest time it took. The instruments are served by `bench rig emulate` in another process, and the bench runs
+as on hardware.
 
 The trials `cut` and `unplug` have rows for each instrument whose line is lost: for the outputs of the other ones, for
 its own, which its watchdog switches off, and for those that no watchdog does, once the line is mended.

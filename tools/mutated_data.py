@@ -90,7 +90,9 @@ def cells_of(content: bytes, delimiter: str) -> list[Cells]:
 def check(folder: Path, file: Path, rows: Sequence[Cells], decimal: str = ".") -> str:
     """Import a file; return what is wrong with what was taken, empty if nothing is."""
     result, out = folder / "result.json", folder / "runs"
-    ended = call("import", file, "--input", "u", "--output", "y", "--time", "t", "--out", out, "--json", result)
+    ended = call(
+        "runs", "import", file, "--input", "u", "--output", "y", "--time", "t", "--out", out, "--json", result
+    )
     if ended.code:
         return ""
     (run,) = out.iterdir()
@@ -278,7 +280,9 @@ def _flat(values: Any) -> list[Any]:
 def count_only(folder: Path, file: Path, rows: int) -> str:
     """Import a file whose numbers may be damaged; return what is wrong with the number of rows."""
     result, out = folder / "result.json", folder / "runs"
-    ended = call("import", file, "--input", "u", "--output", "y", "--time", "t", "--out", out, "--json", result)
+    ended = call(
+        "runs", "import", file, "--input", "u", "--output", "y", "--time", "t", "--out", out, "--json", result
+    )
     if ended.code:
         return ""
     shutil.rmtree(out)
@@ -337,7 +341,7 @@ def try_parquet(folder: Path, rng: random.Random) -> str:
         file.write_bytes(archive.getvalue())
         return (
             "npz is read"
-            if call("import", file, "--input", "u", "--output", "y", "--out", folder / "runs").code == 0
+            if call("runs", "import", file, "--input", "u", "--output", "y", "--out", folder / "runs").code == 0
             else ""
         )
     file = folder / "m.parquet"

@@ -155,7 +155,7 @@ def try_campaign(folder: Path, rng: random.Random) -> str:
     shutil.copy(ROOT / "examples/campaign-faults.toml", folder)
     text = (ROOT / "examples/campaign.toml").read_text(encoding="utf-8").replace("..2", "..1")
     return try_document(
-        file, text, rng, lambda: call("campaign", file, "--dry-run", "--out", folder / "out").code == 0,
+        file, text, rng, lambda: call("study", file, "--dry-run", "--out", folder / "out").code == 0,
         ("parameters", "overrides", "seeds", "levels", "rigs", "controller", "protocol", "model", "runs"),
     )  # fmt: skip
 

@@ -106,7 +106,7 @@ def try_journal(folder: Path, rng: random.Random) -> str:
     call("runs", folder)
     wrong = _read_wrongly(run, "reading")
     result = folder / "result.json"
-    recovered = call("recover-journal", run, "--json", result)
+    recovered = call("runs", "repair", run, "--json", result)
     if wrong or not result.exists():
         return wrong
     return _recovered_wrongly(run, json.loads(result.read_text(encoding="utf-8")), recovered.code)

@@ -1,6 +1,6 @@
 """Draw the dashboard of every protocol on every emulated rig, dark and light, and check that no view is empty.
 
-The runs are those of the studies, which `bench reproduce` makes, and short ones of the protocols that they leave out.
+The runs are those of the studies, which `bench study` makes, and short ones of the protocols that they leave out.
 A dark picture is drawn by Rerun's viewer without a screen, a light one by its viewer for browsers in Chromium. Runs
 and pictures are kept, and made again once the sources change that they come from.
 """
@@ -238,12 +238,12 @@ def _has_values(chunk: Any) -> bool:
 
 
 def make_study(name: str, folder: Path) -> None:
-    """Carry a study out, in place of what there is of it; the runs of `bench reproduce` do not write recordings."""
+    """Carry a study out, in place of what there is of it; the runs of `bench study` do not write recordings."""
     shutil.rmtree(folder / name, ignore_errors=True)
-    command = [sys.executable, "-P", "-m", "bench", "reproduce", name, "--out", str(folder / name)]
+    command = [sys.executable, "-P", "-m", "bench", "study", name, "--out", str(folder / name)]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
-        raise DataError(f"bench reproduce {name}: {done.stderr.strip() or done.stdout.strip()[-500:]}")
+        raise DataError(f"bench study {name}: {done.stderr.strip() or done.stdout.strip()[-500:]}")
 
 
 def make_recordings(

@@ -33,7 +33,7 @@ SEEDS = 4
 
 CAMPAIGN = "vo2, characterization"
 SETTINGS: Mapping[str, Mapping[str, float]] = {
-    # The paper's characterization, as in `bench reproduce vo2`.
+    # The paper's characterization, as in `bench study vo2`.
     CAMPAIGN: {},
     "vo2": {"increment": 1.5, "half_cycles": 24},
     "sma": {"increment": 0.25, "half_cycles": 16, "dwell": 10.0},

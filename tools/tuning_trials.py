@@ -1,4 +1,4 @@
-"""Trials of `bench tune` on the packaged rigs: controllers with constants by hand, today's numbers and tuned ones.
+"""Trials of `bench model tune` on packaged rigs: controllers with constants by hand, of model and file, and tuned.
 
     python tools/tuning_trials.py [--case mckibben/length-control ...] [--sessions 5] [--out FOLDER]
 
@@ -6,9 +6,9 @@ Each rig is characterized once. Each controller is tuned for the model, and brin
 sessions whose noise and targets the tuning has not seen: with the constants by hand (`by_hand`), with the numbers of
 model and rig file, and with those of the tuning file. The table has for each of the
 three median and worst of the RMS error over the sessions, and the mean time at a target; then in how many sessions
-the cost of `bench tune` is less with the tuning file than by hand, and what supply and sensor of a muscle leave. Of a
-controller that is given up it has at which target. Exits with 1 if tuned numbers cost more than those by hand in most
-sessions.
+the cost of `bench model tune` is less with the tuning file than by hand, and what supply and sensor of a muscle
+leave. Of a controller that is given up it has at which target. Exits with 1 if tuned numbers cost more than those
+by hand in most sessions.
 """
 
 from __future__ import annotations

@@ -61,6 +61,8 @@ from .model_service import (
 )
 from .models_of_several_runs import (
     WholeIdentification as WholeIdentification,
+    WholeModel as WholeModel,
+    only_run as only_run,
     whole_identification as whole_identification,
     whole_models as whole_models,
 )

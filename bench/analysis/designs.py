@@ -1,4 +1,4 @@
-"""Experiments that are designed: the work of `bench design`."""
+"""Experiments that are designed: the work of `bench model design`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What models give for measurements, with the session recalibrated and bands: `bench predict`, `bench compare`."""
+"""What models give for measurements, with the session recalibrated and bands: `bench predict`, `bench model test`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A model beside measurements, row by row: the columns that `bench predict` and `bench compare` write."""
+"""A model beside measurements, row by row: the columns that `bench predict` and `bench model test` write."""
 
 from __future__ import annotations
 

@@ -96,7 +96,7 @@ class GuardianError(BenchError):
 
 
 class RecordError(BenchError):
-    """The journal of a run is damaged, or rows are missing in it; `bench recover-journal` says how far it is good."""
+    """The journal of a run is damaged, or rows are missing in it; `bench runs repair` says how far it is good."""
 
     exit_code = 8
 

@@ -1,4 +1,4 @@
-"""Many runs: the studies of `bench reproduce`, campaigns over rigs and seeds, and the tuning of controllers."""
+"""Many runs: the studies of `bench study`, campaigns over rigs and seeds, and the tuning of controllers."""
 
 from lazy_loader import attach_stub
 

@@ -1,6 +1,6 @@
 """Studies: series of runs on emulated rigs, and their results as values, tables and figures.
 
-A package registers a `Study` as an entry point of the group `bench.studies`; `bench reproduce NAME` carries it out.
+A package registers a `Study` as an entry point of the group `bench.studies`; `bench study NAME` carries it out.
 """
 
 from __future__ import annotations
@@ -279,7 +279,7 @@ class StudyResult:
 
 @dataclass(frozen=True)
 class Study:
-    """What `bench reproduce NAME` carries out.
+    """What `bench study NAME` carries out.
 
     Attributes
     ----------

@@ -1,4 +1,5 @@
 from .application import (
+    EXIT_CODES as EXIT_CODES,
     app as app,
     main as main,
 )

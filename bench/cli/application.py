@@ -1,4 +1,4 @@
-"""The `bench` command: its groups put together, and how it ends.
+"""The `bench` command: what is in it, and how it ends.
 
 Every command prints for people, and with `--json FILE` writes the same result for programs. Heavy imports
 wait until a command needs them, so that `bench --help` answers at once.
@@ -12,101 +12,104 @@ import gc
 import sqlite3
 import sys
 from collections.abc import Mapping, Sequence
-from typing import ClassVar, NoReturn
+from typing import Annotated, Any, ClassVar, NoReturn
 
 import typer
 from rich.markup import escape
-from typer.main import get_command_name
-from typer.models import CommandInfo
 
-from bench.base import BenchError, ConfigurationError, registry
-from bench.cli import (
-    calibrations,
-    campaign_command as campaign,
-    comparisons,
-    designs,
-    imports,
-    journals,
-    maintenance_commands as upkeep,
-    model_commands as models,
-    new,
-    panel_command as panel,
-    record_commands as records,
-    rehearse_command as rehearse,
-    repeat_command as repeat,
-    resume_command as resume,
-    run_commands as runs,
-    run_list,
-    tune_command as tune,
-    twin_command as twin,
-    watch,
-)
+from bench.base import AbortError, BenchError, ConfigurationError, registry
 from bench.cli.command_support import error_console, exit_code, fail, told_of_records
-from bench.cli.registered import RegisteredCommands, Studies
+from bench.cli.groups import HELP_OPTIONS, Command, Group
 from bench.cli.streams import standard_streams
 
-_EPILOG = (
+EXIT_CODES = (
     "Exit codes: 0 done; 1 failed, or done but the file of --json could not be written; 2 wrong command, rig file or "
     "parameter (nothing has moved); 3 unusable data or model file; 4 device fault; 5 interlock; 6 not steady in "
     "time; 7 safe state not confirmed; 8 record damaged or incomplete; 9 a resumed specimen is not as it was; 10 a "
-    "controller does not converge; 130 ended by the operator. Try: bench list, and bench run PROTOCOL --rig RIG "
-    "--clock virtual"
+    "controller does not converge; 130 ended by the operator."
 )
 
-_MID_WAY = ("safe", "recover")
+_MID_WAY = ("safe", "rig clear")
 """Commands that have devices open without asking for Ctrl-C in between."""
 
-_PARTS = (
-    runs.app,
-    rehearse.app,
-    repeat.app,
-    campaign.app,
-    resume.app,
-    run_list.app,
-    upkeep.app,
-    panel.app,
-    models.app,
-    designs.app,
-    comparisons.app,
-    calibrations.app,
-    records.app,
-    imports.app,
-    watch.app,
-    journals.app,
-    twin.app,
-    tune.app,
-    new.app,
-)
+_RUN, _LOOK, _MODEL, _EXTEND = "Run", "Look", "Model", "Rig & extend"
 
 
-class BenchCommands(RegisteredCommands):
+class BenchCommands(Group):
     """The commands of `bench`."""
 
-    own: ClassVar[Mapping[str, CommandInfo]] = {
-        info.name or get_command_name(info.callback.__name__): info
-        for part in _PARTS
-        for info in part.registered_commands
-        if info.callback is not None
+    panel = _EXTEND
+    own: ClassVar[Mapping[str, Command]] = {
+        "rehearse": Command("Say what a run would do, before anything moves.", "rehearse_command:rehearse", _RUN),
+        "run": Command("Carry a protocol out on a rig, and record it.", "run_commands:run", _RUN, has_help=True),
+        "resume": Command("Go on with a run that was ended or died.", "resume_command:resume", _RUN),
+        "panel": Command("Move a rig by hand, or answer a run in progress.", "panel_command:panel", _RUN),
+        "safe": Command("Bring every device of a rig into its safe state.", "maintenance_commands:safe", _RUN),
+        "list": Command("List rigs, protocols, models, controllers, studies.", "run_commands:list_", _LOOK),
+        "show": Command("Show one of these in full.", "run_commands:show", _LOOK),
+        "runs": Command("List, export, import, repair and compare runs.", "groups:RunsGroup", _LOOK),
+        "view": Command("Show a run in a viewer, live or once more.", "view:view", _LOOK),
+        "report": Command("Make tables, figures and a page of a run.", "record_commands:report", _LOOK),
+        "identify": Command("Identify a hysteresis model from measurements.", "model_commands:identify_", _MODEL),
+        "predict": Command("Apply a model to a column of inputs.", "model_commands:predict_", _MODEL),
+        "invert": Command("Compute the set-points for a column of targets.", "model_commands:invert", _MODEL),
+        "model": Command("Test models, design experiments, make twins, tune.", "groups:ModelGroup", _MODEL),
+        "study": Command("Carry out a study or a campaign on emulated rigs.", "groups:StudyGroup", _MODEL),
+        "rig": Command("Check, clear, calibrate and emulate instruments.", "groups:RigGroup", _EXTEND),
+        "new": Command("Write the skeleton of a device, protocol, model, rig.", "new:new", _EXTEND),
+    }
+    former: ClassVar[Mapping[str, str]] = {
+        "repeat": "bench run --from RUN",
+        "campaign": "bench study FILE.toml",
+        "reproduce": "bench study NAME",
+        "recover": "bench rig clear",
+        "doctor": "bench rig check",
+        "calibrate": "bench rig calibrate",
+        "emulate": "bench rig emulate",
+        "find": "bench rig find",
+        "torture": "bench rig torture",
+        "design": "bench model design",
+        "compare": "bench model test, and for two runs bench runs compare",
+        "twin": "bench model twin",
+        "tune": "bench model tune",
+        "export": "bench runs export",
+        "import": "bench runs import",
+        "recover-journal": "bench runs repair",
+        "watch": "bench view",
+        "replay": "bench view",
+        "identify-*": "bench identify RUN... --model NAME",
     }
 
 
 app = typer.Typer(
     name="bench",
     cls=BenchCommands,
-    help="A lab bench for smart-material actuators: run step protocols on real or emulated instruments, "
-    "identify hysteresis models from the measurements, and apply them.",
-    epilog=_EPILOG,
-    no_args_is_help=True,
-    add_completion=False,
-    rich_markup_mode="markdown",
+    epilog="Start with: bench list; bench run PROTOCOL --rig RIG",
+    rich_markup_mode=None,
     pretty_exceptions_enable=False,
+    context_settings=HELP_OPTIONS,
 )
-reproduce_ = typer.Typer(
-    help="Reproduce a paper's results on its emulated rig, at the wire level, on the virtual clock.",
-    no_args_is_help=True,
-    cls=Studies,
-)
-app.add_typer(reproduce_, name="reproduce")
+
+
+def _show_version(is_wanted: bool) -> None:
+    if is_wanted:
+        from bench import __version__
+
+        typer.echo(f"bench {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def bench(
+    *,
+    _version: Annotated[
+        bool, typer.Option("--version", help="Show the version.", is_eager=True, callback=_show_version)
+    ] = False,
+) -> None:
+    """Run step protocols on real or emulated instruments of a lab bench for smart-material actuators.
+
+    Identify hysteresis models from the measurements, and apply them. Every command has --help.
+    """
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
@@ -122,12 +125,17 @@ def main(arguments: Sequence[str] | None = None) -> NoReturn:
 
 def _carry_out(arguments: Sequence[str] | None) -> NoReturn:
     words = sys.argv[1:] if arguments is None else list(arguments)
+    code: int | None = None
     try:
         _check_words(words)
         registry.check_own_packages()
-        app(args=words)
+        code = app(args=words, prog_name="bench", standalone_mode=False)
     except BenchError as error:
         fail(error)
+    except (typer.Abort, KeyboardInterrupt):
+        code = AbortError.exit_code
+    except typer.TyperException as error:
+        fail(ConfigurationError(_usage(error)))
     except OSError as error:
         if error.errno != errno.ENAMETOOLONG:
             raise
@@ -135,15 +143,14 @@ def _carry_out(arguments: Sequence[str] | None) -> NoReturn:
     except sqlite3.Error as error:
         error_console.print("[bold red]error:[/] the journal cannot be written:", escape(str(error)), highlight=False)
         sys.exit(1)
-    # As typer ends a command at Ctrl-C: without a word.
     except SystemExit as ended:
-        if _is_by_keyboard(ended):
-            error_console.print(f"[yellow]ended by Ctrl-C:[/] {_state_of_outputs(words)}", highlight=False)
-        code = 0 if ended.code is None else ended.code
-        if isinstance(code, int) and (code := exit_code(code)) != ended.code:
+        if isinstance(ended.code, int | None) and (code := exit_code(ended.code or 0)) != (ended.code or 0):
             sys.exit(code)
         raise
-    sys.exit(exit_code(0))
+    # As typer ends a command at Ctrl-C: without a word.
+    if code == AbortError.exit_code:
+        error_console.print(f"[yellow]ended by Ctrl-C:[/] {_state_of_outputs(words)}", highlight=False)
+    sys.exit(exit_code(code or 0))
 
 
 def _check_words(words: Sequence[str]) -> None:
@@ -158,15 +165,14 @@ def _check_words(words: Sequence[str]) -> None:
             ) from None
 
 
-def _is_by_keyboard(error: BaseException | None) -> bool:
-    """Return whether Ctrl-C is what an exception comes from; that of a run is heard by its `Interrupts`."""
-    while error is not None and not isinstance(error, KeyboardInterrupt):
-        error = error.__cause__ or error.__context__
-    return error is not None
+def _usage(error: Any) -> str:  # noqa: ANN401 - of typer
+    """Return what is wrong with the use of a command, in a line."""
+    context = getattr(error, "ctx", None)
+    return f"{context.command_path}: {error.format_message()}" if context else str(error)
 
 
 def _state_of_outputs(words: Sequence[str]) -> str:
-    command = next((word for word in words if not word.startswith("-")), "")
-    if command in _MID_WAY:
+    command = " ".join([word for word in words if not word.startswith("-")][:2])
+    if command.startswith(_MID_WAY):
         return f"in the middle of {command}; `bench safe RIG` makes sure that every output is off"
     return "no device was opened, nothing has moved; the outputs are as they were"

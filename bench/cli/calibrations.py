@@ -10,10 +10,7 @@ import typer
 from bench.base import print_plain
 from bench.cli.command_support import JsonOption, check_outputs, console, print_rows, write_json
 
-app = typer.Typer()
 
-
-@app.command()
 def calibrate(
     run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run of a calibration protocol.")],
     sensor: Annotated[str, typer.Option(metavar="SIGNAL", help="Signal of the sensor.")],

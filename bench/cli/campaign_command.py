@@ -21,13 +21,10 @@ if TYPE_CHECKING:
 
     from bench.batch import CampaignTask, Done, Executor, Expansion
 
-app = typer.Typer()
-
 SAID_EVERY = 10.0
 """Wall-clock seconds between two lines about a campaign whose output is no terminal."""
 
 
-@app.command()
 @show_compilation()
 def campaign(
     file: Annotated[Path, typer.Argument(metavar="FILE.toml", help="Campaign file; docs/reference/campaign.md.")],

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
@@ -66,6 +66,7 @@ JsonOption = Annotated[
         callback=_take_json,
     ),
 ]
+RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run, or its journal.")]
 LiveOption = Annotated[
     bool, typer.Option("--live/--no-live", help="Open the live view, or print its address where there is no display.")
 ]
@@ -187,6 +188,15 @@ def parse_numbers(option: str, texts: Sequence[str]) -> dict[str, int | float]:
         except ValueError:
             raise ConfigurationError(f"{option} {key}={text}: expected a number") from None
     return numbers
+
+
+def check_given(context: typer.Context, taken: Collection[str], why: str) -> None:
+    """Raise ConfigurationError if the command line gives a parameter that is not among those `taken`; says why."""
+    for parameter in context.command.params:
+        source = context.get_parameter_source(parameter.name or "")
+        if parameter.name not in taken and source is not None and source.name == "COMMANDLINE":
+            given = max(parameter.opts, key=len) if parameter.param_type_name == "option" else parameter.name.upper()
+            raise ConfigurationError(f"{why}; leave {given} out")
 
 
 def check_outputs(

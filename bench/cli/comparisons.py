@@ -1,4 +1,4 @@
-"""The command that compares: models on measurements, or two runs with each other."""
+"""The commands that compare: models on measurements, and two runs with each other."""
 
 from __future__ import annotations
 
@@ -9,10 +9,17 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from bench.analysis import ReadingOptions
-from bench.base import ConfigurationError, print_plain, show_table
+from bench.base import print_plain, show_table
 from bench.cli.band_options import BandsOption, Recalibrating, print_examined
-from bench.cli.command_support import JsonOption, check_outputs, console, show_compilation, warn, write_json
+from bench.cli.command_support import (
+    JsonOption,
+    RunArgument,
+    check_outputs,
+    console,
+    show_compilation,
+    warn,
+    write_json,
+)
 from bench.cli.data_options import ReadingGroup, offer_groups, print_assumptions
 from bench.cli.model_commands import InitialOption
 from bench.cli.patience import show_patience
@@ -21,22 +28,19 @@ from bench.cli.written import print_figures, write_rows
 if TYPE_CHECKING:
     from bench.analysis import RunComparison
 
-app = typer.Typer()
 
-
-@app.command("compare")
 @offer_groups
 @show_compilation()
-def compare_(
-    compared: Annotated[list[Path], typer.Argument(metavar="A B", help="Model files with --data; or two runs.")],
+def models_on_data(
+    compared: Annotated[list[Path], typer.Argument(metavar="model.json...", help="Model files.")],
     data: Annotated[
-        Path | None,
+        Path,
         typer.Option(
             "--data",
             metavar="FILE",
-            help="For models: table of measurements (text, .mat, .xlsx, .h5, .tdms, .parquet), or folder of a run.",
+            help="Table of measurements (text, .mat, .xlsx, .h5, .tdms, .parquet), or folder of a run.",
         ),
-    ] = None,
+    ],
     input_column: Annotated[
         str | None, typer.Option("--input", metavar="COLUMN", help="Input column; the first model's if not given.")
     ] = None,
@@ -61,38 +65,18 @@ def compare_(
     recalibrating: Recalibrating,
     out: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.csv", help="For models: file for input, measured output, and by model the rest."),
+        typer.Option(metavar="FILE.csv", help="File for input, measured output, and by model the rest."),
     ] = None,
     figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for figures.")] = None,
-    html: Annotated[
-        Path | None, typer.Option(metavar="FILE.html", help="For two runs: page of the comparison, in one file.")
-    ] = None,
     json_file: JsonOption = None,
     reading: ReadingGroup,
 ) -> None:
-    """Compare models on measurements that they may not have seen; or, without `--data`, two runs with each other.
+    """Compare models on measurements that they may not have seen.
 
-    `bench compare A.json B.json --data FILE` shows each model's errors raw, and after re-zeroing the sensor: between
-    sessions a sensor's offset moves, and what a model is worth then is another number. `--out` writes input, measured
-    output and by model `predicted` and `residual` (measured minus predicted) of every row.
-
-    `bench compare RUN RUN` shows what differs in parameters, rig, instruments, versions and files, how both ended,
-    and how far each signal is apart at equal steps. `--html FILE` writes the same with figures as a page.
+    Each model's errors are shown raw, and after re-zeroing the sensor: between sessions a sensor's offset moves, and
+    what a model is worth then is another number. `--out` writes input, measured output and by model `predicted` and
+    `residual` (measured minus predicted) of every row. `bench runs compare` compares two runs.
     """
-    if data is None:
-        of_models = (
-            input_column, output_column, time_column, skip, initial, bands, out, figures,
-        )  # fmt: skip
-        if any(of_models) or reading != ReadingOptions() or recalibrating != Recalibrating():
-            raise ConfigurationError(
-                "--input, --output, --time, --skip, --initial, --bands, --recalibrate, --out, --figures and how a "
-                "file is read are for models, with --data FILE"
-            )
-        check_outputs(html=html, json_file=json_file, read=compared)
-        _compare_runs(compared, html, json_file)
-        return
-    if html is not None:
-        raise ConfigurationError("--html is for two runs, without --data; --figures draws models")
     from bench.analysis import ColumnNames, compare_models, load_models, read_for
 
     check_outputs(out=out, figures=figures, json_file=json_file, read=(data, *compared))
@@ -129,15 +113,23 @@ def compare_(
     write_json(json_file, result.to_json())
 
 
-def _compare_runs(runs: list[Path], html: Path | None, json_file: Path | None) -> None:
+def compare(
+    first_run: RunArgument,
+    second_run: RunArgument,
+    html: Annotated[
+        Path | None, typer.Option(metavar="FILE.html", help="Page of the comparison with figures, in one file.")
+    ] = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Compare two runs: what they were given, how they ended, and how far each signal is apart at equal steps.
+
+    Shown is what differs in parameters, rig, instruments, versions and files.
+    """
     from bench.analysis import compare_runs
     from bench.record import Record
 
-    if any(path.suffix == ".json" for path in runs):
-        raise ConfigurationError("model files are compared on measurements: add --data FILE")
-    if len(runs) != 2:
-        raise ConfigurationError(f"expected two runs to compare, or model files with --data; got {len(runs)}")
-    with Record(runs[0]) as first, Record(runs[1]) as second:
+    check_outputs(html=html, json_file=json_file, read=[first_run, second_run])
+    with Record(first_run) as first, Record(second_run) as second:
         found = compare_runs(first, second)
         _print_runs(found)
         if html is not None:

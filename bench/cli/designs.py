@@ -17,10 +17,7 @@ from bench.cli.patience import show_patience
 if TYPE_CHECKING:
     from bench.identification import Continuation
 
-app = typer.Typer()
 
-
-@app.command()
 @offer_groups
 @show_compilation()
 def design(
@@ -79,9 +76,9 @@ def design(
     which lower it. The condition number does not order the errors; it says how exactly the coefficients can be
     computed.
 
-    `bench design --model model.json --data FILE --continue HOURS` goes on from measurements: it adds damped tails,
-    each where it tells most per second. Each tail visits its first maximum again: outputs that differ there by more
-    than the noise say that the specimen has no return-point memory, so that no Preisach model fits it.
+    `bench model design --model model.json --data FILE --continue HOURS` goes on from measurements: it adds damped
+    tails, each where it tells most per second. Each tail visits its first maximum again: outputs that differ there by
+    more than the noise say that the specimen has no return-point memory, so that no Preisach model fits it.
     """
     from bench.analysis import assess_designs, write_sequence
 

@@ -11,10 +11,7 @@ from bench.base import print_plain
 from bench.cli.command_support import JsonOption, check_outputs, console, write_json
 from bench.cli.data_options import ReadingGroup, offer_groups, print_assumptions
 
-app = typer.Typer()
 
-
-@app.command("import")
 @offer_groups
 def import_(
     file: Annotated[
@@ -44,8 +41,8 @@ def import_(
 ) -> None:
     """Make a run of a file of measurements of another program: each row becomes a reading.
 
-    `bench report`, `bench identify`, `bench compare` and `bench export` then take its folder as that of any run. The
-    file is kept in the record. Without times or --interval, rows are 1 s apart; the time of day is that of the file.
+    `bench report`, `bench identify` and `bench runs` then take its folder as that of any run. The file is kept in the
+    record. Without times or --interval, rows are 1 s apart; the time of day is that of the file.
     """
     from bench.analysis import import_file
 

@@ -13,11 +13,8 @@ from rich.table import Table
 from bench.base import RecordError, print_plain, show_table
 from bench.cli.command_support import JsonOption, check_outputs, console, write_json
 
-app = typer.Typer()
 
-
-@app.command()
-def recover_journal(
+def repair(
     journal: Annotated[Path, typer.Argument(metavar="FILE", help="A journal, or the folder of a run.")],
     second: Annotated[
         list[Path] | None,

@@ -1,4 +1,4 @@
-"""The commands that look after the instruments of a rig: safe, recover, doctor."""
+"""The commands that look after the instruments of a rig: safe, rig check, rig clear."""
 
 from __future__ import annotations
 
@@ -16,8 +16,6 @@ from rich.table import Table
 from bench.base import AbortError, ConfigurationError, DeviceError, show_table
 from bench.cli.command_support import JsonOption, console, parse_assignments, show_compilation, warn, write_json
 
-app = typer.Typer()
-
 UNSAFE_EXIT_CODE = 7
 
 RigArgument = Annotated[str, typer.Argument(metavar="RIG", help="A packaged rig, or a rig file: path/to/rig.toml.")]
@@ -27,11 +25,10 @@ OverrideOption = Annotated[
 ]
 AttachOption = Annotated[
     Path | None,
-    typer.Option(metavar="FILE", help="Endpoints file of `bench emulate --json`: use the instruments served there."),
+    typer.Option(metavar="FILE", help="Endpoints file of `bench rig emulate --json`: use the instruments there."),
 ]
 
 
-@app.command()
 def safe(
     rig: RigArgument,
     force: Annotated[
@@ -49,7 +46,7 @@ def safe(
     For when a run has died, or an instrument reports an error. The lines are tried in parallel. A device that does
     not confirm its safe state is named at once, with what to unplug, and tried again each second until it does, also
     one whose port is not there. Ctrl-C and every signal that would end the process end it; a script sets `--limit`.
-    Nothing is configured, and errors stay (see `bench recover`). A run that goes on holds its lines: end it, or use
+    Nothing is configured, and errors stay (see `bench rig clear`). A run that goes on holds its lines: end it, or use
     `--force`; a serial line that is open elsewhere may still be refused then.
 
     Exit codes: 0 every output is off; 2 the rig file is wrong, or the rig is in use; 7 at least one device had not
@@ -84,9 +81,8 @@ def safe(
         sys.exit(UNSAFE_EXIT_CODE)
 
 
-@app.command()
 @show_compilation()
-def recover(
+def clear(
     rig: RigArgument,
     device: Annotated[str | None, typer.Argument(help="Only this device; without it all that are in error.")] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
@@ -103,9 +99,9 @@ def recover(
     Exit codes: 0 every device is ready; 2 the rig file is wrong or does not fit an instrument, or the rig is in use;
     4 a device is still in error, or cannot be reached; 130 not confirmed.
     """
-    from bench.rig import Condition, look, opened, recover as recover_device
+    from bench.rig import Condition, look, opened, recover
 
-    with opened(rig, parse_assignments("--override", overrides or []), attach, "bench recover") as place:
+    with opened(rig, parse_assignments("--override", overrides or []), attach, "bench rig clear") as place:
         entries = place.only(device)
         found: dict[str, Condition] = {entry.name: look(place, entry) for entry in entries}
         _print_conditions(list(found.values()))
@@ -117,7 +113,7 @@ def recover(
             question = f"Is the cause removed? Clear the errors of {names}"
             if not yes and not typer.confirm(question, err=console.stderr):
                 raise AbortError("nothing was cleared")
-            found |= {entry.name: recover_device(place, entry) for entry in wanted}
+            found |= {entry.name: recover(place, entry) for entry in wanted}
             console.print()
             _print_conditions([found[entry.name] for entry in wanted])
     write_json(json_file, {name: {"state": each.state, "meaning": each.meaning} for name, each in found.items()})
@@ -139,9 +135,8 @@ def _print_conditions(conditions: Sequence[object]) -> None:
     show_table(console, table)
 
 
-@app.command()
 @show_compilation()
-def doctor(
+def check(
     rig: RigArgument,
     exercise: Annotated[
         bool,
@@ -171,7 +166,7 @@ def doctor(
             raise AbortError("the check-up was ended; every device was brought into its safe state")
 
     replaced = parse_assignments("--override", overrides or [])
-    with Interrupts() as interrupts, opened(rig, replaced, attach, "bench doctor") as place:
+    with Interrupts() as interrupts, opened(rig, replaced, attach, "bench rig check") as place:
         place.clock.interrupted = lambda: interrupts.pause_requested or interrupts.abort_requested()
         checks = check_up(place, exercise, keep_on)
         name = place.file.name

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
@@ -22,6 +23,7 @@ from bench.cli.choice_options import (
 from bench.cli.command_line import command_line
 from bench.cli.command_support import (
     JsonOption,
+    check_given,
     check_outputs,
     console,
     print_rows,
@@ -35,9 +37,7 @@ from bench.cli.patience import show_patience
 from bench.cli.written import print_figures, write_rows
 
 if TYPE_CHECKING:
-    from bench.analysis import FitOptions
-
-app = typer.Typer()
+    from bench.analysis import FitOptions, WholeIdentification
 
 
 DataArgument = Annotated[
@@ -86,8 +86,10 @@ class Fitting:
             metavar="COLUMN",
             help="Input column. FILE:COLUMN is of a second file; A,B joins columns in order.",
         ),
-    ]
-    output_column: Annotated[str, typer.Option("--output", metavar="COLUMN", help="Output column, as the input.")]
+    ] = ""
+    output_column: Annotated[str, typer.Option("--output", metavar="COLUMN", help="Output column, as the input.")] = (
+        ""
+    )
     model: Annotated[
         str,
         typer.Option(
@@ -172,6 +174,11 @@ class Fitting:
 
         Raises ConfigurationError otherwise.
         """
+        missing = [
+            name for name, column in (("--input", self.input_column), ("--output", self.output_column)) if not column
+        ]
+        if missing:
+            raise ConfigurationError(f"{' and '.join(missing)} must be given: a column of the measurements")
         if self.input_column == self.output_column:
             raise ConfigurationError(
                 f"--input and --output are the same column, {self.input_column}; a model needs two"
@@ -201,7 +208,6 @@ class FitOutputs:
     json_file: JsonOption = None
 
 
-@app.command("identify")
 @offer_groups
 @show_compilation()
 def identify_(
@@ -227,11 +233,14 @@ def identify_(
     its steps are taken: `bench identify RUN --input voltage --output displacement --model preisach --out model.json`;
     `--table telemetry` takes those within its steps, as of a fast loop.
     """
-    from bench.analysis import ColumnNames, certificate_lines, identify_model
+    from bench.analysis import ColumnNames, certificate_lines, identify_model, whole_identification
     from bench.identification import ONE_RUN
 
     out = outputs.out
     check_outputs(**vars(outputs), read=[*files, *comparing.test_files])
+    if (whole := whole_identification(fitting.model)) is not None:
+        _identify_whole(context, whole, files, comparing, options, outputs)
+        return
     if comparing.table_out is not None:
         check_outputs(out=comparing.table_out)
     fitting.check(comparing, options)
@@ -285,7 +294,27 @@ def identify_(
     write_json(outputs.json_file, found.summary() | more)
 
 
-@app.command("predict")
+def _identify_whole(
+    context: typer.Context,
+    whole: WholeIdentification,
+    runs: Sequence[Path],
+    comparing: Comparing,
+    options: ModelOptions,
+    outputs: FitOutputs,
+) -> None:
+    """Identify a model from several runs together, such as one of several inputs."""
+    check_given(context, ("files", "model", "test", "options", "out", "json_file"), "this model is of whole runs")
+    test = None if comparing.test is None else Path(comparing.test)
+    with show_patience(f"reading and fitting {len(runs)} runs"):
+        found = whole.of_runs(runs, test, options.values)
+    if outputs.out is not None:
+        found.file.save(outputs.out)
+    print_rows(found.title, found.rows)
+    if outputs.out is not None:
+        print_plain(console, f"model: {outputs.out}")
+    write_json(outputs.json_file, found.summary)
+
+
 @offer_groups
 @show_compilation()
 def predict_(
@@ -374,7 +403,6 @@ class PolicyOption(Enum):
     PAPER: Literal["paper"] = "paper"  # type: ignore[misc]
 
 
-@app.command()
 @offer_groups
 @show_compilation()
 def invert(

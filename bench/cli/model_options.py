@@ -64,9 +64,10 @@ class ModelOptions:
     options: Annotated[
         list[str] | None,
         typer.Option(
+            "-o",
             "--option",
             metavar="NAME=VALUE",
-            help="Another option of the model, as `bench list MODEL` names it: a number, numbers with commas, or a "
+            help="Another option of the model, as `bench show MODEL` names it: a number, numbers with commas, or a "
             "word; repeatable.",
         ),
     ] = None

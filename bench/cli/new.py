@@ -11,10 +11,7 @@ from bench.base import print_plain
 from bench.cli.command_support import console
 from bench.cli.skeletons import Part
 
-app = typer.Typer()
 
-
-@app.command()
 def new(
     part: Annotated[Part, typer.Argument(help="What it is: device, protocol, model or rig.")],
     name: Annotated[

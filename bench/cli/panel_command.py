@@ -13,10 +13,7 @@ from bench.cli.command_support import parse_assignments, print_error
 from bench.cli.maintenance_commands import AttachOption, OverrideOption
 from bench.cli.run_commands import print_result
 
-app = typer.Typer()
 
-
-@app.command()
 def panel(
     rig: Annotated[
         str, typer.Argument(metavar="RIG|RUN", help="A packaged rig, a rig file, or the folder of a run in progress.")

@@ -13,18 +13,16 @@ from bench.cli.command_support import (
     FigureFormat,
     FigureFormatOption,
     JsonOption,
+    RunArgument,
     console,
     show_compilation,
     write_json,
 )
 
-app = typer.Typer()
 
-
-@app.command()
 @show_compilation()
 def report(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run, or its journal.")],
+    run: RunArgument,
     models: Annotated[
         list[Path] | None,
         typer.Option("--model", metavar="FILE", help="Model file to compare; repeatable."),
@@ -65,10 +63,9 @@ class ExportFormat(StrEnum):
     PNG = "png"
 
 
-@app.command()
 @show_compilation()
 def export(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run, or its journal.")],
+    run: RunArgument,
     format_: Annotated[ExportFormat, typer.Option("--format", help="Format of the files.")],
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder to write to; the folder of the run if not given.")

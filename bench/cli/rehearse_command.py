@@ -24,10 +24,7 @@ from bench.cli.command_support import (
 if TYPE_CHECKING:
     from bench.execution import Extremes, Rehearsal, Run
 
-app = typer.Typer()
 
-
-@app.command()
 def rehearse(
     protocol: Annotated[
         str, typer.Argument(help="Name of a protocol, or a file of your own: path/to/file.py[:NAME].")

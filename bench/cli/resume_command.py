@@ -7,15 +7,20 @@ from typing import Annotated
 
 import typer
 
-from bench.cli.command_support import JsonOption, LiveOption, NotifyOption, check_outputs, console, show_compilation
+from bench.cli.command_support import (
+    JsonOption,
+    LiveOption,
+    NotifyOption,
+    RunArgument,
+    check_outputs,
+    console,
+    show_compilation,
+)
 from bench.cli.run_commands import print_result
 
-app = typer.Typer()
 
-
-@app.command()
 def resume(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of the run.")],
+    run: RunArgument,
     sigmas: Annotated[
         float,
         typer.Option(min=0.1, max=1000, help="Standard deviations by which the specimen may differ from the record."),
@@ -38,7 +43,7 @@ def resume(
     ] = None,
     attach: Annotated[
         Path | None,
-        typer.Option(metavar="FILE", help="Endpoints file of `bench emulate --json`, if the run was attached."),
+        typer.Option(metavar="FILE", help="Endpoints file of `bench rig emulate --json`, if the run was attached."),
     ] = None,
     notify: NotifyOption = None,
     live: LiveOption = False,
@@ -48,8 +53,8 @@ def resume(
 
     The protocol is started again with its recorded parameters, and the recorded readings are fed back to it: nothing
     is sent, and no time passes. What it yields has to be what the record says. Errors that watchdogs left in the
-    instruments when the run died are cleared, no others (see `bench recover`). Then the specimen is brought to where
-    it was by the corners of the set-points that it still remembers, and its signals are compared with the last
+    instruments when the run died are cleared, no others (see `bench rig clear`). Then the specimen is brought to
+    where it was by the corners of the set-points that it still remembers, and its signals are compared with the last
     readings. The step that had not finished is done again, and the run goes on: same record, same numbers of steps,
     same zero of time.
 

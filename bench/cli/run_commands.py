@@ -17,6 +17,7 @@ from bench.cli.command_support import (
     LiveOption,
     NotifyOption,
     SettingsOption,
+    check_given,
     check_outputs,
     console,
     error_console,
@@ -33,34 +34,32 @@ from bench.cli.rehearse_command import show_rehearsal
 if TYPE_CHECKING:
     from bench.execution import RunResult
 
-app = typer.Typer()
-
 UNSAFE_EXIT_CODE = 7
 
 
-@app.command("list")
-def list_(
+def list_(json_file: JsonOption = None) -> None:
+    """List rigs with the protocols that fit them, models, controllers and studies; `bench show NAME` shows one.
+
+    What comes from another package bears its name; an entry that cannot be loaded is named and left out.
+    """
+    from bench.cli.listing import listing
+
+    listed = listing()
+    _print_listing(listed)
+    write_json(json_file, listed)
+
+
+def show(
     name: Annotated[
-        str | None,
-        typer.Argument(
-            help="A rig, a protocol or a model to show in full, or `models` for all their options; without it, names."
-        ),
-    ] = None,
+        str, typer.Argument(help="A rig, protocol, model, controller or study; or models, for all their options.")
+    ],
     json_file: JsonOption = None,
 ) -> None:
-    """Show what there is: rigs with the protocols that fit them, models, controllers, studies; or one of these.
+    """Show a rig, a protocol, a model, a controller or a study in full.
 
-    A protocol is shown with its parameters, a rig with its file: `bench list RIG > desk.toml` gives you a copy to
-    fill in. What comes from another package bears its name; an entry that cannot be loaded is named and left out.
+    A protocol is shown with its parameters, a rig with its file: `bench show RIG > desk.toml` gives you a copy to
+    fill in.
     """
-    if name is None:
-        from bench.cli.listing import listing
-
-        listed = listing()
-        _print_listing(listed)
-        write_json(json_file, listed)
-        return
-
     from bench.cli.catalogue import Catalogue
     from bench.models import identifiable_models, timed_models
 
@@ -108,12 +107,11 @@ def _print_listing(listed: Mapping[str, Any]) -> None:
         console.print(f"    [dim]protocols (*: takes a model file):[/] {names}\n", highlight=False)
     for group in ("protocols", "models", "controllers"):
         print_table(group, titles(group))
-    print_table("studies, for `bench reproduce`", titles("studies"))
+    print_table("studies, for `bench study`", titles("studies"))
     for problem in listed["problems"]:
         warn(f"left out: {problem}")
 
 
-@app.command(add_help_option=False)
 def run(
     context: typer.Context,
     protocol: Annotated[
@@ -122,6 +120,10 @@ def run(
     rig: Annotated[
         str | None,
         typer.Option("--rig", metavar="RIG", help="Name of a packaged rig, or a rig file: path/to/rig.toml."),
+    ] = None,
+    from_run: Annotated[
+        Path | None,
+        typer.Option("--from", metavar="RUN", help="Carry this run out again, in place of PROTOCOL; see below."),
     ] = None,
     settings: SettingsOption = None,
     overrides: Annotated[
@@ -145,7 +147,7 @@ def run(
         Path | None,
         typer.Option(
             metavar="FILE",
-            help="Endpoints file of `bench emulate --json`: use the instruments served there, on their clock.",
+            help="Endpoints file of `bench rig emulate --json`: use the instruments served there, on their clock.",
         ),
     ] = None,
     faults: Annotated[
@@ -196,7 +198,19 @@ def run(
     step and asks; Ctrl-C again ends at once; so does every signal that would end a process, such as
     SIGTERM, SIGHUP and SIGUSR1. However the run ends, every device is brought into its safe state,
     and what was recorded so far is kept.
+
+    `--from RUN` carries a run out again from its record alone, and says whether the same came out. Protocol,
+    parameters, seed, clock, faults and the content of every file that the run was given are those of the record. A
+    run that was emulated has its rig from the record as well; on the virtual clock its values come out equal to the
+    last bit. Any other run is repeated on the rig that you name by --rig, with --override or --attach, and what
+    differs from the record is printed before anything moves. A record is code: its protocol and the modules of its
+    rig file are run as they were kept.
     """
+    if from_run is not None:
+        taken = ("from_run", "out", "rig", "overrides", "attach", "live", "json_file")
+        check_given(context, taken, "--from: the record says it")
+        _repeat(from_run, out, rig, parse_assignments("--override", overrides or []), attach, json_file, live=live)
+        return
     from bench.protocol import find_protocol
 
     if help_ or protocol is None:
@@ -242,6 +256,42 @@ def run(
         with show_compilation():
             result = carry_out(asked, console, interrupts)
         print_result(result, json_file)
+
+
+def _repeat(
+    run: Path,
+    out: Path,
+    rig: str | None,
+    overrides: Mapping[str, str],
+    attach: Path | None,
+    json_file: Path | None,
+    *,
+    live: bool,
+) -> None:
+    """Carry a recorded run out again, and say whether the same came out."""
+    from bench.analysis import compare_runs
+    from bench.base import Interrupts
+    from bench.execution import repeat, say_what_ctrl_c_does
+    from bench.record import Record
+
+    check_outputs(json_file=json_file, folder=out, read=[run])
+    with Interrupts(say_what_ctrl_c_does) as interrupts:
+        with show_compilation():
+            found = repeat(
+                run, out=out, console=console, rig=rig, overrides=overrides, attach=attach, live=live,
+                interrupts=interrupts,
+            )  # fmt: skip
+        with Record(found.original) as before, Record(found.result.folder) as now:
+            comparison = compare_runs(before, now)
+        differ = ", ".join(name for name, same in comparison.equal.items() if not same)
+        if not differ:
+            console.print(
+                f"as the original: {', '.join(comparison.equal)} are equal to the last bit", highlight=False
+            )
+        else:
+            text = f"{differ} differ from the original: bench runs compare {found.original} {found.result.folder}"
+            warn(text) if found.is_exact else print_plain(console, text)
+        print_result(found.result, json_file, {"repeats": str(found.original), **comparison.to_json()})
 
 
 def print_result(result: RunResult, json_file: Path | None, more: Mapping[str, Any] | None = None) -> None:

@@ -16,8 +16,6 @@ from bench.cli.command_support import JsonOption, console, parse_assignments, wr
 if TYPE_CHECKING:
     from bench.analysis import ListedRun
 
-app = typer.Typer()
-
 
 class Status(StrEnum):
     """How a run ended, or has not."""
@@ -33,7 +31,6 @@ class Status(StrEnum):
 _STYLES = {"completed": "", "running": "green", "unfinished": "yellow"}
 
 
-@app.command("runs")
 def runs_(
     folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Where to look, at any depth.")] = Path(
         "recordings"
@@ -55,7 +52,7 @@ def runs_(
     """List the runs below a folder in the order of their start: how they ended, what was set, what came out.
 
     `running` is a run of a process of this computer, `unfinished` one whose process died, with no guardian to say
-    how, or is of another computer, `damaged` one whose journal is damaged or gone; `bench recover-journal` says what
+    how, or is of another computer, `damaged` one whose journal is damaged or gone; `bench runs repair` says what
     is left of it. Shown are the parameters that differ from their defaults; any can be searched for:
     `bench runs --where controller=integral`.
     """

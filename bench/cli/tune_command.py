@@ -10,10 +10,7 @@ import typer
 from bench.base import print_plain
 from bench.cli.command_support import JsonOption, check_outputs, console, print_rows, show_compilation, write_json
 
-app = typer.Typer()
 
-
-@app.command("tune")
 @show_compilation()
 def tune_(
     model: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file of the specimen.")],

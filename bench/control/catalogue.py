@@ -152,7 +152,7 @@ class ControllerSpec:
     make: Callable[[ControllerSetup], Any]
     adapts: bool = False
     numbers: Callable[[ControllerSetup], Any] | None = None
-    """Returns the numbers of the controller, a dataclass, for `bench tune`."""
+    """Returns the numbers of the controller, a dataclass, for `bench model tune`."""
     tunable: tuple[str, ...] = ()
     """Those of them that it may change, all positive; one of a table as `TABLE.NAME`, those that change together as
     `NAME+NAME`."""

@@ -57,7 +57,7 @@ Tuning = Annotated[dict[str, dict[str, Any]], BeforeValidator(_given)]
 
 def tuning_text(tuning: Mapping[str, Mapping[str, Any]], provenance: Mapping[str, str | float]) -> str:
     """Return the text of a tuning file."""
-    lines = ["# Numbers of controllers, found by bench tune; used by --set tuning=FILE.", ""]
+    lines = ["# Numbers of controllers, found by bench model tune; used by --set tuning=FILE.", ""]
     for controller, numbers in tuning.items():
         lines += [f"[tuning.{controller}]", *(f"{name} = {_value(value)}" for name, value in numbers.items()), ""]
     lines += ["[provenance]", *(f"{name} = {_value(value)}" for name, value in provenance.items())]

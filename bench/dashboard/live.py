@@ -144,8 +144,8 @@ class Dashboard:
             self._is_said = True
             print_plain(
                 task_console(),
-                f"warning: the recording {self._path} is incomplete; bench export {self._path.parent} --format rrd "
-                "--out DIR rebuilds it from the journal",
+                f"warning: the recording {self._path} is incomplete; bench runs export {self._path.parent} "
+                "--format rrd --out DIR rebuilds it from the journal",
             )
 
     def _is_incomplete(self, path: Path) -> bool:

@@ -60,7 +60,7 @@ def check_address(uri: str) -> None:
         socket.create_connection((host, port), timeout=_START_SECONDS).close()
     except (OSError, ValueError) as error:
         raise DataError(
-            f"{uri}: nothing is shown there ({error}); a run with --live, `bench watch` and `bench replay` print "
+            f"{uri}: nothing is shown there ({error}); a run with --live, `bench view` print "
             "addresses such as rerun+http://127.0.0.1:9876/proxy"
         ) from None
 

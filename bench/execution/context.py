@@ -114,7 +114,7 @@ class Run:
     recording : bool
         Whether to write the .rrd beside the journal while the run goes on.
     attach : Path, optional
-        Endpoints file of `bench emulate`: the emulated laboratory is served there, on its own clock and seed.
+        Endpoints file of `bench rig emulate`: the emulated laboratory is served there, on its own clock and seed.
     interlock_rate : float, optional
         Looks at the interlocks of an emulated rig in a laboratory second, Hz, beside each reading and tick; on
         hardware the rig file says it, `[safety] rate`.
@@ -371,7 +371,7 @@ def _open_view(dashboard: Dashboard, console: Console) -> None:
 
     if dashboard.uri is not None and has_display():
         open_viewer(dashboard.uri)
-        print_plain(console, f"live view: {dashboard.uri}; bench watch opens it again")
+        print_plain(console, f"live view: {dashboard.uri}; bench view opens it again")
     else:
         console.print(f"live view: run [bold]rerun {dashboard.uri}[/] in another terminal", highlight=False)
 

@@ -70,13 +70,13 @@ def advise_on_record(
         yield Advice(
             FEW_REVERSALS,
             f"the input {times_of}, which tells little of hysteresis",
-            "record more cycles, of several amplitudes, as `bench design` proposes",
+            "record more cycles, of several amplitudes, as `bench model design` proposes",
         )
     elif has_one_kind(inputs, np.ones(inputs.size, dtype=bool) if fitted is None else fitted):
         yield Advice(
             "one-kind",
             "the input does not vary its amplitude, so that the error on other cycles is unknown",
-            "record smaller cycles too, as `bench design` proposes",
+            "record smaller cycles too, as `bench model design` proposes",
         )
     if times is not None and turns.size > 1:
         speeds = np.abs(np.diff(inputs[turns])) / np.diff(times[turns])

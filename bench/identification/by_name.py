@@ -99,7 +99,7 @@ def identify(
     """Return the model of a given name that fits a measured sequence best in the least-squares sense.
 
     The models are the entries of the group `bench.models`, to which packages may add; see `ModelSpec`. The command
-    `bench list NAME` shows the options of one, and docs/reference/models.md explains them. The shape parameters of an
+    `bench show NAME` shows the options of one, and docs/reference/models.md explains them. The shape parameters of an
     operator (`Operator.shape_parameters`), on which its output does not depend linearly, are fitted together with its
     coefficients by variable projection.
 

@@ -34,14 +34,14 @@ def missing(path: Path) -> str:
         if second_files(folder / FILE_NAME):
             return (
                 f"{path} has lost its {FILE_NAME}, but a second file has its rows: "
-                f"`bench recover-journal {folder}` writes {RECOVERED_NAME} from them"
+                f"`bench runs repair {folder}` writes {RECOVERED_NAME} from them"
             )
     return f"{path} is not a run: there is no {FILE_NAME}"
 
 
 def way_back(path: Path) -> str:
     """Return how an error about an unreadable file goes on: by what to do, if it is a journal by its name."""
-    return f"; `bench recover-journal {path}` says what is left of it" if path.suffix == ".sqlite" else ""
+    return f"; `bench runs repair {path}` says what is left of it" if path.suffix == ".sqlite" else ""
 
 
 def cause_of(error: Exception) -> str:

@@ -258,7 +258,7 @@ class Keeper:
         assert second is not None
         raise RecordError(
             f"{path} was {self._loss} while the run went on; everything so far is in {second.path}{problem}, "
-            f"from which `bench recover-journal {path.parent}` writes it anew, and the run ends here"
+            f"from which `bench runs repair {path.parent}` writes it anew, and the run ends here"
         )
 
     def _look_around(self) -> None:

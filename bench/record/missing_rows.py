@@ -49,7 +49,7 @@ class MissingRows:
         why = f" ({self.damage})" if self.damage else ""
         if self.journal.name == RECOVERED_NAME:
             return f"{self.journal} {what}{why}; they were in no file when it was recovered"
-        return f"{self.journal} {what}{why}; `bench recover-journal {self.journal}` writes a copy of what is left"
+        return f"{self.journal} {what}{why}; `bench runs repair {self.journal}` writes a copy of what is left"
 
     def to_json(self) -> dict[str, Any]:
         """Return it for programs."""

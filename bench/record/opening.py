@@ -84,7 +84,7 @@ class OpenedJournal:
         where = " and ".join(str(place) for place, found in rows.items() if found)
         return (
             f"{self.path} lacks {count} rows that its second file {where} has, and that are read from there; "
-            f"`bench recover-journal {self.path}` writes a copy with all rows, and bench resume takes them in"
+            f"`bench runs repair {self.path}` writes a copy with all rows, and bench resume takes them in"
         )
 
     def _copied(self, why: str) -> sqlite3.Connection:

@@ -315,7 +315,7 @@ class Record:
         return self._damaged(f"table {table}, row {row}: its checksum does not fit")
 
     def _damaged(self, what: str) -> DataError:
-        return DataError(f"{self.path} is damaged: {what}; `bench recover-journal {self.path}` says what is good")
+        return DataError(f"{self.path} is damaged: {what}; `bench runs repair {self.path}` says what is good")
 
     def _table(self, table: str, names: tuple[str, ...], rows: Sequence[tuple[Any, ...]]) -> Table:
         try:

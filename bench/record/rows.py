@@ -21,7 +21,7 @@ FILE_NAME = "journal.sqlite"
 IDENTITY = "identity"
 """Key of the metadata: a random number that tells a journal from every other one."""
 RECOVERED_NAME = "journal.recovered.sqlite"
-"""The copy that `bench recover-journal` writes."""
+"""The copy that `bench runs repair` writes."""
 
 
 _TABLES = (

@@ -250,7 +250,7 @@ class Journal:
         problem = self._keeper.why or problem
         if problem:
             raise RecordError(
-                f"{self.path} is not whole: {problem}; `bench recover-journal {self.path}` says what there is"
+                f"{self.path} is not whole: {problem}; `bench runs repair {self.path}` says what there is"
             )
         if lost:
             raise RecordError(f"{self.path} lacks {lost}")

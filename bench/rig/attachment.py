@@ -1,4 +1,4 @@
-"""A laboratory that another process serves by `bench emulate`: its endpoints file, control socket and clock."""
+"""A laboratory that another process serves by `bench rig emulate`: its endpoints file, control socket and clock."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class ServedRig(_Table):
 
 
 class Endpoints(_Table):
-    """What `bench emulate --json` writes; one rig stands at the top, several under `rigs`."""
+    """What `bench rig emulate --json` writes; one rig stands at the top, several under `rigs`."""
 
     factor: float = Field(gt=0, description="laboratory seconds per wall-clock second")
     control: str = Field(description="address of the control socket: tcp://HOST:PORT or unix:PATH")
@@ -82,16 +82,16 @@ def read_endpoints(path: Path) -> Endpoints:
     except OSError as error:
         raise ConfigurationError(f"{path} cannot be read: {error.strerror}") from None
     except ValueError as error:
-        raise ConfigurationError(f"{path} is not an endpoints file of `bench emulate --json`: {error}") from None
+        raise ConfigurationError(f"{path} is not an endpoints file of `bench rig emulate --json`: {error}") from None
     try:
         return Endpoints.model_validate(content)
     except ValidationError as error:
         first = next(problems(error, Endpoints))
-        raise ConfigurationError(f"{path} is not an endpoints file of `bench emulate --json`: {first}") from None
+        raise ConfigurationError(f"{path} is not an endpoints file of `bench rig emulate --json`: {first}") from None
 
 
 class ControlClient:
-    """A connection to the control socket of `bench emulate`; docs/reference/emulate.md has the requests.
+    """A connection to the control socket of `bench rig emulate`; docs/reference/emulate.md has the requests.
 
     Parameters
     ----------
@@ -361,7 +361,7 @@ def attach(path: Path, rig: str) -> Attachment:
     Parameters
     ----------
     path : Path
-        Endpoints file of `bench emulate --json`.
+        Endpoints file of `bench rig emulate --json`.
     rig : str
         Name of the rig.
 
@@ -384,7 +384,8 @@ def attach(path: Path, rig: str) -> Attachment:
             server = None
         if server != endpoints.server:
             raise ConfigurationError(
-                f"{path} is out of date: its server does not answer at {endpoints.control}; start bench emulate again"
+                f"{path} is out of date: its server does not answer at {endpoints.control}; "
+                "start bench rig emulate again"
             )
         ports = {name: endpoint.port for name, endpoint in endpoints.served[rig].instruments.items()}
         return Attachment(clock, control, ports, opened.pop_all())

@@ -4,7 +4,7 @@ TOML, with a table a fault::
 
     [[fault]]
     at = 30.0                       # s of laboratory time from the start of the run
-    fault = "heater.delay"          # as `bench emulate` and its control socket name it
+    fault = "heater.delay"          # as `bench rig emulate` and its control socket name it
     values = { seconds = 0.4 }      # what is chosen of it; the others have their defaults
     duration = 5.0                  # s; without it, for ever or once
 

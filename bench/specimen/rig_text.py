@@ -36,7 +36,7 @@ def rig_text(twin: IdentifiedTwin, file: RigFile, rig: str, out: Path) -> str:
         Where the text will stand.
     """
     lines = [
-        f"# A twin of the present specimen on the rig {file.name}, made by `bench twin` from the runs",
+        f"# A twin of the present specimen on the rig {file.name}, made by `bench model twin` from the runs",
         *(f"#   {recording.path.name}" for recording in twin.recordings),
         "# Its slots, derived signals, interlocks, parameters of protocols and telemetry are those of that rig. Its",
         "# devices have the same names, signals, units and limits, but are emulated: the drive follows its",

@@ -615,7 +615,7 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
         return DeviceError(
             self.name,
             f"hardware error 0x{bits:02X} ({texts}; {volts:.1f} V, {celsius} °C): {advice}; "
-            f"then run `bench recover RIG {self.name}`, or switch the servo off and on, which loses the number of "
+            f"then run `bench rig clear RIG {self.name}`, or switch the servo off and on, which loses the number of "
             "turns: check zero_counts",
         )
 

@@ -1,1 +1,1 @@
-"""Which instrument is at which port: `ports` lists them, `places` asks who is there, `commands` has `bench find`."""
+"""Which instrument is at which port: `ports` lists ports, `places` asks who is there; `bench rig find`."""

@@ -1,4 +1,4 @@
-"""The command `bench find`."""
+"""The command `bench rig find`."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def find(
     attach: Annotated[
         Path | None,
         typer.Option(
-            metavar="FILE", help="Endpoints file of `bench emulate --json`: look at the ports that are served."
+            metavar="FILE", help="Endpoints file of `bench rig emulate --json`: look at the ports that are served."
         ),
     ] = None,
     overrides: Annotated[

@@ -562,7 +562,7 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         return kind(
             self.name,
             f"error {number} ({text}; instance {instance}, parameter {parameter}): {advice}, "
-            f"then clear it by `bench recover RIG {self.name}`, or switch the device off and on",
+            f"then clear it by `bench rig clear RIG {self.name}`, or switch the device off and on",
         )
 
     def _read(self, parameter: Parameter) -> float:

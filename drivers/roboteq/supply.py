@@ -75,7 +75,7 @@ FAULT_FLAGS: Mapping[int, tuple[str, str]] = {
     0x08: ("short circuit", "check the load and its cables"),
     0x10: (
         "emergency stop",
-        "find out who stopped it and why, then run `bench recover`, or switch the controller off and on",
+        "find out who stopped it and why, then run `bench rig clear`, or switch the controller off and on",
     ),
     0x20: ("setup fault", "check the configuration with the maker's software"),
     0x40: ("MOSFET failure", "the power stage is damaged: have the controller repaired"),

@@ -23,7 +23,7 @@ class Parameters(ProtocolParameters):
 def calibration_displacement(parameters: Parameters, slots: Slots) -> Messages:
     """Sweep the tip over its range by heat, and read the displacement sensor beside an interferometer.
 
-    The sensor `witness` is the reference. `bench calibrate` makes a calibration of the run: gain, offset and
+    The sensor `witness` is the reference. `bench rig calibrate` makes a calibration of the run: gain, offset and
     nonlinearity over the range, and how late the sensor is.
     """
     p = parameters

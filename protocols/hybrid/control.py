@@ -39,7 +39,7 @@ class Parameters(ProtocolParameters):
     """What can be set."""
 
     model: str = parameter(
-        ..., unit="", help="file of a hybrid model, as `bench identify-hybrid` writes it", file=True
+        ..., unit="", help="file of a hybrid model, as `bench identify --model hybrid` writes it", file=True
     )
     controller: ControllerName = parameter("hybrid", unit="", help="which controller")
     reference: ReferenceName = parameter("moves", unit="", help="what is followed")
@@ -119,7 +119,7 @@ class StepParameters(ProtocolParameters):
     """What can be set."""
 
     model: str = parameter(
-        ..., unit="", help="file of a hybrid model, as `bench identify-hybrid` writes it", file=True
+        ..., unit="", help="file of a hybrid model, as `bench identify --model hybrid` writes it", file=True
     )
     step: float = parameter(..., unit="m", help="height of the step")
     stroke: float = parameter(

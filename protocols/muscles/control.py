@@ -55,7 +55,7 @@ class Controlled(SupervisedParameters):
     """Parameters of either task."""
 
     model: str = parameter(
-        ..., unit="", help="file of a two-stage model, as `bench identify-muscle` writes it", file=True
+        ..., unit="", help="file of a two-stage model, as `bench identify --model two-stage` writes it", file=True
     )
     controller: str = parameter(
         "closed-loop-inverse", unit="", help="which controller", choices=lambda: controller_names("coupled-length")

@@ -308,7 +308,7 @@ class _MidRanging:
             raise ConvergenceError(
                 f"the deflection answers the piezo part {1e3 * found:.3g} ms late, the controller was given "
                 f"{1e3 * p.lateness:.3g} ms: moves would be off by their speed times the difference; calibrate the "
-                "sensor (calibration-displacement, bench calibrate) and set the parameter lateness"
+                "sensor (calibration-displacement, bench rig calibrate) and set the parameter lateness"
             )
 
     def update(self, t: float, measured: tuple[float, ...]) -> tuple[float, float]:

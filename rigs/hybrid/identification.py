@@ -10,12 +10,13 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from bench.analysis import WholeIdentification
-from bench.base import DataError
+from bench.analysis import WholeIdentification, WholeModel, only_run
+from bench.base import ConfigurationError, DataError
 from bench.identification import DynamicsIdentification, Errors, Identification, ModelFile, identify_dynamics
 from bench.models import Polynomial, PrandtlIshlinskii
 from bench.protocol import LATENESS
@@ -241,13 +242,40 @@ def hybrid_file(found: HybridIdentification, runs: Sequence[Path]) -> ModelFile:
     return ModelFile("hybrid", found.model, provenance={"sources": [run.name for run in runs]})
 
 
-def identify_runs(runs: Mapping[str, Path]) -> ModelFile:
+def identify_runs(runs: Mapping[str, Sequence[Path]], _: Path | None, options: Mapping[str, Any]) -> WholeModel:
     """Return the model of a hybrid from its runs by protocol; raises as `identify_hybrid`."""
-    folders = [runs[name] for name in PROTOCOLS]
-    return hybrid_file(identify_hybrid(*folders), folders)
+    folders = [only_run(runs, name, "hybrid") for name in PROTOCOLS]
+    plays = options.get("plays", 15)
+    if not isinstance(plays, int) or not 1 <= plays <= 200:
+        raise ConfigurationError(f"-o plays={plays}: expected a whole number from 1 to 200")
+    found = identify_hybrid(*folders, plays=plays)
+    network, dynamics, piezo = found.network, found.dynamics, found.piezo.errors
+    fitted = ((name, value) for name, value in network.uncertainties.items() if name != "ambient")
+    rows = (
+        ("network, RMS of base and tip", f"{network.base.rms:.3f} and {network.tip.rms:.3f} K"),
+        *((name, f"{getattr(network.network, name):.4g} ± {uncertainty:.2g}") for name, uncertainty in fitted),
+        (f"polynomial of order {found.order.order}, RMS", f"{found.polynomial.errors.rms * 1e6:.3f} µm"),
+        (f"{plays} plays, RMS", f"{piezo.rms_percent:.2f} % of {piezo.span * 1e6:.1f} µm"),
+        *(
+            (
+                name.replace("_", " "),
+                f"{getattr(dynamics.model, name):.5g} ± {dynamics.uncertainties[name]:.2g} {unit}",
+            )
+            for name, unit in (("real_pole", "rad/s"), ("frequency", "rad/s"), ("damping", ""))
+        ),
+    )
+    summary = {
+        "network_rms_K": {"base": network.base.rms, "tip": network.tip.rms},
+        "polynomial_order": found.order.order,
+        "polynomial_rms_um": found.polynomial.errors.rms * 1e6,
+        "prandtl_ishlinskii_rms_percent": piezo.rms_percent,
+        "poles_rad_s": {"real": dynamics.model.real_pole, "resonance": dynamics.model.frequency},
+        "damping": dynamics.model.damping,
+    }
+    return WholeModel(hybrid_file(found, folders), "hybrid", rows, summary)
 
 
-FROM_RUNS = WholeIdentification(PROTOCOLS, identify_runs)
+FROM_RUNS = WholeIdentification(PROTOCOLS, identify_runs, {"plays": "number of play operators, 1 to 200; 15"})
 
 
 def identify_piezo(samples: Samples, plays: int = 15) -> PiezoIdentification:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, cast
@@ -19,9 +20,11 @@ import numpy.typing as npt
 from bench.analysis import (
     TransientRecording,
     WholeIdentification,
+    WholeModel,
     identify_dynamics,
     identify_transients,
     noise_of,
+    only_run,
     read_transients,
 )
 from bench.base import DataError
@@ -36,6 +39,7 @@ from bench.identification import (
     identify_linear,
     identify_second_stage,
     identify_summed,
+    measure_series,
 )
 from bench.models import IdentifiedDynamics, Model, PrandtlIshlinskii, TwoStage
 from bench.record import Record
@@ -190,7 +194,7 @@ def _parts(recording: TransientRecording, label: str) -> list[TransientRecording
 
 
 def muscle_file(
-    name: ModelName,
+    name: str,
     found: CoupledIdentification[Any],
     sources: Sequence[Path],
     dynamics: IdentifiedDynamics | None,
@@ -209,20 +213,50 @@ def muscle_file(
     )
 
 
-def identify_runs(runs: Mapping[str, Path]) -> ModelFile:
-    """Return the two-stage model of a muscle from its runs by protocol.
+def identify_runs(
+    name: ModelName, registered: str, runs: Mapping[str, Sequence[Path]], test: Path | None, _: Mapping[str, Any]
+) -> WholeModel:
+    """Return a model of a muscle from its runs by protocol, registered under a name.
 
     Raises DataError if one was not completed, or they do not determine the model.
     """
-    force_run = runs["force-voltage"]
-    length_runs = [runs[name] for name in ("length-voltage", "length-force")]
+    force_run = only_run(runs, *RESTING_PROTOCOLS, registered)
+    length_runs = [run for protocol in runs if protocol != RESTING_PROTOCOLS[0] for run in runs[protocol]]
+    if not length_runs:
+        raise DataError(f"model {registered} needs runs of length-voltage or length-force")
     series = [one for run in length_runs for one in read_series(run)]
-    found = identify_muscle("two-stage", read_resting(force_run), series)
+    found = identify_muscle(name, read_resting(force_run), series)
+    errors = dict(found.errors)
+    if test is not None:
+        errors["verification"] = measure_series(found.model, read_series(test))
+    kkt = {stage: fit.kkt_residual for stage, fit in found.certificates.items()}
+    rows = [(kind, f"average {e.average_percent:.2f} %, RMS {e.rms_percent:.2f} %") for kind, e in errors.items()]
+    rows += [(f"smoothing, {stage}", f"{weight:.0e}") for stage, weight in found.smoothing.items()]
+    rows += [(f"KKT residual, {stage}", f"{residual:.1e}") for stage, residual in kkt.items()]
     dynamics = identify_muscle_dynamics(found.model, force_run, length_runs)
-    return muscle_file("two-stage", found, [force_run, *length_runs], dynamics)
+    return WholeModel(
+        muscle_file(registered, found, [force_run, *length_runs], dynamics),
+        f"{registered} from {len(series)} series of lengths",
+        tuple(rows),
+        {
+            "model": registered,
+            "series": len(series),
+            "errors": {kind: errors_json(e) for kind, e in errors.items()},
+            "kkt": kkt,
+            "smoothing": dict(found.smoothing),
+        },
+    )
 
 
-FROM_RUNS = WholeIdentification(("force-voltage", "length-voltage", "length-force"), identify_runs)
+def _from_runs(name: ModelName, registered: str) -> WholeIdentification:
+    protocols = ("force-voltage", "length-voltage", "length-force")
+    return WholeIdentification(protocols, partial(identify_runs, name, registered), takes_test=True)
+
+
+TWO_STAGE = _from_runs("two-stage", "two-stage")
+TWO_STAGE_PRANDTL_ISHLINSKII = _from_runs("two-stage-prandtl-ishlinskii", "two-stage-prandtl-ishlinskii")
+SUMMED = _from_runs("summed", "summed")
+COUPLED_LINEAR = _from_runs("linear", "coupled-linear")
 
 
 def protocol_of(run: Path) -> str:

@@ -1,4 +1,4 @@
-"""The command `bench emulate`."""
+"""The command `bench rig emulate`."""
 
 from __future__ import annotations
 

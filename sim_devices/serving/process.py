@@ -97,7 +97,7 @@ def serve(
     Raises
     ------
     ConfigurationError
-        If the rig cannot be served, or has no such fault; the message is that of `bench emulate`.
+        If the rig cannot be served, or has no such fault; the message is that of `bench rig emulate`.
     """
     with ExitStack() as stack:
         folder = Path(stack.enter_context(TemporaryDirectory(prefix="bench-emulate-")))
@@ -106,7 +106,7 @@ def serve(
         options += ["--tcp"] * tcp + ["--baud-time"] * baud_time
         options += [f"--override={key}={value}" for key, value in (overrides or {}).items()]
         # -P: a folder of the caller's project may have the name of one of the bench's packages.
-        command = [sys.executable, "-P", "-m", "bench", "emulate", rig, *options]
+        command = [sys.executable, "-P", "-m", "bench", "rig", "emulate", rig, *options]
         with output.open("wb") as file:
             process = subprocess.Popen(  # noqa: S603
                 command, stdin=subprocess.DEVNULL, stdout=file, stderr=subprocess.STDOUT
@@ -130,9 +130,9 @@ def _await(file: Path, process: subprocess.Popen[bytes], output: Path) -> None:
         with suppress(subprocess.TimeoutExpired):
             process.wait(_NAP)
             text = output.read_text(encoding="utf-8", errors="replace").strip().removeprefix("error: ")
-            raise ConfigurationError(text or f"bench emulate ended with exit code {process.returncode}")
+            raise ConfigurationError(text or f"bench rig emulate ended with exit code {process.returncode}")
         if waited.seconds() > _LONGEST_START:
-            raise ConfigurationError(f"bench emulate was not ready within {_LONGEST_START:.0f} s")
+            raise ConfigurationError(f"bench rig emulate was not ready within {_LONGEST_START:.0f} s")
 
 
 def _stop(control: ControlClient) -> None:

@@ -1,4 +1,4 @@
-"""The command `bench torture`."""
+"""The command `bench rig torture`."""
 
 from __future__ import annotations
 

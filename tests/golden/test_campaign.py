@@ -59,7 +59,7 @@ def test_a_model_of_several_runs_is_identified_from_those_of_a_rig_and_seed(tmp_
     file, out = tmp_path / "wire.toml", tmp_path / "out"
     file.write_text(PARTS + MODEL)
     with pytest.raises(SystemExit) as end:
-        main(["campaign", str(file), "--out", str(out), "--workers", "1"])
+        main(["study", str(file), "--out", str(out), "--workers", "1"])
     assert end.value.code == 0
     (folder,) = (out / "wire").iterdir()
     assert folder.name.startswith("sma-seed=0-")

@@ -39,7 +39,7 @@ SHORT = {
 
 
 def options_of(study):
-    """Return the options of `bench reproduce` for the short study."""
+    """Return the options of `bench study` for the short study."""
     return [text for setting in SHORT[study] for text in ("--set", setting)]
 
 

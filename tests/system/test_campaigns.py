@@ -98,9 +98,9 @@ def campaign(tmp_path, rig_file):
 
 
 def start(*arguments):
-    """Return the exit code of `bench campaign`."""
+    """Return the exit code of `bench study`."""
     with pytest.raises(SystemExit) as end:
-        main(["campaign", *map(str, arguments)])
+        main(["study", *map(str, arguments)])
     return end.value.code
 
 

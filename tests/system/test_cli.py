@@ -56,16 +56,15 @@ class TestHelp:
             "list",
             "run",
             "identify",
-            "identify-muscle",
             "predict",
             "invert",
-            "compare",
-            "design",
+            "model test",
+            "model design",
+            "runs compare",
             "report",
-            "export",
-            "reproduce",
-            "reproduce hybrid",
-            "identify-hybrid",
+            "runs export",
+            "study",
+            "study hybrid",
             "run damped-oscillation",
         ],
     )
@@ -86,7 +85,7 @@ class TestHelp:
     def test_the_help_of_a_protocol_has_its_parameters_with_units(self, bench, tmp_path, protocol, parameters):
         code, out, _ = bench("run", protocol, "--help")
         assert code == 0
-        bench("list", protocol, "--json", tmp_path / "list.json")
+        bench("show", protocol, "--json", tmp_path / "list.json")
         shown = {entry["name"]: entry for entry in json.loads((tmp_path / "list.json").read_text())["parameters"]}
         for name, (default, unit) in parameters.items():
             assert name in out
@@ -95,7 +94,7 @@ class TestHelp:
 
     def test_a_parameter_of_a_study_is_set_with_its_protocol(self, bench, tmp_path):
         for wrong in ("count=9", "nothing.count=9"):
-            code, _, err = bench("reproduce", "vo2", "--set", wrong, "--out", tmp_path / "out")
+            code, _, err = bench("study", "vo2", "--set", wrong, "--out", tmp_path / "out")
             assert (code, err.count("error: ")) == (2, 1)
             assert not (tmp_path / "out").exists()
 
@@ -122,14 +121,14 @@ class TestList:
         assert "vo2-hardware" in out
 
     def test_gives_a_copy_of_a_rig_file(self, bench, tmp_path):
-        _, out, _ = bench("list", "vo2")
+        _, out, _ = bench("show", "vo2")
         copy = tmp_path / "copy.toml"
         copy.write_text(out)
         code, _, _ = bench("run", "creep", "--rig", copy, "--clock", "virtual", *SHORT_CREEP, "--out", tmp_path)
         assert code == 0
 
     def test_unknown_name_lists_what_there_is(self, bench):
-        code, _, err = bench("list", "nothing")
+        code, _, err = bench("show", "nothing")
         assert code == 2
         assert "vo2" in err
 
@@ -211,7 +210,7 @@ class TestRun:
 
     def test_interlock_ends_the_run_and_keeps_the_record(self, bench, tmp_path):
         rig = tmp_path / "tight.toml"
-        _, text, _ = bench("list", "vo2")
+        _, text, _ = bench("show", "vo2")
         rig.write_text(text.replace("high = 100.0", "high = 60.0"))
         code, _, err = bench(
             "run", "creep", "--rig", rig, "--clock", "virtual", "--out", tmp_path, "--json", tmp_path / "r.json"
@@ -298,7 +297,7 @@ class TestIdentifyAndPredict:
 
     def test_a_run_is_as_good_as_a_file(self, bench, tmp_path, finished_run):
         options = ["--input", "tec_temperature", "--output", "curvature", "--model", "polynomial"]
-        bench("export", finished_run["folder"], "--format", "csv", "--out", tmp_path)
+        bench("runs", "export", finished_run["folder"], "--format", "csv", "--out", tmp_path)
         results = []
         for source in (finished_run["folder"], tmp_path / "readings.csv"):
             code, _, _ = bench(
@@ -440,7 +439,7 @@ class TestTheCoreOnTheCommandLine:
             writer.writerow(["voltage [V]", "displacement [µm]"])
             writer.writerows(zip(inputs, outputs + 0.75, strict=True))
         code, out, _ = bench(
-            "compare", tmp_path / "a.json", tmp_path / "b.json", "--data", tmp_path / "session.csv",
+            "model", "test", tmp_path / "a.json", tmp_path / "b.json", "--data", tmp_path / "session.csv",
             "--json", tmp_path / "compared.json", "--figures", tmp_path / "figures",
         )  # fmt: skip
         assert code == 0
@@ -452,7 +451,7 @@ class TestTheCoreOnTheCommandLine:
         assert (tmp_path / "figures" / "residuals.png").stat().st_size > 0
 
     def test_designs_are_compared_by_what_they_cover_and_cost(self, bench, tmp_path):
-        code, out, _ = bench("design", "--rig", "vo2", "--levels", "8", "--json", tmp_path / "design.json")
+        code, out, _ = bench("model", "design", "--rig", "vo2", "--levels", "8", "--json", tmp_path / "design.json")
         assert code == 0
         assert "covering" in out
         designs = json.loads((tmp_path / "design.json").read_text())
@@ -463,7 +462,7 @@ class TestTheCoreOnTheCommandLine:
         assert designs["covering, fine"]["time"] < 0.5 * designs["damped-oscillation"]["time"]
         per_hour = {name: design["log_determinant"] for name, design in designs.items()}
         assert per_hour["covering, fewest"] == max(per_hour.values()) > per_hour["damped-oscillation"]
-        code, _, err = bench("design", "--rig", "vo2", "--plane", "30", "90")
+        code, _, err = bench("model", "design", "--rig", "vo2", "--plane", "30", "90")
         assert code == 2
         assert "design" in err
 
@@ -509,11 +508,11 @@ class TestIdentifyMuscle:
     KINDS = ("force-voltage", "length-voltage", "length-force")
 
     def identify(self, bench, runs, *options):
-        return bench("identify-muscle", *(runs[kind] for kind in self.KINDS), *options)
+        return bench("identify", *(runs[kind] for kind in self.KINDS), "--model", "two-stage", *options)
 
     def test_a_model_with_its_errors_that_is_none_of_one_input(self, bench, muscle_runs, tmp_path):
         code, out, err = self.identify(
-            bench, muscle_runs, "--verify", muscle_runs["length-verification"],
+            bench, muscle_runs, "--test", muscle_runs["length-verification"],
             "--out", tmp_path / "model.json", "--json", tmp_path / "result.json",
         )  # fmt: skip
         assert (code, err) == (0, "")
@@ -550,15 +549,17 @@ class TestIdentifyMuscle:
     @cases(
         ("names", "words"),
         [
-            (["length-voltage", "length-force"], ["is a run of length-voltage; expected one of force-voltage"]),
-            (["force-voltage", "force-voltage"], ["is a run of force-voltage; expected", "length-verification"]),
+            (["length-voltage", "length-force"], ["needs one run of force-voltage; given are: 1 of length-voltage"]),
+            (["force-voltage", "force-voltage"], ["needs one run of force-voltage; given are: 2 of force-voltage"]),
             (["force-voltage", "failed"], ["the run is failed; a model needs a completed one"]),
             (["force-voltage", "none"], ["is not a run"]),
         ],
     )
     def test_runs_that_do_not_fit_are_one_message(self, bench, muscle_runs, tmp_path, names, words):
         places = {**muscle_runs, "none": tmp_path / "none"}
-        code, _, err = bench("identify-muscle", *(places[name] for name in names), "--out", tmp_path / "model.json")
+        code, _, err = bench(
+            "identify", *(places[name] for name in names), "--model", "two-stage", "--out", tmp_path / "model.json"
+        )
         assert code == 3
         assert err.count("error:") == 1
         for word in words:
@@ -566,10 +567,9 @@ class TestIdentifyMuscle:
         assert not list(tmp_path.iterdir())
 
     def test_wrong_commands_are_refused(self, bench, muscle_runs, tmp_path):
-        assert bench("identify-muscle", muscle_runs["force-voltage"])[0] == 2
-        code, _, err = self.identify(bench, muscle_runs, "--model", "cubic")
-        assert code == 2
-        assert "cubic" in err
+        code, _, err = bench("identify", muscle_runs["force-voltage"], "--model", "two-stage")
+        assert code == 3
+        assert "needs runs of length-voltage or length-force" in err
         code, _, err = self.identify(bench, muscle_runs, "--out", tmp_path / "none" / "model.json")
         assert code == 3
         assert "cannot be written" in err
@@ -598,7 +598,7 @@ class TestReportAndExport:
 
     @pytest.mark.parametrize("format_", ["csv", "parquet"])
     def test_export_holds_the_journal_with_units(self, bench, tmp_path, finished_run, format_):
-        code, _, _ = bench("export", finished_run["folder"], "--format", format_, "--out", tmp_path)
+        code, _, _ = bench("runs", "export", finished_run["folder"], "--format", format_, "--out", tmp_path)
         assert code == 0
         with Record(Path(finished_run["folder"])) as record:
             tables = {"readings": record.steps(), "telemetry": record.telemetry()}
@@ -608,10 +608,10 @@ class TestReportAndExport:
             np.testing.assert_array_equal(columns.values["curvature"], table["curvature"])
 
     def test_recording_is_rebuilt_but_never_overwritten(self, bench, tmp_path, finished_run):
-        code, _, _ = bench("export", finished_run["folder"], "--format", "rrd", "--out", tmp_path)
+        code, _, _ = bench("runs", "export", finished_run["folder"], "--format", "rrd", "--out", tmp_path)
         assert code == 0
         assert (tmp_path / "run.rrd").stat().st_size > 0
-        code, _, err = bench("export", finished_run["folder"], "--format", "rrd")
+        code, _, err = bench("runs", "export", finished_run["folder"], "--format", "rrd")
         assert code == 2
         assert "exists already" in err
 
@@ -654,7 +654,11 @@ class TestIdentifyHybrid:
 
     def identify(self, bench, runs, *options, **others):
         return bench(
-            "identify-hybrid", *(runs[others.get(part.replace("-", "_"), part)] for part in self.PARTS), *options
+            "identify",
+            *(runs[others.get(part.replace("-", "_"), part)] for part in self.PARTS),
+            "--model",
+            "hybrid",
+            *options,
         )
 
     def test_a_model_part_by_part_that_is_none_of_one_input(self, bench, hybrid_runs, tmp_path):
@@ -686,7 +690,7 @@ class TestIdentifyHybrid:
 
     def test_a_protocol_can_use_what_it_writes(self, bench, hybrid_runs, tmp_path):
         model = tmp_path / "model.json"
-        self.identify(bench, hybrid_runs, "--plays", "6", "--out", model)
+        self.identify(bench, hybrid_runs, "-o", "plays=6", "--out", model)
         assert len(json.loads(model.read_text())["model"]["hysteresis"]["weights"]) == 6
         code, _, err = bench(
             "run", "fine-step", "--rig", "hybrid", "--clock", "virtual", "--set", f"model={model}",
@@ -698,8 +702,11 @@ class TestIdentifyHybrid:
     @cases(
         ("others", "words"),
         [
-            ({"current_steps": "piezo-loops"}, ["is a run of piezo-loops; expected one of current-steps"]),
-            ({"thermomechanical": "current-steps"}, ["is a run of current-steps; expected one of thermomechanical"]),
+            ({"current_steps": "piezo-loops"}, ["needs one run of current-steps; given are: 2 of piezo-loops"]),
+            (
+                {"thermomechanical": "current-steps"},
+                ["given are: 2 of current-steps, 1 of piezo-loops"],
+            ),
             ({"piezo_loops": "failed"}, ["the run is failed; a model needs a completed one"]),
             ({"piezo_loops": "flat"}, ["the hybrid cannot be identified: voltages: expected values that vary"]),
             ({"piezo_step": "none"}, ["is not a run"]),
@@ -715,11 +722,13 @@ class TestIdentifyHybrid:
         assert not list(tmp_path.iterdir())
 
     def test_wrong_commands_are_refused(self, bench, hybrid_runs, tmp_path):
-        assert bench("identify-hybrid", hybrid_runs["current-steps"])[0] == 2
         for plays in ("0", "201", "some"):
-            code, _, err = self.identify(bench, hybrid_runs, "--plays", plays)
+            code, _, err = self.identify(bench, hybrid_runs, "-o", f"plays={plays}")
             assert code == 2
-            assert "--plays" in err
+            assert "plays" in err
+        code, _, err = self.identify(bench, hybrid_runs, "--input", "piezo_voltage")
+        assert code == 2
+        assert "leave --input out" in err
         code, _, err = self.identify(bench, hybrid_runs, "--out", tmp_path / "none" / "model.json")
         assert code == 3
         assert "cannot be written" in err

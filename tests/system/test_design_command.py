@@ -37,7 +37,18 @@ def measured(tmp_path_factory):
 def test_a_sequence_is_written_and_carried_out(bench, tmp_path):
     path = tmp_path / "sequence.csv"
     code, out, err = bench(
-        "design", "--rig", "vo2", "--levels", 2, "--dwell", 0.5, "--sequence", "first-order-reversals", "--out", path
+        "model",
+        "design",
+        "--rig",
+        "vo2",
+        "--levels",
+        2,
+        "--dwell",
+        0.5,
+        "--sequence",
+        "first-order-reversals",
+        "--out",
+        path,
     )
     assert code == 0, err
     assert f"setpoints={path}" in out.replace("\n", "")
@@ -97,7 +108,7 @@ def test_columns_and_dwell_may_be_named(bench, tmp_path):
 def test_measurements_are_continued(bench, tmp_path, measured):
     out, result = tmp_path / "more.csv", tmp_path / "more.json"
     code, text, err = bench(
-        "design", "--model", measured / "model.json", "--data", measured / "data.csv", "--continue", 0.25,
+        "model", "design", "--model", measured / "model.json", "--data", measured / "data.csv", "--continue", 0.25,
         "--dwell", 8, "--out", out, "--json", result,
     )  # fmt: skip
     assert code == 0, err
@@ -133,7 +144,7 @@ def test_measurements_are_continued(bench, tmp_path, measured):
 def test_what_does_not_fit_together_is_said(bench, tmp_path, measured, options, code, words):
     places = {"MODEL": measured / "model.json", "DATA": measured / "data.csv"}
     arguments = [places.get(option, option.replace("DIR", str(tmp_path))) for option in options]
-    found, _, err = bench("design", *arguments)
+    found, _, err = bench("model", "design", *arguments)
     assert found == code, err
     for word in words:
         assert word in err.replace("\n", " ")

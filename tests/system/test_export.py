@@ -37,7 +37,7 @@ class TestParquet:
     def tables(self, run, tmp_path, bench):
         import pyarrow.parquet as pq
 
-        code, _, _ = bench("export", run, "--format", "parquet", "--out", tmp_path)
+        code, _, _ = bench("runs", "export", run, "--format", "parquet", "--out", tmp_path)
         assert code == 0
         return {name: pq.read_table(tmp_path / f"{name}.parquet") for name in ("readings", "telemetry", "events")}
 
@@ -84,7 +84,7 @@ class TestParquet:
 
 
 def test_csv_says_what_numbers_and_words_are(run, tmp_path, bench):
-    code, out, _ = bench("export", run, "--format", "csv", "--out", tmp_path)
+    code, out, _ = bench("runs", "export", run, "--format", "csv", "--out", tmp_path)
     assert code == 0
     assert [line.rpartition("/")[2] for line in out.split()] == [
         "readings.csv", "telemetry.csv", "events.csv", "metadata.json",
@@ -148,7 +148,7 @@ class TestDocuments:
         assert isinstance(data["step"], int)
 
     def test_they_are_lines_that_databroker_reads(self, run, found, tmp_path, bench):
-        code, _, _ = bench("export", run, "--format", "bluesky", "--out", tmp_path)
+        code, _, _ = bench("runs", "export", run, "--format", "bluesky", "--out", tmp_path)
         assert code == 0
         lines = (tmp_path / "documents.jsonl").read_text(encoding="utf-8").splitlines()
         assert [tuple(json.loads(line)) for line in lines] == found
@@ -161,7 +161,7 @@ class TestDocuments:
 
 
 def test_an_unfinished_run_is_exported_as_far_as_it_is(unfinished, tmp_path, bench):
-    code, _, _ = bench("export", unfinished, "--format", "csv", "--out", tmp_path)
+    code, _, _ = bench("runs", "export", unfinished, "--format", "csv", "--out", tmp_path)
     assert code == 0
     assert json.loads((tmp_path / "metadata.json").read_text())["status"] == "unfinished"
 
@@ -186,7 +186,7 @@ class TestFormulas:
             return list(csv.DictReader(file))
 
     def test_are_texts_for_a_spreadsheet(self, noted, tmp_path, bench):
-        assert bench("export", noted, "--format", "csv", "--out", tmp_path)[0] == 0
+        assert bench("runs", "export", noted, "--format", "csv", "--out", tmp_path)[0] == 0
         texts = [row["text"] for row in self.rows(tmp_path, "events")]
         assert texts[0] == f"'{self.FORMULA}"
         assert [text[0] for text in texts] == ["'"] * 5 + ["-", "p"]
@@ -195,7 +195,7 @@ class TestFormulas:
         assert (reading["phase"], reading["label"], reading["plate [°C]"]) == ("'=phase", "-5", "-2.0")
 
     def test_are_as_they_were_recorded_where_that_is_asked_for(self, noted, tmp_path, bench):
-        assert bench("export", noted, "--format", "csv", "--formulas", "--out", tmp_path)[0] == 0
+        assert bench("runs", "export", noted, "--format", "csv", "--formulas", "--out", tmp_path)[0] == 0
         assert self.rows(tmp_path, "events")[0]["text"] == self.FORMULA
 
     def test_of_a_name_in_a_head_is_one_too(self, tmp_path):
@@ -286,13 +286,13 @@ def damaged(run, folder):
 
 def test_a_damaged_record_leaves_the_files_that_are_there(run, tmp_path, bench):
     out = tmp_path / "out"
-    assert bench("export", run, "--format", "csv", "--out", out)[0] == 0
+    assert bench("runs", "export", run, "--format", "csv", "--out", out)[0] == 0
     before = {path.name: path.read_bytes() for path in out.iterdir()}
     copy = shutil.copytree(run, tmp_path / "run")
     with closing(sqlite3.connect(copy / FILE_NAME)) as db, db:
         db.execute("UPDATE telemetry SET t = 5 WHERE tick = 15")
     for kind in ("csv", "parquet", "bluesky"):
-        assert bench("export", copy, "--format", kind, "--out", out)[0] == 3
+        assert bench("runs", "export", copy, "--format", kind, "--out", out)[0] == 3
     left = {path.name: path.read_bytes() for path in out.iterdir()}
     assert {name: left[name] for name in before if name != "readings.csv"} == {
         name: content for name, content in before.items() if name != "readings.csv"

@@ -31,16 +31,16 @@ def without_extras(folder, finished_process):
         "live": [*RUN, "--live", "--out", folder / "live"],
         "identify": ["identify", "RUN", *IDENTIFY, "--out", folder / "model.json"],
         "identify with figures": ["identify", "RUN", *IDENTIFY, "--figures", folder, "--out", folder / "no.json"],
-        "compare": ["compare", folder / "model.json", "--data", "RUN", "--figures", folder / "figures"],
+        "compare": ["model", "test", folder / "model.json", "--data", "RUN", "--figures", folder / "figures"],
         "report": ["report", "RUN"],
-        "export csv": ["export", "RUN", "--format", "csv", "--out", folder],
+        "export csv": ["runs", "export", "RUN", "--format", "csv", "--out", folder],
         "identify csv": ["identify", folder / "readings.csv", *IDENTIFY],
         "identify xlsx": ["identify", folder / "data.xlsx", *IDENTIFY],
         "identify parquet": ["identify", folder / "data.parquet", *IDENTIFY],
-        "export parquet": ["export", "RUN", "--format", "parquet", "--out", folder],
-        "export rrd": ["export", "RUN", "--format", "rrd", "--out", folder],
-        "export png": ["export", "RUN", "--format", "png", "--out", folder],
-        "reproduce": ["reproduce", "vo2", "--out", folder / "studies"],
+        "export parquet": ["runs", "export", "RUN", "--format", "parquet", "--out", folder],
+        "export rrd": ["runs", "export", "RUN", "--format", "rrd", "--out", folder],
+        "export png": ["runs", "export", "RUN", "--format", "png", "--out", folder],
+        "reproduce": ["study", "vo2", "--out", folder / "studies"],
     }
     (folder / "data.xlsx").write_bytes(b"PK\x03\x04")
     (folder / "data.parquet").write_bytes(b"PAR1")

@@ -24,7 +24,7 @@ def file(tmp_path):
 @pytest.fixture
 def imported(bench, file, tmp_path):
     code, out, err = bench(
-        "import", file, "--input", "plate", "--output", "tip", "--column", "state", "--title", "A plate",
+        "runs", "import", file, "--input", "plate", "--output", "tip", "--column", "state", "--title", "A plate",
         "--out", tmp_path / "runs", "--json", tmp_path / "import.json",
     )  # fmt: skip
     assert code == 0, err
@@ -57,14 +57,14 @@ def test_it_is_a_run_for_the_other_commands(imported, bench, tmp_path):
     code, out, _ = bench("runs", tmp_path / "runs")
     assert code == 0
     assert "imported" in out
-    assert bench("export", imported, "--format", "csv", "--out", tmp_path / "csv")[0] == 0
-    assert bench("compare", imported, imported)[0] == 0
+    assert bench("runs", "export", imported, "--format", "csv", "--out", tmp_path / "csv")[0] == 0
+    assert bench("runs", "compare", imported, imported)[0] == 0
 
 
 def test_without_times_rows_are_a_second_apart_and_that_is_said(bench, tmp_path):
     path = tmp_path / "plain.csv"
     path.write_text("a,b\n" + "\n".join(f"{i},{2 * i}" for i in range(12)))
-    code, out, _ = bench("import", path, "--input", "a", "--output", "b", "--out", tmp_path / "runs")
+    code, out, _ = bench("runs", "import", path, "--input", "a", "--output", "b", "--out", tmp_path / "runs")
     assert code == 0
     assert "rows are 1 s apart" in out
 
@@ -78,13 +78,13 @@ def test_without_times_rows_are_a_second_apart_and_that_is_said(bench, tmp_path)
     ],
 )
 def test_what_cannot_be_is_one_message(bench, file, tmp_path, arguments, code, words):
-    found, _, err = bench("import", file, *arguments, "--out", tmp_path / "runs")
+    found, _, err = bench("runs", "import", file, *arguments, "--out", tmp_path / "runs")
     assert found == code
     assert words in err
     assert not (tmp_path / "runs").exists()
 
 
 def test_a_run_is_not_imported(bench, imported):
-    code, _, err = bench("import", imported, "--input", "plate", "--output", "tip")
+    code, _, err = bench("runs", "import", imported, "--input", "plate", "--output", "tip")
     assert code == 3
     assert "is a run already" in err

@@ -62,7 +62,7 @@ class TestAnOverwrittenPage:
     def test_leaves_the_rows_of_the_other_tables(self, bench, completed, folder, tmp_path, table):
         overwrite(folder, table)
         journal = (folder / FILE_NAME).read_bytes()
-        code, out, err = bench("recover-journal", folder, "--json", tmp_path / "found.json")
+        code, out, err = bench("runs", "repair", folder, "--json", tmp_path / "found.json")
         assert (code, err) == (8, "")
         assert "status: failed" in out
         assert "completed" not in out
@@ -78,26 +78,26 @@ class TestAnOverwrittenPage:
         assert len(after[place]) < len(before[place])
         with pytest.warns(IncompleteRecordWarning), Record(folder / RECOVERED_NAME) as record:
             assert record.meta["recovered"]["from"] == str(folder / FILE_NAME)
-        code, _, err = bench("recover-journal", folder)
+        code, _, err = bench("runs", "repair", folder)
         assert code == 2
         assert "exists already" in err
 
     @pytest.mark.parametrize("table", ["meta", "signals"])
     def test_that_has_the_heading_leaves_nothing_and_says_so(self, bench, folder, table):
         overwrite(folder, table)
-        code, _, err = bench("recover-journal", folder)
+        code, _, err = bench("runs", "repair", folder)
         assert code == 3
         assert f"has lost its heading (table {table})" in err
         assert not (folder / RECOVERED_NAME).exists()
 
     def test_that_is_the_first_leaves_nothing_and_says_so(self, bench, folder):
         overwrite(folder, None)
-        code, _, err = bench("recover-journal", folder)
+        code, _, err = bench("runs", "repair", folder)
         assert code == 3
         assert "nothing of it is readable by SQLite: file is not a database" in err
         assert f"there is no second file ({SECOND_NAME}) in its folder" in err
         (folder / SECOND_NAME).write_bytes(b"nothing")
-        code, _, err = bench("recover-journal", folder)
+        code, _, err = bench("runs", "repair", folder)
         assert code == 3
         assert f"nor of {folder / SECOND_NAME}" in err
 
@@ -109,19 +109,19 @@ class TestDamage:
         with closing(sqlite3.connect(folder / FILE_NAME)) as db, db:
             db.execute("UPDATE telemetry SET t = t + 1 WHERE tick = 3")
         with Record(folder) as record:
-            assert "table telemetry, row 3: its checksum does not fit; `bench recover-journal" in record.damage()
+            assert "table telemetry, row 3: its checksum does not fit; `bench runs repair" in record.damage()
 
     def test_is_found_in_a_page_that_is_overwritten(self, folder):
         overwrite(folder, "telemetry")
         with Record(folder) as record:
-            assert "bench recover-journal" in record.damage()
+            assert "bench runs repair" in record.damage()
 
     def test_is_a_row_that_is_missing(self, folder):
         with closing(sqlite3.connect(folder / FILE_NAME)) as db, db:
             db.execute("DELETE FROM telemetry WHERE tick = 3")
         with Record(folder) as record:
             assert record.missing.ranges == {"telemetry": ((3, 3),)}
-            assert "bench recover-journal" in record.damage()
+            assert "bench runs repair" in record.damage()
 
     def test_that_is_a_flipped_bit_is_one_row(self, folder):
         with closing(sqlite3.connect(folder / FILE_NAME)) as db, db:
@@ -133,16 +133,16 @@ class TestDamage:
 
     def test_is_none_in_a_whole_one_which_is_left_alone(self, bench, folder):
         before = sorted(folder.iterdir())
-        code, out, _ = bench("recover-journal", folder / FILE_NAME)
+        code, out, _ = bench("runs", "repair", folder / FILE_NAME)
         assert code == 0
         assert "the journal is whole" in out
         assert sorted(folder.iterdir()) == before
 
     def test_cannot_be_looked_for_in_what_is_no_journal(self, bench, tmp_path):
-        code, _, err = bench("recover-journal", tmp_path)
+        code, _, err = bench("runs", "repair", tmp_path)
         assert (code, err.count("\n")) == (3, 1)
         (tmp_path / FILE_NAME).write_bytes(b"nothing")
-        code, _, err = bench("recover-journal", tmp_path, "--second", tmp_path / "absent")
+        code, _, err = bench("runs", "repair", tmp_path, "--second", tmp_path / "absent")
         assert code == 2
 
 
@@ -163,12 +163,12 @@ class TestALostJournal:
     def test_is_found_and_the_way_back_named(self, bench, lost):
         assert find_journals(lost.parent) == [lost / FILE_NAME]
         for path in (lost, lost / FILE_NAME):
-            with pytest.raises(DataError, match=f"has lost its {FILE_NAME}, .*`bench recover-journal {lost}`"):
+            with pytest.raises(DataError, match=f"has lost its {FILE_NAME}, .*`bench runs repair {lost}`"):
                 Record(path)
         for command in ("resume", "report"):
             code, _, err = bench(command, lost)
             assert code == 3
-            assert f"`bench recover-journal {lost}`" in err
+            assert f"`bench runs repair {lost}`" in err
         recover(lost)
         (lost / SECOND_NAME).unlink()
         assert find_journals(lost.parent) == [lost / FILE_NAME]
@@ -183,9 +183,7 @@ class TestALostJournal:
 
     def test_that_cannot_be_read_names_the_way_back(self, tmp_path):
         (tmp_path / FILE_NAME).write_bytes(b"nothing" * 99)
-        with pytest.raises(
-            DataError, match=r"not a readable journal: .*; `bench recover-journal .* says what is left"
-        ):
+        with pytest.raises(DataError, match=r"not a readable journal: .*; `bench runs repair .* says what is left"):
             Record(tmp_path)
         (tmp_path / "notes.txt").write_bytes(b"nothing" * 99)
         with pytest.raises(DataError, match=r"not a readable journal: file is not a database$"):

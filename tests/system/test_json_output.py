@@ -6,37 +6,36 @@ import sys
 from pathlib import Path
 
 import pytest
-import typer
+from every_command import every_command
 
 from bench.base import InterlockError
-from bench.cli import app
 
 COMMANDS = [
     ["run", "creep", "--rig", "vo2", "--clock", "virtual"],
     ["rehearse", "creep", "--rig", "vo2"],
-    ["repeat", "RUN"],
+    ["run", "--from", "RUN"],
     ["resume", "RUN"],
-    ["campaign", "none.toml"],
-    ["reproduce", "vo2"],
+    ["study", "none.toml"],
+    ["study", "vo2"],
     ["runs"],
     ["list"],
-    ["doctor", "vo2"],
+    ["rig", "check", "vo2"],
     ["safe", "vo2"],
-    ["recover", "vo2"],
+    ["rig", "clear", "vo2"],
     ["report", "RUN"],
-    ["export", "RUN", "--format", "csv"],
-    ["import", "RUN", "--input", "a", "--output", "b"],
-    ["twin", "RUN", "--rig", "vo2", "--out", "new.toml"],
-    ["recover-journal", "RUN"],
-    ["emulate", "vo2"],
-    ["find"],
-    ["torture", "vo2"],
+    ["runs", "export", "RUN", "--format", "csv"],
+    ["runs", "import", "RUN", "--input", "a", "--output", "b"],
+    ["model", "twin", "RUN", "--rig", "vo2", "--out", "new.toml"],
+    ["runs", "repair", "RUN"],
+    ["rig", "emulate", "vo2"],
+    ["rig", "find"],
+    ["rig", "torture", "vo2"],
 ]
 
 needs_full = pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full, a disk that is always full")
 
 
-@pytest.mark.parametrize("command", COMMANDS, ids=lambda command: command[0])
+@pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
 def test_a_file_that_cannot_be_written_is_refused_before_anything_is_done(bench, tmp_path, monkeypatch, command):
     monkeypatch.chdir(tmp_path)
     code, out, err = bench(*command, "--json", "none/result.json")
@@ -46,9 +45,8 @@ def test_a_file_that_cannot_be_written_is_refused_before_anything_is_done(bench,
 
 
 def test_every_command_that_writes_json_checks_it():
-    context = typer.Context(typer.main.get_command(app))
-    for name in context.command.list_commands(context):
-        for option in context.command.get_command(context, name).params:
+    for name, command in every_command():
+        for option in command.params:
             if option.name == "json_file":
                 assert option.callback is not None, name
 
@@ -97,8 +95,8 @@ def test_a_dash_is_the_standard_output_and_texts_go_to_the_standard_error(bench)
 
 @pytest.mark.parametrize(
     "command",
-    [["list"], ["list", "vo2"], ["list", "creep"], ["list", "models"], ["runs", "."], ["safe", "vo2"],
-     ["recover", "vo2"], ["doctor", "vo2"]],
+    [["list"], ["show", "vo2"], ["show", "creep"], ["show", "models"], ["runs", "."], ["safe", "vo2"],
+     ["rig", "clear", "vo2"], ["rig", "check", "vo2"]],
     ids=" ".join,
 )  # fmt: skip
 def test_nothing_else_goes_to_the_standard_output(bench, tmp_path, monkeypatch, command):

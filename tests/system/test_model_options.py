@@ -135,14 +135,14 @@ def test_a_wrong_option_is_one_message(bench, table, options, words):
 
 
 def test_the_list_says_what_each_model_takes(bench, tmp_path):
-    code, out, _ = bench("list", "models", "--json", tmp_path / "models.json")
+    code, out, _ = bench("show", "models", "--json", tmp_path / "models.json")
     assert code == 0
     listed = json.loads((tmp_path / "models.json").read_text())
     assert listed.keys() == identifiable_models().keys() | timed_models().keys()
     assert {"exact", "numerical", "table", "none"} >= {each["inverse"] for each in listed.values()}
     assert "inverse" in out
     for name in ("preisach", "prandtl-ishlinskii"):
-        _, shown, _ = bench("list", name)
+        _, shown, _ = bench("show", name)
         assert all(option in shown for option in listed[name]["options"])
         assert "inverse: exact" in shown
 

@@ -125,7 +125,7 @@ class TestRows:
     def test_compared_rows_give_the_compared_errors(self, bench, tmp_path, loop, models):
         out, result = tmp_path / "out.csv", tmp_path / "out.json"
         code, _, err = bench(
-            *("compare", *models.values(), "--data", loop, "--skip", 40, "--out", out, "--json", result)
+            *("model", "test", *models.values(), "--data", loop, "--skip", 40, "--out", out, "--json", result)
         )
         assert code == 0, err
         compared = json.loads(result.read_text())
@@ -330,7 +330,7 @@ class TestCard:
             write_card(tmp_path / "none" / "card.md", found, command="bench", model=None, figures=[])
 
 
-@pytest.mark.parametrize("command", ["predict", "compare"])
+@pytest.mark.parametrize("command", [("predict",), ("model", "test")])
 def test_errors_that_stand_in_the_first_rows_are_told_with_the_option_that_leaves_them_out(
     bench, loop, models, tmp_path, command
 ):
@@ -341,9 +341,9 @@ def test_errors_that_stand_in_the_first_rows_are_told_with_the_option_that_leave
     moved = tmp_path / "moved.csv"
     moved.write_text("\n".join(rows), encoding="utf-8")
     for file, skip, is_told in ((moved, 0, True), (moved, 4, False), (loop, 0, False)):
-        given = {"predict": (models["preisach"], file), "compare": (models["preisach"], "--data", file)}[command]
+        given = (models["preisach"], file) if command == ("predict",) else (models["preisach"], "--data", file)
         out = ("--out", tmp_path / "rows.csv", "--skip", skip)
-        code, _, err = bench(command, *given, *COLUMNS, *out)
+        code, _, err = bench(*command, *given, *COLUMNS, *out)
         assert code == 0, err
         text = " ".join(err.split())
         assert ("largest errors stand in the first 4 rows" in text) is is_told

@@ -85,7 +85,7 @@ class TestPageOfARun:
             ("numbers-of-the-paper", ["largest error", "1.5", "µm", "Fig. 3"]),
             ("real-time", ["4000 recorded samples", "greatest", "0.600", "hold: 17 samples at 100 Hz, 2 left out"]),
             ("events", ["rise", "stands still", "WARN"]),
-            ("how-to-repeat-it", ["bench repeat", "bench run loops --set", "0123456789ab", "numpy"]),
+            ("how-to-repeat-it", ["bench run --from", "bench run loops --set", "0123456789ab", "numpy"]),
         ],
     )
     def test_a_section_holds_what_is_listed(self, page, section, words):
@@ -134,7 +134,7 @@ def test_two_runs_have_a_page(tmp_path, opened, bench):
         write_run(tmp_path / "first", steps=30),
         write_run(tmp_path / "second", steps=40, meta={**META, "parameters": {"high": 81.0}}),
     ]
-    code, out, _ = bench("compare", *folders, "--html", tmp_path / "both.html")
+    code, out, _ = bench("runs", "compare", *folders, "--html", tmp_path / "both.html")
     assert code == 0
     assert "page:" in out
     sections, page = opened(tmp_path / "both.html")

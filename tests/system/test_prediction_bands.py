@@ -124,11 +124,11 @@ def test_inverted_setpoints_have_bands(bench, model, tmp_path):
 def test_comparisons_show_coverage_on_request(bench, model, files, tmp_path):
     plain = tmp_path / "plain.json"
     assert bench("identify", files["training"], *ASKED, "--model", "polynomial", "--out", plain)[0] == 0
-    code, out, err = bench("compare", model, plain, "--data", files["same"], "--bands")
+    code, out, err = bench("model", "test", model, plain, "--data", files["same"], "--bands")
     assert code == 0
     assert "model: 90 % band: ±" in out
     assert "plain has no prediction band; `bench identify --band` calibrates one" in err
-    assert " band: " not in bench("compare", model, plain, "--data", files["same"])[1]
+    assert " band: " not in bench("model", "test", model, plain, "--data", files["same"])[1]
 
 
 def test_a_session_is_recalibrated_and_judged_on_other_rows(bench, model, files, tmp_path):
@@ -163,7 +163,7 @@ def test_a_session_is_recalibrated_and_judged_on_other_rows(bench, model, files,
 def test_compare_recalibrates_each_model(bench, model, files, tmp_path):
     result = tmp_path / "c.json"
     arguments = ("--recalibrate", "offset,gain", "--recalibrate-rows", 400, "--json", result)
-    code, out, _ = bench("compare", model, "--data", files["moved"], *arguments)
+    code, out, _ = bench("model", "test", model, "--data", files["moved"], *arguments)
     assert code == 0
     assert "recalibration of model" in out
     entry = json.loads(result.read_text())["model"]

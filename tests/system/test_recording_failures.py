@@ -39,7 +39,7 @@ def test_a_recording_that_could_not_be_written_is_said_in_a_line_and_can_be_rebu
     )  # fmt: skip
     (run,) = tmp_path.iterdir()
     assert not is_whole(run / "run.rrd")
-    said = f"the recording {run}/run.rrd is incomplete; bench export {run} --format rrd --out DIR rebuilds it"
+    said = f"the recording {run}/run.rrd is incomplete; bench runs export {run} --format rrd --out DIR rebuilds it"
     assert done.stdout.count(said) == 1
     assert "re_log_encoding" not in done.stdout + done.stderr
     assert "re_sdk" not in done.stdout + done.stderr

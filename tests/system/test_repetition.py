@@ -109,7 +109,7 @@ def test_the_content_of_every_file_is_kept_under_the_name_of_its_parameter(track
 
 def test_the_same_comes_out_when_every_file_is_gone(bench, tracked, tmp_path):
     run, _ = tracked
-    code, out, err = bench("repeat", run, "--out", tmp_path, "--json", tmp_path / "result.json")
+    code, out, err = bench("run", "--from", run, "--out", tmp_path, "--json", tmp_path / "result.json")
     assert (code, err) == (0, "")
     assert "as the original: steps, telemetry, events are equal to the last bit" in out
     result = json.loads((tmp_path / "result.json").read_text(encoding="utf-8"))
@@ -127,7 +127,7 @@ def test_the_same_comes_out_when_every_file_is_gone(bench, tracked, tmp_path):
 
 def test_the_density_is_in_both_recordings(bench, tracked, tmp_path):
     run, _ = tracked
-    code, *_ = bench("export", run, "--format", "rrd", "--out", tmp_path)
+    code, *_ = bench("runs", "export", run, "--format", "rrd", "--out", tmp_path)
     assert code == 0
     for path in (run / "run.rrd", tmp_path / "run.rrd"):
         entities = {str(chunk.entity_path) for chunk in RrdReader(path).stream()}
@@ -135,7 +135,7 @@ def test_the_density_is_in_both_recordings(bench, tracked, tmp_path):
 
 
 def test_a_script_and_the_module_beside_it_are_kept(bench, climbed, tmp_path):
-    code, out, _ = bench("repeat", climbed, "--out", tmp_path / "again")
+    code, out, _ = bench("run", "--from", climbed, "--out", tmp_path / "again")
     assert code == 0
     assert "are equal to the last bit" in out
     again = next((tmp_path / "again").iterdir())
@@ -144,7 +144,7 @@ def test_a_script_and_the_module_beside_it_are_kept(bench, climbed, tmp_path):
         assert {"protocol.py", "modules/beside_the_script.py"} <= record.files().keys()
     # A repetition is a whole record as well.
     del sys.modules["beside_the_script"]
-    assert bench("repeat", again, "--out", tmp_path / "third")[0] == 0
+    assert bench("run", "--from", again, "--out", tmp_path / "third")[0] == 0
 
 
 @pytest.mark.parametrize(
@@ -163,7 +163,7 @@ def test_a_record_that_cannot_be_repeated_gets_one_message(bench, tracked, tmp_p
     run.mkdir()
     shutil.copy(tracked[0] / FILE_NAME, run)
     put_meta(run, **meta)
-    code, _, err = bench("repeat", run, "--out", tmp_path / "again")
+    code, _, err = bench("run", "--from", run, "--out", tmp_path / "again")
     assert code in (2, 3)
     assert expected in err
     assert err.count("error:") == 1
@@ -177,21 +177,21 @@ def test_a_damaged_record_is_refused_before_anything_moves(bench, tracked, tmp_p
     shutil.copy(tracked[0] / FILE_NAME, run)
     with closing(sqlite3.connect(run / FILE_NAME)) as db, db:
         db.execute(change)
-    code, _, err = bench("repeat", run, "--out", tmp_path / "again")
+    code, _, err = bench("run", "--from", run, "--out", tmp_path / "again")
     assert code == 3
-    assert "its checksum does not fit; `bench recover-journal" in err
+    assert "its checksum does not fit; `bench runs repair" in err
     assert not (tmp_path / "again").exists()
 
 
 def test_a_rig_whose_module_is_gone_and_a_rig_that_is_in_the_record(bench, climbed, tmp_path):
-    code, _, err = bench("repeat", climbed, "--rig", "vo2", "--out", tmp_path / "again")
+    code, _, err = bench("run", "--from", climbed, "--rig", "vo2", "--out", tmp_path / "again")
     assert code == 2
     assert "was emulated, so that its rig is in the record; leave --rig" in err
     with Record(climbed) as record:
         content = record.meta["rig_content"]
     content["emulation"]["laboratory"] = "a_lost_module:Laboratory"
     put_meta(climbed, rig_content=content)
-    code, _, err = bench("repeat", climbed, "--out", tmp_path / "again")
+    code, _, err = bench("run", "--from", climbed, "--out", tmp_path / "again")
     assert code == 3
     assert "cannot be repeated: its rig is no longer the same here" in err
     assert "a_lost_module" in err
@@ -201,7 +201,7 @@ def test_a_rig_whose_module_is_gone_and_a_rig_that_is_in_the_record(bench, climb
 def test_a_run_at_a_served_laboratory_is_repeated_on_the_rig_that_is_named(bench, climbed, tmp_path, rig_file):
     put_meta(climbed, clock="attached x1")
     other = rig_file(("high = 90.0", "high = 89.0"))
-    code, out, _ = bench("repeat", climbed, "--rig", other, "--out", tmp_path / "again")
+    code, out, _ = bench("run", "--from", climbed, "--rig", other, "--out", tmp_path / "again")
     assert code == 0
     assert "not as in the original: clock: attached x1 → wall" in out
     assert "not as in the original: rig_content.interlocks.probe_temperature.high: 90.0 → 89.0" in out

@@ -129,7 +129,7 @@ class TestWrong:
 
 class TestThroughTheCommandLine:
     def test_a_copy_of_the_hardware_rig_loads(self, bench, tmp_path):
-        code, text, _ = bench("list", "vo2-hardware")
+        code, text, _ = bench("show", "vo2-hardware")
         assert code == 0
         copy = tmp_path / "ours.toml"
         copy.write_text(text, encoding="utf-8")

@@ -78,7 +78,7 @@ def test_damaged_rows_and_lost_journals_are_marked(bench, runs, tmp_path):
     assert [run["status"] for run in found] == ["damaged", "damaged"]
     assert by_name[str(damaged)]["protocol"] == "stairs"
     assert "table telemetry, row 3" in by_name[str(damaged)]["result"]
-    assert f"`bench recover-journal {lost}`" in by_name[str(lost)]["result"]
+    assert f"`bench runs repair {lost}`" in by_name[str(lost)]["result"]
 
 
 def test_a_run_that_goes_on_is_told_from_one_that_died(bench, runs, tmp_path):
@@ -123,7 +123,7 @@ def test_the_folder_tells_the_parameters_that_differ(runs):
 
 def test_two_runs_are_compared(bench, runs, tmp_path):
     result = tmp_path / "result.json"
-    code, out, _ = bench("compare", runs["plain"], runs["hotter"], "--json", result)
+    code, out, _ = bench("runs", "compare", runs["plain"], runs["hotter"], "--json", result)
     assert code == 0
     found = json.loads(result.read_text(encoding="utf-8"))
     different = {each["key"]: (each["first"], each["second"]) for each in found["differences"]}
@@ -150,7 +150,7 @@ def test_of_a_list_only_what_differs_is_named(bench, tmp_path, rig_file):
         asked = Run(stairs, {}, rig_file(append=append), tmp_path / "runs", clock="virtual", recording=False)
         folders.append(carry_out(asked, Console(file=io.StringIO())).folder)
     result = tmp_path / "result.json"
-    code, out, _ = bench("compare", *folders, "--json", result)
+    code, out, _ = bench("runs", "compare", *folders, "--json", result)
     assert code == 0
     found = json.loads(result.read_text(encoding="utf-8"))["differences"]
     different = {each["key"]: (each["first"], each["second"]) for each in found if each["key"] != "files.rig.toml"}
@@ -169,14 +169,14 @@ def test_of_a_list_only_what_differs_is_named(bench, tmp_path, rig_file):
 @cases(
     ("arguments", "expected"),
     [
-        (["a.json", "b.json"], "model files are compared on measurements: add --data FILE"),
-        (["a"], "expected two runs to compare, or model files with --data; got 1"),
+        (["a.json", "b.json"], "a.json is not a run"),
+        (["a"], "RUN"),
         (["a", "b"], "a is not a run"),
-        (["a", "b", "--skip", "3"], "are for models, with --data FILE"),
+        (["a", "b", "--skip", "3"], "--skip"),
     ],
 )
-def test_a_comparison_of_neither_models_nor_runs_is_refused(bench, arguments, expected):
-    code, _, err = bench("compare", *arguments)
+def test_a_comparison_of_what_are_not_two_runs_is_refused(bench, arguments, expected):
+    code, _, err = bench("runs", "compare", *arguments)
     assert code in (2, 3)
     assert expected in err
 

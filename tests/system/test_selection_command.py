@@ -228,7 +228,7 @@ def test_each_file_is_parsed_once(bench, tmp_path, monkeypatch):
         ((*identify, *TWO, "--test", tmp_path / "other.csv"), 2),
         ((*identify, "--model", "hammerstein", "--dynamics", "drift", "--levels", 4, "--out", model), 1),
         (("predict", model, tmp_path / "other.csv", *COLUMNS, "--out", tmp_path / "predicted.csv"), 1),
-        (("compare", model, "--data", tmp_path / "other.csv"), 1),
+        (("model", "test", model, "--data", tmp_path / "other.csv"), 1),
         (("invert", model, tmp_path / "other.csv", "--column", "travel", "--out", tmp_path / "setpoints.csv"), 1),
     ):
         parsed.clear()

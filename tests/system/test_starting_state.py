@@ -1,4 +1,4 @@
-"""A model starts where its identification did: `predict` and `compare` give the errors of `identify` on its data."""
+"""A model starts where its identification did: `predict` and `model test` give the errors of `identify` on its data."""
 
 import json
 
@@ -124,7 +124,7 @@ def test_the_start_is_kept_and_can_be_chosen(bench, tmp_path, data):
         assert bench("predict", model, data[1], *COLUMNS, *chosen, "--out", out, "--json", result)[0] == 0
         found = json.loads(result.read_text())
         errors[initial] = found["rms_percent"], found["skipped"]
-        assert bench("compare", model, "--data", data[1], *chosen, "--json", result)[0] == 0
+        assert bench("model", "test", model, "--data", data[1], *chosen, "--json", result)[0] == 0
         assert json.loads(result.read_text())["model"]["raw"]["rms_percent"] == found["rms_percent"]
     assert errors[None] == errors["file"] == errors["positive"]
     assert errors[None][0] < 1.0

@@ -22,7 +22,7 @@ COMMANDS = {
     "rehearse": ["rehearse", "creep", "--rig", "vo2", *CREEP],
     "dry run": ["run", "creep", "--rig", "vo2", "--dry-run", *CREEP],
     "run": ["run", "creep", "--rig", "vo2", "--clock", "virtual", *CREEP, "--out", "runs"],
-    "list": ["list", "creep"],
+    "list": ["show", "creep"],
 }
 
 

@@ -73,9 +73,9 @@ def test_a_number_that_is_not_finite_is_null(content, read):
 def test_every_command_that_reads_a_run(run, tmp_path, bench):
     out = tmp_path / "out"
     for kind in ("csv", "parquet", "bluesky"):
-        words = ("export", run, "--format", kind, "--out", out, "--json", out.parent / f"{kind}.json")
+        words = ("runs", "export", run, "--format", kind, "--out", out, "--json", out.parent / f"{kind}.json")
         assert bench(*words)[0] == 0
-    for number, words in enumerate((("compare", run, run), ("runs", run), ("report", run, "--out", out))):
+    for number, words in enumerate((("runs", "compare", run, run), ("runs", run), ("report", run, "--out", out))):
         assert bench(*words, "--json", tmp_path / f"{number}.json")[0] == 0
     assert assert_strict(tmp_path) >= 8
     metadata = strict(out / "metadata.json")[0]

@@ -1,4 +1,4 @@
-"""`bench tune`: the search and its cost, the models beside the specimen, and the file that runs take."""
+"""`bench model tune`: the search and its cost, the models beside the specimen, and the file that runs take."""
 
 import math
 import tomllib
@@ -268,7 +268,7 @@ def test_what_is_no_tuning_file_is_refused(tmp_path, content, said):
 
 def fails(capsys, *arguments):
     with pytest.raises(SystemExit) as stopped:
-        main(["tune", *map(str, arguments)])
+        main(["model", "tune", *map(str, arguments)])
     return stopped.value.code, " ".join(capsys.readouterr().err.split())
 
 

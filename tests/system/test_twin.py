@@ -55,7 +55,7 @@ def twin(measured, model, tmp_path_factory):
     out, found = folder / "twin.toml", folder / "twin.json"
     options = ["--rig", "vo2", "--model", str(model), "--out", str(out), "--json", str(found)]
     with pytest.raises(SystemExit) as stopped:
-        main(["twin", *map(str, measured), *options])
+        main(["model", "twin", *map(str, measured), *options])
     assert not stopped.value.code
     return out, json.loads(found.read_text())
 
@@ -89,7 +89,7 @@ def test_a_run_under_control_makes_a_twin_and_warnings(model, tmp_path):
     run = bench.run("tracking", "vo2", out=tmp_path, seed=1, model=str(model), count=2).folder
     found = tmp_path / "twin.json"
     with pytest.raises(SystemExit) as stopped:
-        main(["twin", str(run), "--rig", "vo2", "--out", str(tmp_path / "twin.toml"), "--json", str(found)])
+        main(["model", "twin", str(run), "--rig", "vo2", "--out", str(tmp_path / "twin.toml"), "--json", str(found)])
     assert not stopped.value.code
     few, *_, still = json.loads(found.read_text())["warnings"]
     assert "the model is from" in few

@@ -1,4 +1,4 @@
-"""`bench safe`, `bench recover` and `bench doctor` on served rigs; what is safe is read from the instruments."""
+"""`bench safe`, `bench rig clear` and `bench rig check` on served rigs; what is safe is read from the instruments."""
 
 import io
 import json
@@ -126,7 +126,7 @@ class TestSafe:
         state = rig.control.state()
         assert (state["amplifier_enable"], state["tec_output"]) == (0.0, 0.0)
         # It stays in its error until that is cleared.
-        assert bench("recover", *attached(rig), "--yes")[0] == 0
+        assert bench("rig", "clear", *attached(rig), "--yes")[0] == 0
 
     @pytest.mark.slow
     def test_a_line_that_is_dead_delays_no_other_and_is_named(self, bench, served, tmp_path):
@@ -205,13 +205,13 @@ class TestOneBench:
 
     @pytest.mark.slow
     @pytest.mark.parametrize(
-        ("command", "names"), [("safe", "same"), ("recover", "same"), ("doctor", "same"), ("safe", "other")]
+        ("command", "names"), [("safe", "same"), ("rig clear", "same"), ("rig check", "same"), ("safe", "other")]
     )
     def test_the_second_is_refused_before_it_sends_a_byte(self, bench, served, tmp_path, command, names):
         rig = served("vo2")
         file = rig.endpoints_file if names == "same" else renamed(rig, tmp_path)
         with client(rig, "tec=30") as process:
-            code, _, err = bench(command, "vo2", "--attach", file)
+            code, _, err = bench(*command.split(), "vo2", "--attach", file)
             assert code == 2
             assert len(err.splitlines()) == 1
             assert "rig vo2 is in use: line " in err
@@ -244,7 +244,7 @@ class TestOneBench:
             changed["instruments"][other]["port"] = elsewhere
             file.write_text(json.dumps(changed))
             with client(rig):
-                code, _, err = bench("doctor", "vo2", "--attach", file)
+                code, _, err = bench("rig", "check", "vo2", "--attach", file)
             assert code == 2
             assert changed["instruments"][name]["port"] in err
             assert original["instruments"][name]["port"] != changed["instruments"][name]["port"]
@@ -262,15 +262,15 @@ class TestRecover:
     def test_a_watchdog_that_tripped(self, bench, served, tmp_path):
         rig = served("vo2")
         self.trip(rig)
-        code, _, err = bench("doctor", *attached(rig))
+        code, _, err = bench("rig", "check", *attached(rig))
         assert code == 4
-        code, out, err = bench("recover", *attached(rig))
+        code, out, err = bench("rig", "clear", *attached(rig))
         assert code == 2
         assert "--yes" in err
         assert "error 183" in out
         assert "in error" in out
         file = tmp_path / "recovered.json"
-        code, out, err = bench("recover", *attached(rig), "tec", "--yes", "--json", file)
+        code, out, err = bench("rig", "clear", *attached(rig), "tec", "--yes", "--json", file)
         assert (code, err) == (0, "")
         assert json.loads(file.read_text())["tec"]["state"] == "ready"
         assert rig.control.state()["tec_output"] == 0.0
@@ -281,12 +281,12 @@ class TestRecover:
     def test_its_message_names_the_command(self, bench, served):
         rig = served("vo2")
         rig.control.fault("tec-over-temperature")
-        code, out, _ = bench("recover", *attached(rig))
+        code, out, _ = bench("rig", "clear", *attached(rig))
         assert code == 2
         text = " ".join(out.split())
         assert "error 138" in text
-        assert "bench recover RIG tec" in text
-        assert bench("recover", *attached(rig), "--yes")[0] == 0
+        assert "bench rig clear RIG tec" in text
+        assert bench("rig", "clear", *attached(rig), "--yes")[0] == 0
 
     def test_its_question_is_no_part_of_the_json(self, bench, served, monkeypatch):
         class Terminal(io.StringIO):
@@ -296,25 +296,25 @@ class TestRecover:
         rig = served("vo2")
         rig.control.fault("tec-over-temperature")
         monkeypatch.setattr("sys.stdin", Terminal("n\n"))
-        code, out, err = bench("recover", *attached(rig), "--json", "-")
+        code, out, err = bench("rig", "clear", *attached(rig), "--json", "-")
         assert (code, out.strip()) == (130, "")
         assert "Clear the errors of tec" in err
-        assert bench("recover", *attached(rig), "--yes")[0] == 0
+        assert bench("rig", "clear", *attached(rig), "--yes")[0] == 0
 
     @pytest.mark.slow
     def test_a_servo_that_let_go(self, bench, served):
         rig = served("sma")
         rig.control.fault("servo-overload")
-        code, out, _ = bench("recover", *attached(rig), "--yes")
+        code, out, _ = bench("rig", "clear", *attached(rig), "--yes")
         assert code == 0
         assert "overload" in out
-        assert bench("recover", *attached(rig))[0] == 0
+        assert bench("rig", "clear", *attached(rig))[0] == 0
 
     def test_what_cannot_be_reached_is_no_error_to_clear(self, bench, served):
         rig = served("vo2")
         rig.control.unplug("tec")
         try:
-            code, out, err = bench("recover", *attached(rig), "--yes")
+            code, out, err = bench("rig", "clear", *attached(rig), "--yes")
         finally:
             rig.control.plug_in("tec")
         assert code == 4
@@ -322,7 +322,7 @@ class TestRecover:
         assert "error: tec: is not reached" in err
 
     def test_of_a_device_that_is_none(self, bench):
-        code, _, err = bench("recover", "vo2", "plate")
+        code, _, err = bench("rig", "clear", "vo2", "plate")
         assert code == 2
         assert "has no device 'plate'; it has: tec, psd" in err
 
@@ -340,7 +340,7 @@ class TestDoctor:
     def findings(self, bench, tmp_path, rig, *options):
         """Give the exit code, and the findings with an advice by device and subject."""
         file = tmp_path / "check.json"
-        code, _, err = bench("doctor", rig, *options, "--json", file)
+        code, _, err = bench("rig", "check", rig, *options, "--json", file)
         assert err == ""
         result = json.loads(file.read_text())
         assert result["exit_code"] == code
@@ -354,7 +354,7 @@ class TestDoctor:
     @cases("rig", ["vo2", "hybrid"])
     def test_identifies_each_instrument(self, bench, tmp_path, rig):
         file = tmp_path / "check.json"
-        bench("doctor", rig, "--json", file)
+        bench("rig", "check", rig, "--json", file)
         for check in json.loads(file.read_text())["devices"][:-1]:
             assert "serial number" in check["identity"]
             assert "firmware" in check["identity"]
@@ -430,7 +430,7 @@ class TestDoctor:
     @pytest.mark.slow
     def test_moves_nothing_but_when_it_is_asked_to(self, bench, tmp_path):
         log = tmp_path / "state.jsonl"
-        command = [sys.executable, "-P", "-m", "bench", "emulate", "vo2", "--clock", "x1",
+        command = [sys.executable, "-P", "-m", "bench", "rig", "emulate", "vo2", "--clock", "x1",
                    "--json", str(tmp_path / "ports.json"), "--state", str(log)]  # fmt: skip
         with subprocess.Popen(command, stdout=subprocess.DEVNULL) as server:
             try:

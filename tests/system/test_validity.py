@@ -49,15 +49,15 @@ def check(bench, tmp_path, *arguments, part=()):
 def test_commands_say_how_many_inputs_lie_beyond_and_how_far(bench, files, tmp_path):
     model, large = files["model"], files["large"]
     check(bench, tmp_path, "predict", model, large, *ASKED[:4], "--out", tmp_path / "p.csv")
-    check(bench, tmp_path, "compare", model, "--data", large, part=["model"])
+    check(bench, tmp_path, "model", "test", model, "--data", large, part=["model"])
     check(bench, tmp_path, "identify", files["small"], *ASKED, "--test", large, part=["test"])
-    assert bench("compare", model, "--data", files["small"])[2] == ""
+    assert bench("model", "test", model, "--data", files["small"])[2] == ""
     # An older file has the operating range of its model.
     content = json.loads(model.read_text())
     del content["validity"]
     model.write_text(json.dumps(content))
     assert load_model(model).validity is None
-    check(bench, tmp_path, "compare", model, "--data", large, part=["model"])
+    check(bench, tmp_path, "model", "test", model, "--data", large, part=["model"])
 
 
 def test_it_is_of_the_rows_that_were_fitted(bench, files, tmp_path):

@@ -116,12 +116,12 @@ def test_a_run_in_progress_is_watched_from_another_process_and_once_more(tmp_pat
         wait_until(lambda: list(runs.glob(f"*/{FILE_NAME}")))
         (journal,) = runs.glob(f"*/{FILE_NAME}")
         for i, what in enumerate((str(runs), str(journal.parent))):
-            with started("watch", what, "--port", "0") as watch:
+            with started("view", what, "--port", "0") as watch:
                 uri = wait_for(watch, "rerun+http").split()[-1]
                 assert received(uri, tmp_path / f"{i}.rrd", enough=10) >= 10
         assert run.poll() is None
         # What is watched ends with the run.
-        with started("watch", str(runs), "--port", "0") as watch:
+        with started("view", str(runs), "--port", "0") as watch:
             wait_for(watch, "rerun+http")
             run.send_signal(signal.SIGTERM)
             assert "aborted" in wait_for(watch, "the run has ended")
@@ -140,20 +140,18 @@ def test_a_view_follows_a_journal_and_knows_its_end(ended: Path) -> None:
 def test_a_replay_takes_its_time(ended: Path, tmp_path: Path) -> None:
     with Record(ended) as record:
         steps = len(list(record.step_records()))
-    with started("replay", str(ended), "--speed", "1000", "--port", "0") as replay:
+    with started("view", str(ended), "--speed", "1000", "--port", "0") as replay:
         uri = wait_for(replay, "rerun+http").split()[-1]
         wait_for(replay, "the replay has ended")
         assert received(uri, tmp_path / "all.rrd", enough=steps) == steps
 
 
-def test_only_what_is_in_progress_is_watched(tmp_path: Path, ended: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    code, said = refused(capsys, "watch", str(tmp_path))
+def test_what_cannot_be_shown_is_refused(tmp_path: Path, ended: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree(ended, tmp_path / "runs" / "ended")
+    code, said = refused(capsys, "view", str(tmp_path / "runs"))
     assert code == 3
     assert "no run is in progress" in said
-    code, said = refused(capsys, "watch", str(ended))
-    assert code == 3
-    assert "not in progress" in said
-    code, said = refused(capsys, "watch", "rerun+http://127.0.0.1:1/proxy")
+    code, said = refused(capsys, "view", "rerun+http://127.0.0.1:1/proxy")
     assert code == 3
     assert "nothing is shown there" in said
 
@@ -165,11 +163,11 @@ def test_a_damaged_run_is_not_replayed(tmp_path: Path, ended: Path, capsys: pyte
     db.execute("UPDATE telemetry SET t = t + 1 WHERE tick = 3")
     db.commit()
     db.close()
-    code, said = refused(capsys, "replay", str(journal))
+    code, said = refused(capsys, "view", str(journal))
     assert code == 3
     assert "row 3" in said
     journal.write_bytes(b"no database")
-    code, said = refused(capsys, "replay", str(journal))
+    code, said = refused(capsys, "view", str(journal))
     assert code == 3
     assert "not a readable journal" in said
 

@@ -28,7 +28,7 @@ A campaign file is TOML; `docs/reference/campaign.md` describes each key::
     runs = "validate"
     models = ["density"]
 
-    [[studies]]                             # what `bench reproduce` carries out
+    [[studies]]                             # what `bench study` carries out
     name = "my-study"
     seeds = "0..9"
 

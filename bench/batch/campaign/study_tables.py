@@ -48,7 +48,7 @@ def write_study(found: StudyResult, folder: Path) -> None:
 
 
 def print_over_seeds(name: str, folders: Sequence[Path], console: Console) -> str:
-    """Print the tables of a study over the folders of its seeds, as `bench reproduce` prints those of one.
+    """Print the tables of a study over the folders of its seeds, as `bench study` prints those of one.
 
     Returns them as Markdown.
     """

@@ -346,7 +346,7 @@ class ModelTask(CampaignTask):
         runs = [completed_run(campaign, name) for name in self.sources]
         whole = whole_identification(self.model)
         if whole is not None:
-            whole.identify({str(run.meta["protocol"]): run.folder for run in runs}).save(made / MODEL_NAME)
+            whole.of_runs([run.folder for run in runs], None, {}).file.save(made / MODEL_NAME)
             return made, Done(self.identity, "completed")
         (source,) = runs
         names = ColumnNames(self.input or source.signal_of("drive"), self.output or source.signal_of("response"))

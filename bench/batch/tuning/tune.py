@@ -82,7 +82,7 @@ def tune(
     folder: Path = Path("recordings/tuning"),
     console: Console | None = None,
 ) -> Tuned:
-    """Tune a controller; parameters as the options of `bench tune`.
+    """Tune a controller; parameters as the options of `bench model tune`.
 
     Of the best numbers of the search those are taken that are best in sessions that it has not seen, and better there
     than the first ones by `bench.batch.tuning.search.confirm`.
@@ -105,7 +105,7 @@ def tune(
     tuned_on = load_rig(on)
     if not tuned_on.in_process:
         raise ConfigurationError(
-            f"rig {on} is not emulated: give --twin, such as a rig file that bench twin has made"
+            f"rig {on} is not emulated: give --twin, such as a rig file that bench model twin has made"
         )
     tables = (load_rig(rig).protocols.get(task.protocol) or {}).get("tuning", {})
     spec = controller_spec(task.kind, controller)

@@ -58,7 +58,7 @@ class GuardedRig:
     overrides : mapping of str to str
         Values of the rig file to replace, by dotted key.
     attach : Path or None
-        Endpoints file of `bench emulate`, where the instruments are served.
+        Endpoints file of `bench rig emulate`, where the instruments are served.
     seed : int
         Seed of everything random in an emulated laboratory.
     doing : str

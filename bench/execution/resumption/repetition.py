@@ -67,7 +67,7 @@ def repeat(
     overrides : mapping of str to str, optional
         Values of that rig's file to replace, by dotted key.
     attach : Path, optional
-        Endpoints file of `bench emulate`.
+        Endpoints file of `bench rig emulate`.
     live : bool
         Whether to serve the live view.
     interrupts : Interrupts, optional

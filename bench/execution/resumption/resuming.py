@@ -33,7 +33,7 @@ class Resume:
     rig : str, optional
         Where its rig file is now; the one that it was started with if not given.
     attach : Path, optional
-        Endpoints file of `bench emulate`, for a run on a laboratory that is served elsewhere.
+        Endpoints file of `bench rig emulate`, for a run on a laboratory that is served elsewhere.
     sigmas : float
         Standard deviations by which the specimen may differ from the last readings of the record.
     accept_changes : bool
@@ -111,8 +111,8 @@ def resume(asked: Resume, console: Console, interrupts: Interrupts | None = None
     if recording.exists():
         # It ends where the run died.
         recording.unlink()
-        text = f"{recording} was of the first part and is removed; bench export {folder} --format rrd makes the whole"
-        print_plain(console, text)
+        how = f"bench runs export {folder} --format rrd makes the whole"
+        print_plain(console, f"{recording} was of the first part and is removed; {how}")
     return result
 
 

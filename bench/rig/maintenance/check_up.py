@@ -154,7 +154,7 @@ def _failure(name: str, error: BenchError) -> CheckFinding:
     if isinstance(error, DeviceConnectionError):
         return CheckFinding("connection", text, "see that it is on and connected as the rig file says")
     if isinstance(error, DeviceError):
-        return CheckFinding("error", text, "do as it says; `bench recover` clears an error that the instrument keeps")
+        return CheckFinding("error", text, "do as it says; `bench rig clear` clears an error that it keeps")
     return CheckFinding("rig file", text, "correct the rig file")
 
 

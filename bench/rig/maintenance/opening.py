@@ -79,7 +79,7 @@ def opened(
     overrides : mapping of str to str
         Values of the rig file to replace, by dotted key.
     endpoints : Path, optional
-        Endpoints file of `bench emulate`, for the instruments that are served there.
+        Endpoints file of `bench rig emulate`, for the instruments that are served there.
     doing : str
         The command, for those who find the lines in use.
     report_use : callable, optional

@@ -31,7 +31,7 @@ class RodLaboratory(EmulatedLaboratory):
         super().__init__("rod laboratory", {"coil": self.coil, "bridge": self.bridge}, clock, world=world, seed=seed)
 
     def truth(self) -> dict[str, TrueValue]:
-        """Return the state of the rod and of the coil source, for `bench emulate`."""
+        """Return the state of the rod and of the coil source, for `bench rig emulate`."""
         return {
             "coil_current": TrueValue(self.rod.current, "A"),
             "coil_output": TrueValue(self.coil.on, is_output=True),

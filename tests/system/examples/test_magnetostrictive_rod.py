@@ -62,7 +62,7 @@ def characterized(python, tmp_path_factory):
 
 
 def test_the_list_names_its_parts_and_its_package(python, tmp_path):
-    commands = [["list", "--json", str(tmp_path / "list.json")], ["list", "magnetostrictive-rod-hardware"]]
+    commands = [["list", "--json", str(tmp_path / "list.json")], ["show", "magnetostrictive-rod-hardware"]]
     shown, extended, _ = python("-c", TRY_EACH, *map(json.dumps, commands)).split("exit code 0\n")
     listed = json.loads((tmp_path / "list.json").read_text())
     assert "magnetostrictive-rod" in listed["rigs"]
@@ -114,7 +114,7 @@ def test_its_study_is_reproduced(python, tmp_path):
     # In processes that have to find its package as well.
     out = ("--workers", "2", "--out", tmp_path, "--json", tmp_path / "study.json")
     short = ("--set", "tracking.count=8", "--set", "damped-oscillation.half_cycles=16")
-    shown = python(*BENCH, "reproduce", "magnetostrictive-rod", *short, *out)
+    shown = python(*BENCH, "study", "magnetostrictive-rod", *short, *out)
     found = json.loads((tmp_path / "study.json").read_text())
     assert "models of the rod, RMS errors in µm/m (seed 0)" in shown
     for model in ("quadratic-play", "preisach-signed"):

@@ -56,14 +56,14 @@ def test_a_run_whose_journal_stays_locked_has_a_code_of_its_own(bench, monkeypat
     )
     assert code == 8
     assert "database is locked" in err
-    assert "bench recover-journal" in err
+    assert "bench runs repair" in err
     monkeypatch.undo()
     (folder,) = (tmp_path / "runs").iterdir()
     with pytest.warns(IncompleteRecordWarning, match="its second file"):
         opened = Record(folder)
     with opened as record:
         assert (record.status, len(record.steps())) == ("failed", 16)
-    code, _, err = bench("recover-journal", folder, "--json", tmp_path / "found.json")
+    code, _, err = bench("runs", "repair", folder, "--json", tmp_path / "found.json")
     assert (code, err) == (0, "")
     found = json.loads((tmp_path / "found.json").read_text())
     assert found["tables"]["steps"] == {"good": 0, "added": 16, "missing": 0, "first_bad": "0"}

@@ -1,4 +1,4 @@
-"""A small part of `bench torture`; `make fault-matrix` runs all of it on three rigs."""
+"""A small part of `bench rig torture`; `make fault-matrix` runs all of it on three rigs."""
 
 import json
 from functools import cache
@@ -189,7 +189,17 @@ def careless(tmp_path):
 
 def test_a_careless_driver_is_found_out(bench, careless, tmp_path):
     code, out, err = bench(
-        "torture", careless, "--fault", "source.", "--seeds", "2", "--processes", "1", "--json", tmp_path / "f.json"
+        "rig",
+        "torture",
+        careless,
+        "--fault",
+        "source.",
+        "--seeds",
+        "2",
+        "--processes",
+        "1",
+        "--json",
+        tmp_path / "f.json",
     )
     assert code == 1, err
     found = json.loads((tmp_path / "f.json").read_text())
@@ -214,7 +224,7 @@ def test_a_careless_driver_is_found_out(bench, careless, tmp_path):
     ],
 )
 def test_what_cannot_be_tortured_is_refused(bench, options, said):
-    code, _, err = bench("torture", *options)
+    code, _, err = bench("rig", "torture", *options)
     assert code == 2
     assert said in " ".join(err.split())
 

@@ -189,7 +189,7 @@ class TestCommands:
         assert json.loads(result.read_text())["rms"] < 1e-5
 
         models = [tmp_path / "normalised-bouc-wen.json", tmp_path / "polynomial.json"]
-        bench("compare", *models, "--data", data, "--json", result)
+        bench("model", "test", *models, "--data", data, "--json", result)
         compared = json.loads(result.read_text())
         assert compared["normalised-bouc-wen"]["raw"]["rms"] < 1e-3 * compared["polynomial"]["raw"]["rms"]
 

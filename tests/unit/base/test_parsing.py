@@ -133,13 +133,13 @@ def test_json_and_toml_are_read_in_one_place():
     ("name", "text", "command"),
     [
         ("rig.toml", TOML, [*CREEP, "--rig", "FILE"]),
-        ("rig.toml", f'extends = "vo2"\n[devices.psd]\ncalibrations = {DEEP}\n', ["list", "FILE"]),
-        ("campaign.toml", TOML, ["campaign", "FILE"]),
+        ("rig.toml", f'extends = "vo2"\n[devices.psd]\ncalibrations = {DEEP}\n', ["show", "FILE"]),
+        ("campaign.toml", TOML, ["study", "FILE"]),
         ("faults.toml", TOML, [*CREEP, "--rig", "vo2", "--faults", "FILE"]),
         ("faults.jsonl", JSON, [*CREEP, "--rig", "vo2", "--faults", "FILE"]),
         ("faults.jsonl", JSON, ["run", "creep", "--rig", "vo2", "--dry-run", "--faults", "FILE"]),
         ("endpoints.json", JSON, ["run", "creep", "--rig", "vo2", "--attach", "FILE"]),
-        ("model.json", JSON, ["compare", "FILE", "--data", "RIG"]),
+        ("model.json", JSON, ["model", "test", "FILE", "--data", "RIG"]),
         ("calibration.json", JSON, [*CREEP, "--rig", "RIG"]),
     ],
     ids=["rig", "key", "campaign", "faults", "lines", "dry run", "endpoints", "model", "calibration"],
@@ -157,8 +157,8 @@ def test_it_is_one_message(bench, tmp_path, name, text, command):
 
 LONG, NO_TEXT = "a" * 4200, "a\udcff"
 COMMANDS = (
-    [*CREEP, "--rig", "vo2", "--out"], ["runs"], ["identify", "--input", "u", "--output", "y"], ["report"], ["watch"],
-    ["new", "rig"], ["repeat"], ["resume"], ["reproduce", "vo2", "--out"], ["emulate", "vo2", "--json"],
+    [*CREEP, "--rig", "vo2", "--out"], ["runs"], ["identify", "--input", "u", "--output", "y"], ["report"], ["view"],
+    ["new", "rig"], ["run", "--from"], ["resume"], ["study", "vo2", "--out"], ["rig", "emulate", "vo2", "--json"],
 )  # fmt: skip
 
 

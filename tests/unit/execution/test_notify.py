@@ -138,7 +138,7 @@ class TestSecrets:
         assert "was not told of the end" in out + err
         (run,) = (tmp_path / "runs").iterdir()
         for kind in ("csv", "bluesky"):
-            assert bench("export", run, "--format", kind, "--out", tmp_path / kind)[0] == 0
+            assert bench("runs", "export", run, "--format", kind, "--out", tmp_path / kind)[0] == 0
         assert bench("report", run)[0] == 0
         with Record(run) as record:
             assert record.meta["command"][-1].endswith("://127.0.0.1/…")

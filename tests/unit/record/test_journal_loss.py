@@ -162,7 +162,7 @@ class TestAnotherProgramWrites:
         monkeypatch.setattr(keeping, "OTHERS", 0.05)
         with locked(journal.path):
             add(journal, 3)
-            with pytest.raises(RecordError, match=f"{SECOND_NAME}; `bench recover-journal"):
+            with pytest.raises(RecordError, match=f"{SECOND_NAME}; `bench runs repair"):
                 journal.finish(**STATUS)
             journal.close()
         with pytest.warns(IncompleteRecordWarning, match="its second file"):

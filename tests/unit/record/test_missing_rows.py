@@ -100,7 +100,7 @@ def test_what_is_missing_is_named(folder):
     with opened as record:
         assert 0 < len(record.steps()) < STEPS
         assert "write-ahead log" in record.missing.damage
-        assert f"bench recover-journal {record.path}" in str(record.missing)
+        assert f"bench runs repair {record.path}" in str(record.missing)
 
 
 def test_a_log_that_is_cut_off_is_noticed(killed, tmp_path):
@@ -149,7 +149,7 @@ def test_a_signal_that_is_gone_is_an_error(tmp_path, bench):
     run = write_run(tmp_path / "run", steps=5)
     with closing(sqlite3.connect(run / FILE_NAME)) as db, db:
         db.execute("DELETE FROM signals WHERE name = 'tip'")
-    code, _, err = bench("export", run, "--format", "csv", "--out", tmp_path / "out")
+    code, _, err = bench("runs", "export", run, "--format", "csv", "--out", tmp_path / "out")
     assert code == 3
     assert "table signals has no row of tip" in err
 
@@ -180,10 +180,10 @@ class TestCommands:
     @pytest.mark.parametrize(
         "command",
         [
-            ("export", "RUN", "--format", "csv", "--out", "OUT"),
-            ("export", "RUN", "--format", "parquet", "--out", "OUT"),
-            ("export", "RUN", "--format", "bluesky", "--out", "OUT"),
-            ("compare", "RUN", "RUN"),
+            ("runs", "export", "RUN", "--format", "csv", "--out", "OUT"),
+            ("runs", "export", "RUN", "--format", "parquet", "--out", "OUT"),
+            ("runs", "export", "RUN", "--format", "bluesky", "--out", "OUT"),
+            ("runs", "compare", "RUN", "RUN"),
             ("runs", "RUN"),
             ("report", "RUN", "--out", "OUT"),
         ],
@@ -205,7 +205,7 @@ class TestCommands:
         import pyarrow.parquet as pq
 
         for kind in ("csv", "parquet", "bluesky"):
-            assert bench("export", damaged, "--format", kind, "--out", tmp_path)[0] == 0
+            assert bench("runs", "export", damaged, "--format", kind, "--out", tmp_path)[0] == 0
         schema = pq.read_schema(tmp_path / "readings.parquet")
         start = json.loads((tmp_path / "documents.jsonl").read_text().splitlines()[0])[1]
         for metadata in (
@@ -226,7 +226,7 @@ class TestCommands:
         assert err.count("lacks rows that were recorded") == 1
 
     def test_a_recovered_copy_says_so_as_well(self, damaged, bench):
-        assert bench("recover-journal", damaged)[0] == 8
+        assert bench("runs", "repair", damaged)[0] == 8
         assert missing(damaged / "journal.recovered.sqlite").ranges == {"steps": ((3, 5),)}
 
     def test_rows_of_a_second_file_are_said_once_and_are_not_missing(self, folder, tmp_path, bench):
@@ -234,11 +234,11 @@ class TestCommands:
             second = SecondFile(folder / SECOND_NAME, record.identity)
         second.append([Row("events", (STEPS + 1, 9.0, "INFO", "note", "waits"))])
         second.close()
-        code, _, err = bench("export", folder, "--format", "csv", "--out", tmp_path / "out")
+        code, _, err = bench("runs", "export", folder, "--format", "csv", "--out", tmp_path / "out")
         assert code == 0
         assert err.count("lacks 1 rows that its second file") == err.count("warning") == 1
         assert "waits" in (tmp_path / "out" / "events.csv").read_text()
         assert json.loads((tmp_path / "out" / "metadata.json").read_text()).get("missing_rows") is None
-        assert bench("recover-journal", folder)[0] == 0
+        assert bench("runs", "repair", folder)[0] == 0
         with Record(folder / "journal.recovered.sqlite") as record:
             assert record.events()[-1].text == "waits"

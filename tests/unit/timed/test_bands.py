@@ -127,7 +127,7 @@ def test_commands_write_the_band_and_judge_the_rate(bench, tmp_path):
         rows = np.genfromtxt(tmp_path / "predicted.csv", delimiter=",", names=True)
         widths = rows["predicted_upper_µm"] - rows["predicted_lower_µm"]
         np.testing.assert_allclose(widths, 2.0 * band.pointwise * band.variance.residual, rtol=1e-9)
-    code, out, text = bench("compare", model, "--data", data, "--bands")
+    code, out, text = bench("model", "test", model, "--data", data, "--bands")
     assert (code, "covers" in out) == (0, True), text
     targets = tmp_path / "targets.csv"
     np.savetxt(

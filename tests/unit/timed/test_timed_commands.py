@@ -1,4 +1,4 @@
-"""Models with time from the command line: `identify`, then `predict` and `compare` with the same errors."""
+"""Models with time from the command line: `identify`, then `predict` and `model test` with the same errors."""
 
 import json
 from pathlib import Path
@@ -63,7 +63,7 @@ def test_prediction_of_the_same_file_has_the_errors_of_the_identification(bench,
     assert code == 0, text
     code, _, text = bench("predict", model, data, *COLUMNS, "--out", out, "--json", tmp_path / "predict.json")
     assert code == 0, text
-    code, _, text = bench("compare", model, "--data", data, "--json", tmp_path / "compare.json")
+    code, _, text = bench("model", "test", model, "--data", data, "--json", tmp_path / "compare.json")
     assert code == 0, text
     fit, predicted, compared = (
         json.loads((tmp_path / f"{name}.json").read_text()) for name in ("fit", "predict", "compare")
@@ -107,7 +107,7 @@ def test_time_stands_in_rows_figures_and_card(bench, tmp_path):
     )
     rows = {name: tmp_path / f"{name}.csv" for name in ("predict", "compare")}
     assert bench("predict", model, data, *COLUMNS, "--out", rows["predict"])[0] == 0
-    assert bench("compare", model, "--data", data, "--out", rows["compare"])[0] == 0
+    assert bench("model", "test", model, "--data", data, "--out", rows["compare"])[0] == 0
     for path in rows.values():
         head = path.read_text(encoding="utf-8").splitlines()[0]
         assert head == "time [s],drive [V],measured [µm],predicted [µm],residual [µm]"
@@ -217,10 +217,10 @@ def test_a_drift_is_of_its_own_record_and_a_session_is_recalibrated(bench, tmp_p
     mended = found[later, options]
     assert mended["rms"] < 0.1 * found[later, ()]["rms"]
     assert mended["recalibration"]["gain"]["value"] == pytest.approx(1.1, rel=0.01)
-    code, shown, text = bench("compare", out, "--data", later)
+    code, shown, text = bench("model", "test", out, "--data", later)
     assert code == 0
     assert "that of its own record" in " ".join((shown + text).split())
-    code, _, text = bench("compare", out, "--data", later, *options, "--json", errors)
+    code, _, text = bench("model", "test", out, "--data", later, *options, "--json", errors)
     assert code == 0, text
     assert json.loads(errors.read_text())["model"]["recalibrated"]["rms"] == pytest.approx(mended["rms"], rel=1e-6)
 
@@ -244,6 +244,6 @@ def test_rate_dependent_plays_are_identified_inverted_and_go_on_from_their_memor
     code, _, text = bench("predict", model, setpoints, *options, "--input", "setpoint", "--out", predicted)
     assert code == 0, text
     np.testing.assert_allclose(np.loadtxt(predicted, delimiter=",", skiprows=1)[:, 2], lead, atol=1e-9)
-    _, shown, _ = bench("list", "rate-dependent-plays")
+    _, shown, _ = bench("show", "rate-dependent-plays")
     assert "inverse: exact" in shown
     assert "time_constants" in shown

@@ -367,8 +367,8 @@ def test_every_hardware_error_is_told_with_advice(script, servo, bit):
         servo.measure()
     assert str(caught.value) == (
         f"servo: hardware error 0x{1 << bit:02X} ({text}; 12.1 V, 31 °C): {advice}; "
-        "then run `bench recover RIG servo`, or switch the servo off and on, which loses the number of turns: check "
-        "zero_counts"
+        "then run `bench rig clear RIG servo`, or switch the servo off and on, which loses the number of turns: "
+        "check zero_counts"
     )
 
 

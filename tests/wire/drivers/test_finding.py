@@ -94,7 +94,7 @@ def test_what_is_found_is_written_with_the_comments_kept(desk, bench, tmp_path):
     (tmp_path / "ports.json").write_text(json.dumps(endpoints | {"rig": "mine"}))
     mine = tmp_path / "mine.toml"
     code, out, err = bench(
-        "find", mine, "--attach", tmp_path / "ports.json", "--write", "--json", tmp_path / "f.json"
+        "rig", "find", mine, "--attach", tmp_path / "ports.json", "--write", "--json", tmp_path / "f.json"
     )
     assert code == 0, out + err
     truly = {device: each.port for each in rig.instruments.values() for device in each.devices}
@@ -105,7 +105,7 @@ def test_what_is_found_is_written_with_the_comments_kept(desk, bench, tmp_path):
     assert "# Bd" in text
     content = json.loads((tmp_path / "f.json").read_text())
     assert content["devices"]["stage"]["answer"]["identity"]["model"].startswith("MX-28")
-    code, out, err = bench("find", "vo2", "--attach", tmp_path / "ports.json", "--write")
+    code, out, err = bench("rig", "find", "vo2", "--attach", tmp_path / "ports.json", "--write")
     assert code == 2
     assert "packaged rig" in err
 
@@ -117,7 +117,7 @@ def test_instruments_on_a_shared_line_are_found_and_their_port_is_that_of_the_li
         (port,) = {each.port for each in rig.instruments.values()}
         endpoints = json.loads(rig.endpoints_file.read_text())
         (tmp_path / "ports.json").write_text(json.dumps(endpoints | {"rig": "mine"}))
-        code, out, err = bench("find", mine, "--attach", tmp_path / "ports.json", "--write")
+        code, out, err = bench("rig", "find", mine, "--attach", tmp_path / "ports.json", "--write")
         assert code == 0, out + err
     written = load_rig(str(mine))
     assert {each.settings.port for each in written.devices} == {port}
@@ -170,7 +170,7 @@ def test_a_port_that_is_held_is_named_and_not_asked(desk, bench):
         (found,) = [each for each in ports([port]) if each.address == port]
         assert str(os.getpid()) in found.problem
         assert not answers(load_rig(str(file)), [found])
-    code, out, _ = bench("find", "--port", port)
+    code, out, _ = bench("rig", "find", "--port", port)
     assert code == 0
     assert port in out
 

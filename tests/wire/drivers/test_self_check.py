@@ -1,4 +1,4 @@
-"""What the drivers find when they compare their instrument with the rig file: `self_check`, for `bench doctor`."""
+"""What the drivers find when they compare their instrument with the rig file: `self_check`, for `bench rig check`."""
 
 import pytest
 

@@ -36,11 +36,11 @@ def vo2(warmly):
 
 @pytest.fixture
 def emulate(tmp_path):
-    """Run `bench emulate` with any options; give its process and what it wrote to its endpoints file."""
+    """Run `bench rig emulate` with any options; give its process and what it wrote to its endpoints file."""
 
     @contextmanager
     def run(*arguments, file=tmp_path / "endpoints.json"):
-        command = [sys.executable, "-P", "-m", "bench", "emulate", *map(str, arguments), "--json", str(file)]
+        command = [sys.executable, "-P", "-m", "bench", "rig", "emulate", *map(str, arguments), "--json", str(file)]
         with (tmp_path / "output.txt").open("ab") as output:
             process = subprocess.Popen(command, stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT)
         try:

@@ -121,9 +121,9 @@ def test_a_run_ends_when_its_server_is_killed(emulate, tmp_path):
     ("text", "words"),
     [
         (None, "cannot be read"),
-        ("{", "is not an endpoints file of `bench emulate --json`"),
-        ("[]", "is not an endpoints file of `bench emulate --json`"),
-        ("{}", "is not an endpoints file of `bench emulate --json`: factor: is missing"),
+        ("{", "is not an endpoints file of `bench rig emulate --json`"),
+        ("[]", "is not an endpoints file of `bench rig emulate --json`"),
+        ("{}", "is not an endpoints file of `bench rig emulate --json`: factor: is missing"),
     ],
 )
 def test_a_file_that_is_none_is_one_message(bench, tmp_path, text, words):

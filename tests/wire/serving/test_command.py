@@ -1,4 +1,4 @@
-"""The command `bench emulate`: several rigs, how it ends, and what it refuses."""
+"""The command `bench rig emulate`: several rigs, how it ends, and what it refuses."""
 
 import json
 import signal
@@ -36,7 +36,7 @@ def test_a_signal_ends_it_and_nothing_is_left(emulate, tmp_path, how):
 
 
 def test_a_dash_prints_the_endpoints_on_a_line_and_texts_elsewhere(tmp_path):
-    command = [sys.executable, "-P", "-m", "bench", "emulate", "vo2", "--json", "-"]
+    command = [sys.executable, "-P", "-m", "bench", "rig", "emulate", "vo2", "--json", "-"]
     with subprocess.Popen(
         command, cwd=tmp_path, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as process:
@@ -121,7 +121,7 @@ def test_the_state_is_logged_each_period_and_at_each_change_of_an_output(emulate
     ],
 )
 def test_bad_input_is_one_message(bench, arguments, words):
-    code, _, err = bench("emulate", *arguments)
+    code, _, err = bench("rig", "emulate", *arguments)
     assert code == 2
     (line,) = err.splitlines()
     assert words in line
@@ -130,10 +130,10 @@ def test_bad_input_is_one_message(bench, arguments, words):
 def test_a_port_in_use_is_one_message(bench):
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        code, _, err = bench("emulate", "vo2", "--port", f"psd={port}")
+        code, _, err = bench("rig", "emulate", "vo2", "--port", f"psd={port}")
         assert (code, len(err.splitlines())) == (2, 1)
         assert f"vo2: psd cannot be served at port {port} of 127.0.0.1" in err
-        code, _, err = bench("emulate", "vo2", "--control", f"tcp://127.0.0.1:{port}")
+        code, _, err = bench("rig", "emulate", "vo2", "--control", f"tcp://127.0.0.1:{port}")
         assert (code, len(err.splitlines())) == (2, 1)
 
 
@@ -147,7 +147,7 @@ def test_a_laboratory_without_lines_is_refused(bench, tmp_path):
     (tmp_path / "bare.toml").write_text(
         'extends = "vo2"\nwithout = ["emulation"]\n[emulation]\nlaboratory = "without_lines:Laboratory"\n'
     )
-    code, _, err = bench("emulate", tmp_path / "bare.toml")
+    code, _, err = bench("rig", "emulate", tmp_path / "bare.toml")
     assert code == 2
     assert "rig bare: laboratory Laboratory has no lines, so it cannot be served" in err
 

@@ -295,7 +295,7 @@ def repeat_section(record: Record) -> PageSection:
     folder = record.path.parent
     parts: list[PageTable | PageText] = [
         PageText("From the record alone, on the same rig:"),
-        PageText(shlex.join(["bench", "repeat", str(folder)]), is_command=True),
+        PageText(shlex.join(["bench", "run", "--from", str(folder)]), is_command=True),
     ]
     if command := meta.get("command"):
         words = [Path(command[0]).name, *command[1:]]

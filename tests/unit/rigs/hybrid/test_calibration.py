@@ -35,7 +35,7 @@ def test_a_calibrated_sensor_is_accurate_to_nanometres(bench, tmp_path):
     assert (code, err) == (0, "")
     run = Path(json.loads((tmp_path / "run.json").read_text())["folder"])
     code, out, err = bench(
-        "calibrate", run, "--sensor", "displacement_position", "--reference", "witness_position",
+        "rig", "calibrate", run, "--sensor", "displacement_position", "--reference", "witness_position",
         "--name", "interferometer", "--uncertainty", "1e-9", "--out", tmp_path / "displacement.json",
         "--json", tmp_path / "found.json",
     )  # fmt: skip

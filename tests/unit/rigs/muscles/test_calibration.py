@@ -26,7 +26,7 @@ def test_what_is_set_up_by_hand_is_the_reference(bench, tmp_path, protocol, tabl
     )  # fmt: skip
     assert (code, err) == (0, "")
     run = Path(json.loads((tmp_path / "run.json").read_text())["folder"])
-    code, _, err = bench("calibrate", run, "--sensor", signal, "--json", tmp_path / "found.json")
+    code, _, err = bench("rig", "calibrate", run, "--sensor", signal, "--json", tmp_path / "found.json")
     assert (code, err) == (0, "")
     found = Calibration.model_validate_json((tmp_path / "found.json").read_text())
     assert found.reference == "values that were set up"

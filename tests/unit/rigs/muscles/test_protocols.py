@@ -340,7 +340,7 @@ def identified(tmp_path_factory):
         assert not stopped.value.code
         runs.append(json.loads(result.read_text())["folder"])
     with pytest.raises(SystemExit) as stopped:
-        main(["identify-muscle", *runs, "--out", str(folder / "model.json")])
+        main(["identify", *runs, "--model", "two-stage", "--out", str(folder / "model.json")])
     assert not stopped.value.code
     return folder / "model.json"
 
