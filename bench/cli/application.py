@@ -84,7 +84,7 @@ class BenchCommands(Group):
 app = typer.Typer(
     name="bench",
     cls=BenchCommands,
-    epilog="Start with: bench list; bench run PROTOCOL --rig RIG",
+    epilog="Every command has --help. Start with: bench list; bench run PROTOCOL --rig RIG",
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
     context_settings=HELP_OPTIONS,
@@ -106,10 +106,7 @@ def bench(
         bool, typer.Option("--version", help="Show the version.", is_eager=True, callback=_show_version)
     ] = False,
 ) -> None:
-    """Run step protocols on real or emulated instruments of a lab bench for smart-material actuators.
-
-    Identify hysteresis models from the measurements, and apply them. Every command has --help.
-    """
+    """Run protocols on smart-material actuators, real or emulated; identify hysteresis models, and apply them."""
 
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:

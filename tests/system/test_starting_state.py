@@ -1,4 +1,4 @@
-"""A model starts where its identification did: `predict` and `model test` give the errors of `identify` on its data."""
+"""A model starts where its identification did: `predict` and `model test` give the errors of `identify`."""
 
 import json
 
