@@ -1,4 +1,4 @@
-"""Pages of the reference that follow from the code: commands, rig files, protocols, instruments, the journal.
+"""Pages of the reference that follow from the code: commands, rig and campaign files, protocols, instruments, faults.
 
 `docs/conf.py` writes them before Sphinx reads any page, so that they cannot differ from the code.
 """
@@ -19,10 +19,21 @@ from pydantic.fields import FieldInfo
 from pydantic_core import PydanticUndefined
 from typer.main import get_command
 
-from bench.base import registry
+from bench.base import VirtualClock, registry
+from bench.batch.campaign.file import ComparisonsTable, ModelsTable, RunsTable, StudiesTable
 from bench.cli import EXIT_CODES, Catalogue, app
 from bench.record import rows
-from bench.rig import LONGEST_TURN, DashboardLayout, Interlock, RigTable, RoleTable, SafetyTable, TelemetryTable
+from bench.rig import (
+    LONGEST_TURN,
+    DashboardLayout,
+    Interlock,
+    RigTable,
+    RoleTable,
+    SafetyTable,
+    TelemetryTable,
+    load_rig,
+)
+from sim_devices.serving.requests import REQUESTS
 
 _COLUMNS = {
     "meta": "Facts about the run, one a row, as JSON: protocol, parameters, rig, seed, versions, outcome.",
@@ -47,10 +58,12 @@ def write(folder: Path) -> None:
     pages: dict[str, Callable[[], Iterator[str]]] = {
         "commands": commands,
         "rig-file": rig_file,
+        "campaign-file": campaign_file,
         "instruments": instruments,
         "laboratories": laboratories,
         "protocols": protocols,
         "journal-schema": journal_schema,
+        "emulation": emulation,
     }
     for name, lines in pages.items():
         text = "\n".join(lines()) + "\n"
@@ -132,6 +145,61 @@ def rig_file() -> Iterator[str]:
     yield "The keys of `[devices.NAME]` are those of its driver ([instruments](instruments.md)), the keys of"
     yield "`[emulation]` those of its laboratory ([laboratories](laboratories.md)), and those of `[protocols.NAME]`"
     yield "the parameters of a protocol ([protocols](protocols.md))."
+
+
+def campaign_file() -> Iterator[str]:
+    """Yield the lines of the page about campaign files."""
+    yield "# Campaign files\n"
+    yield "The tables of a file of `bench study FILE.toml`; [campaigns](../campaign.md) has an example. Paths are"
+    yield "relative to the file.\n"
+    for table in (RunsTable, ModelsTable, ComparisonsTable, StudiesTable):
+        head, _, text = _first_paragraph(table).removeprefix("A table ").partition(": ")
+        yield f"## {head}\n"
+        yield f"{text[0].upper()}{text[1:]}\n"
+        yield from _fields(table)
+
+
+def emulation() -> Iterator[str]:
+    """Yield the lines of the page about the control socket of emulated rigs, and about their faults."""
+    yield "# Requests and faults of emulated rigs\n"
+    yield "[Emulated instruments](../emulate.md) says how they are used.\n"
+    yield "## Requests\n"
+    yield "Keys of a request beside `do`. Every request of a rig takes `rig` as well, where several are served.\n"
+    told = []
+    for name, request in REQUESTS.items():
+        fields = {key: info.description or "" for key, info in request.model_fields.items() if key != "rig"}
+        keys = "; ".join(f"`{key}`: {text}" for key, text in fields.items())
+        told.append((f"`{name}`", keys, _first_paragraph(request)))
+    yield from _table(("do", "keys", "what it does"), told)
+    of_all: dict[str, Sequence[str]] = {}
+    of_rig: dict[str, list[Sequence[str]]] = {}
+    for rig in ("vo2", "sma", "hybrid"):
+        file = load_rig(rig)
+        assert file.laboratory is not None
+        laboratory = file.laboratory(file.laboratory_settings, VirtualClock(), 0)
+        for name, fault in laboratory.faults.items():
+            part, _, kind = name.rpartition(".")
+            if part:
+                word = "INSTRUMENT" if part in laboratory.lines else "SENSOR"
+                summary = re.sub(rf"\b{part}\b", f"`{word}`", fault.summary)
+                names = ", ".join(f"`{key}`" for key in fault.values)
+                of_all.setdefault(f"{word}.{kind}", (f"`{word}.{kind}`", names, summary))
+            else:
+                values = "; ".join(_quantity(key, quantity) for key, quantity in fault.values.items())
+                of_rig.setdefault(rig, []).append((f"`{name}`", values, fault.summary))
+    yield "## Faults of every instrument and sensor\n"
+    yield "`count` is the number of answers that are disturbed: 0 for all of the duration, or one without a duration."
+    yield "`probability`, 1 if not given, is that of each. The request `help` has the ranges of a rig. Not every line"
+    yield "has each fault. The faults of `sma` are those of `mckibben` and `coiled-polymer` too.\n"
+    yield from _table(("fault", "values", "what happens"), of_all.values())
+    for rig, faults in of_rig.items():
+        yield f"## Faults of `{rig}`\n"
+        yield from _table(("fault", "values", "what happens"), faults)
+
+
+def _quantity(name: str, quantity: Any) -> str:  # noqa: ANN401 - its class is no public part of sim_devices
+    unit = f" {quantity.unit}" if quantity.unit else ""
+    return f"`{name}`: {quantity.description}, {quantity.low:g} to {quantity.high:g}{unit} ({quantity.default:g})"
 
 
 def instruments() -> Iterator[str]:
@@ -220,6 +288,8 @@ def _type(annotation: object, inner: dict[str, type[BaseModel]]) -> str:
         return f"table `{annotation.__name__}`"
     arguments = [one for one in typing.get_args(annotation) if one not in (type(None), Ellipsis)]
     origin = typing.get_origin(annotation)
+    if origin is dict:
+        return "table"
     if origin is typing.Literal:
         return ", ".join(f"`{one}`" for one in arguments)
     if origin is typing.Annotated:

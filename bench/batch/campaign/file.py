@@ -104,10 +104,12 @@ class RunsTable(CheckedTable):
         description="added to each seed, so that two tables with the same seeds do not have the same noise",
     )
     parameters: dict[str, Any] = Field(
-        default_factory=dict, description="parameters of the protocol; a list is an axis of the grid"
+        default_factory=dict,
+        description="parameters of the protocol; a list is an axis of the grid, a list in a list is a value",
     )
     overrides: dict[str, Any] = Field(
-        default_factory=dict, description="values of the rig file by dotted key; a list is an axis of the grid"
+        default_factory=dict,
+        description="values of the rig file by dotted key; a list is an axis of the grid, a table in it one value",
     )
     faults: Names = Field(default=("",), description="files of faults, an axis of the grid; '' is none")
     interlock_rate: float | None = Field(

@@ -41,7 +41,7 @@ def test_the_tables_of_the_page_are_those_of_the_campaign(renewal, of_docs):
     assert {name.partition(" ")[0] for name in renewal.ROBUSTNESS} == set(CONTROLLED)
     page = (ROOT / "docs" / "reference" / "robustness.md").read_text(encoding="utf-8")
     shown = of_docs("renew_measured").MARKS.findall(page)
-    assert len(shown) > 5
+    assert shown
     for name in shown:
         assert f"<!-- table {name} -->\n| {renewal.ROBUSTNESS[name].unit} |" in page, name
 
