@@ -1,4 +1,8 @@
-"""Calibration of sensors by values that an operator sets up: dead weights, and gauge blocks."""
+"""Calibration of sensors by values that an operator sets up: weights, gauge blocks, angles of a mirror, a micrometer.
+
+`bench rig calibrate` makes a calibration of such a run. Where an instrument reads the values, such as an autocollimator
+on the mirror, its signal is in the record as well, and takes the place of what the operator set up.
+"""
 
 from __future__ import annotations
 
@@ -34,6 +38,30 @@ class WeightParameters(CommonParameters):
     )
 
 
+class MirrorParameters(CommonParameters):
+    """Parameters of the calibration by a mirror."""
+
+    angles: NumberList = parameter(..., unit="°", help="angles of the mirror, one after another")
+    sensitivity: float = parameter(
+        ..., unit="m/°", above=0.0, high=1.0, help="reading of the detector for an angle, as it is expected"
+    )
+    tolerance: float = parameter(
+        ..., unit="m", low=1e-9, high=1.0, help="farthest reading from the expected one that is believed"
+    )
+
+
+class DetectorParameters(CommonParameters):
+    """Parameters of the calibration by a stage under the detector."""
+
+    movements: NumberList = parameter(..., unit="m", help="places of the detector by the micrometer")
+    magnification: float = parameter(
+        ..., unit="1", above=0.0, high=1e6, help="way of the spot on the detector, as a multiple of the tip's"
+    )
+    tolerance: float = parameter(
+        ..., unit="m", low=1e-9, high=1.0, help="farthest reading from the expected one that is believed"
+    )
+
+
 class BlockParameters(CommonParameters):
     """Parameters of the calibration by gauge blocks."""
 
@@ -47,7 +75,7 @@ class BlockParameters(CommonParameters):
 def calibration_load(parameters: WeightParameters, slots: Slots) -> Messages:
     """Read a load cell under dead weights that an operator hangs on it.
 
-    `bench rig calibrate` makes a calibration of the run: its reference are the weights.
+    They are the reference of the calibration.
     """
     if min(parameters.weights) < 0.0:
         weights = ", ".join(f"{weight:g}" for weight in parameters.weights)
@@ -59,15 +87,52 @@ def calibration_load(parameters: WeightParameters, slots: Slots) -> Messages:
 def calibration_position(parameters: BlockParameters, slots: Slots) -> Messages:
     """Read a position sensor with gauge blocks that an operator puts under it.
 
-    `bench rig calibrate` makes a calibration of the run: its reference are the blocks.
+    They are the reference of the calibration.
     """
     yield from _compare(slots["gauge"], parameters.positions, parameters.tolerance, parameters)
 
 
-def _compare(slot: Slot, values: NumberList, tolerance: float, parameters: CommonParameters) -> Messages:
-    """Prompt for one value after another, and read each; the label of a reading is its value."""
+@protocol(needs={"mirror": Signal})
+def calibration_mirror(parameters: MirrorParameters, slots: Slots) -> Messages:
+    """Read a position-sensitive detector while an operator tilts a mirror in place of the cantilever.
+
+    The whole chain from angle to reading is calibrated, the lever from mirror to detector included. The reference
+    is the goniometer under the mirror: `bench rig calibrate` with `--unit °`. One that is read by the rig, such as an
+    autocollimator, is named by `--reference`.
+    """
+    p = parameters
+    yield from _compare(slots["mirror"], p.angles, p.tolerance, p, unit="°", expected=p.sensitivity)
+
+
+@protocol(needs={"detector": Signal})
+def calibration_detector(parameters: DetectorParameters, slots: Slots) -> Messages:
+    """Read a position-sensitive detector while an operator moves it on a micrometer stage and the spot stands still.
+
+    The reference is the micrometer, divided by the magnification. That finds the nonlinearity of the detector, but
+    not the gain: the uncertainty of the lever stays, and is given to `bench rig calibrate` by `--gain-uncertainty`.
+    """
+    p = parameters
+    scale = 1.0 / p.magnification
+    yield from _compare(slots["detector"], p.movements, p.tolerance, p, expected=scale, scale=scale)
+
+
+def _compare(
+    slot: Slot,
+    values: NumberList,
+    tolerance: float,
+    parameters: CommonParameters,
+    *,
+    unit: str = "",
+    expected: float = 1.0,
+    scale: float = 1.0,
+) -> Messages:
+    """Prompt for one value after another, and read each; the label of a reading is its value, times a scale.
+
+    A reading is `expected` times the value, within the tolerance.
+    """
+    unit = unit or slot.unit
     for value in values:
-        yield Phase(f"{value:g} {slot.unit}")
-        yield from prompt_for(slot, value, tolerance)
+        yield Phase(f"{value:g} {unit}")
+        yield from prompt_for(slot, value, tolerance, unit=unit, expected=expected)
         for _ in range(parameters.readings):
-            yield Step({}, Dwell(parameters.dwell), label=repr(float(value)))
+            yield Step({}, Dwell(parameters.dwell), label=repr(scale * value))

@@ -177,16 +177,19 @@ def hang_load(slots: Slots, load: float) -> Part[None]:
         yield from prompt_for(slots["load"], load, slots["load"].table.tolerance_of(load))
 
 
-def prompt_for(slot: Slot, value: float, tolerance: float) -> Part[Reading]:
-    """Prompt for a value set up by hand, and verify by the slot's signal, within a tolerance, that this was done."""
+def prompt_for(slot: Slot, value: float, tolerance: float, *, unit: str = "", expected: float = 1.0) -> Part[Reading]:
+    """Prompt for a value set up by hand, and verify by the slot's signal, within a tolerance, that this was done.
+
+    The value is in the unit of the slot unless one is given, and the reading `expected` times that.
+    """
     reading = yield Prompt(
-        text=slot.table.prompt.format(value=value, unit=slot.unit),
+        text=slot.table.prompt.format(value=value, unit=unit or slot.unit),
         task=slot.table.task or slot.name,
         value=value,
         settle=SETTLE_LOAD,
         signal=slot.signal,
-        low=value - tolerance,
-        high=value + tolerance,
+        low=expected * value - tolerance,
+        high=expected * value + tolerance,
     )
     return reading
 

@@ -104,6 +104,7 @@ from .run_list import (
     select_runs as select_runs,
 )
 from .sensor_calibrations import (
+    Reference as Reference,
     calibrate_run as calibrate_run,
 )
 from .session_recalibration import (

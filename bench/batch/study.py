@@ -6,6 +6,7 @@ A package registers a `Study` as an entry point of the group `bench.studies`; `b
 from __future__ import annotations
 
 import itertools
+import json
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -37,6 +38,7 @@ if TYPE_CHECKING:
     from bench.base import Pending, Workers
     from bench.execution import RunResult
     from bench.identification import ModelFile
+    from bench.rig import Calibration
 
 P = ParamSpec("P")
 
@@ -48,6 +50,11 @@ _KERNELS = (
     "bench.identification.kernels.factor_kernels",
 )
 """Kernels of the identification of a Preisach operator, which every study takes."""
+_CALIBRATED = """[derived.{}]
+kind = "calibrated"
+source = "{}"
+calibration = "{}"
+"""
 _OF_RUNS = "bench.base.compilation_display", "bench.execution.run"
 """Modules that every run takes."""
 _OF_RESULTS = "matplotlib.figure", "bench.dashboard"
@@ -136,6 +143,30 @@ class RunSeries:
         if self._whole is not None:
             self._whole.started.append(run)
         return run
+
+    def calibrated_rig(self, calibrations: Mapping[str, Calibration], tables: str, *, rig: str | None = None) -> str:
+        """Write a rig file that applies calibrations to the campaign's rig, or another; return its path.
+
+        Parameters
+        ----------
+        calibrations : mapping of str to Calibration
+            By the name of the calibrated signal.
+        tables : str
+            TOML of what takes these signals, such as roles.
+        rig : str, optional
+            The other rig.
+        """
+        extended = rig or self.rig
+        path = self.folder / f"{Path(extended).name.removesuffix('.toml')}-calibrated.toml"
+        # A file is named as from anywhere, a packaged rig by its name.
+        base = str(Path(extended).resolve()) if extended.endswith(".toml") else extended
+        parts = [f"extends = {json.dumps(base)}\n"]
+        for name, calibration in calibrations.items():
+            file = self.folder / f"{name}.json"
+            calibration.save(file)
+            parts.append(_CALIBRATED.format(name, calibration.signal, file.name))
+        path.write_text("\n".join([*parts, tables]), encoding="utf-8")
+        return str(path)
 
     def run(
         self, protocol: str, settings: Mapping[str, str], overrides: Mapping[str, str] | None = None

@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
+from datetime import date
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -26,7 +27,6 @@ from bench.base import (
     needed_for,
     print_plain,
     say_at_once,
-    wall_time,
 )
 from bench.devices import Signal
 from bench.execution.detached_observer import DetachedObserver
@@ -242,7 +242,12 @@ class RunContext(ExitStack):
         self._planned = plan(self.run.protocol, self.parameters, self._slots)
         expected = self._planned if self._rehearsal is None else self._rehearsal.widened(self._planned)
         self._warnings = _checked(
-            self.run, description, expected, guarded=self.guardian is not None, attended=self._is_attended
+            self.run,
+            description,
+            expected,
+            guarded=self.guardian is not None,
+            attended=self._is_attended,
+            today=self.clock.date().astimezone().date(),
         )
         if (reason := self.interrupts.abort_reason) is not None:
             raise AbortError(f"ended by {reason} before anything moved")
@@ -377,9 +382,9 @@ def _open_view(dashboard: Dashboard, console: Console) -> None:
 
 
 def _checked(
-    run: Run, description: RigDescription, expected: Plan, *, guarded: bool, attended: bool
+    run: Run, description: RigDescription, expected: Plan, *, guarded: bool, attended: bool, today: date
 ) -> tuple[str, ...]:
-    """Check what is known before anything moves; return what is accepted only as an operator is present."""
+    """Check what is known before anything moves; return warnings."""
     check_before_moving(description, run.protocol, expected)
     file = description.file
     if expected.prompts and not (file.emulated or attended):
@@ -387,12 +392,10 @@ def _checked(
             f"protocol {run.protocol.name} asks the operator {expected.prompts} times to do something by hand; "
             "run it in a terminal, where an operator can answer"
         )
+    warnings = overdue_calibrations(file, today)
     if not guarded:
-        return ()
-    return (
-        *check_start(description, interval=1.0 / file.safety.rate, interval_key="safety.rate"),
-        *overdue_calibrations(file, wall_time().astimezone().date()),
-    )
+        return warnings
+    return (*check_start(description, interval=1.0 / file.safety.rate, interval_key="safety.rate"), *warnings)
 
 
 def _shown(description: RigDescription) -> tuple[str, ...]:

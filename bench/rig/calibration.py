@@ -1,7 +1,7 @@
 """Calibrations: what a sensor reads against a reference, as a file that a rig file names.
 
 A calibration is accuracy: it compares with a reference that is closer to the truth than the sensor. What a sensor
-reads twice at the same place is repeatability, and needs no reference. A file has both, each under its name.
+reads twice at the same place is repeatability, and needs no reference. A file has both.
 
 A file is a JSON object with the fields of `Calibration` besides `format` and `version`. A rig file names it in a
 derived signal, whose value is the calibrated one::
@@ -17,11 +17,11 @@ calibration.
 
 from __future__ import annotations
 
+import datetime
 import math
 from collections.abc import Mapping
-from datetime import date
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.polynomial import chebyshev
@@ -35,6 +35,10 @@ from bench.rig.derived import Derived, DerivedSignal
 Floats = NDArray[np.float64]
 
 MOST_COEFFICIENTS = 24
+_FEWEST = 3
+"""Values of the reference; a line and one degree of freedom."""
+_PLACES = 33
+"""Places over the range at which the uncertainty is averaged."""
 _FOLDS = 8
 _BINS = 24
 _GAIN = 0.9
@@ -46,43 +50,98 @@ _MARGIN = 0.01
 
 
 class Calibration(CheckedTable):
-    """What a sensor reads against a reference: `correction` is added to what it reads."""
+    """What a sensor reads against a reference, and how well that is known.
+
+    The calibrated value is `slope` times the reading plus a Chebyshev series of it, in the unit of the reference.
+    """
 
     format: Literal["bench-calibration"] = "bench-calibration"
-    version: Literal[1] = 1
+    version: Literal[2] = 2
     signal: str = Field(description="signal of the sensor")
-    unit: str = Field(description="its unit, in which everything here is")
-    reference: str = Field(description="what it was compared with")
-    calibrated: date = Field(description="day of the calibration")
+    unit: str = Field(description="unit of its readings")
+    serial_number: str = Field(
+        description="serial number of its instrument; empty if the instrument does not tell one"
+    )
+    date: datetime.date = Field(description="day of the calibration")
+    interval_days: int = Field(ge=1, description="days after which a new calibration is due")
+    reference: str = Field(min_length=1, description="what it was compared with, and its certificate")
+    reference_unit: str = Field(description="unit of the reference, in which the calibrated value is")
+    reference_uncertainty: float = Field(
+        gt=0.0, description="standard uncertainty of the reference, common to all its values, in its unit"
+    )
+    reference_degrees_of_freedom: float | None = Field(
+        default=None, gt=0.0, description="degrees of freedom of that uncertainty; null for infinitely many"
+    )
+    reference_gain_uncertainty: float = Field(
+        default=0.0,
+        ge=0.0,
+        description="standard uncertainty of the scale of the reference, as a share of its values",
+    )
     low: float = Field(description="least reading of the sensor that was compared")
     high: float = Field(description="greatest reading of the sensor that was compared")
+    slope: float = Field(default=1.0, description="part of the value that is in proportion to the reading")
     coefficients: tuple[float, ...] = Field(
-        min_length=1, description="Chebyshev series of the correction over low to high"
+        min_length=1, description="Chebyshev series over low to high of what is added to that"
+    )
+    covariance: tuple[tuple[float, ...], ...] = Field(description="covariance of the coefficients, reference unit²")
+    degrees_of_freedom: int = Field(ge=1, description="degrees of freedom of the covariance")
+    lack_of_fit: float = Field(
+        default=0.0, ge=0.0, description="standard uncertainty by what the series cannot follow, reference unit"
     )
     lateness: float = Field(
         default=0.0, ge=0.0, description="time by which the sensor reads later than the reference, s"
     )
-    uncertainty: float = Field(
-        ge=0.0, description="standard uncertainty of a mean of corrected readings: its accuracy"
+    repeatability: float = Field(
+        ge=0.0, description="standard deviation of one calibrated reading about the mean of many, reference unit"
     )
-    repeatability: float = Field(ge=0.0, description="standard deviation of one reading about the mean of many")
     readings: int = Field(ge=1, description="number of readings that were compared")
     run: str = Field(default="", description="run in which they were taken")
 
     @model_validator(mode="after")
-    def _has_a_range(self) -> Calibration:
+    def _is_consistent(self) -> Calibration:
         if not self.low < self.high:
             raise ValueError(f"low, high: expected low < high, got {self.low:g} and {self.high:g}")
+        size, matrix = len(self.coefficients), np.array(self.covariance, dtype=np.float64, ndmin=2)
+        if matrix.shape != (size, size) or not np.allclose(matrix, matrix.T) or (np.diag(matrix) < 0.0).any():
+            raise ValueError(f"covariance: expected a symmetric matrix of {size} by {size}, no variance below 0")
         return self
 
-    def correction(self, readings: ArrayLike) -> Floats:
-        """Return what is to be added to readings, in the unit of the calibration."""
-        scaled = (2.0 * np.asarray(readings, dtype=np.float64) - self.low - self.high) / (self.high - self.low)
-        return np.asarray(chebyshev.chebval(np.clip(scaled, -1.0, 1.0), self.coefficients))
+    @property
+    def due(self) -> datetime.date:
+        """Day from which a new calibration is due."""
+        return self.date + datetime.timedelta(days=self.interval_days)
+
+    @property
+    def uncertainty(self) -> float:
+        """Standard uncertainty of a mean of calibrated readings, its accuracy: RMS over the range, reference unit."""
+        places = np.linspace(self.low, self.high, _PLACES)
+        gain = self.reference_gain_uncertainty * self.value(places)
+        common = self.reference_uncertainty**2 + self.lack_of_fit**2
+        return math.sqrt(common + float(np.mean(self.coefficient_uncertainty(places) ** 2 + gain**2)))
+
+    def value(self, readings: ArrayLike) -> Floats:
+        """Return the calibrated values of readings, in the unit of the reference and of their shape."""
+        x = np.asarray(readings, dtype=np.float64)
+        return self.slope * x + np.asarray(chebyshev.chebval(self._scaled(x), self.coefficients))
+
+    def sensitivity(self, readings: ArrayLike) -> Floats:
+        """Return by how much the calibrated value changes for a change of the reading, of their shape."""
+        steepness = chebyshev.chebder(self.coefficients) * 2.0 / (self.high - self.low)
+        return self.slope + np.asarray(chebyshev.chebval(self._scaled(np.asarray(readings)), steepness))
+
+    def coefficient_uncertainty(self, readings: ArrayLike) -> Floats:
+        """Return the standard uncertainties of calibrated values by those of the coefficients."""
+        scaled = self._scaled(np.asarray(readings, dtype=np.float64))
+        columns = chebyshev.chebvander(scaled, len(self.coefficients) - 1)
+        return np.asarray(np.sqrt(np.einsum("...i,ij,...j->...", columns, np.array(self.covariance), columns)))
 
     def save(self, path: Path) -> None:
         """Write the file; raise DataError if that fails."""
         write_json_file(path, self.model_dump(mode="json"))
+
+    def _scaled(self, readings: Floats) -> Floats:
+        scaled = (2.0 * readings - self.low - self.high) / (self.high - self.low)
+        return np.asarray(np.clip(scaled, -1.0, 1.0), dtype=np.float64)
 
 
 def read_calibration(path: Path) -> Calibration:
@@ -101,86 +160,111 @@ def read_calibration(path: Path) -> Calibration:
 
 def calibrate(
     readings: ArrayLike,
-    reference: ArrayLike,
+    standard: ArrayLike,
     *,
-    signal: str,
-    unit: str,
-    named: str,
-    day: date,
     times: ArrayLike | None = None,
-    reference_uncertainty: float = 0.0,
-    run: str = "",
+    **about: Any,  # noqa: ANN401 - fields of a `Calibration`
 ) -> Calibration:
     """Find a calibration from readings of a sensor and of a reference at the same instants or places.
 
-    The number of coefficients is that beyond which readings that were left out are not met better: one eighth after
-    another, or one value after another where few were set up. With times, how late the sensor is against the
-    reference is found too, from how fast the reference moves.
+    Neighbouring readings of one value of the reference count as one place, by their mean. The number of coefficients
+    is that beyond which places that were left out are not met better: one eighth after another, or one value after
+    another where few were set up. With times, how late the sensor is against the reference is found too, from how
+    fast the reference moves.
 
     Parameters
     ----------
-    readings, reference : array_like, shape (N,)
-        What both read, in the same unit; N of at least 3.
-    signal, unit, named, day, run
-        For the file: sensor, unit, what the reference is, day, and run.
+    readings, standard : array_like, shape (N,)
+        What sensor and reference read; at least 3 different values of the reference.
     times : array_like, shape (N,), optional
         Instants, s, where the readings are samples of one course.
-    reference_uncertainty : float
-        Standard uncertainty of the reference.
+    **about
+        Fields of the calibration that are not found from the readings: `signal`, `unit`, `serial_number`, `date`,
+        `interval_days`, `reference`, `reference_unit`, `reference_uncertainty` and what else is known.
 
     Raises
     ------
     DataError
-        If there are too few readings, or they do not differ.
+        If there are too few readings, they do not differ, or a field is wrong.
     """
-    x, y = np.asarray(readings, dtype=np.float64), np.asarray(reference, dtype=np.float64)
+    x, y = np.asarray(readings, dtype=np.float64), np.asarray(standard, dtype=np.float64)
     good = np.isfinite(x) & np.isfinite(y)
     x, y = x[good], y[good]
-    if x.size < 3 or not x.max() > x.min():
-        raise DataError(f"{signal}: a calibration needs at least 3 readings that differ, got {x.size}")
+    count, single = x.size, None
+    if times is None and count:
+        x, y, single = _places(x, y)
+    distinct, of_value = np.unique(y, return_inverse=True)
+    if distinct.size < _FEWEST or not x.max() > x.min():
+        raise DataError(
+            f"{about['signal']}: a calibration needs readings at {_FEWEST} values of the reference at least, which "
+            f"differ; got {distinct.size}"
+        )
     low, high = float(x.min()), float(x.max())
     scaled = (2.0 * x - low - high) / (high - low)
     speed: Floats | None = None
     if times is not None:
         speed = np.gradient(_smooth(y), np.asarray(times, dtype=np.float64)[good])
-    # As many places as values that were set up; a sweep has as many as readings.
-    distinct = np.unique(y, return_inverse=True)
-    most = min(MOST_COEFFICIENTS, max(1, x.size // 2), max(1, distinct[0].size - 1))
+    slope = 1.0 if about["unit"] == about["reference_unit"] else float(np.polyfit(x, y, 1)[0])
+    lacking = y - slope * x
+    # Two degrees of freedom are left; a sweep has as many values as readings.
+    most = max(1, min(MOST_COEFFICIENTS, distinct.size - 1, x.size - 2))
     columns: Floats = np.asarray(chebyshev.chebvander(scaled, most - 1), dtype=np.float64)
-    lacking = y - x
     # Short blocks in turn, so that what is left out lies between what is not.
-    if distinct[0].size < x.size // 2 or x.size < _FOLDS**2:
-        blocks = distinct[1].reshape(-1)
-    else:
-        blocks = np.arange(x.size) * _FOLDS**2 // x.size % _FOLDS
-    left_out = {count: _left_out(_design(columns, count, speed), lacking, blocks) for count in range(1, most + 1)}
-    errors = {count: _binned(scaled, each) for count, each in left_out.items()}
+    is_sweep = x.size >= _FOLDS**2 and distinct.size >= x.size // 2
+    blocks = np.arange(x.size) * _FOLDS**2 // x.size % _FOLDS if is_sweep else of_value.reshape(-1)
+    left_out = {n: _left_out(_design(columns, n, speed), lacking, blocks) for n in range(1, most + 1)}
+    # Of few values the outermost do not count: the others do not tell them.
+    inner = np.ones(x.size, dtype=np.bool_) if is_sweep else (blocks > 0) & (blocks < distinct.size - 1)
+    errors = {n: _binned(scaled[inner], each[inner]) for n, each in left_out.items()}
     chosen = 1
-    for count in range(2, most + 1):
-        if errors[count] < _GAIN * errors[chosen]:
-            chosen = count
+    for n in range(2, most + 1):
+        if errors[n] < _GAIN * errors[chosen]:
+            chosen = n
     design = _design(columns, chosen, speed)
     found = np.linalg.lstsq(design, lacking, rcond=None)[0]
     residuals = lacking - design @ found
-    spread = math.sqrt(float(np.mean(residuals**2)) * x.size / max(1, x.size - found.size))
+    freedom = max(1, x.size - found.size)
+    variance = float(np.sum(residuals**2)) / freedom
+    if not is_sweep:
+        # The number of coefficients was chosen on the same few places, so that the residuals are too small; the
+        # errors of what was left out are not (Allen 1974, Technometrics 16, 125: PRESS).
+        variance = max(variance, float(np.mean(left_out[chosen][inner] ** 2)))
+    covariance = variance * np.linalg.pinv(design.T @ design)
     lateness = 0.0
     if speed is not None:
-        doubt = spread * math.sqrt(float(np.linalg.pinv(design.T @ design)[-1, -1]))
+        doubt = math.sqrt(float(covariance[-1, -1]))
         lateness = float(found[-1]) if found[-1] > _SIGNIFICANT * doubt else 0.0
-    return Calibration(
-        signal=signal,
-        unit=unit,
-        reference=named,
-        calibrated=day,
-        low=low,
-        high=high,
-        coefficients=tuple(found[:chosen].tolist()),
-        lateness=lateness,
-        uncertainty=math.hypot(errors[chosen], reference_uncertainty),
-        repeatability=spread,
-        readings=x.size,
-        run=run,
-    )
+    content = {
+        **about,
+        "low": low,
+        "high": high,
+        "slope": slope,
+        "coefficients": found[:chosen].tolist(),
+        "covariance": covariance[:chosen, :chosen].tolist(),
+        "degrees_of_freedom": freedom,
+        # The residuals of few places have it in them.
+        "lack_of_fit": errors[chosen] if is_sweep else 0.0,
+        "lateness": lateness,
+        "repeatability": math.sqrt(variance) if single is None else abs(slope) * single,
+        "readings": count,
+    }
+    try:
+        return Calibration.model_validate(content)
+    except ValidationError as error:
+        raise DataError(
+            "\n".join(f"calibration of {about['signal']}: {e}" for e in problems(error, Calibration))
+        ) from None
+
+
+def _places(x: Floats, y: Floats) -> tuple[Floats, Floats, float | None]:
+    """Return the means of neighbouring readings of one value, the values, and the deviation of one reading."""
+    starts = np.flatnonzero(np.concatenate([[True], np.diff(y) != 0.0]))
+    counts = np.diff(np.append(starts, y.size))
+    means = np.add.reduceat(x, starts) / counts
+    freedom = y.size - starts.size
+    if not freedom:
+        return means, y[starts], None
+    return means, y[starts], math.sqrt(float(np.sum((x - np.repeat(means, counts)) ** 2)) / freedom)
 
 
 def _smooth(values: Floats) -> Floats:
@@ -213,7 +297,7 @@ def _binned(scaled: Floats, errors: Floats) -> float:
 
 
 class Calibrated(DerivedSignal):
-    """A signal corrected by its calibration.
+    """A signal by its calibration, in the unit of the reference.
 
     A reading beyond the calibrated range has no value, but for a hundredth of the range, over which the correction
     at its end holds.
@@ -240,7 +324,7 @@ class Calibrated(DerivedSignal):
         record, source = self.calibration, self.source
         if units[source] != record.unit:
             raise ValueError(f"source = {source!r}: is in {units[source]}; the calibration is in {record.unit}")
-        low, high = record.low, record.high
+        low, high, slope = record.low, record.high, record.slope
         margin = _MARGIN * (high - low)
         # Powers of the scaled reading, highest first: one reading at a time is what a fast loop asks for.
         powers = chebyshev.cheb2poly(record.coefficients)[::-1].tolist()
@@ -252,16 +336,15 @@ class Calibrated(DerivedSignal):
             if abs(value - inside) > margin:
                 raise DeviceError(
                     name,
-                    f"{source} reads {value:.6g} {record.unit}, beyond its calibration of {record.calibrated}, "
+                    f"{source} reads {value:.6g} {record.unit}, beyond its calibration of {record.date}, "
                     f"{low:.6g} to {high:.6g} {record.unit}; calibrate it over the range that is used",
                 )
             scaled = (inside - middle) / half
             correction = 0.0
             for power in powers:
                 correction = correction * scaled + power
-            return value + correction
+            return slope * value + correction
 
         description = self.description or name.replace("_", " ")
-        return Derived(
-            Signal(name, record.unit, description, self.precision, record.uncertainty), self.sources, compute
-        )
+        signal = Signal(name, record.reference_unit, description, self.precision, record.uncertainty)
+        return Derived(signal, self.sources, compute)

@@ -21,7 +21,8 @@ from bench.devices import (
     Signal,
     check_signal_names,
 )
-from bench.rig.derived import Derived
+from bench.rig.calibration import Calibrated
+from bench.rig.derived import Derived, DerivedSignal
 from bench.rig.description import RigDescription
 from bench.rig.file import Laboratory, RigFile
 from bench.rig.maintenance.safe_state import SAFE, make_safe
@@ -306,7 +307,7 @@ class Rig:
         return described
 
     def _bind_signals(self) -> tuple[Signal, ...]:
-        """Return the signals of devices and derived ones; each derived one may use those above it in the file."""
+        """Return the signals of devices and derived ones, in the order in which they are computed."""
         signals: list[Signal] = []
         for device in self.devices.values():
             if isinstance(device, Actuator):
@@ -321,16 +322,30 @@ class Rig:
                     named = {value: field for field, value in derived if isinstance(value, str)}
                     where = f"{named[source]} = {source!r}" if source in named else f"expression: {source!r}"
                     raise ConfigurationError(
-                        f"{key}.{where}: there is no such signal, or it is derived further down; "
+                        f"{key}.{where}: there is no such signal, or it comes from this one; "
                         f"there are: {', '.join(units)}"
                     )
             try:
+                self._check_instrument(derived)
                 self.derived[name] = derived.bind(name, {source: units[source] for source in derived.sources})
             except ValueError as error:
                 raise ConfigurationError(f"{key}.{error}") from None
             signals.append(self.derived[name].signal)
             units[name] = signals[-1].unit
         return tuple(signals)
+
+    def _check_instrument(self, derived: DerivedSignal) -> None:
+        """Raise ValueError if a calibration is of another instrument than the one that answers."""
+        if not isinstance(derived, Calibrated) or not (expected := derived.calibration.serial_number):
+            return
+        for name, device in self.devices.items():
+            identity = device.identity
+            is_source = any(signal.name == derived.source for signal in device.signals)
+            if is_source and identity.tells_serial_number and identity.serial_number != expected:
+                raise ValueError(
+                    f"calibration: is of the instrument with serial number {expected}, but {name} has "
+                    f"{identity.serial_number}; calibrate {name}, or connect the one that was calibrated"
+                )
 
     def _check_references(self) -> None:
         path = self.file.path

@@ -12,7 +12,7 @@ A rig file asks for them by tables::
     source = "spot_position"
     length = 300e-6
 
-They are computed in their order in the file; each may use those above it.
+Each may use others, but none comes from itself.
 """
 
 from __future__ import annotations

@@ -498,7 +498,7 @@ def _validate(path: str, text: str, content: Mapping[str, Any]) -> RigFile:
         devices=tuple(entries),
         roles=tables.roles,
         protocols=tables.protocols,
-        derived=derived,
+        derived=_after_their_sources(derived),
         interlocks=tables.interlocks,
         telemetry=tables.telemetry,
         safety=tables.safety,
@@ -506,6 +506,22 @@ def _validate(path: str, text: str, content: Mapping[str, Any]) -> RigFile:
         laboratory=laboratory,
         laboratory_settings=settings,
     )
+
+
+def _after_their_sources(derived: Mapping[str, DerivedSignal]) -> dict[str, DerivedSignal]:
+    """Return derived signals in their order, but each after those that it comes from."""
+    ordered: dict[str, DerivedSignal] = {}
+
+    def place(name: str, before: frozenset[str]) -> None:
+        for source in derived[name].sources:
+            # One that comes from itself stays where it is; binding it says so.
+            if source in derived and source not in before:
+                place(source, before | {source})
+        ordered.setdefault(name, derived[name])
+
+    for name in derived:
+        place(name, frozenset([name]))
+    return ordered
 
 
 def _load_part(

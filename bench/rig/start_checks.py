@@ -11,6 +11,7 @@ from datetime import date
 
 from bench.base import ConfigurationError
 from bench.devices import Actuator, Device, DeviceDescription, DriverSettings
+from bench.rig.calibration import Calibrated
 from bench.rig.description import RigDescription
 from bench.rig.file import RigFile
 from bench.rig.interlocks.config import SETPOINT, Interlock, Level
@@ -88,12 +89,20 @@ def check_start(
 
 
 def overdue_calibrations(file: RigFile, today: date) -> tuple[str, ...]:
-    """Return a warning for each device of a rig file whose calibration is due on a day or before it."""
-    return tuple(
-        f"{file.path}: devices.{entry.name}: its calibration was due on {due}; calibrate it, then set calibrated and "
-        "calibration_due"
-        for entry in file.devices
-        if (due := entry.settings.calibration_due) is not None and due <= today
+    """Return a warning for each device and calibrated signal whose calibration is due on a day or before it."""
+    return (
+        *(
+            f"{file.path}: devices.{entry.name}: its calibration was due on {due}; calibrate it, then set calibrated "
+            "and calibration_due"
+            for entry in file.devices
+            if (due := entry.settings.calibration_due) is not None and due <= today
+        ),
+        *(
+            f"{file.path}: derived.{name}: the calibration of {of.source} by {of.calibration.reference} of "
+            f"{of.calibration.date} holds for {of.calibration.interval_days} days and was due on {due}; calibrate it"
+            for name, of in file.derived.items()
+            if isinstance(of, Calibrated) and (due := of.calibration.due) <= today
+        ),
     )
 
 

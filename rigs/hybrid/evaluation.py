@@ -26,20 +26,6 @@ HOLD = 30.0
 """Length of each hold between the moves, s, for all controllers alike."""
 HELD = 15.0
 """Time at the end of each hold that counts as held, s."""
-_CALIBRATED = """
-extends = "{extended}"
-
-[rig]
-title = "Thermo-piezoelectric hybrid (emulated, with a calibrated sensor and a witness)"
-
-[derived.displacement]
-kind = "calibrated"
-source = "{source}"
-calibration = "{calibration}"
-
-[roles.response]
-signal = "displacement"
-"""
 BAND = 0.02
 """Band within which a step counts as settled, as a share of the step."""
 
@@ -57,15 +43,6 @@ def displacement_characteristic(rig: str) -> Characteristic:
     if not isinstance(settings, HybridLaboratorySettings):
         raise ConfigurationError(f"{rig}: is not an emulated hybrid, so that the true deflection is not known")
     return settings.characteristic_of("displacement_sensor", DISPLACEMENT)
-
-
-def calibrated_rig(folder: Path, calibration: Calibration, extended: str) -> str:
-    """Write a calibration, and a rig file that applies it to the rig `extended`; return the path of the latter."""
-    file, rig = folder / "displacement.json", folder / "hybrid-calibrated.toml"
-    calibration.save(file)
-    text = _CALIBRATED.format(extended=extended, source=calibration.signal, calibration=file.name)
-    rig.write_text(text, encoding="utf-8")
-    return str(rig)
 
 
 @dataclass(frozen=True)
@@ -131,7 +108,7 @@ def tracked(run: Path, sensor: Characteristic, calibration: Calibration | None =
     times, reference, deflection = samples.times, samples["reference"], samples[WITNESS]
     shown = sensor.course(deflection)
     if calibration is not None:
-        shown = shown + calibration.correction(shown)
+        shown = calibration.value(shown)
     return Tracked(Tracking(times, reference, shown), Tracking(times, reference, deflection))
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from bench.analysis import Published, calibrate_run, errors_text, plot_fit, plot_tracking
+from bench.analysis import Published, Reference, calibrate_run, errors_text, plot_fit, plot_tracking
 from bench.batch import ResultTable, RunSeries, Study, StudyResult
 from bench.identification import measure_errors
 from bench.record import Record
@@ -22,7 +22,6 @@ from rigs.hybrid.evaluation import (
     HELD,
     HOLD,
     Tracked,
-    calibrated_rig,
     displacement_characteristic,
     fine_step,
     tracked,
@@ -92,6 +91,10 @@ def _actuator(name: str, bandwidth: str, *papers: str) -> tuple[str, ...]:
 
 REFERENCE_UNCERTAINTY = 1e-9
 """Standard uncertainty of the interferometer, m."""
+_CALIBRATED_RIG = """
+[roles.response]
+signal = "displacement"
+"""
 
 _PARTS = tuple((part, what) for part in ("hold", "move") for what in ("RMS", "max"))
 
@@ -158,7 +161,10 @@ TABLES = (
         f"six moves at 3 µm/s over {{control[range_um]:.0f}} µm, errors in nm; of each hold of {HOLD:g} s the "
         f"last {HELD:g} s",
         ("controller", *(f"{part} {what}" for part, what in _PARTS)),
-        [_errors_row(name, f"controllers[{name}]") for name in CONTROLLERS],
+        [
+            *(_errors_row(name, f"controllers[{name}]") for name in CONTROLLERS),
+            _errors_row("hybrid, sensor calibrated", "calibrated"),
+        ],
         "Errors are those of what the sensor shows, without its noise: repeatability.",
     ),
     ResultTable(
@@ -285,7 +291,7 @@ def _carry_out(campaign: RunSeries) -> StudyResult:
     runs = _Runs(*(campaign.conclude(run) for run in started))
     figures = list(_draw_models(campaign, found, runs))
     calibration = _calibrated(campaign.conclude(sweep_run).folder)
-    calibrated = calibrated_rig(campaign.folder, calibration, WITNESSED)
+    calibrated = campaign.calibrated_rig({"displacement": calibration}, _CALIBRATED_RIG, rig=WITNESSED)
     calibrated_run = _start(campaign, model, {"controller": "hybrid", "hold": f"{HOLD:g}"}, rig=calibrated)
     calibrated_run.hurry()
     sensor = displacement_characteristic(WITNESSED)
@@ -345,13 +351,8 @@ def _calibrated(sweep: Path) -> Calibration:
     """Return the calibration of the displacement sensor from a sweep beside the witness."""
     with Record(sweep) as record:
         names = signal_names(record)
-    return calibrate_run(
-        sweep,
-        names[DEFLECTION],
-        names[WITNESS],
-        reference_name="interferometer",
-        reference_uncertainty=REFERENCE_UNCERTAINTY,
-    )
+    interferometer = Reference("interferometer", REFERENCE_UNCERTAINTY, 365, signal=names[WITNESS])
+    return calibrate_run(sweep, names[DEFLECTION], interferometer)
 
 
 def _control(moves: Tracked, fine: Mapping[str, Mapping[str, float]]) -> dict[str, float]:

@@ -104,18 +104,13 @@ def json_key(name: str) -> str:
     return name.replace("-", "_")
 
 
-def start_runs(campaign: RunSeries) -> dict[str, Pending[RunResult]]:
-    """Start the four protocols of a muscle; the campaign's seed chooses the random voltages of the verification."""
+def start_runs(campaign: RunSeries, *, verified: bool = True) -> dict[str, Pending[RunResult]]:
+    """Start the protocols of a muscle; the campaign's seed chooses the random voltages of the verification."""
+    protocols: dict[str, dict[str, str]] = {"force-voltage": {}, "length-voltage": {}, "length-force": {}}
+    if verified:
+        protocols["length-verification"] = {"sequence_seed": str(campaign.seed + 1)}
     with campaign.workers.together():
-        runs = {
-            protocol: campaign.start(protocol, settings)
-            for protocol, settings in {
-                "force-voltage": {},
-                "length-voltage": {},
-                "length-force": {},
-                "length-verification": {"sequence_seed": str(campaign.seed + 1)},
-            }.items()
-        }
+        runs = {protocol: campaign.start(protocol, settings) for protocol, settings in protocols.items()}
         # The longest one, and the models wait for it.
         runs["length-force"].hurry()
     return runs

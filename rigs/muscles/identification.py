@@ -51,6 +51,8 @@ VOLTAGE = "supply_setpoint"
 VOLTAGE_READING = "supply_voltage"
 FORCE = "load_cell_force"
 LENGTH = "wire_end_position"
+CALIBRATED = {FORCE: "force", LENGTH: "length"}
+"""Derived signals that take the place of these where a rig has them."""
 
 UNITS = ("V", "N", "m")
 
@@ -175,13 +177,15 @@ def identify_muscle_dynamics(model: Model, force_run: Path, length_runs: Sequenc
     if model.kind != TwoStage.kind:
         return None
     first = cast("TwoStage", model).first
-    recording = read_transients(force_run, VOLTAGE_READING, FORCE)
+    recording = read_transients(force_run, VOLTAGE_READING, _named(force_run, FORCE))
     if recording is None:
         return None
     samples, swings = _parts(recording, SAMPLE), _parts(recording, CONDITIONING)
     found = identify_dynamics(identify_transients(samples), [first.evaluate], ("voltage", "force"), swings)
     under_weights = next((run for run in length_runs if protocol_of(run) == "length-voltage"), None)
-    lengths = None if under_weights is None else read_transients(under_weights, VOLTAGE_READING, LENGTH)
+    if under_weights is None:
+        return found
+    lengths = read_transients(under_weights, VOLTAGE_READING, _named(under_weights, LENGTH))
     if lengths is None:
         return found
     return replace(found, noise={**found.noise, "length": noise_of(lengths, lengths.responded)})
@@ -270,6 +274,17 @@ def errors_json(errors: Errors) -> dict[str, float]:
     return {"average": errors.average_percent, "rms": errors.rms_percent}
 
 
+def signal_of(record: Record, name: str) -> str:
+    """Return the calibrated signal in place of a sensor's, `FORCE` or `LENGTH`, if a run has it."""
+    calibrated = CALIBRATED[name]
+    return calibrated if calibrated in (signal.name for signal in record.signals) else name
+
+
+def _named(run: Path, name: str) -> str:
+    with Record(run) as record:
+        return signal_of(record, name)
+
+
 def _samples(run: Path, protocols: Collection[str]) -> list[Floats]:
     """Return voltages, forces and lengths of each series of a run of one of some protocols, each of shape (N, 3)."""
     with Record(run) as record:
@@ -282,7 +297,7 @@ def _samples(run: Path, protocols: Collection[str]) -> list[Floats]:
         missing = [name for name in (VOLTAGE, FORCE, LENGTH) if name not in names]
         if missing:
             raise DataError(f"{run}: has no signal {', '.join(missing)}; it has: {', '.join(names)}")
-        places = [names.index(name) for name in (VOLTAGE, FORCE, LENGTH)]
+        places = [names.index(name) for name in (VOLTAGE, signal_of(record, FORCE), signal_of(record, LENGTH))]
         # A reset, a phase of its own, stands between any two series, also of the same load.
         groups = [
             [[step.values[i] for i in places] for step in steps if step.label == SAMPLE]

@@ -31,7 +31,7 @@ from sim_devices.plants.grid import GRID_TOLERANCE, Floats, changed
 from sim_devices.plants.mckibben import McKibbenMuscle, McKibbenParameters
 from sim_devices.plants.muscle import MuscleParameters
 from sim_devices.plants.sma import SMAParameters, SMAWire
-from sim_devices.transducers.data_sheets import LOAD_CELL, POSITION
+from sim_devices.transducers.data_sheets import GAUGE_BLOCKS, LOAD_CELL, POSITION, WEIGHTS
 from sim_devices.transducers.imperfect import ImperfectSensor, SensorErrors, imperfect, shown
 from sim_devices.transducers.magnet import RatiometricSensor
 from sim_devices.transducers.specimens import SensorSettings
@@ -129,6 +129,12 @@ class MuscleLaboratorySettings(SensorSettings, ABC):
     )
     position_sensor: SensorErrors = Field(
         default=SensorErrors(), description="systematic errors of the position sensor (m), range 0 to 35 mm"
+    )
+    weights: SensorErrors = Field(
+        default=SensorErrors(), description="errors of true weights against those stated (N), range 0 to 20 N"
+    )
+    gauge_blocks: SensorErrors = Field(
+        default=SensorErrors(), description="errors of the true place of the magnet against the blocks' (m), ±17.5 mm"
     )
     force_noise: float = Field(default=0.04, ge=0, le=1, description="noise of the load cell, unfiltered, N rms")
     plant: dict[str, float] = Field(
@@ -370,13 +376,14 @@ class MuscleLaboratory(EmulatedLaboratory):
         if task not in (LOAD, STAGE, GAUGE):
             raise ConfigurationError(f"this laboratory cannot carry out {task!r}; it can: {LOAD}, {STAGE}, {GAUGE}")
         with self.world.at_present():
-            self.frame.gauge = value if task == GAUGE else None
+            self.frame.gauge = None
             if task == GAUGE:
+                self.frame.gauge = self._settings.characteristic_of("gauge_blocks", GAUGE_BLOCKS).value(value)
                 return
             if task == STAGE:
                 self.frame.fasten()
             elif not self._load_is_forgotten:
-                load = self._load_factor * value
+                load = self._load_factor * self._settings.characteristic_of("weights", WEIGHTS).value(value)
                 try:
                     self.frame.hang(load)
                 except ValueError as error:

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -15,7 +15,9 @@ import numpy.typing as npt
 from bench.analysis import (
     Curve,
     Published,
+    Reference,
     TargetResults,
+    calibrate_run,
     plot_densities,
     plot_errors,
     plot_panels,
@@ -39,11 +41,37 @@ from rigs.muscles.characterization import (
     plot_lengths,
     start_runs,
 )
-from rigs.muscles.identification import FORCE, LENGTH
+from rigs.muscles.identification import CALIBRATED as CALIBRATED_SIGNALS, FORCE, LENGTH
+
+if TYPE_CHECKING:
+    from bench.base import Pending
+    from bench.execution import RunResult
 
 Floats = npt.NDArray[np.float64]
 
 CONTROLLERS = ("open-loop-inverse", "proportional-integral", "closed-loop-inverse")
+_CALIBRATED_RIG = """
+[roles.response]
+signal = "length"
+
+[roles.load]
+signal = "force"
+
+[roles.force]
+signal = "force"
+"""
+WEIGHTS = Reference(
+    "weights of class M1 (OIML R 111-1, table 1)",
+    # 5 mg of the lightest, of 100 g, and the scale of the set; both uniform (JCGM 100:2008, 4.3.7).
+    uncertainty=4.9e-5 / 3.0**0.5,
+    gain_uncertainty=5e-5 / 3.0**0.5,
+    interval_days=365,
+)
+BLOCKS = Reference(
+    "gauge blocks of grade 2 (ISO 3650), on a surface set to 2 µm", uncertainty=2e-6 / 3.0**0.5, interval_days=365
+)
+CALIBRATED = "closed-loop-inverse"
+"""Controller that is tried with calibrated sensors as well."""
 LOAD_CHANGE = 1.96
 """What is hung on and taken off again in the session with a changing load, N."""
 _PROTOCOLS = {
@@ -106,22 +134,24 @@ TABLES = (
         ],
     ),
     ResultTable(
-        "true errors of the same, max / RMS: accuracy",
-        ("", *(controller.removesuffix("-inverse") for controller in CONTROLLERS)),
+        "accuracy of the same: errors by the readings and true",
+        ("", "controller", "RMS", "true RMS", "true max"),
         [
             (
-                f"{session.title}, {session.controlled.unit}",
-                *(
-                    " / ".join(
-                        f"{{control[{key}][{json_key(controller)}][true_{what}]:.3f}}" for what in ("max", "rms")
-                    )
-                    for controller in CONTROLLERS
-                ),
+                f"{session.title}, {session.controlled.unit}" if controller == CONTROLLERS[0] else "",
+                controller,
+                *(f"{{{entry}[{what}]:.3f}}" for what in ("rms", "true_rms", "true_max")),
             )
             for key, session in CONTROL.items()
+            for controller, entry in (
+                *((name, f"control[{key}][{json_key(name)}]") for name in CONTROLLERS),
+                (f"{CALIBRATED}, calibrated", f"calibrated[{key}]"),
+            )
         ],
-        "The errors above are those of the readings: repeatability. These are those of length and force behind the "
-        "readings, of sensors with the systematic errors of their data sheets (docs/reference/sensors.md).",
+        "Errors by the readings are repeatability. True ones are those of length and force behind the readings, of "
+        "sensors with the systematic errors of their data sheets (docs/reference/sensors.md). Calibrated by gauge "
+        "blocks and weights, the length is accurate to {calibration[length]:.4f} mm, the force to "
+        "{calibration[force]:.4f} N (standard uncertainties).",
     ),
 )
 
@@ -140,22 +170,31 @@ def carry_out(campaign: RunSeries) -> StudyResult:
     `units`. Raises BenchError if a run did not complete; its record is kept.
     """
     characterizing = start_runs(campaign)
+    calibrated = campaign.part("calibrated", campaign.rig)
+    calibrating = {name: calibrated.start(f"calibration-{name}", {}) for name in ("position", "load")}
+    calibrations = {
+        CALIBRATED_SIGNALS[signal]: calibrate_run(calibrating[name].result().folder, signal, reference)
+        for name, signal, reference in (("position", LENGTH, BLOCKS), ("load", FORCE, WEIGHTS))
+    }
+    calibrated.rig = calibrated.calibrated_rig(calibrations, _CALIBRATED_RIG)
+    recharacterizing = start_runs(calibrated, verified=False)
     # Loaded while they run.
     truth = true_quantities(campaign.rig)
     measured = measure(characterizing)
     identified = identify_models(measured, campaign.folder)
     # The sessions wait for the first model; the others are identified beside them.
     first = next(identified)
-    common = {"model": str(campaign.folder / "two-stage.json"), "sequence_seed": str(campaign.seed + 1)}
+
+    def start(series: RunSeries, session: ControlSession, controller: str) -> Pending[RunResult]:
+        common = {"model": str(series.folder / "two-stage.json"), "sequence_seed": str(campaign.seed + 1)}
+        return series.start(session.controlled.protocol, {"controller": controller, **session.settings, **common})
+
     runs = {
-        key: {
-            controller: campaign.start(
-                session.controlled.protocol, {"controller": controller, **session.settings, **common}
-            )
-            for controller in CONTROLLERS
-        }
+        key: {controller: start(campaign, session, controller) for controller in CONTROLLERS}
         for key, session in CONTROL.items()
     }
+    next(identify_models(measure(recharacterizing), calibrated.folder))
+    calibrated_runs = {key: start(calibrated, session, CALIBRATED) for key, session in CONTROL.items()}
     found = conclude(campaign, characterizing, measured, dict([first, *identified]))
     figures = _draw(campaign, found)
     reached = {
@@ -175,10 +214,18 @@ def carry_out(campaign: RunSeries) -> StudyResult:
             },
             "control": {
                 key: {
-                    json_key(controller): _errors(results, CONTROL[key].controlled, truth)
-                    for controller, results in entry.items()
+                    json_key(controller): _errors(campaign.conclude(run), CONTROL[key].controlled, truth)
+                    for controller, run in entry.items()
                 }
-                for key, entry in reached.items()
+                for key, entry in runs.items()
+            },
+            "calibrated": {
+                key: _errors(calibrated.conclude(run), CONTROL[key].controlled, truth, calibrated=True)
+                for key, run in calibrated_runs.items()
+            },
+            "calibration": {
+                quantity.name: calibrations[quantity.name].uncertainty * quantity.scale
+                for quantity in (_LENGTH, _FORCE)
             },
             "units": {key: session.controlled.unit for key, session in CONTROL.items()},
         },
@@ -238,11 +285,17 @@ def true_quantities(rig: str) -> Mapping[str, Callable[[Floats], Floats]]:
 
 
 def _errors(
-    results: TargetResults, controlled: Quantity, truth: Mapping[str, Callable[[Floats], Floats]]
+    run: RunResult,
+    controlled: Quantity,
+    truth: Mapping[str, Callable[[Floats], Floats]],
+    *,
+    calibrated: bool = False,
 ) -> dict[str, float]:
+    raw = reached_targets(run, controlled.signal)
+    results = reached_targets(run, CALIBRATED_SIGNALS[controlled.signal]) if calibrated else raw
     summary = results.summary()
     behind = truth.get(controlled.signal)
-    true = np.full_like(results.outputs, np.nan) if behind is None else behind(results.outputs)
+    true = np.full_like(raw.outputs, np.nan) if behind is None else behind(raw.outputs)
     found = {
         **{key: summary[key] for key in ("max", "rms", "median")},
         **true_errors(true - results.targets),

@@ -73,9 +73,9 @@ def deflection_to_curvature(deflection: npt.ArrayLike, length: float, residual_c
 
 
 class CantileverCurvature(DerivedSignal):
-    """Curvature of a cantilever from the deflection of its tip."""
+    """Curvature of a cantilever from the deflection of its tip, or from the angle by which the tip turns."""
 
-    source: str = Field(description="signal of the tip deflection, m")
+    source: str = Field(description="signal of the tip's deflection, m, or angle, °")
     length: float = Field(gt=0, le=1, description="length of the beam, m")
     residual_curvature: float = Field(default=0.0, ge=-1e5, le=1e5, description="curvature of the beam at rest, 1/m")
 
@@ -91,15 +91,21 @@ class CantileverCurvature(DerivedSignal):
 
     @property
     def sources(self) -> tuple[str, ...]:
-        """The deflection."""
+        """The deflection or angle."""
         return (self.source,)
 
     def bind(self, name: str, units: Mapping[str, str]) -> Derived:
         """Return the curvature, 1/m; it has no value where no bending of the beam reaches the deflection."""
-        if units[self.source] != "m":
-            raise ValueError(f"source = {self.source!r}: is in {units[self.source]}; expected a deflection in m")
-
         source, length, residual_curvature = self.source, self.length, self.residual_curvature
+        signal = Signal(name, "1/m", "curvature", 2)
+        if units[source] == "°":
+            # An arc turns by its curvature times its length.
+            scale = math.pi / 180.0 / length
+            return Derived(signal, self.sources, lambda values: scale * values[source])
+        if units[source] != "m":
+            raise ValueError(
+                f"source = {source!r}: is in {units[source]}; expected a deflection in m or an angle in °"
+            )
         rest = _ratio(residual_curvature * length)
 
         def compute(values: Mapping[str, float]) -> float:
@@ -114,7 +120,7 @@ class CantileverCurvature(DerivedSignal):
                 )
             return curvature
 
-        return Derived(Signal(name, "1/m", "curvature", 2), self.sources, compute)
+        return Derived(signal, self.sources, compute)
 
 
 # Scalars by `math`: one reading at a time is what a run asks for, and numpy's calls cost it fifty times as much.

@@ -8,7 +8,8 @@ from functools import partial
 import numpy as np
 from pydantic import Field
 
-from bench.base import Clock
+from bench.base import Clock, ConfigurationError
+from rigs.vo2.curvature import curvature_to_deflection
 from sim_devices.faults.fault import Fault, Quantity
 from sim_devices.faults.sensor import FaultySensor
 from sim_devices.faults.supply import ClippedPeltier
@@ -18,7 +19,7 @@ from sim_devices.instruments.meerstetter_tec import EmulatedTEC
 from sim_devices.laboratory import EmulatedLaboratory, TrueValue, tec_faults
 from sim_devices.plants.grid import changed
 from sim_devices.plants.vo2 import VO2Cantilever, VO2Parameters
-from sim_devices.transducers.data_sheets import PSD
+from sim_devices.transducers.data_sheets import GONIOMETER, MICROMETER, PSD, SETTING
 from sim_devices.transducers.imperfect import SensorErrors, imperfect, shown
 from sim_devices.transducers.photodetector import NormalisedPSD
 from sim_devices.transducers.specimens import SensorSettings
@@ -26,8 +27,12 @@ from sim_devices.wire.mecom import MeComServer
 from sim_devices.wire.modbus_tcp import ModbusTcpInstrument
 from sim_devices.world import World
 
-_SPOT = 1
-"""Beside the seed, for the noise of a faulty sensor; the streams of the laboratory stay as they are."""
+_SPOT, _HAND = 1, 2
+"""Beside the seed, for the noise of a faulty sensor and for an operator."""
+
+MIRROR, DETECTOR = "mirror", "detector"
+"""Tasks of an operator: tilt a mirror in place of the cantilever (°), or move the detector while the mirror is at 0°
+(m by the micrometer)."""
 
 
 class VO2LaboratorySettings(SensorSettings):
@@ -42,6 +47,15 @@ class VO2LaboratorySettings(SensorSettings):
     psd: SensorErrors = Field(
         default=SensorErrors(),
         description="systematic errors of the PSD with its laser, in deflection of the tip (m), range ±100 µm",
+    )
+    goniometer: SensorErrors = Field(
+        default=SensorErrors(), description="errors of the mirror's angle against the goniometer's, °, range ±45°"
+    )
+    micrometer: SensorErrors = Field(
+        default=SensorErrors(), description="errors of the detector's place against the micrometer's, m, range ±20 mm"
+    )
+    magnification: float = Field(
+        default=4 * 14e-3 / 300e-6, gt=0, description="way of the spot for that of the tip, by the lever as measured"
     )
     psd_noise: float = Field(default=5e-3, ge=0, le=1, description="noise of the PSD in one conversion, V rms")
     plant: dict[str, float] = Field(
@@ -67,6 +81,7 @@ class VO2Laboratory(EmulatedLaboratory):
     """
 
     Settings = VO2LaboratorySettings
+    world: World
     kernels = ("sim_devices.plants._vo2_kernels", "sim_devices.transducers._imperfect_kernels")
 
     def __init__(self, settings: VO2LaboratorySettings, clock: Clock, seed: int) -> None:
@@ -84,6 +99,9 @@ class VO2Laboratory(EmulatedLaboratory):
         self.world = World(self.plant, clock)
         peltier = ClippedPeltier(self.plant)
         self.tec = EmulatedTEC("tec", self.world, peltier, rng=tec_stream)
+        self._settings = settings
+        self._hand = np.random.default_rng((seed, _HAND))
+        self._set_by_hand: float | None = None
         self._misalignment = 0.0
         self._stuck: tuple[float, float] | None = None
         self._shown = imperfect(self._spot, settings.errors_of("psd", PSD), *PSD.range, self.world)
@@ -128,6 +146,28 @@ class VO2Laboratory(EmulatedLaboratory):
             seed=seed,
         )
 
+    def operate(self, task: str, value: float) -> None:
+        """Tilt a mirror in place of the cantilever to `value` °, or move the detector to `value` m under the spot.
+
+        Raises ConfigurationError if it is another task.
+        """
+        settings = self._settings
+        if task not in (MIRROR, DETECTOR):
+            raise ConfigurationError(f"this laboratory cannot carry out {task!r}; it can: {MIRROR}, {DETECTOR}")
+        with self.world.at_present():
+            if task == MIRROR:
+                angle = settings.characteristic_of("goniometer", GONIOMETER).value(value)
+                if settings.sensors != "ideal":
+                    angle += float(self._hand.uniform(-SETTING, SETTING))
+                # The spot stands where that of a beam whose tip is turned by as much.
+                length = self.plant.parameters.beam_length
+                self._set_by_hand = float(curvature_to_deflection(np.radians(angle) / length, length))
+                return
+            place = settings.characteristic_of("micrometer", MICROMETER).value(value)
+            # The lever is not in the way of the detector.
+            lever = 1.0 + settings.errors_of("psd", PSD).gain_error
+            self._set_by_hand = place / settings.magnification / lever
+
     def truth(self) -> dict[str, TrueValue]:
         """Return the state of film, plate and controller."""
         plant = self.plant
@@ -151,6 +191,8 @@ class VO2Laboratory(EmulatedLaboratory):
 
     def _spot(self) -> float:
         """Return the deflection of the tip that the spot shows, m."""
+        if self._set_by_hand is not None:
+            return self._set_by_hand + self._misalignment
         deflection = self.plant.tip_deflection if self._stuck is None else self._stuck[1]
         return deflection + self._misalignment
 

@@ -17,11 +17,14 @@ import numpy.typing as npt
 from bench.analysis import (
     FEWEST_ROWS,
     ColumnNames,
+    Dataset,
     FitOptions,
     FollowingResult,
     IdentifiedFile,
     Published,
+    Reference,
     TargetResults,
+    calibrate_run,
     errors_text,
     following_result,
     identify_model,
@@ -34,13 +37,13 @@ from bench.analysis import (
     read_dataset,
     transients_of,
 )
-from bench.base import DataError
+from bench.base import ConfigurationError, DataError
 from bench.batch import ResultTable, RunSeries, Study, StudyResult, reached_targets, true_errors
 from bench.identification import measure_errors
 from bench.models import MemoryCurve
 from bench.record import Record
 from bench.rig import load_rig
-from rigs.vo2.curvature import CantileverCurvature, curvature_to_deflection, deflection_to_curvature
+from rigs.vo2.curvature import CantileverCurvature, deflection_to_curvature
 
 if TYPE_CHECKING:
     from bench.base import Pending
@@ -56,6 +59,22 @@ SESSION_OFFSET = 0.2
 
 TRACKING_OFFSET = 0.12
 """The same in the tracking sessions, K."""
+
+DEFLECTION = "psd_position"
+TIP_ANGLE = "tip_angle"
+"""The calibrated signal."""
+_CALIBRATED_RIG = f"""
+[derived.{OUTPUT}]
+source = "{TIP_ANGLE}"
+"""
+GONIOMETER = Reference(
+    "goniometer of 0.01°, mirror parallel to the chip to 0.01°",
+    # Zero within a division, and the scale within a division over 45°: uniform (JCGM 100:2008, 4.3.7).
+    uncertainty=0.01 / math.sqrt(3.0),
+    gain_uncertainty=2.2e-4 / math.sqrt(3.0),
+    interval_days=365,
+    unit="°",
+)
 
 PROPOSED = "preisach-nonmonotonic"
 PERIODS = (60, 200)
@@ -106,6 +125,9 @@ CONTROLLERS = {
 }
 """Title, and the paper's largest and RMS error, 1/m (section V-B). With - for _ the keys are names of controllers,
 but for the one of equal time."""
+
+CALIBRATED = ("open_loop_inverse", "closed_loop_inverse", "latched")
+"""Those that are tried with a calibrated detector as well."""
 
 EQUAL_TIME = "integral_equal_time"
 """Integral action with as many seconds a target as the slowest controller took in the same study."""
@@ -168,35 +190,36 @@ TABLES = (
     ),
     ResultTable(
         "following a modulated sine at 2 Hz, errors in 1/m",
-        ("controller", *(f"{what}, {period} s" for period in PERIODS for what in ("max", "RMS"))),
+        ("controller", *(f"{what}, {period} s" for period in PERIODS for what in ("max", "RMS", "true RMS"))),
         [
             (
                 CONTROLLERS[key][0],
                 *(
                     f"{{continuous[period_{period}][{key}][{what}]:.1f}}"
                     for period in PERIODS
-                    for what in ("max", "rms")
+                    for what in ("max", "rms", "true_rms")
                 ),
             )
             for key in FOLLOWERS
         ],
     ),
     ResultTable(
-        "true errors of both in 1/m: accuracy",
-        ("controller", "targets, max", "targets, RMS", *(f"sine of {period} s, RMS" for period in PERIODS)),
+        "accuracy at the targets, RMS errors in 1/m by the readings and true",
+        ("controller", "RMS", "true RMS", "calibrated: RMS", "true RMS", "true max"),
         [
             (
                 title,
-                *(f"{{tracking[{key}][true_{what}]:.1f}}" for what in ("max", "rms")),
+                *(f"{{tracking[{key}][{what}]:.2f}}" for what in ("rms", "true_rms")),
                 *(
-                    f"{{continuous[period_{period}][{key}][true_rms]:.1f}}" if key in FOLLOWERS else "–"
-                    for period in PERIODS
+                    f"{{calibrated[{key}][{what}]:.2f}}" if key in CALIBRATED else "–"
+                    for what in ("rms", "true_rms", "true_max")
                 ),
             )
             for key, (title, *_) in CONTROLLERS.items()
         ],
-        "The errors above are those of the readings: repeatability. These are those of the curvature behind the "
-        "readings, of a PSD with the systematic errors of its data sheet (docs/reference/sensors.md).",
+        "Errors by the readings are repeatability. True ones are those of the curvature behind them, of a PSD "
+        "with the systematic errors of its data sheet (docs/reference/sensors.md). Calibrated by a mirror on a "
+        "goniometer, detector and lever are accurate to {calibration[accuracy]:.2f} 1/m (standard uncertainty).",
     ),
 )
 
@@ -217,10 +240,14 @@ def carry_out(campaign: RunSeries) -> StudyResult:
     sign = 1.0 if campaign.seed % 2 == 0 else -1.0
 
     def session(
-        protocol: str, settings: Mapping[str, str], offset: float, tuning: Mapping[str, str] | None = None
+        protocol: str,
+        settings: Mapping[str, str],
+        offset: float,
+        tuning: Mapping[str, str] | None = None,
+        series: RunSeries = campaign,
     ) -> Pending[RunResult]:
         overrides = {"emulation.session_offset": str(sign * offset), **(tuning or {})}
-        return campaign.start(protocol, settings, overrides)
+        return series.start(protocol, settings, overrides)
 
     def model_path(name: str) -> str:
         return str(folder / f"{name}.json")
@@ -231,8 +258,12 @@ def carry_out(campaign: RunSeries) -> StudyResult:
     )
     # Loaded while they run.
     truth = true_curvatures(campaign.rig)
-    characterized = characterization.result().folder
-    data = read_dataset([characterized], ColumnNames(INPUT, OUTPUT), at_least=FEWEST_ROWS)
+    calibrated = campaign.part("calibrated", campaign.rig)
+    mirror = calibrated.run("calibration-mirror", {})
+    calibration = calibrate_run(mirror.folder, DEFLECTION, GONIOMETER)
+    calibrated.rig = calibrated.calibrated_rig({TIP_ANGLE: calibration}, _CALIBRATED_RIG)
+    recharacterization = session("damped-oscillation", {}, 0.0, series=calibrated)
+    data = _measured(characterization)
     transients = transients_of(data)
 
     def identified(key: str) -> IdentifiedFile:
@@ -241,11 +272,13 @@ def carry_out(campaign: RunSeries) -> StudyResult:
         found.file.save(Path(model_path(key if MODELS[key].validation is None else name)))
         return found
 
-    def tracking(key: str, tuning: Mapping[str, str] | None = None) -> Pending[RunResult]:
+    def tracking(
+        key: str, tuning: Mapping[str, str] | None = None, series: RunSeries = campaign
+    ) -> Pending[RunResult]:
         controller = "integral" if key == EQUAL_TIME else key.replace("_", "-")
-        model = model_path("polynomial" if key == "polynomial" else PROPOSED)
-        settings = {"model": model, "controller": controller, "sequence_seed": str(campaign.seed + 1)}
-        return session("tracking", settings, TRACKING_OFFSET, tuning)
+        model = series.folder / f"{'polynomial' if key == 'polynomial' else PROPOSED}.json"
+        settings = {"model": str(model), "controller": controller, "sequence_seed": str(campaign.seed + 1)}
+        return session("tracking", settings, TRACKING_OFFSET, tuning, series)
 
     # The sessions wait for these; the others are identified beside them.
     needed = {key: identified(key) for key in ("nonmonotonic", "polynomial")}
@@ -261,6 +294,12 @@ def carry_out(campaign: RunSeries) -> StudyResult:
     }
     # The last run waits for this one.
     tracking_runs["latched"].hurry()
+    again = _measured(recharacterization)
+    proposed = MODELS["nonmonotonic"]
+    accurate = identify_model(again, proposed.model, FitOptions.of(proposed.options), transients_of(again)).file
+    accurate.save(calibrated.folder / f"{PROPOSED}.json")
+    campaign.conclude(recharacterization, [accurate])
+    calibrated_runs = {key: tracking(key, series=calibrated) for key in CALIBRATED}
     models = {key: needed.get(key) or identified(key) for key in MODELS}
     with Record(validation.result().folder) as record:
         steps = record.steps()
@@ -277,6 +316,11 @@ def carry_out(campaign: RunSeries) -> StudyResult:
     )
     reached = {key: reached_targets(campaign.conclude(run), OUTPUT) for key, run in tracking_runs.items()}
     followed = {key: _followed(campaign.conclude(run)) for key, run in following_runs.items()}
+
+    def errors_of(run: Pending[RunResult]) -> dict[str, float]:
+        found, raw = (reached_targets(campaign.conclude(run), signal) for signal in (OUTPUT, DEFLECTION))
+        return {**found.summary(), **true_errors(truth(raw.outputs) - found.targets)}
+
     figures += _draw_control(campaign, reached, followed)
     return StudyResult(
         {
@@ -288,17 +332,21 @@ def carry_out(campaign: RunSeries) -> StudyResult:
             },
             "kkt": {key: model.identification.certificate.kkt_residual for key, model in models.items()},
             "parameters": _parameters(models["nonmonotonic"].file.operator),
-            "tracking": {
-                key: {**results.summary(), **true_errors(truth(results.outputs) - results.targets)}
-                for key, results in reached.items()
-            },
+            "tracking": {key: errors_of(run) for key, run in tracking_runs.items()},
             "continuous": {
                 f"period_{period}": {
-                    key: {**result.summary(), **true_errors(truth(result.output) - result.reference)}
+                    key: {**result.summary(), **true_errors(truth(raw.output) - result.reference)}
                     for key in FOLLOWERS
-                    for result in (followed[period, key],)
+                    for result, raw in (
+                        (followed[period, key], _followed(following_runs[period, key].result(), DEFLECTION)),
+                    )
                 }
                 for period in PERIODS
+            },
+            "calibrated": {key: errors_of(run) for key, run in calibrated_runs.items()},
+            "calibration": {
+                "accuracy": math.radians(calibration.uncertainty) / _beam(campaign.rig),
+                "coefficients": len(calibration.coefficients),
             },
         },
         TABLES,
@@ -364,30 +412,45 @@ STUDY = Study(
 )
 
 
-def _followed(run: RunResult) -> FollowingResult:
+def _measured(run: Pending[RunResult]) -> Dataset:
+    return read_dataset([run.result().folder], ColumnNames(INPUT, OUTPUT), at_least=FEWEST_ROWS)
+
+
+def _followed(run: RunResult, signal: str = OUTPUT) -> FollowingResult:
     with Record(run.folder) as record:
-        result = following_result(record, OUTPUT)
+        result = following_result(record, signal)
     if result is None:
         raise DataError(f"{run.folder}: has no reference")
     return result
 
 
 def true_curvatures(rig: str) -> Callable[[Floats], Floats]:
-    """Return what gives the curvatures behind readings of an emulated rig, but for noise; nan of any other rig."""
+    """Return what gives the curvatures behind readings (m) of an emulated detector; nan of any other."""
     # Here, as `bench list` reads the names of the studies.
     from rigs.vo2.laboratory import VO2LaboratorySettings
+    from sim_devices.plants.grid import changed
+    from sim_devices.plants.vo2 import VO2Parameters
     from sim_devices.transducers.data_sheets import PSD
 
-    loaded = load_rig(rig)
-    settings, derived = loaded.laboratory_settings, loaded.derived.get(OUTPUT)
-    if not isinstance(settings, VO2LaboratorySettings) or not isinstance(derived, CantileverCurvature):
+    settings = load_rig(rig).laboratory_settings
+    if not isinstance(settings, VO2LaboratorySettings):
         return lambda readings: np.full_like(readings, np.nan)
-    beam, sensor = (derived.length, derived.residual_curvature), settings.characteristic_of("psd", PSD)
+    plant = changed(VO2Parameters(), settings.plant)
+    sensor = settings.characteristic_of("psd", PSD)
 
     def truth(readings: Floats) -> Floats:
-        return deflection_to_curvature(sensor.quantities(curvature_to_deflection(readings, *beam)), *beam)
+        deflections = sensor.quantities(readings)
+        return deflection_to_curvature(deflections, plant.beam_length, plant.residual_curvature)
 
     return truth
+
+
+def _beam(rig: str) -> float:
+    """Return the length of the beam by the rig file, m."""
+    derived = load_rig(rig).derived[OUTPUT]
+    if not isinstance(derived, CantileverCurvature):
+        raise ConfigurationError(f"{rig}: derived.{OUTPUT}: expected kind = 'cantilever-curvature'")
+    return derived.length
 
 
 def _parameters(operator: Any) -> dict[str, float]:  # noqa: ANN401 - the non-monotonic model

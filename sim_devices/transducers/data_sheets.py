@@ -31,6 +31,31 @@ direction of the motion, cos 2.5° = 0.999.
 THERMISTOR = DataSheet((-40.0, 80.0), SensorErrors(), offset_tolerance=0.1)
 """In °C and K. Class of interchangeable precision thermistors of 10 kΩ: ±0.1 °C between 0 and 70 °C."""
 
+GONIOMETER = DataSheet((-45.0, 45.0), SensorErrors(), gain_tolerance=2.2e-4, offset_tolerance=0.01)
+"""The true angle of a mirror where its goniometer shows one, in °.
+
+Class of goniometer stages with a scale of 0.01°. Offset: the mirror is parallel to the chip within one division.
+Gain: one division over 45°.
+"""
+
+SETTING = 0.005
+"""Largest error of one setting of the goniometer, °: half a division of its scale."""
+
+MICROMETER = DataSheet((-20e-3, 20e-3), SensorErrors(), gain_tolerance=1e-4, offset_tolerance=2e-6)
+"""The true place of a detector where the micrometer of its stage shows one, in m.
+
+Class of micrometer heads of ±2 µm (25 mm); gain of the same size over the stroke.
+"""
+
+WEIGHTS = DataSheet((0.0, 20.0), SensorErrors(), gain_tolerance=5e-5)
+"""The true weight where a set of weights states one, in N. Class M1 (OIML R 111-1, table 1: 50 mg in 1 kg)."""
+
+GAUGE_BLOCKS = DataSheet((-17.5e-3, 17.5e-3), SensorErrors(), offset_tolerance=2e-6)
+"""The true place of the magnet where gauge blocks state one, in m.
+
+Blocks of grade 2 (ISO 3650) are true to 0.5 µm; the surface that they stand on is set to within 2 µm.
+"""
+
 LOAD_CELL = DataSheet((0.0, 20.0), SensorErrors(nonlinearity=2e-4), gain_tolerance=1.6e-4, offset_tolerance=1.7e-3)
 """In N.
 

@@ -59,6 +59,15 @@ def the_closed_loop_reaches_its_targets(campaign):
     assert campaign["control"]["force"]["closed_loop_inverse"]["rms"] <= 0.05
 
 
+def calibrated_sensors_make_it_accurate(campaign):
+    for session in LENGTHS:
+        before, after = campaign["control"][session]["closed_loop_inverse"], campaign["calibrated"][session]
+        assert after["true_rms"] <= 0.02 < before["true_rms"], session
+    assert campaign["calibrated"]["force"]["true_rms"] <= 0.05
+    assert 0 < campaign["calibration"]["length"] < 0.01
+    assert 0 < campaign["calibration"]["force"] < 0.01
+
+
 def each_loop_is_better_than_the_one_before(campaign):
     for session in (*LENGTHS, "force"):
         errors = [campaign["control"][session][controller]["rms"] for controller in CONTROLLERS]
@@ -112,7 +121,8 @@ def the_saved_model_is_that_of_the_tables(campaign):
 
 def everything_that_it_says_is_there(campaign):
     assert {Path(path).stem for path in campaign["figures"]} == set(FIGURES)
-    assert len(campaign["recordings"]) == 16
+    # Nine of them with calibrated sensors, the calibrations among them.
+    assert len(campaign["recordings"]) == 16 + 9
 
 
 @pytest.mark.slow
@@ -129,6 +139,7 @@ def test_campaign(reproduce, seed, is_short):
     the_models_come_in_the_paper_s_order(campaign)
     every_fit_is_certified(campaign)
     the_closed_loop_reaches_its_targets(campaign)
+    calibrated_sensors_make_it_accurate(campaign)
     each_loop_is_better_than_the_one_before(campaign)
     every_run_is_complete_and_says_what_the_tables_say(
         campaign, *((SHORT_SAMPLES, 10) if is_short else (SAMPLES, 40))

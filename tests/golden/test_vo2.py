@@ -87,6 +87,15 @@ def a_slow_sine_is_followed(campaign):
         )
 
 
+def a_calibrated_detector_makes_it_accurate(campaign):
+    for controller, allowed in (("closed_loop_inverse", 8), ("latched", 2)):
+        before, after = campaign["tracking"][controller], campaign["calibrated"][controller]
+        # Nonlinearity, gain and offset of the detector.
+        assert before["true_rms"] > 7
+        assert after["true_rms"] <= allowed
+    assert 0.2 < campaign["calibration"]["accuracy"] < 0.8
+
+
 def everything_that_it_says_is_there(campaign):
     folder = Path(campaign["folder"])
     assert all(Path(path).stat().st_size > 1000 for path in campaign["figures"] + campaign["recordings"])
@@ -126,6 +135,7 @@ def test_campaign(reproduce, seed, is_short):
     closed_loop_beats_the_open_one_within_seven_seconds_a_target(campaign, seed)
     latched_is_an_order_of_magnitude_better(campaign)
     a_slow_sine_is_followed(campaign)
+    a_calibrated_detector_makes_it_accurate(campaign)
     everything_that_it_says_is_there(campaign)
 
 

@@ -11,11 +11,13 @@ from bench.base import DataError, DeviceError
 from bench.rig import Calibration, calibrate
 from bench.rig.calibration import Calibrated, read_calibration
 
-DAY = date(2026, 3, 1)
-TEXTS = {"signal": "spot_position", "unit": "m", "named": "interferometer", "day": DAY}
+TEXTS = {
+    "signal": "spot_position", "unit": "m", "serial_number": "7", "date": date(2026, 3, 1), "interval_days": 365,
+    "reference": "interferometer", "reference_unit": "m", "reference_uncertainty": 1e-9,
+}  # fmt: skip
 RECORD = {
-    "signal": "spot_position", "unit": "m", "reference": "interferometer", "calibrated": "2026-03-01", "low": -1e-4,
-    "high": 1e-4, "coefficients": [1e-6, 0.5e-6], "uncertainty": 1e-9, "repeatability": 1e-8, "readings": 100,
+    **TEXTS, "date": "2026-03-01", "low": -1e-4, "high": 1e-4, "coefficients": [1e-6, 0.5e-6],
+    "covariance": [[0, 0], [0, 0]], "degrees_of_freedom": 98, "repeatability": 1e-8, "readings": 100,
 }  # fmt: skip
 
 
@@ -35,7 +37,7 @@ def test_it_finds_gain_offset_and_nonlinearity():
     times, readings, truth = swept()
     found = calibrate(readings, truth, times=times, **TEXTS)
     places = np.linspace(-0.98, 0.98, 201)
-    errors = sensed(places) + found.correction(sensed(places)) - places
+    errors = found.value(sensed(places)) - places
     # Before: up to 3 in a thousand. The stated accuracy is that of the errors that are left.
     assert np.sqrt(np.mean(errors**2)) < 1e-5
     assert np.sqrt(np.mean(errors**2)) < 3 * found.uncertainty < 5e-5
@@ -46,7 +48,7 @@ def test_it_finds_gain_offset_and_nonlinearity():
 
 def test_accuracy_includes_that_of_the_reference_and_repeatability_does_not():
     times, readings, truth = swept()
-    found = calibrate(readings, truth, times=times, reference_uncertainty=1e-3, **TEXTS)
+    found = calibrate(readings, truth, times=times, **TEXTS | {"reference_uncertainty": 1e-3})
     assert found.uncertainty == pytest.approx(1e-3, rel=1e-3)
     assert found.repeatability == pytest.approx(1e-4, rel=0.05)
 
@@ -55,20 +57,55 @@ def test_it_finds_how_late_the_sensor_is():
     times, readings, truth = swept(late=0.3)
     found = calibrate(readings, truth, times=times, **TEXTS)
     assert found.lateness == pytest.approx(0.3, abs=0.01)
-    assert abs(sensed(0.0) + found.correction(sensed(0.0))) < 2e-5
+    assert abs(found.value(sensed(0.0))) < 2e-5
 
 
 def test_few_weights_give_a_line():
     weights = np.array([0.98, 2.94, 4.90, 6.86, 8.82])
     noise = np.array([1, -1, 1, 0, -1]) * 1e-3
-    found = calibrate(1.01 * weights + 0.05 + noise, weights, signal="cell_force", unit="N", named="weights", day=DAY)
+    found = calibrate(1.01 * weights + 0.05 + noise, weights, **TEXTS)
     assert len(found.coefficients) == 2
-    assert 1.01 * 5.0 + 0.05 + found.correction(1.01 * 5.0 + 0.05) == pytest.approx(5.0, abs=2e-3)
+    assert found.value(1.01 * 5.0 + 0.05) == pytest.approx(5.0, abs=2e-3)
+
+
+def angles_read(seed=0):
+    """Ten readings of 0.01 mm at each of 13 angles, which are set to 0.005°."""
+    rng = np.random.default_rng(seed)
+    stated = np.arange(-3.0, 36.0, 3.0)
+    true = stated + rng.uniform(-5e-3, 5e-3, stated.size)
+    readings = 2e-6 * true + 1e-6 * np.sin(0.1 * true) + 1e-7
+    return (readings[:, None] + 1e-8 * rng.standard_normal((13, 10))).ravel(), np.repeat(stated, 10)
+
+
+def test_a_reference_in_another_unit_gives_values_in_that():
+    readings, angles = angles_read()
+    found = calibrate(readings, angles, **TEXTS | {"reference_unit": "°"})
+    assert np.abs(found.value(readings) - angles).max() < 0.03
+    inner = readings[10:-10]
+    steps = found.value(inner + 1e-9) - found.value(inner - 1e-9)
+    assert found.sensitivity(inner) == pytest.approx(steps / 2e-9, rel=1e-5)
+    # Of one reading, not of the setting of an angle.
+    assert found.repeatability == pytest.approx(1e-8 / 2e-6, rel=0.2)
+
+
+def test_the_covariance_is_that_of_calibrations_made_again():
+    """The settings of the angles are what differs: ten readings at one place are no ten places."""
+    places = np.linspace(0.0, 6e-5, 7)
+    made = [calibrate(*angles_read(seed), **TEXTS | {"reference_unit": "°"}) for seed in range(200)]
+    stated = np.sqrt(np.mean([each.coefficient_uncertainty(places) ** 2 for each in made], axis=0))
+    spread = np.std([each.value(places) for each in made], axis=0)
+    assert stated == pytest.approx(spread, rel=0.25)
+
+
+def test_the_scale_of_a_reference_counts_with_the_value():
+    found = Calibration.model_validate(RECORD | {"reference_gain_uncertainty": 0.005})
+    # 0.5 % of 0.1 mm at the ends, RMS over the range.
+    assert found.uncertainty == pytest.approx(0.005 * 1e-4 / np.sqrt(3.0), rel=0.1)
 
 
 @cases("readings", [[1.0, 2.0], [1.0, 1.0, 1.0], [1.0, np.nan, 2.0]])
 def test_too_few_readings_are_refused(readings):
-    with pytest.raises(DataError, match="at least 3 readings that differ"):
+    with pytest.raises(DataError, match="readings at 3 values of the reference at least"):
         calibrate(readings, readings, **TEXTS)
 
 
@@ -82,8 +119,13 @@ def test_a_file_keeps_it(tmp_path):
     ("change", "words"),
     [
         ({"low": 1.0}, "expected low < high"),
-        ({"version": 2}, "version"),
+        ({"version": 1}, "version"),
         ({"coefficients": []}, "coefficients"),
+        ({"covariance": [[0.0]]}, "covariance: expected a symmetric matrix of 2 by 2"),
+        ({"covariance": [[-1.0, 0.0], [0.0, 1.0]]}, "no variance below 0"),
+        ({"reference_uncertainty": -1e-9}, "reference_uncertainty = -1e-09"),
+        ({"reference_uncertainty": 0.0}, "reference_uncertainty = 0"),
+        ({"interval_days": 0}, "interval_days"),
         ({"extra": 1}, "extra"),
     ],
 )
@@ -105,9 +147,9 @@ def bound(**units):
 def test_the_derived_signal_is_the_corrected_reading():
     derived = bound()
     assert derived.signal.unit == "m"
-    assert derived.signal.accuracy == 1e-9
+    assert derived.signal.accuracy == pytest.approx(1e-9)
     for value in (-1e-4, -3e-5, 0.0, 9e-5):
-        expected = value + Calibration.model_validate(RECORD).correction(value)
+        expected = Calibration.model_validate(RECORD).value(value)
         assert derived.compute({"spot_position": value}) == pytest.approx(expected, abs=1e-18)
     # A little beyond, the correction at the end holds.
     assert derived.compute({"spot_position": 1.01e-4}) == pytest.approx(1.01e-4 + 1.5e-6)

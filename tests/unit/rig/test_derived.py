@@ -218,7 +218,7 @@ class TestOnARig:
                 "half.expression: 'tec_temprature': there is no such signal",
             ),
             ("tec_temperature", "half", "derived.half.expression: 'half': there is no such signal"),
-            ("tec_temperature", "total", "or it is derived further down; there are: tec_setpoint"),
+            ("tec_temperature", "total", "or it comes from this one; there are: tec_setpoint"),
             ('unit = "K"', 'unit = "V"', "derived.half.expression = '0.5 * tec_temperature' is in K, not in unit"),
             ('unit = "K"', 'unit = "V"\nunits = 3', "derived.half.units: there is no such key; allowed are: kind, "),
             ('unit = "K"', "", "derived.half.unit: is missing (unit of the result; 1 for a plain number)"),

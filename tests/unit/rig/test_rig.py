@@ -329,7 +329,7 @@ class TestDerived:
             (
                 DERIVED.replace("spot_position", "later")
                 + DERIVED.replace(".curvature", ".later").replace("spot_position", "probe_temperature"),
-                ("derived.curvature.source = 'later'",),
+                ("derived.later.source = 'probe_temperature'",),
             ),
             (
                 DERIVED.replace("spot_position", "probe_temperature"),

@@ -272,6 +272,28 @@ class TestCalibrations:
         # As the record of a run has it.
         assert json.loads(json.dumps(file.content))["devices"]["psd"]["calibration_due"] == "2027-03-01"
 
+    def test_of_a_calibrated_signal_is_due_after_its_interval(self, tmp_path):
+        record = {
+            "signal": "psd_position", "unit": "m", "serial_number": "", "date": "2026-03-01", "interval_days": 90,
+            "reference": "goniometer 12", "reference_unit": "°", "reference_uncertainty": 0.01, "low": -1, "high": 1,
+            "coefficients": [0], "covariance": [[0]], "degrees_of_freedom": 8, "repeatability": 0.01, "readings": 9,
+        }  # fmt: skip
+        (tmp_path / "psd.json").write_text(json.dumps(record))
+        path = tmp_path / "mine.toml"
+        path.write_text(
+            'extends = "vo2"\n[derived.tip_angle]\nkind = "calibrated"\nsource = "psd_position"\n'
+            'calibration = "psd.json"\n[derived.curvature]\nsource = "tip_angle"\n'
+        )
+        file = load_rig(str(path))
+        # It comes before what comes from it.
+        assert list(file.derived) == ["tip_angle", "curvature"]
+        assert overdue_calibrations(file, date(2026, 5, 29)) == ()
+        (warning,) = overdue_calibrations(file, date(2026, 5, 30))
+        assert (
+            "derived.tip_angle: the calibration of psd_position by goniometer 12 of 2026-03-01 holds for 90"
+            in warning
+        )
+
     @cases(
         ("lines", "message"),
         [

@@ -6,7 +6,7 @@ import math
 import shlex
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from datetime import date, datetime
+from datetime import date, datetime, timedelta
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -27,6 +27,8 @@ Floats = npt.NDArray[np.float64]
 _MOST_EVENTS = 1000
 """Events that a page lists; a record of a long run may have more."""
 _IDENTITY_OF_LINES = ("port", "baudrate", "timeout", "address")
+_NOT_SHOWN = ("format", "version", "date")
+"""Keys of a calibration that say nothing more."""
 
 
 class Phase(NamedTuple):
@@ -103,6 +105,10 @@ def devices_section(meta: Mapping[str, Any]) -> PageSection:
     for name, entry in meta.get("calibration", {}).items():
         own = {key: value for key, value in entry.items() if value is not None}
         calibrated, due = own.pop("calibrated", ""), own.pop("calibration_due", "")
+        if isinstance(applied := own.pop("calibration", None), dict):
+            calibrated = applied["date"]
+            due = (date.fromisoformat(calibrated) + timedelta(days=applied["interval_days"])).isoformat()
+            own |= {key: value for key, value in applied.items() if key not in _NOT_SHOWN}
         if due and day is not None and date.fromisoformat(due) <= day:
             due = f"{due}: overdue"
         low_high = limits.get(name)
