@@ -262,7 +262,7 @@ class Latched(Correcting):
                 break
             setpoint = self._ahead(target - direction * p.approach - self._estimator.value)
             if setpoint is None:
-                return reading
+                break
             reading = yield from self._arrive(setpoint, self._arrival)
             self._estimator.update(reading.output - self._modelled())
 
@@ -270,12 +270,12 @@ class Latched(Correcting):
         for _ in range(round(p.approach / (p.steepest * p.creep_least) / self._poll)):
             if left(reading) <= p.creep_until:
                 break
-            ahead = self._ahead(self._modelled() + direction * left(reading))
-            if ahead is None:
-                return reading
             rate = min(max(p.creep_gain * (left(reading) - p.creep_offset), p.creep_least), p.creep_most)
             # The model may have the target further ahead, as after a turn: it is half way there in half of the rest.
-            rate = max(rate, 2.0 * abs(ahead - reading.input) / p.rest)
+            # Or nowhere, as near saturation, where the output is more than the model's: the readings lead there.
+            ahead = self._ahead(self._modelled() + direction * left(reading))
+            if ahead is not None:
+                rate = max(rate, 2.0 * abs(ahead - reading.input) / p.rest)
             reading = yield self._command(self._setpoint + direction * rate * self._poll, self._poll)
         if abs(left(reading) - p.creep_offset) > 2.0 * p.reserve:
             return reading

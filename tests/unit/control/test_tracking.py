@@ -91,6 +91,21 @@ class IdealActuator:
         return commands
 
 
+class ColderActuator(IdealActuator):
+    """The same, whose input is above that of the specimen."""
+
+    def __init__(self, model, colder):
+        super().__init__(model)
+        self.colder = colder
+
+    def read(self):
+        measured, output = super().read()
+        return measured + self.colder, output
+
+    def carry_out(self, command):
+        super().carry_out(replace(command, setpoint=command.setpoint - self.colder))
+
+
 class TestGoals:
     """What each controller reaches on a plant that is not of the model's structure."""
 
@@ -483,6 +498,17 @@ class TestLatched:
         for wander in (0.05, -0.05):
             wandered = model.value(actuator.state.step(actuator.state.input + wander))
             assert wandered + actuator.disturbance == pytest.approx(target, abs=0.05 + 1.1 * 0.05 * slope)
+
+    @pytest.mark.parametrize("colder", [0.1, 0.2, 0.3])
+    def test_locks_near_saturation_where_the_model_is_saturated_before_the_target(self, models, colder):
+        """A film that is colder than the plate has the target ahead where the model has none."""
+        model = with_wide_loops(models.film)
+        actuator = ColderActuator(model, colder)
+        controller = Latched(PreisachInverse(model), LatchParameters.of(model, 8.0))
+        target = model.evaluate((model.levels[0], model.levels[-1])).max() - 10.0
+        actuator.reach(controller, target)
+        assert controller.locked
+        assert actuator.read()[1] == pytest.approx(target, abs=0.5)
 
     def test_an_actuator_that_does_not_lock_ends_in_the_fall_back(self, models):
         """The model's narrowest loops let go at once: the slope turns, the clamp holds, the tries end."""
