@@ -5,13 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date
 from functools import partial
 from itertools import pairwise
 
 from bench.base import BenchError, Clock, DeviceConnectionError, DeviceError, wall_time
-from bench.devices import Actuator, CheckFinding, Device, DeviceDescription, DriverSettings, Limits, Status
+from bench.devices import Actuator, CheckFinding, Device, DeviceDescription, Limits, Status
+from bench.rig.calibration import Calibrated
 from bench.rig.file import RigFile
 from bench.rig.interlocks.config import Interlock
 from bench.rig.maintenance.opening import Workplace
@@ -78,12 +79,22 @@ def check_up(place: Workplace, exercise: bool, keep_on: Callable[[], None]) -> l
         One a device in the order of the rig file, and one of the rig as a whole.
     """
     today = wall_time().astimezone().date()
-    found = {entry.name: _calibration(entry.settings, today) for entry in place.entries}
+    found = {
+        entry.name: _calibration(
+            entry.settings.calibrated, entry.settings.calibration_due, today, "set calibrated and calibration_due"
+        )
+        for entry in place.entries
+    }
     identities: dict[str, str] = {}
     failed: set[str] = set()
     devices: dict[str, Device] = {}
     unsafe: set[str] = set()
-    whole: list[CheckFinding] = []
+    whole = [
+        replace(each, subject=f"calibration of {name}")
+        for name, derived in place.file.derived.items()
+        if isinstance(derived, Calibrated)
+        for each in _calibration(derived.calibration.date, derived.calibration.due, today, "name the new file")
+    ]
 
     def of(name: str, check: Callable[[], Iterable[CheckFinding]]) -> None:
         keep_on()
@@ -112,7 +123,7 @@ def check_up(place: Workplace, exercise: bool, keep_on: Callable[[], None]) -> l
             if isinstance(device, Actuator):
                 of(name, partial(_limits, device, place.file.roles))
                 of(name, partial(_watchdog, device, place.file))
-        whole = _times(place.file, devices, ticks)
+        whole += _times(place.file, devices, ticks)
         if exercise:
             for name, role in _exercised(place.file.roles, devices).items():
                 if name not in failed:
@@ -135,17 +146,14 @@ def check_up(place: Workplace, exercise: bool, keep_on: Callable[[], None]) -> l
     return [*checks, DeviceCheck("", "", tuple(whole))]
 
 
-def _calibration(settings: DriverSettings, today: date) -> list[CheckFinding]:
-    """Say when a device was calibrated, and whether it is due again."""
-    day, due = settings.calibrated, settings.calibration_due
+def _calibration(day: date | None, due: date | None, today: date, afterwards: str) -> list[CheckFinding]:
+    """Say when something was calibrated, whether that is due again, and what to do afterwards."""
     parts = [*([f"of {day}"] if day else []), *([f"due on {due}"] if due else [])]
     if not parts:
         return []
     if due is not None and due <= today:
         parts.append(f"{(today - due).days} days ago")
-        return [
-            CheckFinding("calibration", ", ".join(parts), "calibrate it, then set calibrated and calibration_due")
-        ]
+        return [CheckFinding("calibration", ", ".join(parts), f"calibrate it, then {afterwards}")]
     return [CheckFinding("calibration", ", ".join(parts))]
 
 
