@@ -1,7 +1,7 @@
 """Calibration of sensors by values that an operator sets up: weights, gauge blocks, angles of a mirror, a micrometer.
 
-`bench rig calibrate` makes a calibration of such a run. Where an instrument reads the values, such as an autocollimator
-on the mirror, its signal is in the record as well, and takes the place of what the operator set up.
+`bench rig calibrate` makes a calibration of such a run. Where an instrument reads the values, as an autocollimator
+does, its signal is in the record as well, and takes the place of what the operator set up.
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ COMMANDS = {
     "invert": ["model.json", "targets.csv", "--column", "y", "--out", "new.csv"],
     "model design": ["--levels", "5"],
     "model test": ["model.json", "--data", "m.csv", *COLUMNS],
-    "rig calibrate": ["run", "--sensor", "psd_position"],
+    "rig calibrate": ["run", "--sensor", "psd_position", "--uncertainty", "1e-9", "--interval", "365"],
     "report": ["missing"],
     "runs export": ["run", "--format", "csv", "--out", "new"],
     "runs import": ["m.csv", *COLUMNS, "--out", "new"],

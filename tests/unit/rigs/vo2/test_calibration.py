@@ -47,7 +47,9 @@ def calibrated(bench, tmp_path):
         )  # fmt: skip
         assert (code, err) == (0, "")
         run = json.loads((tmp_path / "run.json").read_text())["folder"]
-        code, _, err = bench("rig", "calibrate", run, "--sensor", "psd_position", *options, "--out", tmp_path / "psd.json")
+        code, _, err = bench(
+            "rig", "calibrate", run, "--sensor", "psd_position", *options, "--out", tmp_path / "psd.json"
+        )
         assert (code, err) == (0, "")
         return Calibration.model_validate_json((tmp_path / "psd.json").read_text())
 
