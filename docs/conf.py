@@ -34,7 +34,7 @@ numpydoc_show_class_members = False
 numpydoc_xref_param_type = False
 
 html_theme = "pydata_sphinx_theme"
-html_title = project
+html_title = "actuator-bench"
 html_show_sourcelink = False
 html_copy_source = False
 html_theme_options = {"show_nav_level": 1, "navigation_depth": 2, "secondary_sidebar_items": ["page-toc"]}

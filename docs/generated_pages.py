@@ -149,7 +149,7 @@ def rig_file() -> Iterator[str]:
 
 def campaign_file() -> Iterator[str]:
     """Yield the lines of the page about campaign files."""
-    yield "# Campaign files\n"
+    yield "# Keys of campaign files\n"
     yield "The tables of a file of `bench study FILE.toml`; [campaigns](../campaign.md) has an example. Paths are"
     yield "relative to the file.\n"
     for table in (RunsTable, ModelsTable, ComparisonsTable, StudiesTable):
