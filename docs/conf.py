@@ -11,7 +11,7 @@ import generated_pages
 from pygments.lexers import TextLexer
 from sphinx.application import Sphinx
 
-project = "A lab bench for smart-material actuators"
+project = "actuator-bench"
 author = "the contributors"
 release = version = version_of("actuator-bench")
 

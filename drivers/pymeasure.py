@@ -32,7 +32,7 @@ from typing import Annotated, Any, ClassVar
 
 from pydantic import AfterValidator, Field, ValidationInfo, field_validator
 
-from bench.base import Clock, ConfigurationError, DeviceConnectionError, DeviceError, registry
+from bench.base import Clock, ConfigurationError, DeviceConnectionError, DeviceError, how_to_install, registry
 from bench.devices import (
     ANY_TEXT,
     DriverSettings,
@@ -109,7 +109,7 @@ def instrument_class(reference: str) -> Any:  # noqa: ANN401 - a class of the li
         If PyMeasure is not installed, the class may not be imported, there is none, or it is no instrument.
     """
     if importlib.util.find_spec("pymeasure") is None:
-        raise ValueError("needs PyMeasure; install it by: pip install 'actuator-bench[pymeasure]'")
+        raise ValueError(f"needs PyMeasure; install it by: {how_to_install('pymeasure')}")
     from pymeasure.instruments import Instrument
 
     module, _, name = reference.partition(":")

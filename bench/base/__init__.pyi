@@ -64,6 +64,7 @@ from .extras import (
     Extra as Extra,
     MissingExtraError as MissingExtraError,
     check_extra as check_extra,
+    how_to_install as how_to_install,
     needed_for as needed_for,
 )
 from .interrupts import (

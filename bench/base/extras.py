@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import importlib.metadata
 import importlib.util
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Literal
+from urllib.parse import urlsplit
+from urllib.request import url2pathname
 
 from bench.base.errors import ConfigurationError
 
@@ -14,6 +19,17 @@ Extra = Literal["cluster", "dashboard", "files", "panel", "report"]
 
 class MissingExtraError(ConfigurationError):
     """The libraries of an extra are not installed."""
+
+
+def how_to_install(extra: str) -> str:
+    """Return the command that installs an extra, from where the bench itself was installed.
+
+    That is a checkout or a wheel on this computer (PEP 610, `direct_url.json`), else an index.
+    """
+    recorded = importlib.metadata.distribution("actuator-bench").read_text("direct_url.json") or "{}"
+    source = urlsplit(json.loads(recorded).get("url", ""))
+    place = Path(url2pathname(source.path))
+    return f"pip install '{place if source.scheme == 'file' and place.exists() else 'actuator-bench'}[{extra}]'"
 
 
 @contextmanager
@@ -26,7 +42,7 @@ def needed_for(purpose: str, extra: Extra) -> Iterator[None]:
         yield
     except ImportError as error:
         raise MissingExtraError(
-            f"{purpose} needs a library that is not installed ({error}): pip install 'actuator-bench[{extra}]'"
+            f"{purpose} needs a library that is not installed ({error}): {how_to_install(extra)}"
         ) from error
 
 

@@ -8,7 +8,7 @@ from typing import Annotated, Any, ClassVar, Literal, Protocol, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from bench.base import DeviceConnectionError
+from bench.base import DeviceConnectionError, how_to_install
 from drivers.serial_line import RESENDS, SerialSettings, forget_received, lost_line, open_port, settle_line
 
 TCP = "tcp://"
@@ -29,7 +29,7 @@ def _port(port: str) -> str:
         if not (host and number.isdigit() and 0 < int(number) < 65536):
             raise ValueError("expected tcp://HOST:PORT, such as tcp://192.0.2.5:5025")
     if port.startswith(VISA) and importlib.util.find_spec("pyvisa") is None:
-        raise ValueError("needs pyvisa; install it by: pip install 'actuator-bench[visa]'")
+        raise ValueError(f"needs pyvisa; install it by: {how_to_install('visa')}")
     return port
 
 

@@ -13,8 +13,10 @@ from bench.record import Record
 SCRIPT = SUPPORT / "run_without_extras.py"
 RUN = ("run", "creep", "--rig", "vo2", "--clock", "virtual", "--set", "duration=4", "--set", "settling=2")
 IDENTIFY = ("--input", "tec_temperature", "--output", "curvature", "--model", "polynomial", "--degree", "3")
-DASHBOARD, REPORT = "pip install 'actuator-bench[dashboard]'", "pip install 'actuator-bench[report]'"
-FILES = "pip install 'actuator-bench[files]'"
+# The tests run in a checkout, and there is where the extras are to be installed from.
+DASHBOARD, REPORT, FILES = (
+    f"pip install '{SUPPORT.parents[1]}[{extra}]'" for extra in ("dashboard", "report", "files")
+)
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,15 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.analysis.tables.reading.text import WHAT_IS_READ, reading_errors
-from bench.base import ConfigurationError, DataError, Extra, MissingExtraError, check_extra, needed_for
+from bench.base import (
+    ConfigurationError,
+    DataError,
+    Extra,
+    MissingExtraError,
+    check_extra,
+    how_to_install,
+    needed_for,
+)
 
 HDF5 = b"\x89HDF"
 
@@ -35,7 +43,7 @@ _KINDS: dict[str, tuple[str, str, Extra]] = {
 }
 """By kind its words, the library that reads it, and the extra of that."""
 
-_LEFT_OUT = "tables and strings of MATLAB left out, which pip install 'actuator-bench[files]' reads"
+_LEFT_OUT = "tables and strings of MATLAB left out"
 
 
 def load_contents(path: Path, kind: str) -> tuple[Any, tuple[str, ...]]:
@@ -87,7 +95,11 @@ def _load(kind: str, path: Path) -> tuple[Any, tuple[str, ...]]:
         return DataError(f"{path} cannot be read as {_KINDS[kind][0]}: {error}; {WHAT_IS_READ}"), ()
     if kind == "spreadsheet":
         return found, ()
-    notes = (_LEFT_OUT,) if isinstance(found, dict) and found.pop(_LEFT_OUT, None) else ()
+    notes = (
+        (f"{_LEFT_OUT}, which {how_to_install('files')} reads",)
+        if isinstance(found, dict) and found.pop(_LEFT_OUT, None)
+        else ()
+    )
     return _plain(found), notes
 
 
