@@ -79,7 +79,7 @@ if __name__ == "__main__":
     (study,) = sys.argv[1:]
     with TemporaryDirectory() as folder:
         file = Path(folder) / "result.json"
-        command = ["reproduce", study, "--seed", RECORDED_SEED, *options_of(study), "--out", folder, "--json", file]
+        command = ["study", study, "--seed", RECORDED_SEED, *options_of(study), "--out", folder, "--json", file]
         try:
             main([str(argument) for argument in command])
         except SystemExit as stopped:
