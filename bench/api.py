@@ -214,7 +214,7 @@ def identify(
     )
     names = ColumnNames(input, output, options.pop("time_column", None), options.pop("weights_column", None))
     data = read_dataset([folder], names, reading, at_least=FEWEST_ROWS)
-    return identify_model(data, model, FitOptions.of(options))
+    return identify_model(data, model, FitOptions.of(options)).with_uncertainty()
 
 
 def predict(

@@ -173,3 +173,16 @@ from .transients.transient_dynamics import (
     noise_of as noise_of,
     read_transients as read_transients,
 )
+from .uncertain_models import (
+    ModelUncertainty as ModelUncertainty,
+    identified_uncertainty as identified_uncertainty,
+    quantities_of as quantities_of,
+    setpoint_uncertainty as setpoint_uncertainty,
+)
+from .uncertain_results import (
+    ControlUncertainty as ControlUncertainty,
+    RunUncertainty as RunUncertainty,
+    control_uncertainties as control_uncertainties,
+    signal_budgets as signal_budgets,
+    uncertain_signals as uncertain_signals,
+)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from bench.analysis.transients.transient_dynamics import (
     identify_transients,
     read_transients,
 )
+from bench.analysis.uncertain_models import PROVENANCE, ModelUncertainty, identified_uncertainty
 from bench.base import ConfigurationError
 from bench.identification import (
     ONE_RUN,
@@ -54,6 +55,7 @@ from bench.models import (
     identifiable_models,
     timed_models,
 )
+from bench.record import Record
 
 Floats = npt.NDArray[np.float64]
 
@@ -141,6 +143,10 @@ class IdentifiedFile:
     fitted : int or None
         Number of rows that were fitted, to which the errors of the identification belong; None if it is all that
         were not skipped.
+    refit : callable or None
+        Fits other inputs and outputs of the same rows in the same way; None of a model with time.
+    uncertainty : ModelUncertainty or None
+        What is known of the model, after `with_uncertainty`.
     """
 
     file: ModelFile
@@ -153,6 +159,8 @@ class IdentifiedFile:
     resolution: Resolution | None = None
     trials: CrossValidation | None = None
     fitted: int | None = None
+    refit: Callable[[Floats, Floats], Operator[Any]] | None = None
+    uncertainty: ModelUncertainty | None = None
 
     def __repr__(self) -> str:
         """Return what a person should know of the fit."""
@@ -179,6 +187,30 @@ class IdentifiedFile:
         found = self.identification
         measured = self.outputs[found.skip :]
         return measure_errors(measured, measured - found.residuals[found.skip :])
+
+    def with_uncertainty(self) -> IdentifiedFile:
+        """Return the model with the uncertainty of its quantities, which its file keeps as well.
+
+        It is unchanged if it has time, or was not identified from one run whose rig file states the uncertainty of
+        the output.
+        """
+        data = self.data
+        if self.refit is None or len(data.paths) != 1 or not is_run(data.paths[0]) or data.output is None:
+            return self
+        with Record(data.paths[0]) as record:
+            found = identified_uncertainty(
+                record,
+                (data.input.name, data.output.name),
+                self.inputs,
+                self.outputs,
+                self.identification.residuals,
+                self.file.operator,
+                self.refit,
+            )
+        if found is None:
+            return self
+        provenance = {**self.file.provenance, PROVENANCE: found.to_json()}
+        return replace(self, file=replace(self.file, provenance=provenance), uncertainty=found)
 
     @cached_property
     def band(self) -> BandedPrediction | None:
@@ -225,6 +257,7 @@ class IdentifiedFile:
             "validity": self.file.valid.to_json(),
             **({"band": {**band.to_json(), "held_out": band.band.held_out}} if (band := self.band) else {}),
             **({"shape": shape} if (shape := _shape(operator)) else {}),
+            **({} if self.uncertainty is None else {"uncertainty": self.uncertainty.to_json()}),
         }
 
 
@@ -383,7 +416,25 @@ def identify_model(
         resolution,
         trials,
         None if fitted.all() else int(counted.sum()),
+        None if times is not None else partial(_refit, model, data.weights, options.skip, penalties, own),
     )
+
+
+def _refit(
+    model: str,
+    weights: Floats | None,
+    skip: int,
+    penalties: Regularization,
+    own: Mapping[str, Any],
+    inputs: Floats,
+    outputs: Floats,
+) -> Operator[Any]:
+    """Return the model of other inputs and outputs, shape (N,), fitted with the same options and penalties."""
+    smoothing, ridge = penalties.smoothing, penalties.ridge
+    found: Identification[Any] = identify(
+        model, inputs, outputs, weights=weights, skip=skip, smoothing=smoothing, ridge=ridge, **own
+    )
+    return found.model  # type: ignore[no-any-return]
 
 
 def _check_model(model: str, data: Dataset, options: FitOptions, own: Mapping[str, Any]) -> None:
@@ -506,6 +557,7 @@ def certificate_lines(identified: IdentifiedFile) -> Sequence[tuple[str, str]]:
         ("valid for inputs", identified.file.valid.text(operator.input_unit)),
         ("excitation", identified.coverage.summary() if identified.coverage else "no plane to be swept"),
         *[(name, test.text) for name, test in tests if test.agrees],
+        *([] if identified.uncertainty is None else identified.uncertainty.lines()),
     )
 
 

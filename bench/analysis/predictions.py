@@ -11,6 +11,7 @@ import numpy.typing as npt
 from bench.analysis.band_columns import BandedPrediction
 from bench.analysis.tables.data import Quantity
 from bench.analysis.tables.dataset import Dataset
+from bench.analysis.uncertain_models import predicted_uncertainty
 from bench.base import DataError, header_with_unit
 from bench.identification import Errors, ModelFile, measure_errors
 
@@ -57,6 +58,8 @@ class Predictions:
         First rows, which drive the memory but count in no error.
     bands : mapping of str to BandedPrediction
         Prediction bands of those models that have one.
+    uncertainties : mapping of str to ndarray
+        Standard uncertainties of the predicted outputs, shape (N,) each, of the models whose file has them.
     """
 
     input: Quantity
@@ -66,6 +69,7 @@ class Predictions:
     time: Quantity | None = None
     skip: int = 0
     bands: Mapping[str, BandedPrediction] = field(default_factory=dict)
+    uncertainties: Mapping[str, Floats] = field(default_factory=dict)
 
     @classmethod
     def of(
@@ -78,6 +82,7 @@ class Predictions:
     ) -> Predictions:
         """Return what models give for a dataset; units that its file does not say are those of `model`."""
         unit = model.response.output_unit
+        uncertain = {name: predicted_uncertainty(model, values) for name, values in predicted.items()}
         return cls(
             replace(data.input, unit=data.input.unit or model.response.input_unit),
             unit,
@@ -86,6 +91,7 @@ class Predictions:
             None if data.times is None else Quantity("time", "s", data.times),
             skip=skip,
             bands={name: band for name, band in bands.items() if band is not None},
+            uncertainties={name: each for name, each in uncertain.items() if each is not None},
         )
 
     def __post_init__(self) -> None:
@@ -107,7 +113,7 @@ class Predictions:
         return {name: measure_errors(measured, values[self.skip :]) for name, values in self.predicted.items()}
 
     def table(self) -> list[tuple[str, Floats]]:
-        """Return the columns of a file with their heads: time, input, measured; predicted and residual; bands.
+        """Return the columns of a file with their heads: time, input, measured; what belongs to each model.
 
         The model is named in the heads if there are several.
         """
@@ -118,6 +124,8 @@ class Predictions:
         for name, values in self.predicted.items():
             prefix = f"{name} " if len(self.predicted) > 1 else ""
             columns.append((header_with_unit(f"{prefix}predicted", self.unit), values))
+            if name in self.uncertainties:
+                columns.append((header_with_unit(f"{prefix}u_predicted", self.unit), self.uncertainties[name]))
             if name in residuals:
                 columns.append((header_with_unit(f"{prefix}residual", self.unit), residuals[name]))
         for name, band in self.bands.items():

@@ -112,16 +112,22 @@ def target_results(record: Record, output: str) -> TargetResults | None:
     output : str
         The controlled signal.
     """
-    names = [signal.name for signal in record.signals]
-    found: list[tuple[float, float, list[float]]] = []
-    for step in record.step_records():
-        values = dict(zip(names, step.values, strict=True))
-        if step.label == REACH and "reference" in values:
-            found.append((values["reference"], step.finished - step.started, []))
-        elif step.label == READING and found:
-            found[-1][2].append(values[output])
-    complete = [(target, float(np.mean(readings)), seconds) for target, seconds, readings in found if readings]
+    column = [signal.name for signal in record.signals].index(output)
+    found = targets_visited(record)
+    complete = [(target, float(np.mean(readings[:, column])), seconds) for target, seconds, readings in found]
     return TargetResults(*np.array(complete).T.copy()) if complete else None
+
+
+def targets_visited(record: Record) -> list[tuple[float, float, Floats]]:
+    """Return the targets of a run: target, time of the controller in s, and readings, shape (n, signals), of each."""
+    names = [signal.name for signal in record.signals]
+    found: list[tuple[float, float, list[Sequence[float]]]] = []
+    for step in record.step_records():
+        if step.label == REACH and "reference" in names:
+            found.append((step.values[names.index("reference")], step.finished - step.started, []))
+        elif step.label == READING and found:
+            found[-1][2].append(step.values)
+    return [(target, seconds, np.array(readings)) for target, seconds, readings in found if readings]
 
 
 def following_result(record: Record, output: str) -> FollowingResult | None:

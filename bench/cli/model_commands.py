@@ -255,7 +255,7 @@ def identify_(
             selected = choose_model(data, model, options, fit)
             model, fit = selected.model, selected.settings(fit)
             data = data if selected.is_timed else data.without_time()
-        found = identify_model(data, model, fit)
+        found = identify_model(data, model, fit).with_uncertainty()
     if selected is not None:
         found = selected.record_in(found)
     # Before anything is printed: a terminal that fails must not cost the fit.
@@ -442,6 +442,7 @@ def invert(
         invert_band,
         invert_targets,
         read_for,
+        setpoint_uncertainty,
         starting_state,
         write_csv,
     )
@@ -476,6 +477,7 @@ def invert(
         (header_with_unit("setpoint", units[0]), found.setpoints),
         (header_with_unit("predicted", units[1]), found.predicted),
         ("flag", list(found.flags)),
+        *setpoint_uncertainty(model, found.setpoints, found.predicted, start.state),
         *bands,
     ]
     write_csv(out, [head for head, _ in written], [values for _, values in written])

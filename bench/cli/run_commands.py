@@ -180,6 +180,14 @@ def run(
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Only say what the run would do and touch, as `bench rehearse` does.")
     ] = False,
+    accuracy: Annotated[
+        str,
+        typer.Option(
+            metavar="U",
+            help="Refuse the run, before anything moves, unless the uncertainty budget of the controlled signal "
+            "supports this: largest expanded uncertainty (95 %) in its unit, or with one, such as 2 or '20 µm'.",
+        ),
+    ] = "",
     notify: NotifyOption = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Parent of the run's folder.")] = Path("recordings"),
     live: LiveOption = False,
@@ -245,6 +253,7 @@ def run(
         faults=faults,
         rehearse=rehearse,
         notify=tuple(notify or ()),
+        accuracy=accuracy,
     )
     if dry_run:
         if not rehearse:

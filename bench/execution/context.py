@@ -29,6 +29,7 @@ from bench.base import (
     say_at_once,
 )
 from bench.devices import Signal
+from bench.execution.accuracy import check_accuracy
 from bench.execution.detached_observer import DetachedObserver
 from bench.execution.dialogue import Dialogue
 from bench.execution.engine import Engine, Outcome, check_before_moving
@@ -129,6 +130,9 @@ class Run:
     notify : tuple of str
         Who is sent messages at a pause, a prompt, a warning, a trip and the end, also that of a bench which hung or
         died; see `bench.execution.notify`.
+    accuracy : str
+        Largest expanded uncertainty (95 %) of the controlled signal that is accepted, in its unit or with one: a run
+        whose budget does not support it is refused. Empty for any.
     changes : tuple of ParameterChange
         Parameters that are changed on the way, as in the run that is repeated.
     rig_file : RigFile, optional
@@ -150,6 +154,7 @@ class Run:
     original: Original | None = None
     rehearse: bool = True
     notify: tuple[str, ...] = ()
+    accuracy: str = ""
     changes: tuple[ParameterChange, ...] = ()
     rig_file: RigFile | None = None
 
@@ -198,6 +203,7 @@ class RunContext(ExitStack):
         self._observers: list[Any] = []
         self._rehearsal: Rehearsal | None = None
         self.resumption: Resumption | None = None
+        self._accuracy: dict[str, Any] | None = None
         self._interrupts = interrupts
 
     def begin(self) -> None:
@@ -249,6 +255,10 @@ class RunContext(ExitStack):
             attended=self._is_attended,
             today=self.clock.date().astimezone().date(),
         )
+        if self.run.accuracy:
+            self._accuracy = check_accuracy(
+                self.run.accuracy, self.run.protocol, self.parameters, description, self._slots
+            )
         if (reason := self.interrupts.abort_reason) is not None:
             raise AbortError(f"ended by {reason} before anything moved")
 
@@ -278,6 +288,7 @@ class RunContext(ExitStack):
         self.folder = again.folder if again is not None else self._new.make(run.folder, run_name(run.protocol, meta))
         self._take_folder(meta)
         meta["run"] = self.folder.name
+        meta["accuracy"] = self._accuracy
         meta["rehearsal"] = None if self._rehearsal is None else self._rehearsal.to_json()
         self._signals = description.signals + trace_signals(run.protocol, description, self._slots)
         self._meta = meta

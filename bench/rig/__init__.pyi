@@ -107,3 +107,14 @@ from .start_checks import (
     longest_away as longest_away,
     overdue_calibrations as overdue_calibrations,
 )
+from .uncertainty import (
+    LEVEL as LEVEL,
+    Budget as Budget,
+    BudgetRow as BudgetRow,
+    Component as Component,
+    Part as Part,
+    UncertainReading as UncertainReading,
+    UncertainSignals as UncertainSignals,
+    coverage_factor as coverage_factor,
+    effective_freedom as effective_freedom,
+)

@@ -361,6 +361,7 @@ class Rig:
         for key, signal in used:
             if signal not in self.description.by_name:
                 raise ConfigurationError(f"{path}: {key} = {signal!r}: there is no such signal; there are: {known}")
+        self.description.uncertain()
         check_roles(self.file.roles, self.description.devices, self.description.by_name, path)
 
 

@@ -62,6 +62,9 @@ _ON_QUANTITIES: dict[str, Callable[..., Any]] = {
     "max": lambda first, *others: reduce(np.maximum, others, first),
 }
 """The same functions on quantities with units."""
+_STEP = 1e-5
+"""Step of a numerical derivative, as a part of the value. Derivation: 1e-10 of it is lost by the third derivative,
+1e-11 by rounding."""
 _NODES = (ast.Expression, ast.BinOp, ast.UnaryOp, ast.Call, ast.Name, ast.Constant, ast.Load, *_OPERATORS)
 
 
@@ -103,6 +106,52 @@ class DerivedSignal(CheckedTable, ABC):
         ValueError
             If a unit does not fit; says which unit is expected.
         """
+
+    def quantities(self) -> dict[str, tuple[float, str]]:
+        """Return value and unit of each key whose uncertainty a rig file may state: numbers with a unit."""
+        return {
+            name: (float(getattr(self, name)), str(extra["unit"]))
+            for name, info in type(self).model_fields.items()
+            if isinstance(extra := info.json_schema_extra, dict) and "unit" in extra
+        }
+
+    def uncertain(
+        self, name: str, units: Mapping[str, str], sources: Mapping[str, Any], errors: Mapping[str, Any]
+    ) -> Any:  # noqa: ANN401 - an uncertain number
+        """Return the signal as an uncertain number of the library GTC.
+
+        This one takes the derivatives numerically, as GUM 5.1.3 allows; a kind may compute with uncertain numbers.
+
+        Parameters
+        ----------
+        name, units
+            As for `bind`.
+        sources : mapping of str to uncertain number
+            The signals that it is computed from.
+        errors : mapping of str to uncertain number
+            Errors of keys that `quantities` names, in their units; expected to be 0.
+        """
+        compute = self.bind(name, units).compute
+        values = {source: float(number.x) for source, number in sources.items()}
+
+        def slope(at: float, of: Callable[[float], float]) -> float:
+            step = _STEP * abs(at) or _STEP
+            return (of(at + step) - of(at - step)) / (2.0 * step)
+
+        result: Any = compute(values)
+        for source, number in sources.items():
+
+            def moved(x: float, source: str = source) -> float:
+                return compute({**values, source: x})
+
+            result = result + slope(values[source], moved) * (number - values[source])
+        for key, error in errors.items():
+
+            def changed(x: float, key: str = key) -> float:
+                return self.model_copy(update={key: x}).bind(name, units).compute(values)
+
+            result = result + slope(self.quantities()[key][0], changed) * error
+        return result
 
 
 class Expression(DerivedSignal):
@@ -185,6 +234,45 @@ class Expression(DerivedSignal):
 
         description = self.description or name.replace("_", " ")
         return Derived(Signal(name, self.unit, description, self.precision), sources, compute)
+
+    def quantities(self) -> dict[str, tuple[float, str]]:
+        """Return value and unit of each constant."""
+        found = {key: quantity(f"constants.{key}", str(value)) for key, value in self.constants.items()}
+        return {key: (float(each.magnitude), f"{each.units:~}" or "1") for key, each in found.items()}
+
+    def uncertain(
+        self, name: str, units: Mapping[str, str], sources: Mapping[str, Any], errors: Mapping[str, Any]
+    ) -> Any:  # noqa: ANN401 - an uncertain number
+        """Return the expression of uncertain numbers; see `DerivedSignal.uncertain`."""
+
+        def base(number: Any, unit: str) -> Any:  # noqa: ANN401 - an uncertain number
+            return number * _in_base_units(quantity("unit", f"1 {unit}"))
+
+        names = {source: base(number, units[source]) for source, number in sources.items()}
+        for key, (value, unit) in self.quantities().items():
+            names[key] = base(value + errors[key] if key in errors else value, unit)
+        operators = {**_OPERATORS, ast.Pow: operator.pow}
+        evaluator = SimpleEval(operators=operators, functions=_on_uncertain_numbers(), names=names)
+        try:
+            return evaluator.eval(self.expression) / base(1.0, self.unit)
+        except (ArithmeticError, ValueError) as error:
+            raise DeviceError(name, f"{self.expression} has no uncertainty there: {error}") from None
+
+
+def _on_uncertain_numbers() -> dict[str, Callable[..., Any]]:
+    """Return the functions of expressions for uncertain numbers and for plain ones."""
+    # Takes a second to import.
+    import GTC
+
+    def value(number: Any) -> float:  # noqa: ANN401 - an uncertain number
+        return float(GTC.value(number))
+
+    return {
+        "abs": GTC.magnitude,
+        **{name: getattr(GTC, name) for name in ("sqrt", "exp", "log", "sin", "cos", "tan", "atan")},
+        "min": lambda *values: min(values, key=value),
+        "max": lambda *values: max(values, key=value),
+    }
 
 
 def _power_of_quantity(base: Any, exponent: Any) -> Any:  # noqa: ANN401 - quantities or numbers

@@ -10,6 +10,7 @@ from bench.base import ConfigurationError
 from bench.devices import DeviceDescription, Limits, Signal
 from bench.rig.file import RigFile
 from bench.rig.slots import Slots, SlotsAsked, bind
+from bench.rig.uncertainty import UncertainSignals
 
 
 @dataclass(frozen=True)
@@ -44,6 +45,14 @@ class RigDescription:
     def reading_limits(self) -> dict[str, Limits]:
         """The readings beyond which a device raises, by signal."""
         return {name: limits for device in self.devices.values() for name, limits in device.reading_limits.items()}
+
+    def uncertain(self) -> UncertainSignals:
+        """Return the signals as uncertain numbers, as the rig file states them.
+
+        Raises ConfigurationError if it states what does not fit a signal.
+        """
+        units = {signal.name: signal.unit for signal in self.signals}
+        return UncertainSignals(self.file.uncertainty, self.file.derived, units, self.file.path)
 
     def limits_of(self, name: str) -> Limits:
         """Return the set-points that a device allows; raises ConfigurationError if it takes none."""

@@ -29,6 +29,9 @@ A rig file is TOML::
     expression = "2 * spot_position / length ** 2"
     ...
 
+    [uncertainty.bending.length]                   # what is known of its uncertainty; see `bench.rig.uncertainty`
+    ...
+
     [[interlocks]]                                 # the run ends in the safe state outside of these; what else
     signal = "plate_sink_temperature"              # an interlock can watch and do is in `bench.rig.interlocks`
     high = 60.0
@@ -83,6 +86,7 @@ from bench.rig.layout import DashboardLayout
 from bench.rig.maintenance.locks import ECHO, EMULATED, JOIN
 from bench.rig.shared_lines import with_line, wrong_lines
 from bench.rig.slots import RoleTable
+from bench.rig.uncertainty import Component, Uncertainties
 
 
 class RigTable(CheckedTable):
@@ -132,6 +136,9 @@ class _RigFileContent(CheckedTable):
     roles: dict[str, RoleTable] = Field(default_factory=dict, description="one table a role")
     protocols: dict[str, dict[str, Any]] = Field(default_factory=dict, description="parameters by protocol")
     derived: dict[str, dict[str, Any]] = Field(default_factory=dict, description="one table a derived signal")
+    uncertainty: dict[str, dict[str, Component]] = Field(
+        default_factory=dict, description="components of uncertainty by signal and name"
+    )
     interlocks: tuple[Interlock, ...] = ()
     telemetry: TelemetryTable = TelemetryTable()
     safety: SafetyTable = SafetyTable()
@@ -249,6 +256,7 @@ class RigFile:
     roles: Mapping[str, RoleTable]
     protocols: Mapping[str, Mapping[str, Any]]
     derived: Mapping[str, DerivedSignal]
+    uncertainty: Uncertainties
     interlocks: tuple[Interlock, ...]
     telemetry: TelemetryTable
     safety: SafetyTable
@@ -499,6 +507,7 @@ def _validate(path: str, text: str, content: Mapping[str, Any]) -> RigFile:
         roles=tables.roles,
         protocols=tables.protocols,
         derived=_after_their_sources(derived),
+        uncertainty=tables.uncertainty,
         interlocks=tables.interlocks,
         telemetry=tables.telemetry,
         safety=tables.safety,

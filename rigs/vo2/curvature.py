@@ -76,8 +76,14 @@ class CantileverCurvature(DerivedSignal):
     """Curvature of a cantilever from the deflection of its tip, or from the angle by which the tip turns."""
 
     source: str = Field(description="signal of the tip's deflection, m, or angle, °")
-    length: float = Field(gt=0, le=1, description="length of the beam, m")
-    residual_curvature: float = Field(default=0.0, ge=-1e5, le=1e5, description="curvature of the beam at rest, 1/m")
+    length: float = Field(gt=0, le=1, description="length of the beam, m", json_schema_extra={"unit": "m"})
+    residual_curvature: float = Field(
+        default=0.0,
+        ge=-1e5,
+        le=1e5,
+        description="curvature of the beam at rest, 1/m",
+        json_schema_extra={"unit": "1/m"},
+    )
 
     @model_validator(mode="after")
     def _rest_can_be_inverted(self) -> Self:

@@ -11,6 +11,7 @@ from typing import Any, Literal, TypeAlias, TypeVar
 
 import numpy as np
 
+from bench.analysis.uncertain_results import reading_uncertainties
 from bench.base import header_with_unit
 from bench.record import Record
 from bench.rig import SETPOINT
@@ -106,8 +107,14 @@ def _readings(record: Record, epoch: datetime) -> TypedTable:
     for step in record.step_records():
         commanded |= dict.fromkeys(step.setpoints)
 
+    names = [signal.name for signal in record.signals]
+    uncertainties = reading_uncertainties(record)
+    stated = list(uncertainties({name: np.empty(0) for name in names}))
+
     def blocks() -> Iterator[Block]:
         for records in _portions(record.step_records()):
+            rows = np.array([each.values for each in records], dtype=np.float64).T
+            uncertain = uncertainties(dict(zip(names, rows, strict=True)))
             finished = [each.finished for each in records]
             yield [
                 [each.step for each in records],
@@ -119,7 +126,8 @@ def _readings(record: Record, epoch: datetime) -> TypedTable:
                 [not each.settled.failed for each in records],
                 [each.settled.value for each in records],
                 *([each.setpoints.get(name) for each in records] for name in commanded),
-                *(list(map(_known, values)) for values in zip(*(each.values for each in records), strict=True)),
+                *(list(map(_known, values)) for values in rows.tolist()),
+                *(list(map(_known, uncertain[name].tolist())) for name in stated),
             ]
 
     columns = (
@@ -140,6 +148,7 @@ def _readings(record: Record, epoch: datetime) -> TypedTable:
             for name in commanded
         ),
         *_signals(record),
+        *(Column(f"u_{name}", _unit(record, name), "number", f"standard uncertainty of {name}") for name in stated),
     )
     return TypedTable(columns, blocks())
 

@@ -25,7 +25,17 @@ from bench.analysis.report.page.run_page import run_page
 from bench.analysis.report.page.run_parts import watched_pairs
 from bench.analysis.report.published import Published
 from bench.analysis.report.telemetry_summary import TelemetrySummary, summarize, wider
+from bench.analysis.report.uncertainty_tables import (
+    BUDGET_HEADS,
+    SIGNAL_HEADS,
+    budget_rows,
+    budget_title,
+    control_lines,
+    not_stated,
+    signal_rows,
+)
 from bench.analysis.tracking_errors import results_json
+from bench.analysis.uncertain_results import RunUncertainty
 from bench.base import format_numbers, print_plain, with_unit
 from bench.devices import Signal
 from bench.identification import ModelFile, models_among
@@ -105,8 +115,10 @@ def report_run(
         controlled = str(record.meta.get("controls", ""))
         control = results_json(record, controlled) if controlled else {}
         _print_control(control, record, controlled, console)
+        uncertainty = RunUncertainty.of(record, steps)
+        _print_uncertainty(uncertainty, console)
         _print_comparison(comparison, applied, record, console)
-        found = {"extremes": extremes, "models": comparison, **control}
+        found = {"extremes": extremes, "models": comparison, "uncertainty": uncertainty, **control}
         if page is not None:
             write_page(page, run_page(record, steps, summary, applied, found, published))
     for path in [*figures, *more]:
@@ -123,6 +135,7 @@ def report_run(
         "extremes": extremes,
         "models": comparison,
         "lateness": record.meta.get("lateness", {}),
+        "uncertainty": uncertainty.to_json(),
         **control,
         "figures": [str(path) for path in [*figures, *more]],
         "page": None if page is None else str(page),
@@ -276,6 +289,25 @@ def _print_control(
         if "seconds_per_target" in entry:
             parts.append(f"{entry['seconds_per_target']:.1f} s a target")
         console.print(f"{name}: {', '.join(parts)}", highlight=False)
+
+
+def _print_uncertainty(found: RunUncertainty, console: Console) -> None:
+    if rows := signal_rows(found.signals):
+        table = Columns(*SIGNAL_HEADS, title="uncertainty at the farthest reading from 0", title_justify="left")
+        for row in rows:
+            table.add_row(*row)
+        console.print(table)
+    if text := not_stated(found.signals):
+        print_plain(console, text)
+    if (budget := found.shown) is not None:
+        table = Columns(*BUDGET_HEADS, title=budget_title(budget), title_justify="left")
+        for row in budget_rows(budget):
+            table.add_row(*row)
+        console.print(table)
+        print_plain(console, budget.advice())
+    for name, each in found.control.items():
+        for line in control_lines(each):
+            print_plain(console, f"{name}: {line}")
 
 
 def _precision(record: Record, name: str) -> int:

@@ -34,7 +34,17 @@ from bench.analysis.report.page.run_parts import (
 from bench.analysis.report.page.svg import inlined
 from bench.analysis.report.published import Published, concerning
 from bench.analysis.report.telemetry_summary import TelemetrySummary
+from bench.analysis.report.uncertainty_tables import (
+    BUDGET_HEADS,
+    SIGNAL_HEADS,
+    budget_rows,
+    budget_title,
+    control_lines,
+    not_stated,
+    signal_rows,
+)
 from bench.analysis.tracking_errors import FollowingResult, following_result, target_results, ticks_with
+from bench.analysis.uncertain_results import RunUncertainty
 from bench.base import fitting_prefix, format_duration, format_numbers, with_unit
 from bench.devices import Signal
 from bench.identification import models_among
@@ -81,6 +91,8 @@ def run_page(
         scratch = Path(folder)
         if (control := _control_section(record, result, stated, scratch)) is not None:
             sections.append(control)
+        if (uncertain := _uncertainty_section(result["uncertainty"])) is not None:
+            sections.append(uncertain)
         if models:
             sections.append(models_section(models, steps["finished"], scratch))
         elif (loops := _loops_section(record, steps, summary, scratch)) is not None:
@@ -226,6 +238,19 @@ def _control_section(
         caption = f"Reference (grey) and output under {controller}; below, the error."
         parts.append(PageFigure(inlined(path, caption), caption))
     return PageSection("Control", parts)
+
+
+def _uncertainty_section(found: RunUncertainty) -> PageSection | None:
+    parts: list[PageFigure | PageTable | PageText] = []
+    for name, each in found.control.items():
+        parts += [PageText(f"{name}: {line}.") for line in control_lines(each)]
+    if (budget := found.shown) is not None:
+        parts.append(PageTable(BUDGET_HEADS, budget_rows(budget), title=budget_title(budget), note=budget.advice()))
+    if rows := signal_rows(found.signals):
+        parts.append(PageTable(SIGNAL_HEADS, rows, title="signals, at the reading farthest from 0", numbers_from=1))
+    if text := not_stated(found.signals):
+        parts.append(PageText(f"{text}."))
+    return PageSection("Uncertainty", parts) if parts else None
 
 
 def _followed(record: Record, controlled: str) -> FollowingResult | None:

@@ -1,0 +1,104 @@
+"""Uncertainties of a run in words and rows, for the terminal and for the page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+
+from bench.analysis.uncertain_results import ControlUncertainty
+from bench.base import fitting_prefix
+from bench.rig import Budget
+
+SIGNAL_HEADS = ("signal", "at", "U (95 %)", "k", "unit", "largest component")
+BUDGET_HEADS = ("component", "type", "u", "sensitivity", "ν", "part", "%")
+
+_MANY = 1000.0
+"""Degrees of freedom that count as infinite. Derivation: Student's t then differs from the normal one by 0.1 %."""
+
+
+def signal_rows(budgets: Mapping[str, Budget]) -> list[tuple[str, ...]]:
+    """Return a row for each signal whose uncertainty is stated: at its reading farthest from 0."""
+    rows: list[tuple[str, ...]] = []
+    for name, budget in budgets.items():
+        if budget.stated:
+            factor, unit = fitting_prefix(budget.unit, budget.value, least=0.1)
+            expanded = two_digits(factor * budget.expanded)
+            value = f"{factor * budget.value:.{_digits(expanded)}f}"
+            rows.append((name, value, expanded, f"{budget.factor:.2f}", unit, budget.rows[0].label))
+    return rows
+
+
+def not_stated(budgets: Mapping[str, Budget]) -> str:
+    """Return in one sentence of which signals no uncertainty is stated; empty if there are none."""
+    names = [name for name, budget in budgets.items() if not budget.stated]
+    return f"uncertainty not stated: {', '.join(names)}" if names else ""
+
+
+def budget_title(budget: Budget) -> str:
+    """Return the value of a budget with its expanded uncertainty."""
+    factor, unit = fitting_prefix(budget.unit, budget.value, least=0.1)
+    expanded = two_digits(factor * budget.expanded)
+    value = f"{factor * budget.value:.{_digits(expanded)}f}"
+    shown = "" if unit == "1" else f" {unit}"
+    return (
+        f"budget of {budget.signal}: ({value} ± {expanded}){shown}; 95 %, k = {budget.factor:.2f}, "
+        f"ν = {_freedom(budget.freedom)}"
+    )
+
+
+def _freedom(freedom: float) -> str:
+    return f"{freedom:.0f}" if freedom < _MANY else "∞"
+
+
+def budget_rows(budget: Budget) -> list[tuple[str, ...]]:
+    """Return the components of a budget, the largest first.
+
+    u is the standard uncertainty, ν has the degrees of freedom; `part` is the sensitivity times u, in the unit of the
+    budget, and its square a share in % of the variance.
+    """
+    return [
+        (
+            row.label,
+            f"{row.type} {row.distribution}",
+            f"{row.standard:.3g} {row.unit}",
+            f"{row.sensitivity:.3g}",
+            _freedom(row.freedom),
+            f"{row.contribution:.3g}",
+            f"{100.0 * budget.share(row):.1f}",
+        )
+        for row in budget.rows
+    ]
+
+
+def control_lines(found: ControlUncertainty) -> list[str]:
+    """Return repeatability, reproducibility and accuracy of a run under control, a sentence each."""
+    factor, unit = fitting_prefix(found.unit, found.accuracy, least=0.1)
+    low, high = (two_digits(factor * each) for each in found.intervals["rms"])
+    spread = (
+        "not known, as there is one reading a target"
+        if found.repeatability is None
+        else f"{two_digits(factor * found.repeatability)} {unit}, standard deviation of one reading at a target "
+        f"({found.freedom} degrees of freedom)"
+    )
+    return [
+        f"repeatability: {spread}",
+        "reproducibility: not known from one session; bench compare RUN RUN has that of two",
+        f"accuracy: {two_digits(factor * found.accuracy)} {unit}, RMS of the true errors that is expected; the "
+        f"readings alone say {two_digits(factor * found.rms)} {unit}; for 95 % it is between {low} and {high} {unit}",
+    ]
+
+
+def two_digits(value: float) -> str:
+    """Return a positive number with two significant digits, as an uncertainty is given (GUM 7.2.6)."""
+    return f"{value:.{_decimals(value)}f}"
+
+
+def _decimals(value: float) -> int:
+    if not value:
+        return 0
+    rounded = float(f"{value:.1e}")
+    return max(1 - math.floor(math.log10(abs(rounded))), 0)
+
+
+def _digits(text: str) -> int:
+    return len(text.partition(".")[2])

@@ -1,0 +1,219 @@
+"""What was identified from a run, with its uncertainty: quantities of a model, its predictions, its set-points.
+
+A component that is common to all readings, such as the gain of a sensor, is propagated by a second fit of readings
+that it has moved by its standard uncertainty. What the fit itself leaves open is found by fits of readings whose
+residuals are exchanged in blocks (bootstrap), as neighbouring residuals are alike.
+
+Sources: JCGM 100:2008 (GUM), 5.1.3, note 2; H. R. Künsch, The jackknife and the bootstrap for general stationary
+observations, Annals of Statistics 17 (1989), 1217.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from bench.analysis.uncertain_results import uncertain_signals
+from bench.base import header_with_unit
+from bench.identification import ModelFile, input_half_widths
+from bench.models import Operator
+from bench.record import Record
+from bench.rig import Budget, BudgetRow, UncertainSignals, effective_freedom
+
+Floats = npt.NDArray[np.float64]
+
+_FITS = 20
+"""Fits with other residuals. Derivation: their deviation has 19 degrees of freedom, and k is 2.09 instead of 1.96."""
+_BLOCKS = 60
+"""Blocks of neighbouring residuals. Derivation: half as many as the loops of a characterization have branches, so
+that a block has the errors of a branch together."""
+_PLACES = 33
+"""Values of a signal at which the contributions of its components are computed; between them they are straight."""
+PROVENANCE = "uncertainty"
+"""Key of the provenance of a model file."""
+
+
+@dataclass(frozen=True)
+class ModelUncertainty:
+    """What is known of a model that was identified from a run.
+
+    Attributes
+    ----------
+    quantities : mapping of str to Budget
+        Budgets of its quantities by name, as `quantities_of` has them.
+    coefficients : ndarray, shape (K,)
+        Standard uncertainties of the coefficients of the model, such as the cells of its density.
+    outputs, standard : ndarray, shape (33,)
+        Values of the output, and its standard uncertainty there but for noise; both in its unit.
+    """
+
+    quantities: Mapping[str, Budget]
+    coefficients: Floats
+    outputs: Floats
+    standard: Floats
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it for programs, and for the provenance of a model file."""
+        return {
+            "quantities": {name: budget.to_json() for name, budget in self.quantities.items()},
+            "u_coefficients": self.coefficients.tolist(),
+            "outputs": self.outputs.tolist(),
+            "standard": self.standard.tolist(),
+        }
+
+    def lines(self) -> list[tuple[str, str]]:
+        """Return the quantities with their expanded uncertainty, as (name, text) pairs."""
+        return [(name, _quantity_text(budget)) for name, budget in self.quantities.items() if budget.rows]
+
+
+def _quantity_text(budget: Budget) -> str:
+    expanded = f"{budget.expanded:.1e}"
+    digits = max(1 - int(expanded.partition("e")[2]), 0)
+    largest = f"95 %, k = {budget.factor:.2f}, largest part: {budget.rows[0].label}"
+    unit = f" {budget.unit}" if budget.unit else ""
+    return f"{budget.value:.{digits}f} ± {float(expanded):.{digits}f}{unit} ({largest})"
+
+
+def quantities_of(operator: Operator[Any]) -> dict[str, tuple[float, str]]:
+    """Return the quantities of a model that have a name, with their units.
+
+    Of a density they are its sum, and the transition inputs: means of its thresholds, rising and falling, weighted by
+    the magnitudes of its cells.
+    """
+    input_unit, output_unit = operator.input_unit, operator.output_unit
+    found: dict[str, tuple[float, str]] = {"output at zero": (operator.bias, output_unit)}
+    reversible = getattr(operator, "reversible", None)
+    for name in ("k0", "k1"):
+        if isinstance(value := getattr(reversible, name, None), float):
+            found[name] = value, f"({output_unit})/{input_unit.replace('°C', 'K')}"
+    for density in operator.densities():
+        title = f"{density.title} " if density.title else ""
+        cells = np.nan_to_num(density.values)
+        middles = 0.5 * (density.levels[1:] + density.levels[:-1])
+        areas = np.outer(np.diff(density.levels), np.diff(density.levels))
+        # Of a cell on the diagonal half is there.
+        weights = cells * areas * (1.0 - 0.5 * np.eye(middles.size))
+        magnitudes = np.abs(weights)
+        found[f"{title}density, sum"] = float(weights.sum()), output_unit
+        if total := float(magnitudes.sum()):
+            found[f"{title}transition, rising"] = float(magnitudes.sum(axis=1) @ middles) / total, input_unit
+            found[f"{title}transition, falling"] = float(magnitudes.sum(axis=0) @ middles) / total, input_unit
+    shape = operator.shape_parameters()
+    found.update({name: (value, "") for name, value in zip(shape.names, shape.values, strict=True)})
+    low, high = operator.output_range()
+    return found | {"lowest output": (low, output_unit), "highest output": (high, output_unit)}
+
+
+def identified_uncertainty(
+    record: Record,
+    names: tuple[str, str],
+    inputs: Floats,
+    outputs: Floats,
+    residuals: Floats,
+    model: Operator[Any],
+    fit: Callable[[Floats, Floats], Operator[Any]],
+) -> ModelUncertainty | None:
+    """Return the uncertainty of a model of a run; None where the run's rig file states none of the output.
+
+    Parameters
+    ----------
+    record : Record
+        The run.
+    names : (str, str)
+        Signals of input and output.
+    inputs, outputs, residuals : ndarray, shape (N,)
+        Readings, and what the model leaves of the outputs.
+    model : Operator
+        The model that was fitted.
+    fit : callable
+        Fits other inputs and outputs in the same way.
+    """
+    signals = uncertain_signals(record)
+    if not signals.stated([names[1]]):
+        return None
+    nominal, quantities = quantities_of(model), {}
+    rows: dict[str, dict[tuple[str, str], list[BudgetRow]]] = {name: {} for name in nominal}
+    squares = np.zeros_like(model.coefficients)
+
+    def add(row: BudgetRow, other: Operator[Any]) -> None:
+        nonlocal squares
+        squares = squares + (other.coefficients - model.coefficients) ** 2
+        for name, (value, _) in quantities_of(other).items():
+            contribution = abs(value - nominal[name][0])
+            rows[name].setdefault((row.signal, row.component), []).append(replace(row, contribution=contribution))
+
+    for row, moved in _moved(signals, names[1], outputs):
+        add(row, fit(inputs, moved))
+    for row, moved in _moved(signals, names[0], inputs) if signals.stated([names[0]]) else ():
+        add(row, fit(moved, outputs))
+    rng = np.random.default_rng(0)
+    others = [fit(inputs, outputs - residuals + _exchanged(residuals, rng)) for _ in range(_FITS)]
+    squares = squares + np.var([other.coefficients for other in others], axis=0, ddof=1)
+    spreads = np.std([[value for value, _ in quantities_of(other).values()] for other in others], axis=0, ddof=1)
+    for (name, (value, unit)), spread in zip(nominal.items(), spreads.tolist(), strict=True):
+        how = f"measured: {_FITS} fits with blocks of residuals exchanged"
+        found = [
+            BudgetRow(model.kind, "fit", "A", "normal", spread, unit, _FITS - 1.0, spread, how),
+            *(replace(each[0], contribution=_together(each)) for each in rows[name].values()),
+        ]
+        ordered = tuple(sorted((row for row in found if row.contribution), key=lambda row: -row.contribution))
+        quantities[name] = Budget(name, unit, value, ordered, effective_freedom(ordered))
+    places = np.linspace(outputs.min(), outputs.max(), _PLACES)
+    standard = np.array([signals.at(names[1], value, noise=False).standard for value in places.tolist()])
+    return ModelUncertainty(quantities, np.sqrt(squares), places, standard)
+
+
+def _moved(signals: UncertainSignals, name: str, values: Floats) -> list[tuple[BudgetRow, Floats]]:
+    """Return readings that each component common to all of them has moved by its standard uncertainty."""
+    places = np.linspace(values.min(), values.max(), _PLACES)
+    table = [signals.at(name, value, noise=False).contributions() for value in places.tolist()]
+    return [
+        (part.row, values + np.interp(values, places, [row[i][1] for row in table]))
+        for i, (part, _) in enumerate(table[0])
+    ]
+
+
+def _together(rows: list[BudgetRow]) -> float:
+    return math.hypot(*(row.contribution for row in rows))
+
+
+def _exchanged(residuals: Floats, rng: np.random.Generator) -> Floats:
+    """Return residuals whose blocks were drawn with replacement."""
+    length = max(residuals.size // _BLOCKS, 1)
+    starts = rng.integers(0, residuals.size - length + 1, -(-residuals.size // length))
+    return np.concatenate([residuals[start : start + length] for start in starts])[: residuals.size]
+
+
+def predicted_uncertainty(model: ModelFile, outputs: Floats) -> Floats | None:
+    """Return the standard uncertainty of predicted outputs, of their shape; None if the model file has none.
+
+    It is that of the true output: the RMS error of the fit, and what is common to all readings of the sensor.
+    """
+    known = model.provenance.get(PROVENANCE)
+    if not known or (rms := model.provenance.get("rms")) is None:
+        return None
+    return np.asarray(np.hypot(rms, np.interp(outputs, known["outputs"], known["standard"])))
+
+
+def setpoint_uncertainty(
+    model: ModelFile,
+    setpoints: Floats,
+    predicted: Floats,
+    state: Any = None,  # noqa: ANN401 - each operator has its own
+) -> list[tuple[str, Floats | list[object]]]:
+    """Return the columns `u_setpoint` and `u_predicted` of inverted set-points; none if the model file has none.
+
+    The first is the second over the slope of the model there, and empty where that is flat.
+    """
+    standard = predicted_uncertainty(model, predicted)
+    if standard is None or not isinstance(model.model, Operator):
+        return []
+    widths = input_half_widths(model.operator, setpoints, standard, state)
+    cells: list[object] = ["" if width != width else width for width in widths.tolist()]
+    units = model.operator.input_unit.replace("°C", "K"), model.operator.output_unit
+    return [(header_with_unit("u_setpoint", units[0]), cells), (header_with_unit("u_predicted", units[1]), standard)]

@@ -1,0 +1,109 @@
+"""What is known of the true errors of a run, and of a model that was identified from it."""
+
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+import bench
+from bench.analysis.uncertain_models import predicted_uncertainty
+from bench.analysis.uncertain_results import control_uncertainties, draw_errors, signal_budgets, uncertain_signals
+from bench.cli import app
+from bench.record import Record
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    """A short run of the cantilever."""
+    folder = tmp_path_factory.mktemp("run")
+    return bench.run("creep", "vo2", out=folder, hot=70.0, cool=50.0, duration=8.0).folder
+
+
+def test_drawn_errors_have_the_standard_uncertainty_and_the_correlation_of_the_budgets(run):
+    with Record(run) as record:
+        signals = uncertain_signals(record)
+    readings = [signals.reading("curvature", {"psd_position": each}) for each in (2e-5, 7e-5, 7e-5)]
+    drawn = draw_errors(readings, 40_000)
+    assert drawn.std(axis=0) == pytest.approx([each.standard for each in readings], rel=0.02)
+    # The same place has the same error, but for noise.
+    assert np.corrcoef(drawn[:, 1], drawn[:, 2])[0, 1] > 0.99
+    expanded = [each.budget().expanded for each in readings]
+    assert np.mean(np.abs(drawn) <= expanded, axis=0) == pytest.approx(0.95, abs=0.015)
+
+
+def test_every_signal_of_a_run_has_a_budget_or_says_that_none_is_stated(run):
+    with Record(run) as record:
+        budgets = signal_budgets(record, record.steps())
+        assert control_uncertainties(record, "curvature") == {}
+    assert {name for name, each in budgets.items() if each.stated} == {"psd_position", "curvature", "tec_temperature"}
+    assert budgets["tec_current"].not_stated == ("tec_current",)
+
+
+def test_reports_and_exports_have_the_uncertainty(run, tmp_path):
+    invoke = CliRunner().invoke
+    result = invoke(app, ["report", str(run), "--json", str(tmp_path / "report.json"), "--out", str(tmp_path)])
+    assert result.exit_code == 0, result.output
+    found = json.loads((tmp_path / "report.json").read_text())["uncertainty"]["signals"]["curvature"]
+    shares = [each["share"] for each in found["components"]]
+    assert shares == sorted(shares, reverse=True)
+    assert sum(shares) == pytest.approx(1.0)
+    assert found["expanded"] == pytest.approx(found["coverage_factor"] * found["standard"])
+    assert found["advice"] in " ".join(result.output.split())
+    result = invoke(app, ["export", str(run), "--format", "csv", "--out", str(tmp_path)])
+    assert result.exit_code == 0, result.output
+    heads = (tmp_path / "readings.csv").read_text().splitlines()[0].split(",")
+    assert {"u_curvature [1/m]", "u_psd_position [m]", "u_tec_temperature [°C]"} <= {*heads}
+    table = np.genfromtxt(
+        tmp_path / "readings.csv", delimiter=",", skip_header=1, usecols=heads.index("u_curvature [1/m]")
+    )
+    with Record(run) as record:
+        signals, steps = uncertain_signals(record), record.steps()
+    position = float(steps["psd_position"][3])
+    assert table[3] == pytest.approx(signals.reading("curvature", {"psd_position": position}).standard, rel=1e-9)
+
+
+def test_a_model_of_a_run_has_the_uncertainty_of_its_sensor(run):
+    found = bench.identify(run, "polynomial", degree=3)
+    assert found.uncertainty is not None
+    highest = found.uncertainty.quantities["highest output"]
+    rows = {each.component: each.contribution for each in highest.rows}
+    # A gain moves a fit that is linear in the outputs by its share of them.
+    lever = 0.005 / np.sqrt(3.0) * highest.value
+    assert rows["lever"] == pytest.approx(lever, rel=0.1)
+    assert rows["fit"] > 0.0
+    standard = predicted_uncertainty(found.file, np.array([100.0, 1500.0]))
+    assert standard is not None
+    assert (standard > found.file.provenance["rms"]).all()
+
+
+@pytest.mark.parametrize(
+    ("protocol", "accuracy", "text"),
+    [
+        ("tracking", "2", "linearity of psd_position"),
+        ("tracking", "2 K", "expected a number in 1/m"),
+        ("tracking", "-2", "above 0"),
+        ("creep", "2", "controls no signal"),
+    ],
+)
+def test_an_accuracy_that_the_budget_does_not_support_is_refused(run, tmp_path, protocol, accuracy, text):
+    arguments = [
+        "run",
+        protocol,
+        "--rig",
+        "vo2",
+        "--clock",
+        "virtual",
+        "--accuracy",
+        accuracy,
+        "--out",
+        str(tmp_path / "runs"),
+    ]
+    if protocol == "tracking":
+        model = tmp_path / "model.json"
+        bench.identify(run, "polynomial", degree=3).file.save(model)
+        arguments += ["--set", f"model={model}", "--set", "controller=polynomial"]
+    result = CliRunner().invoke(app, arguments)
+    assert result.exit_code != 0
+    assert text in " ".join(str(result.exception or result.output).split())
+    assert not (tmp_path / "runs").exists()
