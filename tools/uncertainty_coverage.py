@@ -1,10 +1,11 @@
 """Coverage of stated uncertainties: many emulated sessions with other specimens of the sensors, beside the truth.
 
 Run as a script: `.venv/bin/python tools/uncertainty_coverage.py RIG [SESSIONS] [PART...]`. RIG is vo2, sma or hybrid,
-SESSIONS is 200 if not given, and of the parts raw, identified and tracking (which vo2 has) all or those named are done.
+SESSIONS is 200 if not given, and the parts are raw, calibrated, identified and tracking; the last two are of vo2.
 
 Each session draws the sensors from the tolerances of their data sheets (`sensor_seed`), and the cantilever's beam
-from that of its length. For each quantity the table has the number of values, the part of them whose interval of 95 %
+from that of its length. The part calibrated calibrates the sensors of each session first, and reads them then. For
+each quantity the table has the number of values, the part of them whose interval of 95 %
 contains the truth, and how many times as wide as needed the intervals are: they could all be divided by that number,
 and 95 % of them would still contain the truth.
 
@@ -21,10 +22,13 @@ from pathlib import Path
 import numpy as np
 
 import bench
-from bench.analysis import control_uncertainties, target_results
+from bench.analysis import Reference, calibrate_run, control_uncertainties, target_results
 from bench.record import Record
 from bench.rig import load_rig
+from rigs.hybrid.study import REFERENCE_UNCERTAINTY
+from rigs.muscles.study_sma import BLOCKS, WEIGHTS
 from rigs.vo2.curvature import curvature_to_deflection, deflection_to_curvature
+from rigs.vo2.study import GONIOMETER
 from sim_devices.transducers.data_sheets import PSD
 
 LENGTH, LENGTH_TOLERANCE = 300e-6, 0.3e-6
@@ -41,14 +45,30 @@ TRUE_NAMES = {
         "piezo_voltage": "piezo_voltage",
     },
 }
+CALIBRATED_NAMES = {
+    "vo2": {"curvature": "curvature"},
+    "sma": {"length": "position", "force": "force"},
+    "hybrid": {"displacement": "deflection"},
+}
+WITNESSED = {"hybrid": "hybrid-witness"}
+INTERFEROMETER = Reference("interferometer", REFERENCE_UNCERTAINTY, 365, signal="witness_position")
+CALIBRATIONS = {
+    "vo2": {"tip_angle": ("calibration-mirror", "psd_position", GONIOMETER, {})},
+    "sma": {
+        "length": ("calibration-position", "wire_end_position", BLOCKS, {}),
+        "force": ("calibration-load", "load_cell_force", WEIGHTS, {}),
+    },
+    "hybrid": {"displacement": ("calibration-displacement", "displacement_position", INTERFEROMETER, {"sweeps": 1})},
+}
+"""Protocol, signal, reference and parameters by the calibrated signal."""
 RANGES = {
     "vo2": {"tec": (25.0, 80.0)},
     "sma": {"supply": (0.0, 3.0)},
     "hybrid": {"tec": (-0.1, 0.1), "piezo": (-40, 40)},
 }
 """Set-points by device."""
-HOLD = {"vo2": 10, "sma": 20, "hybrid": 60}
-"""Seconds at a set-point before it is read."""
+HOLD = {"vo2": 5, "sma": 30, "hybrid": 400}
+"""Times of 2 s at a set-point before it is read."""
 SETTINGS = {"low": 21.0, "high": 84.0, "dwell": 4.0, "increment": 1.4, "half_cycles": 24}
 MODEL = {"levels": 10, "plane": (30.0, 70.0), "reference": 20.0}
 IDEAL = {"emulation.sensors": "ideal", "emulation.psd_noise": "0.0", "emulation.disturbances": "false"}
@@ -66,10 +86,27 @@ def specimens(rig: str, session: int) -> dict[str, str]:
     return drawn
 
 
-def raw(rig: str, session: int, found: Found) -> None:
-    """Read all signals at random set-points, beside what is true there."""
+def calibrated_rig(rig: str, folder: Path, session: int) -> str:
+    """Calibrate the sensors of a session; return the path of the rig file that applies that."""
+    path = folder / f"{rig}-{session}.toml"
+    text = [f'extends = "{WITNESSED.get(rig, rig)}"']
+    for name, (protocol, signal, reference, settings) in CALIBRATIONS[rig].items():
+        run = bench.run(
+            protocol, WITNESSED.get(rig, rig), out=folder, clock="virtual", seed=session, recording=False,
+            overrides=specimens(rig, session), **settings,
+        )  # fmt: skip
+        file = folder / f"{rig}-{session}-{name}.json"
+        calibrate_run(run.folder, signal, reference).save(file)
+        text.append(f'[derived.{name}]\nkind = "calibrated"\nsource = "{signal}"\ncalibration = "{file.name}"')
+    path.write_text("\n".join([*text, *(('[derived.curvature]\nsource = "tip_angle"',) if rig == "vo2" else ())]))
+    return str(path)
+
+
+def raw(rig: str, session: int, found: Found, file: str | None = None) -> None:
+    """Read signals at random set-points, those of a rig file with calibrated ones if given, beside what is true."""
     rng = np.random.default_rng([session, 2])
-    with bench.open_rig(rig, seed=session, overrides=specimens(rig, session)) as bench_rig:
+    names = TRUE_NAMES[rig] if file is None else CALIBRATED_NAMES[rig]
+    with bench.open_rig(file or rig, seed=session, overrides=specimens(rig, session)) as bench_rig:
         signals = bench_rig.description.uncertain()
         laboratory, clock = bench_rig.laboratory, bench_rig.clock
         for _ in range(READINGS):
@@ -79,13 +116,15 @@ def raw(rig: str, session: int, found: Found) -> None:
                 bench_rig.actuators[device].set(rng.uniform(low, high))
             for _ in range(HOLD[rig]):
                 # Watchdogs want to hear of somebody.
-                clock.sleep(1.0)
+                clock.sleep(2.0)
                 bench_rig.glance()
-            values = bench_rig.measure()
-            truth = laboratory.truth()
-            for name, true in TRUE_NAMES[rig].items():
+            # What still moves is true in the middle of the reading.
+            before, values, after = laboratory.truth(), bench_rig.measure(), laboratory.truth()
+            for name, true in names.items():
+                truth = 0.5 * (before[true].value + after[true].value)
                 budget = signals.reading(name, values).budget()
-                found[name].append((values[name] - truth[true].value, budget.expanded))
+                title = name if file is None else f"{name}, calibrated"
+                found[title].append((values[name] - truth, budget.expanded))
 
 
 def characterized(folder: Path, overrides: dict[str, str], seed: int):
@@ -148,6 +187,8 @@ def main(rig: str, sessions: int, parts: list[str]) -> None:
         for session in range(sessions):
             if "raw" in parts:
                 raw(rig, session, found)
+            if "calibrated" in parts:
+                raw(rig, session, found, calibrated_rig(rig, folder, session))
             if rig == "vo2" and "identified" in parts:
                 identified(folder, session, truth, found)
             if rig == "vo2" and "tracking" in parts:
@@ -161,5 +202,5 @@ if __name__ == "__main__":
     main(
         sys.argv[1],
         int(sys.argv[2]) if len(sys.argv) > 2 else 200,
-        sys.argv[3:] or ["raw", "identified", "tracking"],
+        sys.argv[3:] or ["raw", "calibrated", "identified", "tracking"],
     )

@@ -158,7 +158,7 @@ def identified_uncertainty(
     for (name, (value, unit)), spread in zip(nominal.items(), spreads.tolist(), strict=True):
         how = f"measured: {_FITS} fits with blocks of residuals exchanged"
         found = [
-            BudgetRow(model.kind, "fit", "A", "normal", spread, unit, _FITS - 1.0, spread, how),
+            BudgetRow("the model", "fit", "fit", "A", "normal", spread, unit, _FITS - 1.0, spread, how),
             *(replace(each[0], contribution=_together(each)) for each in rows[name].values()),
         ]
         ordered = tuple(sorted((row for row in found if row.contribution), key=lambda row: -row.contribution))

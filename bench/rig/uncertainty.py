@@ -47,6 +47,16 @@ Uncertain = Any
 """An uncertain number of the library's, which is not typed."""
 Distribution = Literal["normal", "rectangular", "triangular", "U"]
 
+_REMEDIES = {
+    **dict.fromkeys(("gain", "offset", "nonlinearity"), "calibrate the sensor"),
+    "drift": "calibrate more often, or correct for it",
+    "noise": "average more readings",
+    "resolution": "take a sensor with finer steps",
+    "calibration": "take more readings in the calibration",
+    "reference": "take a better reference",
+    "fit": "take more readings",
+}
+"""What reduces a component, by how it acts."""
 LEVEL = 0.95
 """Coverage of an expanded uncertainty. Source: GUM 6.3.3, the level of conformity statements."""
 _DIVISORS = {"rectangular": math.sqrt(3.0), "triangular": math.sqrt(6.0), "U": math.sqrt(2.0)}
@@ -127,8 +137,8 @@ class BudgetRow:
 
     Attributes
     ----------
-    signal, component : str
-        Which signal it belongs to, and its name.
+    signal, component, acts : str
+        Which signal it belongs to, its name, and how it acts.
     type : {"A", "B"}
         Whether it was found by statistics.
     distribution : str
@@ -147,6 +157,7 @@ class BudgetRow:
 
     signal: str
     component: str
+    acts: str
     type: str
     distribution: Distribution
     standard: float
@@ -222,13 +233,7 @@ class Budget:
             return f"The uncertainty of {missing} is not stated: add [uncertainty.SIGNAL.COMPONENT] to the rig file."
         first, *others = self.rows
         left = coverage_factor(others) * math.hypot(*(row.contribution for row in others)) if others else 0.0
-        how = (
-            "average more readings"
-            if first.distribution == "normal" and first.component in ("noise", "repeatability")
-            else "calibrate the sensor"
-            if first.component in _CALIBRATED or first.type == "B"
-            else "take more readings in the calibration"
-        )
+        how = _REMEDIES.get(first.acts, "measure it better")
         return (
             f"Most would be gained at {first.label} ({100.0 * self.share(first):.0f} % of the variance; {how}): "
             f"without it U would be {left:.2g} instead of {self.expanded:.2g} {self.unit}."
@@ -349,7 +354,7 @@ class UncertainReading:
         if not spread:
             return self
         row = BudgetRow(
-            self.signal, "repeatability", "A", "normal", spread, self.unit, freedom, 0.0, f"measured: {how}"
+            self.signal, "repeatability", "noise", "A", "normal", spread, self.unit, freedom, 0.0, f"measured: {how}"
         )
         part = Part(row, GTC.ureal(0.0, spread, freedom))
         return replace(self, number=self.number + part.number, parts=(*self.parts, part))
@@ -539,6 +544,7 @@ class UncertainSignals:
             row = BudgetRow(
                 signal=signal,
                 component=name,
+                acts=component.acts,
                 type="A" if component.basis == "measured" else "B",
                 distribution=component.distribution,
                 standard=component.uncertainty,
@@ -557,28 +563,29 @@ class UncertainSignals:
     def _of_calibration(self, signal: str, record: Calibration, at: float, parts: list[Part]) -> Uncertain:
         """Return the error of a calibration at a reading: the components are common to all readings."""
         number: Uncertain = 0.0
-        for name, type_, size, freedom in _components_of(record, at):
+        for name, acts, type_, size, freedom in _components_of(record, at):
             if not size:
                 continue
-            unit = self._shared.setdefault(
-                (signal, name),
-                [Part(self._row_of(signal, name, type_, freedom, record), GTC.ureal(0.0, 1.0, freedom))],
-            )
-            number = number + size * unit[0].number
-            parts.append(replace(unit[0], row=replace(unit[0].row, standard=size)))
+            source = f"certificate: {record.reference}"
+            row = BudgetRow(signal, name, acts, type_, "normal", size, self._units[signal], freedom, 0.0, source)
+            (first,) = self._shared.setdefault((signal, name), [Part(row, GTC.ureal(0.0, 1.0, freedom))])
+            number = number + size * first.number
+            parts.append(replace(first, row=row))
         return number
 
-    def _row_of(self, signal: str, name: str, type_: str, freedom: float, record: Calibration) -> BudgetRow:
-        source = f"certificate: {record.reference}"
-        return BudgetRow(signal, name, type_, "normal", 0.0, self._units[signal], freedom, 0.0, source)
 
-
-def _components_of(record: Calibration, at: float) -> list[tuple[str, str, float, float]]:
-    """Return name, type, standard uncertainty and degrees of freedom of each component of a calibrated value."""
-    value, fitted = float(record.value(at)), float(record.coefficient_uncertainty(at))
+def _components_of(record: Calibration, at: float) -> list[tuple[str, str, str, float, float]]:
+    """Return name, action, type, standard uncertainty and degrees of freedom of each component of a calibrated value."""
+    value, fitted = float(record.value(at)), float(record.coefficient_uncertainty([at])[0])
     return [
-        ("calibration", "A", fitted, float(record.degrees_of_freedom)),
-        ("reference", "B", record.reference_uncertainty, record.reference_degrees_of_freedom or math.inf),
-        ("scale of the reference", "B", record.reference_gain_uncertainty * abs(value), math.inf),
-        ("lack of fit", "A", record.lack_of_fit, float(record.degrees_of_freedom)),
+        ("calibration", "calibration", "A", fitted, float(record.degrees_of_freedom)),
+        (
+            "reference",
+            "reference",
+            "B",
+            record.reference_uncertainty,
+            record.reference_degrees_of_freedom or math.inf,
+        ),
+        ("scale of the reference", "reference", "B", record.reference_gain_uncertainty * abs(value), math.inf),
+        ("lack of fit", "calibration", "A", record.lack_of_fit, float(record.degrees_of_freedom)),
     ]

@@ -32,7 +32,7 @@ def signals(derived=None, units=UNITS, **stated):
 
 
 def row(distribution, contribution, freedom=math.inf):
-    return BudgetRow("spot", "part", "B", distribution, contribution, "m", freedom, contribution, "a test")
+    return BudgetRow("spot", "part", "gain", "B", distribution, contribution, "m", freedom, contribution, "a test")
 
 
 @cases(
