@@ -176,8 +176,11 @@ from .transients.transient_dynamics import (
 from .uncertain_models import (
     ModelUncertainty as ModelUncertainty,
     identified_uncertainty as identified_uncertainty,
+    propagated as propagated,
     quantities_of as quantities_of,
+    quantity_text as quantity_text,
     setpoint_uncertainty as setpoint_uncertainty,
+    spread_row as spread_row,
 )
 from .uncertain_results import (
     ControlUncertainty as ControlUncertainty,

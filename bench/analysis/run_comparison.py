@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from bench.analysis.run_list import main_result
-from bench.analysis.tracking_errors import results_json
+from bench.analysis.tracking_errors import results_json, target_results
 from bench.protocol import PARAMETER
 from bench.record import Difference, Record, Table, differences
 
@@ -79,6 +79,9 @@ class RunComparison:
         Number of steps that both have, by their numbers.
     signals : mapping of str to SignalDifference
         By the signals that both have, over these steps.
+    reproducibility : mapping of str to float
+        By the signals that both controlled: standard deviation of what two sessions reach at the same targets, in the
+        unit of the signal. Empty if they had no targets, or others.
     equal : mapping of str to bool
         Whether `steps`, `telemetry` and `events` are equal to the last bit; events without those of the wall clock.
     """
@@ -87,6 +90,7 @@ class RunComparison:
     outcomes: tuple[Outcomes, Outcomes]
     common_steps: int
     signals: Mapping[str, SignalDifference]
+    reproducibility: Mapping[str, float]
     equal: Mapping[str, bool]
 
     def to_json(self) -> dict[str, Any]:
@@ -114,12 +118,24 @@ def compare_runs(first: Record, second: Record) -> RunComparison:
         (_outcomes(first, len(tables[0])), _outcomes(second, len(tables[1]))),
         len(common),
         signals,
+        _reproducibility(first, second),
         {
             "steps": _steps(first) == _steps(second) and _equal(*tables),
             "telemetry": _equal(first.telemetry(), second.telemetry()),
             "events": _events(first) == _events(second),
         },
     )
+
+
+def _reproducibility(first: Record, second: Record) -> dict[str, float]:
+    output = str(first.meta.get("controls", ""))
+    if not output or second.meta.get("controls") != output:
+        return {}
+    ours, theirs = target_results(first, output), target_results(second, output)
+    if ours is None or theirs is None or not np.array_equal(ours.targets, theirs.targets):
+        return {}
+    # The variance of a difference is that of both sessions.
+    return {output: float(np.sqrt(np.mean((theirs.outputs - ours.outputs) ** 2) / 2.0))}
 
 
 def _files(first: Record, second: Record) -> tuple[Difference, ...]:

@@ -1,11 +1,12 @@
 """What was identified from a run, with its uncertainty: quantities of a model, its predictions, its set-points.
 
 A component that is common to all readings, such as the gain of a sensor, is propagated by a second fit of readings
-that it has moved by its standard uncertainty. What the fit itself leaves open is found by fits of readings whose
-residuals are exchanged in blocks (bootstrap), as neighbouring residuals are alike.
+that it has moved by its standard uncertainty. What the noise of the readings leaves open is found by fits of readings
+with other noise: differences of neighbouring residuals with random signs, as what neighbours have in common is what the
+model cannot follow. That is the same in each session, and stands beside the model as its error.
 
-Sources: JCGM 100:2008 (GUM), 5.1.3, note 2; H. R. Künsch, The jackknife and the bootstrap for general stationary
-observations, Annals of Statistics 17 (1989), 1217.
+Sources: JCGM 100:2008 (GUM), 5.1.3, note 2; J. von Neumann, Annals of Mathematical Statistics 12 (1941), 153, for noise
+from differences; C. F. J. Wu, Annals of Statistics 14 (1986), 1261, for random signs.
 """
 
 from __future__ import annotations
@@ -28,10 +29,7 @@ from bench.rig import Budget, BudgetRow, UncertainSignals, effective_freedom
 Floats = npt.NDArray[np.float64]
 
 _FITS = 20
-"""Fits with other residuals. Derivation: their deviation has 19 degrees of freedom, and k is 2.09 instead of 1.96."""
-_BLOCKS = 60
-"""Blocks of neighbouring residuals. Derivation: half as many as the loops of a characterization have branches, so
-that a block has the errors of a branch together."""
+"""Fits with other noise. Derivation: their deviation has 19 degrees of freedom, and k is 2.09 instead of 1.96."""
 _PLACES = 33
 """Values of a signal at which the contributions of its components are computed; between them they are straight."""
 PROVENANCE = "uncertainty"
@@ -68,10 +66,11 @@ class ModelUncertainty:
 
     def lines(self) -> list[tuple[str, str]]:
         """Return the quantities with their expanded uncertainty, as (name, text) pairs."""
-        return [(name, _quantity_text(budget)) for name, budget in self.quantities.items() if budget.rows]
+        return [(name, quantity_text(budget)) for name, budget in self.quantities.items() if budget.rows]
 
 
-def _quantity_text(budget: Budget) -> str:
+def quantity_text(budget: Budget) -> str:
+    """Return a quantity with its expanded uncertainty, the coverage factor and the largest component."""
     expanded = f"{budget.expanded:.1e}"
     digits = max(1 - int(expanded.partition("e")[2]), 0)
     largest = f"95 %, k = {budget.factor:.2f}, largest part: {budget.rows[0].label}"
@@ -109,6 +108,54 @@ def quantities_of(operator: Operator[Any]) -> dict[str, tuple[float, str]]:
     return found | {"lowest output": (low, output_unit), "highest output": (high, output_unit)}
 
 
+Quantities = Mapping[str, tuple[float, str]]
+"""Values and units by name."""
+
+
+def propagated(
+    signals: UncertainSignals,
+    columns: Mapping[str, Floats],
+    nominal: Quantities,
+    spreads: Mapping[str, BudgetRow],
+    refit: Callable[[Mapping[str, Floats]], Quantities],
+) -> dict[str, Budget]:
+    """Return the budgets of quantities that were identified from readings.
+
+    Parameters
+    ----------
+    signals : UncertainSignals
+        The signals of the run.
+    columns : mapping of str to ndarray
+        Readings by signal, shape (N,) each.
+    nominal : mapping
+        What was identified from them.
+    spreads : mapping of str to BudgetRow
+        What the fit itself leaves open of each quantity.
+    refit : callable
+        Identifies the same from other readings.
+    """
+    rows: dict[str, dict[tuple[str, str], list[BudgetRow]]] = {name: {} for name in nominal}
+    for column in signals.stated([*columns]):
+        for row, moved in _moved(signals, column, columns[column]):
+            for name, (value, _) in refit({**columns, column: moved}).items():
+                contribution = abs(value - nominal[name][0])
+                found = rows[name].setdefault((row.signal, row.component), [])
+                found.append(replace(row, contribution=contribution))
+    budgets = {}
+    for name, (value, unit) in nominal.items():
+        # A wave is its sine and its cosine.
+        parts = [replace(each[0], contribution=_together(each)) for each in rows[name].values()]
+        ordered = sorted([spreads[name], *parts], key=lambda row: -row.contribution)
+        kept = tuple(row for row in ordered if row.contribution)
+        budgets[name] = Budget(name, unit, value, kept, effective_freedom(kept))
+    return budgets
+
+
+def spread_row(spread: float, unit: str, freedom: float, how: str) -> BudgetRow:
+    """Return the component that a fit leaves open: standard deviation, degrees of freedom, and how it was found."""
+    return BudgetRow("the model", "fit", "fit", "A", "normal", spread, unit, freedom, spread, f"measured: {how}")
+
+
 def identified_uncertainty(
     record: Record,
     names: tuple[str, str],
@@ -136,33 +183,24 @@ def identified_uncertainty(
     signals = uncertain_signals(record)
     if not signals.stated([names[1]]):
         return None
-    nominal, quantities = quantities_of(model), {}
-    rows: dict[str, dict[tuple[str, str], list[BudgetRow]]] = {name: {} for name in nominal}
-    squares = np.zeros_like(model.coefficients)
-
-    def add(row: BudgetRow, other: Operator[Any]) -> None:
-        nonlocal squares
-        squares = squares + (other.coefficients - model.coefficients) ** 2
-        for name, (value, _) in quantities_of(other).items():
-            contribution = abs(value - nominal[name][0])
-            rows[name].setdefault((row.signal, row.component), []).append(replace(row, contribution=contribution))
-
-    for row, moved in _moved(signals, names[1], outputs):
-        add(row, fit(inputs, moved))
-    for row, moved in _moved(signals, names[0], inputs) if signals.stated([names[0]]) else ():
-        add(row, fit(moved, outputs))
+    nominal = quantities_of(model)
     rng = np.random.default_rng(0)
-    others = [fit(inputs, outputs - residuals + _exchanged(residuals, rng)) for _ in range(_FITS)]
-    squares = squares + np.var([other.coefficients for other in others], axis=0, ddof=1)
-    spreads = np.std([[value for value, _ in quantities_of(other).values()] for other in others], axis=0, ddof=1)
-    for (name, (value, unit)), spread in zip(nominal.items(), spreads.tolist(), strict=True):
-        how = f"measured: {_FITS} fits with blocks of residuals exchanged"
-        found = [
-            BudgetRow("the model", "fit", "fit", "A", "normal", spread, unit, _FITS - 1.0, spread, how),
-            *(replace(each[0], contribution=_together(each)) for each in rows[name].values()),
-        ]
-        ordered = tuple(sorted((row for row in found if row.contribution), key=lambda row: -row.contribution))
-        quantities[name] = Budget(name, unit, value, ordered, effective_freedom(ordered))
+    others = [fit(inputs, outputs + _noise(residuals, rng)) for _ in range(_FITS)]
+    squares = np.var([other.coefficients for other in others], axis=0, ddof=1)
+    deviations = np.std([[value for value, _ in quantities_of(other).values()] for other in others], axis=0, ddof=1)
+
+    def refit(columns: Mapping[str, Floats]) -> Quantities:
+        nonlocal squares
+        other = fit(columns[names[0]], columns[names[1]])
+        squares = squares + (other.coefficients - model.coefficients) ** 2
+        return quantities_of(other)
+
+    how = f"{_FITS} fits with other noise"
+    spreads = {
+        name: spread_row(deviation, unit, _FITS - 1.0, how)
+        for (name, (_, unit)), deviation in zip(nominal.items(), deviations.tolist(), strict=True)
+    }
+    quantities = propagated(signals, {names[0]: inputs, names[1]: outputs}, nominal, spreads, refit)
     places = np.linspace(outputs.min(), outputs.max(), _PLACES)
     standard = np.array([signals.at(names[1], value, noise=False).standard for value in places.tolist()])
     return ModelUncertainty(quantities, np.sqrt(squares), places, standard)
@@ -182,11 +220,10 @@ def _together(rows: list[BudgetRow]) -> float:
     return math.hypot(*(row.contribution for row in rows))
 
 
-def _exchanged(residuals: Floats, rng: np.random.Generator) -> Floats:
-    """Return residuals whose blocks were drawn with replacement."""
-    length = max(residuals.size // _BLOCKS, 1)
-    starts = rng.integers(0, residuals.size - length + 1, -(-residuals.size // length))
-    return np.concatenate([residuals[start : start + length] for start in starts])[: residuals.size]
+def _noise(residuals: Floats, rng: np.random.Generator) -> Floats:
+    """Return noise as large as that of the readings, place by place."""
+    differences = np.append(np.diff(residuals), residuals[-1] - residuals[-2]) / math.sqrt(2.0)
+    return differences * rng.choice((-1.0, 1.0), differences.size)
 
 
 def predicted_uncertainty(model: ModelFile, outputs: Floats) -> Floats | None:

@@ -166,5 +166,11 @@ def _print_runs(found: RunComparison) -> None:
     for signal, apart in found.signals.items():
         table.add_row(signal, f"{apart.rms:.3g}", f"{apart.maximum:.3g}", apart.unit, str(apart.step))
     show_table(console, table)
+    for signal, deviation in found.reproducibility.items():
+        console.print(
+            f"reproducibility of {signal}: {deviation:.2g} {found.signals[signal].unit}, standard deviation of what "
+            "two sessions reach at the same targets",
+            highlight=False,
+        )
     same = [name for name, equal in found.equal.items() if equal]
     console.print(f"equal to the last bit: {', '.join(same) or 'nothing'}", highlight=False)

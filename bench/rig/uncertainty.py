@@ -575,7 +575,7 @@ class UncertainSignals:
 
 
 def _components_of(record: Calibration, at: float) -> list[tuple[str, str, str, float, float]]:
-    """Return name, action, type, standard uncertainty and degrees of freedom of each component of a calibrated value."""
+    """Return name, action, type, standard uncertainty and degrees of freedom of what a calibrated value has."""
     value, fitted = float(record.value(at)), float(record.coefficient_uncertainty([at])[0])
     return [
         ("calibration", "calibration", "A", fitted, float(record.degrees_of_freedom)),

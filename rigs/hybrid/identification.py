@@ -15,12 +15,21 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bench.analysis import WholeIdentification, WholeModel, only_run
+from bench.analysis import (
+    WholeIdentification,
+    WholeModel,
+    only_run,
+    propagated,
+    quantity_text,
+    spread_row,
+    uncertain_signals,
+)
 from bench.base import ConfigurationError, DataError
 from bench.identification import DynamicsIdentification, Errors, Identification, ModelFile, identify_dynamics
 from bench.models import Polynomial, PrandtlIshlinskii
 from bench.protocol import LATENESS
 from bench.record import Record, Table
+from bench.rig import Budget
 from rigs.hybrid.model import HybridModel, OrderChoice, choose_order, identify_pi, identify_polynomial
 from rigs.hybrid.network_identification import NetworkIdentification, identify_network
 
@@ -37,6 +46,16 @@ PROTOCOLS = ("current-steps", "thermomechanical", "piezo-loops", "piezo-step")
 REFERENCE = 22.0
 """Reference of the polynomial, °C: the nominal temperature of the room."""
 
+_UNITS = {
+    "seebeck": "V/K",
+    "electrical_resistance": "Ω",
+    "tec_capacity": "J/K",
+    **dict.fromkeys(("tec_resistance", "beam_resistance", "beam_side_resistance", "block_side_resistance"), "K/W"),
+}
+"""Units of the fitted parameters of the network."""
+_MOST_ALIKE = 0.99
+"""Largest correlation of neighbouring residuals. Derivation: 100 samples then count as half a one, as in any fit that
+misses the model."""
 _DRIFT_PASSES = 64
 """Passes in which operator and parabola are fitted in turn; more change less than the sensor's noise."""
 
@@ -227,6 +246,35 @@ def network_of(steps: Path) -> NetworkIdentification:
         raise _unidentified(error) from error
 
 
+def network_uncertainty(steps: Path, found: NetworkIdentification) -> dict[str, Budget]:
+    """Return the budgets of the fitted parameters of a thermal network, from its run of `current-steps`."""
+    samples = read_loop(steps)
+    base, tip = samples.names[BASE], samples.names[TIP]
+    freedom = found.residuals.size - len(found.uncertainties)
+    fitted = [name for name in found.uncertainties if name in _UNITS]
+    # Residuals that are alike say less than as many that are not.
+    alike = max(float(np.sum(found.residuals[1:] * found.residuals[:-1]) / np.sum(found.residuals**2)), 0.0)
+    wider = math.sqrt((1.0 + alike) / (1.0 - min(alike, _MOST_ALIKE)))
+
+    nominal = {name: (float(getattr(found.network, name)), _UNITS[name]) for name in fitted}
+
+    def refit(columns: Mapping[str, Floats]) -> dict[str, tuple[float, str]]:
+        moved = np.column_stack([columns[base] - samples[BASE], columns[tip] - samples[TIP]])
+        logarithms = np.tensordot(found.moves, moved, 2).tolist()
+        return {
+            name: (nominal[name][0] * math.exp(x), _UNITS[name]) for name, x in zip(fitted, logarithms, strict=True)
+        }
+
+    spreads = {
+        name: spread_row(wider * found.uncertainties[name], _UNITS[name], freedom, "covariance of the fit")
+        for name in fitted
+    }
+    with Record(steps) as record:
+        signals = uncertain_signals(record)
+    columns = {base: samples[BASE], tip: samples[TIP]}
+    return propagated(signals, columns, nominal, spreads, refit)
+
+
 def _check_protocol(run: Path, protocol: str) -> None:
     with Record(run) as record:
         if record.meta.get("protocol") != protocol:
@@ -250,10 +298,10 @@ def identify_runs(runs: Mapping[str, Sequence[Path]], _: Path | None, options: M
         raise ConfigurationError(f"-o plays={plays}: expected a whole number from 1 to 200")
     found = identify_hybrid(*folders, plays=plays)
     network, dynamics, piezo = found.network, found.dynamics, found.piezo.errors
-    fitted = ((name, value) for name, value in network.uncertainties.items() if name != "ambient")
+    uncertain = network_uncertainty(folders[0], network)
     rows = (
         ("network, RMS of base and tip", f"{network.base.rms:.3f} and {network.tip.rms:.3f} K"),
-        *((name, f"{getattr(network.network, name):.4g} ± {uncertainty:.2g}") for name, uncertainty in fitted),
+        *((name.replace("_", " "), quantity_text(budget)) for name, budget in uncertain.items()),
         (f"polynomial of order {found.order.order}, RMS", f"{found.polynomial.errors.rms * 1e6:.3f} µm"),
         (f"{plays} plays, RMS", f"{piezo.rms_percent:.2f} % of {piezo.span * 1e6:.1f} µm"),
         *(
@@ -271,6 +319,7 @@ def identify_runs(runs: Mapping[str, Sequence[Path]], _: Path | None, options: M
         "prandtl_ishlinskii_rms_percent": piezo.rms_percent,
         "poles_rad_s": {"real": dynamics.model.real_pole, "resonance": dynamics.model.frequency},
         "damping": dynamics.model.damping,
+        "uncertainty": {name: budget.to_json() for name, budget in uncertain.items()},
     }
     return WholeModel(hybrid_file(found, folders), "hybrid", rows, summary)
 

@@ -56,6 +56,8 @@ class NetworkIdentification:
         Condition number of the Jacobian with its columns scaled to unit norm.
     gradient : float
         Greatest cosine between the residuals and a column of the Jacobian; 0 is exact optimality.
+    moves : ndarray, shape (n, N, 2)
+        Change of the logarithm of each fitted parameter with each measured temperature of base and tip, 1/K.
     """
 
     network: ThermalNetwork
@@ -66,6 +68,7 @@ class NetworkIdentification:
     tip: Errors
     condition: float
     gradient: float
+    moves: Floats
 
 
 def identify_network(
@@ -170,4 +173,5 @@ def identify_network(
         tip=errors[1],
         condition=condition,
         gradient=float(evidence.cosines.max()),
+        moves=-np.linalg.pinv(found.jacobian)[:-1].reshape(len(free), -1, 2),
     )
