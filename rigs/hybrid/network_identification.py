@@ -173,5 +173,5 @@ def identify_network(
         tip=errors[1],
         condition=condition,
         gradient=float(evidence.cosines.max()),
-        moves=-np.linalg.pinv(found.jacobian)[:-1].reshape(len(free), -1, 2),
+        moves=np.asarray(-np.linalg.pinv(found.jacobian)[:-1], dtype=np.float64).reshape(len(free), -1, 2),
     )

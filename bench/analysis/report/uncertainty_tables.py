@@ -82,7 +82,7 @@ def control_lines(found: ControlUncertainty) -> list[str]:
     )
     return [
         f"repeatability: {spread}",
-        "reproducibility: not known from one session; bench compare RUN RUN has that of two",
+        "reproducibility: not known from one session; bench runs compare RUN RUN has that of two",
         f"accuracy: {two_digits(factor * found.accuracy)} {unit}, RMS of the true errors that is expected; the "
         f"readings alone say {two_digits(factor * found.rms)} {unit}; for 95 % it is between {low} and {high} {unit}",
     ]

@@ -144,8 +144,8 @@ class TestUnknownKeys:
                 "[rig]",
                 "titel = 1\n[rig]",
                 "titel",
-                "rig, devices, lines, roles, protocols, derived, uncertainty, interlocks, telemetry, safety, dashboard, "
-                "emulation",
+                "rig, devices, lines, roles, protocols, derived, uncertainty, interlocks, telemetry, safety, "
+                "dashboard, emulation",
             ),
             ("[rig]", "[tele-metry]\n[rig]", "tele-metry", "telemetry"),
             ("[rig]", "[rig]\ntitel = 'x'", "rig.titel", "title, description"),
