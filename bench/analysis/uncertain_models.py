@@ -2,11 +2,11 @@
 
 A component that is common to all readings, such as the gain of a sensor, is propagated by a second fit of readings
 that it has moved by its standard uncertainty. What the noise of the readings leaves open is found by fits of readings
-with other noise: differences of neighbouring residuals with random signs, as what neighbours have in common is what the
-model cannot follow. That is the same in each session, and stands beside the model as its error.
+with other noise: differences of neighbouring residuals with random signs, as what neighbours have in common is what
+the model cannot follow. That is the same in each session, and stands beside the model as its error.
 
-Sources: JCGM 100:2008 (GUM), 5.1.3, note 2; J. von Neumann, Annals of Mathematical Statistics 12 (1941), 153, for noise
-from differences; C. F. J. Wu, Annals of Statistics 14 (1986), 1261, for random signs.
+Sources: JCGM 100:2008 (GUM), 5.1.3, note 2; J. von Neumann, Annals of Mathematical Statistics 12 (1941), 153, for
+noise from differences; C. F. J. Wu, Annals of Statistics 14 (1986), 1261, for random signs.
 """
 
 from __future__ import annotations
