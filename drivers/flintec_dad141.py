@@ -285,8 +285,7 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
             serial_number = self.serial_number
             self._check_order()
         except RefusalError as error:
-            reason = str(error).removeprefix(f"{self.name}: ")
-            raise self._wrong(f"is not a DAD 141.1: {reason}; check the address") from error
+            raise self._wrong(f"is not a DAD 141.1: {error.text}; check the address") from error
         minor, major = low >> 8, low & 0xFF
         return Identity("Flintec", "DAD 141.1", str(serial_number), f"{major}.{minor:02d}")
 

@@ -15,7 +15,7 @@ from bench.analysis.tables.data import check_variation
 from bench.analysis.tables.dataset import Dataset, check_rows, overwritten_from, parse_rows
 from bench.analysis.tables.reading.table import FEWEST_ROWS
 from bench.analysis.tables.starting_state import bind_times, left_out
-from bench.base import ConfigurationError, DataError
+from bench.base import ConfigurationError, DataError, whole_file
 from bench.identification import (
     Beyond,
     Comparison,
@@ -149,12 +149,12 @@ class SelectedModel:
         Raises DataError if it cannot be written.
         """
         try:
-            with path.open("w", newline="", encoding="utf-8") as file:
+            with whole_file(path) as part, part.open("w", newline="", encoding="utf-8") as file:
                 writer = csv.DictWriter(file, COLUMNS)
                 writer.writeheader()
                 writer.writerows(self.rows())
         except OSError as error:
-            raise DataError(f"{path} cannot be written: {error}") from None
+            raise DataError(f"{path} cannot be written: {error.strerror or error}") from None
 
 
 def named_models(text: str) -> tuple[str, ...]:

@@ -111,6 +111,10 @@ from .units import (
     unit_registry as unit_registry,
     with_unit as with_unit,
 )
+from .whole_files import (
+    whole_file as whole_file,
+    write_whole as write_whole,
+)
 from .workers.display import (
     TasksDisplay as TasksDisplay,
 )

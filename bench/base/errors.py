@@ -52,13 +52,20 @@ class DeviceError(BenchError):
         Name of the device in the rig.
     message : str
         What happened and what to do about it.
+
+    Attributes
+    ----------
+    device : str
+        Name of the device in the rig.
+    text : str
+        The message, without the name.
     """
 
     exit_code = 4
 
     def __init__(self, device: str, message: str) -> None:
         super().__init__(f"{device}: {message}")
-        self.device = device
+        self.device, self.text = device, message
 
 
 class DeviceConnectionError(DeviceError):

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.base.errors import DataError
+from bench.base.whole_files import write_whole
 
 _TOO_DEEP = "it is nested too deeply"
 _WITH_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
@@ -98,7 +99,7 @@ def json_text(content: Any, *, indent: int | None = None) -> str:  # noqa: ANN40
 def write_json_file(path: Path, content: Any) -> None:  # noqa: ANN401 - anything that JSON can hold
     """Write a file of JSON for people too; raises DataError if that cannot be."""
     try:
-        path.write_text(f"{json_text(content, indent=1)}\n", encoding="utf-8")
+        write_whole(path, f"{json_text(content, indent=1)}\n")
     except OSError as error:
         raise DataError(f"{path} cannot be written: {error.strerror or error}") from None
 

@@ -23,6 +23,7 @@ from bench.base import (
     PlainConsole,
     json_text,
     show_table,
+    write_whole,
 )
 from bench.cli.streams import write_out
 
@@ -261,7 +262,7 @@ def write_json(path: Path | None, content: Any) -> None:  # noqa: ANN401 - anyth
         failure = write_out(text)
     else:
         try:
-            path.write_text(text, encoding="utf-8")
+            write_whole(path, text)
             failure = ""
         except OSError as error:
             failure = error.strerror or str(error)

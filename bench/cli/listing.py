@@ -14,7 +14,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from bench.base import json_text, parse_json, registry
+from bench.base import json_text, parse_json, registry, write_whole
 
 
 def listing() -> dict[str, Any]:
@@ -36,9 +36,7 @@ def listing() -> dict[str, Any]:
         # Where nothing can be remembered, it is said anew each time.
         with suppress(OSError):
             file.parent.mkdir(parents=True, exist_ok=True)
-            made = file.with_name(f"{file.name}.{os.getpid()}")
-            made.write_text(json_text({"state": state, "catalogue": found}), encoding="utf-8")
-            made.replace(file)
+            write_whole(file, json_text({"state": state, "catalogue": found}))
     return found
 
 

@@ -43,6 +43,9 @@ class Document:
 
         Raises ValueError if a key is missing or a value is wrong.
         """
+        kind = _checks.json_field(document, "type", cls.kind)
+        if kind != cls.kind:
+            raise ValueError(f"{cls.kind}: expected type {cls.kind!r}, got {kind!r}")
         values: dict[str, Any] = {}
         for field in fields(cls):  # type: ignore[arg-type]
             is_optional = field.default in (None, "") or field.name in cls.added

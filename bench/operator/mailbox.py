@@ -6,17 +6,16 @@ the folder is: in another session, on another computer, on Windows, and nothing 
 
 from __future__ import annotations
 
-import os
 import threading
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Annotated, Literal, Self, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Strict
 
-from bench.base import Interrupts, json_text, parse_json, wall_time
+from bench.base import Interrupts, json_text, parse_json, wall_time, write_whole
 from bench.operator.questions import Question
 
 _NAME = "operator"
@@ -106,7 +105,7 @@ class RunMailbox:
         """Let a panel see a question, under a number of its own."""
         self._asked += 1
         with suppress(OSError):
-            _write(self._folder / _QUESTION, {"number": self._asked, **asdict(question)})
+            write_whole(self._folder / _QUESTION, json_text({"number": self._asked, **asdict(question)}))
 
     def answer(self) -> str | None:
         """Return what a panel has answered to the question, None while it has not."""
@@ -170,18 +169,11 @@ class PanelMailbox:
 
     def reply(self, number: int, answer: str) -> None:
         """Answer a question; raises OSError if the folder cannot be written."""
-        _write(self._folder / _ANSWER.format(number), {"answer": answer})
+        write_whole(self._folder / _ANSWER.format(number), json_text({"answer": answer}))
 
     def request(self, do: str) -> None:
         """Ask for a pause or for the end; raises OSError if the folder cannot be written."""
-        _write(self._folder / _REQUEST, {"do": do})
-
-
-def _write(path: Path, content: dict[str, Any]) -> None:
-    """Write a file that is never seen half written."""
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
-    part.write_text(json_text(content), encoding="utf-8")
-    part.replace(path)
+        write_whole(self._folder / _REQUEST, json_text({"do": do}))
 
 
 def _read(path: Path, kind: type[_Kind]) -> _Kind | None:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote, unquote
 
-from bench.base import DataError, json_text, parse_json
+from bench.base import DataError, json_text, parse_json, write_whole
 from bench.record.rows import FILE_NAME
 
 FOLDER = "models"
@@ -47,11 +46,9 @@ def add_model(path: Path, name: str, t: float, model: Mapping[str, Any]) -> None
     position = 1 + max((position for position, _, _ in _kept(folder)), default=0)
     file = folder / f"{quote(name, safe=' ')}.json"
     content = {**model, _KEPT: {"t": t, "position": position}} if isinstance(model, dict) else model
-    unfinished = file.with_suffix(f".{os.getpid()}.tmp")
     try:
         folder.mkdir(exist_ok=True)
-        unfinished.write_text(json_text(content, indent=1) + "\n", encoding="utf-8")
-        unfinished.replace(file)
+        write_whole(file, json_text(content, indent=1) + "\n")
     except OSError as error:
         raise DataError(f"model file {file} cannot be written: {error.strerror}") from None
 

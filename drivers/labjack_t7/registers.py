@@ -625,8 +625,7 @@ class LabJackT7:
         except DeviceConnectionError:
             raise
         except DeviceError as error:
-            reason = str(error).removeprefix(f"{self._name}: ")
-            raise self._wrong(f"is not a LabJack T-series: register TEST gave {reason}") from error
+            raise self._wrong(f"is not a LabJack T-series: register TEST gave {error.text}") from error
         if words != _TEST_WORDS:
             raise self._wrong(
                 swapped(words, lambda order: list(order) == _TEST_WORDS)

@@ -314,7 +314,7 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
                     unconfirmed = self._unconfirmed("output", failures)
                     if dead:
                         # Another line is tried then.
-                        raise DeviceConnectionError(self.name, str(unconfirmed).removeprefix(f"{self.name}: "))
+                        raise DeviceConnectionError(self.name, unconfirmed.text)
                     raise unconfirmed
             self._on = False
             # The output is off, so whether the watchdog could be disarmed does not matter for safety. A device that

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import ipaddress
-import os
 import secrets
 import socket
 import sys
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from rich.table import Table
 
-from bench.base import ConfigurationError, json_text, parse_json
+from bench.base import ConfigurationError, json_text, parse_json, write_whole
 from bench.cli import STANDARD_OUTPUT, JsonOption, console, parse_assignments, parse_numbers, warn
 
 if TYPE_CHECKING:
@@ -201,13 +200,9 @@ def _print_line(content: dict[str, Any]) -> None:
 
 
 def _write_at_once(path: Path, content: dict[str, Any]) -> None:
-    """Write a file that is never seen half written."""
-    beside = path.with_name(f".{path.name}.{os.getpid()}")
     try:
-        beside.write_text(json_text(content, indent=1) + "\n", encoding="utf-8")
-        beside.replace(path)
+        write_whole(path, json_text(content, indent=1) + "\n")
     except OSError as error:
-        beside.unlink(missing_ok=True)
         raise ConfigurationError(f"--json {path} cannot be written: {error.strerror}") from None
 
 

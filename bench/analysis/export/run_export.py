@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
 from typing import Any
@@ -13,7 +10,7 @@ from typing import Any
 from bench.analysis.export.bluesky_documents import write_documents
 from bench.analysis.export.typed_tables import TypedTable, metadata_of, typed_tables
 from bench.analysis.tables.data import write_blocks
-from bench.base import ConfigurationError, DataError, json_text, needed_for, write_json_file
+from bench.base import ConfigurationError, DataError, json_text, needed_for, whole_file, write_json_file
 from bench.execution import RECORDING_NAME
 from bench.record import Record
 
@@ -26,8 +23,7 @@ def export_run(run: Path, format_: str, out: Path | None, *, escape_formulas: bo
 
     `csv` and `parquet` are readings, telemetry and events, with the metadata beside or in the schema; `bluesky` are
     documents as JSON lines; `rrd` is the recording, `png` a picture of the dashboard. `escape_formulas` is that of
-    `write_blocks`, for CSV. Rows are read and written in blocks, and a file is there only as a
-    whole.
+    `write_blocks`, for CSV. Rows are read and written in blocks, and a file is there only as a whole.
 
     Raises
     ------
@@ -50,37 +46,22 @@ def export_run(run: Path, format_: str, out: Path | None, *, escape_formulas: bo
             return [_picture(record, folder)]
         if format_ == "bluesky":
             path = folder / "documents.jsonl"
-            with _made_whole(path) as part:
-                write_documents(record, part)
+            write_documents(record, path)
             return [path]
         metadata = metadata_of(record)
         paths = []
         for name, table in typed_tables(record).items():
             paths.append(folder / f"{name}.{format_}")
-            with _made_whole(paths[-1]) as part:
-                if format_ == "csv":
-                    heads = [column.head for column in table.columns]
-                    blocks = ([list(map(_cell, values)) for values in block] for block in table.blocks)
-                    write_blocks(part, heads, blocks, escape_formulas=escape_formulas)
-                else:
-                    _write_parquet(part, table, metadata)
+            if format_ == "csv":
+                heads = [column.head for column in table.columns]
+                blocks = ([list(map(_cell, values)) for values in block] for block in table.blocks)
+                write_blocks(paths[-1], heads, blocks, escape_formulas=escape_formulas)
+            else:
+                _write_parquet(paths[-1], table, metadata)
     if format_ == "csv":
         paths.append(folder / "metadata.json")
         write_json_file(paths[-1], metadata)
     return paths
-
-
-@contextmanager
-def _made_whole(path: Path) -> Iterator[Path]:
-    """Give another name to write a file under, which becomes the file once it is whole."""
-    part = path.with_name(f"{path.name}.{os.getpid()}.part")
-    try:
-        yield part
-        part.replace(path)
-    except OSError as error:
-        raise DataError(f"{path} cannot be written: {error.strerror}") from None
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def make_folder(path: Path) -> Path:
@@ -152,9 +133,9 @@ def _write_parquet(path: Path, table: TypedTable, metadata: dict[str, Any]) -> N
     ]
     schema = pa.schema(fields, metadata={"bench": json_text(metadata)})
     try:
-        with pa.parquet.ParquetWriter(path, schema) as writer:
+        with whole_file(path) as part, pa.parquet.ParquetWriter(part, schema) as writer:
             for block in table.blocks:
                 arrays = [pa.array(values, type=field.type) for values, field in zip(block, fields, strict=True)]
                 writer.write_table(pa.table(arrays, schema=schema))
     except OSError as error:
-        raise DataError(f"{path} cannot be written: {error}") from None
+        raise DataError(f"{path} cannot be written: {error.strerror or error}") from None

@@ -15,7 +15,7 @@ import numpy.typing as npt
 from bench.analysis.model_service import IdentifiedFile, certificate_lines
 from bench.analysis.predictions import Predictions
 from bench.analysis.tables.data import Quantity
-from bench.base import DataError
+from bench.base import DataError, write_whole
 from bench.identification import Errors
 from bench.models import MemoryCurve, Operator, TimedModel
 from bench.record import Record
@@ -58,7 +58,7 @@ def write_card(
         figures=[Path(os.path.relpath(each, path.parent)).as_posix() for each in figures],
     )
     try:
-        path.write_text(text, encoding="utf-8")
+        write_whole(path, text)
     except OSError as error:
         raise DataError(f"model card {path} cannot be written: {error.strerror}") from None
 

@@ -20,7 +20,7 @@ from bench.analysis.tables.reading.spreadsheet import read_spreadsheet
 from bench.analysis.tables.reading.table import ReadColumns
 from bench.analysis.tables.reading.text import reading_errors
 from bench.analysis.tables.reading.text_table import read_text
-from bench.base import ConfigurationError, DataError, header_with_unit
+from bench.base import ConfigurationError, DataError, header_with_unit, whole_file
 from bench.record import Record
 
 _OVERLOAD = 9.9e37
@@ -227,7 +227,7 @@ def write_blocks(
     """
     shown = _as_text if escape_formulas else _as_it_is
     try:
-        with path.open("w", newline="", encoding="utf-8") as file:
+        with whole_file(path) as part, part.open("w", newline="", encoding="utf-8") as file:
             writer = csv.writer(file)
             writer.writerow(map(shown, header))
             for columns in blocks:
@@ -237,7 +237,7 @@ def write_blocks(
                 ]
                 writer.writerows(zip(*plain, strict=True))
     except OSError as error:
-        raise DataError(f"{path} cannot be written: {error}") from None
+        raise DataError(f"{path} cannot be written: {error.strerror or error}") from None
 
 
 def _as_it_is(cell: object) -> object:

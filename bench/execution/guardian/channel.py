@@ -144,20 +144,17 @@ def to_message(error: BaseException) -> Message:
     One of a class of its own, of a driver, say, goes as the nearest class that both sides know.
     """
     known = isinstance(error, BenchError)
-    text = str(error) if known else f"{type(error).__name__}: {error}"
+    device, text = (error.device, error.text) if isinstance(error, DeviceError) else (None, str(error))
     return {
         "kind": next((kind.__name__ for kind in type(error).__mro__ if kind in _KINDS.values()), BenchError.__name__),
-        "text": text,
-        "device": error.device if isinstance(error, DeviceError) else None,
+        "text": text if known else f"{type(error).__name__}: {text}",
+        "device": device,
     }
 
 
 def to_error(message: Message) -> BenchError:
     """Return the error that a message stands for."""
     kind = _KINDS[message["kind"]]
-    text, device = message["text"], message["device"]
-    if device is not None:
-        error: BenchError = kind(device, text.removeprefix(f"{device}: "))
-        return error
-    made: BenchError = kind(text)
+    device, text = message["device"], message["text"]
+    made: BenchError = kind(*((text,) if device is None else (device, text)))
     return made

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bench.base import ENDING, BenchError, parse_json
+from bench.base import ENDING, BenchError, parse_json, write_whole
 from bench.execution.guardian.parent import SIGKILL, ParentProcess
 from bench.execution.guardian.start import start_module
 from bench.rig import SAFE, Rescued, load_rig, opened, rescue
@@ -110,10 +110,8 @@ class Report:
 
     def write(self, states: dict[str, str]) -> None:
         """Write the states of devices down, empty while they are not known; a bench that has left reads no more."""
-        new = self.path.with_suffix(".new")
         with suppress(OSError):
-            new.write_text(json.dumps({"process": os.getpid(), "devices": states}), encoding="utf-8")
-            new.replace(self.path)
+            write_whole(self.path, json.dumps({"process": os.getpid(), "devices": states}))
 
 
 def is_needed(signs: queue.SimpleQueue[bytes]) -> bool:

@@ -234,9 +234,8 @@ class LocalStation(Station):
         others.pop(error.device, None)
         if not others:
             raise error
-        text = str(error).removeprefix(f"{error.device}: ")
         causes = ", ".join(f"{name} {what}" for name, what in sorted(others.items()))
-        raise type(error)(error.device, f"{text} ({causes} just before)") from error
+        raise type(error)(error.device, f"{error.text} ({causes} just before)") from error
 
     def _reconnect(self, name: str, error: DeviceConnectionError) -> None:
         absence = Absence(self._rig.devices[name], error, self.clock, self._longest_away[name])

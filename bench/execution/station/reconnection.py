@@ -63,9 +63,8 @@ class Absence:
         except DeviceConnectionError:
             now = self._clock.now()
             if now - self._since >= self._longest:
-                text = str(self.lost).removeprefix(f"{self.lost.device}: ")
                 raise DeviceConnectionError(
-                    self.lost.device, f"{text}; it was not back within {self._longest:g} s"
+                    self.lost.device, f"{self.lost.text}; it was not back within {self._longest:g} s"
                 ) from None
             if self._clock.interrupted():
                 raise self.lost from None

@@ -102,7 +102,7 @@ def check_up(place: Workplace, exercise: bool, keep_on: Callable[[], None]) -> l
             found[name].extend(check())
         except DeviceError as error:
             failed.add(name)
-            found[name].append(_failure(name, error))
+            found[name].append(_failure(error))
 
     try:
         for entry in place.entries:
@@ -111,7 +111,7 @@ def check_up(place: Workplace, exercise: bool, keep_on: Callable[[], None]) -> l
                 device = entry.driver.connect(entry.name, entry.settings, place.clock)
             except BenchError as error:
                 failed.add(entry.name)
-                found[entry.name].append(_failure(entry.name, error))
+                found[entry.name].append(_failure(error))
                 continue
             devices[entry.name] = device
             identities[entry.name] = str(device.identity)
@@ -157,13 +157,12 @@ def _calibration(day: date | None, due: date | None, today: date, afterwards: st
     return [CheckFinding("calibration", ", ".join(parts))]
 
 
-def _failure(name: str, error: BenchError) -> CheckFinding:
-    text = str(error).removeprefix(f"{name}: ")
+def _failure(error: BenchError) -> CheckFinding:
     if isinstance(error, DeviceConnectionError):
-        return CheckFinding("connection", text, "see that it is on and connected as the rig file says")
+        return CheckFinding("connection", error.text, "see that it is on and connected as the rig file says")
     if isinstance(error, DeviceError):
-        return CheckFinding("error", text, "do as it says; `bench rig clear` clears an error that it keeps")
-    return CheckFinding("rig file", text, "correct the rig file")
+        return CheckFinding("error", error.text, "do as it says; `bench rig clear` clears an error that it keeps")
+    return CheckFinding("rig file", str(error), "correct the rig file")
 
 
 def _readings(device: Device, place: Workplace, ticks: dict[str, float]) -> list[CheckFinding]:

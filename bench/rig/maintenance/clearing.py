@@ -49,21 +49,21 @@ def _condition(place: Workplace, entry: DeviceEntry, connect: Any) -> Condition:
     can_recover = callable(getattr(entry.driver, "recover", None))
 
     def found(state: State, meaning: object) -> Condition:
-        return Condition(entry.name, state, str(meaning).removeprefix(f"{entry.name}: "), can_recover)
+        return Condition(entry.name, state, str(meaning), can_recover)
 
     try:
         device: Device = connect(entry.name, entry.settings, place.clock)
     except DeviceConnectionError as error:
-        return found("not reached", error)
+        return found("not reached", error.text)
     except DeviceError as error:
-        return found("in error", error)
+        return found("in error", error.text)
     except ConfigurationError as error:
         return found("refused", error)
     try:
         place.take_instrument(device)
         device.safe()
     except DeviceError as error:
-        return found("in error", error)
+        return found("in error", error.text)
     finally:
         device.close()
     return found("ready", device.identity)
@@ -90,5 +90,5 @@ def clear_expired_watchdogs(place: Workplace) -> dict[str, str]:
             found = recover(place, entry)
             if found.state != "ready":
                 raise DeviceError(entry.name, f"is {found.state}: {found.meaning}") from None
-            cleared[entry.name] = str(error).removeprefix(f"{entry.name}: ").partition(";")[0]
+            cleared[entry.name] = error.text.partition(";")[0]
     return cleared

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-from bench.base import Clock, Stopwatch, parse_json
+from bench.base import Clock, DeviceError, Stopwatch, parse_json
 from bench.devices import Actuator
 from bench.rig.file import DeviceEntry
 from bench.rig.maintenance.locks import port_of
@@ -196,7 +196,7 @@ class _Tries:
             state = SAFE
         # Nothing may keep the next device from being tried, a defect of a driver included.
         except Exception as error:
-            state = str(error).removeprefix(f"{entry.name}: ") or type(error).__name__
+            state = (error.text if isinstance(error, DeviceError) else str(error)) or type(error).__name__
         self._states[entry.name] = state
 
 

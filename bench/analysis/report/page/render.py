@@ -6,7 +6,7 @@ import importlib.metadata
 from pathlib import Path
 
 from bench.analysis.report.page.elements import Page
-from bench.base import DataError, needed_for
+from bench.base import DataError, needed_for, write_whole
 
 _HERE = Path(__file__).parent
 
@@ -34,6 +34,6 @@ def write_page(path: Path, page: Page) -> None:
     Raises DataError if it cannot be written.
     """
     try:
-        path.write_text(render(page), encoding="utf-8")
+        write_whole(path, render(page))
     except OSError as error:
         raise DataError(f"{path} cannot be written: {error.strerror}") from None
