@@ -2,11 +2,12 @@
 
 import gzip
 import io
+import re
 
 import numpy as np
 import pytest
 from cases import cases
-from hypothesis import given, settings, strategies as st
+from hypothesis import assume, given, settings, strategies as st
 from lab_tables import WITH_UNITS, U, Y, body, check, number, table, write
 
 from bench.analysis import ReadingOptions, read_columns
@@ -380,3 +381,30 @@ def test_a_remark_behind_the_last_column_is_left_alone(tmp_path):
     rows = [f"{i}.5,{2 * i}.25,{3 * i}.125" + ",looks odd" * (i == 20) for i in range(30)]
     path = write(tmp_path, ("\n".join(["time,u,y", *rows]) + "\n").encode())
     assert read_columns(path, ["y"]).values["y"].tolist() == [3 * i + 0.125 for i in range(30)]
+
+
+_MARKS = "\u200f\u202e\u2066\u200b\xad([{<)]}>*?~^='’_/+-$€½٣１dex \xa0\t.,;#|%"
+
+
+@settings(max_examples=400, deadline=None)
+@given(st.data())
+def test_a_cell_with_a_character_that_is_no_part_of_a_number_is_refused(tmp_path_factory, data):
+    delimiter, decimal = data.draw(st.sampled_from([(";", ","), (";", "."), ("\t", "."), ("\t", ","), (",", ".")]))
+    has_heads = data.draw(st.booleans())
+    rows = [[f"{0.5 * i + 0.25 * j}".replace(".", decimal) for j in range(3)] for i in range(12)]
+    row, place = data.draw(st.integers(0, 11)), data.draw(st.integers(0, 2))
+    marks = st.text([mark for mark in _MARKS if mark != delimiter], max_size=3)
+    before, after = data.draw(marks), data.draw(marks)
+    wrong = before + rows[row][place] + after
+    strict = re.fullmatch(rf"[+-]?(\d+({decimal}\d*)?|{decimal}\d+)(e[+-]?\d+)?".replace(".", r"\."), wrong.strip())
+    assume(strict is None and not wrong.lstrip().startswith(("#", "%", "//", ";")))
+    rows[row][place] = wrong
+    lines = [["a", "b", "c"]] * has_heads + rows
+    path = write(tmp_path_factory.mktemp("cells"), "".join(delimiter.join(line) + "\n" for line in lines))
+    try:
+        found = read_columns(path, ("1", "2", "3"))
+    except DataError:
+        return
+    # What is left out, or taken for heads, is said.
+    assert all(len(column) == 11 for column in found.values.values()), (wrong, found)
+    assert re.search(r"1 line|heads from line 1", found.assumptions), (wrong, found)

@@ -62,6 +62,14 @@ def test_a_model_is_the_same_after_json():
     np.testing.assert_array_equal(again.densities()[0].values, model.densities()[0].values)
 
 
+@pytest.mark.parametrize("wrong", [[1.0], "hammerstein", None])
+def test_a_part_of_another_type_is_refused(wrong):
+    document = specimen(delay=0.0071).to_json()
+    document["linear"]["type"] = wrong
+    with pytest.raises(ValueError, match="linear-part"):
+        Hammerstein.from_json(document)
+
+
 @cases("sign", [1.0, -1.0])
 def test_every_element_is_found_again_on_uneven_times(sign):
     rng = np.random.default_rng(5)

@@ -41,6 +41,9 @@ D_EXPONENTS = "exponents with D"
 
 _MOST_LINES_OF_HEADS = 4
 
+_WITHIN = re.compile(r"(?<![\d.,])\d+[.,]\d+(?![\d.,])")
+"""A number with a decimal sign, in a text."""
+
 _TIME = re.compile(r"\d+[-./:]\d")
 """Begins a date or a time of day."""
 
@@ -214,6 +217,9 @@ def find_layout(path: Path, lines: Sequence[str], options: ReadingOptions, first
             header = find_header(rows, decimal, delimiter, in_order=options.table is not None)
             if header is None or (delimiter == decimal and not _quoted(rows, lines, options)):
                 continue
+            # A blank within a cell delimits nothing where another character does.
+            if delimiter == " " and any(rank[1] and other.columns == header.columns for rank, other in found):
+                continue
             if not header.heads and header.fit == 1:
                 header = _header_in_comment(lines, first, header, delimiter)
             data = [row.cells for row in rows if row.line > header.start]
@@ -242,14 +248,15 @@ def find_layout(path: Path, lines: Sequence[str], options: ReadingOptions, first
             if same == rank and other.columns != layout.columns and "," in (layout.delimiter, other.delimiter)
         ]
         cells = [row for row in split_rows(lines, layout.delimiter, first) if row.line > layout.start]
-        if rivals or (layout.delimiter == "," and rank[0] < 2 and _may_be_decimal(cells, layout)):
+        has_names = rank[0] == 2 and not any(is_number(head.text, ".") for head in layout.heads)
+        if rivals or (layout.delimiter == "," and not has_names and _may_be_decimal(cells, layout)):
             raise DataError(
                 f"{path}: line {cells[0].line}: a comma may stand between columns or be the decimal sign: say "
                 "--delimiter comma, or --decimal comma; where it is both, save the file with another delimiter"
             )
     for head in layout.heads:
-        bare = "".join(sign for sign in head.text if sign in "0123456789.,")
-        if bare != head.text and not any(map(str.isalpha, head.text)) and re.fullmatch(r"\d+[.,]\d+", bare):
+        text = head.text
+        if _WITHIN.search(text) and not any(map(str.isalpha, text)) and not any(is_number(text, s) for s in ".,"):
             raise DataError(
                 f"{path}: line {layout.start}: {head.text!r} is neither a number nor the head of a column: correct "
                 "it in the file, or leave the line out with --skip-lines"
@@ -304,7 +311,7 @@ def _find_heads(
     rows: Sequence[Row], masks: Sequence[Mask], begin: int, pattern: Mask, decimal: str, delimiter: str
 ) -> Header:
     """Return the heads and units above the data, which begin in a row and have a pattern."""
-    columns = len(pattern)
+    columns, notes = len(pattern), list[str]()
     if (
         begin == 0
         and len(rows) > 1
@@ -313,11 +320,11 @@ def _find_heads(
     ):
         # Such as `time, 1, 2`.
         begin = 1
+        notes.append(f"heads from line {rows[0].line}, some of them numbers")
     if begin == 0:
         return Header(rows[0].line - 1, (), columns, 1, ())
     start = rows[begin - 1].line
     texts, units = rows[begin - 1].cells, list[str]()
-    notes: list[str] = []
     # As of two channels, heads may be numbers but for the first.
     above = rows[begin - 2].cells if begin > 1 and masks[begin - 2][0] is False else []
     highest = rows[begin - 3].cells if above and begin > 2 and not any(masks[begin - 3]) else []
@@ -335,7 +342,8 @@ def _find_heads(
         # Numbers with the other decimal sign.
         return Header(start, (), columns, 0, ())
     heads = _matched(texts, columns, delimiter)
-    if len(heads) == 1 < columns and (aligned := _aligned(rows[:begin], columns)):
+    aligned = _aligned(rows[:begin], columns) if len(heads) == 1 < columns else []
+    if aligned and not any(is_number(text, sign) for text in aligned for sign in ".,"):
         return Header(start, make_heads(aligned), columns, 2, ("heads aligned by blanks",))
     if len(heads) == 1 < columns and begin > 1:
         # A title, perhaps between the heads and the data.

@@ -262,7 +262,9 @@ class _Body:
         values: list[list[float]] = [[] for _ in self._places]
         lines = self._closed(self._file.lines(layout.start, self._end()))
         for number, row in enumerate(split_rows(lines, layout.delimiter, layout.start), start=1):
-            if any(is_number(cell, layout.decimal) for cell in row.cells[self._width :]):
+            beyond = row.cells[self._width :]
+            # Between blanks a text may be a part of the cell before it.
+            if any(layout.delimiter == " " or is_number(cell, layout.decimal) for cell in beyond):
                 raise DataError(
                     f"{path}: line {row.line}, row {number}: has {len(row.cells)} cells; the table has {self._width} "
                     "columns, so that its numbers may stand in the wrong ones; remove what is too much"
