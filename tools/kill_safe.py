@@ -27,6 +27,7 @@ from dataclasses import dataclass
 from guarded_run import SETPOINTS, GuardedRun, hear_signals, outputs_on, start_busy
 
 from bench.execution.guardian.rescuer import SILENCE
+from bench.record import ending_of
 from bench.rig import load_rig
 from sim_devices.serving.process import EmulatedRig, serve
 
@@ -142,8 +143,12 @@ def harm_bench(rig: EmulatedRig, trial: Trial, wait: float) -> dict[str, Found]:
                 problem = problem or f"exit code {code} after SIGCONT"
             if outputs_on(rig):
                 problem = "switched on again after SIGCONT"
-        elif trial.sent not in (None, signal.SIGKILL) and (code := run.exit_code()) != 130:
-            problem = problem or f"exit code {code}"
+        elif trial.sent not in (None, signal.SIGKILL):
+            code = run.exit_code()
+            # A bench that hangs is ended by its guardian where the patience is over first.
+            by_guardian = trial.protocol == "spin" and ending_of(run.folder) is not None
+            if code != (7 if by_guardian else 130):
+                problem = problem or f"exit code {code}, ended by {'its guardian' if by_guardian else 'the signal'}"
         return {"": Found(found.seconds, found.within, problem)}
 
 
