@@ -21,6 +21,7 @@ from bench.protocol import (
     Slots,
     Step,
     Views,
+    difference_of,
     from_slot,
     parameter,
     unit_of,
@@ -74,7 +75,10 @@ class RampParameters(SweepParameters):
     """What can be set where ramps join the set-points."""
 
     increment: float = parameter(
-        from_slot("drive", "increment"), unit=DRIVE, above=0.0, help="largest difference of neighbouring set-points"
+        from_slot("drive", "increment"),
+        unit=difference_of("drive"),
+        above=0.0,
+        help="largest difference of neighbouring set-points",
     )
 
 

@@ -100,14 +100,18 @@ from .shares import (
     shares_to as shares_to,
 )
 from .units import (
+    Display as Display,
     check_unit as check_unit,
     fitting_prefix as fitting_prefix,
     format_duration as format_duration,
     format_numbers as format_numbers,
     header_with_unit as header_with_unit,
+    in_si as in_si,
     in_unit as in_unit,
+    is_quantity as is_quantity,
     per_square as per_square,
     quantity as quantity,
+    read_quantity as read_quantity,
     unit_registry as unit_registry,
     with_unit as with_unit,
 )

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import cache
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
-_PREFIXABLE = ("m", "A", "V", "N", "W")
+_PREFIXABLE = ("m", "A", "V", "N", "W", "m/s")
 _PREFIXES = {"": 1.0, "m": 1e3, "µ": 1e6, "n": 1e9}
 _DIGITS = 3
 """Most digits after the point of a number whose unit can take a prefix."""
+_QUANTITY = re.compile(
+    r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*([^\s\d.,+\-*/^][^,]*?)\s*", re.ASCII | re.IGNORECASE
+)
 
 
 def fitting_prefix(unit: str, *numbers: float, least: float = 1.0) -> tuple[float, str]:
@@ -47,6 +53,56 @@ def format_numbers(numbers: Sequence[float | None], unit: str, precision: int) -
         digits = min(digits, _DIGITS)
     texts = ["–" if number is None else f"{factor * number:.{digits}f}" for number in numbers]
     return [*texts, "" if shown == "1" else shown]
+
+
+@dataclass(frozen=True)
+class Display:
+    """How the values of one quantity are shown, wherever that is: in one unit, with so many digits.
+
+    Attributes
+    ----------
+    factor : float
+        From the unit of the values to the one that is shown.
+    unit : str
+        What is shown; empty for a plain number.
+    digits : int
+        After the point.
+    """
+
+    factor: float
+    unit: str
+    digits: int
+
+    @classmethod
+    def of(cls, unit: str, precision: int, extent: float | None = None) -> Self:
+        """Return how values are shown.
+
+        Parameters
+        ----------
+        unit : str
+            Theirs.
+        precision : int
+            Digits after the point that are worth showing in it.
+        extent : float, optional
+            Greatest magnitude that they can have; judged by the digits if it is not known.
+        """
+        factor, shown = fitting_prefix(unit, extent or 10.0 ** (3 - precision))
+        digits = max(precision - round(math.log10(factor)), 0)
+        return cls(factor, "" if shown == "1" else shown, min(digits, _DIGITS) if unit in _PREFIXABLE else digits)
+
+    def number(self, value: float | None) -> str:
+        """Return a value without its unit; a dash for None."""
+        if value is None:
+            return "–"
+        # No zero has a sign.
+        return f"{round(self.factor * value, self.digits) + 0.0:.{self.digits}f}"
+
+    def text(self, value: float) -> str:
+        """Return a value with its unit, and with two digits that are not zero, as of a small error."""
+        scaled = abs(self.factor * value)
+        needed = 1 - math.floor(math.log10(scaled)) if 0.0 < scaled < math.inf else 0
+        digits = needed if self.digits < needed <= self.digits + _DIGITS else self.digits
+        return f"{replace(self, digits=digits).number(value)} {self.unit}".rstrip()
 
 
 def format_duration(seconds: float) -> str:
@@ -96,6 +152,50 @@ def quantity(key: str, text: str) -> Any:  # noqa: ANN401 - a quantity of the li
     if not np.isfinite(found.magnitude) or origin != 0.0:
         raise ValueError(f"{key} = {text!r}: expected a finite number and a unit whose scale begins at 0")
     return found
+
+
+def is_quantity(text: str) -> bool:
+    """Return whether a text is a number with a unit behind it, such as `3K` or `300 µm`."""
+    return _QUANTITY.fullmatch(text) is not None
+
+
+def read_quantity(text: str, unit: str) -> float:
+    """Return the number in `unit` that a text stands for, such as `300 µm` or `3K`; a number alone is in `unit`.
+
+    Where `unit` is K or K/s, °C counts as K: it is of a difference.
+
+    Raises
+    ------
+    ValueError
+        If the text is neither, or its unit is of another kind; says what is expected.
+    """
+    found = _QUANTITY.fullmatch(text)
+    try:
+        if found is None:
+            return float(text)
+        number, given = float(found[1]), found[2]
+        if unit == "°C":
+            given = "degC" if given in ("C", "°C") else given
+        else:
+            given = re.sub("°?C\\b|degC", "K", given) if unit.startswith("K") else given
+        wanted = "degC" if unit == "°C" else unit or "1"
+        return float(unit_registry().Quantity(number, given.replace("%", "percent")).to(wanted).magnitude)
+    except Exception:
+        shown = "a plain number" if unit in ("", "1") else f"a number in {unit}, or one with a unit of this kind"
+        raise ValueError(f"expected {shown}, not {text!r}") from None
+
+
+def in_si(text: str) -> float:
+    """Return the number that a text such as `3 ms` stands for, in SI units; temperatures in °C.
+
+    Raises ValueError if it is none.
+    """
+    found = _QUANTITY.fullmatch(text)
+    with suppress(Exception):
+        if found is not None:
+            given = found[2].replace("%", "percent").replace("°C", "K")
+            return float(unit_registry().Quantity(float(found[1]), given).to_base_units().magnitude)
+    raise ValueError(f"expected a number and a unit, such as 3 ms, not {text!r}") from None
 
 
 def check_unit(unit: str) -> str:

@@ -111,10 +111,14 @@ def _print(rehearsal: Rehearsal) -> None:
 
 
 def _cells(extremes: Extremes) -> tuple[str, ...]:
-    allowed = ", ".join(f"{_number(each.low)} to {_number(each.high)} ({each.by})" for each in extremes.bounds)
-    margin = f"{extremes.margin:.4g}" if math.isfinite(extremes.margin) else ""
+    shown = extremes.display
+    allowed = ", ".join(
+        f"{_number(shown.factor * each.low)} to {_number(shown.factor * each.high)} ({each.by})"
+        for each in extremes.bounds
+    )
+    margin = shown.number(extremes.margin) if math.isfinite(extremes.margin) else ""
     style = "[bold red]" if extremes.margin < 0 else ""
-    return f"{extremes.low:.5g}", f"{extremes.high:.5g}", extremes.unit, allowed, style + margin
+    return shown.number(extremes.low), shown.number(extremes.high), shown.unit, allowed, style + margin
 
 
 def _number(value: float) -> str:

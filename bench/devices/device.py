@@ -35,7 +35,15 @@ from typing import Any, ClassVar, Self, TypedDict
 
 from pydantic import Field, model_validator
 
-from bench.base import CheckedTable, Clock, ConfigurationError, DeviceConnectionError, DeviceError, LimitError
+from bench.base import (
+    CheckedTable,
+    Clock,
+    ConfigurationError,
+    DeviceConnectionError,
+    DeviceError,
+    Display,
+    LimitError,
+)
 
 _NO_SERIAL_NUMBER = re.compile(r"(|0+|none|unknown|id \d+)", re.IGNORECASE)
 """Serial numbers that tell no instrument from another: missing ones, and the address on a bus in the place of one."""
@@ -77,6 +85,8 @@ class Signal:
     accuracy : float or None
         Standard uncertainty against a reference, in its unit, of a signal that was calibrated; None if that is not
         known.
+    extent : float or None
+        Greatest magnitude that the limits and interlocks of its rig allow, in its unit; None if that is not known.
     """
 
     name: str
@@ -84,6 +94,12 @@ class Signal:
     description: str
     precision: int = 3
     accuracy: float | None = None
+    extent: float | None = None
+
+    @property
+    def display(self) -> Display:
+        """How its values are shown, in every table, figure and view."""
+        return Display.of(self.unit, self.precision, self.extent)
 
 
 RESERVED_NAMES = (

@@ -548,5 +548,5 @@ def trace_signals(protocol: ProtocolDefinition, description: RigDescription, slo
         return ()
     description.check_needs(protocol.name, [controlled])
     signal = description.by_name[controlled]
-    traces = (replace(trace, unit=signal.unit, precision=signal.precision) for trace in TRACES)
+    traces = (replace(trace, unit=signal.unit, precision=signal.precision, extent=signal.extent) for trace in TRACES)
     return (*traces, LATENESS)

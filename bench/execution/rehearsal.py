@@ -11,7 +11,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
-from bench.base import AbortError, ConfigurationError, DataError, Interrupts, VirtualClock
+from bench.base import AbortError, ConfigurationError, DataError, Display, Interrupts, VirtualClock
 from bench.devices import Signal
 from bench.execution.engine import Engine, Outcome, check_before_moving
 from bench.execution.run_at_hand import Observer
@@ -46,6 +46,9 @@ class Bound:
     high: float
 
 
+_PLAIN_NUMBER = Display(1.0, "", 3)
+
+
 @dataclass(frozen=True)
 class Extremes:
     """The range that a signal went through.
@@ -58,12 +61,15 @@ class Extremes:
         Unit of the signal.
     bounds : tuple of Bound
         What it may not leave.
+    display : Display
+        How its values are shown.
     """
 
     low: float
     high: float
     unit: str
     bounds: tuple[Bound, ...] = ()
+    display: Display = _PLAIN_NUMBER
 
     @property
     def margin(self) -> float:
@@ -425,10 +431,13 @@ def _bounded(name: str, range_: tuple[float, float], description: RigDescription
         limits = description.limits.get(name.removesuffix(SETPOINT))
     if limits is not None:
         bounds.insert(0, Bound("device", limits.low, limits.high))
-    signal = description.by_name.get(name)
-    unit = signal.unit if signal is not None else description.unit(locks[0].signal).replace("°C", "K")
+    signal = description.by_name.get(name) or description.by_name[locks[0].signal]
     low, high = range_
-    return Extremes(float(low), float(high), unit, tuple(bounds))
+    unit, display = signal.unit, signal.display
+    if signal.name != name:
+        # Of a difference.
+        unit, display = unit.replace("°C", "K"), replace(display, unit=display.unit.replace("°C", "K"))
+    return Extremes(float(low), float(high), unit, tuple(bounds), display)
 
 
 def _at_most(expected: Plan, finished: Sequence[float], seconds: float) -> float:

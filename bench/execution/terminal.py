@@ -273,7 +273,10 @@ class ProgressDisplay:
             if math.isfinite(left.at_most):
                 times[-1] += ","
                 times.append(f"at most {_time_of_day(left.at_most)}")
-        readings = [f"{signal.name} {values[i]:.{signal.precision}f} {signal.unit}" for i, signal in self._shown]
+        readings = [
+            f"{signal.name} {signal.display.number(values[i])} {signal.display.unit}".rstrip()
+            for i, signal in self._shown
+        ]
         self.latest = "  ".join(readings)
         with self.lock:
             if not self._is_still:

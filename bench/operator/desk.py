@@ -7,17 +7,18 @@ import queue
 import re
 import threading
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from bench.base import ConfigurationError
+from bench.base import ConfigurationError, is_quantity, read_quantity
 from bench.devices import Limits, Signal
-from bench.rig import Interlock
+from bench.rig import Interlock, rate_unit
 
 _MOST_LINES = 500
 """Lines of the log that are kept for the display; the journal has all events."""
 
 _NUMBER = re.compile(r"[+-]?(\d+([.,]\d*)?|[.,]\d+)(e[+-]?\d+)?", re.ASCII | re.IGNORECASE)
+_BEGINS = re.compile(r"[+-]?[.,]?\d", re.ASCII)
 
 
 @dataclass(frozen=True)
@@ -71,8 +72,8 @@ class Leave:
 Command = SetPoint | HoldAll | Tare | Rest | Remark | Leave
 
 SYNTAX: Mapping[str, str] = {
-    "set": "set DEVICE VALUE",
-    "ramp": "ramp DEVICE VALUE RATE (its unit per s)",
+    "set": "set DEVICE VALUE (in its unit, or with one: 54 °C)",
+    "ramp": "ramp DEVICE VALUE RATE (its unit per s, or with one: 2 K/min)",
     "hold": "hold (stop all ramps)",
     "tare": "tare DEVICE (a load cell)",
     "zero": "zero SIGNAL (on the screen only; again: off)",
@@ -82,8 +83,8 @@ SYNTAX: Mapping[str, str] = {
 }
 
 
-def parse_command(line: str) -> Command:
-    """Return what a line of the operator stands for.
+def parse_command(line: str, limits: Mapping[str, Limits] | None = None) -> Command:
+    """Return what a line of the operator stands for; numbers may have units where the `limits` of devices are known.
 
     Raises ConfigurationError if it stands for nothing; says what is expected.
     """
@@ -91,8 +92,9 @@ def parse_command(line: str) -> Command:
     word = word.lower()
     try:
         if word in ("set", "ramp"):
-            device, *numbers = rest
-            value, *rate = map(_number, numbers)
+            device, *words = rest
+            unit = limits[device].unit if limits is not None and device in limits else ""
+            value, *rate = map(_number, _numbers(words), (unit, unit and rate_unit(unit)))
             if len(rate) == (word == "ramp") and (not rate or rate[0] > 0):
                 return SetPoint(device, value, *rate)
         elif word == "tare" and len(rest) == 1:
@@ -108,8 +110,23 @@ def parse_command(line: str) -> Command:
     raise ConfigurationError(f"{line!r}: expected {expected or '; '.join(SYNTAX.values())}")
 
 
-def _number(text: str) -> float:
-    """Return the number in a word; raise ValueError for what Python alone takes for one, such as `nan` or `1_0`."""
+def _numbers(words: Sequence[str]) -> Sequence[str]:
+    """Return one or two numbers, with the units that stand behind them."""
+    found: list[str] = []
+    for word in words:
+        if found and not _BEGINS.match(word):
+            found[-1] += f" {word}"
+        else:
+            found.append(word)
+    if len(found) > 2:
+        raise ValueError(found)
+    return found
+
+
+def _number(text: str, unit: str) -> float:
+    """Return the number in a text; raise ValueError for what Python alone takes for one, such as `nan` or `1_0`."""
+    if unit and is_quantity(text):
+        return read_quantity(text, unit)
     value = float(text.replace(",", ".")) if _NUMBER.fullmatch(text) else math.nan
     if not math.isfinite(value):
         raise ValueError(text)

@@ -94,10 +94,10 @@ class Panel(App[None]):
                 course = sparkline([values[name] for _, values in view.ticks if name in values], _WIDTH)
                 table.add_row(
                     f"Δ {name}" if zero is not None else name,
-                    f"{value - (zero or 0.0):.{signal.precision}f}",
-                    signal.unit,
+                    signal.display.number(value - (zero or 0.0)),
+                    signal.display.unit,
                     course,
-                    f"{'! ' if margin.is_warned else ''}{margin}",
+                    f"{'! ' if margin.is_warned else ''}{margin.text(signal.display)}",
                 )
         if view.closes or (view.over and self._leaving):
             self.exit()

@@ -6,6 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from bench.base import Display
 from bench.operator import Shown
 from bench.rig import SETPOINT, Level
 
@@ -33,9 +34,11 @@ class Margin:
     by: str
     is_warned: bool
 
-    def __str__(self) -> str:
-        """Return it for a table."""
-        return "" if math.isinf(self.distance) else f"{self.distance:.4g} to {self.limit:g} ({self.by})"
+    def text(self, display: Display) -> str:
+        """Return it for a table, in the unit that the signal is shown in."""
+        if math.isinf(self.distance):
+            return ""
+        return f"{display.number(self.distance)} to {display.factor * self.limit:g} ({self.by})"
 
 
 def margin_of(signal: str, values: Mapping[str, float], shown: Shown) -> Margin:

@@ -115,7 +115,7 @@ class HandsOnRig:
     def submit(self, line: str) -> str:
         """Have a command carried out."""
         try:
-            self.desk.send(parse_command(line))
+            self.desk.send(parse_command(line, None if self.desk.shown is None else self.desk.shown.limits))
         except ConfigurationError as error:
             return str(error)
         return ""

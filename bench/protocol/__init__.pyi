@@ -21,6 +21,7 @@ from .parameters import (
     ParameterHelp as ParameterHelp,
     ProtocolDefinition as ProtocolDefinition,
     ProtocolParameters as ProtocolParameters,
+    difference_of as difference_of,
     from_slot as from_slot,
     parameter as parameter,
     protocol as protocol,

@@ -10,7 +10,7 @@ from typing import Any, Literal, cast, get_args, get_origin, get_type_hints
 from pydantic import Field, ValidationError
 from pydantic_core import PydanticUndefined
 
-from bench.base import CheckedTable, ConfigurationError, comma_remark
+from bench.base import CheckedTable, ConfigurationError, comma_remark, is_quantity, read_quantity
 from bench.devices import Device, Signal
 from bench.protocol.changes import ParameterChange
 from bench.protocol.views import Views
@@ -64,6 +64,11 @@ def unit_of(slot: str) -> str:
     return f"@{slot}"
 
 
+def difference_of(slot: str) -> str:
+    """Return a unit for `parameter` that is that of a difference of a slot's values: K of temperatures."""
+    return f"Δ@{slot}"
+
+
 class ProtocolParameters(CheckedTable):
     """Base of a protocol's parameters; declare each with `parameter`."""
 
@@ -87,7 +92,8 @@ def parameter(
     default
         Value when nothing is said; `...` if it must be given, `from_slot(...)` if the rig says it.
     unit : str
-        Its unit; `1` for a count or a plain number, empty for a text, `unit_of(...)` for that of a slot.
+        Its unit; `1` for a count or a plain number, empty for a text, `unit_of(...)` or `difference_of(...)` for that
+        of a slot.
     help : str
         What it does, in one sentence without a full stop.
     low, high : float, optional
@@ -292,7 +298,7 @@ class ProtocolDefinition:
         if roles is not None:
             # Before the parameters, whose defaults then are missing too.
             check_bound(self.name, self.slots, roles, path)
-        merged = self._from_roles(roles or {}) | dict(defaults or {}) | dict(settings)
+        merged = self._from_roles(roles or {}) | dict(defaults or {}) | self._in_units(settings, roles or {})
         try:
             parameters = self.parameters.model_validate(merged)
         except ValidationError as error:
@@ -316,9 +322,34 @@ class ProtocolDefinition:
         given = self._from_roles(roles or {}) | dict(defaults or {})
         return tuple(self._parameter_help(name, roles or {}, given) for name in self.parameters.model_fields)
 
+    def units(self, roles: Mapping[str, RoleTable]) -> dict[str, str]:
+        """Return the units of the parameters on a rig, by name; those of texts and plain numbers are left out."""
+        return {
+            entry.name: entry.unit
+            for entry in self.help(roles)
+            if entry.unit not in ("", "1") and not entry.unit.startswith(_UNIT_OF)
+        }
+
     def _extra(self, name: str) -> dict[str, Any]:
         extra = self.parameters.model_fields[name].json_schema_extra
         return cast("dict[str, Any]", extra) if isinstance(extra, dict) else {}
+
+    def _in_units(self, settings: Mapping[str, Any], roles: Mapping[str, RoleTable]) -> dict[str, Any]:
+        """Return settings in which `3K`, `300 µm` or a list of such texts are numbers in the parameters' units."""
+        found, wrong = dict(settings), []
+        for name, value in settings.items():
+            unit = self._unit(name, roles) if name in self.parameters.model_fields else ""
+            if not isinstance(value, str) or not unit or unit.startswith(_UNIT_OF):
+                continue
+            parts = value.split(",")
+            if any(is_quantity(part) for part in parts):
+                try:
+                    found[name] = ",".join(str(read_quantity(part, unit)) for part in parts)
+                except ValueError as error:
+                    wrong.append(f"protocol {self.name}: parameter {name}: {error}")
+        if wrong:
+            raise ConfigurationError("\n".join(wrong))
+        return found
 
     def _from_roles(self, roles: Mapping[str, RoleTable]) -> dict[str, Any]:
         found: dict[str, Any] = {}
@@ -334,11 +365,7 @@ class ProtocolDefinition:
     def _parameter_help(self, name: str, roles: Mapping[str, RoleTable], given: Mapping[str, Any]) -> ParameterHelp:
         info = self.parameters.model_fields[name]
         extra = self._extra(name)
-        unit = str(extra.get("unit", ""))
-        if unit.startswith("@"):
-            slot, slash, _ = unit[1:].partition("/")
-            unit = (roles[slot].unit if slot in roles else None) or f"{_UNIT_OF}{slot}"
-            unit = rate_unit(unit) if slash else unit
+        unit = self._unit(name, roles)
         low = next((m.ge for m in info.metadata if getattr(m, "ge", None) is not None), None)
         above = next((m.gt for m in info.metadata if getattr(m, "gt", None) is not None), None)
         high = next((m.le for m in info.metadata if getattr(m, "le", None) is not None), None)
@@ -370,6 +397,15 @@ class ProtocolDefinition:
         else:
             default = "must be given" if info.default is PydanticUndefined else str(info.default)
         return ParameterHelp(name, default, unit, allowed, info.description or "")
+
+    def _unit(self, name: str, roles: Mapping[str, RoleTable]) -> str:
+        unit = str(self._extra(name).get("unit", ""))
+        if "@" not in unit:
+            return unit
+        difference, _, slot = unit.partition("@")
+        slot, slash, _ = slot.partition("/")
+        unit = (roles[slot].unit if slot in roles else None) or f"{_UNIT_OF}{slot}"
+        return rate_unit(unit) if slash else unit.replace("°C", "K") if difference else unit
 
     def _allowed(self, name: str, roles: Mapping[str, RoleTable]) -> str:
         """Return what a parameter may be, with its unit, for a message."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from bench.base import format_duration
+from bench.base import fitting_prefix, format_duration
 
 
 def run_card(meta: Mapping[str, Any]) -> str:
@@ -13,6 +13,7 @@ def run_card(meta: Mapping[str, Any]) -> str:
 
     `missing_rows` in the metadata, a text, says what its record lacks.
     """
+    units = meta.get("units", {})
     lines = [
         f"# {meta['rig_title']}",
         "",
@@ -28,11 +29,16 @@ def run_card(meta: Mapping[str, Any]) -> str:
         **_expected(meta),
         "seed": meta["seed"],
         **{f"device {name}": identity for name, identity in meta["devices"].items()},
-        **{f"parameter {name}": value for name, value in meta["parameters"].items()},
+        **{f"parameter {name}": _shown(value, units.get(name, "")) for name, value in meta["parameters"].items()},
         "git": meta["git"],
     }
     lines += [f"| {key} | {value} |" for key, value in rows.items()]
     return "\n".join(lines)
+
+
+def _shown(value: Any, unit: str) -> str:  # noqa: ANN401 - anything that JSON can hold
+    text = f"{value:g}" if isinstance(value, float) else str(value)
+    return text if value is None or unit in ("", "1") else f"{text} {unit}"
 
 
 def _expected(meta: Mapping[str, Any]) -> dict[str, str]:
@@ -47,7 +53,7 @@ def _expected(meta: Mapping[str, Any]) -> dict[str, str]:
     if (most := rehearsal["at_most"]) is not None:
         length += f", at most {format_duration(most)}"
     margins = [
-        f"{name} {each['margin']:.3g} {each['unit']}"
+        f"{name} {_in_prefixed(each['margin'], each['unit'])}"
         for name, each in rehearsal["extremes"].items()
         if each["margin"] is not None
     ]
@@ -55,6 +61,11 @@ def _expected(meta: Mapping[str, Any]) -> dict[str, str]:
     if margins:
         rows["least margins"] = ", ".join(margins)
     return rows
+
+
+def _in_prefixed(value: float, unit: str) -> str:
+    factor, shown = fitting_prefix(unit, value)
+    return f"{factor * value:.3g} {'' if shown == '1' else shown}".rstrip()
 
 
 def _between(seconds: float, most: float | None) -> str:

@@ -110,7 +110,8 @@ class Record:
             meta = self._db.execute("SELECT * FROM meta").fetchall()
             self.meta: dict[str, Any] = {key: parse_json(value) for key, value, *_ in meta}
             signals = self._db.execute("SELECT * FROM signals ORDER BY position").fetchall()
-            self.signals = tuple(Signal(*row[1:5]) for row in signals)
+            extents = self.meta.get("extents", {})
+            self.signals = tuple(Signal(*row[1:5], None, extents.get(row[1])) for row in signals)
         except (sqlite3.DatabaseError, ValueError, TypeError) as error:
             raise DataError(f"{self.path} is not a readable journal: {error}{way_back(self.path)}") from error
         found = self.meta.get("schema")

@@ -116,6 +116,7 @@ def metadata(
             "sha256": digest_of(protocol),
         },
         "parameters": parameters.model_dump(mode="json"),
+        "units": protocol.units(file.roles),
         "changed": protocol.changed(parameters, file.roles, file.protocols.get(protocol.name, {})),
         "controls": protocol.controlled(slots),
         "slots": {slot.name: {"device": slot.device, "signal": slot.signal} for slot in slots.values()},
@@ -127,6 +128,7 @@ def metadata(
         },
         "epoch": epoch.isoformat(),
         "devices": {name: str(device.identity) for name, device in description.devices.items()},
+        "extents": {each.name: each.extent for each in description.signals if each.extent is not None},
         "limits": {name: (limits.low, limits.high) for name, limits in description.limits.items()},
         "calibration": {
             **{entry.name: entry.settings.model_dump(mode="json") for entry in file.devices},

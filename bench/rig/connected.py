@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from contextlib import ExitStack, suppress
+from dataclasses import replace
 from enum import StrEnum
 from functools import cached_property, partial
 from types import TracebackType
@@ -90,7 +91,9 @@ class Rig:
             self.signals = self._bind_signals()
             self._setpoint_names = {name: f"{name}_setpoint" for name in self.actuators}
             self._read_before: dict[tuple[Look, frozenset[str]], dict[str, Callable[[], dict[str, float]]]] = {}
-            self.description = RigDescription(file, self._describe_devices(), self.signals)
+            described = RigDescription(file, self._describe_devices(), self.signals)
+            self.signals = tuple(replace(each, extent=described.extent(each.name)) for each in self.signals)
+            self.description = replace(described, signals=self.signals)
             self._check_references()
             self._stack = stack.pop_all()
 

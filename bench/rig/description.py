@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -9,6 +10,7 @@ from functools import cached_property
 from bench.base import ConfigurationError
 from bench.devices import DeviceDescription, Limits, Signal
 from bench.rig.file import RigFile
+from bench.rig.interlocks.config import SETPOINT
 from bench.rig.slots import Slots, SlotsAsked, bind
 from bench.rig.uncertainty import UncertainSignals
 
@@ -53,6 +55,16 @@ class RigDescription:
         """
         units = {signal.name: signal.unit for signal in self.signals}
         return UncertainSignals(self.file.uncertainty, self.file.derived, units, self.file.path)
+
+    def extent(self, signal: str) -> float | None:
+        """Return the greatest magnitude that limits and interlocks allow of a signal, in its unit."""
+        allowed = [self.reading_limits.get(signal)]
+        if signal.endswith(SETPOINT):
+            allowed.append(self.limits.get(signal.removesuffix(SETPOINT)))
+        locks = [lock for lock in self.file.interlocks if lock.label == signal]
+        ends = [(each.low, each.high) for each in (*allowed, *locks) if each is not None]
+        greatest = [max(abs(low), abs(high)) for low, high in ends]
+        return min((each for each in greatest if 0.0 < each < math.inf), default=None)
 
     def limits_of(self, name: str) -> Limits:
         """Return the set-points that a device allows; raises ConfigurationError if it takes none."""

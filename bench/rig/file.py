@@ -69,6 +69,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import date, time
 from importlib import resources
@@ -77,7 +78,17 @@ from typing import Any, ClassVar, Protocol
 
 from pydantic import BaseModel, Field, ValidationError
 
-from bench.base import CheckedTable, Clock, ConfigurationError, parse_toml, problems, registry
+from bench.base import (
+    CheckedTable,
+    Clock,
+    ConfigurationError,
+    in_si,
+    is_quantity,
+    parse_toml,
+    problems,
+    read_quantity,
+    registry,
+)
 from bench.devices import Device, DriverSettings
 from bench.rig.calibration import read_calibration
 from bench.rig.derived import DerivedSignal
@@ -85,8 +96,11 @@ from bench.rig.interlocks.config import Interlock
 from bench.rig.layout import DashboardLayout
 from bench.rig.maintenance.locks import ECHO, EMULATED, JOIN
 from bench.rig.shared_lines import with_line, wrong_lines
-from bench.rig.slots import RoleTable
+from bench.rig.slots import RoleTable, rate_unit
 from bench.rig.uncertainty import Component, Uncertainties
+
+_DIFFERENCES = ("increment", "tolerance", "resolution", "accuracy", "drift", "noise")
+"""Keys of rig files that are no values of a signal but differences of such."""
 
 
 class RigTable(CheckedTable):
@@ -453,7 +467,23 @@ def _override(content: dict[str, Any], key: str, value: str, path: str) -> None:
     try:
         table[last] = _without_dates(parse_toml(f"value = {value}"))["value"]
     except ValueError:
-        table[last] = value
+        number = is_quantity(value) and not isinstance(table.get(last), str)
+        table[last] = _in_unit_of(content, parents, key, value) if number else value
+
+
+def _in_unit_of(content: Mapping[str, Any], parents: Sequence[str], key: str, text: str) -> float:
+    """Return a number with a unit in the unit that its table, or one that this stands in, names; else in SI."""
+    tables = [_table(content, parents[:count]) or {} for count in range(len(parents), 0, -1)]
+    own = next((table["unit"] for table in tables if isinstance(table.get("unit"), str)), "")
+    # Of a difference of temperatures K are °C.
+    units = (own.replace("°C", "K"),) if key.rpartition(".")[2] in _DIFFERENCES else (own, own and rate_unit(own))
+    for unit in filter(None, units):
+        with suppress(ValueError):
+            return read_quantity(text, unit)
+    try:
+        return in_si(text)
+    except ValueError as error:
+        raise ConfigurationError(f"--override {key}: {error}") from None
 
 
 def _validate(path: str, text: str, content: Mapping[str, Any]) -> RigFile:

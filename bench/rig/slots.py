@@ -29,7 +29,7 @@ from typing import Protocol, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from bench.base import CheckedTable, ConfigurationError, format_numbers
+from bench.base import CheckedTable, ConfigurationError, Display
 from bench.devices import Device, DeviceDescription, Dwell, Settle, Signal, UntilSteady
 from bench.rig.layout import Range
 
@@ -138,8 +138,8 @@ class Slot:
         Of the signal.
     setpoint_unit : str
         Unit of the set-points; empty for a slot that only measures.
-    precision : int
-        Digits after the point of the signal that are worth showing.
+    display : Display
+        How values of the signal are shown.
     table : RoleTable
         What the rig file says of it.
     accuracy : float or None
@@ -152,7 +152,7 @@ class Slot:
     unit: str
     description: str
     setpoint_unit: str
-    precision: int
+    display: Display
     table: RoleTable
     accuracy: float | None = None
 
@@ -168,8 +168,7 @@ class Slot:
 
     def show(self, value: float) -> str:
         """Return a value of the signal with its unit, for notes."""
-        number, unit = format_numbers([value], self.unit, self.precision)
-        return f"{number} {unit}".rstrip()
+        return self.display.text(value)
 
     def settle(self, minimum: float) -> Settle:
         """Return how a reset settles: by the rule of the rig file, but at least `minimum` s."""
@@ -262,7 +261,7 @@ def _bind(
         unit=signal.unit,
         description=signal.description,
         setpoint_unit=setpoint.unit if setpoint else "",
-        precision=signal.precision,
+        display=signal.display,
         table=table,
         accuracy=signal.accuracy,
     )

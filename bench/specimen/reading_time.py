@@ -98,6 +98,6 @@ def _slots(recording: TransientRecording, file: RigFile) -> Slots:
         signal, setpoint = signals[bound["signal"]], signals.get(f"{bound['device']}_setpoint")
         found[name] = Slot(
             name, bound["device"], signal.name, signal.unit, signal.description, setpoint.unit if setpoint else "",
-            signal.precision, file.roles.get(name) or RoleTable(signal=signal.name),
+            signal.display, file.roles.get(name) or RoleTable(signal=signal.name),
         )  # fmt: skip
     return found

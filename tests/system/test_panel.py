@@ -10,7 +10,7 @@ from cases import cases
 from heater_protocols import stairs
 from rich.console import Console
 
-from bench.base import ConfigurationError, DataError, Interrupts
+from bench.base import ConfigurationError, DataError, Display, Interrupts
 from bench.devices import Limits, Signal
 from bench.execution import Run, carry_out
 from bench.operator import Desk, HoldAll, Leave, Remark, Rest, SetPoint, Shown, Tare, parse_command
@@ -95,7 +95,7 @@ class TestMargins:
         assert (margin.distance, margin.limit, margin.by, margin.is_warned) == (distance, limit, by, warned)
 
     def test_none(self):
-        assert str(margin_of("curvature", {"curvature": 1.0}, SHOWN)) == ""
+        assert margin_of("curvature", {"curvature": 1.0}, SHOWN).text(Display.of("1/m", 2)) == ""
 
     def test_a_course(self):
         assert sparkline([0.0, 7.0, math.nan, 3.0], 10) == "▁█ ▄"

@@ -13,6 +13,7 @@ from bench.protocol import (
     ProtocolParameters,
     Slots,
     Step,
+    difference_of,
     from_slot,
     parameter,
     protocol,
@@ -24,7 +25,9 @@ class Parameters(ProtocolParameters):
     """What can be set."""
 
     amplitude: float = parameter(from_slot("drive", "high"), unit=unit_of("drive"), help="set-point of the tips")
-    increment: float = parameter(from_slot("drive", "increment"), unit=unit_of("drive"), help="between set-points")
+    increment: float = parameter(
+        from_slot("drive", "increment"), unit=difference_of("drive"), help="between set-points"
+    )
     cycles: int = parameter(2, unit="1", low=1, high=100, help="how often the loop is driven; the last one counts")
     dwell: float = parameter(from_slot("drive", "dwell"), unit="s", low=0.01, high=60, help="hold before a reading")
 

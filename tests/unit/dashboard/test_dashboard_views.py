@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from rerun.chunk import RrdReader
 
+from bench.base import Display
 from bench.dashboard.bounds import bounds_of, nearest
 from bench.dashboard.controlled_run import ControlPlots, ErrorPlot
 from bench.dashboard.drawing import Frame
@@ -52,7 +53,7 @@ VIEWS = "ViewBlueprint:space_origin"
 
 
 def slot(name: str, signal: str, unit: str, range_: tuple[float, float] | None = None) -> Slot:
-    return Slot(name, "", signal, unit, signal, "", 3, RoleTable(signal=signal, range=range_))
+    return Slot(name, "", signal, unit, signal, "", Display.of(unit, 3), RoleTable(signal=signal, range=range_))
 
 
 def targets(errors: list[float], disturbance: float = 1.0) -> list[object]:
