@@ -36,7 +36,7 @@ from bench.analysis import (
     read_dataset,
     report_run,
 )
-from bench.base import BenchError, DeviceError, VirtualClock, wall_time
+from bench.base import BenchError, DeviceError, VirtualClock, show_patience, wall_time
 from bench.batch import published_of
 from bench.execution import Run, carry_out
 from bench.identification import ModelFile, load_model
@@ -213,8 +213,9 @@ def identify(
         **{field.name: options.pop(field.name) for field in fields(ReadingOptions) if field.name in options}
     )
     names = ColumnNames(input, output, options.pop("time_column", None), options.pop("weights_column", None))
-    data = read_dataset([folder], names, reading, at_least=FEWEST_ROWS)
-    return identify_model(data, model, FitOptions.of(options)).with_uncertainty()
+    with show_patience(f"reading and fitting {folder.name}", Console(stderr=True)):
+        data = read_dataset([folder], names, reading, at_least=FEWEST_ROWS)
+        return identify_model(data, model, FitOptions.of(options)).with_uncertainty()
 
 
 def predict(

@@ -22,7 +22,7 @@ from bench.analysis.transients.transient_dynamics import (
     read_transients,
 )
 from bench.analysis.uncertain_models import PROVENANCE, ModelUncertainty, identified_uncertainty
-from bench.base import ConfigurationError
+from bench.base import ConfigurationError, percent
 from bench.identification import (
     ONE_RUN,
     Advice,
@@ -563,8 +563,8 @@ def certificate_lines(identified: IdentifiedFile) -> Sequence[tuple[str, str]]:
 
 def _error_lines(errors: Errors, unit: str, which: str = "") -> list[tuple[str, str]]:
     return [
-        (f"largest error{which}", f"{errors.maximum:.4g}{unit} ({errors.maximum_percent:.2f} % of the range)"),
-        (f"RMS error{which}", f"{errors.rms:.4g}{unit} ({errors.rms_percent:.2f} % of the range)"),
+        (f"largest error{which}", f"{errors.maximum:.4g}{unit} ({percent(errors.maximum_percent)} of the range)"),
+        (f"RMS error{which}", f"{errors.rms:.4g}{unit} ({percent(errors.rms_percent)} of the range)"),
     ]
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from bench.analysis.figures.fits import plot_fit, plot_loops
 from bench.analysis.predictions import Predictions
-from bench.base import with_unit
+from bench.base import percent, with_unit
 from bench.identification import Errors
 
 
@@ -47,4 +47,6 @@ def draw_predictions(found: Predictions, folder: Path, prefix: str) -> list[Path
 def errors_text(errors: Errors, unit: str) -> str:
     """Return largest and RMS error, with the digits of the tables."""
     shown = f" {unit}" if unit not in ("", "1") else ""
-    return f"max {errors.maximum:.4g}{shown}, RMS {errors.rms:.4g}{shown} ({errors.rms_percent:.2f} % of the range)"
+    return (
+        f"max {errors.maximum:.4g}{shown}, RMS {errors.rms:.4g}{shown} ({percent(errors.rms_percent)} of the range)"
+    )

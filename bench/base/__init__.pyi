@@ -81,6 +81,11 @@ from .parsing import (
     parse_toml as parse_toml,
     write_json_file as write_json_file,
 )
+from .patience import (
+    PATIENCE as PATIENCE,
+    PatienceDisplay as PatienceDisplay,
+    show_patience as show_patience,
+)
 from .printing import (
     PlainConsole as PlainConsole,
     print_plain as print_plain,
@@ -93,6 +98,7 @@ from .redaction import (
 )
 from .remaining_time import (
     Expectation as Expectation,
+    Remaining as Remaining,
     RemainingTime as RemainingTime,
 )
 from .shares import (
@@ -110,6 +116,7 @@ from .units import (
     in_unit as in_unit,
     is_quantity as is_quantity,
     per_square as per_square,
+    percent as percent,
     quantity as quantity,
     read_quantity as read_quantity,
     unit_registry as unit_registry,

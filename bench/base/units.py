@@ -10,8 +10,6 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, Self
 
-import numpy as np
-
 _PREFIXABLE = ("m", "A", "V", "N", "W", "m/s")
 _PREFIXES = {"": 1.0, "m": 1e3, "µ": 1e6, "n": 1e9}
 _DIGITS = 3
@@ -105,6 +103,11 @@ class Display:
         return f"{replace(self, digits=digits).number(value)} {self.unit}".rstrip()
 
 
+def percent(value: float) -> str:
+    """Return a percentage as a text with two digits after the point, or with two that are not zero."""
+    return Display(1.0, "%", 2).text(value)
+
+
 def format_duration(seconds: float) -> str:
     """Return a time in s as `h:mm:ss`; what is unknown or infinite as `?`."""
     if not math.isfinite(seconds):
@@ -144,12 +147,14 @@ def quantity(key: str, text: str) -> Any:  # noqa: ANN401 - a quantity of the li
     """
     number, _, unit = text.strip().partition(" ")
     try:
-        # Numpy's numbers divide by zero without an exception.
+        import numpy as np
+
+        # Its numbers divide by zero without an exception.
         found = unit_registry().Quantity(np.float64(number), unit.replace("°C", "K") or "1")
         origin = unit_registry().Quantity(0.0, found.units).to_base_units().magnitude
     except Exception as error:
         raise ValueError(f"{key} = {text!r}: expected a number and a unit, such as '300e-6 m': {error}") from None
-    if not np.isfinite(found.magnitude) or origin != 0.0:
+    if not math.isfinite(found.magnitude) or origin != 0.0:
         raise ValueError(f"{key} = {text!r}: expected a finite number and a unit whose scale begins at 0")
     return found
 

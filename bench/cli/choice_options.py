@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bench.base import print_plain
+from bench.base import percent, print_plain
 from bench.cli.command_support import console, print_rows, warn
 from bench.cli.model_options import ModelOptions
 
@@ -250,8 +250,8 @@ def print_test(found: IdentifiedFile, comparing: Comparing, test: Dataset | None
     print_rows(
         f"on {tested.source}{skipped}",
         (
-            ("largest error", f"{raw.maximum:.4g} {unit} ({raw.maximum_percent:.2f} % of the range)"),
-            ("RMS error", f"{raw.rms:.4g} {unit} ({raw.rms_percent:.2f} % of the range)"),
+            ("largest error", f"{raw.maximum:.4g} {unit} ({percent(raw.maximum_percent)} of the range)"),
+            ("RMS error", f"{raw.rms:.4g} {unit} ({percent(raw.rms_percent)} of the range)"),
             ("re-zeroed RMS error", f"{rezeroed.rms:.4g} {unit} (offset {tested.comparison.offset:+.4g})"),
         ),
     )

@@ -9,7 +9,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from bench.base import print_plain, show_table
+from bench.base import percent, print_plain, show_patience, show_table
 from bench.cli.band_options import BandsOption, Recalibrating, print_examined
 from bench.cli.command_support import (
     JsonOption,
@@ -22,7 +22,6 @@ from bench.cli.command_support import (
 )
 from bench.cli.data_options import ReadingGroup, offer_groups, print_assumptions
 from bench.cli.model_commands import InitialOption
-from bench.cli.patience import show_patience
 from bench.cli.written import print_figures, write_rows
 
 if TYPE_CHECKING:
@@ -81,7 +80,7 @@ def models_on_data(
 
     check_outputs(out=out, figures=figures, json_file=json_file, read=(data, *compared))
     session = recalibrating.session()
-    with show_patience(f"reading {data.name}"):
+    with show_patience(f"reading {data.name}", console):
         models = load_models(compared)
         names = ColumnNames(input_column or "", output_column or "", time_column)
         measured = read_for([*models.values()], data, names, reading)
@@ -98,8 +97,8 @@ def models_on_data(
     for name, entry in result.comparisons.items():
         raw, mended = entry.raw, entry.rezeroed
         table.add_row(
-            name, f"{raw.maximum:.4g}", f"{raw.rms:.4g}", f"{raw.rms_percent:.2f}", f"{entry.offset:+.4g}",
-            f"{mended.maximum:.4g}", f"{mended.rms:.4g}",
+            name, f"{raw.maximum:.4g}", f"{raw.rms:.4g}", percent(raw.rms_percent).removesuffix(" %"),
+            f"{entry.offset:+.4g}", f"{mended.maximum:.4g}", f"{mended.rms:.4g}",
         )  # fmt: skip
     show_table(console, table)
     for name, examined in result.examined.items():

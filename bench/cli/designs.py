@@ -9,10 +9,9 @@ import typer
 from rich.table import Table
 
 from bench.analysis import ReadingOptions
-from bench.base import ConfigurationError, show_table
+from bench.base import ConfigurationError, show_patience, show_table
 from bench.cli.command_support import JsonOption, check_outputs, console, print_rows, show_compilation, write_json
 from bench.cli.data_options import ReadingGroup, offer_groups
-from bench.cli.patience import show_patience
 
 if TYPE_CHECKING:
     from bench.identification import Continuation
@@ -147,7 +146,7 @@ def _continue(
     from bench.identification import load_model
 
     model = load_model(path)
-    with show_patience(f"designing {hours:g} h of measurements"):
+    with show_patience(f"designing {hours:g} h of measurements", console):
         found = continue_file(
             model, data, input_column=input_column, seconds=3600.0 * hours, dwell=dwell, reading=reading
         )

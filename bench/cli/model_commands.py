@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from bench.base import ConfigurationError, print_plain
+from bench.base import ConfigurationError, percent, print_plain, show_patience
 from bench.cli.band_options import BandOption, Recalibrating, print_band, print_examined
 from bench.cli.choice_options import (
     Comparing,
@@ -33,7 +33,6 @@ from bench.cli.command_support import (
 )
 from bench.cli.data_options import ReadingGroup, offer_groups, print_assumptions
 from bench.cli.model_options import ModelOptions
-from bench.cli.patience import show_patience
 from bench.cli.written import print_figures, write_rows
 
 if TYPE_CHECKING:
@@ -247,10 +246,10 @@ def identify_(
     names = ColumnNames(fitting.input_column, fitting.output_column, fitting.time_column, fitting.weights_column)
     model, fit = fitting.model, fitting.settings(comparing, options)
     patience = f"reading and fitting {', '.join(file.name for file in files)}"
-    with show_patience(patience):
+    with show_patience(patience, console):
         data, test = read_measured(files, names, model, comparing, reading)
     selected = None
-    with show_patience(patience):
+    with show_patience(patience, console):
         if is_comparison(model):
             selected = choose_model(data, model, options, fit)
             model, fit = selected.model, selected.settings(fit)
@@ -364,7 +363,7 @@ def predict_(
     check_outputs(out=out, figures=figures, json_file=json_file, read=(model_path, file))
     session = recalibrating.session()
     model = load_model(model_path)
-    with show_patience(f"reading {file.name}"):
+    with show_patience(f"reading {file.name}", console):
         data = read_for([model], file, ColumnNames(input_column, output_column or None, time_column), reading)
     print_assumptions(file.name, data.assumptions)
     data.check_units(model)
@@ -384,8 +383,8 @@ def predict_(
             f"{model.name} on {file.name}",
             (
                 ("samples", f"{inputs.size - found.first} (skipped: {found.first})"),
-                ("largest error", f"{errors.maximum:.4g} {unit} ({errors.maximum_percent:.2f} % of the range)"),
-                ("RMS error", f"{errors.rms:.4g} {unit} ({errors.rms_percent:.2f} % of the range)"),
+                ("largest error", f"{errors.maximum:.4g} {unit} ({percent(errors.maximum_percent)} of the range)"),
+                ("RMS error", f"{errors.rms:.4g} {unit} ({percent(errors.rms_percent)} of the range)"),
             ),
         )
     write_rows(out, rows)
@@ -451,7 +450,7 @@ def invert(
 
     check_outputs(out=out, json_file=json_file, read=(model_path, file))
     model = load_model(model_path)
-    with show_patience(f"reading {file.name}"):
+    with show_patience(f"reading {file.name}", console):
         data = read_for([model], file, ColumnNames(column, time=time_column), reading)
     print_assumptions(file.name, data.assumptions)
     units = (model.response.input_unit, model.response.output_unit)

@@ -82,12 +82,12 @@ def _print(rehearsal: Rehearsal) -> None:
     least = "" if rehearsal.complete else "at least "
     most = ""
     if math.isfinite(rehearsal.at_most) and rehearsal.at_most - rehearsal.seconds >= 1.0:
-        most = f", at most {format_duration(rehearsal.at_most)} ({rehearsal.at_most:.0f} s)"
+        most = f", at most {format_duration(rehearsal.at_most)}"
     elif not rehearsal.twin and not rehearsal.complete:
         most = "; the rest is unknown, as readings decide"
     rows = [
         ("steps", f"{least}{rehearsal.steps}"),
-        ("duration", f"{least}{format_duration(rehearsal.seconds)} ({rehearsal.seconds:.1f} s){most}"),
+        ("duration", f"{least}{format_duration(rehearsal.seconds)}{most}"),
         ("prompts", f"{least}{rehearsal.prompts}"),
     ]
     console.print(f"{rehearsal.protocol} on {rehearsal.rig}, {on}", highlight=False)

@@ -11,7 +11,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from bench.base import BenchError, ConfigurationError, print_plain, show_table
+from bench.base import BenchError, ConfigurationError, format_duration, print_plain, show_table
 from bench.cli.command_support import (
     JsonOption,
     LiveOption,
@@ -309,10 +309,14 @@ def print_result(result: RunResult, json_file: Path | None, more: Mapping[str, A
 
     outcome, ratio = result.outcome, result.time_ratio
     # Of a run that was resumed, this process has seen the end only.
-    end = "" if outcome.own_seconds >= outcome.laboratory_seconds else f", the last {outcome.own_seconds:.0f} s of it"
+    end = (
+        ""
+        if outcome.own_seconds >= outcome.laboratory_seconds
+        else f", the last {format_duration(outcome.own_seconds)} of it"
+    )
     console.print(
-        f"{outcome.status}: {outcome.steps} steps, {outcome.laboratory_seconds:.0f} s of laboratory time{end} in "
-        f"{result.wall_seconds:.1f} s" + (f" ({ratio:.0f} times as fast)" if ratio >= 2 else ""),
+        f"{outcome.status}: {outcome.steps} steps, {format_duration(outcome.laboratory_seconds)} of laboratory time"
+        f"{end} in {format_duration(result.wall_seconds)}" + (f" ({ratio:.0f} times as fast)" if ratio >= 2 else ""),
         highlight=False,
     )
     if outcome.pace is not None and not outcome.pace.is_reached:

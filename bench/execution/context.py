@@ -83,6 +83,8 @@ if TYPE_CHECKING:
 RECORDING_NAME = "run.rrd"
 _DEFINITE = 1.1
 """Longest time of a plan over its shortest, up to which it says when the run ends."""
+_SHOWN = 3
+"""Most readings beside the progress of a run. Derivation: a line of 80 columns has room for three."""
 _LAST_WORDS = 1.0
 """Longest wait for a terminal at the end, s."""
 
@@ -310,7 +312,12 @@ class RunContext(ExitStack):
                 _open_view(self._dashboard, console)
         length = _expectation(self._rehearsal, self._planned)
         self._progress = ProgressDisplay(
-            console, run.protocol.name, self._signals, _shown(description), length, self.clock.factor
+            console,
+            run.protocol.name,
+            self._signals,
+            _shown(run.protocol, description, self._slots),
+            length,
+            self.clock.factor,
         )
         self._observers.append(self.enter_context(DetachedObserver(self._progress)))
         if (notifier := self._notifier) is not None:
@@ -409,10 +416,13 @@ def _checked(
     return (*check_start(description, interval=1.0 / file.safety.rate, interval_key="safety.rate"), *warnings)
 
 
-def _shown(description: RigDescription) -> tuple[str, ...]:
-    """Return the signals that the progress display shows."""
+def _shown(protocol: ProtocolDefinition, description: RigDescription, slots: Slots) -> tuple[str, ...]:
+    """Return the signals that the progress display shows: those of the slots, or those that the protocol names."""
+    if slots:
+        return tuple(dict.fromkeys(slot.signal for slot in slots.values()))[:_SHOWN]
+    named = tuple(name for name in protocol.names if name in description.by_name)
     layout = description.file.dashboard
-    return (layout.input, layout.output) if layout else tuple(signal.name for signal in description.signals[:2])
+    return named[:_SHOWN] or ((layout.input, layout.output) if layout else tuple(description.by_name)[:2])
 
 
 def _asked(run: Run, attachment: Attachment | None, rig: RigFile) -> dict[str, Any]:

@@ -21,6 +21,7 @@ from rich.text import Text
 
 from bench.base import (
     Expectation,
+    Remaining,
     RemainingTime,
     Stopwatch,
     format_duration,
@@ -269,10 +270,11 @@ class ProgressDisplay:
         if self._remaining is not None:
             left = self._remaining.at(t, self._since_start.seconds())
             completed = left.share
-            times += [f"left {format_duration(left.laboratory)},", f"ends {_time_of_day(left.wall)}"]
-            if math.isfinite(left.at_most):
+            times[-1] += ","
+            times += [f"{_left(left)},", f"ends {_time_of_day(left.wall)}"]
+            if math.isfinite(left.at_most) and _time_of_day(left.at_most) != _time_of_day(left.wall):
                 times[-1] += ","
-                times.append(f"at most {_time_of_day(left.at_most)}")
+                times.append(f"at the latest {_time_of_day(left.at_most)}")
         readings = [
             f"{signal.name} {signal.display.number(values[i])} {signal.display.unit}".rstrip()
             for i, signal in self._shown
@@ -357,8 +359,23 @@ class RehearsalDisplay:
         """Show nothing: the result of the rehearsal says what it found."""
 
 
+def _left(left: Remaining) -> str:
+    """Return what is left of a run in laboratory time, and what that takes where its clock is not the wall's."""
+    text = f"left {format_duration(left.laboratory)}"
+    if math.isclose(left.laboratory, left.wall, rel_tol=0.1, abs_tol=1.0):
+        return text
+    return f"{text} laboratory ≈ {_roughly(left.wall)}"
+
+
+def _roughly(seconds: float) -> str:
+    for most, unit, name in ((100.0, 1.0, "s"), (6000.0, 60.0, "min")):
+        if seconds < most:
+            return f"{seconds / unit:.0f} {name}"
+    return f"{seconds / 3600.0:.1f} h"
+
+
 def _time_of_day(seconds: float) -> str:
     """Return the local time of day that many wall-clock seconds from now; with the date if that is another day."""
     now = wall_time()
     end = (now + timedelta(seconds=seconds)).astimezone()
-    return end.strftime("%H:%M:%S" if end.date() == now.astimezone().date() else "%Y-%m-%d %H:%M")
+    return end.strftime("%H:%M" if end.date() == now.astimezone().date() else "%Y-%m-%d %H:%M")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal, cast, get_args, get_origin, get_type_hints
 
@@ -318,9 +318,19 @@ class ProtocolDefinition:
     def help(
         self, roles: Mapping[str, RoleTable] | None = None, defaults: Mapping[str, Any] | None = None
     ) -> tuple[ParameterHelp, ...]:
-        """Return what there is to set; with a rig's roles and table, its defaults and units."""
+        """Return what there is to set; with a rig's roles and table, its defaults and units.
+
+        What belongs to a slot that the rig does not bind is left out.
+        """
         given = self._from_roles(roles or {}) | dict(defaults or {})
-        return tuple(self._parameter_help(name, roles or {}, given) for name in self.parameters.model_fields)
+        hidden = () if roles is None else self.without_slot(roles)
+        names = (name for name in self.parameters.model_fields if name not in hidden)
+        return tuple(self._parameter_help(name, roles or {}, given) for name in names)
+
+    def without_slot(self, roles: Container[str]) -> tuple[str, ...]:
+        """Return the parameters that are of a slot which is used only where a rig binds it, and this one does not."""
+        missing = tuple(f"@{slot}" for slot in self.may_use if slot not in roles)
+        return tuple(name for name in self.parameters.model_fields if str(self._extra(name).get("unit")) in missing)
 
     def units(self, roles: Mapping[str, RoleTable]) -> dict[str, str]:
         """Return the units of the parameters on a rig, by name; those of texts and plain numbers are left out."""

@@ -29,7 +29,11 @@ def run_card(meta: Mapping[str, Any]) -> str:
         **_expected(meta),
         "seed": meta["seed"],
         **{f"device {name}": identity for name, identity in meta["devices"].items()},
-        **{f"parameter {name}": _shown(value, units.get(name, "")) for name, value in meta["parameters"].items()},
+        **{
+            f"parameter {name}": _shown(value, units.get(name, ""))
+            for name, value in meta["parameters"].items()
+            if name not in meta.get("without_slot", ())
+        },
         "git": meta["git"],
     }
     lines += [f"| {key} | {value} |" for key, value in rows.items()]

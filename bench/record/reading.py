@@ -111,7 +111,9 @@ class Record:
             self.meta: dict[str, Any] = {key: parse_json(value) for key, value, *_ in meta}
             signals = self._db.execute("SELECT * FROM signals ORDER BY position").fetchall()
             extents = self.meta.get("extents", {})
-            self.signals = tuple(Signal(*row[1:5], None, extents.get(row[1])) for row in signals)
+            self.signals = tuple(
+                Signal(row[1], row[2], row[3], row[4], extent=extents.get(row[1])) for row in signals
+            )
         except (sqlite3.DatabaseError, ValueError, TypeError) as error:
             raise DataError(f"{self.path} is not a readable journal: {error}{way_back(self.path)}") from error
         found = self.meta.get("schema")

@@ -116,6 +116,7 @@ def metadata(
             "sha256": digest_of(protocol),
         },
         "parameters": parameters.model_dump(mode="json"),
+        "without_slot": protocol.without_slot(slots),
         "units": protocol.units(file.roles),
         "changed": protocol.changed(parameters, file.roles, file.protocols.get(protocol.name, {})),
         "controls": protocol.controlled(slots),

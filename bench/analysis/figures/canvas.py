@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,6 +14,7 @@ import numpy.typing as npt
 from bench.base import DataError, needed_for
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 Floats = npt.NDArray[np.float64]
@@ -72,6 +74,23 @@ def drawn(path: Path, size: tuple[float, float], *, grid: bool = True) -> Iterat
             figure.savefig(path, metadata=undated)
         except OSError as error:
             raise DataError(f"figure {path} cannot be written: {error.strerror or error}") from None
+
+
+def legend_above(axes: Axes, size: float = 7.5, markers: float = 3.0) -> None:
+    """Put the legend above the axes, where it covers no data, in as many columns as its texts leave room for."""
+    handles, labels = axes.get_legend_handles_labels()
+    if not handles:
+        return
+    # Of a character, and of what stands beside a text, in inches.
+    width, beside = 0.58 * size / 72.0, 0.45
+    room = float(axes.figure.bbox.width / axes.figure.dpi) - 0.9
+    wrapped = ["\n".join(wrap(label, int((room - beside) / width))) for label in labels]
+    longest = max(len(line) for label in wrapped for line in label.splitlines())
+    columns = max(1, min(len(labels), int(room / (longest * width + beside))))
+    axes.legend(
+        handles, wrapped, loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=columns, fontsize=size,
+        markerscale=markers, borderaxespad=0.2, columnspacing=1.2,
+    )  # fmt: skip
 
 
 def _label_ticks_plainly(figure: Figure) -> None:

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from bench.analysis.figures.canvas import apart, drawn, outline
-from bench.analysis.figures.colors import MEASURED, SKIPPED, color_of
+from bench.analysis.figures.canvas import apart, drawn, legend_above, outline
+from bench.analysis.figures.colors import MEASURED, SKIPPED, color_of, series_color
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -19,17 +19,21 @@ Floats = npt.NDArray[np.float64]
 
 _MODEL: dict[str, Any] = {"linewidth": 1.3, "alpha": 0.75}
 """Wide lines: the points of what was measured are drawn onto them."""
+MOST_PHASES = 8
+"""Most phases that are told apart by colours."""
 _MOST_PANELS = 4
 """Most models whose residuals have a panel each."""
 
 
-def draw_measured(axes: Axes, horizontal: Floats, vertical: Floats, *, label: str = "measured") -> None:
-    """Draw what was measured: dark points."""
+def draw_measured(
+    axes: Axes, horizontal: Floats, vertical: Floats, *, label: str = "measured", color: str = MEASURED
+) -> None:
+    """Draw what was measured: points, dark ones if nothing else is said."""
     size = 2.6 if horizontal.size <= 1500 else 1.7
     axes.plot(
         *apart(horizontal, vertical),
         ".",
-        color=MEASURED,
+        color=color,
         markersize=size,
         markeredgewidth=0.0,
         label=label,
@@ -38,14 +42,34 @@ def draw_measured(axes: Axes, horizontal: Floats, vertical: Floats, *, label: st
 
 
 def plot_loops(
-    path: Path, inputs: Floats, measured: Floats, modelled: Floats | None, *, input_label: str, output_label: str
+    path: Path,
+    inputs: Floats,
+    measured: Floats,
+    modelled: Floats | None,
+    *,
+    input_label: str,
+    output_label: str,
+    phases: Sequence[str] = (),
 ) -> None:
-    """Draw measured loops, one sample a step, and what a model leaves of them below; arrays of shape (N,)."""
+    """Draw measured loops, one sample a step, and what a model leaves of them below; arrays of shape (N,).
+
+    With the phase of each sample, a few phases have colours of their own.
+    """
     if modelled is None:
+        names = list(dict.fromkeys(phases))
         with drawn(path, (6.0, 4.2)) as figure:
             axes = figure.subplots()
-            axes.plot(inputs, measured, "-", color=SKIPPED, linewidth=0.5)
-            draw_measured(axes, inputs, measured)
+            if 1 < len(names) <= MOST_PHASES:
+                of = np.array([names.index(name) for name in phases])
+                for i, name in enumerate(names):
+                    # What follows another phase is not joined to what comes before it.
+                    part = np.where(of == i, measured, np.nan)
+                    axes.plot(inputs, part, "-", color=series_color(i), linewidth=0.5, alpha=0.6, label="_")
+                    draw_measured(axes, inputs, part, label=name, color=series_color(i))
+                legend_above(axes)
+            else:
+                axes.plot(inputs, measured, "-", color=SKIPPED, linewidth=0.5)
+                draw_measured(axes, inputs, measured)
             axes.set(xlabel=input_label, ylabel=output_label)
         return
     plot_fit(
@@ -100,7 +124,7 @@ def plot_errors(
             draw_published(axes, (published or {}).get(title), color)
             if bands and title in bands:
                 _draw_band(axes, indices, *bands[title], color)
-                axes.legend(loc="upper right", fontsize=7.5)
+                axes.set_title(f"{axes.get_title(loc='left')}; shaded: {bands[title][0]}", fontsize=9, loc="left")
         panels[-1].set_xlabel("index of the set-point")
 
 
@@ -181,7 +205,7 @@ def plot_fit(
             axes.axhline(0.0, color="black", linewidth=0.5)
             axes.set_ylabel(error_label)
             if any(titles.values()):
-                axes.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=3, fontsize=7.5, markerscale=3.0)
+                legend_above(axes)
         # Of what counts; the samples before may be far off.
         counted = np.concatenate([(measured - values)[skip:] for values in modelled.values()])
         widths = [float(np.nanmax(width[skip:])) for _, width in (bands or {}).values()]
@@ -193,7 +217,7 @@ def plot_fit(
         panels[1].set_ylim(least - margin, most + margin)
         top.set_ylabel(output_label)
         panels[-1].set_xlabel(horizontal_label)
-        top.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=4, fontsize=7.5, markerscale=3.0)
+        legend_above(top)
 
 
 _DENSE = 3000

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -9,8 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from bench.analysis.figures.canvas import apart, drawn, outline
+from bench.analysis.figures.canvas import apart, drawn, legend_above, outline
 from bench.analysis.figures.colors import MEASURED, color_of, series_color
+from bench.analysis.figures.fits import MOST_PHASES
 
 Floats = npt.NDArray[np.float64]
 
@@ -45,7 +47,7 @@ def plot_panels(
     rows = -(-len(panels) // columns)
     with drawn(path, (3.3 * columns, 0.4 + 2.6 * rows)) as figure:
         grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
-        for i, (axes, (title, curves)) in enumerate(zip(grid.flat, panels.items(), strict=False)):
+        for axes, (title, curves) in zip(grid.flat, panels.items(), strict=False):
             for k, curve in enumerate(curves):
                 color = series_color(k)
                 if len(curves) == 1 and not curve.label:
@@ -59,8 +61,11 @@ def plot_panels(
                 else:
                     axes.plot(curve.horizontal, curve.vertical, "-", linewidth=0.8, **style)
             axes.set_title(title, fontsize=9, loc="left")
-            if i == 0 and any(curve.label for curve in curves):
-                axes.legend(fontsize=6.5, markerscale=2.5)
+        if any(label for label in grid[0, 0].get_legend_handles_labels()[1]):
+            figure.legend(
+                *grid[0, 0].get_legend_handles_labels(), loc="outside upper left", ncols=2 * columns, fontsize=6.5,
+                markerscale=2.5,
+            )  # fmt: skip
         for axes in grid.flat[len(panels) :]:
             axes.set_visible(False)
         for axes in grid[-1]:
@@ -69,21 +74,54 @@ def plot_panels(
             axes.set_ylabel(vertical_label)
 
 
+def time_axis(seconds: float) -> tuple[float, str]:
+    """Return the factor from s to the unit of a time axis of this length, and its label."""
+    factor, unit = next((1.0 / each, unit) for each, unit, most in _TIMES if seconds <= most)
+    return factor, f"laboratory time / {unit}"
+
+
+_TIMES = ((1.0, "s", 600.0), (60.0, "min", 4 * 3600.0), (3600.0, "h", math.inf))
+"""Seconds in a unit, the unit, and the longest axis in it, s."""
+
+
 def plot_signals(
     path: Path,
-    hours: Floats,
-    signals: Mapping[str, Floats],
-    labels: Sequence[str],
-    *,
-    horizontal_label: str = "laboratory time / h",
+    curves: Sequence[Curve],
+    horizontal_label: str,
+    phases: Sequence[tuple[str, float, float]] = (),
 ) -> None:
-    """Draw signals, each of shape (N,), over laboratory time in h or other positions; labels include units."""
-    with drawn(path, (7.0, 0.8 + 1.2 * len(signals))) as figure:
-        panels = figure.subplots(len(signals), 1, sharex=True, squeeze=False)[:, 0]
-        for i, values in enumerate(signals.values()):
-            panels[i].plot(*outline(hours, values), color=series_color(i), linewidth=0.7)
-            panels[i].set_ylabel(labels[i], rotation=0, ha="right", va="center", fontsize=8)
+    """Draw curves below each other over one axis; their labels are those of the axes, and include units.
+
+    Of a few phases, given by name, start and end on the horizontal axis, each has a colour behind the curves.
+    """
+    length = max((end for _, _, end in phases), default=0.0)
+    phases = [each for each in phases if each[2] - each[1] > _VISIBLE * length]
+    names = list(dict.fromkeys(name for name, _, _ in phases))
+    is_told = 1 < len(names) <= MOST_PHASES
+    with drawn(path, (7.0, 0.8 + 0.3 * is_told + 1.2 * len(curves))) as figure:
+        panels = figure.subplots(len(curves), 1, sharex=True, squeeze=False)[:, 0]
+        for axes, curve in zip(panels, curves, strict=True):
+            for name, start, end in phases if is_told else ():
+                i = names.index(name)
+                is_named = axes is panels[0] and name not in axes.get_legend_handles_labels()[1]
+                axes.axvspan(
+                    start, end, color=series_color(i), alpha=0.13, linewidth=0.0, label=name if is_named else "_"
+                )
+            known = np.isfinite(curve.horizontal) & np.isfinite(curve.vertical)
+            few = np.count_nonzero(known) <= _FEW_POINTS
+            axes.plot(
+                *outline(curve.horizontal, curve.vertical), color=MEASURED, linewidth=0.7, marker="." if few else "",
+                markersize=3.0,
+            )  # fmt: skip
+            axes.set_ylabel(curve.label, rotation=0, ha="right", va="center", fontsize=8)
+        legend_above(panels[0])
         panels[-1].set_xlabel(horizontal_label)
+
+
+_VISIBLE = 0.003
+"""Least part of the axis that a phase has to take to be seen. Derivation: two pixels of 600."""
+_FEW_POINTS = 60
+"""Points that are drawn as such, as some may have no neighbour."""
 
 
 def plot_histogram(path: Path, values: Floats, *, label: str, limit: float | None = None) -> None:
@@ -93,5 +131,5 @@ def plot_histogram(path: Path, values: Floats, *, label: str, limit: float | Non
         axes.hist(values, bins=60, color=series_color(1), log=True)
         if limit is not None:
             axes.axvline(limit, color="black", linestyle="--", linewidth=0.8, label="period")
-            axes.legend(fontsize=7.5)
+            legend_above(axes)
         axes.set(xlabel=label, ylabel="samples")

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from bench.analysis.figures.canvas import drawn, outline
+from bench.analysis.figures.canvas import drawn, legend_above, outline
 from bench.analysis.figures.colors import REFERENCE, color_of
 from bench.analysis.figures.fits import draw_published
 
@@ -75,7 +75,7 @@ def plot_tracking(
             draw_published(bottom, (published or {}).get(title), color)
         top.set_ylabel(output_label)
         bottom.set(xlabel=horizontal_label, ylabel=error_label)
-        top.legend(loc="lower left", bbox_to_anchor=(0.0, 1.0), ncols=min(len(outputs) + 1, 4), fontsize=7.5)
+        legend_above(top, markers=1.0)
         if not by_target and (said := _limits(places, errors)) is not None:
             bottom.set_ylim(*said[0])
             bottom.set_title(said[1], fontsize=7.5, loc="left")

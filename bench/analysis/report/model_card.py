@@ -15,7 +15,7 @@ import numpy.typing as npt
 from bench.analysis.model_service import IdentifiedFile, certificate_lines
 from bench.analysis.predictions import Predictions
 from bench.analysis.tables.data import Quantity
-from bench.base import DataError, write_whole
+from bench.base import DataError, percent, write_whole
 from bench.identification import Errors
 from bench.models import MemoryCurve, Operator, TimedModel
 from bench.record import Record
@@ -155,9 +155,9 @@ def _between(low: float, high: float, unit: str) -> str:
 def _errors(found: IdentifiedFile) -> list[tuple[str, str, str]]:
     errors: Errors = found.identification.errors
     return [
-        ("largest", f"{errors.maximum:.4g}", f"{errors.maximum_percent:.2f}"),
-        ("RMS", f"{errors.rms:.4g}", f"{errors.rms_percent:.2f}"),
-        ("mean absolute", f"{errors.average:.4g}", f"{errors.average_percent:.2f}"),
+        ("largest", f"{errors.maximum:.4g}", percent(errors.maximum_percent).removesuffix(" %")),
+        ("RMS", f"{errors.rms:.4g}", percent(errors.rms_percent).removesuffix(" %")),
+        ("mean absolute", f"{errors.average:.4g}", percent(errors.average_percent).removesuffix(" %")),
         ("range of the output", f"{errors.span:.4g}", "100.00"),
     ]
 

@@ -6,15 +6,13 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rich.console import Console
 from rich.table import Table as Columns
 
 from bench.analysis.examined import ComparedModels
 from bench.analysis.export.run_export import make_folder
 from bench.analysis.figures.canvas import check_matplotlib
-from bench.analysis.figures.fits import plot_errors, plot_loops
-from bench.analysis.figures.panels import plot_signals
+from bench.analysis.figures.fits import plot_errors
 from bench.analysis.figures.planes import plot_coverage, plot_densities
 from bench.analysis.model_service import IdentifiedFile
 from bench.analysis.models_on_run import ModelOnRun, apply_models, models_of
@@ -24,7 +22,8 @@ from bench.analysis.report.page.render import write_page
 from bench.analysis.report.page.run_page import run_page
 from bench.analysis.report.page.run_parts import watched_pairs
 from bench.analysis.report.published import Published
-from bench.analysis.report.telemetry_summary import TelemetrySummary, summarize, wider
+from bench.analysis.report.run_figures import draw_loops, draw_signals, phases
+from bench.analysis.report.telemetry_summary import TelemetrySummary, summarize, wider, without_priors
 from bench.analysis.report.uncertainty_tables import (
     BUDGET_HEADS,
     SIGNAL_HEADS,
@@ -36,8 +35,7 @@ from bench.analysis.report.uncertainty_tables import (
 )
 from bench.analysis.tracking_errors import results_json
 from bench.analysis.uncertain_results import RunUncertainty
-from bench.base import format_numbers, print_plain, with_unit
-from bench.devices import Signal
+from bench.base import format_duration, percent, print_plain, with_unit
 from bench.identification import ModelFile, models_among
 from bench.models import MemoryCurve
 from bench.record import Record, Table, expected_steps, lateness_lines, run_card
@@ -90,6 +88,7 @@ def report_run(
         folder = make_folder(out or record.path.parent / "report")
         console.print(Markdown(run_card(record.meta)))
         steps = record.steps()
+        without_priors(record, steps)
         if remark := record.remark():
             print_plain(console, remark)
         _print_status(record, len(steps), console)
@@ -99,7 +98,7 @@ def report_run(
         _print_events(record, console)
         for line in lateness_lines(record.meta.get("lateness", {})):
             print_plain(console, line)
-        figures = _draw_run(record, steps, folder, figure_format)
+        figures = _draw_run(record, steps, summary, folder, figure_format)
         compared = [*models_of(record), *_given_with_band(record), *models]
         applied = apply_models(record, steps, compared) if len(steps) else []
         comparison = {
@@ -204,35 +203,30 @@ def _print_extremes(record: Record, extremes: Mapping[str, Mapping[str, Any]], c
     )
     for signal in record.signals:
         entry = extremes[signal.name]
-        table.add_row(signal.name, *format_numbers([entry["low"], entry["high"]], signal.unit, signal.precision))
+        if entry["low"] is None:
+            continue
+        shown = signal.display
+        table.add_row(signal.name, shown.number(entry["low"]), shown.number(entry["high"]), shown.unit)
     console.print(table)
 
 
 def _print_events(record: Record, console: Console) -> None:
     for event in record.events():
         if event.level != "INFO" or event.kind == "note":
-            console.print(f"{event.t:10.1f} s  {event.kind}: {event.text}", highlight=False, markup=False)
+            console.print(
+                f"{format_duration(event.t):>10}  {event.kind}: {event.text}", highlight=False, markup=False
+            )
 
 
-def _draw_run(record: Record, steps: Table, folder: Path, figure_format: str) -> list[Path]:
+def _draw_run(
+    record: Record, steps: Table, summary: TelemetrySummary, folder: Path, figure_format: str
+) -> list[Path]:
     if len(steps) == 0:
         return []
-    names = [signal.name for signal in record.signals if np.any(np.isfinite(steps[signal.name]))]
-    labels = [with_unit(name, record.unit(name)).replace(" / ", "\n/ ") for name in names]
-    paths = [folder / f"signals.{figure_format}"]
-    plot_signals(paths[0], steps["finished"] / 3600.0, {name: steps[name] for name in names}, labels)
-    layout = record.meta.get("dashboard")
-    if layout:
-        paths.append(folder / f"loop.{figure_format}")
-        plot_loops(
-            paths[1],
-            steps[layout["input"]],
-            steps[layout["output"]],
-            None,
-            input_label=with_unit(layout["input"], record.unit(layout["input"])),
-            output_label=with_unit(layout["output"], record.unit(layout["output"])),
-        )
-    return paths
+    found = phases(record, steps, record.events())
+    path = folder / f"signals.{figure_format}"
+    paths = [path] if draw_signals(path, record, steps, summary, found) else []
+    return [*paths, *(path for path, _ in draw_loops(folder, figure_format, record, steps, summary, found))]
 
 
 def _given_with_band(record: Record) -> list[ModelFile]:
@@ -265,13 +259,12 @@ def _print_comparison(
 ) -> None:
     if not comparison:
         return
-    table = Columns(
-        "model", "max", "RMS", "unit", "RMS / % of range", title="models on this run", title_justify="left"
-    )
+    table = Columns("model", "max", "RMS", "RMS of the range", title="models on this run", title_justify="left")
+    displays = {signal.name: signal.display for signal in record.signals}
     outputs = {each.file.name: each.measured.name for each in models}
     for name, entry in comparison.items():
-        cells = format_numbers([entry["max"], entry["rms"]], entry["unit"], _precision(record, outputs[name]))
-        table.add_row(name, *cells, f"{entry['rms_percent']:.2f}")
+        shown = displays[outputs[name]]
+        table.add_row(name, shown.text(entry["max"]), shown.text(entry["rms"]), percent(entry["rms_percent"]))
     console.print(table)
     for each in models:
         if text := each.beyond.text():
@@ -283,9 +276,8 @@ def _print_control(
 ) -> None:
     for name, entry in results.items():
         keys = [key for key in ("max", "rms", "median") if key in entry]
-        errors = [entry[key] for key in keys]
-        *numbers, unit = format_numbers(errors, record.unit(controlled), _precision(record, controlled))
-        parts = [f"error {key} {number} {unit}".rstrip() for key, number in zip(keys, numbers, strict=True)]
+        shown = next(signal.display for signal in record.signals if signal.name == controlled)
+        parts = [f"error {key} {shown.text(entry[key])}" for key in keys]
         if "seconds_per_target" in entry:
             parts.append(f"{entry['seconds_per_target']:.1f} s a target")
         console.print(f"{name}: {', '.join(parts)}", highlight=False)
@@ -308,7 +300,3 @@ def _print_uncertainty(found: RunUncertainty, console: Console) -> None:
     for name, each in found.control.items():
         for line in control_lines(each):
             print_plain(console, f"{name}: {line}")
-
-
-def _precision(record: Record, name: str) -> int:
-    return next((signal.precision for signal in record.signals if signal.name == name), Signal.precision)

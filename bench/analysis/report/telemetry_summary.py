@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from bench.protocol import TRACES
 from bench.record import Record, Table
 
 Floats = npt.NDArray[np.float64]
@@ -15,6 +16,7 @@ Extremes = tuple[float | None, float | None]
 
 _MOST_WHOLE = 20_000
 """Ticks up to which all of them are kept."""
+_UNCERTAINTY = TRACES[3].name
 _STRETCHES = 700
 """Stretches of a longer telemetry, about as many as a figure has columns of points."""
 
@@ -66,6 +68,7 @@ def summarize(record: Record, pairs: Sequence[tuple[str, str]] = ()) -> Telemetr
     columns = ["t", "step", *names]
     pending, position = np.empty((0, len(columns))), 0
     for ticks in record.ticks():
+        without_priors(record, ticks)
         for name in names:
             extremes[name] = wider(extremes[name], ticks[name])
         for signal, minus in pairs:
@@ -94,6 +97,16 @@ def _outline(rows: Floats) -> Floats:
     greatest = np.where(np.isfinite(values), values, -np.inf).argmax(axis=0)
     chosen = np.unique(np.concatenate([[0, len(rows) - 1], least, greatest]))
     return np.asarray(rows[chosen])
+
+
+def without_priors(record: Record, rows: Table) -> None:
+    """Leave out the uncertainty of a controller's filter before its first estimate: it only says that it is unknown.
+
+    It is beyond all that the output has been.
+    """
+    uncertainty, output = rows.columns.get(_UNCERTAINTY), rows.columns.get(str(record.meta.get("controls", "")))
+    if uncertainty is not None and output is not None and np.isfinite(output).any():
+        uncertainty[uncertainty > np.nanmax(output) - np.nanmin(output)] = np.nan
 
 
 def wider(before: Extremes, values: Floats) -> Extremes:

@@ -7,8 +7,7 @@ import numpy as np
 from rich.console import Console
 
 from bench.analysis import read_columns
-from bench.base import say_share, shares_to
-from bench.cli.patience import PatienceDisplay
+from bench.base import PatienceDisplay, say_share, shares_to
 from bench.identification import damped_oscillation, identify
 
 

@@ -123,14 +123,15 @@ def _signals(found: RunComparison, tables: Sequence[Table], scratch: Path) -> li
     title = f"second less first, {found.common_steps} common steps"
     parts: list[PageTable | PageFigure] = [PageTable(heads, rows, title=title, numbers_from=1)]
     common, ours, theirs = np.intersect1d(tables[0]["step"], tables[1]["step"], return_indices=True)
-    columns, labels = {}, []
+    curves = []
     for name, apart in found.signals.items():
         factor, unit = fitting_prefix(apart.unit, apart.maximum)
-        columns[name] = factor * (tables[1][name][theirs] - tables[0][name][ours])
-        labels.append(with_unit(name, unit).replace(" / ", "\n/ "))
-    if columns and common.size > 1:
+        apart_now = factor * (tables[1][name][theirs] - tables[0][name][ours])
+        if np.any(np.nan_to_num(apart_now)):
+            curves.append(Curve(with_unit(name, unit).replace(" / ", "\n/ "), common, apart_now))
+    if curves and common.size > 1:
         path = scratch / "differences.svg"
-        plot_signals(path, common, columns, labels, horizontal_label="step")
+        plot_signals(path, curves, "step")
         caption = "Second less first, over the steps that both have."
         parts.append(PageFigure(inlined(path, caption), caption))
     return parts

@@ -52,10 +52,13 @@ class PageFigure:
         An `svg` element, as `bench.analysis.report.page.svg.inlined` returns it.
     caption : str
         What it shows.
+    is_map : bool
+        Whether its colours are values, which a dark page leaves as they are.
     """
 
     svg: str
     caption: str
+    is_map: bool = False
     kind = "figure"
 
 

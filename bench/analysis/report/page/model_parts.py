@@ -14,7 +14,7 @@ from bench.analysis.models_on_run import ModelOnRun
 from bench.analysis.prediction_figures import errors_text
 from bench.analysis.report.page.elements import PageFigure, PageSection, PageTable, PageText
 from bench.analysis.report.page.svg import inlined
-from bench.base import fitting_prefix, with_unit
+from bench.base import fitting_prefix, percent, with_unit
 from bench.identification import CoefficientUncertainties, ModelFile, coefficient_uncertainties
 from bench.models import MemoryCurve, TimedModel
 
@@ -63,7 +63,7 @@ def given_section(files: Sequence[tuple[str, ModelFile]], scratch: Path) -> Page
             path = scratch / f"given-{i}-{k}.svg"
             plot_densities(path, [density])
             caption = f"Density of {file.name} {density.title}".rstrip()
-            figures.append(PageFigure(inlined(path, caption), f"{caption}, as the run was given it."))
+            figures.append(PageFigure(inlined(path, caption), f"{caption}, as the run was given it.", is_map=True))
     heads = ("parameter", "model", "kind", "identified from", "valid for inputs", "prediction band")
     return PageSection("Models that the run was given", (PageTable(heads, rows), *figures))
 
@@ -76,7 +76,13 @@ def _errors_table(models: Sequence[ModelOnRun]) -> PageTable:
         factor, unit = fitting_prefix(model.unit, *numbers, least=0.1)
         cells = [f"{factor * number:.4g}" for number in numbers]
         rows.append(
-            (model.file.name, model.file.model.kind, *cells, "" if unit == "1" else unit, f"{errors.rms_percent:.2f}")
+            (
+                model.file.name,
+                model.file.model.kind,
+                *cells,
+                "" if unit == "1" else unit,
+                percent(errors.rms_percent).removesuffix(" %"),
+            )
         )
     heads = ("model", "kind", "max", "RMS", "mean absolute", "unit", "RMS / % of range")
     return PageTable(heads, rows, title="errors on this run", numbers_from=2)
@@ -149,12 +155,12 @@ def _details(model: ModelOnRun, scratch: Path, number: int) -> Iterator[PageFigu
             caption += f"; {coverage.summary()} by this run"
         if sigma is not None:
             caption += "; beside it its standard uncertainty"
-        yield PageFigure(inlined(path, caption), f"{caption}.")
+        yield PageFigure(inlined(path, caption), f"{caption}.", is_map=True)
         if coverage is not None and isinstance(memory := model.file.memory, MemoryCurve):
             path = scratch / f"coverage-{number}-{i}.svg"
             plot_coverage(path, density, coverage.swept, memory)
             caption = f"What this run swept of the plane of {name}, and the memory at the end of the model's data"
-            yield PageFigure(inlined(path, caption), f"{caption}.")
+            yield PageFigure(inlined(path, caption), f"{caption}.", is_map=True)
     yield _coefficients(model, found, cells)
 
 
@@ -163,7 +169,7 @@ def _details_in_time(model: ModelOnRun, scratch: Path, number: int) -> Iterator[
         path = scratch / f"density-{number}-{i}.svg"
         plot_densities(path, [density])
         caption = f"Density of {model.file.name}"
-        yield PageFigure(inlined(path, caption), f"{caption}.")
+        yield PageFigure(inlined(path, caption), f"{caption}.", is_map=True)
     rows = [(name, f"{value:.6g}", unit) for name, (value, unit) in model.file.model.parameters().items()]
     heads = ("parameter", "value", "unit")
     yield PageTable(heads, rows, title=f"parameters of {model.file.name}", numbers_from=1)

@@ -10,29 +10,26 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bench.analysis.figures.fits import plot_loops
-from bench.analysis.figures.panels import plot_histogram, plot_signals
+from bench.analysis.figures.panels import plot_histogram
 from bench.analysis.figures.targets import plot_tracking
 from bench.analysis.models_on_run import ModelOnRun
 from bench.analysis.report.page.elements import Page, PageFigure, PageSection, PageTable, PageText
 from bench.analysis.report.page.model_parts import given_section, models_section
 from bench.analysis.report.page.run_parts import (
-    Phase,
     devices_section,
     events_section,
     interlocks_section,
     parameters_section,
-    phases,
     phases_section,
     published_section,
     repeat_section,
     requests_section,
     safe_state_text,
-    signal_labels,
     signals_table,
 )
 from bench.analysis.report.page.svg import inlined
 from bench.analysis.report.published import Published, concerning
+from bench.analysis.report.run_figures import Phase, draw_loops, draw_signals, phases
 from bench.analysis.report.telemetry_summary import TelemetrySummary
 from bench.analysis.report.uncertainty_tables import (
     BUDGET_HEADS,
@@ -45,7 +42,7 @@ from bench.analysis.report.uncertainty_tables import (
 )
 from bench.analysis.tracking_errors import FollowingResult, following_result, target_results, ticks_with
 from bench.analysis.uncertain_results import RunUncertainty
-from bench.base import fitting_prefix, format_duration, format_numbers, with_unit
+from bench.base import Display, format_duration, percent, with_unit
 from bench.devices import Signal
 from bench.identification import models_among
 from bench.record import Event, Record, Table, expected_steps
@@ -95,7 +92,7 @@ def run_page(
             sections.append(uncertain)
         if models:
             sections.append(models_section(models, steps["finished"], scratch))
-        elif (loops := _loops_section(record, steps, summary, scratch)) is not None:
+        elif (loops := _loops_section(record, steps, summary, found, scratch)) is not None:
             sections.append(loops)
         if stated:
             sections.append(published_section(stated, result))
@@ -103,7 +100,7 @@ def run_page(
             sections.append(given_section(list(given.items()), scratch))
         sections += [
             phases_section(found),
-            _signals_section(record, steps, summary, extremes, scratch),
+            _signals_section(record, steps, summary, extremes, found, scratch),
             interlocks_section(record, steps, summary, extremes, events),
             parameters_section(meta),
             devices_section(meta),
@@ -141,7 +138,7 @@ def _lead(
     )
     expected = expected_steps(meta)
     of = f" of {expected}" if expected is not None else ""
-    lasted = f" and {format_duration(found[-1].end)} h of laboratory time" if found else ""
+    lasted = f" and {format_duration(found[-1].end)} of laboratory time" if found else ""
     if record.status == "unfinished":
         second = (
             "UNFINISHED: the run goes on, or its process died; this page has what was recorded until now, "
@@ -168,10 +165,10 @@ def _lead(
             )
     for model in models:
         errors = model.errors
-        numbers = format_numbers([errors.maximum, errors.rms], model.unit, _precision(record, model.measured.name))
+        display = _signal(record, model.measured.name).display
         lead.append(
-            f"Model {model.file.name} is off by at most {numbers[0]} {numbers[2]}, RMS {numbers[1]} {numbers[2]} "
-            f"({errors.rms_percent:.2f} % of the range)."
+            f"Model {model.file.name} is off by at most {display.text(errors.maximum)}, RMS "
+            f"{display.text(errors.rms)} ({percent(errors.rms_percent)} of the range)."
         )
     notes = [event.text for event in events if event.kind == "note"]
     if notes:
@@ -181,11 +178,9 @@ def _lead(
 
 def _errors_in_words(record: Record, controlled: str, errors: Mapping[str, float]) -> str:
     keys = [key for key in ("max", "rms", "median") if key in errors]
-    *numbers, unit = format_numbers(
-        [errors[key] for key in keys], record.unit(controlled), _precision(record, controlled)
-    )
+    display = _signal(record, controlled).display
     names = {"max": "at most", "rms": "RMS", "median": "median"}
-    return ", ".join(f"{names[key]} {number} {unit}".rstrip() for key, number in zip(keys, numbers, strict=True))
+    return ", ".join(f"{names[key]} {display.text(errors[key])}" for key in keys)
 
 
 def _control_section(
@@ -195,7 +190,7 @@ def _control_section(
     followed = _followed(record, controlled)
     if not controlled or not ("tracking" in result or followed is not None):
         return None
-    unit, precision = record.unit(controlled), _precision(record, controlled)
+    display = _signal(record, controlled).display
     controller = str(record.meta["parameters"].get("controller", "output"))
     parts: list[PageFigure | PageTable | PageText] = []
     rows = []
@@ -204,12 +199,12 @@ def _control_section(
             if name == "seconds_per_target":
                 rows.append((key, "time a target", f"{value:.1f}", "s"))
             else:
-                number, shown = format_numbers([value], unit, precision)
+                number, _, shown = display.text(value).partition(" ")
                 rows.append((key, f"error {name}", number, shown))
     if rows:
         parts.append(PageTable(("", "figure", "value", "unit"), rows, numbers_from=2))
     if (reached := target_results(record, controlled)) is not None:
-        factor, shown = fitting_prefix(unit, float(np.abs(reached.targets).max(initial=0.0)))
+        factor, shown = display.factor, display.unit
         path = scratch / "targets.svg"
         largest = next((float(each.value) / each.scale for each in stated if each.path == ("tracking", "max")), None)
         plot_tracking(
@@ -222,9 +217,9 @@ def _control_section(
         )
         caption = f"Targets (marks) and what was reached (points) under {controller}; below, the errors."
         parts.append(PageFigure(inlined(path, caption), caption))
-        parts.append(_targets_table(reached.targets, reached.outputs, reached.seconds, unit))
+        parts.append(_targets_table(reached.targets, reached.outputs, reached.seconds, display))
     if followed is not None and "tracking" not in result:
-        factor, shown = fitting_prefix(unit, float(np.abs(followed.reference).max(initial=0.0)))
+        factor, shown = display.factor, display.unit
         path = scratch / "following.svg"
         plot_tracking(
             path,
@@ -267,23 +262,13 @@ def _followed(record: Record, controlled: str) -> FollowingResult | None:
     return FollowingResult(times - times[0], ticks["reference"][rows], ticks[controlled][rows])
 
 
-def _samples(steps: Table, summary: TelemetrySummary) -> tuple[Table, str, str]:
-    """Return the table of samples, its column of times, and what a figure of it says beside its caption.
-
-    A loop at a fixed rate is one step of many ticks.
-    """
-    if len(steps) > 1:
-        return steps, "finished", ""
-    return summary.shown, "t", summary.remark and f" {summary.remark}"
-
-
-def _targets_table(targets: Floats, outputs: Floats, seconds: Floats, unit: str) -> PageTable:
-    factor, shown = fitting_prefix(unit, float(np.abs(targets).max(initial=0.0)))
+def _targets_table(targets: Floats, outputs: Floats, seconds: Floats, display: Display) -> PageTable:
+    factor, shown = display.factor, display.unit
     rows = [
         (
             str(i),
-            f"{factor * target:.6g}",
-            f"{factor * output:.6g}",
+            display.number(target),
+            display.number(output),
             f"{factor * (output - target):+.3g}",
             f"{time:.1f}",
         )
@@ -293,28 +278,11 @@ def _targets_table(targets: Floats, outputs: Floats, seconds: Floats, unit: str)
     return PageTable(heads, rows, title="targets", folded=True, numbers_from=1)
 
 
-def _loops_section(record: Record, steps: Table, summary: TelemetrySummary, scratch: Path) -> PageSection | None:
-    samples, _, remark = _samples(steps, summary)
-    layout = record.meta.get("dashboard")
-    if not layout or len(samples) == 0:
-        return None
-    figures = []
-    for i, pair in enumerate([layout, *layout.get("loops", ())]):
-        names = [pair["input"], pair["output"]]
-        if not all(name in samples.columns for name in names):
-            continue
-        values = [samples[name] for name in names]
-        if not (np.isfinite(values[0]) & np.isfinite(values[1])).any():
-            continue
-        scaled, labels = [], []
-        for name, column in zip(names, values, strict=True):
-            factor, unit = fitting_prefix(record.unit(name), float(np.nanmax(np.abs(column))))
-            scaled.append(factor * column)
-            labels.append(with_unit(name, unit))
-        path = scratch / f"loop-{i}.svg"
-        plot_loops(path, scaled[0], scaled[1], None, input_label=labels[0], output_label=labels[1])
-        caption = f"{names[1]} over {names[0]}, one point a reading.{remark}"
-        figures.append(PageFigure(inlined(path, caption), caption))
+def _loops_section(
+    record: Record, steps: Table, summary: TelemetrySummary, found: Sequence[Phase], scratch: Path
+) -> PageSection | None:
+    drawn = draw_loops(scratch, "svg", record, steps, summary, found)
+    figures = [PageFigure(inlined(path, caption), caption) for path, caption in drawn]
     return PageSection("Loops", figures) if figures else None
 
 
@@ -323,21 +291,12 @@ def _signals_section(
     steps: Table,
     summary: TelemetrySummary,
     extremes: Mapping[str, Mapping[str, Any]],
+    found: Sequence[Phase],
     scratch: Path,
 ) -> PageSection:
     parts: list[PageFigure | PageTable | PageText] = [signals_table(record, extremes)]
-    table, over, remark = _samples(steps, summary)
-    names = [signal.name for signal in record.signals if np.isfinite(table[signal.name]).sum() > 1]
-    if names:
-        path = scratch / "signals.svg"
-        columns = {}
-        labels = []
-        for name, label in zip(names, signal_labels(record, names), strict=True):
-            factor, unit = fitting_prefix(record.unit(name), float(np.nanmax(np.abs(table[name]))))
-            columns[name] = factor * table[name]
-            labels.append(label if factor == 1.0 else f"{name}\n/ {unit}")
-        plot_signals(path, table[over] / 3600.0, columns, labels)
-        caption = f"{'Readings' if table is steps else 'Telemetry'} of all signals over laboratory time.{remark}"
+    path = scratch / "signals.svg"
+    if caption := draw_signals(path, record, steps, summary, found):
         parts.append(PageFigure(inlined(path, caption), caption))
     return PageSection("Signals", parts)
 
@@ -365,5 +324,5 @@ def _lateness_section(record: Record, scratch: Path) -> PageSection | None:
     return PageSection("Real time", parts) if parts else None
 
 
-def _precision(record: Record, name: str) -> int:
-    return next((signal.precision for signal in record.signals if signal.name == name), Signal.precision)
+def _signal(record: Record, name: str) -> Signal:
+    return next((signal for signal in record.signals if signal.name == name), Signal(name, "", name))

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from datetime import date, datetime, timedelta
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -16,8 +16,9 @@ from pydantic import ValidationError
 
 from bench.analysis.report.page.elements import PageSection, PageTable, PageText
 from bench.analysis.report.published import Published
+from bench.analysis.report.run_figures import Phase
 from bench.analysis.report.telemetry_summary import TelemetrySummary, wider
-from bench.base import BenchError, fitting_prefix, format_duration, format_numbers, with_unit
+from bench.base import BenchError, Display, format_duration
 from bench.protocol import ParameterHelp, find_protocol
 from bench.record import Event, Record, Table
 from bench.rig import SETPOINT, Interlock, RoleTable
@@ -29,27 +30,6 @@ _MOST_EVENTS = 1000
 _IDENTITY_OF_LINES = ("port", "baudrate", "timeout", "address")
 _NOT_SHOWN = ("format", "version", "date")
 """Keys of a calibration that say nothing more."""
-
-
-class Phase(NamedTuple):
-    """A phase of a run: its name, when it began and ended (laboratory s), and how many steps it has finished."""
-
-    name: str
-    start: float
-    end: float
-    steps: int
-
-
-def phases(record: Record, steps: Table, events: Sequence[Event]) -> list[Phase]:
-    """Return the phases of a run in their order; the last of one that has not ended lasts until its last reading."""
-    begun = [(event.t, event.text) for event in events if event.kind == "phase"] or [(0.0, "the whole run")]
-    last = max([float(steps["finished"].max())] if len(steps) else [0.0])
-    end = float(record.meta.get("finished") or max([last, *(event.t for event in events)]))
-    ends = [t for t, _ in begun[1:]] + [end]
-    return [
-        Phase(name, t, until, int(np.count_nonzero((steps["started"] >= t) & (steps["started"] < max(until, t)))))
-        for (t, name), until in zip(begun, ends, strict=True)
-    ]
 
 
 def phases_section(found: Sequence[Phase]) -> PageSection:
@@ -69,6 +49,8 @@ def parameters_section(meta: Mapping[str, Any]) -> PageSection:
     changed = meta.get("changed", {})
     rows = []
     for name, value in meta["parameters"].items():
+        if name in meta.get("without_slot", ()):
+            continue
         about = known.get(name)
         unit = about.unit if about is not None and about.unit not in ("1",) else ""
         rows.append((name, _plain(value), unit, "set" if name in changed else "", about.text if about else ""))
@@ -147,9 +129,12 @@ def signals_table(record: Record, extremes: Mapping[str, Mapping[str, Any]]) -> 
     bounds = _bounds(record)
     for signal in record.signals:
         entry = extremes[signal.name]
-        numbers = format_numbers([entry["low"], entry["high"]], signal.unit, signal.precision)
+        if entry["low"] is None:
+            continue
+        shown = signal.display
         margin = _margin(entry, bounds.get(signal.name, ()))
-        rows.append((signal.name, *numbers, _with_unit(margin, signal.unit)))
+        numbers = [shown.number(entry[end]) for end in ("low", "high")]
+        rows.append((signal.name, *numbers, shown.unit, "–" if margin is None else shown.text(margin)))
     return PageTable(
         ("signal", "lowest", "highest", "unit", "least margin"),
         [(name, low, high, unit, margin) for name, low, high, unit, margin in rows],
@@ -194,19 +179,20 @@ def interlocks_section(
 ) -> PageSection:
     """Return each interlock with what it allows, what was seen, the margin, and how often it acted."""
     rows = []
+    displays = {signal.name: signal.display for signal in record.signals}
     for each in interlocks_of(record):
         if each.signal not in extremes:
             continue
-        unit = extremes[each.signal]["unit"]
+        shown = displays[each.signal]
         seen = extremes[each.signal] if not each.minus else _difference(steps, summary, each.signal, each.minus)
         margin = _margin(seen, [(each.low, each.high)])
         acted = [event for event in events if event.kind == "interlock" and event.text.startswith(each.label)]
         rows.append(
             (
                 each.label,
-                _allowed(each, unit),
-                _between(seen["low"], seen["high"], unit),
-                _with_unit(margin, unit),
+                _allowed(each, shown),
+                _between(seen["low"], seen["high"], shown),
+                "–" if margin is None else shown.text(margin),
                 each.level.value,
                 str(len(acted)) if acted else "no",
             )
@@ -223,18 +209,10 @@ def interlocks_section(
     return PageSection("Interlocks and margins", parts)
 
 
-def _between(low: float | None, high: float | None, unit: str) -> str:
+def _between(low: float | None, high: float | None, shown: Display) -> str:
     if low is None or high is None:
         return "–"
-    factor, shown = fitting_prefix(unit, low, high)
-    return f"{factor * low:.4g} to {factor * high:.4g} {'' if shown == '1' else shown}".rstrip()
-
-
-def _with_unit(value: float | None, unit: str) -> str:
-    if value is None:
-        return "–"
-    factor, shown = fitting_prefix(unit, value)
-    return f"{factor * value:.4g} {'' if shown == '1' else shown}".rstrip()
+    return f"{shown.number(low)} to {shown.number(high)} {shown.unit}".rstrip()
 
 
 def watched_pairs(record: Record) -> list[tuple[str, str]]:
@@ -250,17 +228,18 @@ def _difference(steps: Table, summary: TelemetrySummary, signal: str, minus: str
     return {"low": low, "high": high}
 
 
-def _allowed(interlock: Interlock, unit: str) -> str:
-    shown = "" if unit == "1" else f" {unit}"
+def _allowed(interlock: Interlock, display: Display) -> str:
+    shown, factor = f" {display.unit}" if display.unit else "", display.factor
+    low, high = f"{factor * interlock.low:g}", f"{factor * interlock.high:g}"
     found = []
     if math.isfinite(interlock.low) and math.isfinite(interlock.high):
-        found.append(f"{interlock.low:g} to {interlock.high:g}{shown}")
+        found.append(f"{low} to {high}{shown}")
     elif math.isfinite(interlock.high):
-        found.append(f"≤ {interlock.high:g}{shown}")
+        found.append(f"≤ {high}{shown}")
     elif math.isfinite(interlock.low):
-        found.append(f"≥ {interlock.low:g}{shown}")
+        found.append(f"≥ {low}{shown}")
     if interlock.fastest is not None:
-        found.append(f"at most {interlock.fastest:g}{shown}/s over {interlock.over:g} s")
+        found.append(f"at most {factor * interlock.fastest:g}{shown}/s over {interlock.over:g} s")
     if interlock.stale is not None:
         found.append(f"equal readings for {interlock.stale:g} s at most")
     if (stuck := interlock.stuck) is not None:
@@ -270,9 +249,9 @@ def _allowed(interlock: Interlock, unit: str) -> str:
 
 def events_section(events: Sequence[Event]) -> PageSection:
     """Return what happened, in its order."""
-    rows = [(f"{each.t:.1f}", each.level, each.kind, each.text) for each in events[:_MOST_EVENTS]]
+    rows = [(format_duration(each.t), each.level, each.kind, each.text) for each in events[:_MOST_EVENTS]]
     note = f"The record has {len(events) - _MOST_EVENTS} more." if len(events) > _MOST_EVENTS else ""
-    return PageSection("Events", (PageTable(("t / s", "level", "kind", "what happened"), rows, note=note),))
+    return PageSection("Events", (PageTable(("t / h:mm:ss", "level", "kind", "what happened"), rows, note=note),))
 
 
 def requests_section(events: Sequence[Event]) -> PageSection | None:
@@ -349,8 +328,3 @@ def _plain(value: Any) -> str:  # noqa: ANN401 - anything that JSON can hold
     if isinstance(value, dict):
         return ", ".join(f"{key} = {_plain(each)}" for key, each in value.items())
     return str(value)
-
-
-def signal_labels(record: Record, names: Sequence[str]) -> list[str]:
-    """Return labels of axes in two lines."""
-    return [with_unit(name, record.unit(name)).replace(" / ", "\n/ ") for name in names]

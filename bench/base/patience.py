@@ -9,8 +9,7 @@ from threading import Event, Thread
 from rich.console import Console
 from rich.errors import LiveError
 
-from bench.base import shares_to
-from bench.cli.command_support import console
+from bench.base.shares import shares_to
 
 PATIENCE = 2.0
 """Seconds of work after which a terminal shows that it goes on."""
@@ -79,7 +78,7 @@ class PatienceDisplay:
 
 
 @contextmanager
-def show_patience(text: str) -> Iterator[None]:
+def show_patience(text: str, console: Console) -> Iterator[None]:
     """Show on a terminal that work goes on, once it has taken more than two seconds, and how much of it is left."""
     if not console.is_terminal:
         yield
