@@ -8,8 +8,7 @@ What scripts and notebooks need::
     model = bench.identify(run, "preisach", levels=20)
     setpoints = bench.invert(model, [500.0, 900.0]).setpoints
 
-`open_rig`, `run`, `identify`, `predict`, `invert`, `load` and `report` are documented in `bench.api`; each is
-imported when it is first used.
+All functions are documented in `bench.api`; each is imported when it is first used.
 """
 
 from __future__ import annotations
@@ -17,9 +16,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from bench.api import identify, invert, load, open_rig, predict, report, run
+    from bench.api import compare, identify, invert, load, open_rig, predict, rehearse, report, run, runs
 
-__all__ = ["identify", "invert", "load", "open_rig", "predict", "report", "run"]
+__all__ = [
+    "compare", "identify", "invert", "load", "open_rig", "predict", "rehearse", "report", "run", "runs",
+]  # fmt: skip
 
 
 def __getattr__(name: str) -> Any:  # noqa: ANN401 - any of the names above

@@ -29,18 +29,25 @@ from bench.analysis import (
     IdentifiedFile,
     InvertedTargets,
     ReadingOptions,
+    Report,
+    RunComparison,
     RunFolder,
+    RunTable,
+    compare_runs,
     identify_model,
     invert_targets,
+    list_runs,
     predict as predict_file,
     read_dataset,
     report_run,
+    select_runs,
 )
 from bench.base import BenchError, DeviceError, VirtualClock, show_patience, wall_time
 from bench.batch import published_of
-from bench.execution import Run, carry_out
+from bench.execution import Rehearsal, Run, carry_out, foresee
 from bench.identification import ModelFile, load_model
 from bench.protocol import ProtocolDefinition, find_protocol
+from bench.record import Record
 from bench.rig import SAFE, Rig, clock_for, load_rig
 
 Model: TypeAlias = IdentifiedFile | ModelFile | Path | str
@@ -203,7 +210,7 @@ def identify(
     >>> invert(model, [500.0, 900.0]).flags
     ('met', 'met')
     """
-    folder = source.folder if isinstance(source, RunFolder) else Path(source)
+    folder = _folder(source)
     if folder.is_dir():
         recorded = RunFolder(folder)
         input, output = input or recorded.signal_of("drive"), output or recorded.signal_of("response")  # noqa: A001
@@ -296,8 +303,10 @@ def load(path: str | Path) -> RunFolder | ModelFile:
     return found
 
 
-def report(source: RunFolder | str | Path, models: Sequence[Model] = ()) -> dict[str, Any]:
+def report(source: RunFolder | str | Path, models: Sequence[Model] = ()) -> Report:
     """Print tables of a run, draw its figures and write its page `report.html`; return the same for programs.
+
+    A notebook shows the page, figures included, in the place of the tables.
 
     Parameters
     ----------
@@ -311,10 +320,86 @@ def report(source: RunFolder | str | Path, models: Sequence[Model] = ()) -> dict
     DataError
         If the run or a model cannot be read.
     """
-    folder = source.folder if isinstance(source, RunFolder) else Path(source)
+    folder = _folder(source)
     published = published_of(folder)
     page = (folder if folder.is_dir() else folder.parent) / PAGE_NAME
-    return report_run(folder, [_model(model) for model in models], None, Console(), page=page, published=published)
+    console = Console()
+    console.quiet = console.is_jupyter
+    found = report_run(folder, [_model(model) for model in models], None, console, page=page, published=published)
+    return Report(found)
+
+
+def rehearse(
+    protocol: str | ProtocolDefinition,
+    rig: str | Path,
+    *,
+    seed: int = 0,
+    overrides: Mapping[str, str] | None = None,
+    **parameters: Any,  # noqa: ANN401 - each protocol names and types its own
+) -> Rehearsal:
+    """Return what a run would do and touch, as found on the emulated twin of its rig; nothing moves.
+
+    Parameters
+    ----------
+    protocol, rig, seed, overrides, **parameters
+        As for `run`.
+
+    Raises
+    ------
+    BenchError
+        If anything is wrong before the start.
+
+    Examples
+    --------
+    >>> found = rehearse("creep", "vo2", hot=70.0, cool=50.0, duration=8.0)
+    >>> found.status, found.steps
+    ('completed', 35)
+    """
+    definition = find_protocol(protocol) if isinstance(protocol, str) else protocol
+    asked = Run(definition, parameters, str(rig), Path(), overrides=overrides or {}, seed=seed)
+    return foresee(asked, Console(stderr=True))
+
+
+def runs(
+    folder: str | Path = "recordings",
+    *,
+    status: str | None = None,
+    protocol: str | None = None,
+    rig: str | None = None,
+    **where: Any,  # noqa: ANN401 - each protocol names and types its own
+) -> RunTable:
+    """Return the runs below a folder, the oldest first; a notebook shows them as a table.
+
+    Parameters
+    ----------
+    folder : str or Path
+        Where they are.
+    status, protocol, rig : str, optional
+        What these have to be.
+    **where
+        Values that parameters have to have.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is no such folder, or no run has such a parameter.
+    """
+    found = list_runs(Path(folder))
+    wanted = {name: str(value) for name, value in where.items()}
+    return RunTable(select_runs(found, wanted, status=status, protocol=protocol, rig=rig))
+
+
+def compare(first: RunFolder | str | Path, second: RunFolder | str | Path) -> RunComparison:
+    """Return what tells two runs apart, and how far their signals are apart.
+
+    Raises DataError if one of them cannot be read.
+    """
+    with Record(_folder(first)) as ours, Record(_folder(second)) as theirs:
+        return compare_runs(ours, theirs)
+
+
+def _folder(source: RunFolder | str | Path) -> Path:
+    return source.folder if isinstance(source, RunFolder) else Path(source)
 
 
 def _model(model: Model) -> ModelFile:

@@ -55,6 +55,7 @@ from .model_service import (
     IdentifiedFile as IdentifiedFile,
     certificate_lines as certificate_lines,
     check_template as check_template,
+    fit_sentence as fit_sentence,
     identify_model as identify_model,
     option_names as option_names,
     transients_of as transients_of,
@@ -65,6 +66,11 @@ from .models_of_several_runs import (
     only_run as only_run,
     whole_identification as whole_identification,
     whole_models as whole_models,
+)
+from .notebook import (
+    Picture as Picture,
+    Report as Report,
+    RunTable as RunTable,
 )
 from .prediction_figures import (
     errors_text as errors_text,

@@ -69,6 +69,13 @@ class SelectedModel:
         return self.selection.chosen.candidate.fitted[0]
 
     @property
+    def error_left_out(self) -> float:
+        """RMS error of the chosen model on whole runs or blocks left out of the fit, as a part of the range."""
+        selection = self.selection
+        error = selection.on_runs if np.isfinite(selection.on_runs) else selection.on_blocks
+        return error / selection.span
+
+    @property
     def is_timed(self) -> bool:
         """Whether the chosen model is one with time."""
         return self.model in timed_models()

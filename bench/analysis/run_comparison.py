@@ -11,6 +11,7 @@ import numpy as np
 
 from bench.analysis.run_list import main_result
 from bench.analysis.tracking_errors import results_json, target_results
+from bench.base import Display, html_table
 from bench.protocol import PARAMETER
 from bench.record import Difference, Record, Table, differences
 
@@ -96,6 +97,17 @@ class RunComparison:
     def to_json(self) -> dict[str, Any]:
         """Return it for programs."""
         return asdict(self)
+
+    def _repr_html_(self) -> str:
+        names = [each.run for each in self.outcomes]
+        rows = [(each.key, *("none" if v is None else str(v) for v in (each.first, each.second)))
+                for each in self.differences]  # fmt: skip
+        apart = []
+        for name, each in self.signals.items():
+            shown = Display.of(each.unit, 9, each.maximum)
+            apart.append((name, shown.text(each.rms), shown.text(each.maximum), str(each.step)))
+        title = f"second less first, {self.common_steps} common steps"
+        return html_table(("differs", *names), rows) + html_table(("signal", "RMS", "max", "at step"), apart, title)
 
 
 def compare_runs(first: Record, second: Record) -> RunComparison:

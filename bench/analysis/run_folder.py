@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, Literal
 
-from bench.base import DataError
+from bench.base import DataError, html_table
 from bench.record import Event, Record, Table
+
+if TYPE_CHECKING:
+    from bench.analysis.notebook import Picture
 
 
 @dataclass(frozen=True)
@@ -76,6 +79,45 @@ class RunFolder:
                 f"it had: {', '.join(slots) or 'none'}"
             )
         return str(slots[slot]["signal"])
+
+    def plot(self, kind: Literal["signals", "loops"] = "signals") -> Picture:
+        """Draw the signals over time, or the loop that its dashboard shows first.
+
+        Raises
+        ------
+        DataError
+            If there is nothing to draw, or the journal cannot be read.
+        """
+        from bench.analysis.notebook import Picture
+        from bench.analysis.report.run_figures import draw_loops, draw_signals, phases
+        from bench.analysis.report.telemetry_summary import summarize
+
+        def draw(folder: Path) -> Path:
+            with Record(self.folder) as record:
+                steps, summary = record.steps(), summarize(record)
+                known = record, steps, summary, phases(record, steps, record.events())
+                if kind == "loops":
+                    drawn = next((path for path, _ in draw_loops(folder, "png", *known)), None)
+                else:
+                    path = folder / "signals.png"
+                    drawn = path if draw_signals(path, *known) else None
+            if drawn is None:
+                raise DataError(f"{self.folder}: there are no {kind} to draw")
+            return drawn
+
+        return Picture.drawn_by(draw)
+
+    def _repr_html_(self) -> str:
+        meta = self.meta
+        rows = {
+            "run": self.folder.name,
+            "status": self.status,
+            "protocol": f"{meta['protocol']}: {meta['protocol_summary']}",
+            "rig": f"{meta['rig']}: {meta['rig_title']}",
+            "readings": str(len(self.readings)),
+            **{f"note {i}": text for i, text in enumerate(self.notes, 1)},
+        }
+        return html_table((), rows.items())
 
     def __repr__(self) -> str:
         """Return what was run, how it ended and where it is."""

@@ -88,6 +88,7 @@ from .patience import (
 )
 from .printing import (
     PlainConsole as PlainConsole,
+    html_table as html_table,
     print_plain as print_plain,
     show_table as show_table,
 )

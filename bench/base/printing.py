@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
+from html import escape
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
@@ -71,6 +72,17 @@ def show_table(console: Console, table: Table) -> None:
         console.print(table.title, highlight=False, soft_wrap=True, style="table.title")
     for row in zip(*columns, strict=True):
         _print_block(console, [head.plain for head in heads], row, table.columns)
+
+
+def html_table(heads: Sequence[str], rows: Iterable[Sequence[str]], title: str = "") -> str:
+    """Return a table of texts as HTML, for notebooks."""
+
+    def cells(tag: str, texts: Sequence[str]) -> str:
+        return "<tr>" + "".join(f"<{tag}>{escape(text)}</{tag}>" for text in texts) + "</tr>"
+
+    caption = f'<caption style="text-align:left">{escape(title)}</caption>' if title else ""
+    head = f"<thead>{cells('th', heads)}</thead>" if any(heads) else ""
+    return f"<table>{caption}{head}<tbody>{''.join(cells('td', row) for row in rows)}</tbody></table>"
 
 
 def _print_block(console: Console, heads: Sequence[str], row: Sequence[Text], columns: Sequence[Column]) -> None:

@@ -119,7 +119,7 @@ def _print_table(found: SelectedModel) -> None:
     unit, of_runs = found.unit or "units", selection.on_runs > 0.0
     left_out = "runs" if of_runs else "blocks"
     heads = [
-        ("", "", "deg. of", "training", "score", "% of", left_out, "other", "", "CPU"),
+        ("", "", "deg. of", "training", "score", "% of", left_out, "unseen", "", "CPU"),
         ("", "model", "freedom", unit, unit, "range", unit, f"cycles, {unit}", "rows", "s"),
     ]
     usable = [score for score in selection.scores if not score.failure]
@@ -252,7 +252,7 @@ def print_test(found: IdentifiedFile, comparing: Comparing, test: Dataset | None
         (
             ("largest error", f"{raw.maximum:.4g} {unit} ({percent(raw.maximum_percent)} of the range)"),
             ("RMS error", f"{raw.rms:.4g} {unit} ({percent(raw.rms_percent)} of the range)"),
-            ("re-zeroed RMS error", f"{rezeroed.rms:.4g} {unit} (offset {tested.comparison.offset:+.4g})"),
+            ("RMS, offset removed", f"{rezeroed.rms:.4g} {unit} (offset {tested.comparison.offset:+.4g})"),
         ),
     )
     return tested

@@ -92,7 +92,7 @@ def models_on_data(
         console.print(f"rows 1 to {result.skip} are left out of the errors", highlight=False)
     table = Table(title=f"models on {data.name}, errors in {result.unit or 'output units'}", title_justify="left")
     table.add_column("model")
-    for column in ("max", "RMS", "RMS / %", "offset", "re-zeroed max", "re-zeroed RMS"):
+    for column in ("max", "RMS", "RMS / %", "offset", "max, offset removed", "RMS, offset removed"):
         table.add_column(column, justify="right")
     for name, entry in result.comparisons.items():
         raw, mended = entry.raw, entry.rezeroed

@@ -157,6 +157,9 @@ class Fitting:
         bool, typer.Option("--cross-validate", help="Choose the smoothing by cross-validation, and show the table.")
     ] = False
     band: BandOption = False
+    verbose: Annotated[
+        bool, typer.Option("--verbose", help="Also print the numerics of the fit: KKT residual, condition, σ.")
+    ] = False
 
     def settings(self, comparing: Comparing, options: ModelOptions) -> FitOptions:
         """Return the options of the fit; with several models without those of one."""
@@ -232,7 +235,7 @@ def identify_(
     its steps are taken: `bench identify RUN --input voltage --output displacement --model preisach --out model.json`;
     `--table telemetry` takes those within its steps, as of a fast loop.
     """
-    from bench.analysis import ColumnNames, certificate_lines, identify_model, whole_identification
+    from bench.analysis import ColumnNames, certificate_lines, fit_sentence, identify_model, whole_identification
     from bench.identification import ONE_RUN
 
     out = outputs.out
@@ -260,6 +263,7 @@ def identify_(
     # Before anything is printed: a terminal that fails must not cost the fit.
     if out is not None:
         found.file.save(out)
+    console.print(fit_sentence(found, None if selected is None else selected.error_left_out), highlight=False)
     print_assumptions(data.name, data.assumptions)
     if selected is not None:
         print_choice(selected, comparing)
@@ -268,7 +272,7 @@ def identify_(
         console.print(found.trials.table(), highlight=False, markup=False)
     for warning in found.warnings:
         warn(warning)
-    print_rows(f"{model} from {data.name}", certificate_lines(found))
+    print_rows(f"{model} from {data.name}", certificate_lines(found, verbose=fitting.verbose))
     for advice in found.advice:
         if advice.code == ONE_RUN:
             print_plain(console, str(advice))

@@ -11,7 +11,16 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Self
 
-from bench.base import AbortError, ConfigurationError, DataError, Display, Interrupts, VirtualClock
+from bench.base import (
+    AbortError,
+    ConfigurationError,
+    DataError,
+    Display,
+    Interrupts,
+    VirtualClock,
+    format_duration,
+    html_table,
+)
 from bench.devices import Signal
 from bench.execution.engine import Engine, Outcome, check_before_moving
 from bench.execution.run_at_hand import Observer
@@ -174,6 +183,21 @@ class Rehearsal:
     def is_right(self) -> bool:
         """Whether nothing in it says that the run would not complete."""
         return self.status in ("completed", "planned")
+
+    def _repr_html_(self) -> str:
+        heads = ("signal", "lowest", "highest", "unit", "margin")
+        rows = [
+            (
+                name,
+                each.display.number(each.low),
+                each.display.number(each.high),
+                each.display.unit,
+                each.display.number(each.margin) if math.isfinite(each.margin) else "",
+            )
+            for name, each in self.extremes.items()
+        ]
+        title = f"{self.protocol} on {self.rig}: {self.status}, {self.steps} steps, {format_duration(self.seconds)}"
+        return html_table(heads, rows, title)
 
     def raise_if_wrong(self) -> None:
         """Raise ConfigurationError if the run would not complete."""

@@ -72,8 +72,8 @@ class Leave:
 Command = SetPoint | HoldAll | Tare | Rest | Remark | Leave
 
 SYNTAX: Mapping[str, str] = {
-    "set": "set DEVICE VALUE (in its unit, or with one: 54 °C)",
-    "ramp": "ramp DEVICE VALUE RATE (its unit per s, or with one: 2 K/min)",
+    "set": "set DEVICE VALUE",
+    "ramp": "ramp DEVICE VALUE RATE (its unit per s, or 2 K/min)",
     "hold": "hold (stop all ramps)",
     "tare": "tare DEVICE (a load cell)",
     "zero": "zero SIGNAL (on the screen only; again: off)",

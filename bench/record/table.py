@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bench.base import ConfigurationError, header_with_unit
+from bench.base import ConfigurationError, header_with_unit, html_table
 from bench.record.rows import StepRecord
 
 _ROWS_SHOWN = 5
@@ -55,16 +55,24 @@ class Table:
         frame.attrs["units"] = dict(self.units)
         return frame
 
-    def __repr__(self) -> str:
-        """Return size, column heads with units, and the first and last rows."""
+    def _shown(self) -> tuple[list[str], list[list[str]]]:
+        """Return column heads with units, and the first and last rows."""
         count = len(self)
         heads = [header_with_unit(name, self.units.get(name, "")) for name in self.columns]
         shown = list(range(count)) if count <= 2 * _ROWS_SHOWN else [*range(_ROWS_SHOWN), *range(-_ROWS_SHOWN, 0)]
         rows = [[f"{column[i]:.6g}" for column in self.columns.values()] for i in shown]
         if len(shown) < count:
             rows.insert(_ROWS_SHOWN, ["…"] * len(heads))
+        return heads, rows
+
+    def _repr_html_(self) -> str:
+        return html_table(*self._shown(), f"{len(self)} rows")
+
+    def __repr__(self) -> str:
+        """Return size, column heads with units, and the first and last rows."""
+        heads, rows = self._shown()
         widths = [max(map(len, column)) for column in zip(heads, *rows, strict=True)]
         lines = [
             "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in [heads, *rows]
         ]
-        return "\n".join([*lines, f"{count} rows"])
+        return "\n".join([*lines, f"{len(self)} rows"])

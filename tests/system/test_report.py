@@ -96,7 +96,7 @@ def test_targets(report, output, errors, said):
     [
         (LENGTH, (30e-6, -10e-6), "error max 30.000 µm, error rms 22.361 µm"),
         (CURVATURE, (1.25, -0.75), "error max 1.25 1/m, error rms 1.03 1/m"),
-        (STRAIN, (2e-6, -1e-6), "error max 0.000002, error rms 0.000002"),
+        (STRAIN, (2e-6, -1e-6), "error max 0.0000020, error rms 0.0000016"),
     ],
 )
 def test_a_moving_reference(report, output, errors, said):
@@ -122,9 +122,9 @@ def test_a_plain_number_has_no_unit(report):
 @pytest.mark.parametrize(
     ("output", "unit", "row"),
     [
-        (LENGTH, "m", ["line", "0.250", "0.250", "mm", "6.67"]),
-        (CURVATURE, "1/m", ["line", "0.00", "0.00", "1/m", "6.67"]),
-        (STRAIN, "1", ["line", "0.000250", "0.000250", "", "6.67"]),
+        (LENGTH, "m", ["line", "0.250 mm", "0.250 mm", "6.67 %"]),
+        (CURVATURE, "1/m", ["line", "0.00025 1/m", "0.00025 1/m", "6.67 %"]),
+        (STRAIN, "1", ["line", "0.000250", "0.000250", "6.67 %"]),
     ],
 )
 def test_models_on_a_run_of_steps(report, output, unit, row):

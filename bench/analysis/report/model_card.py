@@ -112,7 +112,7 @@ def model_card(
         )
     if (selection := found.file.provenance.get("selection")) is not None:
         unit = selection["unit"] or "output units"
-        heads = ("model", f"score, {unit}", "% of the range", f"blocks, {unit}", f"other cycles, {unit}", "free", "")
+        heads = ("model", f"score, {unit}", "% of the range", f"blocks, {unit}", f"unseen cycles, {unit}", "free", "")
         sections["Models compared"] = _table(heads, _compared(selection["table"]))
     if found.trials is not None:
         sections["Selection"] = _fenced(found.trials.table())

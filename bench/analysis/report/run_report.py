@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +95,11 @@ def report_run(
         _print_status(record, len(steps), console)
         summary = summarize(record, watched_pairs(record))
         extremes = _extremes(record, steps, summary)
+        # A record that does not say what its limits allow has the range that was seen.
+        record.signals = tuple(
+            signal if signal.extent else replace(signal, extent=_greatest(extremes[signal.name]))
+            for signal in record.signals
+        )
         _print_extremes(record, extremes, console)
         _print_events(record, console)
         for line in lateness_lines(record.meta.get("lateness", {})):
@@ -195,6 +201,11 @@ def _extremes(record: Record, steps: Table, summary: TelemetrySummary) -> dict[s
         low, high = wider(summary.extremes[signal.name], steps[signal.name])
         extremes[signal.name] = {"low": low, "high": high, "unit": signal.unit}
     return extremes
+
+
+def _greatest(extremes: Mapping[str, Any]) -> float | None:
+    low, high = extremes["low"], extremes["high"]
+    return None if low is None else max(abs(low), abs(high)) or None
 
 
 def _print_extremes(record: Record, extremes: Mapping[str, Mapping[str, Any]], console: Console) -> None:
