@@ -161,7 +161,16 @@ def quantity(key: str, text: str) -> Any:  # noqa: ANN401 - a quantity of the li
 
 def is_quantity(text: str) -> bool:
     """Return whether a text is a number with a unit behind it, such as `3K` or `300 µm`."""
-    return _QUANTITY.fullmatch(text) is not None
+    return _with_its_unit(text) is not None
+
+
+def _with_its_unit(text: str) -> re.Match[str] | None:
+    try:
+        float(text)
+    except ValueError:
+        return _QUANTITY.fullmatch(text)
+    # Also `1e3`, which is no number of the unit e3.
+    return None
 
 
 def read_quantity(text: str, unit: str) -> float:
@@ -174,7 +183,7 @@ def read_quantity(text: str, unit: str) -> float:
     ValueError
         If the text is neither, or its unit is of another kind; says what is expected.
     """
-    found = _QUANTITY.fullmatch(text)
+    found = _with_its_unit(text)
     try:
         if found is None:
             return float(text)
@@ -195,7 +204,7 @@ def in_si(text: str) -> float:
 
     Raises ValueError if it is none.
     """
-    found = _QUANTITY.fullmatch(text)
+    found = _with_its_unit(text)
     with suppress(Exception):
         if found is not None:
             given = found[2].replace("%", "percent").replace("°C", "K")

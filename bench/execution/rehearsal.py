@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 from bench.base import (
@@ -78,7 +78,7 @@ class Extremes:
     high: float
     unit: str
     bounds: tuple[Bound, ...] = ()
-    display: Display = _PLAIN_NUMBER
+    display: Display = field(default=_PLAIN_NUMBER, compare=False)
 
     @property
     def margin(self) -> float:

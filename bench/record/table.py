@@ -58,7 +58,9 @@ class Table:
     def _shown(self) -> tuple[list[str], list[list[str]]]:
         """Return column heads with units, and the first and last rows."""
         count = len(self)
-        heads = [header_with_unit(name, self.units.get(name, "")) for name in self.columns]
+        heads = [
+            header_with_unit(name, unit if (unit := self.units.get(name, "")) != "1" else "") for name in self.columns
+        ]
         shown = list(range(count)) if count <= 2 * _ROWS_SHOWN else [*range(_ROWS_SHOWN), *range(-_ROWS_SHOWN, 0)]
         rows = [[f"{column[i]:.6g}" for column in self.columns.values()] for i in shown]
         if len(shown) < count:

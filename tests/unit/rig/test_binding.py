@@ -236,7 +236,7 @@ class TestDefaults:
     @pytest.mark.parametrize(
         ("rig", "expected"),
         [
-            ("vo2", {"low": ("21.0", "°C"), "center": ("54.0", "°C"), "increment": ("0.35", "°C")}),
+            ("vo2", {"low": ("21.0", "°C"), "center": ("54.0", "°C"), "increment": ("0.35", "K")}),
             ("sma", {"low": ("0.0", "V"), "center": ("1.5", "V"), "load": ("4.9", "N")}),
             (None, {"low": ("the rig's: `low` of drive", "unit of drive")}),
         ],
