@@ -1,0 +1,51 @@
+"""The how-to about notebooks, executed as a notebook: every result shows itself."""
+
+import re
+from pathlib import Path
+
+import nbformat
+import pytest
+from nbclient import NotebookClient
+
+PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "use-a-notebook.md"
+
+
+@pytest.fixture(scope="module")
+def cells(tmp_path_factory):
+    """Execute the first block of the page; return the outputs by the last line of their cell."""
+    code = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)[0]
+    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(cell) for cell in code.split("\n\n")])
+    folder = tmp_path_factory.mktemp("notebook")
+    NotebookClient(
+        notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(folder)}}
+    ).execute()
+    return {cell.source.splitlines()[-1]: cell.outputs for cell in notebook.cells}
+
+
+def shown(outputs, kind):
+    return [each.data[kind] for each in outputs if each.output_type == "execute_result" and kind in each.data]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ('bench.rehearse("damped-oscillation", "vo2", half_cycles=8, increment="3 K")', "tec_temperature"),
+        ("run", "completed"),
+        ("run.readings", "curvature [1/m]"),
+        ("model", "identifiable coefficients"),
+        ("bench.report(run, [model])", "svg"),
+        ('bench.runs("runs", protocol="damped-oscillation")', "vo2-damped-oscillation"),
+        ('bench.compare(run, bench.runs("runs")[0])', "common steps"),
+    ],
+)
+def test_a_result_is_a_table_or_a_page(cells, line, said):
+    (html,) = shown(cells[line], "text/html")
+    assert said in html
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("line", ["run.plot()", 'run.plot("loops")', "model.plot()"])
+def test_a_plot_is_a_picture(cells, line):
+    (png,) = shown(cells[line], "image/png")
+    assert len(png) > 10_000

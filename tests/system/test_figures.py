@@ -1,0 +1,104 @@
+"""The figures of reports: every axes shows something, no legend covers data, nothing is cut off."""
+
+import io
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from figure_checks import problems_of
+from matplotlib.figure import Figure
+from rich.console import Console
+from written_run import META, SIGNALS, write_run
+
+from bench.analysis import PAGE_NAME, report_run
+from bench.api import identify
+from bench.devices import Settled, Signal
+from bench.identification import damped_oscillation
+from bench.protocol import TRACES
+from bench.record import FILE_NAME, Event, Journal, StepRecord, add_model
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """Look at every figure that is saved; yield what is wrong with each, by its file."""
+    found = {}
+    save = Figure.savefig
+
+    def look(figure, path, **options):
+        found[path.name] = problems_of(figure)
+        save(figure, path, **options)
+
+    monkeypatch.setattr(Figure, "savefig", look)
+    return found
+
+
+def test_what_is_wrong_with_a_figure_is_found():
+    figure = Figure()
+    full, empty = figure.subplots(2)
+    full.plot([0.0, 1.0], [0.0, 1.0], ".", label="covered")
+    full.legend(loc="upper right", bbox_to_anchor=(1.1, 1.1))
+    full.set_ylabel("a label that is far longer than the axes are high, so that its ends are cut off " * 2)
+    empty.plot([0.0, 1.0], [np.nan, np.nan])
+    empty.axhline(0.0)
+    found = "; ".join(problems_of(figure))
+    assert "show nothing finite" in found
+    assert "covers 1 points" in found
+    assert "is cut off" in found
+
+
+def write_tracking(folder):
+    """Write a run whose traces, unlike its readings, are in the telemetry alone, with a fan that never moves."""
+    signals = (
+        *SIGNALS[:3],
+        *(replace(trace, unit="m", precision=9) for trace in TRACES),
+        Signal("fan", "1", "fan", 0),
+    )
+    folder.mkdir()
+    journal = Journal(folder / FILE_NAME, signals, {**META, "controls": "tip", "run": "tracking", "interlocks": []})
+    for k, phase in enumerate(("reset", "latched, targets of the generated sequence", "open loop")):
+        journal.event(Event(100.0 * k, "INFO", "phase", phase))
+        for i in range(20):
+            step, t = 20 * k + i, 100.0 * k + 5.0 * i
+            heat = 40.0 + 20.0 * np.sin(0.3 * step)
+            traces = (1e-6 * heat, 1e-6 * heat, 0.0, 63245.0 if i < 3 else 1e-7)
+            journal.telemetry(t + 1.0, step, (heat, heat, 1e-6 * heat, *traces, 0.0))
+            none = (np.nan,) * len(TRACES)
+            values = (heat, heat, 1e-6 * heat, *none, 0.0)
+            journal.step(StepRecord(step, t, t + 5.0, phase, "", Settled.DWELL, {"plate": heat}, values))
+    journal.finish(status="completed", reason="", finished=300.0, safe_state={"plate": "safe"})
+    journal.close()
+    return folder
+
+
+def test_of_a_run_under_control(tmp_path, drawn):
+    folder = write_tracking(tmp_path / "run")
+    console = Console(file=io.StringIO(), width=160)
+    result = report_run(folder, (), None, console, page=folder / PAGE_NAME)
+    assert {"signals.png", "loop.png", "signals.svg", "loop.svg"} <= set(drawn)
+    assert {name: problems for name, problems in drawn.items() if problems} == {}
+    # The prior of the filter is no uncertainty, and what never moves needs no room.
+    assert result["extremes"]["disturbance_uncertainty"]["high"] == pytest.approx(1e-7)
+    page = (folder / PAGE_NAME).read_text(encoding="utf-8")
+    assert "Constant: " in page
+    assert "fan 0" in page
+    assert "Resets are left out." in page
+
+
+def test_of_models_on_a_run(tmp_path, drawn):
+    folder = write_run(tmp_path / "run", steps=400)
+    found = identify(folder, input="plate", output="tip", model="preisach", levels=8, band=True)
+    for name in ("preisach", "a model with a name that is longer than any legend has room for in one line"):
+        add_model(folder, name, 1.0, found.file.to_json())
+    report_run(folder, (), None, Console(file=io.StringIO()), page=folder / PAGE_NAME)
+    assert len(drawn) > 4
+    assert {name: problems for name, problems in drawn.items() if problems} == {}
+
+
+def test_a_plot_of_a_fit(tmp_path, drawn):
+    inputs = damped_oscillation(0.0, 10.0, 5.0, 8, step=0.5)
+    outputs = inputs + np.sign(np.gradient(inputs))
+    table = "\n".join(f"{u},{y}" for u, y in zip(inputs, outputs, strict=True))
+    (tmp_path / "loop.csv").write_text(f"voltage [V],position [µm]\n{table}\n", encoding="utf-8")
+    model = identify(tmp_path / "loop.csv", "prandtl-ishlinskii", input="voltage", output="position")
+    assert model.plot().png.startswith(b"\x89PNG")
+    assert [problems for problems in drawn.values() if problems] == []
