@@ -308,7 +308,7 @@ def _identify_whole(
     """Identify a model from several runs together, such as one of several inputs."""
     check_given(context, ("files", "model", "test", "options", "out", "json_file"), "this model is of whole runs")
     test = None if comparing.test is None else Path(comparing.test)
-    with show_patience(f"reading and fitting {len(runs)} runs"):
+    with show_patience(f"reading and fitting {len(runs)} runs", console):
         found = whole.of_runs(runs, test, options.values)
     if outputs.out is not None:
         found.file.save(outputs.out)
