@@ -33,7 +33,7 @@ from bench.base import DataError, WallClock
 from bench.cli import Catalogue
 from bench.dashboard import rebuild
 from bench.dashboard.rerun_recording import LOOPBACK, free_port
-from bench.dashboard.screenshot import Camera
+from bench.dashboard.screenshot import MENU_BAR, Camera
 from bench.dashboard.viewers import start_viewer, wait_until_it_listens
 from bench.identification import load_model
 from bench.identification.model_file import FORMAT
@@ -319,7 +319,8 @@ class Browser:
             content = self._page.screenshot()
             is_drawn = content == before and content != former and _colours(content) > 500
             before = content
-        png.write_bytes(before)
+        with Image.open(io.BytesIO(before)) as picture:
+            picture.crop((0, MENU_BAR, *picture.size)).save(png)
         return [] if is_drawn else ["the browser does not draw it"]
 
 

@@ -36,6 +36,8 @@ class Arranged:
         How late the samples of loops were.
     state : str
         What the run is doing, or how it ended.
+    lanes : sequence of str
+        Entities that show phases and states over time.
     """
 
     control: Sequence[rrb.TimeSeriesView]
@@ -46,6 +48,7 @@ class Arranged:
     planes: Sequence[View]
     lateness: rrb.Spatial2DView | None
     state: str
+    lanes: Sequence[str]
 
 
 def blueprint(views: Arranged) -> rrb.Blueprint:
@@ -77,7 +80,9 @@ def blueprint(views: Arranged) -> rrb.Blueprint:
         columns.append(rrb.Vertical(numbers, below, row_shares=[2, 1]))
     else:
         columns.append(rrb.Vertical(numbers, views.lateness, below, row_shares=[4, 3, 3]))
-    state = rrb.StateTimelineView(origin="/state", name=f"Protocol: {views.state}", time_view=whole_run())
+    state = rrb.StateTimelineView(
+        origin="/state", name=f"Protocol: {views.state}", contents=views.lanes, time_view=whole_run()
+    )
     widths = [4, 3 if len(drawn) <= 2 else 5, 3][-len(columns) :] if len(columns) == 3 else [3, 2]
     return rrb.Blueprint(
         rrb.Vertical(rrb.Horizontal(*columns, column_shares=widths), state, row_shares=[11, 2]),

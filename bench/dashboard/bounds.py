@@ -72,7 +72,8 @@ def _pair(column: int, signal: Signal, low: float, high: float, kind: str, colou
     for value, is_high in ((low, False), (high, True)):
         if math.isfinite(value):
             span = high - low if math.isfinite(high - low) else abs(value) or 1.0
-            name = f"{signal.name} {'<' if is_high else '>'} {value:g} {signal.unit}"
+            shown = signal.display
+            name = f"{signal.name} {'<' if is_high else '>'} {shown.factor * value:g} {shown.unit}".rstrip()
             yield Bound(column, value, is_high, span, name, kind, colour)
 
 

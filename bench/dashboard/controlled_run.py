@@ -14,10 +14,10 @@ import rerun.blueprint as rrb
 
 from bench.base import fitting_prefix
 from bench.dashboard.arrangement import seldom
-from bench.dashboard.drawing import Colour, time_view
+from bench.dashboard.drawing import FAINT, Colour, time_view
 from bench.dashboard.entries import End, Part, Ticks
 from bench.dashboard.rerun_recording import Floats, RerunRecording, times
-from bench.dashboard.signal_plots import find_column, likely_magnitude
+from bench.dashboard.signal_plots import find_column
 from bench.devices import Settled, Signal
 from bench.protocol import TRACES
 from bench.record import StepRecord
@@ -39,7 +39,8 @@ _RECENT_TICKS = 2000
 _OUTPUT: Colour = (236, 100, 46)
 _PREDICTED: Colour = (150, 110, 190)
 _REFERENCE: Colour = (112, 168, 226)
-_ERROR: Colour = (150, 156, 166)
+# Between the targets an error is that of a transient.
+_ERROR: Colour = FAINT
 _AT_TARGET: Colour = (236, 100, 46)
 _WITNESSED: Colour = (30, 170, 170)
 _DISTURBANCE: Colour = (30, 170, 170)
@@ -82,7 +83,7 @@ class ControlPlots:
         """Return the plots of a run whose controllers control the signal `controls`, which `witness` sees as well."""
         output, *traces = (find_column(signals, "controls", name) for name in (controls, *TRACE_NAMES))
         signal = signals[output]
-        unit = fitting_prefix(signal.unit, *(extent or [likely_magnitude(signal)]))
+        unit = signal.display.factor, signal.display.unit
         # What an error comes down to: a thousandth of the range, or the last digits that are worth showing.
         error_unit = fitting_prefix(
             signal.unit, 1e-3 * (extent[1] - extent[0]) if extent else 10.0 ** (1 - signal.precision)
@@ -149,10 +150,10 @@ class ControlPlots:
         """
         views = []
         if "tracking" in shown:
-            views.append((time_view("/control/tracking", f"Tracking [{self.unit}]", rrb.Corner2D.LeftTop), 4))
+            title = f"Tracking [{self.unit}]: output (orange), reference (pale blue), predicted (violet)"
+            views.append((time_view("/control/tracking", title), 4))
         if "error" in shown:
             y = None if error_range is None else (-error_range, error_range)
-            # A legend would hide a quarter of it.
             title = f"Error [{self.error_unit}]: each tick within ± 2σ, mean at each target (points)"
             if self.witness is not None:
                 title = f"Error [{self.error_unit}]: each tick within ± 2σ, and of the witness (green)"

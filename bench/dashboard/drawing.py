@@ -64,10 +64,9 @@ class Frame:
     @classmethod
     def of_plot(cls, plot: XYPlot, x: Signal, y: Signal) -> Frame:
         """Return the frame of one signal over another."""
-        x_factor, x_unit = fitting_prefix(x.unit, *plot.input_range)
-        y_factor, y_unit = fitting_prefix(y.unit, *plot.output_range)
-        titles = f"{x.description} [{x_unit}]", f"{y.description} [{y_unit}]"
-        return cls(plot.input_range, plot.output_range, *titles, x_factor, y_factor)
+        titles = [f"{each.description} [{each.display.unit or 1}]" for each in (x, y)]
+        factors = x.display.factor, y.display.factor
+        return cls(plot.input_range, plot.output_range, titles[0], titles[1], *factors)
 
     @classmethod
     def of_plane(cls, extent: tuple[float, float], unit: str) -> Frame:
@@ -172,14 +171,12 @@ def xy_view(path: str, name: str, past: Mapping[str, float] = MappingProxyType({
     )
 
 
-def time_view(
-    origin: str, name: str, legend: rrb.Corner2D | None = None, y: tuple[float, float] | None = None
-) -> rrb.TimeSeriesView:
-    """Return the view of a quantity over the time of the whole run."""
+def time_view(origin: str, name: str, y: tuple[float, float] | None = None) -> rrb.TimeSeriesView:
+    """Return the view of a quantity over the time of the whole run, without a legend, which would hide data."""
     return rrb.TimeSeriesView(
         origin=origin,
         name=name,
-        plot_legend=rrb.PlotLegend(legend, visible=legend is not None),
+        plot_legend=rrb.PlotLegend(visible=False),
         axis_x=whole_run(),
         axis_y=None if y is None else rrb.ScalarAxis(range=y),
     )

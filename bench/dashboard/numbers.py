@@ -9,13 +9,12 @@ from typing import Any
 
 import rerun as rr
 
-from bench.base import Expectation, fitting_prefix, format_duration, format_numbers
+from bench.base import Expectation, fitting_prefix, format_duration
 from bench.dashboard.bounds import Bound, nearest
 from bench.dashboard.controlled_run import ErrorPlot
 from bench.dashboard.entries import End, Part, Ticks
 from bench.dashboard.model_band import ModelBand
 from bench.dashboard.rerun_recording import RerunRecording, times
-from bench.dashboard.signal_plots import likely_magnitude
 from bench.devices import Signal
 from bench.record import Event, StepRecord, expected_steps
 
@@ -168,9 +167,7 @@ class Numbers:
         signal = self._signals[column]
         if not math.isfinite(value):
             return "–"
-        # Near zero with the prefix of what is usual, not with one of its own.
-        number, unit = format_numbers([value, likely_magnitude(signal)], signal.unit, signal.precision)[::2]
-        return f"{number} {unit}".rstrip().replace("-", "−")
+        return signal.display.text(value).replace("-", "−")
 
 
 def _small(value: float, unit: str) -> str:

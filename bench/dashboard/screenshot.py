@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Callable
+from io import BytesIO
 from pathlib import Path
 from types import TracebackType
 from typing import Self, TypeVar
 
+from PIL import Image
 from rerun.experimental import ViewerClient
 
 from bench.base import ConfigurationError, DataError, WallClock
@@ -24,6 +26,9 @@ _NO_DRIVER = (
     "Rerun's viewer does not start; without a screen it needs a Vulkan driver, such as the one of the packages "
     "mesa-vulkan-drivers and libvulkan1"
 )
+
+MENU_BAR = 36
+"""Height of the menu bar of Rerun's viewer 0.41, pixels: it warns of the computer that draws, not of the run."""
 
 _LOOK = 1.5
 """Wall-clock time between two looks at what it has drawn, s. Derivation: eighty looks within `_PATIENCE`."""
@@ -78,6 +83,8 @@ class Camera:
     def take(self, rrd: Path, png: Path, at: float | None = None) -> list[str]:
         """Write a picture of a recording at a laboratory time (s), its end if None; return what its views report.
 
+        The menu bar of the viewer is left out.
+
         Raises
         ------
         DataError
@@ -108,7 +115,8 @@ class Camera:
                 if content == before and self._patiently(client.get_state).views:
                     break
                 before = content
-        png.write_bytes(before)
+        with Image.open(BytesIO(before)) as picture:
+            picture.crop((0, MENU_BAR, *picture.size)).save(png)
         return [
             f"{view.name}: {report.severity}: {report.summary}"
             for view in self._patiently(client.get_state).views

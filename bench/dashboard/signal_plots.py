@@ -9,7 +9,7 @@ from typing import Any
 import rerun as rr
 import rerun.blueprint as rrb
 
-from bench.base import ConfigurationError, fitting_prefix
+from bench.base import ConfigurationError
 from bench.dashboard.drawing import Colour, time_view
 from bench.dashboard.rerun_recording import Floats
 from bench.devices import Signal
@@ -31,6 +31,7 @@ _PALETTE: tuple[Colour, ...] = (
     (226, 88, 136),
     (128, 146, 44),
 )
+_COLOUR_NAMES = ("orange", "blue", "green", "violet", "brown", "teal", "pink", "olive")
 _READING = 1.25
 """Size of the point of a reading; in a hold that is shorter than a tick there is nothing else.
 
@@ -68,15 +69,14 @@ class SignalPlot:
 
     def view(self) -> rrb.TimeSeriesView:
         """Return the view of the ticks, as lines, and of the readings, as points."""
-        view = time_view(f"/signals/{self.path}", self.title, rrb.Corner2D.LeftBottom)
+        # A legend would hide what is below it: the title says which colour is what.
+        view = time_view(f"/signals/{self.path}", self.title)
         view.contents = ["$origin/**", f"/readings/{self.path}"]
         return view
 
 
-def plots_by_unit(
-    signals: Sequence[Signal], ranges: Mapping[str, tuple[float, float]], omitted: Collection[str]
-) -> list[SignalPlot]:
-    """Return one plot a unit, of the signals that are not `omitted`; `ranges` are those on axes, by signal."""
+def plots_by_unit(signals: Sequence[Signal], omitted: Collection[str]) -> list[SignalPlot]:
+    """Return one plot a unit, of the signals that are not `omitted`."""
     shown_signals = [(i, signal) for i, signal in enumerate(signals) if signal.name not in omitted]
     plots = []
     for unit in dict.fromkeys(signal.unit for _, signal in shown_signals):
@@ -84,12 +84,12 @@ def plots_by_unit(
         # The set-points first, as what comes last is on top.
         columns.sort(key=lambda i: not signals[i].name.endswith(SETPOINT))
         members = [signals[i] for i in columns]
-        extents = [ranges[signal.name] for signal in members if signal.name in ranges]
-        factor, shown = fitting_prefix(unit, *(extents[0] if extents else [likely_magnitude(members[0])]))
+        display = members[0].display
+        factor, shown = display.factor, display.unit
         quantity = _QUANTITIES.get(unit, unit)
         title = quantity if len(members) > 1 else members[0].description
         look: dict[str, Any] = {
-            "names": [f"{signal.name} [{shown}]" for signal in members],
+            "names": [f"{signal.name} [{shown}]" if shown else signal.name for signal in members],
             "colors": [_colour(signals, i) for i in columns],
         }
         styles: dict[str, rr.SeriesLines | rr.SeriesPoints] = {
@@ -99,7 +99,9 @@ def plots_by_unit(
             ),
         }
         path = rr.escape_entity_path_part(quantity)
-        headline = f"{title[:1].upper()}{title[1:]} [{shown}]"
+        headline = f"{title[:1].upper()}{title[1:]}" + (f" [{shown}]" if shown else "")
+        if len(members) > 1:
+            headline += f": {_legend(signals, columns)}"
         plots.append(SignalPlot(path, headline, columns, factor, styles))
     return plots
 
@@ -112,18 +114,38 @@ def find_column(signals: Sequence[Signal], key: str, name: str) -> int:
     return names.index(name)
 
 
-def likely_magnitude(signal: Signal) -> float:
-    """Return the likely magnitude of a signal's values, judged by the digits that are worth showing."""
-    return float(10.0 ** (3 - signal.precision))
+def _legend(signals: Sequence[Signal], columns: Sequence[int]) -> str:
+    """Return which signal has which colour, without the device that all are of."""
+    names = [signals[i].name for i in columns]
+    device = names[0].partition("_")[0] + "_"
+    if all(name.startswith(device) for name in names):
+        names = [name.removeprefix(device).replace("_", " ") for name in names]
+    named = zip(names, columns, strict=True)
+    return ", ".join(f"{name} ({_colour_name(signals, column)})" for name, column in named)
+
+
+def _colour_name(signals: Sequence[Signal], column: int) -> str:
+    follower = _follower(signals, column)
+    pale = "pale " if signals[column].name.endswith(SETPOINT) else ""
+    return pale + _COLOUR_NAMES[follower % len(_COLOUR_NAMES)]
 
 
 def _colour(signals: Sequence[Signal], column: int) -> Colour:
     """Return the colour of a signal; a set-point has a paler one of what follows it, the next of its device."""
+    colour = _PALETTE[_follower(signals, column) % len(_PALETTE)]
+    if not signals[column].name.endswith(SETPOINT):
+        return colour
+    red, green, blue = (round(_SETPOINT_PART * part + (1 - _SETPOINT_PART) * 150) for part in colour[:3])
+    return red, green, blue
+
+
+def _follower(signals: Sequence[Signal], column: int) -> int:
+    """Return the column of what follows a set-point; that of another signal itself."""
     name = signals[column].name
     if not name.endswith(SETPOINT):
-        return _PALETTE[column % len(_PALETTE)]
+        return column
     device, unit = name.removesuffix(SETPOINT), signals[column].unit
-    follower = next(
+    return next(
         (
             i
             for i, signal in enumerate(signals)
@@ -131,7 +153,3 @@ def _colour(signals: Sequence[Signal], column: int) -> Colour:
         ),
         column,
     )
-    red, green, blue = (
-        round(_SETPOINT_PART * part + (1 - _SETPOINT_PART) * 150) for part in _PALETTE[follower % len(_PALETTE)][:3]
-    )
-    return red, green, blue

@@ -24,6 +24,8 @@ _STATES: Mapping[str, Colour] = {
     "failed": (206, 62, 58),
     _NOT_SETTLED: (206, 118, 52),
 }
+_PLAIN = (_RUNNING, "safe", "completed", "aborted", "failed")
+"""States that every run has, the last ones for a moment at its end."""
 _STATE_OF_EVENT = {"pause": "paused", "resume": _RUNNING, "interlock": "interlock", "safe-state": "safe"}
 # Source: WCAG 2.2, 1.4.3: white text on each has a contrast of 4.5 to 1 or more.
 _PHASE_COLOURS: tuple[Colour, ...] = (
@@ -45,6 +47,8 @@ class Timeline:
         self._step = 0
         self.t = 0.0
         """Laboratory time of the last entry, s."""
+        self.is_eventful = False
+        """Whether the run has been in a state that its end does not say, such as paused."""
 
     def draw(self, recording: RerunRecording) -> None:
         """Give the states their colours."""
@@ -59,6 +63,7 @@ class Timeline:
             if state is not None and self._states.get(lane) != state:
                 self._states[lane] = state
                 changes[lane].append((t, step, state))
+                self.is_eventful |= lane == "run" and state not in _PLAIN
 
         for entry in parts:
             if isinstance(entry, StepRecord):

@@ -60,7 +60,7 @@ class Writer:
             witness = (meta.get("slots") or {}).get(WITNESS, {}).get("signal", "")
             self._control = ControlPlots.of(signals, controls, ranges.get(controls), witness)
             self._errors = ErrorPlot(self._control)
-        self._signals = plots_by_unit(signals, ranges, TRACE_NAMES if controls else ())
+        self._signals = plots_by_unit(signals, TRACE_NAMES if controls else ())
         self._bounds = {
             plot.path: BoundLines(
                 f"signals/{plot.path}", [b for b in bounds if b.column in plot.columns], plot.factor
@@ -139,11 +139,12 @@ class Writer:
             None if self._errors is None else self._errors.range(),
             math.inf if self._errors is None else seldom(self._errors.seconds_bright(self._timeline.t)),
             self._numbers.state,
+            self._timeline.is_eventful,
             frozenset() if self._plots is None else self._plots.moved,
         )
         if wanted != self._arranged:
             self._arranged = wanted
-            self.recording.arrange(self._blueprint(*wanted[:4]))
+            self.recording.arrange(self._blueprint(*wanted[:5]))
 
     def warn(self, text: str) -> None:
         """Report a problem of the dashboard itself in the log."""
@@ -216,7 +217,7 @@ class Writer:
         return Ticks(ticks.t[shown], ticks.step[shown], values)
 
     def _blueprint(
-        self, filled: frozenset[str], error_range: float | None, bright: float, state: str
+        self, filled: frozenset[str], error_range: float | None, bright: float, state: str, eventful: bool
     ) -> rrb.Blueprint:
         over_time: list[rrb.TimeSeriesView] = []
         others: list[rrb.TimeSeriesView] = []
@@ -240,6 +241,10 @@ class Writer:
                 else self._planes.views(has_moved=self._plots is not None and self._plots.has_first_moved),
                 lateness=self._lateness.view(),
                 state=state,
+                # What is over does not run: its lane would say so up to the end.
+                lanes=["/state/phase", "/state/run"]
+                if state in ("running", "paused") or eventful
+                else ["/state/phase"],
             )
         )
 

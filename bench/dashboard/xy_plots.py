@@ -2,7 +2,7 @@
 
 A point is a reading of a step or, while a controller or a fast loop is at work, a tick. Every tick moves the memory,
 but a point is drawn only if it comes `_REDRAW_SECONDS` after the last one and differs visibly from it; the line to it
-passes through the points left out. Under control the lines to old targets are pale, those to the last ones bright.
+passes through the points left out. Under control the path is pale, and the readings at the last targets are bright.
 A plot is shown once its input has moved.
 """
 
@@ -117,7 +117,7 @@ class XYPlots:
             self._draw_axes(recording, track)
             recording.log(f"{track.path}/data/path", line_style(1.0 if self._fades else 1.25))
             if self._fades:
-                recording.log(f"{track.path}/data/recent", line_style(1.75))
+                recording.log(f"{track.path}/data/recent", rr.Points2D.from_fields(radii=rr.Radius.ui_points(2.5)))
             recording.log(f"{track.path}/data/now", point_style())
 
     def _draw_axes(self, recording: RerunRecording, track: _Track) -> None:
@@ -155,8 +155,14 @@ class XYPlots:
             colours = [_RISING if line[-1][0] >= line[0][0] else _FALLING for line in strips]
             ends = [line[-1] for line in strips]
             if self._fades:
-                recent = rr.LineStrips2D.columns(strips=drawable, colors=colours)
-                recording.send(f"{track.path}/data/recent", when, recent)
+                # What leads to a target is pale; a reading at it is bright.
+                read = [i for i, k in enumerate(numbers) if points.is_reading[k]]
+                if read:
+                    at = times(
+                        points.rows.t[[numbers[i] for i in read]], points.rows.step[[numbers[i] for i in read]]
+                    )
+                    recent = rr.Points2D.columns(positions=[ends[i] for i in read], colors=[colours[i] for i in read])
+                    recording.send(f"{track.path}/data/recent", at, recent)
                 colours = [_FADED[colour] for colour in colours]
             recording.send(f"{track.path}/data/path", when, rr.LineStrips2D.columns(strips=drawable, colors=colours))
             recording.send(f"{track.path}/data/now", when, rr.Points2D.columns(positions=ends))
