@@ -474,7 +474,8 @@ class OpenParameters:
             if entry.name in self.definition.changeable:
                 unit = f" {entry.unit}" if entry.unit not in ("", "1") else ""
                 value = getattr(self.parameters, entry.name)
-                found[entry.name] = f"{value}{unit}, {entry.text} ({entry.allowed})"
+                shown = f"{value:g}" if isinstance(value, float) else str(value)
+                found[entry.name] = f"{shown}{unit}, {entry.text} ({entry.allowed})"
         return found
 
     def change(self, step: int, name: str, value: str) -> ParameterChange:
