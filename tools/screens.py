@@ -54,13 +54,13 @@ _OVERLAPPING = """() => {
 
 
 def make_runs(out: Path) -> tuple[Path, Path, Path]:
-    """Carry out a characterization and a run under control; return their folders and that of the model."""
+    """Carry out a characterization and a run under control; return their folders and the model file."""
     measured = bench.run("damped-oscillation", "vo2", out=out / "runs", half_cycles=12, increment="2 K")
     model = bench.identify(measured, "preisach-nonmonotonic", levels=10, plane=(30.0, 72.0), band=True)
     path = out / "model.json"
     model.file.save(path)
     model.plot().save(out / "fit.png")
-    controlled = bench.run("tracking", "vo2", out=out / "runs", model=path, controller="latched", count=12)
+    controlled = bench.run("tracking", "vo2", out=out / "runs", model=str(path), controller="latched", count=12)
     return measured.folder, controlled.folder, path
 
 

@@ -68,9 +68,11 @@ from .models_of_several_runs import (
     whole_models as whole_models,
 )
 from .notebook import (
-    Picture as Picture,
     Report as Report,
     RunTable as RunTable,
+)
+from .picture import (
+    Picture as Picture,
 )
 from .prediction_figures import (
     errors_text as errors_text,

@@ -7,12 +7,13 @@ import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
 from bench.analysis.band_columns import BandedPrediction, calibrate, predict_band
+from bench.analysis.picture import Picture
 from bench.analysis.predictions import Predictions
 from bench.analysis.tables.data import check_variation, is_run
 from bench.analysis.tables.dataset import Dataset, digest
@@ -57,9 +58,6 @@ from bench.models import (
     timed_models,
 )
 from bench.record import Record
-
-if TYPE_CHECKING:
-    from bench.analysis.notebook import Picture
 
 Floats = npt.NDArray[np.float64]
 
@@ -171,7 +169,6 @@ class IdentifiedFile:
 
         Raises DataError if the measurements cannot be read again.
         """
-        from bench.analysis.notebook import Picture
         from bench.analysis.prediction_figures import draw_predictions
 
         return Picture.drawn_by(lambda folder: draw_predictions(self.predictions(), folder, self.file.name)[0])
@@ -604,7 +601,7 @@ def certificate_lines(identified: IdentifiedFile, *, verbose: bool = True) -> Se
     tests = identified.return_points, identified.congruency
     return (
         *own,
-        ("samples", f"{rows if identified.fitted is None else partly} ({found.skip} skipped)"),
+        ("samples", f"{rows if identified.fitted is None else partly} (skipped: {found.skip})"),
         *_error_lines(errors, unit),
         *([] if identified.fitted is None else _error_lines(identified.all_errors, unit, " of all rows")),
         *_uniqueness(found, identified.resolution, verbose=verbose),

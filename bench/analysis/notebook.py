@@ -1,10 +1,8 @@
-"""What notebooks show: pictures, pages, and lists of runs."""
+"""What notebooks show: pages, and lists of runs."""
 
 from __future__ import annotations
 
-import tempfile
-from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable
 from html import escape
 from pathlib import Path
 from typing import Any
@@ -15,32 +13,6 @@ from bench.base import format_duration, html_table
 
 _HEIGHT = 700
 """Height of a page within a notebook, CSS pixels."""
-
-
-@dataclass(frozen=True, repr=False)
-class Picture:
-    """A figure that a notebook shows.
-
-    Attributes
-    ----------
-    png : bytes
-        The figure.
-    """
-
-    png: bytes
-
-    @classmethod
-    def drawn_by(cls, draw: Callable[[Path], Path]) -> Picture:
-        """Return what a function draws in a folder, of which it returns the file."""
-        with tempfile.TemporaryDirectory() as folder:
-            return cls(draw(Path(folder)).read_bytes())
-
-    def save(self, path: str | Path) -> None:
-        """Write the figure as a PNG file."""
-        Path(path).write_bytes(self.png)
-
-    def _repr_png_(self) -> bytes:
-        return self.png
 
 
 class Report(dict[str, Any]):

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
+from bench.analysis.picture import Picture
 from bench.base import DataError, html_table
 from bench.record import Event, Record, Table
-
-if TYPE_CHECKING:
-    from bench.analysis.notebook import Picture
 
 
 @dataclass(frozen=True)
@@ -88,7 +86,6 @@ class RunFolder:
         DataError
             If there is nothing to draw, or the journal cannot be read.
         """
-        from bench.analysis.notebook import Picture
         from bench.analysis.report.run_figures import draw_loops, draw_signals, phases
         from bench.analysis.report.telemetry_summary import summarize
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -44,6 +45,13 @@ class Writer:
     def __init__(self, signals: Sequence[Signal], meta: Mapping[str, Any], models: Sequence[ModelFile] = ()) -> None:
         layout = _layout_of(meta)
         ranges = {} if layout is None else layout.ranges
+        # A record that does not say what limits allow has the ranges of its axes.
+        signals = [
+            replace(each, extent=max(map(abs, ranges[each.name])))
+            if not each.extent and each.name in ranges
+            else each
+            for each in signals
+        ]
         controls = meta.get("controls", "")
         self._run_id, self._card = str(meta["run"]), run_card(meta)
         self._title = f"{meta['rig_title']}: {meta['protocol']}"

@@ -89,7 +89,7 @@ def test_tables_become_pandas_frames_where_pandas_is_installed(found, monkeypatc
 
 def test_a_model_is_saved_loaded_and_reported(found, tmp_path, capsys):
     model = bench.identify(found, "polynomial", degree=2)
-    assert re.search(r"polynomial\n +samples +35 ", repr(model))
+    assert re.search(r"polynomial: \w+ fit: .*\n +samples +35 ", repr(model))
     model.file.save(tmp_path / "model.json")
     loaded = bench.load(tmp_path / "model.json")
     assert isinstance(loaded, ModelFile)

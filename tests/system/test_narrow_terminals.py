@@ -34,15 +34,15 @@ class TestProgress:
         assert all(len(line) <= columns for line in lines)
         text = " ".join(line.strip() for line in lines)
         for whole in (
-            r"damped-oscillation +3/100", r"t 0:01:40", r"left \d+:\d\d:\d\d, ", r"ends (\d+-\d+-\d+ )?\d\d:\d\d",
-            r"at most (\d+-\d+-\d+ )?\d\d:\d\d", r"supply_voltage 2\.850 V", r"load_cell_force -0\.123 N",
+            r"damped-oscillation +3/100", r"t 0:01:40,", r"left \d+:\d\d:\d\d laboratory ≈ [\d.]+ (s|min|h),", r"ends (\d+-\d+-\d+ )?\d\d:\d\d",
+            r"at the latest (\d+-\d+-\d+ )?\d\d:\d\d", r"supply_voltage 2\.850 V", r"load_cell_force -0\.123 N",
         ):  # fmt: skip
             assert re.search(whole, text), whole
         assert "…" not in text
 
     def test_readings_give_way_before_times(self):
         lines = drawn(140)
-        assert "at most" in lines[0]
+        assert "at the latest" in lines[0]
         assert "supply_voltage" not in lines[0]
         assert lines[1] == "supply_voltage 2.850 V  load_cell_force -0.123 N"
 

@@ -207,7 +207,7 @@ class TestDisplay:
     def test_at_a_terminal_a_bar_with_readings(self):
         shown = self.show(force_terminal=True)
         assert "2/2" in shown
-        assert "t 0:00:08  left 0:00:00, ends " in shown
+        assert "t 0:00:08, left 0:00:00, ends " in shown
         assert "at most " in shown
         assert "x[/red].py" in shown
         assert "climb [/red]" in shown

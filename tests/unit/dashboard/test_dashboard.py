@@ -1030,7 +1030,8 @@ def test_the_viewer_draws_it_without_complaint(
     png = tmp_path / "dashboard.png"
     assert picture(rebuilt, png, at=1700.0, size=(1280, 800)) == []
     pixels = read_png(png)
-    assert pixels.shape[:2] == (800, 1280)
+    # Without the menu bar of the viewer.
+    assert pixels.shape[:2] == (764, 1280)
     # Loop, memory curve and plots fill it with colours; an empty viewer is nearly uniform.
     assert len(np.unique(pixels[:, :, :3].reshape(-1, 3), axis=0)) > 1_000
     # The middle: the loop above the plane.

@@ -253,3 +253,8 @@ class TestDefaults:
         entries = definition.help(file.roles, file.protocols.get(definition.name)) if file else definition.help()
         shown = {entry.name: (entry.default, entry.unit) for entry in entries}
         assert {name: shown[name] for name in expected} == expected
+
+    def test_a_parameter_of_a_slot_that_the_rig_does_not_bind_is_left_out(self):
+        definition = find_protocol("damped-oscillation")
+        shown = {rig: {entry.name for entry in definition.help(load_rig(rig).roles)} for rig in ("vo2", "sma")}
+        assert shown["sma"] - shown["vo2"] == {"load"}
