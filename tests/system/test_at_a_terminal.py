@@ -93,7 +93,7 @@ def test_ctrl_c_in_the_first_moments_says_what_is(start, tmp_path):
 def test_the_times_are_whole_on_a_terminal_of_eighty_columns(start):
     child = start("run", "creep", "--rig", "sma", "--set", "duration=20", "--clock", "x60", columns=80)
     child.expect(r"creep.*?\d+/\d+  t \d:\d\d:\d\d, left \d:\d\d:\d\d.*?, ends (\d+-\d+-\d+ )?\d\d:\d\d")
-    child.expect(r"supply_voltage [\d.]+ V  wire_end_position [\d.-]+ mm")
+    child.expect(r"supply_voltage [\d.]+ V  load_cell_force [\d.-]+ N  wire_end_position [\d.-]+ mm")
     child.expect("completed: 84 steps")
     assert ended(child) == 0
 

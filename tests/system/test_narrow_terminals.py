@@ -34,7 +34,8 @@ class TestProgress:
         assert all(len(line) <= columns for line in lines)
         text = " ".join(line.strip() for line in lines)
         for whole in (
-            r"damped-oscillation +3/100", r"t 0:01:40,", r"left \d+:\d\d:\d\d laboratory ≈ [\d.]+ (s|min|h),", r"ends (\d+-\d+-\d+ )?\d\d:\d\d",
+            r"damped-oscillation +3/100", r"t 0:01:40,",
+            r"left \d+:\d\d:\d\d laboratory ≈ [\d.]+ (s|min|h),", r"ends (\d+-\d+-\d+ )?\d\d:\d\d",
             r"at the latest (\d+-\d+-\d+ )?\d\d:\d\d", r"supply_voltage 2\.850 V", r"load_cell_force -0\.123 N",
         ):  # fmt: skip
             assert re.search(whole, text), whole

@@ -208,7 +208,6 @@ class TestDisplay:
         shown = self.show(force_terminal=True)
         assert "2/2" in shown
         assert "t 0:00:08, left 0:00:00, ends " in shown
-        assert "at most " in shown
         assert "x[/red].py" in shown
         assert "climb [/red]" in shown
         assert "tec_temperature 20.12 °C" in shown
