@@ -2,8 +2,8 @@
 
 A component that is common to all readings, such as the gain of a sensor, is propagated by a second fit of readings
 that it has moved by its standard uncertainty. What the noise of the readings leaves open is found by fits of readings
-with other noise: differences of neighbouring residuals with random signs, as what neighbours have in common is what
-the model cannot follow. That is the same in each session, and stands beside the model as its error.
+with other noise: differences of neighbouring residuals with random signs. What neighbours have in common is what the
+model cannot follow: it is the same in each session, and stands beside the model as its error.
 
 Sources: JCGM 100:2008 (GUM), 5.1.3, note 2; J. von Neumann, Annals of Mathematical Statistics 12 (1941), 153, for
 noise from differences; C. F. J. Wu, Annals of Statistics 14 (1986), 1261, for random signs.
@@ -223,7 +223,7 @@ def _together(rows: list[BudgetRow]) -> float:
 def _noise(residuals: Floats, rng: np.random.Generator) -> Floats:
     """Return noise as large as that of the readings, place by place."""
     differences = np.append(np.diff(residuals), residuals[-1] - residuals[-2]) / math.sqrt(2.0)
-    return differences * rng.choice((-1.0, 1.0), differences.size)
+    return np.asarray(differences * rng.choice((-1.0, 1.0), differences.size))
 
 
 def predicted_uncertainty(model: ModelFile, outputs: Floats) -> Floats | None:
