@@ -162,6 +162,30 @@ def mbpoll():
 
 
 @pytest.fixture(scope="session")
+def gcc():
+    """A compiler of C, by its path."""
+    return _installed("gcc")
+
+
+@pytest.fixture(scope="session")
+def clang():
+    """Another compiler of C, by its path."""
+    return _installed("clang")
+
+
+@pytest.fixture(scope="session")
+def arm_gcc():
+    """A compiler for microcontrollers, by its path."""
+    return _installed("arm-none-eabi-gcc")
+
+
+@pytest.fixture(scope="session")
+def valgrind():
+    """A counter of instructions, by its path."""
+    return _installed("valgrind")
+
+
+@pytest.fixture(scope="session")
 def vulkan():
     """A Vulkan driver, with which Rerun's viewer draws without a screen."""
     return _installed("vulkan")

@@ -53,7 +53,7 @@ class BenchCommands(Group):
         "identify": Command("Identify a hysteresis model from measurements.", "model_commands:identify_", _MODEL),
         "predict": Command("Apply a model to a column of inputs.", "model_commands:predict_", _MODEL),
         "invert": Command("Compute the set-points for a column of targets.", "model_commands:invert", _MODEL),
-        "model": Command("Test models, design experiments, make twins, tune.", "groups:ModelGroup", _MODEL),
+        "model": Command("Test models, design experiments, make twins, tune, deploy.", "groups:ModelGroup", _MODEL),
         "study": Command("Carry out a study or a campaign on emulated rigs.", "groups:StudyGroup", _MODEL),
         "rig": Command("Check, clear, calibrate and emulate instruments.", "groups:RigGroup", _EXTEND),
         "new": Command("Write the skeleton of a device, protocol, model, rig.", "new:new", _EXTEND),

@@ -172,13 +172,14 @@ class RigGroup(Group):
 
 
 class ModelGroup(Group):
-    """Test models, design experiments for them, and use them: emulated twins, tuned controllers."""
+    """Test models, design experiments for them, and use them: emulated twins, tuned controllers, exports."""
 
     own: ClassVar[Mapping[str, Command]] = {
         "test": Command("Compare models on measurements.", "comparisons:models_on_data"),
         "design": Command("Compare excitation sequences, and write one.", "designs:design"),
         "twin": Command("Make an emulated twin of the present specimen.", "twin_command:twin_"),
         "tune": Command("Tune a controller on the emulated twin.", "tune_command:tune_"),
+        "deploy": Command("Export a model for a controller that runs elsewhere.", "deploy_command:deploy_"),
     }
     others = "model."
 

@@ -21,9 +21,13 @@ from .dynamic.hammerstein import (
     HammersteinState as HammersteinState,
     velocities as velocities,
 )
+from .dynamic.linear_inverse import (
+    bring_responses as bring_responses,
+)
 from .dynamic.linear_parts import (
     FilterState as FilterState,
     LinearPart as LinearPart,
+    free_evolution as free_evolution,
     logarithmic_creep as logarithmic_creep,
 )
 from .dynamic.model_with_time import (
@@ -49,6 +53,9 @@ from .dynamic.rate_dependent_plays import (
     PlaysState as PlaysState,
     RateDependentPlays as RateDependentPlays,
 )
+from .inverses.branch_inverse import (
+    BranchInverse as BranchInverse,
+)
 from .inverses.falling_inverse import (
     OPPOSITE as OPPOSITE,
     FallingInverse as FallingInverse,
@@ -56,6 +63,8 @@ from .inverses.falling_inverse import (
 from .inverses.inverse import (
     Inverse as Inverse,
     Inversion as Inversion,
+    NumericalInverse as NumericalInverse,
+    PlayInverse as PlayInverse,
     Policy as Policy,
     PreisachInverse as PreisachInverse,
     TableInverse as TableInverse,

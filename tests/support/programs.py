@@ -35,6 +35,14 @@ PROGRAMS = {
     "vulkan": Program(
         "a software Vulkan driver", "mesa-vulkan-drivers libvulkan1 libxkbcommon-x11-0 libgl1", _vulkan
     ),
+    "gcc": Program("a compiler of C", "gcc libc6-dev", lambda: shutil.which("gcc")),
+    "clang": Program("another compiler of C", "clang", lambda: shutil.which("clang")),
+    "arm-none-eabi-gcc": Program(
+        "a compiler for microcontrollers",
+        "gcc-arm-none-eabi libnewlib-arm-none-eabi",
+        lambda: shutil.which("arm-none-eabi-gcc"),
+    ),
+    "valgrind": Program("a counter of instructions", "valgrind", lambda: shutil.which("valgrind")),
     "mbpoll": Program("an independent Modbus client", "mbpoll", lambda: shutil.which("mbpoll")),
 }
 

@@ -390,8 +390,8 @@ class PreisachInverse(Inverse[MemoryCurve]):
     operator: Preisach
 
     @cached_property
-    def _ends(self) -> tuple[float, float, float]:
-        """Outputs at negative and positive saturation, and the tolerance."""
+    def ends(self) -> tuple[float, float, float]:
+        """Outputs at negative and positive saturation, and the tolerance, output units."""
         operator = self.operator
         low, high = float(operator.levels[0]), float(operator.levels[-1])
         minus, plus = operator.evaluate([low, high], MemoryCurve.from_negative_saturation(low)).tolist()
@@ -405,7 +405,7 @@ class PreisachInverse(Inverse[MemoryCurve]):
 
     @cached_property
     def _constants(self) -> tuple[_Plane, Floats, float, _Terms, _Ends]:
-        t, (minus, plus, tolerance) = self.operator.lattice, self._ends
+        t, (minus, plus, tolerance) = self.operator.lattice, self.ends
         low, high = self.operator.input_range
         ends = (low, high, minus, plus, tolerance, self._fall, self.policy == "nearest")
         return t.plane, t.below, t.offset, t.terms, ends
@@ -416,7 +416,7 @@ class PreisachInverse(Inverse[MemoryCurve]):
 
         if not math.isfinite(target):
             raise ValueError(f"target: expected a finite number, got {target}")
-        minus, plus, tolerance = self._ends
+        minus, plus, tolerance = self.ends
         start = self.operator._pieces(state)
         count, first, last, error, iterations = _kernels.invert_state(
             *self._constants, start, state.input, float(target)

@@ -1,0 +1,56 @@
+"""The command that exports a model for another controller."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from bench.base import ConfigurationError, print_plain
+from bench.cli.command_support import JsonOption, check_outputs, console, print_rows, show_compilation, write_json
+
+
+class RealType(StrEnum):
+    """Types of the numbers in C."""
+
+    FLOAT = "float"
+    DOUBLE = "double"
+
+
+@show_compilation()
+def deploy_(
+    model: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.")],
+    c: Annotated[
+        Path | None, typer.Option("--c", metavar="FOLDER", help="Write a header, a C99 source, main.c and a README.")
+    ] = None,
+    real: Annotated[RealType, typer.Option("--real", help="Type of the numbers.")] = RealType.FLOAT,
+    name: Annotated[str, typer.Option("--name", help="Prefix of the functions, and name of the files.")] = "model",
+    period: Annotated[
+        float | None,
+        typer.Option("--period", metavar="SECONDS", help="Time of a step, of a model with time."),
+    ] = None,
+    max_bytes: Annotated[
+        int | None,
+        typer.Option("--max-bytes", min=1, metavar="N", help="Most bytes of code and constants."),
+    ] = None,
+    json_file: JsonOption = None,
+) -> None:
+    """Export a model, its inverse and its memory as C99, for a controller that runs elsewhere.
+
+    The functions are `NAME_init`, `NAME_step` (input to output), `NAME_invert` (target to input, and whether it
+    can be met), `NAME_save` and `NAME_restore`. They allocate nothing, and every loop has a bound.
+    """
+    from bench.deploy import deploy
+    from bench.identification import load_model
+
+    if c is None:
+        raise ConfigurationError("--c: expected a folder for the C")
+    check_outputs(folder=c, json_file=json_file, read=[model])
+    found = deploy(load_model(model), name=name, real=real.value, period=period, max_bytes=max_bytes)
+    found.write(c)
+    rows = {"constants": found.constants, "code": found.code, "state": found.state}
+    print_rows(f"{model.name} in {real.value}", [(what, f"{count} bytes") for what, count in rows.items()])
+    print_plain(console, f"C: {c}")
+    write_json(json_file, {"folder": str(c), "files": sorted(found.files), "sha256": found.digest, **rows})
