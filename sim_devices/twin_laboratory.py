@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from functools import partial
 from types import MappingProxyType
-from typing import ClassVar
+from typing import ClassVar, Protocol
 
 import numpy as np
 from pydantic import Field, InstanceOf
@@ -35,6 +35,26 @@ class TwinLaboratorySettings(TwinTable):
     )
 
 
+class Actuated(Protocol):
+    """A specimen with its actuator, as a plant."""
+
+    @property
+    def drive(self) -> float:
+        """The drive, input units."""
+        ...
+
+    @property
+    def response(self) -> float:
+        """The response, output units."""
+        ...
+
+    def set(self, value: float) -> None:
+        """Take a set-point, input units."""
+
+    def advance(self, dt: float) -> None:
+        """Let `dt` seconds pass."""
+
+
 class SpecimenPlant:
     """A specimen on its grid of time, however calls divide the time; see `bench.specimen.specimen`.
 
@@ -58,6 +78,16 @@ class SpecimenPlant:
         self._taken = 0
         self._level = initial
         self._coming: list[tuple[float, float]] = []
+
+    @property
+    def drive(self) -> float:
+        """The drive, input units."""
+        return self.specimen.drive
+
+    @property
+    def response(self) -> float:
+        """The response, output units."""
+        return self.specimen.response
 
     def set(self, value: float) -> None:
         """Take a set-point."""
@@ -92,16 +122,15 @@ class TwinLaboratory(EmulatedLaboratory):
     """A laboratory with the devices of a rig, whose specimen behaves as was identified; see the module."""
 
     Settings: ClassVar[type[LaboratorySettings]] = TwinLaboratorySettings
+    title: ClassVar[str] = "twin"
 
     def __init__(self, settings: TwinLaboratorySettings, clock: Clock, seed: int) -> None:
         specimen_stream, session_stream, reading_stream = np.random.default_rng(seed).spawn(3)
         drive, response = settings.drive, settings.response
         self._settings = settings
         self._session = settings.session_offset * float(session_stream.standard_normal())
-        self._specimen = Specimen(settings.operator, settings.dynamics, drive.rest, specimen_stream)
-        at_rest = (drive.rest - drive.offset) / drive.gain
-        self.plant = SpecimenPlant(self._specimen, at_rest)
-        self._at_rest = at_rest
+        self._at_rest = (drive.rest - drive.offset) / drive.gain
+        self.plant = self.make_specimen(settings, specimen_stream)
         world = World(self.plant, clock)
         self._outputs = dict.fromkeys(settings.devices, math.nan)
         pairs = np.array(response.conversion).reshape(-1, 2)
@@ -117,13 +146,18 @@ class TwinLaboratory(EmulatedLaboratory):
                 name, world, table, meters, rng, partial(self._act, name)
             )
         super().__init__(
-            "twin",
+            self.title,
             {port: TwinServer(instrument) for port, instrument in instruments.items()},
             clock,
             world=world,
             instruments=MappingProxyType(instruments),
             seed=seed,
         )
+
+    def make_specimen(self, settings: TwinLaboratorySettings, rng: np.random.Generator) -> Actuated:
+        """Return the specimen at rest."""
+        specimen = Specimen(settings.operator, settings.dynamics, settings.drive.rest, rng)
+        return SpecimenPlant(specimen, self._at_rest)
 
     def truth(self) -> dict[str, TrueValue]:
         """Return drive and response of the specimen as they are, and what the devices set."""
@@ -139,7 +173,7 @@ class TwinLaboratory(EmulatedLaboratory):
             for name, value in self._outputs.items()
         }
         return {
-            drive: TrueValue(self._specimen.drive, units.get(drive, "")),
+            drive: TrueValue(self.plant.drive, units.get(drive, "")),
             response: TrueValue(self._response(), units.get(response, "")),
             **outputs,
         }
@@ -172,7 +206,7 @@ class TwinLaboratory(EmulatedLaboratory):
         if signal == self._settings.response.signal:
             return self._response
         if signal == self._settings.drive.signal:
-            return lambda: self._specimen.drive
+            return lambda: self.plant.drive
         return partial(self._standing, noise)
 
     def _standing(self, noise: NoiseTable) -> float:
@@ -180,7 +214,7 @@ class TwinLaboratory(EmulatedLaboratory):
         return noise.level if math.isnan(value) else value
 
     def _response(self) -> float:
-        value = self._specimen.response + self._session
+        value = self.plant.response + self._session
         if self._conversion is None:
             return value
         outputs, values = self._conversion

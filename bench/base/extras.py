@@ -14,7 +14,7 @@ from urllib.request import url2pathname
 
 from bench.base.errors import ConfigurationError
 
-Extra = Literal["cluster", "dashboard", "files", "panel", "report"]
+Extra = Literal["cluster", "dashboard", "files", "fmu", "panel", "report"]
 
 
 class MissingExtraError(ConfigurationError):

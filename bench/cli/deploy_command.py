@@ -19,6 +19,13 @@ class RealType(StrEnum):
     DOUBLE = "double"
 
 
+class FmiVersion(StrEnum):
+    """Versions of FMI."""
+
+    TWO = "2.0"
+    THREE = "3.0"
+
+
 @show_compilation()
 def deploy_(
     model: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.")],
@@ -26,6 +33,14 @@ def deploy_(
         Path | None, typer.Option("--c", metavar="FOLDER", help="Write a header, a C99 source, main.c and a README.")
     ] = None,
     real: Annotated[RealType, typer.Option("--real", help="Type of the numbers.")] = RealType.FLOAT,
+    fmu: Annotated[
+        Path | None,
+        typer.Option("--fmu", metavar="FILE.fmu", help="Write a functional mock-up unit for co-simulation."),
+    ] = None,
+    fmi: Annotated[FmiVersion, typer.Option("--fmi", help="Version of FMI.")] = FmiVersion.TWO,
+    inverse: Annotated[
+        bool, typer.Option("--inverse", help="Let the unit be the inverse: from target to input.")
+    ] = False,
     name: Annotated[str, typer.Option("--name", help="Prefix of the functions, and name of the files.")] = "model",
     period: Annotated[
         float | None,
@@ -37,18 +52,27 @@ def deploy_(
     ] = None,
     json_file: JsonOption = None,
 ) -> None:
-    """Export a model, its inverse and its memory as C99, for a controller that runs elsewhere.
+    """Export a model, its inverse and its memory as C99 or as a functional mock-up unit (FMI), to run elsewhere.
 
     The functions are `NAME_init`, `NAME_step` (input to output), `NAME_invert` (target to input, and whether it
     can be met), `NAME_save` and `NAME_restore`. They allocate nothing, and every loop has a bound.
     """
-    from bench.deploy import deploy
+    from bench.deploy import deploy, write_fmu
     from bench.identification import load_model
 
-    if c is None:
-        raise ConfigurationError("--c: expected a folder for the C")
+    if c is None and fmu is None:
+        raise ConfigurationError("bench model deploy: say what to write, by --c FOLDER or --fmu FILE.fmu")
     check_outputs(folder=c, json_file=json_file, read=[model])
-    found = deploy(load_model(model), name=name, real=real.value, period=period, max_bytes=max_bytes)
+    file = load_model(model)
+    if fmu is not None:
+        if fmu.suffix != ".fmu":
+            raise ConfigurationError(f"--fmu {fmu}: expected a name that ends with .fmu")
+        write_fmu(file, fmu, what="inverse" if inverse else "operator", version=fmi.value, period=period)
+        print_plain(console, f"FMU: {fmu}")
+    if c is None:
+        write_json(json_file, {"fmu": str(fmu), "fmi": fmi.value})
+        return
+    found = deploy(file, name=name, real=real.value, period=period, max_bytes=max_bytes)
     found.write(c)
     rows = {"constants": found.constants, "code": found.code, "state": found.state}
     print_rows(f"{model.name} in {real.value}", [(what, f"{count} bytes") for what, count in rows.items()])

@@ -5,3 +5,8 @@ from .export import (
     Deployment as Deployment,
     deploy as deploy,
 )
+from .fmu import (
+    Version as Version,
+    What as What,
+    write_fmu as write_fmu,
+)

@@ -121,7 +121,7 @@ def _source(file: ModelFile, real: Real, period: float | None, name: str) -> Sou
             raise ConfigurationError(f"--period {period:g}: model {file.name} has no linear part to discretize")
         if not 0.0 < period < np.inf:
             raise ConfigurationError(f"--period {period:g}: expected a positive time, s")
-    for what, (low, high), unit in _ranges(model):
+    for what, (low, high), unit in ranges_of(model):
         resolved = float(np.spacing(np.float32(max(abs(low), abs(high))))) / (high - low) if high > low else 0.0
         if real == "float" and resolved > _RESOLVED:
             raise DataError(
@@ -148,7 +148,7 @@ def starts_of(file: ModelFile, operator: Operator[Any]) -> Starts:
     return last, first, operator.saturated_state(-1), operator.saturated_state(1)
 
 
-def _ranges(model: Any) -> list[tuple[str, tuple[float, float], str]]:  # noqa: ANN401 - any registered model
+def ranges_of(model: Any) -> list[tuple[str, tuple[float, float], str]]:  # noqa: ANN401 - any registered model
     """Return the inputs and outputs of a model: what, range, unit."""
     if (coupled := COUPLED.get(type(model))) is not None:
         return list(zip(("voltage", "force", "length"), coupled.ranges(model), model.units, strict=True))
@@ -176,7 +176,7 @@ def _check_size(file: ModelFile, source: Source, real: Real, max_bytes: int | No
 
 
 def _words(file: ModelFile, source: Source, digest: str, name: str, real: Real) -> dict[str, object]:
-    model, ranges = file.model, _ranges(file.model)
+    model, ranges = file.model, ranges_of(file.model)
     *inputs, (_, (least, greatest), output) = ranges
     coupled = isinstance(model, Coupled)
     force = getattr(model, "pretension", 0.0)
@@ -204,7 +204,7 @@ def _named(what: str, span: tuple[float, float], unit: str) -> str:  # noqa: ARG
 
 
 def _readme(file: ModelFile, source: Source, words: Mapping[str, object]) -> str:
-    *inputs, (_, (least, greatest), output) = _ranges(file.model)
+    *inputs, (_, (least, greatest), output) = ranges_of(file.model)
     rows = [
         ("model", f"{file.name}, {file.model.kind}"),
         ("SHA-256 of the model", f"`{words['digest']}`"),
@@ -215,8 +215,8 @@ def _readme(file: ModelFile, source: Source, words: Mapping[str, object]) -> str
         ("constants", f"{source.constants} bytes"),
         ("code", f"about {source.machine} bytes (Cortex-M4, -O2, without the library of mathematics)"),
         ("state", f"{source.state} bytes; saved, 8 bytes more"),
-        ("a step, at most", source.step),
-        ("an inverse, at most", source.inverse),
+        ("a step", source.step),
+        ("an inverse", source.inverse),
         *(
             (f"fit: {key}", str(value))
             for key, value in file.provenance.items()

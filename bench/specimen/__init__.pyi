@@ -16,6 +16,7 @@ from .specimen import (
 )
 from .tables import (
     NoiseTable as NoiseTable,
+    SetUpTable as SetUpTable,
     TwinTable as TwinTable,
     rounded as rounded,
 )

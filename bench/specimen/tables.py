@@ -110,24 +110,29 @@ class ResponseTable(CheckedTable):
         return ResponseDynamics(self.lag, self.power, self.gain, self.shares, self.times)
 
 
-class TwinTable(LaboratorySettings):
-    """The table `[emulation]` of a twin."""
+class SetUpTable(LaboratorySettings):
+    """What `[emulation]` says of the devices around a specimen."""
 
-    step: float = Field(gt=0, le=1, description="step of the grid of time, s")
-    model: str = Field(description="the model, as the content of its file, in JSON")
-    session_offset: float = Field(
-        default=0.0, ge=0, description="standard deviation of the response from session to session, output units"
-    )
     drive: DriveTable
     response: ResponseTable
-    wander: Wander = Wander()
-    unevenness: Unevenness = Unevenness()
-    drift: float = Field(
-        default=0.0, ge=0, description="random walk of the response, output units per root of a second"
+    session_offset: float = Field(
+        default=0.0, ge=0, description="standard deviation of the response from session to session, output units"
     )
     signals: dict[str, NoiseTable] = Field(default_factory=dict, description="how each signal is read")
     tasks: dict[str, str] = Field(
         default_factory=dict, description="what may be asked of an operator, and the signal that shows it"
+    )
+
+
+class TwinTable(SetUpTable):
+    """The table `[emulation]` of a twin."""
+
+    step: float = Field(gt=0, le=1, description="step of the grid of time, s")
+    model: str = Field(description="the model, as the content of its file, in JSON")
+    wander: Wander = Wander()
+    unevenness: Unevenness = Unevenness()
+    drift: float = Field(
+        default=0.0, ge=0, description="random walk of the response, output units per root of a second"
     )
 
     @field_validator("model")

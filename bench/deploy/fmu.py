@@ -1,0 +1,311 @@
+"""A model as a functional mock-up unit for co-simulation: description, source and a binary for Linux."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import shutil
+import subprocess
+import tempfile
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal, TypeAlias
+from xml.sax.saxutils import quoteattr
+
+from bench.base import ConfigurationError, DataError
+from bench.deploy.c_source import parts_of, rendered
+from bench.deploy.export import deploy, ranges_of
+from bench.identification import ModelFile
+from bench.models import Coupled, Hammerstein
+
+Version: TypeAlias = Literal["2.0", "3.0"]
+What: TypeAlias = Literal["operator", "inverse"]
+
+_KINDS = (
+    "Float32",
+    "Int8",
+    "UInt8",
+    "Int16",
+    "UInt16",
+    "UInt32",
+    "Int64",
+    "UInt64",
+    "Boolean",
+    "String",
+    "Binary",
+    "Clock",
+)
+_OTHERS = """
+EnterConfigurationMode ExitConfigurationMode EnterEventMode EnterStepMode EnterContinuousTimeMode
+CompletedIntegratorStep SetTime SetContinuousStates GetContinuousStateDerivatives GetEventIndicators
+GetContinuousStates GetNominalsOfContinuousStates GetNumberOfEventIndicators GetNumberOfContinuousStates
+ActivateModelPartition GetOutputDerivatives GetDirectionalDerivative GetAdjointDerivative
+GetNumberOfVariableDependencies GetVariableDependencies UpdateDiscreteStates EvaluateDiscreteStates
+GetIntervalDecimal GetIntervalFraction SetIntervalDecimal SetIntervalFraction GetShiftDecimal GetShiftFraction
+SetShiftDecimal SetShiftFraction
+"""
+_UNUSED = [f"{way}{kind}" for kind in _KINDS for way in ("Get", "Set")] + _OTHERS.split()
+"""Functions of FMI 3.0 that a unit for co-simulation without events has, and that do nothing."""
+
+
+@dataclass(frozen=True)
+class _Variable:
+    """A variable of the description; `reference` is its place, see `fmu.c.in`."""
+
+    name: str
+    reference: int
+    causality: str
+    unit: str = ""
+    start: float | int | None = None
+    whole: bool = False
+
+
+def write_fmu(
+    file: ModelFile, path: Path, *, what: What = "operator", version: Version = "2.0", period: float | None = None
+) -> None:
+    """Write a model, or its inverse, as a functional mock-up unit for co-simulation.
+
+    An operator has the input `u` and the output `y`; its inverse `target`, and `u`, `y` at `u` and `reach` (1 too
+    high, -1 too low). A model from voltage and force to length has these names. The parameter `start` chooses the
+    memory: 0 at the end of the fitted data, 1 before them (the default), 2 and 3 negative and positive saturation.
+
+    Parameters
+    ----------
+    file : ModelFile
+        The model.
+    path : Path
+        File to write, `.fmu`.
+    what : {"operator", "inverse"}
+        What of it.
+    version : {"2.0", "3.0"}
+        Version of FMI.
+    period : float, optional
+        Time of a step, s, for a model with time; every communication step then has it.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is no compiler of C, or the period does not suit the model.
+    DataError
+        If the model cannot be exported, or the file not written.
+    """
+    compiler = shutil.which("gcc") or shutil.which("clang")
+    if compiler is None:
+        raise ConfigurationError(
+            "--fmu: no compiler of C was found, which makes the binary within; install the Debian package gcc"
+        )
+    found = deploy(file, real="double", period=period)
+    coupled = isinstance(file.model, Coupled)
+    variables = _variables(file, what)
+    words = {
+        "title": f"Model {file.name}, {what}",
+        "identity": f"SHA-256 of the model: {found.digest}",
+        "name": found.name,
+        "guid": found.digest,
+        **_actions(what, coupled, period, variables),
+        "none": "\n".join(f"NONE(fmi3{name})" for name in _UNUSED),
+    }
+    template = parts_of("fmu.c.in")
+    fmi = f"fmi{version[0]}"
+    files = {name: text for name, text in found.files.items() if name in (f"{found.name}.h", f"{found.name}.c")} | {
+        f"{fmi}.c": rendered(template["head"] + template[fmi], "double", found.name, found.name, words)
+    }
+    binary = "binaries/linux64" if version == "2.0" else "binaries/x86_64-linux"
+    described = {"2.0": _description2, "3.0": _description3}[version]
+    content = {f"sources/{name}": text.encode() for name, text in files.items()}
+    content["modelDescription.xml"] = described(file, found.digest, variables, period, sorted(files)).encode()
+    content["documentation/README.md"] = found.files["README.md"].encode()
+    if version == "3.0":
+        content["sources/buildDescription.xml"] = _build_description(sorted(files)).encode()
+    content[f"{binary}/model.so"] = _compiled(compiler, files, fmi)
+    try:
+        with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name, data in content.items():
+                # Without the time of day: the same model gives the same bytes.
+                archive.writestr(zipfile.ZipInfo(name, (1980, 1, 1, 0, 0, 0)), data)
+    except OSError as error:
+        raise DataError(f"--fmu {path} cannot be written: {error.strerror}") from None
+
+
+def _compiled(compiler: str, files: Mapping[str, str], fmi: str) -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        for name, text in files.items():
+            Path(folder, name).write_text(text, encoding="utf-8")
+        options = ["-std=c99", "-O2", "-fPIC", "-shared", "-fvisibility=hidden", "-o", "model.so"]
+        command = [compiler, *options, "model.c", f"{fmi}.c", "-lm"]
+        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)  # noqa: S603
+        if done.returncode:
+            raise DataError(f"--fmu: {compiler} failed: {done.stderr.strip()}")
+        return Path(folder, "model.so").read_bytes()
+
+
+def _variables(file: ModelFile, what: What) -> list[_Variable]:
+    *inputs, (_, _, output) = ranges_of(file.model)
+    coupled = isinstance(file.model, Coupled)
+    first, last = ("voltage", "length") if coupled else ("u", "y")
+    unit = inputs[0][2]
+    found = [_Variable("start", 5, "parameter", start=1, whole=True)]
+    if what == "operator":
+        found += [_Variable(first, 0, "input", unit, _begin(file)), _Variable(last, 2, "output", output)]
+    else:
+        target = 0.5 * sum(ranges_of(file.model)[-1][1])
+        found += [_Variable("target", 0, "input", output, target), _Variable(first, 2, "output", unit)]
+        found += [_Variable(last, 3, "output", output), _Variable("reach", 4, "output", whole=True)]
+    if coupled:
+        found.append(_Variable("force", 1, "input", inputs[1][2], float(file.model.pretension)))
+    return found
+
+
+def _begin(file: ModelFile) -> float:
+    """Return the input at which a model starts."""
+    model: Any = file.model
+    if isinstance(model, Coupled):
+        return float(ranges_of(model)[0][1][0])
+    operator = model.static if isinstance(model, Hammerstein) else model
+    initial = getattr(file.initial, "memory", file.initial)
+    return float(operator.present_input(operator.initial_state() if initial is None else initial))
+
+
+def _actions(what: What, coupled: bool, period: float | None, variables: list[_Variable]) -> dict[str, str]:
+    load = ", load" if coupled else ""
+    starts = {each.reference: each.start for each in variables if each.causality == "input"}
+    check = (
+        "" if period is None else f"    if (step < {0.999 * period!r} || step > {1.001 * period!r}) return FAILED;\n"
+    )
+    if what == "operator":
+        begin, advance = "i->outputs[1]", [f"i->outputs[0] = i->outputs[1] = BASE_step(&i->state, u{load});"]
+    else:
+        given = ", i->inputs[1]" if coupled else ""
+        begin = f"BASE_invert(&i->state, i->outputs[1]{given}).setpoint"
+        advance = [
+            "{",
+            f"    BASE_answer answer = BASE_invert(&i->state, u{load});",
+            f"    if (answer.count == 2) BASE_step(&i->state, answer.saturating{load});",
+            f"    i->outputs[1] = BASE_step(&i->state, answer.setpoint{load});",
+            "    i->outputs[0] = answer.setpoint;",
+            "    i->reach = answer.reach;",
+            "}",
+        ]
+    return {
+        "begin": begin,
+        "check": check,
+        "advance": "\n".join(f"    {line}" for line in advance),
+        "inputs": f"{float(starts[0] or 0.0)!r}, {float(starts.get(1) or 0.0)!r}",
+    }
+
+
+def _attributes(**values: object) -> str:
+    return " ".join(
+        f"{name}={quoteattr(str(value).lower() if isinstance(value, bool) else str(value))}"
+        for name, value in values.items()
+        if value not in (None, "")
+    )
+
+
+def _tool() -> str:
+    return f"actuator-bench {importlib.metadata.version('actuator-bench')}"
+
+
+def _description2(
+    file: ModelFile, guid: str, variables: list[_Variable], period: float | None, sources: list[str]
+) -> str:
+    units = sorted({each.unit for each in variables if each.unit})
+    lines, outputs = [], []
+    for index, each in enumerate(variables, start=1):
+        initial = {"parameter": "exact", "output": "calculated"}.get(each.causality)
+        variability = "fixed" if each.causality == "parameter" else "discrete"
+        head = _attributes(
+            name=each.name, valueReference=each.reference, causality=each.causality, variability=variability,
+            initial=initial,
+        )  # fmt: skip
+        kind = "Integer" if each.whole else "Real"
+        lines.append(
+            f"    <ScalarVariable {head}><{kind} {_attributes(unit=each.unit, start=each.start)}/></ScalarVariable>"
+        )
+        if each.causality == "output":
+            outputs.append(index)
+    unknowns = "".join(f'<Unknown index="{index}"/>' for index in outputs)
+    abilities = _attributes(
+        modelIdentifier="model", canHandleVariableCommunicationStepSize=period is None,
+        canGetAndSetFMUstate=True, canSerializeFMUstate=True,
+    )  # fmt: skip
+    head = _attributes(
+        fmiVersion="2.0", modelName=file.name, guid=guid, generationTool=_tool(), variableNamingConvention="flat"
+    )
+    unit_lines = "".join(f"<Unit name={quoteattr(unit)}/>" for unit in units)
+    return "\n".join(
+        [
+            '<?xml version="1.0" encoding="UTF-8"?>',
+            f"<fmiModelDescription {head}>",
+            f"  <CoSimulation {abilities}><SourceFiles>"
+            + "".join(f'<File name="{name}"/>' for name in sources if name.endswith(".c"))
+            + "</SourceFiles></CoSimulation>",
+            *([f"  <UnitDefinitions>{unit_lines}</UnitDefinitions>"] if units else []),
+            f'  <DefaultExperiment startTime="0" stopTime="1" stepSize="{period or 0.01!r}"/>',
+            "  <ModelVariables>",
+            *lines,
+            "  </ModelVariables>",
+            f"  <ModelStructure><Outputs>{unknowns}</Outputs><InitialUnknowns>{unknowns}</InitialUnknowns>"
+            "</ModelStructure>",
+            "</fmiModelDescription>",
+            "",
+        ]
+    )
+
+
+def _description3(
+    file: ModelFile,
+    guid: str,
+    variables: list[_Variable],
+    period: float | None,
+    sources: list[str],  # noqa: ARG001 - named in a file of their own
+) -> str:
+    units = sorted({each.unit for each in variables if each.unit})
+    lines = ['    <Float64 name="time" valueReference="6" causality="independent" variability="continuous"/>']
+    for each in variables:
+        initial = {"parameter": "exact", "output": "calculated"}.get(each.causality)
+        variability = "fixed" if each.causality == "parameter" else "discrete"
+        attributes = _attributes(
+            name=each.name, valueReference=each.reference, causality=each.causality, variability=variability,
+            initial=initial, unit=each.unit, start=each.start,
+        )  # fmt: skip
+        lines.append(f"    <{'Int32' if each.whole else 'Float64'} {attributes}/>")
+    outputs = [each.reference for each in variables if each.causality == "output"]
+    abilities = _attributes(
+        modelIdentifier="model", canHandleVariableCommunicationStepSize=period is None,
+        canGetAndSetFMUState=True, canSerializeFMUState=True,
+    )  # fmt: skip
+    head = _attributes(
+        fmiVersion="3.0", modelName=file.name, instantiationToken=guid, generationTool=_tool(),
+        variableNamingConvention="flat",
+    )  # fmt: skip
+    unit_lines = "".join(f"<Unit name={quoteattr(unit)}/>" for unit in units)
+    return "\n".join(
+        [
+            '<?xml version="1.0" encoding="UTF-8"?>',
+            f"<fmiModelDescription {head}>",
+            f"  <CoSimulation {abilities}/>",
+            *([f"  <UnitDefinitions>{unit_lines}</UnitDefinitions>"] if units else []),
+            f'  <DefaultExperiment startTime="0" stopTime="1" stepSize="{period or 0.01!r}"/>',
+            "  <ModelVariables>",
+            *lines,
+            "  </ModelVariables>",
+            "  <ModelStructure>",
+            *(f'    <Output valueReference="{reference}"/>' for reference in outputs),
+            *(f'    <InitialUnknown valueReference="{reference}"/>' for reference in outputs),
+            "  </ModelStructure>",
+            "</fmiModelDescription>",
+            "",
+        ]
+    )
+
+
+def _build_description(sources: list[str]) -> str:
+    files = "".join(f'<SourceFile name="{name}"/>' for name in sources if name.endswith(".c"))
+    return (
+        '<?xml version="1.0" encoding="UTF-8"?>\n<fmiBuildDescription fmiVersion="3.0">\n'
+        '  <BuildConfiguration modelIdentifier="model">\n'
+        f'    <SourceFileSet language="C99">{files}</SourceFileSet>\n'
+        "  </BuildConfiguration>\n</fmiBuildDescription>\n"
+    )
