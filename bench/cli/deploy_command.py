@@ -41,10 +41,25 @@ def deploy_(
     inverse: Annotated[
         bool, typer.Option("--inverse", help="Let the unit be the inverse: from target to input.")
     ] = False,
+    controller: Annotated[
+        str | None,
+        typer.Option(
+            "--controller",
+            metavar="NAME",
+            help="Write this controller of `following` too: closed-loop-inverse or open-loop-inverse.",
+        ),
+    ] = None,
+    rig: Annotated[
+        str | None,
+        typer.Option("--rig", metavar="RIG", help="Whose limits and rest set-point the controller has."),
+    ] = None,
+    tuning: Annotated[
+        Path | None, typer.Option("--tuning", metavar="FILE.toml", help="Tuning file of the controller.")
+    ] = None,
     name: Annotated[str, typer.Option("--name", help="Prefix of the functions, and name of the files.")] = "model",
     period: Annotated[
         float | None,
-        typer.Option("--period", metavar="SECONDS", help="Time of a step, of a model with time."),
+        typer.Option("--period", metavar="SECONDS", help="Time of a step, of a controller or a model with time."),
     ] = None,
     max_bytes: Annotated[
         int | None,
@@ -57,11 +72,13 @@ def deploy_(
     The functions are `NAME_init`, `NAME_step` (input to output), `NAME_invert` (target to input, and whether it
     can be met), `NAME_save` and `NAME_restore`. They allocate nothing, and every loop has a bound.
     """
-    from bench.deploy import deploy, write_fmu
+    from bench.deploy import controller_of_rig, deploy, write_fmu
     from bench.identification import load_model
 
     if c is None and fmu is None:
         raise ConfigurationError("bench model deploy: say what to write, by --c FOLDER or --fmu FILE.fmu")
+    if (controller is None) != (rig is None) or (tuning is not None and controller is None):
+        raise ConfigurationError("--controller and --rig belong together, and --tuning to them")
     check_outputs(folder=c, json_file=json_file, read=[model])
     file = load_model(model)
     if fmu is not None:
@@ -72,7 +89,10 @@ def deploy_(
     if c is None:
         write_json(json_file, {"fmu": str(fmu), "fmi": fmi.value})
         return
-    found = deploy(file, name=name, real=real.value, period=period, max_bytes=max_bytes)
+    follower = None
+    if controller is not None and rig is not None:
+        follower, period = controller_of_rig(controller, rig, period, tuning), None
+    found = deploy(file, name=name, real=real.value, period=period, max_bytes=max_bytes, controller=follower)
     found.write(c)
     rows = {"constants": found.constants, "code": found.code, "state": found.state}
     print_rows(f"{model.name} in {real.value}", [(what, f"{count} bytes") for what, count in rows.items()])

@@ -24,6 +24,9 @@ from .estimators import (
     DriftEstimator as DriftEstimator,
     agility_for as agility_for,
 )
+from .following import (
+    FollowingParameters as FollowingParameters,
+)
 from .loops import (
     SHORTEST_WAIT as SHORTEST_WAIT,
     BlockController as BlockController,
@@ -67,5 +70,6 @@ from .tuning import (
 )
 from .tuning_file import (
     Tuning as Tuning,
+    load_tuning as load_tuning,
     tuning_text as tuning_text,
 )

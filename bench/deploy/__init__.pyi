@@ -1,6 +1,11 @@
 from .c_source import (
     Real as Real,
 )
+from .controller import (
+    CONTROLLERS as CONTROLLERS,
+    Controller as Controller,
+    controller_of_rig as controller_of_rig,
+)
 from .export import (
     Deployment as Deployment,
     deploy as deploy,

@@ -14,6 +14,7 @@ import numpy as np
 from bench.base import ConfigurationError, DataError, json_text
 from bench.deploy.c_source import Real, Source, parts_of, rendered
 from bench.deploy.compositions import COUPLED, hammerstein_source
+from bench.deploy.controller import Controller, controller_source
 from bench.deploy.operators import Starts, operator_source, why_not
 from bench.identification import ModelFile
 from bench.models import Coupled, Hammerstein, Operator
@@ -66,6 +67,7 @@ def deploy(
     real: Real = "float",
     period: float | None = None,
     max_bytes: int | None = None,
+    controller: Controller | None = None,
 ) -> Deployment:
     """Return a model, its inverse and its memory as C99.
 
@@ -81,6 +83,8 @@ def deploy(
         Time of a step, s, for which the linear part of a model with time is discretized.
     max_bytes : int, optional
         Most bytes of code and constants.
+    controller : Controller, optional
+        What makes the output follow a reference, beside the model.
 
     Raises
     ------
@@ -92,9 +96,12 @@ def deploy(
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         raise ConfigurationError(f"--name {name!r}: expected letters, digits and _, a letter first")
     source = _source(file, real, period, name)
+    header, code = "", ""
+    if controller is not None:
+        header, code = controller_source(file, controller, real, name)
     _check_size(file, source, real, max_bytes)
     digest = hashlib.sha256(json_text(file.model.to_json()).encode()).hexdigest()
-    words = _words(file, source, digest, name, real)
+    words = _words(file, source, digest, name, real) | {"control": header}
     parts = {
         template: rendered(parts_of(template)["head"], real, name, name, words)
         for template in ("model.h.in", "model.c.in", "saved.c.in", "main.c.in")
@@ -103,7 +110,7 @@ def deploy(
         name,
         {
             f"{name}.h": parts["model.h.in"],
-            f"{name}.c": parts["model.c.in"] + source.code + "\n" + parts["saved.c.in"],
+            f"{name}.c": parts["model.c.in"] + source.code + "\n" + code + parts["saved.c.in"],
             "main.c": parts["main.c.in"],
             "README.md": _readme(file, source, words),
         },

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bench.base import Floats
-from bench.deploy import Real, deploy
+from bench.deploy import Controller, Real, deploy
 from bench.identification import ModelFile
 from bench.models import (
     BoucWen,
@@ -61,6 +61,18 @@ void follow(model_state *s, const model_real *targets, const model_real *loads, 
 """
 
 
+_CONTROLLED = """
+void control(model_controller *c, const model_real *readings, model_real *setpoints, long count);
+void control(model_controller *c, const model_real *readings, model_real *setpoints, long count) {
+    long i;
+    model_controller_init(c, model_NEGATIVE);
+    for (i = 0; i < count; ++i)
+        setpoints[i] = model_control(c, readings[4 * i], readings[4 * i + 1], readings[4 * i + 2], readings[4 * i + 3]);
+}
+unsigned long size_of_controller(void) { return (unsigned long)sizeof(model_controller); }
+"""
+
+
 class Found(NamedTuple):
     """Answers of an inverse, an array each: set-points, inputs before them, outputs, reach and count."""
 
@@ -85,11 +97,13 @@ class Compiled:
         compiler: str = "gcc",
         *options: str,
         period: float | None = None,
+        controller: Controller | None = None,
     ) -> None:
-        self.deployment = deploy(file, real=real, period=period)
+        self.deployment = deploy(file, real=real, period=period, controller=controller)
         self.deployment.write(folder)
         load = ", loads[i]" if isinstance(file.model, Coupled) else ""
-        (folder / "driver.c").write_text(_DRIVER.replace(" LOAD", load))
+        controlled = "" if controller is None else _CONTROLLED
+        (folder / "driver.c").write_text(_DRIVER.replace(" LOAD", load) + controlled)
         library = folder / "model.so"
         run([compiler, *STRICT, "-O2", *options, "-fPIC", "-c", "model.c", "-o", "model.o"], folder)
         run([compiler, "-O2", *options, "-shared", "-fPIC", "driver.c", "model.o", "-o", str(library), "-lm"], folder)
@@ -128,6 +142,14 @@ class Compiled:
     def _arrays(self, *sequences: Floats | None) -> list[Any]:
         count = 0 if sequences[0] is None else sequences[0].size
         return [np.ascontiguousarray(np.zeros(count) if each is None else each, self._dtype) for each in sequences]
+
+    def control(self, readings: Floats) -> Floats:
+        """Return the set-points to rows of time passed, measured input, output and reference, shape (N, 4)."""
+        rows, setpoints = np.ascontiguousarray(readings, self._dtype), np.empty(len(readings), self._dtype)
+        self._library.size_of_controller.restype = ctypes.c_ulong
+        state = ctypes.create_string_buffer(self._library.size_of_controller())
+        self._library.control(state, _pointer(rows), _pointer(setpoints), ctypes.c_long(len(rows)))
+        return setpoints.astype(np.float64)
 
     def save(self) -> bytes:
         """Return the state as bytes."""
