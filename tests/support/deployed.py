@@ -66,8 +66,8 @@ void control(model_controller *c, const model_real *readings, model_real *setpoi
 void control(model_controller *c, const model_real *readings, model_real *setpoints, long count) {
     long i;
     model_controller_init(c, model_NEGATIVE);
-    for (i = 0; i < count; ++i)
-        setpoints[i] = model_control(c, readings[4 * i], readings[4 * i + 1], readings[4 * i + 2], readings[4 * i + 3]);
+    for (i = 0; i < count; ++i, readings += 4)
+        setpoints[i] = model_control(c, readings[0], readings[1], readings[2], readings[3]);
 }
 unsigned long size_of_controller(void) { return (unsigned long)sizeof(model_controller); }
 """

@@ -4,7 +4,7 @@ A reader who copies their blocks in order gets what the page says.
 
 A block with `file: NAME` after its language is written to that file, `sh` and `python` without it are run, and each
 line of a `text` block has to occur in what the block before it has printed. A `bash` block is for hardware, or takes
-long: it is not run, but its commands and options have to exist.
+long: it is not run, but its commands and options have to exist. A `c` block is not run either.
 """
 
 import os
@@ -25,12 +25,14 @@ EXECUTED = [*PAGES, *(DOCS / "reference" / f"{name}.md" for name in ("campaign",
 LONG = {
     "add-a-controller",
     "campaign",
+    "deploy",
     "describe-an-instrument",
     "first-day",
     "hybrid",
     "identify-from-a-file",
     "resume-a-run",
     "sma",
+    "use-an-fmu",
     "vo2",
 }
 """Some seconds each; of these `make test` looks at the commands only (`test_readme.py`)."""
@@ -58,8 +60,10 @@ def environment(tmp_path, warm_commands):
     "path",
     [pytest.param(path, id=path.stem, marks=[pytest.mark.seeds] if path.stem in LONG else []) for path in EXECUTED],
 )
-def test_page(path, tmp_path, environment, finished_process, warm_process):
+def test_page(path, tmp_path, environment, finished_process, warm_process, request):
     page, printed = path.stem, None
+    if "gcc" in path.read_text() or "--fmu" in path.read_text():
+        request.getfixturevalue("gcc")
     for language, name, text in BLOCK.findall(path.read_text()):
         if name:
             (tmp_path / name).write_text(text)
@@ -67,7 +71,7 @@ def test_page(path, tmp_path, environment, finished_process, warm_process):
             assert printed is not None, f"{page}: a text block stands after no block that prints"
             for line in filter(None, map(str.strip, text.splitlines())):
                 assert line in printed, f"{page}: {line!r} is not in\n{printed}"
-        elif language != "bash":
+        elif language not in ("bash", "c"):
             command, run = {
                 "sh": (["sh", "-e", "-c"], finished_process),
                 "python": ([sys.executable, "-c"], warm_process),
