@@ -2,9 +2,11 @@
 
 import json
 
+import numpy as np
 import pytest
 from deployed import plane, run
 
+from bench.api import load, predict
 from bench.identification import ModelFile
 
 RIG = """
@@ -69,18 +71,18 @@ def test_the_example_meets_its_target(model, gcc, tmp_path, bench):
 
 
 def test_a_unit_is_characterized_as_a_specimen(model, gcc, tmp_path, bench):
-    unit, rig, again = tmp_path / "model.fmu", tmp_path / "unit.toml", tmp_path / "again.json"
+    unit, rig = tmp_path / "model.fmu", tmp_path / "unit.toml"
     assert bench("model", "deploy", model, "--fmu", unit, "--fmi", "3.0")[0] == 0
     rig.write_text(RIG.replace("FILE", str(unit)))
     options = ["--clock", "virtual", "--set", "half_cycles=6", "--out", tmp_path / "runs"]
     code, _, err = bench("run", "damped-oscillation", "--rig", rig, *options)
     assert code == 0, err
     (found,) = (tmp_path / "runs").iterdir()
-    columns = ["--input", "voltage", "--output", "position"]
-    assert bench("identify", found, *columns, "--model", "preisach", "--levels", "11", "--out", again)[0] == 0
-    rms = json.loads(again.read_text())["provenance"]["rms_percent"]
+    readings = load(found).readings
+    assert len(readings) > 20
     # The unit is itself such a plane, without noise.
-    assert rms < 0.1
+    expected = predict(model, readings["voltage"])
+    np.testing.assert_allclose(readings["position"], expected, atol=1e-6 * np.ptp(expected))
 
 
 def test_what_is_wrong_is_one_message_and_nothing_is_written(model, tmp_path, bench):
