@@ -141,7 +141,6 @@ def run(
     70
     """
     definition = find_protocol(protocol) if isinstance(protocol, str) else protocol
-    file = load_rig(str(rig), overrides)
     result = carry_out(
         Run(
             protocol=definition,
@@ -150,7 +149,7 @@ def run(
             folder=Path(out),
             overrides=overrides or {},
             seed=seed,
-            clock=clock or ("virtual" if file.in_process else "wall"),
+            clock=clock,
             live=live,
             recording=recording,
         ),

@@ -21,10 +21,10 @@ from bench.rig import load_rig
 ROOT = Path(__file__).parents[1]
 
 MODELS = {
-    "preisach": ("--levels", 5), "preisach-signed": ("--levels", 4), "prandtl-ishlinskii": ("--plays", 4),
-    "polynomial": ("--degree", 3), "duhem": (), "bouc-wen": (), "maxwell-slip": (),
+    "preisach": ("--levels", 5), "preisach-signed": ("--levels", 4), "prandtl-ishlinskii": ("-o", "plays=4"),
+    "polynomial": ("-o", "degree=3"), "duhem": (), "bouc-wen": (), "maxwell-slip": (),
     "generalized-prandtl-ishlinskii": (), "krasnoselskii-pokrovskii": ("--levels", 4), "polynomial-plays": (),
-    "hammerstein": ("--time", "t", "--static", "polynomial", "--dynamics", "lag"),
+    "hammerstein": ("--time", "t", "-o", "static=polynomial", "-o", "dynamics=lag"),
 }  # fmt: skip
 CALIBRATION = {
     "format": "bench-calibration", "version": 1, "signal": "psd_position", "unit": "m", "reference": "a gauge",

@@ -121,6 +121,7 @@ from .session_recalibration import (
 )
 from .tables.data import (
     Quantity as Quantity,
+    input_and_output as input_and_output,
     read_columns as read_columns,
     write_csv as write_csv,
 )

@@ -15,7 +15,7 @@ from bench.analysis.tables.data import check_variation
 from bench.analysis.tables.dataset import Dataset, check_rows, overwritten_from, parse_rows
 from bench.analysis.tables.reading.table import FEWEST_ROWS
 from bench.analysis.tables.starting_state import bind_times, left_out
-from bench.base import ConfigurationError, DataError, whole_file
+from bench.base import ConfigurationError, DataError, closest, whole_file
 from bench.identification import (
     Beyond,
     Comparison,
@@ -178,7 +178,9 @@ def named_models(text: str) -> tuple[str, ...]:
                 f"leave it out of the names, or fit it alone with --model {name}"
             )
         if name not in known:
-            raise ConfigurationError(f"there is no model {name!r}; there are: {', '.join(known)}, or {ALL}")
+            raise ConfigurationError(
+                f"there is no model {name!r}; {closest(name, [*known, ALL], '`bench show models`')}"
+            )
     return names
 
 
@@ -207,7 +209,7 @@ def select_model(data: Dataset, models: Sequence[str], given: Given, options: Fi
     try:
         check_words(given.initial, given.orientation)
     except ValueError as error:
-        raise ConfigurationError(f"--{error}") from None
+        raise ConfigurationError(str(error)) from None
     inputs, output = data.inputs, data.output
     assert output is not None
     check_variation(data.source, output)
@@ -229,9 +231,7 @@ def _check_options(models: Sequence[str], given: Given) -> None:
     known = {option.name for model in models for option in model_options(find_model(model))}
     for name in given.options:
         if name not in known:
-            raise ConfigurationError(
-                f"{name}: none of the models has this option; there are: {', '.join(sorted(known))}"
-            )
+            raise ConfigurationError(f"-o {name}: none of the models has this option; {closest(name, sorted(known))}")
 
 
 @dataclass(frozen=True)

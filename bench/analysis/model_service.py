@@ -24,7 +24,7 @@ from bench.analysis.transients.transient_dynamics import (
     read_transients,
 )
 from bench.analysis.uncertain_models import PROVENANCE, ModelUncertainty, identified_uncertainty
-from bench.base import ConfigurationError, html_table, percent
+from bench.base import ConfigurationError, closest, html_table, percent
 from bench.identification import (
     ONE_RUN,
     Advice,
@@ -77,7 +77,7 @@ _MOST_CROSS_VALIDATED = 6000
 # left of it, and a step of the input cannot be that sharp.
 _SHORTEST = 1e-3
 
-_UNIT_OF_TIMES = "; the rows do not show it, unless the unit of their times is wrong (--time-unit)"
+_UNIT_OF_TIMES = "; the rows do not show it, unless the unit of their times is wrong (--format time-unit=UNIT)"
 
 
 @dataclass(frozen=True)
@@ -462,8 +462,8 @@ def _check_model(model: str, data: Dataset, options: FitOptions, own: Mapping[st
         try:
             find_model(model)
         except ValueError:
-            known = ", ".join(sorted([*identifiable_models(), *timed]))
-            raise ConfigurationError(f"there is no model {model!r}; there are: {known}") from None
+            known = closest(model, sorted([*identifiable_models(), *timed]), "`bench show models`")
+            raise ConfigurationError(f"there is no model {model!r}; {known}") from None
         if data.time is not None:
             raise ConfigurationError(
                 f"--time: {model} is a model without time; with time there are: {', '.join(timed)}"
@@ -476,7 +476,7 @@ def _check_model(model: str, data: Dataset, options: FitOptions, own: Mapping[st
     if data.time is None:
         raise ConfigurationError(f"model {model} needs the time of each row: give --time COLUMN")
     if options.ridge or ((options.smoothing or options.cross_validated) and not _is_smoothed(model)):
-        others = "--ridge" if _is_smoothed(model) else "--smoothing, --ridge or --cross-validate"
+        others = "-o ridge=WEIGHT" if _is_smoothed(model) else "--smoothing, -o ridge=WEIGHT or --cross-validate"
         raise ConfigurationError(f"model {model} takes no {others}")
     if options.levels_to_try:
         raise ConfigurationError(f"--levels: model {model} takes one number; it is not chosen by cross-validation")

@@ -37,6 +37,7 @@ from .compiled import (
     reordered as reordered,
 )
 from .configuration_errors import (
+    explain as explain,
     problems as problems,
 )
 from .deferred import (
@@ -72,6 +73,10 @@ from .interrupts import (
     STACKS as STACKS,
     Interrupts as Interrupts,
     say_at_once as say_at_once,
+)
+from .names import (
+    closest as closest,
+    reason as reason,
 )
 from .parsing import (
     comma_remark as comma_remark,

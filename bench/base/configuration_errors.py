@@ -1,14 +1,39 @@
-"""Problems that pydantic finds, as messages for the author of the file."""
+"""Problems in what a user wrote, as messages: what pydantic finds."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
 from pydantic.fields import FieldInfo
 
+from bench.base.names import closest
 from bench.base.parsing import comma_remark
+
+_EXPECTED = {
+    "bool_parsing": "true or false", "bool_type": "true or false", "dict_type": "a table",
+    "finite_number": "a finite number", "float_parsing": "a number", "float_type": "a number",
+    "greater_than": "a number > {gt:g}", "greater_than_equal": "a number ≥ {ge:g}",
+    "int_from_float": "a whole number", "int_parsing": "a whole number", "int_type": "a whole number",
+    "enum": "{expected}", "less_than": "a number < {lt:g}", "less_than_equal": "a number ≤ {le:g}",
+    "list_type": "a list", "literal_error": "{expected}", "model_attributes_type": "a table", "model_type": "a table",
+    "path_type": "a path", "string_pattern_mismatch": "a text of the form {pattern}",
+    "string_too_long": "a text of at most {max_length} characters",
+    "string_too_short": "a text of at least {min_length} characters", "string_type": "a text",
+    "too_long": "at most {max_length} values", "too_short": "at least {min_length} values", "tuple_type": "a list",
+}  # fmt: skip
+"""What was expected, by pydantic's type of an error and in the words of its context."""
+
+
+def explain(problem: Mapping[str, Any]) -> str:
+    """Return what is wrong with a value, of an entry of `ValidationError.errors`, in the words of the bench."""
+    kind = problem["type"]
+    if kind in ("value_error", "assertion_error"):
+        return str(problem["msg"]).removeprefix("Value error, ").removeprefix("Assertion failed, ")
+    if kind == "missing":
+        return "is missing"
+    return f"expected {_EXPECTED[kind].format(**problem.get('ctx', {}))}" if kind in _EXPECTED else "is not allowed"
 
 
 def problems(error: ValidationError, model: type[BaseModel], prefix: str = "") -> Iterator[str]:
@@ -27,10 +52,9 @@ def problems(error: ValidationError, model: type[BaseModel], prefix: str = "") -
         location = problem["loc"]
         key = prefix + ".".join(str(part) for part in location)
         owner, field = _find(model, location)
-        message = problem["msg"].removeprefix("Value error, ")
         if problem["type"] == "extra_forbidden":
-            known = ", ".join(owner.model_fields) if owner else ""
-            yield f"{key}: there is no such key; allowed are: {known}"
+            known = closest(str(location[-1]), owner.model_fields if owner else ())
+            yield f"{key}: there is no such key; {known}"
         elif problem["type"] == "missing":
             meaning = f" ({field.description})" if field and field.description else ""
             yield f"{key}: is missing{meaning}"
@@ -38,7 +62,7 @@ def problems(error: ValidationError, model: type[BaseModel], prefix: str = "") -
             meaning = f" ({field.description})" if field and field.description else ""
             value = problem["input"]
             shown = f" = {value!r}" if not isinstance(value, dict) else ""
-            yield f"{key or 'file'}{shown}: {message}{meaning}{comma_remark(value)}"
+            yield f"{key or 'file'}{shown}: {explain(problem)}{meaning}{comma_remark(value)}"
 
 
 def _find(model: type[BaseModel], location: Sequence[Any]) -> tuple[type[BaseModel] | None, FieldInfo | None]:

@@ -25,6 +25,7 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 from bench.base.errors import ConfigurationError
+from bench.base.names import closest
 
 Group = Literal[
     "rigs",
@@ -151,7 +152,7 @@ def load(group: Group, name: str) -> Any:  # noqa: ANN401 - each group has a typ
         what = (
             group.replace("_", " ").removesuffix("s").replace("studie", "study").replace("laboratorie", "laboratory")
         )
-        raise ConfigurationError(f"there is no {what} {name!r}; there are: {', '.join(known) or 'none'}")
+        raise ConfigurationError(f"there is no {what} {name!r}; {closest(name, known, '`bench list`')}")
     return known[name].load()
 
 

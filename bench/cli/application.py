@@ -17,7 +17,7 @@ from typing import Annotated, Any, ClassVar, NoReturn
 import typer
 from rich.markup import escape
 
-from bench.base import AbortError, BenchError, ConfigurationError, registry
+from bench.base import AbortError, BenchError, ConfigurationError, closest, registry
 from bench.cli.command_support import error_console, exit_code, fail, told_of_records
 from bench.cli.groups import HELP_OPTIONS, Command, Group
 from bench.cli.streams import standard_streams
@@ -132,7 +132,7 @@ def _carry_out(arguments: Sequence[str] | None) -> NoReturn:
     except (typer.Abort, KeyboardInterrupt):
         code = AbortError.exit_code
     except typer.TyperException as error:
-        fail(ConfigurationError(_usage(error)))
+        fail(ConfigurationError(_usage(error, words)))
     except OSError as error:
         if error.errno != errno.ENAMETOOLONG:
             raise
@@ -162,10 +162,32 @@ def _check_words(words: Sequence[str]) -> None:
             ) from None
 
 
-def _usage(error: Any) -> str:  # noqa: ANN401 - of typer
+def _usage(error: Any, words: Sequence[str]) -> str:  # noqa: ANN401 - of typer
     """Return what is wrong with the use of a command, in a line."""
     context = getattr(error, "ctx", None)
-    return f"{context.command_path}: {error.format_message()}" if context else str(error)
+    if context is None:
+        return str(error)
+    parameters = context.command.params
+    if (name := getattr(error, "option_name", None)) is not None and hasattr(error, "possibilities"):
+        known = [option for each in parameters for option in (*each.opts, *each.secondary_opts) if option[0] == "-"]
+        return f"{context.command_path}: there is no option {name}; {closest(name, known, _help_of(context))}"
+    if hasattr(error, "param_type"):
+        # Of several that are missing, click names the first.
+        left = [each for each in parameters if each.required and not set(each.opts) & set(words)]
+        return f"{context.command_path}: missing: {', '.join(map(_spelled, left))}; see {_help_of(context)}"
+    if (cause := getattr(error.__cause__, "errors", None)) is not None:
+        from bench.base import explain
+
+        return f"{context.command_path}: {_spelled(error.param)} {cause()[0]['input']}: {explain(cause()[0])}"
+    return f"{context.command_path}: {error.format_message().removeprefix('Got ').rstrip('.')}"
+
+
+def _spelled(parameter: Any) -> str:  # noqa: ANN401 - of typer
+    return str(parameter.opts[-1] if parameter.opts[0][0] == "-" else parameter.metavar or parameter.name.upper())
+
+
+def _help_of(context: Any) -> str:  # noqa: ANN401 - of typer
+    return f"`{context.command_path} --help`"
 
 
 def _state_of_outputs(words: Sequence[str]) -> str:

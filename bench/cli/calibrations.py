@@ -9,10 +9,12 @@ import typer
 
 from bench.base import print_plain
 from bench.cli.command_support import JsonOption, check_outputs, console, print_rows, write_json
+from bench.cli.run_names import NEWEST, RunArgument
 
 
 def calibrate(
-    run: Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run of a calibration protocol.")],
+    run: RunArgument = NEWEST,
+    *,
     sensor: Annotated[str, typer.Option(metavar="SIGNAL", help="Signal of the sensor.")],
     uncertainty: Annotated[
         float,
@@ -43,7 +45,7 @@ def calibrate(
     ] = None,
     json_file: JsonOption = None,
 ) -> None:
-    """Calibrate a sensor: what its readings mean, and how well that is known.
+    """Calibrate a sensor from a run of a calibration protocol: what its readings mean, and how well that is known.
 
     `accuracy` is the standard uncertainty of the mean of calibrated readings, that of the reference included;
     `repeatability` the standard deviation of one reading about the mean of many, which no calibration removes. A rig

@@ -35,18 +35,14 @@ class Comparing:
 
     train: Annotated[
         str | None,
-        typer.Option(
-            metavar="START:STOP", help="Rows to fit, from 0, without STOP; the others still drive the memory."
-        ),
+        typer.Option(metavar="START:STOP", help="Rows to fit, from 0, without STOP; others drive the memory."),
     ] = None
     test: Annotated[
         str | None,
-        typer.Option(
-            metavar="START:STOP|FILE", help="Rows, or another file, on which the errors of the model are stated."
-        ),
+        typer.Option(metavar="START:STOP|FILE", help="Rows, or another file or run, to test the model on."),
     ] = None
     table_out: Annotated[
-        Path | None, typer.Option(metavar="FILE.csv", help="File for the table of the models that were compared.")
+        Path | None, typer.Option(metavar="FILE.csv", help="Table of the models that were compared.")
     ] = None
 
     @property
@@ -95,7 +91,7 @@ def choose_model(data: Dataset, model: str, options: ModelOptions, fit: FitOptio
 
     orientation = fit.own["orientation"]
     given = Given(
-        options.values,
+        {name: value for name, value in options.values.items() if name not in ("ridge", "orientation")},
         initial=fit.own["initial"],
         orientation=None if orientation == "auto" else orientation,
         smoothing=fit.smoothing,

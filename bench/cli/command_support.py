@@ -67,7 +67,6 @@ JsonOption = Annotated[
         callback=_take_json,
     ),
 ]
-RunArgument = Annotated[Path, typer.Argument(metavar="RUN", help="Folder of a run, or its journal.")]
 LiveOption = Annotated[
     bool, typer.Option("--live/--no-live", help="Open the live view, or print its address where there is no display.")
 ]
@@ -80,9 +79,55 @@ NotifyOption = Annotated[
         "variables and as JSON on its input; or mailto:ADDRESS, or https://ADDRESS of a webhook. Repeatable.",
     ),
 ]
+
+
+def complete_rig(incomplete: str) -> list[str]:
+    """Return the rigs whose names begin so, for the completion of a shell."""
+    return _listed("rigs", incomplete)
+
+
+def complete_protocol(incomplete: str) -> list[str]:
+    """Return the protocols whose names begin so, for the completion of a shell."""
+    return _listed("protocols", incomplete)
+
+
+def complete_setting(context: typer.Context, incomplete: str) -> list[str]:
+    """Return the parameters of the protocol whose names begin so, for the completion of a shell."""
+    from bench.protocol import find_protocol
+
+    names = find_protocol(context.params.get("protocol") or "").parameters.model_fields
+    return [f"{name}=" for name in names if name.startswith(incomplete)]
+
+
+def _listed(kind: str, incomplete: str) -> list[str]:
+    from bench.cli.listing import listing
+
+    return [name for name in listing()[kind] if name.startswith(incomplete)]
+
+
+RigOption = Annotated[
+    str | None,
+    typer.Option(
+        "--rig",
+        metavar="RIG",
+        help="Name of a packaged rig, or a rig file: path/to/rig.toml.",
+        autocompletion=complete_rig,
+    ),
+]
+ProtocolArgument = Annotated[
+    str | None,
+    typer.Argument(
+        help="Name of a protocol, or a file of your own: path/to/file.py[:NAME].", autocompletion=complete_protocol
+    ),
+]
 SettingsOption = Annotated[
     list[str] | None,
-    typer.Option("--set", metavar="KEY=VALUE", help="Set a parameter of the protocol; repeatable."),
+    typer.Option(
+        "--set",
+        metavar="KEY=VALUE",
+        help="Set a parameter of the protocol; repeatable.",
+        autocompletion=complete_setting,
+    ),
 ]
 
 

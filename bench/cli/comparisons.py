@@ -13,7 +13,6 @@ from bench.base import percent, print_plain, show_patience, show_table
 from bench.cli.band_options import BandsOption, Recalibrating, print_examined
 from bench.cli.command_support import (
     JsonOption,
-    RunArgument,
     check_outputs,
     console,
     show_compilation,
@@ -22,6 +21,7 @@ from bench.cli.command_support import (
 )
 from bench.cli.data_options import ReadingGroup, offer_groups, print_assumptions
 from bench.cli.model_commands import InitialOption
+from bench.cli.run_names import BEFORE, NEWEST, RunArgument, find_run
 from bench.cli.written import print_figures, write_rows
 
 if TYPE_CHECKING:
@@ -37,7 +37,8 @@ def models_on_data(
         typer.Option(
             "--data",
             metavar="FILE",
-            help="Table of measurements (text, .mat, .xlsx, .h5, .tdms, .parquet), or folder of a run.",
+            help="Table of measurements (text, .mat, .xlsx, .h5, .tdms, .parquet), or a run.",
+            parser=find_run,
         ),
     ],
     input_column: Annotated[
@@ -113,8 +114,8 @@ def models_on_data(
 
 
 def compare(
-    first_run: RunArgument,
-    second_run: RunArgument,
+    first_run: RunArgument = BEFORE,
+    second_run: RunArgument = NEWEST,
     html: Annotated[
         Path | None, typer.Option(metavar="FILE.html", help="Page of the comparison with figures, in one file.")
     ] = None,

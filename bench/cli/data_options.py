@@ -16,35 +16,19 @@ from bench.cli.command_support import console
 
 
 def _layout(
-    delimiter: Annotated[
-        str | None,
-        typer.Option(metavar="CHARACTER", help="Between columns: comma, semicolon, tab, blanks, or the character."),
-    ] = None,
-    decimal: Annotated[str | None, typer.Option(metavar="SIGN", help="Decimal sign: point or comma.")] = None,
-    encoding: Annotated[
-        str | None, typer.Option(metavar="NAME", help="Encoding of the text, such as utf-8, cp1252 or utf-16.")
-    ] = None,
-    skip_lines: Annotated[int, typer.Option(metavar="LINES", help="First lines of the file that are left out.")] = 0,
-    table: Annotated[
-        str | None,
+    format_: Annotated[
+        list[str] | None,
         typer.Option(
-            metavar="TABLE",
-            help="Table of a file of several: number from 1; name of a sheet or variable; of a run: telemetry.",
-        ),
-    ] = None,
-    interval: Annotated[
-        str | None,
-        typer.Option(metavar="TIME", help="Rows are this far apart, and no column has times: 0.1s, 50ms."),
-    ] = None,
-    time_unit: Annotated[
-        str | None,
-        typer.Option(
-            metavar="UNIT", help="Times have this unit, which their head does not say: d, h, min, s, ms, us or ns."
+            "--format",
+            metavar="WORD=VALUE,...",
+            help="What is not to be found from the file: decimal=comma, delimiter=semicolon, encoding=cp1252, skip=3 "
+            "(first lines), table=2 (number, sheet or variable; telemetry of a run), interval=0.1s (between rows), "
+            "time-unit=ms.",
         ),
     ] = None,
 ) -> ReadingOptions:
-    """Return the options of the layout of a file; its signature is that of the options."""
-    return ReadingOptions(delimiter, decimal, encoding, skip_lines, table, interval, time_unit)
+    """Return the options of the layout of a file; its signature is that of the option."""
+    return ReadingOptions.parse(",".join(format_ or ()))
 
 
 ReadingGroup = Annotated[ReadingOptions, _layout]

@@ -12,6 +12,7 @@ from bench.analysis import ReadingOptions
 from bench.base import ConfigurationError, show_patience, show_table
 from bench.cli.command_support import JsonOption, check_outputs, console, print_rows, show_compilation, write_json
 from bench.cli.data_options import ReadingGroup, offer_groups
+from bench.cli.run_names import find_run
 
 if TYPE_CHECKING:
     from bench.identification import Continuation
@@ -44,7 +45,7 @@ def design(
         Path | None, typer.Option(metavar="model.json", help="Model that is to be measured further, with --continue.")
     ] = None,
     data: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Measurements of the model, or the folder of their run.")
+        Path | None, typer.Option(metavar="FILE", help="Measurements of the model, or their run.", parser=find_run)
     ] = None,
     input_column: Annotated[
         str | None, typer.Option("--input", metavar="COLUMN", help="Their input column; the model's if not given.")

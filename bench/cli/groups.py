@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Callable, Mapping
+from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, NamedTuple
@@ -11,7 +12,7 @@ from typing import Annotated, Any, ClassVar, NamedTuple
 import typer
 from typer.core import TyperGroup
 
-from bench.base import ConfigurationError, registry
+from bench.base import ConfigurationError, closest, registry
 from bench.cli.command_support import (
     FigureFormat,
     FigureFormatOption,
@@ -116,7 +117,11 @@ class Group(TyperGroup):
         """Take the words; without any, show help and end, or carry out the command that is meant by none."""
         asks_for_help = any(word in HELP_OPTIONS["help_option_names"] for word in args[:1])
         is_meant = not self.no_args_is_help and not ctx.resilient_parsing if not args else not asks_for_help
-        if self.otherwise and is_meant and args[:1] not in [[name] for name in self.list_commands(ctx)]:
+        names = self.list_commands(ctx)
+        if self.otherwise and is_meant and args[:1] not in [[name] for name in names]:
+            word = args[0] if args else "-"
+            if word[0] != "-" and not Path(word).exists() and (near := get_close_matches(word, names)):
+                raise ConfigurationError(f"{ctx.command_path}: there is no {word}; did you mean {near[0]}?")
             args = [self.otherwise, *args]
         if not args and not ctx.resilient_parsing:
             args = ["--help"]
@@ -127,6 +132,9 @@ class Group(TyperGroup):
         now = next((now for former, now in self.former.items() if fnmatchcase(args[0], former)), None)
         if now is not None and args[0] not in self.registered():
             raise ConfigurationError(f"bench {args[0]} is now {now}")
+        if self.get_command(ctx, args[0]) is None and not ctx.resilient_parsing:
+            known = closest(args[0], self.list_commands(ctx), f"`{ctx.command_path} --help`")
+            raise ConfigurationError(f"{ctx.command_path}: there is no command {args[0]}; {known}")
         return super().resolve_command(ctx, args)
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401

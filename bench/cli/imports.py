@@ -42,7 +42,7 @@ def import_(
     """Make a run of a file of measurements of another program: each row becomes a reading.
 
     `bench report`, `bench identify` and `bench runs` then take its folder as that of any run. The file is kept in the
-    record. Without times or --interval, rows are 1 s apart; the time of day is that of the file.
+    record. Without times or --format interval=TIME, rows are 1 s apart; the time of day is that of the file.
     """
     from bench.analysis import import_file
 

@@ -12,10 +12,11 @@ from rich.table import Table
 
 from bench.base import RecordError, print_plain, show_table
 from bench.cli.command_support import JsonOption, check_outputs, console, write_json
+from bench.cli.run_names import NEWEST, RunArgument
 
 
 def repair(
-    journal: Annotated[Path, typer.Argument(metavar="FILE", help="A journal, or the folder of a run.")],
+    journal: RunArgument = NEWEST,
     second: Annotated[
         list[Path] | None,
         typer.Option(

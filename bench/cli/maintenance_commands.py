@@ -14,11 +14,24 @@ from rich.markup import escape
 from rich.table import Table
 
 from bench.base import AbortError, ConfigurationError, DeviceError, show_table
-from bench.cli.command_support import JsonOption, console, parse_assignments, show_compilation, warn, write_json
+from bench.cli.command_support import (
+    JsonOption,
+    complete_rig,
+    console,
+    parse_assignments,
+    show_compilation,
+    warn,
+    write_json,
+)
 
 UNSAFE_EXIT_CODE = 7
 
-RigArgument = Annotated[str, typer.Argument(metavar="RIG", help="A packaged rig, or a rig file: path/to/rig.toml.")]
+RigArgument = Annotated[
+    str,
+    typer.Argument(
+        metavar="RIG", help="A packaged rig, or a rig file: path/to/rig.toml.", autocompletion=complete_rig
+    ),
+]
 OverrideOption = Annotated[
     list[str] | None,
     typer.Option("--override", metavar="KEY=VALUE", help="Replace a value of the rig file; repeatable."),

@@ -33,6 +33,7 @@ from bench.cli.command_support import (
 )
 from bench.cli.data_options import ReadingGroup, offer_groups, print_assumptions
 from bench.cli.model_options import ModelOptions
+from bench.cli.run_names import NEWEST, complete_run, find_run
 from bench.cli.written import print_figures, write_rows
 
 if TYPE_CHECKING:
@@ -43,7 +44,9 @@ DataArgument = Annotated[
     Path,
     typer.Argument(
         metavar="FILE",
-        help="Table of measurements (text, .mat, .xlsx, .h5, .tdms, .parquet), or the folder of a run.",
+        help="Table of measurements (text, .mat, .xlsx, .h5, .tdms, .parquet), or a run.",
+        parser=find_run,
+        autocompletion=complete_run,
     ),
 ]
 ModelArgument = Annotated[Path, typer.Argument(metavar="model.json", help="A model file.")]
@@ -83,42 +86,35 @@ class Fitting:
         typer.Option(
             "--input",
             metavar="COLUMN",
-            help="Input column. FILE:COLUMN is of a second file; A,B joins columns in order.",
+            help="Input column; of a run its drive. FILE:COLUMN: of a second file; A,B: joined in order.",
         ),
     ] = ""
-    output_column: Annotated[str, typer.Option("--output", metavar="COLUMN", help="Output column, as the input.")] = (
-        ""
-    )
+    output_column: Annotated[
+        str, typer.Option("--output", metavar="COLUMN", help="Output column; of a run its response.")
+    ] = ""
     model: Annotated[
         str,
         typer.Option(
             metavar="NAME[,NAME...]|all",
-            help="Model to fit; `bench list` shows the names. Of several, or all, the one that predicts best what is "
-            "left out of its fit.",
+            help="Model to fit, see `bench list`; of several, the one that best predicts what its fit left out.",
         ),
     ] = "all"
     smoothing: Annotated[
         float | None,
         typer.Option(
             min=0.0,
-            help="Weight of the roughness penalty on the density; if not given, 0, and by cross-validation for "
-            "signed densities.",
+            help="Weight of the roughness penalty on the density; 0, for signed densities by cross-validation.",
         ),
-    ] = None
-    ridge: Annotated[
-        float | None,
-        typer.Option(min=0.0, help="Weight of the penalty on the size of the density; if not given, as --smoothing."),
     ] = None
     skip: Annotated[
         int,
-        typer.Option(min=0, metavar="ROWS", help="First rows, which drive the memory but are left out of the fit."),
+        typer.Option(min=0, metavar="ROWS", help="First rows that drive the memory only."),
     ] = 0
     initial: Annotated[
         str | None,
         typer.Option(
             metavar="KIND",
-            help="Memory at the first row: negative or positive saturation, or unknown: skip the rows that it could "
-            "reach, or estimate it.",
+            help="Memory at the first row: negative, positive, skip (the rows that it could reach), or estimate.",
         ),
     ] = None
     time_column: Annotated[
@@ -126,35 +122,15 @@ class Fitting:
         typer.Option(
             "--time",
             metavar="COLUMN|none",
-            help="Column of times: models with time take part in the comparison. If not given, one named time or t; "
-            "none leaves time out.",
+            help="Column of times, for models with time; one named time or t if not given.",
         ),
     ] = None
-    static: Annotated[
-        str | None,
-        typer.Option(metavar="NAME", help="Operator within a model with time, such as preisach (hammerstein)."),
-    ] = None
-    dynamics: Annotated[
-        str | None,
-        typer.Option(
-            metavar="LIST",
-            help="What follows the operator or stands beside it: lag, resonance, delay, creep, kelvin-voigt, drift, "
-            "fading-drift, viscous, friction, or none; chosen by the data if not given (hammerstein).",
-        ),
-    ] = None
-    orientation: Annotated[
-        str,
-        typer.Option(
-            metavar="KIND",
-            help="Whether the output rises or falls with the input: auto (what fits better), rising, falling.",
-        ),
-    ] = "auto"
     weights_column: Annotated[
         str | None,
-        typer.Option("--weights", metavar="COLUMN", help="Column of the weight of each row in the fit, ≥ 0."),
+        typer.Option("--weights", metavar="COLUMN", help="Column of the weights of the rows, ≥ 0."),
     ] = None
     cross_validate: Annotated[
-        bool, typer.Option("--cross-validate", help="Choose the smoothing by cross-validation, and show the table.")
+        bool, typer.Option("--cross-validate", help="Choose the smoothing by cross-validation.")
     ] = False
     band: BandOption = False
     verbose: Annotated[
@@ -165,23 +141,20 @@ class Fitting:
         """Return the options of the fit; with several models without those of one."""
         from bench.analysis import FitOptions
 
-        own: dict[str, Any] = {"initial": self.initial, "orientation": self.orientation}
+        values = dict(options.values)
+        ridge = values.pop("ridge", None)
+        own: dict[str, Any] = {"initial": self.initial, "orientation": values.pop("orientation", "auto")}
         if not is_comparison(self.model):
-            own |= {**options.values, "static": self.static, "dynamics": self.dynamics}
+            own |= values
         levels, train = options.levels_to_try, comparing.train_rows
-        return FitOptions(self.smoothing, self.ridge, self.skip, self.cross_validate, levels, train, self.band, own)
+        return FitOptions(self.smoothing, ridge, self.skip, self.cross_validate, levels, train, self.band, own)
 
     def check(self, comparing: Comparing, options: ModelOptions) -> None:
         """Check that the options go together, before anything is read.
 
         Raises ConfigurationError otherwise.
         """
-        missing = [
-            name for name, column in (("--input", self.input_column), ("--output", self.output_column)) if not column
-        ]
-        if missing:
-            raise ConfigurationError(f"{' and '.join(missing)} must be given: a column of the measurements")
-        if self.input_column == self.output_column:
+        if self.input_column and self.input_column == self.output_column:
             raise ConfigurationError(
                 f"--input and --output are the same column, {self.input_column}; a model needs two"
             )
@@ -191,8 +164,6 @@ class Fitting:
             return
         if self.cross_validate or self.weights_column:
             raise ConfigurationError("--cross-validate and --weights go with one --model NAME")
-        if self.static is not None or self.dynamics is not None:
-            raise ConfigurationError("--static and --dynamics go with --model hammerstein")
         if options.levels_to_try:
             raise ConfigurationError("--levels: give one number, or none, to compare models; or one --model")
 
@@ -204,7 +175,7 @@ class FitOutputs:
     out: Annotated[Path | None, typer.Option(metavar="model.json", help="Model file to write.")] = None
     card: Annotated[
         Path | None,
-        typer.Option(metavar="FILE.md", help="Model card to write: data, errors, limits of validity, command line."),
+        typer.Option(metavar="FILE.md", help="Model card to write."),
     ] = None
     figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for figures.")] = None
     json_file: JsonOption = None
@@ -215,12 +186,17 @@ class FitOutputs:
 def identify_(
     context: typer.Context,
     files: Annotated[
-        list[Path],
+        list[Path] | None,
         typer.Argument(
             metavar="FILE...",
-            help="Tables of measurements (text, .mat, .xlsx, .h5, .tdms, .parquet), or runs; one model of all.",
+            help="Tables of measurements (text, .mat, .xlsx, .h5, .tdms, .parquet), or runs; one model of all. The "
+            "newest run if not given.",
+            parser=find_run,
+            autocompletion=complete_run,
+            show_default=False,
         ),
-    ],
+    ] = None,
+    *,
     fitting: Fitting,
     outputs: FitOutputs,
     reading: ReadingGroup,
@@ -229,16 +205,21 @@ def identify_(
 ) -> None:
     """Identify a hysteresis model from measurements, and say how good it is.
 
-    Columns are named as in the header; a unit at the end, as in `force [N]`, may be left out and goes into the
-    model. A number, such as `--input 1`, chooses a column by its place. The layout of a file is found from it and
-    printed; `--delimiter`, `--decimal`, `--encoding`, `--skip-lines` and `--table` set it. Of a run, the readings of
-    its steps are taken: `bench identify RUN --input voltage --output displacement --model preisach --out model.json`;
-    `--table telemetry` takes those within its steps, as of a fast loop.
+    Columns are named as in the header, without or with their unit, or by number. Of a run, the readings of its steps
+    are taken, by default the signals of the slots drive and response. The layout of a file is found from it and
+    printed; --format sets what is not. A model of several inputs takes the runs of its protocols, in any order.
     """
-    from bench.analysis import ColumnNames, certificate_lines, fit_sentence, identify_model, whole_identification
+    from bench.analysis import (
+        ColumnNames,
+        certificate_lines,
+        fit_sentence,
+        identify_model,
+        input_and_output,
+        whole_identification,
+    )
     from bench.identification import ONE_RUN
 
-    out = outputs.out
+    out, files = outputs.out, files or [find_run(NEWEST)]
     check_outputs(**vars(outputs), read=[*files, *comparing.test_files])
     if (whole := whole_identification(fitting.model)) is not None:
         _identify_whole(context, whole, files, comparing, options, outputs)
@@ -246,7 +227,8 @@ def identify_(
     if comparing.table_out is not None:
         check_outputs(out=comparing.table_out)
     fitting.check(comparing, options)
-    names = ColumnNames(fitting.input_column, fitting.output_column, fitting.time_column, fitting.weights_column)
+    columns = input_and_output(files[0], (fitting.input_column, fitting.output_column), reading)
+    names = ColumnNames(*columns, fitting.time_column, fitting.weights_column)
     model, fit = fitting.model, fitting.settings(comparing, options)
     patience = f"reading and fitting {', '.join(file.name for file in files)}"
     with show_patience(patience, console):

@@ -28,47 +28,20 @@ class ModelOptions:
         str | None,
         typer.Option(
             metavar="NUMBER[,NUMBER...]",
-            help="Levels of the Preisach plane; 20 if not given. Of several numbers cross-validation chooses.",
+            help="Levels of the Preisach plane; 20 if not given. Cross-validation chooses of several numbers.",
         ),
-    ] = None
-    level_values: Annotated[
-        str | None,
-        typer.Option(metavar="VALUE,VALUE...", help="The levels themselves, in input units, instead of --levels."),
-    ] = None
-    spacing: Annotated[
-        str | None,
-        typer.Option(metavar="KIND", help="Of the levels: uniform, or quantiles of the inputs at the reversals."),
     ] = None
     plane: Annotated[
         tuple[float, float] | None,
-        typer.Option(
-            metavar="LOW HIGH", help="Ends of the Preisach plane, in input units; the model's own if not given."
-        ),
+        typer.Option(metavar="LOW HIGH", help="Ends of the Preisach plane; the model's own if not given."),
     ] = None
-    reversible: Annotated[
-        str | None,
-        typer.Option(metavar="KIND", help="Reversible part beside the density: none, linear, quadratic, polynomial."),
-    ] = None
-    degree: Annotated[
-        int | None,
-        typer.Option(min=1, max=60, help="Degree of a polynomial: of the model (12) or the reversible part (5)."),
-    ] = None
-    plays: Annotated[int | None, typer.Option(min=1, max=1000, help="Number of plays.")] = None
-    maximum: Annotated[
-        float | None, typer.Option(help="Greatest threshold of the plays or elements, in input units.")
-    ] = None
-    origin: Annotated[float | None, typer.Option(help="Input of the relaxed state, in input units.")] = None
-    dead_zones: Annotated[int | None, typer.Option(min=0, max=1000, help="Number of dead zones after the plays.")] = (
-        None
-    )
     options: Annotated[
         list[str] | None,
         typer.Option(
             "-o",
-            "--option",
             metavar="NAME=VALUE",
-            help="Another option of the model, as `bench show MODEL` names it: a number, numbers with commas, or a "
-            "word; repeatable.",
+            help="Option of the model, see `bench show MODEL`; also ridge=WEIGHT (penalty on the density's size) and "
+            "orientation=rising|falling. Repeatable.",
         ),
     ] = None
 
@@ -84,16 +57,11 @@ class ModelOptions:
 
         Raises ConfigurationError if one is given twice, or is none.
         """
-        named = ("spacing", "plane", "reversible", "degree", "plays", "maximum", "origin", "dead_zones")
-        values = {name: value for name in named if (value := getattr(self, name)) is not None}
-        for name, text in parse_assignments("--option", self.options or ()).items():
-            if name in values:
-                raise ConfigurationError(f"--option {name}={text}: {name} is given twice")
+        values: dict[str, Any] = {} if self.plane is None else {"plane": self.plane}
+        for name, text in parse_assignments("-o", self.options or ()).items():
+            if name in values or (name == "levels" and self.levels is not None):
+                raise ConfigurationError(f"-o {name}={text}: {name} is given twice")
             values[name] = _value(text)
-        if self.level_values is not None:
-            if self.levels is not None:
-                raise ConfigurationError("--levels and --level-values: give one of them")
-            values["levels"] = tuple(_numbers("--level-values", self.level_values))
         counts = _level_counts(self.levels)
         if len(counts) == 1:
             values["levels"] = counts[0]
@@ -108,7 +76,7 @@ def _level_counts(text: str | None) -> tuple[int, ...]:
         if number != int(number) or not _FEWEST_LEVELS <= number <= _MOST_LEVELS:
             raise ConfigurationError(
                 f"--levels {text}: expected whole numbers from {_FEWEST_LEVELS} to {_MOST_LEVELS}, such as 20 or "
-                "10,20,40; --level-values takes the levels themselves"
+                "10,20,40; -o levels=VALUE,VALUE,... takes the levels themselves"
             )
         counts.append(int(number))
     return tuple(counts)

@@ -74,4 +74,4 @@ def panel(
         if hands.error is not None:
             print_error(hands.error)
             raise SystemExit(hands.error.exit_code)
-        print_result(hands.result, None)
+        print_result(hands.result, None, can_resume=False)

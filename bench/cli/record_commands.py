@@ -13,16 +13,16 @@ from bench.cli.command_support import (
     FigureFormat,
     FigureFormatOption,
     JsonOption,
-    RunArgument,
     console,
     show_compilation,
     write_json,
 )
+from bench.cli.run_names import NEWEST, RunArgument
 
 
 @show_compilation()
 def report(
-    run: RunArgument,
+    run: RunArgument = NEWEST,
     models: Annotated[
         list[Path] | None,
         typer.Option("--model", metavar="FILE", help="Model file to compare; repeatable."),
@@ -65,7 +65,8 @@ class ExportFormat(StrEnum):
 
 @show_compilation()
 def export(
-    run: RunArgument,
+    run: RunArgument = NEWEST,
+    *,
     format_: Annotated[ExportFormat, typer.Option("--format", help="Format of the files.")],
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder to write to; the folder of the run if not given.")

@@ -10,9 +10,11 @@ import typer
 from rich.markup import escape
 from rich.table import Column, Table
 
-from bench.base import show_table
+from bench.base import ConfigurationError, show_table
 from bench.cli.command_support import (
     JsonOption,
+    ProtocolArgument,
+    RigOption,
     SettingsOption,
     console,
     parse_assignments,
@@ -26,13 +28,8 @@ if TYPE_CHECKING:
 
 
 def rehearse(
-    protocol: Annotated[
-        str, typer.Argument(help="Name of a protocol, or a file of your own: path/to/file.py[:NAME].")
-    ],
-    rig: Annotated[
-        str,
-        typer.Option("--rig", metavar="RIG", help="Name of a packaged rig, or a rig file: path/to/rig.toml."),
-    ],
+    protocol: ProtocolArgument = None,
+    rig: RigOption = None,
     settings: SettingsOption = None,
     overrides: Annotated[
         list[str] | None,
@@ -52,6 +49,8 @@ def rehearse(
     from bench.execution import Run
     from bench.protocol import find_protocol
 
+    if protocol is None or rig is None:
+        raise ConfigurationError("PROTOCOL and --rig must be given; `bench list` shows both")
     asked = Run(
         protocol=find_protocol(protocol),
         settings=parse_assignments("--set", settings or []),

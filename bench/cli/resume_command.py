@@ -11,16 +11,16 @@ from bench.cli.command_support import (
     JsonOption,
     LiveOption,
     NotifyOption,
-    RunArgument,
     check_outputs,
     console,
     show_compilation,
 )
 from bench.cli.run_commands import print_result
+from bench.cli.run_names import NEWEST, RunArgument
 
 
 def resume(
-    run: RunArgument,
+    run: RunArgument = NEWEST,
     sigmas: Annotated[
         float,
         typer.Option(min=0.1, max=1000, help="Standard deviations by which the specimen may differ from the record."),

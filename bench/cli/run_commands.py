@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 from collections.abc import Mapping
 from pathlib import Path
@@ -11,11 +12,13 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from bench.base import BenchError, ConfigurationError, format_duration, print_plain, show_table
+from bench.base import BenchError, ConfigurationError, closest, format_duration, print_plain, show_table
 from bench.cli.command_support import (
     JsonOption,
     LiveOption,
     NotifyOption,
+    ProtocolArgument,
+    RigOption,
     SettingsOption,
     check_given,
     check_outputs,
@@ -30,6 +33,7 @@ from bench.cli.command_support import (
 )
 from bench.cli.model_options import inverse_of, options_json, print_model, print_models
 from bench.cli.rehearse_command import show_rehearsal
+from bench.cli.run_names import find_run
 
 if TYPE_CHECKING:
     from bench.execution import RunResult
@@ -83,10 +87,8 @@ def show(
         console.print(others[name], highlight=False)
         write_json(json_file, {"name": name, "summary": others[name]})
     else:
-        known = ", ".join([*catalogue.rigs, *catalogue.protocols, *specs, *others])
-        raise ConfigurationError(
-            f"there is no rig, protocol, model, controller or study {name!r}; there are: {known}"
-        )
+        known = closest(name, [*catalogue.rigs, *catalogue.protocols, *specs, *others], "`bench list`")
+        raise ConfigurationError(f"there is no rig, protocol, model, controller or study {name!r}; {known}")
 
 
 def _model_json(spec: Any) -> dict[str, Any]:  # noqa: ANN401 - a ModelSpec, not imported at start
@@ -114,16 +116,16 @@ def _print_listing(listed: Mapping[str, Any]) -> None:
 
 def run(
     context: typer.Context,
-    protocol: Annotated[
-        str | None, typer.Argument(help="Name of a protocol, or a file of your own: path/to/file.py[:NAME].")
-    ] = None,
-    rig: Annotated[
-        str | None,
-        typer.Option("--rig", metavar="RIG", help="Name of a packaged rig, or a rig file: path/to/rig.toml."),
-    ] = None,
+    protocol: ProtocolArgument = None,
+    rig: RigOption = None,
     from_run: Annotated[
         Path | None,
-        typer.Option("--from", metavar="RUN", help="Carry this run out again, in place of PROTOCOL; see below."),
+        typer.Option(
+            "--from",
+            metavar="RUN",
+            help="Carry this run out again, in place of PROTOCOL; see below.",
+            parser=find_run,
+        ),
     ] = None,
     settings: SettingsOption = None,
     overrides: Annotated[
@@ -136,13 +138,14 @@ def run(
     ] = None,
     seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers of an emulated laboratory.")] = 0,
     clock: Annotated[
-        str,
+        str | None,
         typer.Option(
-            help="wall; on emulated rigs also virtual (as fast as possible) or xN (N times as fast as the wall "
-            "clock). There a process that cannot keep up slows the laboratory down, so that no emulated watchdog "
-            "trips because the machine is busy; the factor reached is recorded, and printed if it is below 90 % of N."
+            metavar="CLOCK",
+            help="On emulated rigs: virtual (as fast as possible; if not given), wall, or xN (N times as fast as the "
+            "wall clock; a machine that cannot keep up slows the laboratory down, and the factor reached is "
+            "recorded). Hardware has wall alone.",
         ),
-    ] = "wall",
+    ] = None,
     attach: Annotated[
         Path | None,
         typer.Option(
@@ -228,7 +231,7 @@ def run(
         return
     if rig is None:
         raise ConfigurationError("--rig is missing; `bench list` shows the installed rigs")
-    if attach is not None and (clock != "wall" or seed):
+    if attach is not None and (clock not in (None, "wall") or seed):
         raise ConfigurationError("--attach: clock and seed are the server's; leave --clock and --seed out")
     check_outputs(
         json_file=json_file, folder=None if dry_run else out, read=[Path(rig)] if rig.endswith(".toml") else []
@@ -303,7 +306,9 @@ def _repeat(
         print_result(found.result, json_file, {"repeats": str(found.original), **comparison.to_json()})
 
 
-def print_result(result: RunResult, json_file: Path | None, more: Mapping[str, Any] | None = None) -> None:
+def print_result(
+    result: RunResult, json_file: Path | None, more: Mapping[str, Any] | None = None, *, can_resume: bool = True
+) -> None:
     """Print how a run ended, write it with `more` for programs, and exit with the code of what ended it."""
     from bench.rig import SAFE
 
@@ -322,6 +327,9 @@ def print_result(result: RunResult, json_file: Path | None, more: Mapping[str, A
     if outcome.pace is not None and not outcome.pace.is_reached:
         console.print(f"clock: {outcome.pace}", highlight=False)
     print_plain(console, f"record: {result.folder}")
+    following = "report" if outcome.status == "completed" else "resume" if outcome.steps and can_resume else ""
+    if following:
+        print_plain(console, f"next: {shlex.join(['bench', following, str(result.folder)])}")
     write_json(
         json_file,
         {

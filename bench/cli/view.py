@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bench.base import DataError, needed_for, print_plain
+from bench.base import needed_for, print_plain
 from bench.cli.command_support import console, show_compilation
+from bench.cli.run_names import NEWEST, complete_run, find_run
 
 if TYPE_CHECKING:
     from bench.dashboard import JournalView
@@ -38,11 +39,13 @@ def view(
     run: Annotated[
         str,
         typer.Argument(
-            metavar="[RUN|ADDRESS]",
-            help="Folder of a run; a folder with runs, of which the newest in progress is taken; or the address of a "
-            "live view.",
+            metavar="RUN|ADDRESS",
+            help="A run, as in `bench report`; a folder, of whose runs the newest is taken; or the address of a live "
+            "view. The newest run if not given.",
+            autocompletion=complete_run,
+            show_default=False,
         ),
-    ] = "recordings",
+    ] = str(NEWEST),
     speed: Annotated[
         float,
         typer.Option(
@@ -66,7 +69,10 @@ def view(
         with _viewer(run, browser=browser) as is_open:
             _wait(is_open)
         return
-    folder, goes_on = _find(Path(run))
+    from bench.rig import is_in_use
+
+    folder = find_run(run)
+    goes_on = is_in_use(folder.parent if folder.is_file() else folder)
     with suppress(KeyboardInterrupt), JournalView(folder, port) as shown:
         print_plain(console, f"{'watching' if goes_on else 'replaying'} {folder}")
         with _viewer(shown.uri, browser=browser) as is_open:
@@ -107,23 +113,6 @@ def _replay(shown: JournalView, speed: float, is_open: Callable[[], bool]) -> st
         done = end
         clock.sleep(_FRAME)
     return "the replay has ended"
-
-
-def _find(path: Path) -> tuple[Path, bool]:
-    """Return the folder of a run and whether it goes on: the one given, or the newest in progress below a folder.
-
-    Raises DataError if there is none.
-    """
-    from bench.record import FILE_NAME
-    from bench.rig import is_in_use
-
-    found = [journal.parent for journal in path.glob(f"*/{FILE_NAME}") if is_in_use(journal.parent)]
-    if found:
-        return max(found, key=lambda folder: (folder / FILE_NAME).stat().st_mtime), True
-    if path.is_dir() and not (path / FILE_NAME).is_file() and [*path.glob(f"*/{FILE_NAME}")]:
-        raise DataError(f"{path}: no run is in progress there; bench runs lists those that have ended")
-    folder = path.parent if path.name == FILE_NAME else path
-    return path, is_in_use(folder)
 
 
 @contextmanager

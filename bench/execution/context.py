@@ -108,8 +108,9 @@ class Run:
         Values of the rig file to replace, by dotted key.
     seed : int
         Seed of everything random in an emulated laboratory.
-    clock : str
-        `wall`, `virtual` or `xN`; see `bench.base.clock.make_clock`.
+    clock : str, optional
+        `wall`, `virtual` or `xN`; see `bench.base.clock.make_clock`. If not given, `virtual` where all instruments
+        are emulated in this process, else `wall`.
     folder : Path
         Where the folder of the run is made.
     live : bool
@@ -147,7 +148,7 @@ class Run:
     folder: Path
     overrides: Mapping[str, str] = field(default_factory=dict)
     seed: int = 0
-    clock: str = "wall"
+    clock: str | None = None
     live: bool = False
     recording: bool = True
     attach: Path | None = None
@@ -195,8 +196,10 @@ class RunContext(ExitStack):
         self, run: Run, console: Console, interrupts: Interrupts | None = None, again: Interrupted | None = None
     ) -> None:
         super().__init__()
-        self.run, self._console, self._again = run, console, again
         self.rig_file, self._stated, self.parameters = _read(run)
+        if run.clock is None:
+            run = replace(run, clock="virtual" if self.rig_file.in_process and run.attach is None else "wall")
+        self.run, self._console, self._again = run, console, again
         self._faults = () if run.faults is None else read_schedule(run.faults)
         self._notifier = Notifier(run.notify) if run.notify else None
         self._dashboard_class = _dashboard_class(run, console)
@@ -507,7 +510,7 @@ def _connected(
 def _clock(run: Run, file: RigFile, stack: ExitStack) -> tuple[Clock, Attachment | None]:
     """Return the clock of a run, and the served laboratory that it is of."""
     if run.attach is None:
-        return clock_for(file, run.clock), None
+        return clock_for(file, run.clock or "wall"), None
     if not file.emulated:
         raise ConfigurationError(f"rig {file.name} has no emulated laboratory that could be served elsewhere")
     attachment = attach(run.attach, file.name)

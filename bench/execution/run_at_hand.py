@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from operator import itemgetter
 from typing import Any, Protocol
 
-from bench.base import AbortError, ConfigurationError, Interrupts
+from bench.base import AbortError, ConfigurationError, Interrupts, format_duration
 from bench.control import Trace
 from bench.devices import Settled, Signal
 from bench.execution.station.interface import Station
@@ -23,6 +23,8 @@ NOT_AT_WORK = dict.fromkeys(_TRACE_AND_LATENESS, math.nan)
 
 _GRACE = 2.0
 """Wall-clock time beyond the next tick by which the station expects to hear from a hold, s."""
+_LONG = 600.0
+"""Laboratory time after which the end of a run has to be confirmed at a pause, s."""
 
 
 class RunRecord(Protocol):
@@ -353,12 +355,17 @@ class RunAtHand:
         text = f"paused by {why or 'the operator'}; the set-points stand"
         self.event("WARN", "pause", text)
         off: dict[str, float] = {}
-        problem = ""
+        problem, is_sure = "", False
         while True:
             changeable = {} if self.parameters is None else self.parameters.changeable()
             answer = self.await_answer(self.ask, Question(text, AT_A_PAUSE, "PAUSED", changeable, problem))
             command, _, rest = answer.partition(" ")
             problem = ""
+            if command == ABORT and not is_sure and (past := self.clock.now() - self.zero) > _LONG:
+                problem = f"the run has taken {format_duration(past)}; answer abort once more to end it"
+                is_sure = True
+                continue
+            is_sure = False
             if command == NOTE:
                 self.event("INFO", "remark", rest)
             elif command == SET:

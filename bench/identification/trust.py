@@ -124,7 +124,9 @@ def _free(found: Fit, signed: bool) -> list[Advice]:
     free, count = found.certificate.passive, found.coefficients.size
     if free >= min(_FEWEST_FREE, count):
         return []
-    remedy = "a larger record" if signed else "--orientation auto, --reversible polynomial or --model preisach-signed"
+    remedy = (
+        "a larger record" if signed else "-o orientation=auto, -o reversible=polynomial or --model preisach-signed"
+    )
     text = f"free coefficients: only {free} of {count}, so that the model hardly answers to its input"
     return [Advice("few-free", text, f"try {remedy}")]
 
@@ -135,9 +137,9 @@ def _explained(explained: float, template: Operator[Any], signed: bool) -> list[
     if template.memoryless:
         remedy = "a model with memory, such as --model preisach"
     elif signed:
-        remedy = "--reversible polynomial, or more levels"
+        remedy = "-o reversible=polynomial, or more levels"
     else:
-        remedy = "--model preisach-signed, for outputs that rise and fall, or --reversible polynomial"
+        remedy = "--model preisach-signed, for outputs that rise and fall, or -o reversible=polynomial"
     text = (
         f"the model explains {max(explained, 0.0):.0%} of the variance of the output (R² < 0.5), which may not "
         "depend on this input at all"
@@ -208,7 +210,7 @@ def _unit(template: Operator[Any]) -> list[Advice]:
     if not unit or not template.input_units or unit in template.input_units:
         return []
     text = f"the reversible part of this model is for an input in {template.input_units[0]}; this one is in {unit}"
-    return [Advice("unit", text, "use --model preisach --reversible polynomial")]
+    return [Advice("unit", text, "use --model preisach -o reversible=polynomial")]
 
 
 def _butterfly(problem: FitProblem, errors: Floats) -> list[Advice]:

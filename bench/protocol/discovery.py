@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 
-from bench.base import ConfigurationError, registry
+from bench.base import ConfigurationError, closest, registry
 from bench.protocol.parameters import ProtocolDefinition
 
 
@@ -88,7 +88,7 @@ def find_protocol(name: str) -> ProtocolDefinition:
     if name not in packaged.protocols:
         left_out = "".join(f"\n{problem}" for problem in packaged.problems)
         raise ConfigurationError(
-            f"there is no protocol {name!r}; there are: {', '.join(packaged.protocols)} "
+            f"there is no protocol {name!r}; {closest(name, packaged.protocols, '`bench list`')} "
             f"(or a file of your own, path/to/file.py){left_out}"
         )
     return packaged.protocols[name]

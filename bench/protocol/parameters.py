@@ -10,7 +10,7 @@ from typing import Any, Literal, cast, get_args, get_origin, get_type_hints
 from pydantic import Field, ValidationError
 from pydantic_core import PydanticUndefined
 
-from bench.base import CheckedTable, ConfigurationError, comma_remark, is_quantity, read_quantity
+from bench.base import CheckedTable, ConfigurationError, closest, comma_remark, explain, is_quantity, read_quantity
 from bench.devices import Device, Signal
 from bench.protocol.changes import ParameterChange
 from bench.protocol.views import Views
@@ -291,10 +291,8 @@ class ProtocolDefinition:
         """
         for name in defaults or {}:
             if name not in self.parameters.model_fields:
-                known = ", ".join(self.parameters.model_fields) or "none"
-                raise ConfigurationError(
-                    f"{path}: protocols.{self.name}.{name}: there is no such parameter; there are: {known}"
-                )
+                known = closest(name, self.parameters.model_fields)
+                raise ConfigurationError(f"{path}: protocols.{self.name}.{name}: there is no such parameter; {known}")
         if roles is not None:
             # Before the parameters, whose defaults then are missing too.
             check_bound(self.name, self.slots, roles, path)
@@ -311,7 +309,7 @@ class ProtocolDefinition:
             if choices is not None and getattr(parameters, name) not in choices():
                 raise ConfigurationError(
                     f"protocol {self.name}: parameter {name} = {getattr(parameters, name)!r} is not allowed; "
-                    f"allowed: {', '.join(choices())}"
+                    f"{closest(str(getattr(parameters, name)), choices())}"
                 )
         return parameters
 
@@ -433,20 +431,21 @@ class ProtocolDefinition:
         for problem in error.errors():
             name = ".".join(str(part) for part in problem["loc"]) or "parameters"
             if problem["type"] == "extra_forbidden":
-                known = ", ".join(self.parameters.model_fields) or "none"
-                yield f"protocol {self.name}: there is no parameter {name!r}; there are: {known}"
+                known = closest(name, self.parameters.model_fields)
+                yield f"protocol {self.name}: there is no parameter {name!r}; {known}"
             elif name in self.parameters.model_fields:
                 given = "is missing" if problem["type"] == "missing" else f"= {problem['input']!r} is not allowed"
                 if problem["type"] == "missing" and isinstance(source := self._extra(name).get("default"), FromSlot):
                     given += f" (the rig file does not say {source.text})"
                 elif problem["type"] == "missing" and not self._extra(name).get("file"):
                     given += f" (nor does the rig file say it: [protocols.{self.name}] {name} = ...)"
+                why = "" if problem["type"] == "missing" else f" ({explain(problem)}){comma_remark(problem['input'])}"
                 yield (
                     f"{from_file.get(name, '')}protocol {self.name}: parameter {name} {given}; "
-                    f"allowed: {self._allowed(name, roles)} ({problem['msg']}){comma_remark(problem['input'])}"
+                    f"allowed: {self._allowed(name, roles)}{why}"
                 )
             else:
-                yield f"protocol {self.name}: {problem['msg'].removeprefix('Value error, ')}"
+                yield f"protocol {self.name}: {explain(problem)}"
 
 
 @dataclass(frozen=True)

@@ -28,7 +28,7 @@ from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, ValidationError, model_validator
 
-from bench.base import CheckedTable, DataError, DeviceError, parse_json, problems, write_json_file
+from bench.base import CheckedTable, DataError, DeviceError, parse_json, problems, reason, write_json_file
 from bench.devices import Signal
 from bench.rig.derived import Derived, DerivedSignal
 
@@ -149,7 +149,7 @@ def read_calibration(path: Path) -> Calibration:
     try:
         content = parse_json(path.read_text(encoding="utf-8"))
     except (OSError, ValueError) as error:
-        raise DataError(f"calibration file {path} cannot be read: {error}") from None
+        raise DataError(f"calibration file {path} cannot be read: {reason(error)}") from None
     try:
         return Calibration.model_validate(content)
     except ValidationError as error:

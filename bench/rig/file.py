@@ -82,11 +82,13 @@ from bench.base import (
     CheckedTable,
     Clock,
     ConfigurationError,
+    closest,
     in_si,
     is_quantity,
     parse_toml,
     problems,
     read_quantity,
+    reason,
     registry,
 )
 from bench.devices import Device, DriverSettings
@@ -365,14 +367,14 @@ def _read(name: str) -> tuple[str, str]:
         try:
             text = Path(name).read_text(encoding="utf-8-sig")
         except (OSError, UnicodeDecodeError) as error:
-            raise ConfigurationError(f"rig file {name} cannot be read: {error}") from None
+            raise ConfigurationError(f"rig file {name} cannot be read: {reason(error)}") from None
         registry.import_beside(Path(name))
         return name, text
     left_out: list[str] = []
     packaged = packaged_rigs(left_out)
     if name not in packaged:
-        known = f"{', '.join(packaged)} (or a file of your own, path/to/rig.toml)"
-        raise ConfigurationError("\n".join([f"there is no rig {name!r}; there are: {known}", *left_out]))
+        known = f"{closest(name, packaged, '`bench list`')} (or a file of your own, path/to/rig.toml)"
+        raise ConfigurationError("\n".join([f"there is no rig {name!r}; {known}", *left_out]))
     return f"{name}.toml", (resources.files(packaged[name].load()) / f"{name}.toml").read_text(encoding="utf-8")
 
 
@@ -490,7 +492,8 @@ def _validate(path: str, text: str, content: Mapping[str, Any]) -> RigFile:
     try:
         tables = _RigFileContent.model_validate(content)
     except ValidationError as error:
-        raise ConfigurationError("\n".join(f"{path}: {line}" for line in problems(error, _RigFileContent))) from None
+        wrong = [*problems(error, _RigFileContent), *_wrong_devices(content)]
+        raise ConfigurationError("\n".join(f"{path}: {line}" for line in wrong)) from None
     found: list[str] = []
     entries: list[DeviceEntry] = []
     for device, own in tables.devices.items():
@@ -563,6 +566,22 @@ def _after_their_sources(derived: Mapping[str, DerivedSignal]) -> dict[str, Deri
     return ordered
 
 
+def _wrong_devices(content: Mapping[str, Any]) -> list[str]:
+    """Return what is wrong with the devices of a file that is wrong elsewhere as well."""
+    found: list[str] = []
+    devices, lines = content.get("devices"), content.get("lines", {})
+    if (
+        isinstance(devices, dict)
+        and isinstance(lines, dict)
+        and all(isinstance(each, dict) for each in lines.values())
+    ):
+        for device, own in devices.items():
+            if isinstance(own, dict):
+                table = with_line(device, own, lines, [])
+                _load_part("devices", table, f"devices.{device}.", "driver", DriverSettings, "connect", found)
+    return found
+
+
 def _load_part(
     group: registry.Group,
     table: Mapping[str, Any],
@@ -608,8 +627,8 @@ def _load(group: registry.Group, reference: object, key: str) -> Any:  # noqa: A
     if isinstance(reference, str) and reference in registry.entries(group):
         return registry.load(group, reference)
     if not isinstance(reference, str) or reference.count(":") != 1:
-        names = ", ".join(registry.entries(group)) or "none"
-        raise ConfigurationError(f"{key} = {reference!r}: expected module:class, or a registered name: {names}")
+        names = closest(str(reference), registry.entries(group))
+        raise ConfigurationError(f"{key} = {reference!r}: expected module:class, or a registered name; {names}")
     module, _, name = reference.partition(":")
     try:
         registry.check_import(module)

@@ -157,9 +157,9 @@ def test_the_same_step_by_step(tmp_path, seed):
         runs[name] = json.loads((tmp_path / "run.json").read_text())["folder"]
     identified, validated = {}, {}
     for key, model, options in (
-        ("nonmonotonic", "preisach-nonmonotonic", ["--levels", 20, "--plane", 30, 70, "--option", "reference=20"]),
-        ("signed", "preisach-signed", ["--levels", 20, "--plane", 21, 84, "--smoothing", 0, "--ridge", 0]),
-        ("polynomial", "polynomial", ["--degree", 12]),
+        ("nonmonotonic", "preisach-nonmonotonic", ["--levels", 20, "--plane", 30, 70, "-o", "reference=20"]),
+        ("signed", "preisach-signed", ["--levels", 20, "--plane", 21, 84, "--smoothing", 0, "-o", "ridge=0"]),
+        ("polynomial", "polynomial", ["-o", "degree=12"]),
     ):
         path, result = tmp_path / f"{key}.json", tmp_path / "result.json"
         bench(

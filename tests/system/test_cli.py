@@ -335,7 +335,7 @@ class TestIdentifyAndPredict:
             (["--model", "nothing"], ["preisach-signed"]),
             (["--model", "polynomial", "--levels", "20"], ["levels"]),
             (["--model", "preisach", "--plane", "3", "1"], ["increasing", "3", "1"]),
-            (["--model", "preisach", "--reversible", "cubic"], ["reversible", "quadratic"]),
+            (["--model", "preisach", "-o", "reversible=cubic"], ["reversible", "quadratic"]),
             (["--model", "preisach", "--skip", "-3"], ["--skip"]),
         ],
     )

@@ -15,7 +15,7 @@ from bench.cli import main
 
 CREEP = ["--set", "duration=2", "--set", "settling=1"]
 COLUMNS = ["--input", "u", "--output", "y"]
-MODEL = ["--model", "polynomial", "--degree", "3"]
+MODEL = ["--model", "polynomial", "-o", "degree=3"]
 # What each command does in a folder with measurements, a model and a run; an error of those that serve or take long.
 COMMANDS = {
     "list": [],

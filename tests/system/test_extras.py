@@ -12,7 +12,7 @@ from bench.record import Record
 
 SCRIPT = SUPPORT / "run_without_extras.py"
 RUN = ("run", "creep", "--rig", "vo2", "--clock", "virtual", "--set", "duration=4", "--set", "settling=2")
-IDENTIFY = ("--input", "tec_temperature", "--output", "curvature", "--model", "polynomial", "--degree", "3")
+IDENTIFY = ("--input", "tec_temperature", "--output", "curvature", "--model", "polynomial", "-o", "degree=3")
 # The tests run in a checkout, and there is where the extras are to be installed from.
 DASHBOARD, REPORT, FILES = (
     f"pip install '{SUPPORT.parents[1]}[{extra}]'" for extra in ("dashboard", "report", "files")

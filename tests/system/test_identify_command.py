@@ -51,7 +51,7 @@ def test_a_wrong_orientation_is_one_message(bench, tmp_path):
         ("preisach", "down", "orientation: expected 'auto', 'rising' or 'falling', got 'down'"),
         ("preisach-signed", "falling", "preisach-signed has coefficients of either sign"),
     ):
-        code, _, err = bench("identify", data, *COLUMNS, "--model", model, "--orientation", orientation)
+        code, _, err = bench("identify", data, *COLUMNS, "--model", model, "-o", f"orientation={orientation}")
         assert (code, err.count("error:")) == (2, 1)
         assert words in re.sub(r"\s+", " ", err)
 
@@ -69,9 +69,11 @@ def test_a_time_constant_beyond_the_record_is_warned_of(bench, tmp_path):
     inputs = np.sin(2.0 * times)
     # A lag of 200 s, in a record of 20 s.
     data = write(tmp_path / "d.csv", inputs, np.cumsum(inputs + 1.0) * 0.1 / 200.0)
-    options = ["--interval", "0.1s", "--static", "polynomial-plays", "--dynamics"]
+    options = ["--format", "interval=0.1s", "-o", "static=polynomial-plays"]
     for dynamics, is_warned in (("lag", True), ("none", False)):
-        code, _, err = bench("identify", data, *COLUMNS, "--model", "hammerstein", *options, dynamics)
+        code, _, err = bench(
+            "identify", data, *COLUMNS, "--model", "hammerstein", *options, "-o", f"dynamics={dynamics}"
+        )
         warned = re.search(r"warning: time constant: \S+ s is longer than the record, which lasts 19.9 s", err)
         assert (code, warned is not None) == (0, is_warned)
 

@@ -48,7 +48,7 @@ def test_a_signed_density_is_penalised_by_default(identify, tmp_path):
 
 
 def test_without_penalties_the_null_space_is_named(identify):
-    found, out = identify("--model", "preisach-signed", "--smoothing", 0, "--ridge", 0, rows=40)
+    found, out = identify("--model", "preisach-signed", "--smoothing", 0, "-o", "ridge=0", rows=40)
     assert found["smoothing"] is found["ridge"] is found["cross_validated_rms"] is None
     assert f"rank {found['passive']}, null space of {found['active']} (least norm)" in out
     assert found["passive"] == found["rank"] < 40
@@ -62,7 +62,7 @@ def test_cells_that_could_replace_others_are_counted_until_smoothed(identify):
     smooth, out = identify("--model", "preisach", "--smoothing", 0.01, rows=40)
     assert smooth["exchangeable"] == 0
     assert "not unique" not in out
-    ridged, _ = identify("--model", "preisach", "--ridge", 0.01, rows=40)
+    ridged, _ = identify("--model", "preisach", "-o", "ridge=0.01", rows=40)
     assert ridged["exchangeable"] == 0
     assert ridged["rms"] > found["rms"]
 

@@ -40,8 +40,8 @@ def identify(bench, table, *options):
 
 def test_the_options_of_plays(bench, table):
     operator, _, _ = identify(
-        bench, table, "--model", "prandtl-ishlinskii", "--plays", "8", "--maximum", "4", "--origin", "0.5",
-        "--dead-zones", "3", "--option", "input_range=-6,6",
+        bench, table, "--model", "prandtl-ishlinskii", "-o", "plays=8", "-o", "maximum=4", "-o", "origin=0.5",
+        "-o", "dead_zones=3", "-o", "input_range=-6,6",
     )  # fmt: skip
     assert operator.thresholds.tolist() == [0.5 * i for i in range(8)]
     assert (operator.origin, operator.input_range) == (0.5, (-6.0, 6.0))
@@ -90,9 +90,9 @@ def test_of_several_levels_cross_validation_chooses(bench, table):
 
 
 def test_levels_may_be_given_or_lie_where_the_input_turns(bench, table):
-    operator, _, _ = identify(bench, table, "--model", "preisach", "--level-values", "-5,-2,-1,0,0.5,3,5")
+    operator, _, _ = identify(bench, table, "--model", "preisach", "-o", "levels=-5,-2,-1,0,0.5,3,5")
     assert operator.levels.tolist() == [-5.0, -2.0, -1.0, 0.0, 0.5, 3.0, 5.0]
-    operator, found, _ = identify(bench, table, "--model", "preisach", "--levels", "10", "--spacing", "quantiles")
+    operator, found, _ = identify(bench, table, "--model", "preisach", "--levels", "10", "-o", "spacing=quantiles")
     assert operator.order == 10
     assert np.ptp(np.diff(operator.levels)) > 0.1
     assert found["rms_percent"] < 2.0
@@ -115,14 +115,14 @@ def test_the_weight_of_a_row(bench, table):
     ("options", "words"),
     [
         (["--model", "prandtl-ishlinskii", "--levels", "20"], ["there is no levels", "plays (15)", "dead_zones (0)"]),
-        (["--model", "prandtl-ishlinskii", "--option", "play=3"], ["did you mean plays?"]),
-        (["--model", "prandtl-ishlinskii", "--option", "plays=many"], ["plays: expected an integer, got 'many'"]),
-        (["--model", "preisach", "--option", "plays=3"], ["there is no plays", "levels (20)", "reversible (none)"]),
-        (["--model", "preisach", "--spacing", "odd"], ["spacing: expected one of uniform, quantiles"]),
+        (["--model", "prandtl-ishlinskii", "-o", "play=3"], ["did you mean plays?"]),
+        (["--model", "prandtl-ishlinskii", "-o", "plays=many"], ["plays: expected an integer, got 'many'"]),
+        (["--model", "preisach", "-o", "plays=3"], ["there is no plays", "levels (20)", "reversible (none)"]),
+        (["--model", "preisach", "-o", "spacing=odd"], ["spacing: expected one of uniform, quantiles"]),
         (["--model", "preisach", "--levels", "1"], ["--levels 1", "from 2 to 1000"]),
         (["--model", "preisach", "--levels", "few"], ["--levels few: expected numbers"]),
-        (["--model", "preisach", "--levels", "4", "--level-values", "1,2"], ["give one of them"]),
-        (["--model", "preisach", "--plane", "0", "1", "--option", "plane=1,2"], ["plane is given twice"]),
+        (["--model", "preisach", "--levels", "4", "-o", "levels=1,2"], ["levels is given twice"]),
+        (["--model", "preisach", "--plane", "0", "1", "-o", "plane=1,2"], ["plane is given twice"]),
         (["--model", "preisach", "--weights", "gold"], ["gold"]),
     ],
 )

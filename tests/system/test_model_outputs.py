@@ -308,7 +308,7 @@ class TestCard:
 
     def test_its_command_identifies_the_same_model(self, bench, tmp_path, loop):
         bench(
-            "identify", loop, *COLUMNS, "--model", "prandtl-ishlinskii", "--option", "plays=4", "--option",
+            "identify", loop, *COLUMNS, "--model", "prandtl-ishlinskii", "-o", "plays=4", "-o",
             "origin=0.5", "--initial", "skip", "--card", tmp_path / "card.md", "--out", tmp_path / "model.json",
         )  # fmt: skip
         program, *words = shlex.split(read_card(tmp_path / "card.md")["Reproduce"].splitlines()[1])

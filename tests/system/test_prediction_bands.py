@@ -40,7 +40,7 @@ def files(tmp_path_factory):
 def model(bench, files, tmp_path):
     """A model with a band, and what was printed and written of it."""
     path, result = tmp_path / "model.json", tmp_path / "identified.json"
-    arguments = ("--model", "preisach", "--reversible", "linear", "--band", "--out", path, "--json", result)
+    arguments = ("--model", "preisach", "-o", "reversible=linear", "--band", "--out", path, "--json", result)
     code, out, _ = bench("identify", files["training"], *ASKED, *arguments)
     assert code == 0
     assert "90 % band: ± " in out

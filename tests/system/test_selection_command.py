@@ -15,7 +15,7 @@ from bench.models import PrandtlIshlinskii
 COLUMNS = ("--input", "voltage", "--output", "travel")
 # Few models keep this short; `all` is tested once.
 SOME = ("--model", "polynomial,polynomial-plays,prandtl-ishlinskii")
-TWO = ("--model", "polynomial,prandtl-ishlinskii", "--plays", "5")
+TWO = ("--model", "polynomial,prandtl-ishlinskii", "-o", "plays=5")
 
 
 def measure(path: Path, seed: int = 0, offset: float = 0.0, unit: str = "V") -> None:
@@ -142,7 +142,7 @@ def test_fewer_samples_than_cells_are_smoothed_by_cross_validation(bench, tmp_pa
     for smoothing in ((), ("--smoothing", "0")):
         result = tmp_path / "result.json"
         code, _, err = bench(
-            "identify", tmp_path / "few.csv", *COLUMNS, "--model", "preisach", "--reversible", "linear",
+            "identify", tmp_path / "few.csv", *COLUMNS, "--model", "preisach", "-o", "reversible=linear",
             "--test", tmp_path / "long.csv", *smoothing, "--json", result,
         )  # fmt: skip
         assert code == 0, err
@@ -226,7 +226,7 @@ def test_each_file_is_parsed_once(bench, tmp_path, monkeypatch):
     identify = ("identify", tmp_path / "record.csv", *COLUMNS)
     for arguments, files in (
         ((*identify, *TWO, "--test", tmp_path / "other.csv"), 2),
-        ((*identify, "--model", "hammerstein", "--dynamics", "drift", "--levels", 4, "--out", model), 1),
+        ((*identify, "--model", "hammerstein", "-o", "dynamics=drift", "--levels", 4, "--out", model), 1),
         (("predict", model, tmp_path / "other.csv", *COLUMNS, "--out", tmp_path / "predicted.csv"), 1),
         (("model", "test", model, "--data", tmp_path / "other.csv"), 1),
         (("invert", model, tmp_path / "other.csv", "--column", "travel", "--out", tmp_path / "setpoints.csv"), 1),
@@ -247,13 +247,13 @@ def test_each_file_is_parsed_once(bench, tmp_path, monkeypatch):
         (("--model", "polynomial,plain"), "'plain'"),
         (("--model", "polynomial,hammerstein"), "--time COLUMN"),
         ((*SOME, "--initial", "Negative"), "--initial"),
-        ((*SOME, "--orientation", "down"), "--orientation"),
+        ((*SOME, "-o", "orientation=down"), "orientation"),
         ((*SOME, "--skip", "-3"), "--skip"),
         (("--output", "voltage"), "--output"),
         (("--model", "polynomial", "--table-out", "t.csv"), "--table-out"),
         ((*SOME, "--cross-validate"), "--cross-validate"),
         ((*SOME, "--levels", "5"), "levels"),
-        ((*SOME, "--dynamics", "lag"), "--model hammerstein"),
+        ((*SOME, "-o", "dynamics=lag"), "dynamics: none of the models has this option"),
     ],
 )
 def test_wrong_options_are_named(bench, record, options, word):

@@ -91,9 +91,9 @@ def printed_errors(out):
     ("name", "options"),
     [
         ("preisach", ["--initial", "positive"]),
-        ("preisach", ["--initial", "skip", "--orientation", "falling"]),
+        ("preisach", ["--initial", "skip", "-o", "orientation=falling"]),
         ("preisach", ["--initial", "estimate", "--levels", 5, "--skip", 12]),
-        ("preisach-signed", ["--initial", "positive", "--reversible", "linear"]),
+        ("preisach-signed", ["--initial", "positive", "-o", "reversible=linear"]),
         ("prandtl-ishlinskii", ["--initial", "skip"]),
     ],
 )

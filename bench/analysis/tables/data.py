@@ -164,6 +164,46 @@ def read_columns(
     return columns
 
 
+def input_and_output(path: Path, given: tuple[str, str], options: ReadingOptions | None = None) -> tuple[str, str]:
+    """Return the columns of input and output; those of a run that are not given are of its slots.
+
+    Parameters
+    ----------
+    path : Path
+        A file or a run, as for `read_columns`.
+    given : tuple of str
+        The columns of input and output; an empty one is not given.
+    options : ReadingOptions, optional
+        As for `read_columns`.
+
+    Raises
+    ------
+    ConfigurationError
+        If one is not given and no slot says it: names the columns that there are, with units.
+    DataError
+        If the file cannot be read.
+    """
+    if all(given):
+        return given
+    known: Sequence[str]
+    if is_run(path):
+        with Record(path) as record:
+            slots = record.meta.get("slots", {})
+            known = [header_with_unit(signal.name, signal.unit) for signal in record.signals]
+        signals = [slots.get(slot, {}).get("signal", "") for slot in ("drive", "response")]
+        given = (given[0] or signals[0], given[1] or signals[1])
+        if all(given):
+            return given
+    else:
+        try:
+            _from_files(path, ["\0"], options or ReadingOptions(), ())
+        except NoColumnError as error:
+            known = error.known
+    options_ = zip(("--input", "--output"), given, strict=True)
+    missing = " and ".join(f"{name} COLUMN" for name, column in options_ if not column)
+    raise ConfigurationError(f"{path}: {missing} must be given; its columns are: {', '.join(known)}")
+
+
 def is_run(path: Path) -> bool:
     """Return whether a path is that of a run, its folder or its journal, not of a table."""
     return path.is_dir() or path.suffix == ".sqlite"
@@ -330,7 +370,7 @@ def _joined(path: Path, names: Sequence[str], options: ReadingOptions, times: Se
 
 def _from_run(path: Path, names: Sequence[str], chosen: str, at_least: int, times: Sequence[str]) -> Columns:
     if chosen not in (_STEPS, _TELEMETRY):
-        raise ConfigurationError(f"--table {chosen!r}: {path} is a run; expected {_STEPS} or {_TELEMETRY}")
+        raise ConfigurationError(f"--format table={chosen}: {path} is a run; expected {_STEPS} or {_TELEMETRY}")
     with Record(path) as record:
         table = record.steps() if chosen == _STEPS else record.telemetry()
         known = [name for name in table.columns if name != "settled"]
@@ -343,7 +383,7 @@ def _from_run(path: Path, names: Sequence[str], chosen: str, at_least: int, time
         values = {name: table[name] for name in names}
         units = {name: record.unit(name) for name in names}
         if chosen == _STEPS and len(table) < at_least and (ticks := record.count("telemetry")) >= at_least:
-            other = f"; --table {_TELEMETRY} takes the {ticks} readings within its steps"
+            other = f"; --format table={_TELEMETRY} takes the {ticks} readings within its steps"
             _check_rows(path, len(table), at_least, other)
     for name, column in values.items():
         bad = np.flatnonzero(~np.isfinite(column))

@@ -197,7 +197,7 @@ def read_dataset(
     reading = reading or ReadingOptions()
     interval = reading.seconds_between_rows
     if interval is not None and (names.time is not None or len(paths) > 1):
-        raise ConfigurationError("--interval: expected one file, without --time")
+        raise ConfigurationError("--format interval=TIME: expected one file, without --time")
     wanted = [name for name in (names.input, names.output, names.weights, names.time, *names.others) if name]
     sought = () if names.time or interval else names.times
     found = [read_columns(path, wanted, at_least=at_least, options=reading, times=sought) for path in paths]

@@ -28,7 +28,7 @@ _LONG_BEFORE = 100.0
 """Factor of the span of a record by which its first stamp shows that times count from before it."""
 
 
-_EVEN = "where rows are evenly sampled, leave the column out and say --interval TIME, such as 0.1s"
+_EVEN = "where rows are evenly sampled, leave the column out and say --format interval=TIME, such as 0.1s"
 """Remedy for times that cannot be those of a record."""
 
 
@@ -87,7 +87,7 @@ def seconds_of(source: str, column: Quantity, unit: str | None = None) -> tuple[
         raise DataError(f"{source}: column {name} is in {own}; expected a time in {', '.join(SECONDS)}")
     given = spelled(unit) if unit else ""
     if given and own and given != own:
-        raise ConfigurationError(f"--time-unit {unit}: column {name} of {source} is in {own} by its head")
+        raise ConfigurationError(f"--format time-unit={unit}: column {name} of {source} is in {own} by its head")
     decreasing = np.flatnonzero(np.diff(values) < 0.0)
     if decreasing.size:
         row = int(decreasing[0]) + 2
@@ -121,7 +121,7 @@ def _by_magnitude(source: str, name: str, values: Floats) -> tuple[str, str]:
                 return "d", f"times in days of {program} by their magnitude"
             raise DataError(
                 f"{source}: column {name}: numbers from {low:g} to {high:g} without a unit may be days of {program} "
-                "or seconds: say --time-unit d or --time-unit s"
+                "or seconds: say --format time-unit=d or --format time-unit=s"
             )
     for unit in ("s", "ms", "µs", "ns"):
         if _EPOCHS[0] <= low * SECONDS[unit] and high * SECONDS[unit] <= _EPOCHS[1]:

@@ -47,7 +47,7 @@ from typing import Annotated, Any, Self
 from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from bench.analysis import Session
-from bench.base import CheckedTable, ConfigurationError, parse_toml, problems
+from bench.base import CheckedTable, ConfigurationError, parse_toml, problems, reason
 
 _NAME = r"[A-Za-z0-9][A-Za-z0-9_.-]{0,60}"
 _RANGE = re.compile(r"(\d+)\.\.(\d+)")
@@ -250,7 +250,7 @@ def read_campaign(path: Path) -> CampaignFile:
     try:
         content = parse_toml(path.read_text(encoding="utf-8-sig"))
     except (OSError, UnicodeDecodeError) as error:
-        raise ConfigurationError(f"campaign file {path} cannot be read: {error}") from None
+        raise ConfigurationError(f"campaign file {path} cannot be read: {reason(error)}") from None
     except ValueError as error:
         raise ConfigurationError(f"{path}: not valid TOML: {error}") from None
     try:

@@ -139,7 +139,7 @@ def identify_hammerstein(
         # A delay or creep of 0 is an answer; a time at its bound is not.
         if parameter.name in ("lag", "frequency", "damping", "drift", "friction") and not deviation < 1.0:
             text = f"the data do not determine the {parameter.name} of the linear part"
-            remedy = "record faster and slower inputs, or leave it out with --dynamics"
+            remedy = "record faster and slower inputs, or leave it out with -o dynamics=..."
             advice.append(Advice("dynamics-unknown", text, remedy))
         elif parameter.name == "delay" and value > 0.99 * parameter.high:
             advice.append(

@@ -251,7 +251,7 @@ def identify_rate_dependent_plays(
         found = search.choose(time_constants)
     advice = list(search.static.advice())
     if not (found.deviations < _UNKNOWN).all():
-        remedy = "record faster and slower inputs, or give fewer (--option time_constants=NUMBER)"
+        remedy = "record faster and slower inputs, or give fewer (-o time_constants=NUMBER)"
         advice.append(Advice("dynamics-unknown", "the data do not determine every time constant", remedy))
     model, state, first = search.model(found.lags, found.fit), search.state(found.lags), search.static.skip
     predicted = model.evaluate(moments, sequence, state)

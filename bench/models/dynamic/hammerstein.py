@@ -194,7 +194,7 @@ class Hammerstein(TimedModel[HammersteinState]):
         """
         if self.is_viscous:
             raise ValueError(
-                "a model with viscous terms has no inverse: identify one without them, such as with --dynamics lag"
+                "a model with viscous terms has no inverse: identify one without them, such as with -o dynamics=lag"
             )
         clock, wanted = check_sequence(times, targets=targets)
         state = self.initial_state() if state is None else state

@@ -24,7 +24,7 @@ class TestRefused:
 
     def test_commas_that_delimit_or_are_decimal(self, tmp_path):
         text = "1,234\n2,345\n3,456\n"
-        self.refused(tmp_path, text, "line 1", "--delimiter comma, or --decimal comma", names=("1",))
+        self.refused(tmp_path, text, "line 1", "--format delimiter=comma, or --format decimal=comma", names=("1",))
         path = write(tmp_path, text)
         whole = read_columns(path, ("1", "2"), options=ReadingOptions(delimiter="comma")).values
         np.testing.assert_array_equal(whole["2"], [234.0, 345.0, 456.0])
@@ -39,9 +39,9 @@ class TestRefused:
             ("U\ty\n1.5\t2.5\n1.5\t1,234.5\n", ["line 3, row 2, column y", "thousands are not read"]),
             (
                 table(";", ",") + "2,0;1.234;5,5\n",
-                ["line 42, row 41, column U: '1.234' is not a number", "--decimal ."],
+                ["line 42, row 41, column U: '1.234' is not a number", "--format decimal=."],
             ),
-            (b"U,y\n1,2\n\x81,3\n", ["--encoding"]),
+            (b"U,y\n1,2\n\x81,3\n", ["--format encoding=NAME"]),
             ("U y\n1 0.5 2\n2 0.7 3\n", ["line 1: the header does not fit the 3 columns", "by number, 1 to 3"]),
         ],
     )
@@ -55,29 +55,29 @@ class TestRefused:
 
     def test_a_decimal_comma_after_whole_numbers(self, tmp_path):
         text = "U;y\n" + "1;2\n" * 2000 + "1,5;2\n"
-        self.refused(tmp_path, text, "line 2002, row 2001, column U: '1,5' is not a number", "--decimal ,")
+        self.refused(tmp_path, text, "line 2002, row 2001, column U: '1,5' is not a number", "--format decimal=,")
         columns = read_columns(write(tmp_path, text), ("U",), options=ReadingOptions(decimal=","))
         assert columns.values["U"][-1] == 1.5
 
     @cases(
         ("options", "words"),
         [
-            ({"delimiter": "some"}, "--delimiter 'some': expected a character"),
-            ({"delimiter": "5"}, "--delimiter"),
-            ({"decimal": ";"}, "--decimal ';': expected point or comma"),
-            ({"encoding": "klingon"}, "--encoding 'klingon' is unknown"),
-            ({"skip_lines": -1}, "--skip-lines -1"),
-            ({"table": "0"}, "--table '0'"),
-            ({"interval": "0.1"}, "--interval '0.1': expected a time > 0 with its unit"),
-            ({"time_unit": "weeks"}, "--time-unit 'weeks': expected d, h, min"),
-            ({"table": "run"}, "--table 'run': the tables of a text file have numbers"),
+            ({"delimiter": "some"}, "--format delimiter=some: expected a character"),
+            ({"delimiter": "5"}, "--format delimiter=CHARACTER"),
+            ({"decimal": ";"}, "--format decimal=;: expected point or comma"),
+            ({"encoding": "klingon"}, "--format encoding=klingon is unknown"),
+            ({"skip_lines": -1}, "--format skip=-1"),
+            ({"table": "0"}, "--format table=0"),
+            ({"interval": "0.1"}, "--format interval=0.1: expected a time > 0 with its unit"),
+            ({"time_unit": "weeks"}, "--format time-unit=weeks: expected d, h, min"),
+            ({"table": "run"}, "--format table=run: the tables of a text file have numbers"),
         ],
     )
     def test_options_that_are_wrong(self, tmp_path, options, words):
         self.refused(tmp_path, table(), words, error=ConfigurationError, **options)
 
     def test_options_that_do_not_apply(self, tmp_path):
-        with pytest.raises(ConfigurationError, match=r"--decimal does not apply: .* is a run"):
+        with pytest.raises(ConfigurationError, match=r"--format decimal does not apply: .* is a run"):
             read_columns(tmp_path, ("U",), options=ReadingOptions(decimal=","))
 
 
@@ -95,13 +95,15 @@ class TestSeveralTables:
         first, second = BREAKS[name]
         path = write(tmp_path, first + second)
         names = ("2", "3") if name == "two blank lines" else ("U", "y")
-        with pytest.raises(DataError, match=r"has 2 tables, .* 1 from line .*; choose one with --table, 1 to 2"):
+        with pytest.raises(
+            DataError, match=r"has 2 tables, .* 1 from line .*; choose one with --format table=N, 1 to 2"
+        ):
             read_columns(path, names)
         for number_ in ("1", "2"):
             columns = read_columns(path, names, options=ReadingOptions(table=number_))
             check(columns, names)
             assert f"table {number_}" in columns.assumptions
-        with pytest.raises(DataError, match="--table 3: it has 2 tables"):
+        with pytest.raises(DataError, match="--format table=3: it has 2 tables"):
             read_columns(path, names, options=ReadingOptions(table="3"))
 
     def test_a_table_behind_the_lines_that_are_looked_at(self, tmp_path):
@@ -227,7 +229,7 @@ def test_many_rows_are_read_as_numpy_reads_them(tmp_path):
     assert columns.assumptions == "tab-separated, header from a comment, 1 line of comment"
 
 
-MODEL = ("--model", "polynomial", "--degree", "3")
+MODEL = ("--model", "polynomial", "-o", "degree=3")
 
 
 class TestCommands:
@@ -257,7 +259,7 @@ class TestCommands:
         content += "".join(f"{number(u, ',')};{number(y, ',')}\n" for u, y in zip(U, Y, strict=True))
         file = write(tmp_path, content.encode("utf-16"), "other.dat")
         options = (
-            "--delimiter", ";", "--decimal", "comma", "--encoding", "utf-16", "--skip-lines", "1", "--table", "2"
+            "--format", "delimiter=;,decimal=comma,encoding=utf-16,skip=1", "--format", "table=2",
         )  # fmt: skip
         arguments = {
             "identify": ("identify", file, "--input", "1", "--output", "2", *MODEL),
@@ -271,7 +273,7 @@ class TestCommands:
         code, _, err = bench(*arguments, *options[:-2])
         assert code == 3
         assert "has 2 tables" in err
-        assert "--table" in err
+        assert "--format table=N" in err
 
     @pytest.mark.parametrize(
         ("command", "option", "name", "exit_code"),
@@ -298,8 +300,8 @@ class TestCommands:
 
     def test_wrong_options_are_one_message(self, bench, tmp_path):
         file = write(tmp_path, self.CONTENT)
-        code, _, err = bench("identify", file, *self.COLUMNS, *MODEL, "--decimal", "dot")
-        assert (code, err) == (2, "error: --decimal 'dot': expected point or comma\n")
+        code, _, err = bench("identify", file, *self.COLUMNS, *MODEL, "--format", "decimal=dot")
+        assert (code, err) == (2, "error: --format decimal=dot: expected point or comma\n")
 
     def test_from_python(self, tmp_path):
         import bench
@@ -330,7 +332,7 @@ class TestNoRowVanishes:
         path = self.write(tmp_path / "a.csv", {201: '"5 N hung on', **end})
         columns = ["--input", "u", "--output", "y"]
         options = (
-            ["--model", "polynomial", "--degree", "1"]
+            ["--model", "polynomial", "-o", "degree=1"]
             if command == "identify"
             else ["--time", "t", "--out", tmp_path / "runs"]
         )

@@ -53,10 +53,12 @@ class TestNamesAndValues:
     def test_a_short_table_of_numbers_above_a_long_one_is_a_table(self, tmp_path):
         content = "a,b\n" + "1,2\n" * 10 + "\n" + TABLE
         said = "2 tables, of rows × columns: 1 from line 2 (10 × 2), 2 from line 14 (40 × 3)"
-        assert refused(tmp_path, content, ("1",)) == f"data.txt: has {said}; choose one with --table, 1 to 2"
+        assert refused(tmp_path, content, ("1",)) == f"data.txt: has {said}; choose one with --format table=N, 1 to 2"
         message = refused(tmp_path, content)
         assert f"has no column 'U'; it has: a, b (or a number, 1 to 2); the file has {said}: choose" in message
-        assert message.endswith("another one with --table, or leave out the lines above it with --skip-lines")
+        assert message.endswith(
+            "another one with --format table=N, or leave out the lines above it with --format skip=N"
+        )
         for options in ({"table": "2"}, {"skip_lines": 12}):
             check(read(tmp_path, content, **options))
 
@@ -169,7 +171,7 @@ class TestWhatWouldHelp:
     def test_a_text_in_the_first_row(self, tmp_path):
         message = refused(tmp_path, "time,U,y\nSequence,Volt,5\n" + BODY)
         assert "line 2, row 1, column U: 'Volt' is not a number; if line 2 is above the data" in message
-        assert "leave it out with --skip-lines; otherwise" in message
+        assert "leave it out with --format skip=N; otherwise" in message
         assert "delete it from the file, or put a number there" in message
 
     def test_a_column_of_texts(self, tmp_path):
@@ -182,7 +184,7 @@ class TestWhatWouldHelp:
     @cases(("header", "names"), [("time:U:y\n", ("U",)), ("time:U:y\n", ("2",)), ("", ("1",))])
     def test_another_delimiter(self, tmp_path, header, names):
         content = header + BODY.replace(",", ":")
-        assert refused(tmp_path, content, names).endswith("if ':' stands between columns, say --delimiter ':'")
+        assert refused(tmp_path, content, names).endswith("if ':' stands between columns, say --format delimiter=:")
         check(read(tmp_path, content, ("2", "3"), delimiter=":"), ("2", "3"))
 
     @cases(
@@ -193,13 +195,13 @@ class TestWhatWouldHelp:
         content = (heads + "\n" + BODY).encode(encoding)
         names = heads.split(",")[1:]
         message = refused(tmp_path, content, names)
-        assert f"--encoding {encoding}" in message
+        assert f"--format encoding={encoding}" in message
         check(read(tmp_path, content, names, encoding=encoding), names)
 
     def test_another_encoding_where_no_name_tells_it(self, tmp_path):
         message = refused(tmp_path, ("時間,電圧,変位\n" + BODY).encode("shift_jis"))
-        assert "was read as cp1252: if names look wrong, say --encoding, such as shift_jis" in message
-        assert "--encoding" not in refused(tmp_path, ("t,U (V),x (µm)\n" + BODY).encode("cp1252"))
+        assert "was read as cp1252: if names look wrong, say --format encoding=NAME, such as shift_jis" in message
+        assert "--format encoding=NAME" not in refused(tmp_path, ("t,U (V),x (µm)\n" + BODY).encode("cp1252"))
 
     @cases(
         "above",
@@ -210,13 +212,13 @@ class TestWhatWouldHelp:
         ],
     )
     def test_many_lines_above_the_table(self, tmp_path, above):
-        assert "--skip-lines" in refused(tmp_path, above + TABLE)
+        assert "--format skip=N" in refused(tmp_path, above + TABLE)
         check(read(tmp_path, above + TABLE, skip_lines=1500))
 
     def test_no_header(self, tmp_path):
         message = refused(tmp_path, BODY)
         assert message.endswith(
-            "by number, 1 to 3; if a header stands further down, leave out the lines above it with --skip-lines"
+            "by number, 1 to 3; if a header stands further down, leave out the lines above it with --format skip=N"
         )
 
 
@@ -254,7 +256,7 @@ class TestOtherFormats:
 
     def test_what_stands_above_a_table_is_left_out(self, tmp_path):
         content = '<?xml version="1.0"?>\n' + TABLE
-        assert "with --skip-lines" in refused(tmp_path, content)
+        assert "with --format skip=N" in refused(tmp_path, content)
         check(read(tmp_path, content, skip_lines=1))
 
     @cases(("name", "save"), [("d.mat", matlab), ("d.parquet", parquet)])

@@ -139,7 +139,7 @@ LAYOUTS = {
     "days of Excel": (timed(43922.5 + DAYS), "times in days of Excel by their magnitude", TIMED),
     "days of MATLAB": (timed(736000.5 + DAYS), "times in days of MATLAB", {"near": 1e-4, **TIMED}),
     "days or seconds": (
-        timed(43922.5 + TIME), "may be days of Excel or seconds: say --time-unit d or --time-unit s",
+        timed(43922.5 + TIME), "may be days of Excel or seconds: say --format time-unit=d or --format time-unit=s",
         {"by": ("U", "y"), "time_unit": "s", **TIMED},
     ),
     "seconds since 1970": (timed(1.7e9 + TIME), "times in s since 1970", TIMED),
@@ -252,7 +252,7 @@ LAYOUTS = {
         {"file": "d.xlsx", "by": ("U", "y"), "table": "2"},
     ),
     "tables of a sheet": (
-        sheets(run=[*rows(), [], *rows(U, Y, heads=("a", "b"))]), "choose one with --table, run:1 to run:2",
+        sheets(run=[*rows(), [], *rows(U, Y, heads=("a", "b"))]), "choose one with --format table=N, run:1 to run:2",
         {"file": "d.xlsx", "by": ("U", "y"), "table": "run:1"},
     ),
     "a wrong cell of a sheet": (

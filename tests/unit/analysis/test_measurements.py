@@ -157,9 +157,11 @@ class TestRuns:
 
     def test_what_was_read_within_the_steps(self, run):
         path, names = run((21.0, 0.0), (22.0, -3.0)), ["tec_temperature", "t"]
-        with pytest.raises(DataError, match=r"has 2 rows of data; .* --table telemetry takes the 10 readings"):
+        with pytest.raises(DataError, match=r"has 2 rows of data; .* --format table=telemetry takes the 10 readings"):
             read_columns(path, names[:1], at_least=4)
-        with pytest.raises(ConfigurationError, match=r"--table 'ticks': .* is a run; expected steps or telemetry"):
+        with pytest.raises(
+            ConfigurationError, match=r"--format table=ticks: .* is a run; expected steps or telemetry"
+        ):
             read_columns(path, names, options=ReadingOptions(table="ticks"))
         columns = read_columns(path, names, at_least=4, options=ReadingOptions(table="telemetry"))
         assert columns.values["tec_temperature"].tolist() == [

@@ -87,7 +87,7 @@ def noise():
             (INPUTS, measured(INPUTS)),
             "preisach-nonmonotonic",
             {"input_unit": "V"},
-            r"^the reversible part .* in °C; this one is in V: use --model preisach --reversible polynomial$",
+            r"^the reversible part .* in °C; this one is in V: use --model preisach -o reversible=polynomial$",
         ),
     ],
 )

@@ -31,7 +31,7 @@ class Case:
     identify: tuple[str, ...] = ("--model", "preisach-signed")
 
 
-NONMONOTONIC = ("--model", "preisach-nonmonotonic", "--option", "reference=20")
+NONMONOTONIC = ("--model", "preisach-nonmonotonic", "-o", "reference=20")
 MUSCLE = ("supply_setpoint", "supply_voltage", "wire_end_position")
 # Measured with seed 0: 0.75 (vo2), 4.8 (sma), 0.24 (mckibben), 1.28 (coiled-polymer), 4.2 (hybrid) %; twice that is
 # allowed.

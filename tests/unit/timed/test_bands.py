@@ -107,7 +107,7 @@ def test_commands_write_the_band_and_judge_the_rate(bench, tmp_path):
     for path, clock in ((data, times), (faster, times / 3.0)):
         rows = np.column_stack([clock, inputs, lagging(clock, inputs, rng)])
         np.savetxt(path, rows, delimiter=",", header=head, comments="", encoding="utf-8")
-    options = ("--model", "hammerstein", "--static", "prandtl-ishlinskii", "--dynamics", "lag", "--skip", 50)
+    options = ("--model", "hammerstein", "-o", "static=prandtl-ishlinskii", "-o", "dynamics=lag", "--skip", 50)
     card = tmp_path / "card.md"
     arguments = (*COLUMNS, *options, "--band", "--out", model, "--card", card, "--json", tmp_path / "fit.json")
     code, out, text = bench("identify", data, *arguments)

@@ -46,13 +46,16 @@ def oscillator(folder):
 @pytest.mark.parametrize(
     ("make", "options"),
     [
-        (hammerstein, ("--model", "hammerstein", "--levels", 5, "--dynamics", "lag")),
-        (hammerstein, ("--model", "hammerstein", "--levels", 5, "--dynamics", "none", "--skip", 20)),
-        (hammerstein, ("--model", "hammerstein", "--static", "polynomial", "--degree", 3, "--dynamics", "lag,drift")),
-        (hammerstein, ("--model", "hammerstein", "--levels", 5, "--dynamics", "lag", "--initial", "positive")),
-        (hammerstein, ("--model", "hammerstein", "--levels", 8, "--dynamics", "lag", "--smoothing", 0.01)),
-        (plays, ("--model", "rate-dependent-plays", "--plays", 10, "--option", "time_constants=1")),
-        (plays, ("--model", "rate-dependent-plays", "--initial", "skip", "--maximum", 4)),
+        (hammerstein, ("--model", "hammerstein", "--levels", 5, "-o", "dynamics=lag")),
+        (hammerstein, ("--model", "hammerstein", "--levels", 5, "-o", "dynamics=none", "--skip", 20)),
+        (
+            hammerstein,
+            ("--model", "hammerstein", "-o", "static=polynomial", "-o", "degree=3", "-o", "dynamics=lag,drift"),
+        ),
+        (hammerstein, ("--model", "hammerstein", "--levels", 5, "-o", "dynamics=lag", "--initial", "positive")),
+        (hammerstein, ("--model", "hammerstein", "--levels", 8, "-o", "dynamics=lag", "--smoothing", 0.01)),
+        (plays, ("--model", "rate-dependent-plays", "-o", "plays=10", "-o", "time_constants=1")),
+        (plays, ("--model", "rate-dependent-plays", "--initial", "skip", "-o", "maximum=4")),
         pytest.param(oscillator, ("--model", "bouc-wen-oscillator"), marks=pytest.mark.seeds),
         (oscillator, ("--model", "preisach-oscillator", "--levels", 4)),
     ],
@@ -91,7 +94,7 @@ def test_the_functions_of_the_package_take_times(tmp_path):
 
 def test_time_stands_in_rows_figures_and_card(bench, tmp_path):
     data, model, card = hammerstein(tmp_path), tmp_path / "model.json", tmp_path / "card.md"
-    options = ("--model", "hammerstein", "--levels", 5, "--dynamics", "lag", "--figures", tmp_path / "figures")
+    options = ("--model", "hammerstein", "--levels", 5, "-o", "dynamics=lag", "--figures", tmp_path / "figures")
     code, _, text = bench("identify", data, *COLUMNS, *options, "--out", model, "--card", card)
     assert code == 0, text
     assert (tmp_path / "figures" / "hammerstein-errors.png").is_file()
@@ -117,13 +120,13 @@ def test_time_stands_in_rows_figures_and_card(bench, tmp_path):
 
 def test_smoothing_is_chosen_by_cross_validation_and_refused_where_there_is_none(bench, tmp_path):
     data, summary = hammerstein(tmp_path), tmp_path / "fit.json"
-    options = ("--model", "hammerstein", "--levels", 12, "--dynamics", "lag", "--cross-validate")
+    options = ("--model", "hammerstein", "--levels", 12, "-o", "dynamics=lag", "--cross-validate")
     code, out, text = bench("identify", data, *COLUMNS, *options, "--json", summary)
     assert code == 0, text
     assert "on blocks left out" in " ".join(out.split())
     assert json.loads(summary.read_text())["smoothing"] > 0.0
     for model, option, words in (
-        ("hammerstein", "--ridge=0.1", "takes no --ridge"),
+        ("hammerstein", "-oridge=0.1", "takes no -o ridge"),
         ("rate-dependent-plays", "--cross-validate", "takes no --smoothing"),
         ("preisach-oscillator", "--smoothing=0.1", "takes no --smoothing"),
         ("hammerstein", "--levels=5,10", "takes one number"),
@@ -134,7 +137,7 @@ def test_smoothing_is_chosen_by_cross_validation_and_refused_where_there_is_none
 
 def test_times_are_read_in_their_unit(bench, tmp_path):
     code, _, _ = bench(
-        "identify", hammerstein(tmp_path), *COLUMNS, "--model", "hammerstein", "--levels", 5, "--dynamics", "lag",
+        "identify", hammerstein(tmp_path), *COLUMNS, "--model", "hammerstein", "--levels", 5, "-o", "dynamics=lag",
         "--json", tmp_path / "fit.json",
     )  # fmt: skip
     assert code == 0
@@ -152,12 +155,12 @@ def test_what_does_not_fit_together_is_refused_with_the_option(bench, tmp_path):
     assert (code, "needs the time of each row: give --time COLUMN" in text) == (2, True)
     code, _, text = bench("identify", data, *COLUMNS, "--model", "preisach")
     assert (code, "--time: preisach is a model without time" in text.replace("\n", " ")) == (2, True)
-    code, _, text = bench("identify", data, *COLUMNS, "--model", "hammerstein", "--dynamics", "echo")
+    code, _, text = bench("identify", data, *COLUMNS, "--model", "hammerstein", "-o", "dynamics=echo")
     assert (code, "kelvin-voigt" in text) == (2, True)
     code, _, text = bench("identify", data, *without, "--time", "drive", "--model", "hammerstein")
     assert code != 0
     assert "column drive is in V" in text
-    assert bench("identify", data, *COLUMNS, "--model", "hammerstein", "--dynamics", "lag", "--out", model)[0] == 0
+    assert bench("identify", data, *COLUMNS, "--model", "hammerstein", "-o", "dynamics=lag", "--out", model)[0] == 0
     code, _, text = bench("predict", model, nameless, *without, "--out", tmp_path / "p.csv")
     assert (code, "give --time COLUMN" in text) == (2, True)
     code, _, text = bench("predict", model, data, *COLUMNS, "--out", tmp_path / "p.csv", "--initial", "rest")
@@ -177,7 +180,7 @@ def test_a_column_named_time_and_that_of_the_model_need_not_be_given(bench, tmp_
     without = COLUMNS[2:]
     for file, time in ((data, ()), (clocked, ("--time", "clock"))):
         code, _, text = bench(
-            "identify", file, *without, *time, "--model", "hammerstein", "--dynamics", "lag", "--out", model,
+            "identify", file, *without, *time, "--model", "hammerstein", "-o", "dynamics=lag", "--out", model,
             "--json", errors,
         )  # fmt: skip
         assert code == 0, text
@@ -199,7 +202,7 @@ def test_a_drift_is_of_its_own_record_and_a_session_is_recalibrated(bench, tmp_p
     later = write(tmp_path / "second.csv", 1e3 * t, second, 2.0 + 1.1 * model.evaluate(t, second))
     out, errors, without = tmp_path / "model.json", tmp_path / "errors.json", COLUMNS[2:]
     code, _, text = bench(
-        "identify", drifting, *without, "--model", "hammerstein", "--levels", 5, "--dynamics", "lag,drift",
+        "identify", drifting, *without, "--model", "hammerstein", "--levels", 5, "-o", "dynamics=lag,drift",
         "--out", out,
     )  # fmt: skip
     assert code == 0, text

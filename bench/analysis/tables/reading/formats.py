@@ -12,7 +12,7 @@ from bench.base import DataError, end_of_json
 _MARKUP = re.compile(r"\s*<(?:\?xml|!doctype|svg|html|table)\b", re.IGNORECASE)
 _JSON = re.compile(r'\s*(?:\{\s*["}]|\[\s*["{[])')
 _ARRAY = re.compile(r"\s*[\[{]")
-_BELOW = "; of a table below it, leave out the lines above with --skip-lines"
+_BELOW = "; of a table below it, leave out the lines above with --format skip=N"
 _OTHERS = {"%PDF-": "PDF", "%!PS": "PostScript", "{\\rtf": "RTF"}
 
 

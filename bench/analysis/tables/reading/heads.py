@@ -42,7 +42,11 @@ _ADDED = re.compile(r"\s*[(\[<{][^()\[\]<>{}]*[)\]>}]$|\s*(?:,| in) \S+$")
 
 
 class NoColumnError(DataError):
-    """A column that a table does not have."""
+    """A column that a table does not have; `known` are those that it has."""
+
+    def __init__(self, text: str, known: Sequence[str] = ()) -> None:
+        super().__init__(text)
+        self.known = tuple(known)
 
 
 @dataclass(frozen=True)
@@ -179,10 +183,13 @@ def find_place(path: Path, heads: Sequence[Head], columns: int, name: str) -> in
         return int(name) - 1
     if not heads:
         raise NoColumnError(
-            f"{path}: has no column {name!r}, as it has no header line; name columns by number, 1 to {columns}"
+            f"{path}: has no column {name!r}, as it has no header line; name columns by number, 1 to {columns}",
+            [str(number + 1) for number in range(columns)],
         )
-    known = ", ".join(head.text for head in heads if head.text)
-    raise NoColumnError(f"{path}: has no column {name!r}; it has: {known} (or a number, 1 to {columns})")
+    known = [head.text for head in heads if head.text]
+    raise NoColumnError(
+        f"{path}: has no column {name!r}; it has: {', '.join(known)} (or a number, 1 to {columns})", known
+    )
 
 
 def with_times(

@@ -252,14 +252,15 @@ def find_layout(path: Path, lines: Sequence[str], options: ReadingOptions, first
         if rivals or (layout.delimiter == "," and not has_names and _may_be_decimal(cells, layout)):
             raise DataError(
                 f"{path}: line {cells[0].line}: a comma may stand between columns or be the decimal sign: say "
-                "--delimiter comma, or --decimal comma; where it is both, save the file with another delimiter"
+                "--format delimiter=comma, or --format decimal=comma; where it is both, save the file with another "
+                "delimiter"
             )
     for head in layout.heads:
         text = head.text
         if _WITHIN.search(text) and not any(map(str.isalpha, text)) and not any(is_number(text, s) for s in ".,"):
             raise DataError(
                 f"{path}: line {layout.start}: {head.text!r} is neither a number nor the head of a column: correct "
-                "it in the file, or leave the line out with --skip-lines"
+                "it in the file, or leave the line out with --format skip=N"
             )
     return layout
 

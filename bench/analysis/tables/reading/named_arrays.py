@@ -47,7 +47,7 @@ def read_arrays(
     try:
         places = [find_place(path, heads, len(heads), name) for name in names]
     except NoColumnError as error:
-        raise NoColumnError("; ".join([str(error), *remarks])) from None
+        raise NoColumnError("; ".join([str(error), *remarks]), error.known) from None
     chosen = [arrays[place] for place in places]
     if len({len(column) for column in chosen}) > 1:
         raise DataError(
@@ -76,7 +76,7 @@ def _choose(path: Path, contents: dict[str, Any], table: str | None, turned: lis
     if table is not None:
         name = list(contents)[int(table) - 1] if table.isdecimal() and int(table) <= len(contents) else table
         if name not in contents:
-            raise DataError(f"{path}: --table {table}: has no such variable; it has: {_listed(contents)}")
+            raise DataError(f"{path}: --format table={table}: has no such variable; it has: {_listed(contents)}")
         contents = {name: contents[name]}
     short = len(contents) == 1
     return {

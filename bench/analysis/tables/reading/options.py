@@ -6,9 +6,10 @@ import codecs
 import re
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Any
 
 from bench.analysis.tables.reading.heads import SECONDS, spelled
-from bench.base import ConfigurationError
+from bench.base import ConfigurationError, closest
 
 _DELIMITERS = {"comma": ",", "semicolon": ";", "tab": "\t", "\\t": "\t", "blank": " ", "blanks": " ", "space": " "}
 _DECIMALS = {"point": ".", "comma": ","}
@@ -18,6 +19,15 @@ OF_TIMES = ("interval", "time_unit")
 
 
 _INTERVAL = re.compile(r"(\d+\.?\d*(?:e[+-]?\d+)?)\s*([a-zµ]+)")
+
+
+_WORDS = {
+    "delimiter": "delimiter", "decimal": "decimal", "encoding": "encoding", "skip_lines": "skip", "table": "table",
+    "interval": "interval", "time_unit": "time-unit",
+}  # fmt: skip
+"""The words of `--format`, by option."""
+
+_BETWEEN_WORDS = re.compile(r",(?=[a-z-]+=)")
 
 
 @dataclass(frozen=True)
@@ -62,28 +72,47 @@ class ReadingOptions:
             delimiter = _DELIMITERS.get(delimiter, delimiter)
             if len(delimiter) != 1 or delimiter in '\n\r"' or delimiter.isalnum():
                 raise ConfigurationError(
-                    f"--delimiter {self.delimiter!r}: expected a character, or comma, semicolon, tab or blanks"
+                    f"--format delimiter={self.delimiter}: expected a character, or comma, semicolon, tab or blanks"
                 )
             object.__setattr__(self, "delimiter", delimiter)
         if decimal is not None:
             decimal = _DECIMALS.get(decimal, decimal)
             if decimal not in (".", ","):
-                raise ConfigurationError(f"--decimal {self.decimal!r}: expected point or comma")
+                raise ConfigurationError(f"--format decimal={self.decimal}: expected point or comma")
             object.__setattr__(self, "decimal", decimal)
         if self.encoding is not None:
             try:
                 codecs.lookup(self.encoding)
             except (LookupError, ValueError):
                 raise ConfigurationError(
-                    f"--encoding {self.encoding!r} is unknown; for example utf-8, cp1252, utf-16"
+                    f"--format encoding={self.encoding} is unknown; for example utf-8, cp1252, utf-16"
                 ) from None
         if self.skip_lines < 0:
-            raise ConfigurationError(f"--skip-lines {self.skip_lines}: expected a number of lines ≥ 0")
+            raise ConfigurationError(f"--format skip={self.skip_lines}: expected a number of lines ≥ 0")
         if self.table is not None and (not self.table or self.table == "0"):
-            raise ConfigurationError(f"--table {self.table!r}: expected a number from 1, or a name")
+            raise ConfigurationError(f"--format table={self.table}: expected a number from 1, or a name")
         if self.time_unit is not None and spelled(self.time_unit) not in SECONDS:
-            raise ConfigurationError(f"--time-unit {self.time_unit!r}: expected d, h, min, s, ms, us or ns")
+            raise ConfigurationError(f"--format time-unit={self.time_unit}: expected d, h, min, s, ms, us or ns")
         _ = self.seconds_between_rows
+
+    @classmethod
+    def parse(cls, text: str) -> ReadingOptions:
+        """Return the options of a text such as `decimal=comma,skip=3`.
+
+        Raises ConfigurationError for a word that there is not, or comes twice, or a value that is not allowed.
+        """
+        names = {word: name for name, word in _WORDS.items()}
+        given: dict[str, Any] = {}
+        for part in filter(None, _BETWEEN_WORDS.split(text)):
+            word, _, value = part.partition("=")
+            if word not in names:
+                raise ConfigurationError(f"--format {part}: there is no such word; {closest(word, names)}")
+            if not value or names[word] in given:
+                raise ConfigurationError(f"--format {part}: expected {word}=VALUE, once")
+            given[names[word]] = value
+        if not given.get("skip_lines", "0").isdecimal():
+            raise ConfigurationError(f"--format skip={given['skip_lines']}: expected a number of lines ≥ 0")
+        return cls(**given | {"skip_lines": int(given.get("skip_lines", 0))})
 
     @property
     def seconds_between_rows(self) -> float | None:
@@ -93,7 +122,9 @@ class ReadingOptions:
         match = _INTERVAL.fullmatch(self.interval.strip())
         unit = spelled(match[2]) if match else ""
         if match is None or unit not in SECONDS or float(match[1]) <= 0.0:
-            raise ConfigurationError(f"--interval {self.interval!r}: expected a time > 0 with its unit, such as 0.1s")
+            raise ConfigurationError(
+                f"--format interval={self.interval}: expected a time > 0 with its unit, such as 0.1s"
+            )
         return float(match[1]) * SECONDS[unit]
 
     def check_only(self, path: Path, kind: str, *allowed: str) -> None:
@@ -103,4 +134,4 @@ class ReadingOptions:
         """
         for field in fields(self):
             if field.name not in allowed and getattr(self, field.name) != field.default:
-                raise ConfigurationError(f"--{field.name.replace('_', '-')} does not apply: {path} is {kind}")
+                raise ConfigurationError(f"--format {_WORDS[field.name]} does not apply: {path} is {kind}")

@@ -37,7 +37,7 @@ def cell_remedy(cell: str, layout: Layout, place: int, line: int, *, first: bool
     other = "," if layout.decimal == "." else "."
     if is_number(cell, other):
         sign = "comma" if other == "," else "point"
-        return f"; if its decimal sign is a {sign}, say --decimal {other}; in a spreadsheet make it a number"
+        return f"; if its decimal sign is a {sign}, say --format decimal={other}; in a spreadsheet make it a number"
     if is_number(cell.strip("'"), layout.decimal):
         return "; its quotation marks are not those of tables: replace ' by \" in the file"
     if any(is_number(cell.replace(sign, ""), layout.decimal) for sign in ",.'’ \xa0\u202f" if sign in cell):
@@ -48,16 +48,16 @@ def cell_remedy(cell: str, layout: Layout, place: int, line: int, *, first: bool
         return "; its minus sign is not that of numbers: replace '−' by '-' in the file"
     mark = _delimiting_mark([cell]) if layout.columns == 1 else None
     if mark is not None:
-        return f"; if {mark!r} stands between columns, say --delimiter {mark!r}"
+        return f"; if {mark!r} stands between columns, say --format delimiter={mark}"
     parts = [delimiter for delimiter in "\t;, " if delimiter in cell]
     if first and any(is_number(part, layout.decimal) for delimiter in parts for part in cell.split(delimiter)):
-        return "; the file may have another delimiter (--delimiter) or lines above the data (--skip-lines)"
+        return "; say --format delimiter=CHARACTER for another delimiter, or --format skip=N for lines above the data"
     if place not in layout.numbers:
-        return OTHER_COLUMN + ", or leave out lines above the data with --skip-lines" * first
+        return OTHER_COLUMN + ", or leave out lines above the data with --format skip=N" * first
     if first:
         return (
-            f"; if line {line} is above the data, leave it out with --skip-lines; otherwise delete it from the file, "
-            "or put a number there"
+            f"; if line {line} is above the data, leave it out with --format skip=N; otherwise delete it from the "
+            "file, or put a number there"
         )
     return f"; {NO_ROW_LEFT_OUT}: delete line {line} from the file, or put a number there"
 
@@ -71,7 +71,7 @@ def missing_column(
         _other_encoding(name, file, options, layout, lines),
         _other_lines(name, file, options, layout, lines),
     ]
-    return NoColumnError("; ".join([str(error), *filter(None, remedies)]))
+    return NoColumnError("; ".join([str(error), *filter(None, remedies)]), error.known)
 
 
 def is_cut_off(lines: Sequence[str]) -> bool:
@@ -84,7 +84,7 @@ def _other_delimiter(options: ReadingOptions, layout: Layout, lines: Sequence[st
         return ""
     rows = [line for line in lines if not line.isspace() and not is_comment(line, layout.marks)]
     mark = _delimiting_mark(rows[-10:])
-    return "" if mark is None else f"if {mark!r} stands between columns, say --delimiter {mark!r}"
+    return "" if mark is None else f"if {mark!r} stands between columns, say --format delimiter={mark}"
 
 
 def _delimiting_mark(rows: Sequence[str]) -> str | None:
@@ -111,10 +111,10 @@ def _other_encoding(name: str, file: TextFile, options: ReadingOptions, layout: 
         except UnicodeDecodeError:
             continue
         if found:
-            return f"with --encoding {encoding} it has this column"
+            return f"with --format encoding={encoding} it has this column"
     return (
-        f"it is not UTF-8 and was read as {FALLBACK}: if names look wrong, say --encoding, such as shift_jis, "
-        "gb18030 or mac_roman"
+        f"it is not UTF-8 and was read as {FALLBACK}: if names look wrong, say --format encoding=NAME, such as "
+        "shift_jis, gb18030 or mac_roman"
     )
 
 
@@ -123,11 +123,13 @@ def _other_lines(name: str, file: TextFile, options: ReadingOptions, layout: Lay
     tables = list(walk_tables(file, options, _LOOKED_AT))
     if len(tables) > 1:
         return (
-            f"the file has {list_tables(tables)}: choose another one with --table, or leave out the lines above it "
-            "with --skip-lines"
+            f"the file has {list_tables(tables)}: choose another one with --format table=N, or leave out the lines "
+            "above it with --format skip=N"
         )
     if not layout.numbers and is_cut_off(lines):
-        return f"its first {len(lines)} lines have no numbers: leave out the lines above the table with --skip-lines"
+        return (
+            f"its first {len(lines)} lines have no numbers: leave out the lines above the table with --format skip=N"
+        )
     if "no header" in layout.notes and not name.isdecimal():
-        return "if a header stands further down, leave out the lines above it with --skip-lines"
+        return "if a header stands further down, leave out the lines above it with --format skip=N"
     return ""

@@ -52,7 +52,7 @@ def _choose(path: Path, sheets: Mapping[str, Sequence[str]], table: str | None) 
         longest = max(titles, key=lambda title: len(sheets[title]), default="")
         others = [len(rows) for title, rows in sheets.items() if title != longest]
         if not titles or MUCH_LONGER * max(others, default=0) > len(sheets[longest]):
-            raise DataError(f"{path}: has {len(titles)} sheets: {listed}; choose one with --table")
+            raise DataError(f"{path}: has {len(titles)} sheets: {listed}; choose one with --format table=N")
         return longest, None, f", the longest of {len(titles)}" if others else ""
     sheet, _, last = table.rpartition(":")
     for name, number in ((table, None), (sheet, last)):
@@ -60,4 +60,4 @@ def _choose(path: Path, sheets: Mapping[str, Sequence[str]], table: str | None) 
             return name, number, ""
         if name.isdecimal() and int(name) <= len(titles):
             return titles[int(name) - 1], number, ""
-    raise DataError(f"{path}: --table {table}: there is no such sheet; it has: {listed}")
+    raise DataError(f"{path}: --format table={table}: there is no such sheet; it has: {listed}")

@@ -74,7 +74,7 @@ def read_sample(file: TextFile, start: int) -> list[str]:
 
 
 def walk_tables(file: TextFile, options: ReadingOptions, most: int | None = None) -> Iterator[Table]:
-    """Yield the tables, as `--table` counts them; those in the first `most` lines, if given."""
+    """Yield the tables, as `--format table=N` counts them; those in the first `most` lines, if given."""
     options = replace(options, table=options.table or "1")
     layout = find_layout(file.path, read_sample(file, options.skip_lines), options, options.skip_lines)
     while layout is not None:

@@ -13,7 +13,7 @@ from itertools import islice
 from pathlib import Path
 from typing import BinaryIO, cast
 
-from bench.base import DataError, say_share
+from bench.base import DataError, reason, say_share
 
 WHAT_IS_READ = "text, .gz of text, .mat, .h5, .tdms, .parquet and spreadsheets are read"
 """Kinds of files, for messages."""
@@ -46,7 +46,7 @@ class TextFile:
     compressed : bool
         Whether it is.
     choice : str
-        What stands before the number of a table in `--table`.
+        What stands before the number of a table in `--format table=N`.
     """
 
     path: Path
@@ -93,13 +93,13 @@ def reading_errors(path: Path) -> Iterator[None]:
         raise DataError(f"{path} does not exist") from None
     except UnicodeError as error:
         raise DataError(
-            f"{path} cannot be read as text ({error}); say its encoding with --encoding, such as cp1252, utf-16 "
-            "or shift_jis"
+            f"{path} cannot be read as text ({error}); say its encoding with --format encoding=NAME, such as cp1252, "
+            "utf-16 or shift_jis"
         ) from None
     except MemoryError:
         raise DataError(f"{path} cannot be read: by what it says of itself it is larger than the memory") from None
     except (OSError, EOFError, LookupError, zlib.error) as error:
-        raise DataError(f"{path} cannot be read: {error}") from None
+        raise DataError(f"{path} cannot be read: {reason(error)}") from None
 
 
 def open_text(path: Path, encoding: str | None) -> TextFile:
@@ -129,7 +129,9 @@ def _encoding(path: Path, file: BinaryIO) -> str:
         zeros = sample[::2].count(0), sample[1::2].count(0)
         if min(zeros) == 0 and 4 * max(zeros) > len(sample):
             return "utf-16-be" if zeros[0] else "utf-16-le"
-        raise DataError(f"{path} is no table of text; {WHAT_IS_READ} (of text in another encoding, say --encoding)")
+        raise DataError(
+            f"{path} is no table of text; {WHAT_IS_READ} (of text in another encoding, say --format encoding=NAME)"
+        )
     decoder = codecs.getincrementaldecoder("utf-8")()
     try:
         while start:

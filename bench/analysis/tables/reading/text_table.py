@@ -73,7 +73,7 @@ def read_text(path: Path, names: Sequence[str], options: ReadingOptions, times: 
         If `options.table` is not a number.
     """
     if options.table is not None and not options.table.isdecimal():
-        raise ConfigurationError(f"--table {options.table!r}: the tables of a text file have numbers, from 1")
+        raise ConfigurationError(f"--format table={options.table}: the tables of a text file have numbers, from 1")
     file = split_stamps(open_text(path, options.encoding), options)
     check_format(path, read_sample(file, options.skip_lines))
     try:
@@ -99,7 +99,7 @@ def read_tables(file: TextFile, names: Sequence[str], options: ReadingOptions, t
         chosen = choose_tables(file, tables) if tables else None
         if chosen is None and isinstance(error, _SeveralError):
             raise DataError(
-                f"{file.path}: has {list_tables(tables)}; choose one with --table, {file.choice}1 to "
+                f"{file.path}: has {list_tables(tables)}; choose one with --format table=N, {file.choice}1 to "
                 f"{file.choice}{len(tables)}"
             ) from None
         if chosen is None or (isinstance(error, NoColumnError) and chosen[0][0].layout == layout):
@@ -121,13 +121,13 @@ def _find_table(file: TextFile, options: ReadingOptions, lines: Sequence[str]) -
     else:
         tables = list(itertools.islice(walk_tables(file, options), int(options.table)))
         if len(tables) < int(options.table) > 1:
-            raise DataError(f"{file.path}: --table {int(options.table)}: it has {list_tables(tables)}")
+            raise DataError(f"{file.path}: --format table={int(options.table)}: it has {list_tables(tables)}")
         layout = tables[-1].layout if tables else None
     layout = layout or header_only(lines, options, start)
     if layout is None and is_cut_off(lines):
         raise DataError(
             f"{file.path}: has neither a header nor numbers in {len(lines)} lines from line {start + 1}; leave out "
-            "the lines above the table with --skip-lines"
+            "the lines above the table with --format skip=N"
         )
     if layout is None:
         raise DataError(f"{file.path}: is empty; expected a header line with column names, or numbers")
@@ -355,6 +355,6 @@ def _place(file: TextFile, layout: Layout, name: str) -> int:
         return int(name) - 1
     raise NoColumnError(
         f"{file.path}: line {layout.start}: the header does not fit the {layout.columns} columns below it, so "
-        f"there is no column {name!r}; name columns by number, 1 to {layout.columns}, or say --delimiter, --decimal "
-        "or --skip-lines"
+        f"there is no column {name!r}; name columns by number, 1 to {layout.columns}, or say "
+        "--format delimiter=CHARACTER, decimal=SIGN or skip=N"
     )
