@@ -209,7 +209,7 @@ def select_model(data: Dataset, models: Sequence[str], given: Given, options: Fi
     try:
         check_words(given.initial, given.orientation)
     except ValueError as error:
-        raise ConfigurationError(str(error)) from None
+        raise ConfigurationError(f"{'--' if str(error).startswith('initial') else '-o '}{error}") from None
     inputs, output = data.inputs, data.output
     assert output is not None
     check_variation(data.source, output)

@@ -41,6 +41,8 @@ Group = Literal[
 ]
 """What can be registered; the group of the entry points is `bench.` and this name."""
 GROUPS: tuple[Group, ...] = get_args(Group)
+_LISTED = ("rigs", "protocols", "models", "controllers", "studies")
+"""Groups whose parts `bench list` names."""
 
 OWN_PACKAGE = "actuator-bench"
 _OWN_FOLDERS = ("protocols", "drivers", "sim_devices", "rigs")
@@ -152,7 +154,9 @@ def load(group: Group, name: str) -> Any:  # noqa: ANN401 - each group has a typ
         what = (
             group.replace("_", " ").removesuffix("s").replace("studie", "study").replace("laboratorie", "laboratory")
         )
-        raise ConfigurationError(f"there is no {what} {name!r}; {closest(name, known, '`bench list`')}")
+        raise ConfigurationError(
+            f"there is no {what} {name!r}; {closest(name, known, '`bench list`' if group in _LISTED else '')}"
+        )
     return known[name].load()
 
 

@@ -95,7 +95,12 @@ def complete_setting(context: typer.Context, incomplete: str) -> list[str]:
     """Return the parameters of the protocol whose names begin so, for the completion of a shell."""
     from bench.protocol import find_protocol
 
-    names = find_protocol(context.params.get("protocol") or "").parameters.model_fields
+    # An option without its value leaves the words before it unread.
+    protocol = context.params.get("protocol") or next(iter(context.args), "")
+    try:
+        names = find_protocol(protocol).parameters.model_fields
+    except ConfigurationError:
+        return []
     return [f"{name}=" for name in names if name.startswith(incomplete)]
 
 
@@ -117,7 +122,9 @@ RigOption = Annotated[
 ProtocolArgument = Annotated[
     str | None,
     typer.Argument(
-        help="Name of a protocol, or a file of your own: path/to/file.py[:NAME].", autocompletion=complete_protocol
+        metavar="PROTOCOL",
+        help="Name of a protocol, or a file of your own: path/to/file.py[:NAME].",
+        autocompletion=complete_protocol,
     ),
 ]
 SettingsOption = Annotated[

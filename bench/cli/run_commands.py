@@ -198,6 +198,7 @@ def run(
     help_: Annotated[
         bool,
         typer.Option(
+            "-h",
             "--help",
             help="Show this message; after PROTOCOL also its parameters, and with --rig their defaults there.",
         ),

@@ -108,9 +108,9 @@ class Run:
         Values of the rig file to replace, by dotted key.
     seed : int
         Seed of everything random in an emulated laboratory.
-    clock : str, optional
-        `wall`, `virtual` or `xN`; see `bench.base.clock.make_clock`. If not given, `virtual` where all instruments
-        are emulated in this process, else `wall`.
+    clock : str or None
+        `wall`, `virtual` or `xN`; see `bench.base.clock.make_clock`. None is `virtual` where all instruments are
+        emulated in this process, else `wall`.
     folder : Path
         Where the folder of the run is made.
     live : bool
@@ -148,7 +148,7 @@ class Run:
     folder: Path
     overrides: Mapping[str, str] = field(default_factory=dict)
     seed: int = 0
-    clock: str | None = None
+    clock: str | None = "wall"
     live: bool = False
     recording: bool = True
     attach: Path | None = None

@@ -44,7 +44,7 @@ def test_a_pause_with_all_that_it_offers(start, tmp_path, rig_file):
     child = start(
         "run", f"{SUPPORT / 'heater_protocols.py'}:stairs", "--rig", rig_file(), "--set", "dwell=0.6",
         "--set", "count=8", "--set", "increment=1",
-        "--no-rehearse", "--notify", f"{sys.executable} {listener}",
+        "--clock", "wall", "--no-rehearse", "--notify", f"{sys.executable} {listener}",
     )  # fmt: skip
     child.expect("step 1 at")
     child.sendintr()

@@ -13,7 +13,7 @@ from typing import Any, TypeGuard
 import numpy as np
 
 from bench.analysis import WholeIdentification, check_template, option_names, whole_identification, whole_models
-from bench.base import BenchError, ConfigurationError, registry
+from bench.base import BenchError, ConfigurationError, closest, registry
 from bench.batch.campaign.file import (
     REFERENCE,
     CampaignFile,
@@ -193,9 +193,7 @@ class _Expander:
             allowed = option_names(table.model)
         for key in table.options:
             if key not in allowed:
-                raise ConfigurationError(
-                    f"{where}.{key}: there is no such key; allowed are: {', '.join(allowed) or 'none'}"
-                )
+                raise ConfigurationError(f"{where}.{key}: there is no such key; {closest(key, allowed)}")
 
     def _add_runs(self, number: int, table: RunsTable) -> None:
         where = self._file.where("runs", number)

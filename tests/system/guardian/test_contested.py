@@ -28,7 +28,8 @@ LONGEST = 200.0
 
 
 def bench_run(*options):
-    command = [sys.executable, "-P", "-m", "bench", "run", PROTOCOL, "--rig", "vo2", "--no-rehearse", *options]
+    command = [sys.executable, "-P", "-m", "bench", "run", PROTOCOL, "--rig", "vo2", "--no-rehearse"]
+    command += ["--clock", "wall", *options]
     return subprocess.Popen(
         command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True
     )

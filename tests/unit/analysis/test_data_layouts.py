@@ -63,7 +63,7 @@ class TestRefused:
         ("options", "words"),
         [
             ({"delimiter": "some"}, "--format delimiter=some: expected a character"),
-            ({"delimiter": "5"}, "--format delimiter=CHARACTER"),
+            ({"delimiter": "5"}, "--format delimiter=5"),
             ({"decimal": ";"}, "--format decimal=;: expected point or comma"),
             ({"encoding": "klingon"}, "--format encoding=klingon is unknown"),
             ({"skip_lines": -1}, "--format skip=-1"),

@@ -89,10 +89,9 @@ class TestEntries:
             registry.entries("colours")
 
     @cases(("group", "what"), [("models", "model"), ("studies", "study"), ("laboratories", "laboratory")])
-    def test_an_unknown_name_lists_what_there_is(self, group, what):
-        with pytest.raises(ConfigurationError, match=f"there is no {what} 'magic'; there are: ") as caught:
+    def test_an_unknown_name_says_where_all_are(self, group, what):
+        with pytest.raises(ConfigurationError, match=f"there is no {what} 'magic'; (there are: |`bench list` shows)"):
             registry.load(group, "magic")
-        assert all(name in str(caught.value) for name in registry.entries(group))
 
     def test_two_packages_with_one_name(self, install, list_):
         install("outside-one", {"models": ["same = outside_one:MODEL"]})
@@ -137,9 +136,7 @@ class TestBroken:
 
     def test_a_rig_that_is_asked_for_by_name(self, install):
         install("outside-broken", {"rigs": ["broken = outside_gone"]})
-        with pytest.raises(
-            ConfigurationError, match=r"there is no rig 'coil'; there are: .*vo2(.|\n)*outside-broken"
-        ):
+        with pytest.raises(ConfigurationError, match=r"there is no rig 'coil'; (.|\n)*outside-broken"):
             load_rig("coil")
 
     def test_the_package_of_what_is_not_our_own_is_shown(self, install, list_):

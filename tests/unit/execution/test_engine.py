@@ -859,6 +859,19 @@ class TestInterrupted:
         with b.record() as run:
             assert run.status == "aborted"
 
+    @pytest.mark.parametrize(("second", "status"), [(RESUME, "completed"), (ABORT, "aborted")])
+    def test_the_end_of_a_long_run_is_to_be_confirmed(self, bench, second, status):
+        ask, asked = self.answering(ABORT, second)
+        b = bench(ask=ask)
+
+        def go(parameters):
+            yield Step({"tec": 30.0}, Dwell(700.0))
+            b.interrupts.pause_requested = True
+            yield Step({"tec": 31.0}, Dwell(2.0))
+
+        assert b.run(define(go)).status == status
+        assert "answer abort once more" in asked[1].problem
+
     def test_a_pause_that_nobody_can_end_is_an_abort(self, bench):
         self.b = b = bench()
         outcome = b.run(self.request(pause_requested=True))

@@ -72,7 +72,7 @@ class TestParse:
     def test_an_unknown_name_lists_the_known(self):
         with pytest.raises(ConfigurationError) as caught:
             ramp.parse({"lwo": "3", "needed": "1"})
-        assert "there is no parameter 'lwo'; there are: low, count, slow, free, title, needed" in str(caught.value)
+        assert "there is no parameter 'lwo'; did you mean low?" in str(caught.value)
 
     @cases(
         ("name", "value", "allowed"),

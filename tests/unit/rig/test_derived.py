@@ -220,7 +220,7 @@ class TestOnARig:
             ("tec_temperature", "half", "derived.half.expression: 'half': there is no such signal"),
             ("tec_temperature", "total", "or it comes from this one; there are: tec_setpoint"),
             ('unit = "K"', 'unit = "V"', "derived.half.expression = '0.5 * tec_temperature' is in K, not in unit"),
-            ('unit = "K"', 'unit = "V"\nunits = 3', "derived.half.units: there is no such key; allowed are: kind, "),
+            ('unit = "K"', 'unit = "V"\nunits = 3', "derived.half.units: there is no such key; did you mean unit?"),
             ('unit = "K"', "", "derived.half.unit: is missing (unit of the result; 1 for a plain number)"),
             (
                 "0.5 * tec",

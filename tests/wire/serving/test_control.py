@@ -210,7 +210,7 @@ def test_a_restarted_supply_says_so(sma, opened):
         (b"[1]", "expected an object"),
         (b'{"do": 3}', "expected an object"),
         (b'{"do": "explode"}', "there is no request 'explode'; there are: help, state,"),
-        (b'{"do": "state", "instrument": "tec"}', "state: instrument: there is no such key; allowed are: rig"),
+        (b'{"do": "state", "instrument": "tec"}', "state: instrument: there is no such key; there are: rig"),
         (b'{"do": "advance"}', "advance: seconds: is missing (laboratory time that passes, s)"),
         (b'{"do": "advance", "seconds": -1}', "advance: seconds = -1"),
         (b'{"do": "advance", "seconds": "3"}', "advance: seconds = '3'"),

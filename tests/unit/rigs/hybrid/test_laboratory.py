@@ -409,9 +409,9 @@ class TestSettings:
     @cases(
         ("key", "value", "words"),
         [
-            ("ambient_deviation", "-0.1", "greater than or equal to 0"),
-            ("resonance_offset", "0.2", "less than or equal to 0.1"),
-            ("current_limit", "0.5", "less than or equal to 0.4"),
+            ("ambient_deviation", "-0.1", "≥ 0"),
+            ("resonance_offset", "0.2", "≤ 0.1"),
+            ("current_limit", "0.5", "≤ 0.4"),
             ("fault", "fire", "'open-thermistor'"),
             ("fault_time", "nan", "finite number"),
             ("temperature", "20", "there is no such key"),

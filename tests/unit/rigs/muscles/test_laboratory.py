@@ -333,8 +333,8 @@ class TestSettings:
     @cases(
         ("key", "value", "words"),
         [
-            ("battery_voltage", "0", "greater than 0"),
-            ("rest_position", "0.05", "less than or equal to 0.035"),
+            ("battery_voltage", "0", "> 0"),
+            ("rest_position", "0.05", "≤ 0.035"),
             ("fault", "fire", "'missing-heartbeat'"),
             ("temperature", "20", "there is no such key"),
         ],
