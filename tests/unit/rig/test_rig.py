@@ -162,7 +162,7 @@ class TestUnknownKeys:
         ],
     )
     def test_at_each_level(self, rig_file, old, new, key, allowed):
-        message = wrong(rig_file((old, new)), f"{key}: there is no such key; did you mean {allowed}?")
+        message = wrong(rig_file((old, new)), f"{key}: there is no such key", allowed)
         assert len(message.splitlines()) == 1
 
     @cases(
@@ -188,7 +188,7 @@ class TestWrongValues:
     @cases(
         ("old", "new", "expected"),
         [
-            ('"a heated plate"', "5", ("rig.title = 5", "string")),
+            ('"a heated plate"', "5", ("rig.title = 5", "a text")),
             ("period = 0.5", "period = 0.0", ("telemetry.period = 0.0", "0.01")),
             ("period = 0.5", "period = 'often'", ("telemetry.period = 'often'", "number")),
             ("high = 90.0", "high = 90.0\nlow = 95.0", ("interlocks.0", "low must be below high", "95", "90")),
