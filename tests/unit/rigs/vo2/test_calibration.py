@@ -43,9 +43,9 @@ def calibrated(bench, tmp_path):
         code, _, err = bench(
             "run", protocol, "--rig", "vo2", "--clock", "virtual", "--no-rehearse", "--out", tmp_path,
             "--json", tmp_path / "run.json",
-            *(part for key, value in overrides.items() for part in ("--override", f"emulation.{key}={value}")),
+            *(part for key, value in overrides.items() for part in ("--override", f"{key}={value}")),
         )  # fmt: skip
-        assert (code, err) == (0, "")
+        assert code == 0, err
         run = json.loads((tmp_path / "run.json").read_text())["folder"]
         code, _, err = bench(
             "rig", "calibrate", run, "--sensor", "psd_position", *options, "--out", tmp_path / "psd.json"
@@ -67,7 +67,7 @@ def shown_by(seed):
 
 def test_a_mirror_calibrates_nonlinearity_offset_and_lever(calibrated):
     seed = 3
-    found = calibrated("calibration-mirror", *MIRROR, sensor_seed=seed)
+    found = calibrated("calibration-mirror", *MIRROR, **{"emulation.sensor_seed": seed})
     curvatures = np.radians(found.value(shown_by(seed))) / 300e-6
     errors = curvatures - CURVATURES
     # Of the mirror's angle 0.01 degrees are 0.58 1/m, and the scale of its goniometer 0.4 1/m; before it is 12 1/m.
@@ -78,7 +78,7 @@ def test_a_mirror_calibrates_nonlinearity_offset_and_lever(calibrated):
 
 def test_moving_the_detector_leaves_the_gain_of_the_lever(calibrated):
     stage = ("--uncertainty", 6e-9, "--gain-uncertainty", 0.0029, "--interval", 365)
-    found = calibrated("calibration-detector", *stage, sensor_seed=3)
+    found = calibrated("calibration-detector", *stage, **{"emulation.sensor_seed": 3})
     gain = 1.0 + settings_of(3).errors_of("psd", PSD).gain_error
     left = found.value(shown_by(3)) - gain * DEFLECTIONS
     assert np.abs(left).max() < 50e-9
@@ -88,7 +88,7 @@ def test_moving_the_detector_leaves_the_gain_of_the_lever(calibrated):
 
 
 def test_a_calibrated_rig_and_the_one_message_for_each_calibration_that_does_not_fit(bench, tmp_path, calibrated):
-    found = calibrated("calibration-mirror", *MIRROR)
+    found = calibrated("calibration-mirror", *MIRROR, **{"devices.tec.calibration_due": "1999-12-01"})
     path, file = tmp_path / "calibrated.toml", tmp_path / "psd.json"
     path.write_text(CALIBRATED)
     with Rig(load_rig(str(path)), VirtualClock(), seed=1) as rig:
@@ -132,3 +132,11 @@ def test_a_calibrated_rig_and_the_one_message_for_each_calibration_that_does_not
         code, _, err = bench("rig", "calibrate", run, "--sensor", "psd_position", "--unit", "°", *options)
         assert code
         assert "uncertainty" in err or "--interval" in err
+    of_plate = ("--sensor", "psd_position", "--reference", "tec_temperature", "--uncertainty", 0.1, "--interval", 365)
+    for options, words in (
+        ((), "tec_temperature is in °C, not in m"),
+        (("--unit", "°C"), "the certificate of the reference tec ended on 1999-12-01"),
+    ):
+        code, _, err = bench("rig", "calibrate", run, *of_plate, *options)
+        assert code
+        assert words in " ".join(err.split())
