@@ -64,7 +64,7 @@ CALIBRATIONS = {
 RANGES = {
     "vo2": {"tec": (25.0, 80.0)},
     "sma": {"supply": (0.0, 3.0)},
-    "hybrid": {"tec": (-0.1, 0.1), "piezo": (-40, 40)},
+    "hybrid": {"tec": (-0.08, 0.06), "piezo": (-40, 40)},
 }
 """Set-points by device."""
 HOLD = {"vo2": 5, "sma": 30, "hybrid": 400}
