@@ -3,8 +3,9 @@
 A reader who copies their blocks in order gets what the page says.
 
 A block with `file: NAME` after its language is written to that file, `sh` and `python` without it are run, and each
-line of a `text` block has to occur in what the block before it has printed. A `bash` block is for hardware, or takes
-long: it is not run, but its commands and options have to exist. A `c` block is not run either.
+line of a `text` block has to occur in what the block before it has printed; in a `text like` block any number stands
+for any other, and so does any blank. A `bash` block is for hardware, or takes long: it is not run, but its commands
+and options have to exist. A `c` block is not run either.
 """
 
 import os
@@ -36,7 +37,14 @@ LONG = {
     "vo2",
 }
 """Some seconds each; of these `make test` looks at the commands only (`test_readme.py`)."""
-BLOCK = re.compile(r"^```(\w+)(?: file: (\S+))?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+BLOCK = re.compile(r"^```(\w+(?: like)?)(?: file: (\S+))?\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+NUMBER = re.compile(r"[-+]?\d[\d.,:]*(?:e[-+]?\d+)?")
+
+
+def pattern(line):
+    """Return what a line of a `text like` block stands for."""
+    words = (map(re.escape, NUMBER.split(word)) for word in line.split())
+    return r"\s+".join(NUMBER.pattern.join(word) for word in words)
 
 
 @pytest.fixture
@@ -62,15 +70,18 @@ def environment(tmp_path, warm_commands):
 )
 def test_page(path, tmp_path, environment, finished_process, warm_process, request):
     page, printed = path.stem, None
+    if path.parent.name == "tutorials":
+        environment = {**environment, "COLUMNS": "80"}
     if "gcc" in path.read_text() or "--fmu" in path.read_text():
         request.getfixturevalue("gcc")
     for language, name, text in BLOCK.findall(path.read_text()):
         if name:
             (tmp_path / name).write_text(text)
-        elif language == "text":
+        elif language.startswith("text"):
             assert printed is not None, f"{page}: a text block stands after no block that prints"
             for line in filter(None, map(str.strip, text.splitlines())):
-                assert line in printed, f"{page}: {line!r} is not in\n{printed}"
+                wanted = pattern(line) if language.endswith("like") else re.escape(line)
+                assert re.search(wanted, printed), f"{page}: {line!r} is not in\n{printed}"
         elif language not in ("bash", "c"):
             command, run = {
                 "sh": (["sh", "-e", "-c"], finished_process),
