@@ -34,7 +34,8 @@ THEMES = ("dark", "light")
 _OVERLAPPING = """() => {
     const found = [];
     const boxes = (parent, query) => [...parent.querySelectorAll(query)]
-        .filter(each => each.textContent.trim() && each.checkVisibility()).map(each => [each, each.getBoundingClientRect()])
+        .filter(each => each.textContent.trim() && each.checkVisibility())
+        .map(each => [each, each.getBoundingClientRect()])
         .filter(([_, box]) => box.width > 1 && box.height > 1);
     const over = (a, b) => Math.min(a.right, b.right) - Math.max(a.left, b.left) > 2
         && Math.min(a.bottom, b.bottom) - Math.max(a.top, b.top) > 2;
