@@ -113,7 +113,7 @@ def hammerstein_source(model: Hammerstein, starts: Starts, real: Real, period: f
     if model.is_viscous:
         raise DataError(
             "a model with viscous terms cannot be exported: what the input does next decides them; identify one "
-            "without them, such as with --dynamics lag"
+            "without them, such as with -o dynamics=lag"
         )
     if period is None:
         raise ConfigurationError("--period: a model with time needs one, in s; the linear part is discretized for it")

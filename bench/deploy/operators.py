@@ -78,7 +78,7 @@ _REASONS = {
     "summed": "it is the model to compare with; fit two-stage",
     "bouc-wen-oscillator": "it integrates a differential equation of the load and has no inverse from step to step",
     "preisach-oscillator": "it integrates a differential equation of the load and has no inverse from step to step",
-    "rate-dependent-plays": "its plays follow their input in time; fit prandtl-ishlinskii, or --dynamics lag",
+    "rate-dependent-plays": "its plays follow their input in time; fit prandtl-ishlinskii, or -o dynamics=lag",
 }
 
 
