@@ -28,7 +28,10 @@ _NO_DRIVER = (
 )
 
 MENU_BAR = 36
-"""Height of the menu bar of Rerun's viewer 0.41, pixels: it warns of the computer that draws, not of the run."""
+"""Height of the menu bar of Rerun's viewer, pixels: it warns of the computer that draws, not of the run.
+
+Source: a picture of Rerun 0.41.
+"""
 
 _LOOK = 1.5
 """Wall-clock time between two looks at what it has drawn, s. Derivation: eighty looks within `_PATIENCE`."""

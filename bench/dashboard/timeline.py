@@ -24,6 +24,7 @@ _STATES: Mapping[str, Colour] = {
     "failed": (206, 62, 58),
     _NOT_SETTLED: (206, 118, 52),
 }
+
 _PLAIN = (_RUNNING, "safe", "completed", "aborted", "failed")
 """States that every run has, the last ones for a moment at its end."""
 _STATE_OF_EVENT = {"pause": "paused", "resume": _RUNNING, "interlock": "interlock", "safe-state": "safe"}

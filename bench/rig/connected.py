@@ -92,7 +92,9 @@ class Rig:
             self._setpoint_names = {name: f"{name}_setpoint" for name in self.actuators}
             self._read_before: dict[tuple[Look, frozenset[str]], dict[str, Callable[[], dict[str, float]]]] = {}
             described = RigDescription(file, self._describe_devices(), self.signals)
-            self.signals = tuple(replace(each, extent=described.extent(each.name)) for each in self.signals)
+            self.signals = tuple(
+                replace(each, extent=described.extent(each.name) or each.extent) for each in self.signals
+            )
             self.description = replace(described, signals=self.signals)
             self._check_references()
             self._stack = stack.pop_all()

@@ -94,7 +94,8 @@ def _devices(twin: IdentifiedTwin, file: RigFile) -> Iterator[str]:
         yield from _table(f"devices.{device}", keys)
         for signal in measured:
             described = {"name": signal.name, "unit": signal.unit, "description": signal.description}
-            yield from _table(f"[devices.{device}.signals]", described | {"precision": signal.precision})
+            shown = {"precision": signal.precision} | ({"extent": signal.extent} if signal.extent else {})
+            yield from _table(f"[devices.{device}.signals]", described | shown)
         if setpoint is not None:
             low, high = limits[device]
             described = {"name": setpoint.name, "unit": setpoint.unit, "description": setpoint.description}

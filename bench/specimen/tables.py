@@ -20,11 +20,14 @@ class SignalTable(CheckedTable):
     unit: str = Field(description="its unit")
     description: str = Field(default="", description="a few words for axes and column headers")
     precision: int = Field(default=3, ge=0, le=12, description="digits after the point that are worth showing")
+    extent: float | None = Field(
+        default=None, gt=0, description="greatest magnitude that the rig allows, in its unit, for the unit on display"
+    )
 
     @property
     def signal(self) -> Signal:
         """The signal."""
-        return Signal(self.name, self.unit, self.description, self.precision)
+        return Signal(self.name, self.unit, self.description, self.precision, extent=self.extent)
 
 
 class SetpointTable(SignalTable):
