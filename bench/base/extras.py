@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib.metadata
 import importlib.util
-import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,6 +12,7 @@ from urllib.parse import urlsplit
 from urllib.request import url2pathname
 
 from bench.base.errors import ConfigurationError
+from bench.base.parsing import parse_json
 
 Extra = Literal["cluster", "dashboard", "files", "fmu", "panel", "report"]
 
@@ -27,7 +27,7 @@ def how_to_install(extra: str) -> str:
     That is a checkout or a wheel on this computer (PEP 610, `direct_url.json`), else an index.
     """
     recorded = importlib.metadata.distribution("actuator-bench").read_text("direct_url.json") or "{}"
-    source = urlsplit(json.loads(recorded).get("url", ""))
+    source = urlsplit(parse_json(recorded).get("url", ""))
     place = Path(url2pathname(source.path))
     return f"pip install '{place if source.scheme == 'file' and place.exists() else 'actuator-bench'}[{extra}]'"
 

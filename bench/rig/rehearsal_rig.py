@@ -99,7 +99,7 @@ def _with_limits(twin: Mapping[str, Any], rig: Mapping[str, Any]) -> dict[str, A
 
 
 def _leave_out(content: dict[str, Any], absent: set[str]) -> None:
-    """Leave out what belongs to devices that the twin does not have: slots, derived signals and interlocks."""
+    """Leave out what belongs to devices that the twin does not have: slots, derived signals, interlocks, uncertainties."""
     if not absent:
         return
     # A derived signal may come from one above it.
@@ -112,6 +112,10 @@ def _leave_out(content: dict[str, Any], absent: set[str]) -> None:
     roles = content.get("roles", {})
     content["roles"] = {name: table for name, table in roles.items() if not _names(table, gone)}
     content["interlocks"] = [table for table in content.get("interlocks", []) if not _names(table, gone)]
+    uncertainty = content.get("uncertainty", {})
+    content["uncertainty"] = {
+        name: table for name, table in uncertainty.items() if not _names({"signal": name}, gone)
+    }
     order = content.get("safety", {}).get("order", [])
     content["safety"] = {**content.get("safety", {}), "order": [each for each in order if each not in absent]}
 

@@ -383,9 +383,9 @@ class MuscleLaboratory(EmulatedLaboratory):
             if task == STAGE:
                 self.frame.fasten()
             elif not self._load_is_forgotten:
-                load = self._load_factor * self._settings.characteristic_of("weights", WEIGHTS).value(value)
+                load = self._load_factor * value
                 try:
-                    self.frame.hang(load)
+                    self.frame.hang(self._settings.characteristic_of("weights", WEIGHTS).value(load))
                 except ValueError as error:
                     raise ConfigurationError(f"a load of {load:g} N cannot be hung on the muscle: {error}") from None
 

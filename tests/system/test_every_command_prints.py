@@ -42,6 +42,7 @@ COMMANDS = {
     "runs repair": ["run"],
     "runs compare": ["run", "run"],
     "model twin": ["run", "--rig", "vo2", "--out", "new.toml"],
+    "model deploy": ["model.json", "--c", "exported"],
     "model tune": ["model.json", "--rig", "missing", "--out", "new.toml"],
     "new": ["rig", "bench-of-mine"],
     "study vo2": ["--workers", "0"],

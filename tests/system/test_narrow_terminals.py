@@ -94,7 +94,10 @@ class TestTables:
 @pytest.mark.parametrize(
     ("command", "words"),
     [
-        (["design", "--rig", "vo2"], ["set-points", "condition", "variance", "damped-oscillation", "210/210"]),
+        (
+            ["model", "design", "--rig", "vo2"],
+            ["set-points", "condition", "variance", "damped-oscillation", "210/210"],
+        ),
         (["rehearse", "creep", "--rig", "vo2"], ["tec_sink_temperature", "lowest", "(interlock)", "margin"]),
     ],
     ids=["design", "rehearse"],
@@ -107,7 +110,8 @@ def test_commands_cut_nothing(bench, monkeypatch, columns, command, words):
     assert code == 0
     for word in words:
         assert word in out
-    assert "…" not in out
+    # A line about the progress, where the machine is slow, ends with a blank and three points.
+    assert not [line for line in out.splitlines() if "…" in line.removesuffix(" …")]
 
 
 class TestTextsOfOthers:

@@ -317,7 +317,7 @@ class TestTwin:
 
     def test_a_twin_without_a_device_that_the_protocol_needs(self, tmp_path):
         bare = 'extends = "vo2"\nwithout = ["devices.psd", "derived", "roles.response", "dashboard", ' \
-            '"interlocks"]\n[rig]\ntitle = "bare"\n'  # fmt: skip
+            '"interlocks", "uncertainty"]\n[rig]\ntitle = "bare"\n'  # fmt: skip
         self.write(tmp_path, bare, "bare.toml")
         path = self.write(tmp_path, self.HARDWARE.replace("[rig]\n", '[rig]\ntwin = "bare.toml"\n'))
         twin = self.twin(path)

@@ -297,7 +297,19 @@ def test_a_controller_is_tuned_on_the_emulated_rig(tmp_path):
     with pytest.raises(SystemExit) as stopped:
         main(
             [
-                *("tune", str(model), "--rig", "vo2", "--controller", "integral", "--rounds", "1", "--workers", "1"),
+                *(
+                    "model",
+                    "tune",
+                    str(model),
+                    "--rig",
+                    "vo2",
+                    "--controller",
+                    "integral",
+                    "--rounds",
+                    "1",
+                    "--workers",
+                    "1",
+                ),
                 *("--set", "count=2", "--set", "readings=1", "--set", "low=500", "--set", "high=1200"),
                 *("--seeds", "1", "--checks", "2", "--runs", str(tmp_path / "runs"), "--out", str(out)),
             ]

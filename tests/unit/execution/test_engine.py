@@ -803,8 +803,8 @@ class TestInterrupted:
 
     def test_a_changed_parameter_counts_from_the_next_reading_on(self, bench):
         b, asked = self.paused_in_stairs(bench, "set dwell=2", RESUME)
-        assert asked[0].parameters == {"dwell": "4.0 s, hold (0 to 3600)"}
-        assert asked[1].parameters == {"dwell": "2.0 s, hold (0 to 3600)"}
+        assert asked[0].parameters == {"dwell": "4 s, hold (0 to 3600)"}
+        assert asked[1].parameters == {"dwell": "2 s, hold (0 to 3600)"}
         with b.record() as run:
             assert [step.finished - step.started for step in run.step_records()] == [4.0, 4.0, 2.0, 2.0]
             (change,) = ParameterChange.among((each.kind, each.text) for each in run.events())

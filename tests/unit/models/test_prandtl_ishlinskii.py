@@ -170,7 +170,7 @@ def test_dead_zones():
         (lambda: actuator().step((0.0,), 1.0), "state: expected 15"),
         (lambda: actuator().saturated_state(0), "direction"),
         (lambda: actuator().with_coefficients([1.0], 0.0), "coefficients: expected 15"),
-        (lambda: PrandtlIshlinskii.from_json({"thresholds": [0.0]}), "weights"),
+        (lambda: PrandtlIshlinskii.from_json({"type": "prandtl-ishlinskii", "thresholds": [0.0]}), "weights"),
     ],
 )
 def test_wrong_input_is_named(make, message):

@@ -138,9 +138,9 @@ def test_from_characterization_to_tracking_in_few_steps(run, bench, tmp_path, ri
 
 
 REFUSED = [
-    ("damped-oscillation", {"increment": "-1"}, "increment = '-1' is not allowed; allowed: > 0 °C"),
-    ("random-validation", {"increment": "0"}, "increment = '0' is not allowed; allowed: > 0 °C"),
-    ("damped-oscillation", {"increment": "nan"}, "increment = 'nan' is not allowed; allowed: > 0 °C"),
+    ("damped-oscillation", {"increment": "-1"}, "increment = '-1' is not allowed; allowed: > 0 K"),
+    ("random-validation", {"increment": "0"}, "increment = '0' is not allowed; allowed: > 0 K"),
+    ("damped-oscillation", {"increment": "nan"}, "increment = 'nan' is not allowed; allowed: > 0 K"),
     (
         "damped-oscillation",
         {"center": "90"},

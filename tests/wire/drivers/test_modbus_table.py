@@ -280,7 +280,7 @@ WRONG = {
         {"setpoint": {"at": 1, "kind": "U16", "unit": "W", "limits": [-5, 5]}},
         "does not fit",
     ),
-    "an address": ({"output": {"at": 70000}}, "≤ 65535"),
+    "an address": ({"output": {"at": 70000}}, "65535"),
     "on and off": ({"output": {"at": 1, "on": 0}}, "on and off are both 0"),
     "an arrival": (
         {"setpoint": {"at": 1, "unit": "W", "limits": [0, 5], "arrival": {"signal": "x", "tolerance": 1}}},
