@@ -112,10 +112,8 @@ def _leave_out(content: dict[str, Any], absent: set[str]) -> None:
     roles = content.get("roles", {})
     content["roles"] = {name: table for name, table in roles.items() if not _names(table, gone)}
     content["interlocks"] = [table for table in content.get("interlocks", []) if not _names(table, gone)]
-    uncertainty = content.get("uncertainty", {})
-    content["uncertainty"] = {
-        name: table for name, table in uncertainty.items() if not _names({"signal": name}, gone)
-    }
+    stated = content.get("uncertainty", {})
+    content["uncertainty"] = {name: table for name, table in stated.items() if not _names({"signal": name}, gone)}
     order = content.get("safety", {}).get("order", [])
     content["safety"] = {**content.get("safety", {}), "order": [each for each in order if each not in absent]}
 
