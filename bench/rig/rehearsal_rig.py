@@ -99,7 +99,7 @@ def _with_limits(twin: Mapping[str, Any], rig: Mapping[str, Any]) -> dict[str, A
 
 
 def _leave_out(content: dict[str, Any], absent: set[str]) -> None:
-    """Leave out what belongs to devices that the twin does not have: slots, derived signals, interlocks, uncertainties."""
+    """Leave out what belongs to devices that the twin lacks: slots, derived signals, interlocks, uncertainties."""
     if not absent:
         return
     # A derived signal may come from one above it.
