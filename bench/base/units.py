@@ -15,7 +15,7 @@ _PREFIXES = {"": 1.0, "m": 1e3, "µ": 1e6, "n": 1e9}
 _DIGITS = 3
 """Most digits after the point of a number whose unit can take a prefix."""
 _QUANTITY = re.compile(
-    r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*([A-Za-z°µμΩ%][^,;]*?)\s*", re.ASCII | re.IGNORECASE
+    r"\s*([+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?)\s*((?:(?<=\s)1/)?[A-Za-z°µμΩ%][^,;]*?)\s*", re.ASCII | re.IGNORECASE
 )
 
 

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Self
 
 import typer
 
-from bench.base import AbortError, print_plain
+from bench.base import AbortError, print_plain, write_whole
 from bench.cli.command_support import JsonOption, check_outputs, console, error_console, show_compilation, write_json
 
 if TYPE_CHECKING:
@@ -259,7 +259,7 @@ def _show(expansion: Expansion, done: dict[str, Done], folder: Path) -> list[Pat
             print_over_seeds(name, [folder / task for task in tasks], console)
             for name, tasks in studies_of(expansion, done).items()
         ]
-        (folder / MARKDOWN_NAME).write_text("\n\n".join(texts) + "\n", encoding="utf-8")
+        write_whole(folder / MARKDOWN_NAME, "\n\n".join(texts) + "\n")
         print_plain(console, f"every number: {folder / 'studies.csv'}")
         files |= {"studies": studies, "study-values": study_values(expansion, done)}
     return write_tables(files, folder, console)

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from bench.base import print_plain
+from bench.base import print_plain, write_whole
 from bench.cli.command_support import JsonOption, check_outputs, console, print_rows, show_compilation, write_json
 
 
@@ -61,7 +61,7 @@ def tune_(
         model, rig, twin=twin, controller=controller, protocol=protocol, settings=settings or [], seeds=seeds,
         checks=checks, rounds=rounds, time_weight=time_weight, workers=workers, folder=runs, console=console,
     )  # fmt: skip
-    out.write_text(found.text(), encoding="utf-8")
+    write_whole(out, found.text())
     print_rows(f"{controller} on {found.twin}", found.rows())
     print_plain(console, f"tuning: {out}")
     write_json(json_file, found.summary())

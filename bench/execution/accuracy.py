@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.base import ConfigurationError, quantity
+from bench.base import ConfigurationError, read_quantity
 from bench.protocol import ProtocolDefinition, ProtocolParameters
 from bench.rig import LEVEL, RigDescription, Slots
 
@@ -45,13 +45,11 @@ def check_accuracy(
     if not signal:
         raise ConfigurationError(f"{option}: protocol {definition.name} controls no signal; leave it out")
     unit = description.unit(signal)
-    number, _, given = asked.strip().partition(" ")
     try:
-        scale = quantity("unit", f"1 {given or unit}").to(quantity("unit", f"1 {unit}").units).magnitude
-        wanted = float(number) * float(scale)
-    # The library of units raises many kinds of errors.
-    except Exception:
-        raise ConfigurationError(f"{option}: expected a number in {unit}, or with a unit of that kind") from None
+        # It is a difference.
+        wanted = read_quantity(asked, "K" if unit == "°C" else unit)
+    except ValueError as error:
+        raise ConfigurationError(f"{option}: {error}") from None
     if not 0.0 < wanted < np.inf:
         raise ConfigurationError(f"{option}: expected a number above 0 {unit}")
     low, high = _range(definition, parameters, slots, option)

@@ -12,7 +12,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from bench.base import ConfigurationError, show_table
+from bench.base import ConfigurationError, show_table, write_whole
 from bench.cli import JsonOption, console, parse_assignments, write_json
 
 
@@ -99,5 +99,5 @@ def _write(path: Path, found: Iterable[Mapping[tuple[str, str], Mapping[str, Any
             if keys:
                 tables_of_kind = document.setdefault(kind, tomlkit.table(is_super_table=True))
                 tables_of_kind.setdefault(name, tomlkit.table()).update(keys)
-    path.write_text(tomlkit.dumps(document), encoding="utf-8")
+    write_whole(path, tomlkit.dumps(document))
     console.print(f"written: {path}", highlight=False)

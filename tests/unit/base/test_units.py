@@ -28,6 +28,8 @@ class TestReading:
             ("20 mA", "A", 0.02),
             ("30 deg", "rad", 0.5235987756),
             ("5 %", "1", 0.05),
+            ("2 1/m", "1/m", 2.0),
+            ("2 1/mm", "1/m", 2000.0),
         ],
     )
     def test_a_number_is_in_the_unit_that_is_wanted(self, text, unit, expected):
