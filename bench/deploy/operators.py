@@ -322,7 +322,7 @@ def _duhem(model: Duhem, starts: Starts, real: Real, prefix: str, base: str) -> 
     # As many as three times the range takes, whose width is 2.
     parts = math.ceil(3 * 2 * max(model.rate, 1.0) / 0.5)
     words = {"degree": model.degree, "parts": parts}
-    step = f"at most {parts} parts of 8 nodes and {2 * model.degree} elements"
+    step = f"at most {parts} parts of 8 nodes on each side of an end of the range and {2 * model.degree} elements"
     return _elements(model, starts, "duhem.c.in", words, numbers, rest, real, prefix, base, step=step)
 
 

@@ -265,7 +265,9 @@ def set_up_problem(
     if initial == "estimate" and spec.estimate_state is None:
         raise ValueError(f"initial: 'estimate' needs a nonnegative Preisach density, not {model_name}")
     check_options(model_name, options)
-    template: Operator[Any] = spec.template(sequence, **options)
+    # Its range is that of the rows that are fitted: nothing is known of the output beyond it.
+    rows = counted_weights(sequence.size, w, skip=0) > 0.0
+    template: Operator[Any] = spec.template(sequence[rows], **options)
     if initial == "skip":
         skip = max(skip, template.unknown_until(sequence))
         check_skipped(sequence.size, skip, template.coefficients.size, spec.estimate_state is not None)

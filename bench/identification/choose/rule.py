@@ -383,7 +383,7 @@ class _Search:
 
     def _template(self, spec: ModelSpec, options: Mapping[str, Any]) -> Operator[Any]:
         assert spec.template is not None
-        template: Operator[Any] = spec.template(self.measured.inputs, **options)
+        template: Operator[Any] = spec.template(self.measured.inputs[self.measured.fitted], **options)
         return template
 
     def _penalties(

@@ -123,14 +123,17 @@ class Measurements:
         return cls(inputs, outputs, rows, times, runs, until if left >= _KNOWN * int(rows.sum()) else 0)
 
     def thinned(self, most: int) -> Measurements:
-        """Return about `most` rows, evenly chosen; turning points stay as rows that are not fitted.
+        """Return about `most` rows, evenly chosen, and the ends of the range that is fitted.
 
-        The memory of an operator that does not depend on the rate is the same with and without the rows between.
+        Turning points stay as rows that are not fitted: the memory of an operator that does not depend on the rate is
+        the same with and without the rows between.
         """
         if self.inputs.size <= most:
             return self
         chosen = np.zeros(self.inputs.size, dtype=bool)
         chosen[:: -(-self.inputs.size // most)] = True
+        rows = np.flatnonzero(self.fitted)
+        chosen[rows[[self.inputs[rows].argmin(), self.inputs[rows].argmax()]]] = True
         kept = chosen.copy()
         kept[turning_points(self.inputs, _LEAST_MOVE * float(np.ptp(self.inputs)))] = True
         return Measurements(

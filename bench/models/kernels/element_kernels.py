@@ -199,38 +199,56 @@ _WEIGHTS = (
 )
 
 
+@inlined
+def _duhem_terms(x: float, terms: Floats, slopes: Floats) -> None:
+    """Write T_0 ... T_n at `x`, beyond [-1, 1] `terms` by tangents and `slopes` by their values at the ends."""
+    inside = min(max(x, -1.0), 1.0)
+    slopes[0] = 1.0
+    slopes[1] = inside
+    for k in range(2, slopes.size):
+        slopes[k] = 2.0 * inside * slopes[k - 1] - slopes[k - 2]
+    for k in range(slopes.size):
+        # T_k'(1) = k^2 and T_k'(-1) = (-1)^(k + 1) k^2, where T_k(-1) = (-1)^k.
+        terms[k] = slopes[k] * (1.0 + k * k * (abs(x) - abs(inside)))
+
+
+@inlined
+def _leg_end(present: float, target: float) -> float:
+    """Return the first end of [-1, 1] between two inputs, or the target: a curve bends at the ends."""
+    if present < target:
+        return min(target, -1.0) if present < -1.0 else (min(target, 1.0) if present < 1.0 else target)
+    return max(target, 1.0) if present > 1.0 else (max(target, -1.0) if present > -1.0 else target)
+
+
 @kernel
 def duhem(inputs: Floats, present: float, rate: float, degree: int, state: Floats) -> Floats:
     """Step the elements of a Duhem operator through `inputs`; return their states. `state` is changed.
 
     The first `degree` elements follow T_1 ... T_degree of the input, dw/d|x| = rate (T - w), and the others take
-    T_0 ... T_(degree - 1) up, dv/dx = T - rate sgn(dx) v.
+    T_0 ... T_(degree - 1) up, dv/dx = T - rate sgn(dx) v. Beyond [-1, 1] the first are continued by their tangents
+    and the others by their values at the ends.
     """
     result = np.empty((inputs.size, 2 * degree))
-    chebyshev = np.empty(degree + 1)
+    terms = np.empty(degree + 1)
+    slopes = np.empty(degree + 1)
     total = np.empty(2 * degree)
     for t in range(inputs.size):
-        move = inputs[t] - present
-        count = math.ceil(abs(move) * max(rate, 1.0) / 0.5)
-        step = move / max(count, 1)
-        for part in range(count):
-            start = present + part * step
-            for k in range(2 * degree):
-                total[k] = 0.0
-            for n in range(8):
-                x = start + _NODES[n] * step
-                left = _WEIGHTS[n] * math.exp(-rate * abs(step) * (1.0 - _NODES[n]))
-                chebyshev[0] = 1.0
-                chebyshev[1] = x
-                for k in range(2, degree + 1):
-                    chebyshev[k] = 2.0 * x * chebyshev[k - 1] - chebyshev[k - 2]
-                for k in range(degree):
-                    total[k] += left * rate * abs(step) * chebyshev[k + 1]
-                    total[degree + k] += left * step * chebyshev[k]
+        for _ in range(3):
+            end = _leg_end(present, inputs[t])
+            count = math.ceil(abs(end - present) * max(rate, 1.0) / 0.5)
+            step = (end - present) / max(count, 1)
             decay = math.exp(-rate * abs(step))
-            for k in range(2 * degree):
-                state[k] = state[k] * decay + total[k]
-        present = inputs[t]
-        for k in range(2 * degree):
-            result[t, k] = state[k]
+            for part in range(count):
+                start = present + part * step
+                total[:] = 0.0
+                for n in range(8):
+                    _duhem_terms(start + _NODES[n] * step, terms, slopes)
+                    left = _WEIGHTS[n] * math.exp(-rate * abs(step) * (1.0 - _NODES[n]))
+                    for k in range(degree):
+                        total[k] += left * rate * abs(step) * terms[k + 1]
+                        total[degree + k] += left * step * slopes[k]
+                for k in range(2 * degree):
+                    state[k] = state[k] * decay + total[k]
+            present = end
+        result[t] = state
     return result

@@ -18,10 +18,10 @@ from bench.models.operators.elements import CompiledStep, ElementOperator, check
 class Duhem(ElementOperator):
     """Duhem's operator: dy = rate |dx| (f(x) - y) + g(x) dx, output = bias + y.
 
-    x is the operating range mapped to [-1, 1]; f and g are polynomials (Coleman and Hodgdon, International Journal
-    of Engineering Science 24, 897-919, 1986, with piecewise functions in their place). The output is linear in their
-    coefficients: only the rate is a shape. Minor loops drift towards a closed cycle, where those of a Preisach
-    operator close at once.
+    x is the operating range mapped to [-1, 1]; f and g are polynomials, continued beyond it by the tangents of f and
+    the end values of g (Coleman and Hodgdon, International Journal of Engineering Science 24, 897-919, 1986, with
+    piecewise functions in their place). The output is linear in their coefficients: only the rate is a shape. Minor
+    loops drift towards a closed cycle, where those of a Preisach operator close at once.
 
     Parameters
     ----------

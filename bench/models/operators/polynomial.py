@@ -19,6 +19,8 @@ from bench.models.regressor import Regressor
 class Polynomial(Operator[None]):
     """A polynomial of the input, as Chebyshev series on the range mapped to [-1, 1].
 
+    Beyond the range it is continued by its tangent at the end.
+
     Parameters
     ----------
     series : array_like, shape (degree,)
@@ -81,7 +83,7 @@ class Polynomial(Operator[None]):
     def evaluate(self, inputs: ArrayLike, state: None = None) -> Floats:  # noqa: ARG002
         """Return the outputs, shape (N,)."""
         mapped = self._mapped(_checks.samples("inputs", inputs))
-        return np.asarray(chebyshev.chebval(mapped, np.append(self.bias, self.series)), dtype=np.float64)
+        return np.asarray(self.bias + chebyshev_terms(mapped, self.degree) @ self.series, dtype=np.float64)
 
     def step(self, state: None, value: float) -> tuple[None, float]:  # noqa: ARG002
         """Return None and the output at `value`."""
@@ -90,8 +92,7 @@ class Polynomial(Operator[None]):
     def regressor(self, inputs: ArrayLike, state: None = None) -> Regressor:  # noqa: ARG002
         """Return the columns T1 to Tn."""
         sequence = _checks.samples("inputs", inputs)
-        columns = np.asarray(chebyshev.chebvander(self._mapped(sequence), self.degree)[:, 1:], dtype=np.float64)
-        return Regressor.of_columns(columns)
+        return Regressor.of_columns(chebyshev_terms(self._mapped(sequence), self.degree))
 
     def shifted(self, offset: float) -> Polynomial:
         """Return the operator whose output at an input u is that of this one at u + offset, input units.
@@ -118,3 +119,15 @@ class Polynomial(Operator[None]):
     def inverse(self, policy: Policy = "nearest") -> TableInverse:  # noqa: ARG002
         """Return the look-up table of the polynomial's single-valued inverse."""
         return TableInverse(self)
+
+
+def chebyshev_terms(values: Floats, degree: int) -> Floats:
+    """Return T1 to Tn, a last axis of `degree`, continued beyond [-1, 1] by their tangents at the ends."""
+    inside = np.clip(values, -1.0, 1.0)
+    terms = chebyshev.chebvander(inside, degree)[..., 1:]
+    if not (inside == values).all():
+        # Tn'(1) = n² and Tn'(-1) = (-1)^(n + 1) n².
+        orders = np.arange(1, degree + 1)
+        slopes = np.where(values[..., None] > 0.0, 1.0, (-1.0) ** (orders + 1)) * orders**2
+        terms = terms + slopes * (values - inside)[..., None]
+    return np.asarray(terms)

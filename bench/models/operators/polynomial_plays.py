@@ -1,8 +1,8 @@
 """A polynomial of the input and polynomials of plays, with coefficients of either sign.
 
 A sum of functions of plays is an operator of Prandtl-Ishlinskii type whose density depends on the output of each play
-(Krasnosel'skii and Pokrovskii, Systems with Hysteresis, 1989). Beyond the range of the inputs each polynomial goes on
-as the straight line that touches its end, so that no power runs away there.
+(Krasnosel'skii and Pokrovskii, Systems with Hysteresis, 1989). Beyond the range of the inputs each polynomial is
+continued by its tangent at the end.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from dataclasses import dataclass, replace
 from typing import ClassVar, TypeAlias
 
 import numpy as np
-from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike, NDArray
 
 from bench.base import Floats, checks as _checks
 from bench.models.operator import Operator
+from bench.models.operators.polynomial import chebyshev_terms
 from bench.models.regressor import Regressor
 
 State: TypeAlias = tuple[float, ...]
@@ -140,9 +140,9 @@ class PolynomialPlays(Operator[State]):
         plays = self._plays(sequence, state)
         columns = [plays]
         if self.powers > 1:
-            series = _chebyshev((plays - middle) / (half - self.thresholds), self.powers)
+            series = chebyshev_terms((plays - middle) / (half - self.thresholds), self.powers)
             columns += [series[..., power] for power in range(1, self.powers)]
-        columns.append(_chebyshev((sequence - middle) / half, self.series.size))
+        columns.append(chebyshev_terms((sequence - middle) / half, self.series.size))
         return Regressor.of_columns(np.column_stack(columns))
 
     def evaluate(self, inputs: ArrayLike, state: State | None = None) -> Floats:
@@ -164,15 +164,3 @@ class PolynomialPlays(Operator[State]):
     def nonnegative(self) -> NDArray[np.bool_]:
         """Return False for each coefficient: their signs are free."""
         return np.zeros(self.coefficients.size, dtype=bool)
-
-
-def _chebyshev(values: Floats, degree: int) -> Floats:
-    """Return T1 to Tn, a last axis of `degree`, beyond [-1, 1] by their tangents at the ends."""
-    inside = np.clip(values, -1.0, 1.0)
-    terms = chebyshev.chebvander(inside, degree)[..., 1:]
-    if not (inside == values).all():
-        # Tn'(1) = n² and Tn'(-1) = (-1)^(n + 1) n².
-        orders = np.arange(1, degree + 1)
-        slopes = np.where(values[..., None] > 0.0, 1.0, (-1.0) ** (orders + 1)) * orders**2
-        terms = terms + slopes * (values - inside)[..., None]
-    return np.asarray(terms)

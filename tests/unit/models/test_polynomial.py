@@ -54,3 +54,12 @@ def test_output_range_of_a_line():
 def test_wrong_input_is_named(make_it, message):
     with pytest.raises(ValueError, match=message):
         make_it()
+
+
+def test_goes_on_by_its_tangents_beyond_its_range():
+    p = make()
+    expected = chebyshev.Chebyshev([2.0, *p.series], domain=[21.0, 84.0])
+    for end, beyond in ((84.0, [90.0, 200.0]), (21.0, [15.0, -100.0])):
+        tangents = expected(end) + expected.deriv()(end) * (np.array(beyond) - end)
+        np.testing.assert_allclose(p.evaluate(beyond), tangents)
+        np.testing.assert_allclose(p.regressor(beyond).dense() @ p.coefficients + p.bias, tangents)
