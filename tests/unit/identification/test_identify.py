@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from cases import cases
 
 from bench.identification import damped_oscillation, identify, measure_errors, ramps, random_validation
 from bench.models import Preisach, QuadraticTerm, ThermalExpansion, identifiable_models, uniform_levels
@@ -71,6 +72,22 @@ def test_reversible_part_of_either_sign(kind, term):
     assert found.errors.maximum < 1e-8
     np.testing.assert_allclose(found.model.coefficients, specimen.coefficients, atol=1e-7)
     assert identify("preisach", inputs, outputs, levels=6).errors.maximum > 0.01
+
+
+@cases(
+    ("name", "options"),
+    [("duhem", {"degree": 5}), ("polynomial", {"degree": 5}), ("polynomial-plays", {"degree": 3})],
+)
+def test_a_model_of_small_cycles_does_not_run_away_on_large_ones(name, options):
+    inputs = np.concatenate(
+        [damped_oscillation(-1.0, 1.0, 0.0, 12, 0.05), damped_oscillation(-4.0, 4.0, 0.0, 4, 0.1)]
+    )
+    outputs = np.tanh(inputs) + 0.01 * np.random.default_rng(3).standard_normal(inputs.size)
+    small = np.arange(inputs.size) < damped_oscillation(-1.0, 1.0, 0.0, 12, 0.05).size
+    model = identify(name, inputs, outputs, weights=small.astype(float), **options).model
+    assert model.input_range == (inputs[small].min(), inputs[small].max())
+    # tanh is at most 1, and its secant over the small cycles reaches 3 at the ends of the large ones.
+    assert np.abs(model.evaluate(inputs)).max() < 5.0
 
 
 def test_the_thresholds_of_plays_spread_up_to_the_maximum():
