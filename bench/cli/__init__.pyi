@@ -9,10 +9,12 @@ from .catalogue import (
 from .command_support import (
     STANDARD_OUTPUT as STANDARD_OUTPUT,
     JsonOption as JsonOption,
-    console as console,
     parse_assignments as parse_assignments,
     parse_numbers as parse_numbers,
+    write_json as write_json,
+)
+from .printing import (
+    console as console,
     print_rows as print_rows,
     warn as warn,
-    write_json as write_json,
 )

@@ -15,10 +15,9 @@ from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar, NoReturn
 
 import typer
-from rich.markup import escape
 
 from bench.base import AbortError, BenchError, ConfigurationError, closest, registry
-from bench.cli.command_support import error_console, exit_code, fail, told_of_records
+from bench.cli.command_support import exit_code, told_of_records
 from bench.cli.groups import HELP_OPTIONS, Command, Group
 from bench.cli.streams import standard_streams
 
@@ -45,8 +44,8 @@ class BenchCommands(Group):
         "resume": Command("Go on with a run that was ended or died.", "resume_command:resume", _RUN),
         "panel": Command("Move a rig by hand, or answer a run in progress.", "panel_command:panel", _RUN),
         "safe": Command("Bring every device of a rig into its safe state.", "maintenance_commands:safe", _RUN),
-        "list": Command("List rigs, protocols, models, controllers, studies.", "run_commands:list_", _LOOK),
-        "show": Command("Show one of these in full.", "run_commands:show", _LOOK),
+        "list": Command("List rigs, protocols, models, controllers, studies.", "list_commands:list_", _LOOK),
+        "show": Command("Show one of these in full.", "list_commands:show", _LOOK),
         "runs": Command("List, export, import, repair and compare runs.", "groups:RunsGroup", _LOOK),
         "view": Command("Show a run in a viewer, live or once more.", "view:view", _LOOK),
         "report": Command("Make tables, figures and a page of a run.", "record_commands:report", _LOOK),
@@ -128,26 +127,35 @@ def _carry_out(arguments: Sequence[str] | None) -> NoReturn:
         registry.check_own_packages()
         code = app(args=words, prog_name="bench", standalone_mode=False)
     except BenchError as error:
-        fail(error)
+        _fail(error)
     except (typer.Abort, KeyboardInterrupt):
         code = AbortError.exit_code
     except typer.TyperException as error:
-        fail(ConfigurationError(_usage(error, words)))
+        _fail(ConfigurationError(_usage(error, words)))
     except OSError as error:
         if error.errno != errno.ENAMETOOLONG:
             raise
-        fail(ConfigurationError(f"{str(error.filename)[:60]}…: the name of a file or folder is too long"))
+        _fail(ConfigurationError(f"{str(error.filename)[:60]}…: the name of a file or folder is too long"))
     except sqlite3.Error as error:
-        error_console.print("[bold red]error:[/] the journal cannot be written:", escape(str(error)), highlight=False)
-        sys.exit(1)
+        _fail(BenchError(f"the journal cannot be written: {error}"))
     except SystemExit as ended:
         if isinstance(ended.code, int | None) and (code := exit_code(ended.code or 0)) != (ended.code or 0):
             sys.exit(code)
         raise
     # As typer ends a command at Ctrl-C: without a word.
     if code == AbortError.exit_code:
+        from bench.cli.printing import error_console
+
         error_console.print(f"[yellow]ended by Ctrl-C:[/] {_state_of_outputs(words)}", highlight=False)
     sys.exit(exit_code(code or 0))
+
+
+def _fail(error: BenchError) -> NoReturn:
+    # What prints is imported only now: it takes a third of the time to start.
+    from bench.cli.printing import print_error
+
+    print_error(error)
+    sys.exit(error.exit_code)
 
 
 def _check_words(words: Sequence[str]) -> None:

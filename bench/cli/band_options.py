@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bench.base import print_plain
-from bench.cli.command_support import console, print_rows, warn
+from bench.cli.printing import console, print_rows, warn
 
 if TYPE_CHECKING:
     import numpy as np

@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 
 from bench.base import print_plain
-from bench.cli.command_support import JsonOption, check_outputs, console, print_rows, write_json
+from bench.cli.command_support import JsonOption, check_outputs, write_json
+from bench.cli.printing import console, print_rows
 from bench.cli.run_names import NEWEST, RunArgument
 
 

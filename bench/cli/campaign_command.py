@@ -14,7 +14,8 @@ from typing import TYPE_CHECKING, Annotated, Self
 import typer
 
 from bench.base import AbortError, print_plain, write_whole
-from bench.cli.command_support import JsonOption, check_outputs, console, error_console, show_compilation, write_json
+from bench.cli.command_support import JsonOption, check_outputs, write_json
+from bench.cli.printing import console, error_console, show_compilation
 
 if TYPE_CHECKING:
     from rich.console import Console

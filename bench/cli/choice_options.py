@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bench.base import percent, print_plain
-from bench.cli.command_support import console, print_rows, warn
 from bench.cli.model_options import ModelOptions
+from bench.cli.printing import console, print_rows, warn
 
 if TYPE_CHECKING:
     from bench.analysis import (

@@ -1,34 +1,29 @@
-"""Shared by the commands: console, options, and printing of results and errors."""
+"""Shared by the commands: options, files for results, and what is missing in records.
+
+Rich is imported by what prints only, so that help answers at once.
+"""
 
 from __future__ import annotations
 
 import os
-import sys
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any, NoReturn, TextIO
+from typing import Annotated, Any, TextIO
 
 import typer
-from rich.markup import escape
-from rich.table import Table
 
 from bench.base import (
     BenchError,
     ConfigurationError,
     DataError,
     IncompleteRecordWarning,
-    PlainConsole,
     json_text,
-    show_table,
     write_whole,
 )
 from bench.cli.streams import write_out
-
-console = PlainConsole()
-error_console = PlainConsole(stderr=True)
 
 
 class FigureFormat(StrEnum):
@@ -50,6 +45,8 @@ STANDARD_OUTPUT = Path("-")
 def _take_json(context: typer.Context, path: Path | None) -> Path | None:
     """Check the file of `--json` before its command does anything; with `-` texts go to the standard error."""
     if path == STANDARD_OUTPUT:
+        from bench.cli.printing import console
+
         console.stderr = True
         context.call_on_close(lambda: setattr(console, "stderr", False))
     elif path is not None:
@@ -138,23 +135,6 @@ SettingsOption = Annotated[
 ]
 
 
-def fail(error: BenchError) -> NoReturn:
-    """Print an error of the bench and exit with its code."""
-    print_error(error)
-    sys.exit(error.exit_code)
-
-
-def print_error(error: BenchError) -> None:
-    """Print an error of the bench, a line each of its lines."""
-    for line in str(error).splitlines():
-        error_console.print("[bold red]error:[/]", escape(line), highlight=False, soft_wrap=True)
-
-
-def warn(text: str) -> None:
-    """Print a warning."""
-    error_console.print("[yellow]warning:[/]", escape(text), highlight=False, soft_wrap=True)
-
-
 @contextmanager
 def told_of_records() -> Iterator[None]:
     """Print once what is missing in a record that is opened within; `write_json` writes it for programs too."""
@@ -170,6 +150,8 @@ def told_of_records() -> Iterator[None]:
         if not issubclass(category, IncompleteRecordWarning):
             otherwise(message, category, filename, lineno, file, line)
         elif str(message) not in _of_records:
+            from bench.cli.printing import warn
+
             _of_records.append(str(message))
             warn(str(message))
 
@@ -185,35 +167,6 @@ def told_of_records() -> Iterator[None]:
 
 _of_records: list[str] = []
 """What is missing in the records that the command has opened."""
-
-
-@contextmanager
-def show_compilation() -> Iterator[None]:
-    """Say when numerical kernels are compiled, which a first use does for seconds; also a decorator of commands."""
-    # Here, as numba takes half a second to load.
-    from bench.base import CompilationDisplay
-
-    with CompilationDisplay(console, error_console):
-        yield
-
-
-def print_table(title: str, rows: dict[str, str]) -> None:
-    """Print names and what they stand for under a title."""
-    table = Table(title=title, title_justify="left", show_header=False, box=None, padding=(0, 2))
-    table.add_column(style="bold", no_wrap=True)
-    table.add_column()
-    for name, text in rows.items():
-        table.add_row(name, text)
-    show_table(console, table)
-    console.print()
-
-
-def print_rows(title: str, rows: Sequence[tuple[str, str]]) -> None:
-    """Print (name, text) pairs under a title."""
-    table = Table(title=title, title_justify="left", show_header=False, box=None, padding=(0, 2))
-    for name, text in rows:
-        table.add_row(name, text)
-    show_table(console, table)
 
 
 def parse_assignments(option: str, texts: Sequence[str]) -> dict[str, str]:
@@ -319,6 +272,8 @@ def write_json(path: Path | None, content: Any) -> None:  # noqa: ANN401 - anyth
         except OSError as error:
             failure = error.strerror or str(error)
     if failure:
+        from bench.cli.printing import print_error
+
         _unwritten.append(path)
         print_error(BenchError(f"--json {path} cannot be written: {failure}; the work is done"))
 

@@ -11,16 +11,10 @@ from rich.text import Text
 
 from bench.base import percent, print_plain, show_patience, show_table
 from bench.cli.band_options import BandsOption, Recalibrating, print_examined
-from bench.cli.command_support import (
-    JsonOption,
-    check_outputs,
-    console,
-    show_compilation,
-    warn,
-    write_json,
-)
+from bench.cli.command_support import JsonOption, check_outputs, write_json
 from bench.cli.data_options import ReadingGroup, offer_groups, print_assumptions
 from bench.cli.model_commands import InitialOption
+from bench.cli.printing import console, show_compilation, warn
 from bench.cli.run_names import BEFORE, NEWEST, RunArgument, find_run
 from bench.cli.written import print_figures, write_rows
 
@@ -31,7 +25,7 @@ if TYPE_CHECKING:
 @offer_groups
 @show_compilation()
 def models_on_data(
-    compared: Annotated[list[Path], typer.Argument(metavar="model.json...", help="Model files.")],
+    compared: Annotated[list[Path], typer.Argument(metavar="MODEL", help="Model files.")],
     data: Annotated[
         Path,
         typer.Option(

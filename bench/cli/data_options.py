@@ -12,7 +12,7 @@ import typer
 
 from bench.analysis import ReadingOptions
 from bench.base import print_plain
-from bench.cli.command_support import console
+from bench.cli.printing import console
 
 
 def _layout(

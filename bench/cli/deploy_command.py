@@ -9,7 +9,8 @@ from typing import Annotated
 import typer
 
 from bench.base import ConfigurationError, print_plain
-from bench.cli.command_support import JsonOption, check_outputs, console, print_rows, show_compilation, write_json
+from bench.cli.command_support import JsonOption, check_outputs, write_json
+from bench.cli.printing import console, print_rows, show_compilation
 
 
 class RealType(StrEnum):

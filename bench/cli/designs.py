@@ -9,9 +9,10 @@ import typer
 from rich.table import Table
 
 from bench.analysis import ReadingOptions
-from bench.base import ConfigurationError, show_patience, show_table
-from bench.cli.command_support import JsonOption, check_outputs, console, print_rows, show_compilation, write_json
+from bench.base import ConfigurationError, closest, show_patience, show_table
+from bench.cli.command_support import JsonOption, check_outputs, write_json
 from bench.cli.data_options import ReadingGroup, offer_groups
+from bench.cli.printing import console, print_rows, show_compilation
 from bench.cli.run_names import find_run
 
 if TYPE_CHECKING:
@@ -108,8 +109,8 @@ def design(
         raise ConfigurationError("--sequence NAME and --out FILE.csv belong together")
     found = assess_designs(plane, operating, levels, dwell)
     if sequence is not None and sequence not in found:
-        known = ", ".join(repr(name) for name in found)
-        raise ConfigurationError(f"--sequence {sequence!r}: there is no such sequence; there are: {known}")
+        known = closest(sequence, found)
+        raise ConfigurationError(f"--sequence {sequence!r}: there is no such sequence; {known}")
     result = {name: each.assessment for name, each in found.items()}
     table = Table(title=f"excitation of {levels * (levels + 1) // 2} cells", title_justify="left")
     table.add_column("sequence", no_wrap=True)

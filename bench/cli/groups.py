@@ -1,4 +1,4 @@
-"""The groups of commands: what is in them, how help shows it, and the studies that packages register."""
+"""The groups of commands: what is in them, and how help shows it."""
 
 from __future__ import annotations
 
@@ -7,23 +7,12 @@ from collections.abc import Callable, Mapping
 from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import typer
 from typer.core import TyperGroup
 
 from bench.base import ConfigurationError, closest, registry
-from bench.cli.command_support import (
-    FigureFormat,
-    FigureFormatOption,
-    JsonOption,
-    LiveOption,
-    check_outputs,
-    console,
-    parse_assignments,
-    show_compilation,
-    write_json,
-)
 
 HELP_OPTIONS = {"help_option_names": ["-h", "--help"]}
 
@@ -110,6 +99,8 @@ class Group(TyperGroup):
 
     def make_callback(self, name: str, part: Any) -> Callable[..., None]:  # noqa: ARG002, ANN401
         """Return the function of a command whose entry point is `part`: that itself, with word of compilations."""
+        from bench.cli.printing import show_compilation
+
         callback: Callable[..., None] = show_compilation()(part)
         return callback
 
@@ -213,64 +204,23 @@ class StudyGroup(Group):
 
     def make_callback(self, name: str, part: Any) -> Callable[..., None]:  # noqa: ANN401
         """Return a function that carries a study out."""
+        from bench.cli.study_command import command_of
 
-        def carry_out_study(
-            rig: Annotated[
-                str | None,
-                typer.Option("--rig", metavar="RIG", help="Another rig with the same signals."),
-            ] = None,
-            set_: Annotated[
-                list[str] | None,
-                typer.Option(
-                    "--set",
-                    metavar="PROTOCOL.KEY=VALUE",
-                    help="Set a parameter in each run of a protocol; repeatable.",
-                ),
-            ] = None,
-            seed: Annotated[
-                int, typer.Option(min=0, help="Seed of all noise in the emulated laboratory and of random sequences.")
-            ] = 0,
-            out: Annotated[Path, typer.Option(metavar="DIR", help="Folder for runs, models and figures.")] = Path(
-                "recordings"
-            ),
-            live: LiveOption = False,
-            workers: Annotated[
-                int | None,
-                typer.Option(
-                    min=1, help="Runs that go on beside each other; as many as there are cores if not given."
-                ),
-            ] = None,
-            figures: FigureFormatOption = FigureFormat.PNG,
-            json_file: JsonOption = None,
-        ) -> None:
-            from bench.batch import reproduce
-
-            check_outputs(folder=out)
-            settings: dict[str, dict[str, str]] = {}
-            for name_of_parameter, text in parse_assignments("--set", set_ or []).items():
-                protocol, dot, parameter = name_of_parameter.partition(".")
-                if not dot:
-                    raise ConfigurationError(f"--set {name_of_parameter}={text}: expected PROTOCOL.KEY=VALUE")
-                settings.setdefault(protocol, {})[parameter] = text
-            result = reproduce(
-                name,
-                part,
-                rig=rig,
-                seed=seed,
-                out=out,
-                live=live,
-                console=console,
-                workers=workers,
-                figure_format=figures.value,
-                settings=settings,
-            )
-            write_json(json_file, result)
-
-        carry_out_study.__doc__ = f"{part.summary}\n\n{part.description}"
-        return carry_out_study
+        return command_of(name, part)
 
 
 def _command(name: str, function: Callable[..., None], *, add_help_option: bool = True) -> Any:  # noqa: ANN401
     one = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
     one.command(name, context_settings=HELP_OPTIONS, add_help_option=add_help_option)(function)
-    return typer.main.get_command(one)
+    command: Any = typer.main.get_command(one)
+    for parameter in command.params:
+        _show_no_python(parameter)
+    return command
+
+
+def _show_no_python(parameter: Any) -> None:  # noqa: ANN401 - of typer
+    """Leave the Python types out that typer writes beside arguments, and in place of the value of an option."""
+    if parameter.param_type_name == "argument":
+        parameter.display_type = lambda _: ""
+    elif parameter.metavar is None and not parameter.is_flag and not parameter.type_descriptor.is_choice:
+        parameter.metavar = "NUMBER" if parameter.type_descriptor.is_ranged else "TEXT"

@@ -8,8 +8,9 @@ from typing import Annotated
 import typer
 
 from bench.base import print_plain
-from bench.cli.command_support import JsonOption, check_outputs, console, write_json
+from bench.cli.command_support import JsonOption, check_outputs, write_json
 from bench.cli.data_options import ReadingGroup, offer_groups, print_assumptions
+from bench.cli.printing import console
 
 
 @offer_groups

@@ -11,7 +11,8 @@ import typer
 from rich.table import Table
 
 from bench.base import RecordError, print_plain, show_table
-from bench.cli.command_support import JsonOption, check_outputs, console, write_json
+from bench.cli.command_support import JsonOption, check_outputs, write_json
+from bench.cli.printing import console
 from bench.cli.run_names import NEWEST, RunArgument
 
 

@@ -14,15 +14,8 @@ from rich.markup import escape
 from rich.table import Table
 
 from bench.base import AbortError, ConfigurationError, DeviceError, show_table
-from bench.cli.command_support import (
-    JsonOption,
-    complete_rig,
-    console,
-    parse_assignments,
-    show_compilation,
-    warn,
-    write_json,
-)
+from bench.cli.command_support import JsonOption, complete_rig, parse_assignments, write_json
+from bench.cli.printing import console, show_compilation, warn
 
 UNSAFE_EXIT_CODE = 7
 
@@ -97,7 +90,9 @@ def safe(
 @show_compilation()
 def clear(
     rig: RigArgument,
-    device: Annotated[str | None, typer.Argument(help="Only this device; without it all that are in error.")] = None,
+    device: Annotated[
+        str | None, typer.Argument(metavar="DEVICE", help="Only this device; without it all that are in error.")
+    ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask.")] = False,
     attach: AttachOption = None,
     overrides: OverrideOption = None,

@@ -21,18 +21,10 @@ from bench.cli.choice_options import (
     read_measured,
 )
 from bench.cli.command_line import command_line
-from bench.cli.command_support import (
-    JsonOption,
-    check_given,
-    check_outputs,
-    console,
-    print_rows,
-    show_compilation,
-    warn,
-    write_json,
-)
+from bench.cli.command_support import JsonOption, check_given, check_outputs, write_json
 from bench.cli.data_options import ReadingGroup, offer_groups, print_assumptions
 from bench.cli.model_options import ModelOptions
+from bench.cli.printing import console, print_rows, show_compilation, warn
 from bench.cli.run_names import NEWEST, complete_run, find_run
 from bench.cli.written import print_figures, write_rows
 
@@ -188,7 +180,7 @@ def identify_(
     files: Annotated[
         list[Path] | None,
         typer.Argument(
-            metavar="FILE...",
+            metavar="FILE",
             help="Tables of measurements (text, .mat, .xlsx, .h5, .tdms, .parquet), or runs; one model of all. The "
             "newest run if not given.",
             parser=find_run,

@@ -11,7 +11,8 @@ import typer
 from rich.table import Table
 
 from bench.base import ConfigurationError
-from bench.cli.command_support import console, parse_assignments, print_rows
+from bench.cli.command_support import parse_assignments
+from bench.cli.printing import console, print_rows
 
 if TYPE_CHECKING:
     from bench.models import ModelSpec

@@ -8,12 +8,12 @@ from typing import Annotated
 import typer
 
 from bench.base import print_plain
-from bench.cli.command_support import console
+from bench.cli.printing import console
 from bench.cli.skeletons import Part
 
 
 def new(
-    part: Annotated[Part, typer.Argument(help="What it is: device, protocol, model or rig.")],
+    part: Annotated[Part, typer.Argument(metavar="PART", help="What it is: device, protocol, model or rig.")],
     name: Annotated[
         str, typer.Argument(metavar="NAME", help="Its name, in lower case with hyphens, such as micro-balance.")
     ],

@@ -9,8 +9,9 @@ from typing import Annotated
 import typer
 
 from bench.base import ConfigurationError, check_extra, needed_for
-from bench.cli.command_support import parse_assignments, print_error
+from bench.cli.command_support import parse_assignments
 from bench.cli.maintenance_commands import AttachOption, OverrideOption
+from bench.cli.printing import print_error
 from bench.cli.run_commands import print_result
 
 

@@ -9,14 +9,8 @@ from typing import Annotated
 import typer
 
 from bench.base import print_plain
-from bench.cli.command_support import (
-    FigureFormat,
-    FigureFormatOption,
-    JsonOption,
-    console,
-    show_compilation,
-    write_json,
-)
+from bench.cli.command_support import FigureFormat, FigureFormatOption, JsonOption, write_json
+from bench.cli.printing import console, show_compilation
 from bench.cli.run_names import NEWEST, RunArgument
 
 

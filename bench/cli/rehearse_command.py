@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -16,12 +17,10 @@ from bench.cli.command_support import (
     ProtocolArgument,
     RigOption,
     SettingsOption,
-    console,
     parse_assignments,
-    print_rows,
-    show_compilation,
     write_json,
 )
+from bench.cli.printing import console, print_rows, show_compilation
 
 if TYPE_CHECKING:
     from bench.execution import Extremes, Rehearsal, Run
@@ -111,14 +110,8 @@ def _print(rehearsal: Rehearsal) -> None:
 
 def _cells(extremes: Extremes) -> tuple[str, ...]:
     shown = extremes.display
-    allowed = ", ".join(
-        f"{_number(shown.factor * each.low)} to {_number(shown.factor * each.high)} ({each.by})"
-        for each in extremes.bounds
-    )
+    plain = replace(shown, unit="")
+    allowed = ", ".join(f"{plain.between(each.low, each.high)} ({each.by})" for each in extremes.bounds)
     margin = shown.number(extremes.margin) if math.isfinite(extremes.margin) else ""
     style = "[bold red]" if extremes.margin < 0 else ""
     return shown.number(extremes.low), shown.number(extremes.high), shown.unit, allowed, style + margin
-
-
-def _number(value: float) -> str:
-    return f"{value:g}".replace("inf", "∞")

@@ -7,14 +7,8 @@ from typing import Annotated
 
 import typer
 
-from bench.cli.command_support import (
-    JsonOption,
-    LiveOption,
-    NotifyOption,
-    check_outputs,
-    console,
-    show_compilation,
-)
+from bench.cli.command_support import JsonOption, LiveOption, NotifyOption, check_outputs
+from bench.cli.printing import console, show_compilation
 from bench.cli.run_commands import print_result
 from bench.cli.run_names import NEWEST, RunArgument
 

@@ -1,4 +1,4 @@
-"""The commands that list parts and run protocols."""
+"""`bench run`: carry a protocol out, or a recorded run once more."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from bench.base import BenchError, ConfigurationError, closest, format_duration, print_plain, show_table
+from bench.base import BenchError, ConfigurationError, format_duration, print_plain, show_table
 from bench.cli.command_support import (
     JsonOption,
     LiveOption,
@@ -22,16 +22,10 @@ from bench.cli.command_support import (
     SettingsOption,
     check_given,
     check_outputs,
-    console,
-    error_console,
     parse_assignments,
-    print_error,
-    print_table,
-    show_compilation,
-    warn,
     write_json,
 )
-from bench.cli.model_options import inverse_of, options_json, print_model, print_models
+from bench.cli.printing import console, error_console, print_error, show_compilation, warn
 from bench.cli.rehearse_command import show_rehearsal
 from bench.cli.run_names import find_run
 
@@ -39,79 +33,6 @@ if TYPE_CHECKING:
     from bench.execution import RunResult
 
 UNSAFE_EXIT_CODE = 7
-
-
-def list_(json_file: JsonOption = None) -> None:
-    """List rigs with the protocols that fit them, models, controllers and studies; `bench show NAME` shows one.
-
-    What comes from another package bears its name; an entry that cannot be loaded is named and left out.
-    """
-    from bench.cli.listing import listing
-
-    listed = listing()
-    _print_listing(listed)
-    write_json(json_file, listed)
-
-
-def show(
-    name: Annotated[
-        str, typer.Argument(help="A rig, protocol, model, controller or study; or models, for all their options.")
-    ],
-    json_file: JsonOption = None,
-) -> None:
-    """Show a rig, a protocol, a model, a controller or a study in full.
-
-    A protocol is shown with its parameters, a rig with its file: `bench show RIG > desk.toml` gives you a copy to
-    fill in.
-    """
-    from bench.cli.catalogue import Catalogue
-    from bench.models import identifiable_models, timed_models
-
-    catalogue = Catalogue.of_installed()
-    if name in catalogue.rigs:
-        # Plain, so that it can be redirected into a file.
-        typer.echo(catalogue.rigs[name].text, nl=False, err=console.stderr)
-        write_json(json_file, {"name": name, "text": catalogue.rigs[name].text})
-    elif name in catalogue.protocols:
-        definition = catalogue.protocols[name]
-        print_protocol(definition)
-        write_json(json_file, {"name": name, "parameters": [vars(entry) for entry in definition.help()]})
-    elif name == "models":
-        specs = identifiable_models() | timed_models()
-        print_models(specs)
-        write_json(json_file, {each: _model_json(spec) for each, spec in specs.items()})
-    elif name in (specs := identifiable_models() | timed_models()):
-        print_model(specs[name])
-        write_json(json_file, {"name": name, **_model_json(specs[name])})
-    elif name in (others := {**catalogue.studies, **catalogue.controllers}):
-        console.print(others[name], highlight=False)
-        write_json(json_file, {"name": name, "summary": others[name]})
-    else:
-        known = closest(name, [*catalogue.rigs, *catalogue.protocols, *specs, *others], "`bench list`")
-        raise ConfigurationError(f"there is no rig, protocol, model, controller or study {name!r}; {known}")
-
-
-def _model_json(spec: Any) -> dict[str, Any]:  # noqa: ANN401 - a ModelSpec, not imported at start
-    return {"summary": spec.summary, "inverse": inverse_of(spec), "options": options_json(spec)}
-
-
-def _print_listing(listed: Mapping[str, Any]) -> None:
-    def titles(group: str) -> dict[str, str]:
-        packages = {name: f" \\[{package}]" for name, package in listed["packages"].items()}
-        return {name: text + packages.get(name, "") for name, text in listed[group].items()}
-
-    alike: dict[tuple[str, ...], dict[str, str]] = {}
-    for rig, title in titles("rigs").items():
-        alike.setdefault(tuple(listed["fitting"][rig]), {})[rig] = title
-    for protocols, rigs in alike.items():
-        print_table("rigs", rigs)
-        names = ", ".join(name + "*" * (name in listed["take_a_model"]) for name in protocols) or "none"
-        console.print(f"    [dim]protocols (*: takes a model file):[/] {names}\n", highlight=False)
-    for group in ("protocols", "models", "controllers"):
-        print_table(group, titles(group))
-    print_table("studies, for `bench study`", titles("studies"))
-    for problem in listed["problems"]:
-        warn(f"left out: {problem}")
 
 
 def run(

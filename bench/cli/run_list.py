@@ -11,7 +11,8 @@ import typer
 from rich.text import Text
 
 from bench.base import ConfigurationError
-from bench.cli.command_support import JsonOption, console, parse_assignments, write_json
+from bench.cli.command_support import JsonOption, parse_assignments, write_json
+from bench.cli.printing import console
 
 if TYPE_CHECKING:
     from bench.analysis import ListedRun

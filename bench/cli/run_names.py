@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from bench.base import ConfigurationError
-from bench.cli.command_support import error_console
+from bench.cli.printing import error_console
 
 RECORDINGS = Path("recordings")
 """Where runs are looked for by name."""

@@ -8,7 +8,8 @@ from typing import Annotated
 import typer
 
 from bench.base import print_plain
-from bench.cli.command_support import JsonOption, check_outputs, console, print_rows, show_compilation, write_json
+from bench.cli.command_support import JsonOption, check_outputs, write_json
+from bench.cli.printing import console, print_rows, show_compilation
 from bench.cli.run_names import find_run
 
 
@@ -16,7 +17,7 @@ from bench.cli.run_names import find_run
 def twin_(
     runs: Annotated[
         list[Path],
-        typer.Argument(metavar="RUN...", help="Runs: a characterization, and best also creep.", parser=find_run),
+        typer.Argument(metavar="RUN", help="Runs: a characterization, and best also creep.", parser=find_run),
     ],
     rig: Annotated[str, typer.Option("--rig", metavar="RIG", help="The rig of the runs: a name, or a rig file.")],
     out: Annotated[Path, typer.Option("--out", metavar="FILE.toml", help="Rig file of the twin to write.")],

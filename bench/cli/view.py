@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bench.base import needed_for, print_plain
-from bench.cli.command_support import console, show_compilation
+from bench.cli.printing import console, show_compilation
 from bench.cli.run_names import NEWEST, complete_run, find_run
 
 if TYPE_CHECKING:

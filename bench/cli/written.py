@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from bench.base import print_plain
-from bench.cli.command_support import console
+from bench.cli.printing import console
 
 if TYPE_CHECKING:
     from bench.analysis import Predictions

@@ -19,7 +19,7 @@ from bench.cli import JsonOption, console, parse_assignments, write_json
 def find(
     rig: Annotated[
         str | None,
-        typer.Argument(metavar="[RIG]", help="Rig whose devices are looked for; without it ports are listed."),
+        typer.Argument(metavar="RIG", help="Rig whose devices are looked for; without it ports are listed."),
     ] = None,
     further: Annotated[
         list[str] | None,

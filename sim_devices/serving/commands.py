@@ -27,7 +27,7 @@ _LOOPBACK = "127.0.0.1"
 
 
 def emulate(
-    rigs: Annotated[list[str], typer.Argument(metavar="RIG...", help="Emulated rigs: names, or path/to/rig.toml.")],
+    rigs: Annotated[list[str], typer.Argument(metavar="RIG", help="Emulated rigs: names, or path/to/rig.toml.")],
     clock: Annotated[
         str, typer.Option(help="wall, or xN for N times as fast; a busy machine makes it slower, never unfair.")
     ] = "wall",

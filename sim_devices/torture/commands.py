@@ -43,7 +43,7 @@ def torture(
     ends: within its planned time and a margin. safe: every output is off at the end; w: by a watchdog. limits: no
     output ever was beyond the limits of the rig file. names: what ended the run names the device at fault. rows:
     every step is in the journal. true: every recorded value is what the plant was, or what the same run shows without
-    the fault; . where it is the sensor that is at fault, and the record is as it was measured.
+    the fault; a dot where it is the sensor that is at fault, and the record is as it was measured.
 
     Exit codes: 0 all runs passed; 1 one has failed; 2 the rig has no emulated laboratory, or there is no such fault.
     """

@@ -1,0 +1,93 @@
+"""`bench list` and `bench show`: what is installed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Annotated, Any
+
+import typer
+from rich.padding import Padding
+
+from bench.base import ConfigurationError, closest
+from bench.cli.command_support import JsonOption, write_json
+from bench.cli.listing import listing
+from bench.cli.printing import console, print_table, warn
+
+
+def list_(json_file: JsonOption = None) -> None:
+    """List rigs with the protocols that fit them, models, controllers and studies; `bench show NAME` shows one.
+
+    What comes from another package bears its name; an entry that cannot be loaded is named and left out.
+    """
+    listed = listing()
+    _print_listing(listed)
+    write_json(json_file, listed)
+
+
+def show(
+    name: Annotated[
+        str,
+        typer.Argument(
+            metavar="NAME", help="A rig, protocol, model, controller or study; or models, for all their options."
+        ),
+    ],
+    json_file: JsonOption = None,
+) -> None:
+    """Show a rig, a protocol, a model, a controller or a study in full.
+
+    A protocol is shown with its parameters, a rig with its file: `bench show RIG > desk.toml` gives you a copy to
+    fill in.
+    """
+    from bench.cli.catalogue import Catalogue
+    from bench.cli.model_options import print_model, print_models
+    from bench.cli.run_commands import print_protocol
+    from bench.models import identifiable_models, timed_models
+
+    catalogue = Catalogue.of_installed()
+    if name in catalogue.rigs:
+        # Plain, so that it can be redirected into a file.
+        typer.echo(catalogue.rigs[name].text, nl=False, err=console.stderr)
+        write_json(json_file, {"name": name, "text": catalogue.rigs[name].text})
+    elif name in catalogue.protocols:
+        definition = catalogue.protocols[name]
+        print_protocol(definition)
+        write_json(json_file, {"name": name, "parameters": [vars(entry) for entry in definition.help()]})
+    elif name == "models":
+        specs = identifiable_models() | timed_models()
+        print_models(specs)
+        write_json(json_file, {each: _model_json(spec) for each, spec in specs.items()})
+    elif name in (specs := identifiable_models() | timed_models()):
+        print_model(specs[name])
+        write_json(json_file, {"name": name, **_model_json(specs[name])})
+    elif name in (others := {**catalogue.studies, **catalogue.controllers}):
+        console.print(others[name], highlight=False)
+        write_json(json_file, {"name": name, "summary": others[name]})
+    else:
+        known = closest(name, [*catalogue.rigs, *catalogue.protocols, *specs, *others], "`bench list`")
+        raise ConfigurationError(f"there is no rig, protocol, model, controller or study {name!r}; {known}")
+
+
+def _model_json(spec: Any) -> dict[str, Any]:  # noqa: ANN401 - a ModelSpec, not imported at start
+    from bench.cli.model_options import inverse_of, options_json
+
+    return {"summary": spec.summary, "inverse": inverse_of(spec), "options": options_json(spec)}
+
+
+def _print_listing(listed: Mapping[str, Any]) -> None:
+    def titles(group: str) -> dict[str, str]:
+        packages = {name: f" \\[{package}]" for name, package in listed["packages"].items()}
+        return {name: text + packages.get(name, "") for name, text in listed[group].items()}
+
+    alike: dict[tuple[str, ...], dict[str, str]] = {}
+    for rig, title in titles("rigs").items():
+        alike.setdefault(tuple(listed["fitting"][rig]), {})[rig] = title
+    for protocols, rigs in alike.items():
+        print_table("rigs", rigs)
+        names = ", ".join(name + "*" * (name in listed["take_a_model"]) for name in protocols) or "none"
+        text = f"[dim]protocols (*: takes a model file):[/] {names}"
+        console.print(Padding(text, (0, 0, 1, 4), expand=False), highlight=False)
+    for group in ("protocols", "models", "controllers"):
+        print_table(group, titles(group))
+    print_table("studies, for `bench study`", titles("studies"))
+    for problem in listed["problems"]:
+        warn(f"left out: {problem}")

@@ -1,0 +1,54 @@
+"""What the commands print: errors, warnings and tables, on the two consoles."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+from rich.markup import escape
+from rich.table import Table
+
+from bench.base import BenchError, PlainConsole, show_table
+
+console = PlainConsole()
+error_console = PlainConsole(stderr=True)
+
+
+def print_error(error: BenchError) -> None:
+    """Print an error of the bench, a line each of its lines."""
+    for line in str(error).splitlines():
+        error_console.print("[bold red]error:[/]", escape(line), highlight=False, soft_wrap=True)
+
+
+def warn(text: str) -> None:
+    """Print a warning."""
+    error_console.print("[yellow]warning:[/]", escape(text), highlight=False, soft_wrap=True)
+
+
+@contextmanager
+def show_compilation() -> Iterator[None]:
+    """Say when numerical kernels are compiled, which a first use does for seconds; also a decorator of commands."""
+    # Here, as numba takes half a second to load.
+    from bench.base import CompilationDisplay
+
+    with CompilationDisplay(console, error_console):
+        yield
+
+
+def print_table(title: str, rows: dict[str, str]) -> None:
+    """Print names and what they stand for under a title."""
+    table = Table(title=title, title_justify="left", show_header=False, box=None, padding=(0, 2))
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column()
+    for name, text in rows.items():
+        table.add_row(name, text)
+    show_table(console, table)
+    console.print()
+
+
+def print_rows(title: str, rows: Sequence[tuple[str, str]]) -> None:
+    """Print (name, text) pairs under a title."""
+    table = Table(title=title, title_justify="left", show_header=False, box=None, padding=(0, 2))
+    for name, text in rows:
+        table.add_row(name, text)
+    show_table(console, table)
