@@ -95,6 +95,18 @@ class Display:
         # No zero has a sign.
         return f"{round(self.factor * value, self.digits) + 0.0:.{self.digits}f}"
 
+    def bare(self, value: float) -> str:
+        """Return a limit or a reading beside one, without its unit: six significant digits, no zeros at the end."""
+        return f"{self.factor * value:g}"
+
+    def between(self, low: float, high: float) -> str:
+        """Return a range with its unit, such as `5 to 60 °C`; `≤ 60 °C` where one end is infinite."""
+        if math.isinf(low):
+            ends = "any" if math.isinf(high) else f"≤ {self.bare(high)}"
+        else:
+            ends = f"≥ {self.bare(low)}" if math.isinf(high) else f"{self.bare(low)} to {self.bare(high)}"
+        return f"{ends} {self.unit}".rstrip()
+
     def text(self, value: float) -> str:
         """Return a value with its unit, and with two digits that are not zero, as of a small error."""
         scaled = abs(self.factor * value)

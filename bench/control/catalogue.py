@@ -13,7 +13,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, TypeVar
 
-from bench.base import ConfigurationError, DataError, registry
+from bench.base import ConfigurationError, DataError, closest, registry
 from bench.control.baselines import IntegralControl, IntegralParameters, LookUp
 from bench.control.following import ClosedLoopFollower, FollowingParameters, IntegralFollower, OpenLoopFollower
 from bench.control.latched import Latched, LatchParameters
@@ -221,9 +221,8 @@ def controller_spec(task: str, name: str) -> ControllerSpec:
 
     Raises ConfigurationError if there is none of this name for the task.
     """
-    if name not in controller_names(task):
-        known = ", ".join(controller_names(task)) or "none"
-        raise ConfigurationError(f"there is no controller {name!r} for the task {task}; there are: {known}")
+    if name not in (known := controller_names(task)):
+        raise ConfigurationError(f"there is no controller {name!r} for the task {task}; {closest(name, known)}")
     spec: ControllerSpec = registry.load("controllers", f"{task}.{name}")
     return spec
 

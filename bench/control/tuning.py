@@ -10,6 +10,7 @@ from collections.abc import Mapping
 from dataclasses import fields, is_dataclass, replace
 from typing import Any, NamedTuple, TypeVar
 
+from bench.base import closest
 from bench.models import Operator
 
 T = TypeVar("T")
@@ -48,7 +49,7 @@ def tuned(default: T, options: Mapping[str, Any]) -> T:
     changes: dict[str, Any] = {}
     for name, value in options.items():
         if name not in known:
-            raise ValueError(f"{name}: there is no such number; there are: {', '.join(known)}")
+            raise ValueError(f"{name}: there is no such number; {closest(name, known)}")
         inner = getattr(default, name)
         nested = is_dataclass(inner)
         if nested and not isinstance(value, Mapping):

@@ -9,7 +9,7 @@ from typing import Any
 import rerun as rr
 import rerun.blueprint as rrb
 
-from bench.base import ConfigurationError
+from bench.base import ConfigurationError, closest
 from bench.dashboard.drawing import Colour, time_view
 from bench.dashboard.rerun_recording import Floats
 from bench.devices import Signal
@@ -110,7 +110,7 @@ def find_column(signals: Sequence[Signal], key: str, name: str) -> int:
     """Return the column of the signal that `key` of the layout names."""
     names = [signal.name for signal in signals]
     if name not in names:
-        raise ConfigurationError(f"dashboard: {key}: there is no signal {name!r}; there are: {', '.join(names)}")
+        raise ConfigurationError(f"dashboard: {key}: there is no signal {name!r}; {closest(name, names)}")
     return names.index(name)
 
 

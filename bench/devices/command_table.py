@@ -35,7 +35,7 @@ from typing import Annotated, Self
 
 from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
-from bench.base import CheckedTable, check_unit
+from bench.base import CheckedTable, check_unit, closest
 from bench.devices.templates import ANY, ANY_TEXT, UNIT, VALUE, Decimal, Template, template
 
 Name = Annotated[str, Field(pattern=r"^[A-Za-z][A-Za-z0-9_]*$")]
@@ -355,5 +355,6 @@ def check_arrival(target: TargetTable, signals: Collection[str]) -> None:
     """Raise `ValueError` if a set-point arrives at a signal that is not among those of its device, unless empty."""
     if target.arrival is not None and signals and target.arrival.signal not in signals:
         raise ValueError(
-            f"arrival.signal = {target.arrival.signal!r}: there is no such signal; there are: {', '.join(signals)}"
+            f"arrival.signal = {target.arrival.signal!r}: there is no such signal; "
+            f"{closest(target.arrival.signal, signals)}"
         )

@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from operator import itemgetter
 from typing import Any, Protocol
 
-from bench.base import AbortError, ConfigurationError, Interrupts, format_duration
+from bench.base import AbortError, ConfigurationError, Interrupts, closest, format_duration
 from bench.control import Trace
 from bench.devices import Settled, Signal
 from bench.execution.station.interface import Station
@@ -310,7 +310,7 @@ class RunAtHand:
         """Raise ConfigurationError if the rig lacks a signal."""
         for name in names:
             if name not in self.names:
-                raise ConfigurationError(f"{name} is not a signal of this rig; there are: {', '.join(self.names)}")
+                raise ConfigurationError(f"{name} is not a signal of this rig; {closest(name, self.names)}")
 
     def raise_if_aborted(self) -> None:
         """Raise AbortError if the operator or the system has asked for the end."""

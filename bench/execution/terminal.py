@@ -16,7 +16,7 @@ from rich.errors import LiveError
 from rich.progress import Progress, SpinnerColumn, Task, TaskID, TextColumn
 from rich.progress_bar import ProgressBar
 from rich.segment import ControlType
-from rich.table import Table
+from rich.table import Column, Table
 from rich.text import Text
 
 from bench.base import (
@@ -313,8 +313,8 @@ class RehearsalDisplay:
         self._title = title
         self._progress = Progress(
             SpinnerColumn(),
-            TextColumn("{task.description}", markup=False),
-            TextColumn("{task.fields[times]}", style="green", markup=False),
+            TextColumn("{task.description}", markup=False, table_column=Column(overflow="fold")),
+            TextColumn("{task.fields[times]}", style="green", markup=False, table_column=Column(overflow="fold")),
             console=console,
             transient=True,
             disable=not console.is_terminal,
@@ -349,7 +349,7 @@ class RehearsalDisplay:
             # A compilation draws on the same console.
             with suppress(LiveError):
                 self._progress.start()
-        self._progress.update(self._task, times=f"{step} steps, {format_duration(t)} of laboratory time; Ctrl-C ends")
+        self._progress.update(self._task, times=f"{step} steps, laboratory {format_duration(t)}")
 
     def step(self, record: StepRecord) -> None:
         """Show how far it is."""

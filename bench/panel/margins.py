@@ -38,7 +38,7 @@ class Margin:
         """Return it for a table, in the unit that the signal is shown in."""
         if math.isinf(self.distance):
             return ""
-        return f"{display.number(self.distance)} to {display.factor * self.limit:g} ({self.by})"
+        return f"{display.number(self.distance)} to {display.bare(self.limit)} ({self.by})"
 
 
 def margin_of(signal: str, values: Mapping[str, float], shown: Shown) -> Margin:

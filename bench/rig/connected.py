@@ -10,7 +10,7 @@ from functools import cached_property, partial
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
-from bench.base import Clock, ConfigurationError, DeviceError, make_clock
+from bench.base import Clock, ConfigurationError, DeviceError, closest, make_clock
 from bench.devices import (
     Actuator,
     BlockPlayer,
@@ -181,8 +181,8 @@ class Rig:
         """Return a load cell; raises ConfigurationError if there is none of that name."""
         device = self.devices.get(name)
         if not isinstance(device, LoadCell):
-            known = ", ".join(name for name, each in self.devices.items() if isinstance(each, LoadCell)) or "none"
-            raise ConfigurationError(f"{name} is not a load cell; there are: {known}")
+            known = closest(name, (key for key, each in self.devices.items() if isinstance(each, LoadCell)))
+            raise ConfigurationError(f"{name} is not a load cell; {known}")
         return device
 
     @property
@@ -327,8 +327,7 @@ class Rig:
                     named = {value: field for field, value in derived if isinstance(value, str)}
                     where = f"{named[source]} = {source!r}" if source in named else f"expression: {source!r}"
                     raise ConfigurationError(
-                        f"{key}.{where}: there is no such signal, or it comes from this one; "
-                        f"there are: {', '.join(units)}"
+                        f"{key}.{where}: there is no such signal, or it comes from this one; {closest(source, units)}"
                     )
             try:
                 self._check_instrument(derived)
@@ -362,10 +361,10 @@ class Rig:
         if self.file.dashboard is not None:
             for prefix, plot in self.file.dashboard.plots.items():
                 used += [(f"dashboard.{prefix}input", plot.input), (f"dashboard.{prefix}output", plot.output)]
-        known = ", ".join(self.description.by_name)
         for key, signal in used:
             if signal not in self.description.by_name:
-                raise ConfigurationError(f"{path}: {key} = {signal!r}: there is no such signal; there are: {known}")
+                known = closest(signal, self.description.by_name)
+                raise ConfigurationError(f"{path}: {key} = {signal!r}: there is no such signal; {known}")
         self.description.uncertain()
         check_roles(self.file.roles, self.description.devices, self.description.by_name, path)
 

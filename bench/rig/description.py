@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
-from bench.base import ConfigurationError
+from bench.base import ConfigurationError, closest
 from bench.devices import DeviceDescription, Limits, Signal
 from bench.rig.file import RigFile
 from bench.rig.interlocks.config import SETPOINT
@@ -69,8 +69,8 @@ class RigDescription:
     def limits_of(self, name: str) -> Limits:
         """Return the set-points that a device allows; raises ConfigurationError if it takes none."""
         if name not in self.limits:
-            known = ", ".join(self.limits) or "none"
-            raise ConfigurationError(f"{name} is not a device that takes a set-point; there are: {known}")
+            known = closest(name, self.limits)
+            raise ConfigurationError(f"{name} is not a device that takes a set-point; {known}")
         return self.limits[name]
 
     def unit(self, signal: str) -> str:

@@ -505,9 +505,7 @@ def _validate(path: str, text: str, content: Mapping[str, Any]) -> RigFile:
     found += [] if found else wrong_lines(entries, tables.lines)
     for i, device in enumerate(order := tables.safety.order):
         if device not in tables.devices or device in order[:i]:
-            found.append(
-                f"safety.order: {device!r}: expected devices, each once; there are: {', '.join(tables.devices)}"
-            )
+            found.append(f"safety.order: {device!r}: expected devices, each once; {closest(device, tables.devices)}")
     derived: dict[str, DerivedSignal] = {}
     for name, table in tables.derived.items():
         key = f"derived.{name}."

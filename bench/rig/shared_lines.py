@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from bench.base import closest
+
 if TYPE_CHECKING:
     from bench.rig.file import DeviceEntry
 
@@ -27,8 +29,8 @@ def with_line(
     if not isinstance(name, str):
         return dict(table)
     if name not in lines:
-        known = ", ".join(lines) or "none: the rig has no [lines.NAME]"
-        found.append(f"devices.{device}.line = {name!r}: there is no such line; there are: {known}")
+        known = closest(name, lines) if lines else "the rig has no [lines.NAME]"
+        found.append(f"devices.{device}.line = {name!r}: there is no such line; {known}")
         return dict(table)
     found.extend(
         f"devices.{device}.{key} = {table[key]!r}: stands in lines.{name} as well, as {value!r}; give it once"

@@ -29,7 +29,7 @@ from typing import Protocol, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from bench.base import CheckedTable, ConfigurationError, Display
+from bench.base import CheckedTable, ConfigurationError, Display, closest
 from bench.devices import Device, DeviceDescription, Dwell, Settle, Signal, UntilSteady
 from bench.rig.layout import Range
 
@@ -288,8 +288,7 @@ def check_roles(
             if table.device not in actuators:
                 what = "takes no set-point" if table.device in devices else "is not a device of this rig"
                 raise ConfigurationError(
-                    f"{path}: roles.{name}.device = {table.device!r} {what}; "
-                    f"allowed: {', '.join(actuators) or 'none'}"
+                    f"{path}: roles.{name}.device = {table.device!r} {what}; {closest(table.device, actuators)}"
                 )
         used = {"signal" if table.signal else "reading": reading_of(table, devices)}
         if table.reset is not None and table.reset.signal:
@@ -297,8 +296,7 @@ def check_roles(
         for key, signal in used.items():
             if signal not in signals:
                 raise ConfigurationError(
-                    f"{path}: roles.{name}.{key} = {signal!r}: there is no such signal; "
-                    f"there are: {', '.join(signals)}"
+                    f"{path}: roles.{name}.{key} = {signal!r}: there is no such signal; {closest(signal, signals)}"
                 )
         found = signals[reading_of(table, devices)]
         if table.unit is not None and found.unit != table.unit:

@@ -9,7 +9,7 @@ import math
 from collections.abc import Iterable, Mapping
 from datetime import date
 
-from bench.base import ConfigurationError
+from bench.base import ConfigurationError, closest
 from bench.devices import Actuator, Device, DeviceDescription, DriverSettings
 from bench.rig.calibration import Calibrated
 from bench.rig.description import RigDescription
@@ -144,7 +144,7 @@ def _wrong_interlock(interlock: Interlock, rig: RigDescription) -> Iterable[str]
     units = {name: signal.unit for name, signal in rig.by_name.items()}
     for key, signal in (("signal", interlock.signal), ("minus", interlock.minus)):
         if signal and signal not in units:
-            yield f"{key} = {signal!r}: there is no such signal; there are: {', '.join(units)}"
+            yield f"{key} = {signal!r}: there is no such signal; {closest(signal, units)}"
     unit, other = units.get(interlock.signal), units.get(interlock.minus)
     if interlock.minus and unit is not None and other is not None and unit != other:
         yield f"minus = {interlock.minus!r}: it is in {other} and {interlock.signal} in {unit}; expected one unit"
@@ -155,7 +155,7 @@ def _wrong_interlock(interlock: Interlock, rig: RigDescription) -> Iterable[str]
     if interlock.setpoint and interlock.setpoint not in limits:
         yield (
             f"setpoint = {interlock.setpoint!r}: there is no such device that takes a set-point; "
-            f"there are: {', '.join(limits) or 'none'}"
+            f"{closest(interlock.setpoint, limits)}"
         )
     moving = limits.get(interlock.setpoint)
     if interlock.stuck is not None and moving is not None and interlock.stuck.moved > moving.high - moving.low:

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal, Self, TypeVar
 
 import numpy as np
 
-from bench.base import ConfigurationError, ConvergenceError, DeferredModule
+from bench.base import ConfigurationError, ConvergenceError, DeferredModule, closest
 from bench.control import (
     ApproachedReference,
     ControllerSetup,
@@ -124,8 +124,9 @@ def _made(kind: type[T], table: str, given: Mapping[str, Any], **further: float)
         raise ConfigurationError(f"{_TABLE} {table.removesuffix('.')} = {given!r}: expected a table of numbers")
     known = [each.name for each in fields(kind) if each.name not in further]  # type: ignore[arg-type]
     if unknown := given.keys() - set(known):
-        names = ", ".join(table + each for each in known)
-        raise ConfigurationError(f"{_TABLE} {table}{min(unknown)}: there is no such number; there are: {names}")
+        wrong = table + min(unknown)
+        names = closest(wrong, [table + each for each in known])
+        raise ConfigurationError(f"{_TABLE} {wrong}: there is no such number; {names}")
     try:
         return kind(**given, **further)
     except (TypeError, ValueError) as error:

@@ -168,8 +168,7 @@ class _Expander:
         for name in table.runs:
             if name not in known:
                 raise ConfigurationError(
-                    f"{where}: runs = {name!r}: there is no table of runs of this name; there are: "
-                    f"{', '.join(known) or 'none'}"
+                    f"{where}: runs = {name!r}: there is no table of runs of this name; {closest(name, known)}"
                 )
             seeds = known[name].seeds
             if table.seed is not None and table.seed not in seeds:
@@ -183,8 +182,8 @@ class _Expander:
                 find_model(table.model)
             except ValueError:
                 raise ConfigurationError(
-                    f"{where}: model = {table.model!r}: there is no such model; there are: "
-                    f"{', '.join((*identifiable_models(), *whole_models()))}"
+                    f"{where}: model = {table.model!r}: there is no such model; "
+                    f"{closest(table.model, (*identifiable_models(), *whole_models()))}"
                 ) from None
             if len(table.runs) > 1:
                 raise ConfigurationError(
@@ -227,10 +226,10 @@ class _Expander:
         names = [value[1:] for value in values if isinstance(value, str) and value.startswith(REFERENCE)]
         for name in names:
             if name not in self._models:
-                known = ", ".join(REFERENCE + each for each in self._models) or "none"
+                known = closest(REFERENCE + name, [REFERENCE + each for each in self._models])
                 raise ConfigurationError(
                     f"{where}: parameters.{key} = '{REFERENCE}{name}': there is no such table of models of runs that "
-                    f"come before; there are: {known}"
+                    f"come before; {known}"
                 )
         return names
 
@@ -386,10 +385,8 @@ class _Expander:
             if not column and slot not in slots:
                 raise ConfigurationError(f"{where}: {key} is missing, as {run.protocol} has no slot {slot!r}")
             if column and column not in known.description.by_name:
-                signals = ", ".join(known.description.by_name)
-                raise ConfigurationError(
-                    f"{where}: {key} = {column!r}: there is no such signal; there are: {signals}"
-                )
+                signals = closest(column, known.description.by_name)
+                raise ConfigurationError(f"{where}: {key} = {column!r}: there is no such signal; {signals}")
         drive = known.file.roles.get("drive")
         if table.input or drive is None or drive.range is None:
             return
@@ -409,8 +406,7 @@ class _Expander:
             for name in names:
                 if name not in known:
                     raise ConfigurationError(
-                        f"{where}: {key} = {name!r}: there is no table of {key} of this name; there are: "
-                        f"{', '.join(known) or 'none'}"
+                        f"{where}: {key} = {name!r}: there is no table of {key} of this name; {closest(name, known)}"
                     )
         tables = {models.name: models for models in self._file.models}
         columns = {(tables[name].input, tables[name].output) for name in table.models}

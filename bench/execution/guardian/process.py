@@ -102,8 +102,7 @@ class Guardian:
         self._wall: Clock = WallClock()
         safety = rig.file.safety
         self._factor = factor = float(getattr(rig.clock, "factor", 1.0))
-        units = {signal_.name: signal_.unit for signal_ in rig.signals}
-        watch = InterlockWatch(rig.file.interlocks, units)
+        watch = InterlockWatch(rig.file.interlocks, {each.name: each.display for each in rig.signals})
         self._core = StationCore(watch, 1.0 / (safety.rate * min(factor, 10.0)))
         self._watched = watch.signals
         self._looked_at = self._look_readers()

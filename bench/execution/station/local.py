@@ -39,8 +39,7 @@ class LocalStation(Station):
         self._rig = rig
         self.clock = rig.clock
         self.description = rig.description
-        units = {signal.name: signal.unit for signal in rig.signals}
-        watch = InterlockWatch(rig.file.interlocks, units)
+        watch = InterlockWatch(rig.file.interlocks, {each.name: each.display for each in rig.signals})
         self._core = StationCore(watch, 1.0 / interlock_rate if interlock_rate else math.inf)
         self._watched = watch.signals
         self._core.begin(self.clock.now())

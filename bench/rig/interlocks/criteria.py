@@ -7,7 +7,9 @@ import struct
 from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Mapping
+from dataclasses import replace
 
+from bench.base import Display
 from bench.rig.interlocks.config import SETPOINT, Interlock, Stuck
 
 _SAME_INSTANT = 1e-6
@@ -19,13 +21,19 @@ class _Criterion(ABC):
 
     over = ""  # what the signal does once it is met again
 
-    def __init__(self, interlock: Interlock, units: Mapping[str, str], seconds: float) -> None:
+    def __init__(self, interlock: Interlock, displays: Mapping[str, Display], seconds: float) -> None:
         self._interlock = interlock
-        self._unit = units.get(interlock.signal, "")
+        self._display = displays[interlock.signal]
         if interlock.minus:
-            self._unit = _of_difference(self._unit)
+            self._display = _of_difference(self._display)
         self.seconds = seconds
         self.since: float | None = None
+
+    def _reading(self, value: float) -> str:
+        return f"{self._interlock.label} = {self._shown(value)}"
+
+    def _shown(self, value: float) -> str:
+        return f"{self._display.bare(value)} {self._display.unit}".rstrip()
 
     @abstractmethod
     def look(self, t: float, value: float, setpoint: float | None) -> None:
@@ -37,15 +45,14 @@ class _Criterion(ABC):
 
     def back(self, t: float, since: float, value: float) -> str:
         """Return that it is over."""
-        return f"{self._interlock.label} = {value:.6g} {self._unit} {self.over} (after {t - since:.1f} s)"
+        return f"{self._reading(value)} {self.over} (after {t - since:.1f} s)"
 
 
 class _Range(_Criterion):
-    def __init__(self, interlock: Interlock, units: Mapping[str, str], seconds: float) -> None:
-        super().__init__(interlock, units, seconds)
+    def __init__(self, interlock: Interlock, displays: Mapping[str, Display], seconds: float) -> None:
+        super().__init__(interlock, displays, seconds)
         self._low, self._high = interlock.low, interlock.high
-        low, high = interlock.resume
-        self.over = f"is back within {low:g} to {high:g} {self._unit}"
+        self.over = f"is back within {self._display.between(*interlock.resume)}"
 
     def look(self, t: float, value: float, setpoint: float | None) -> None:  # noqa: ARG002 - as of all
         if self.since is None:
@@ -57,10 +64,8 @@ class _Range(_Criterion):
             self.since = None
 
     def seen(self, t: float, since: float, value: float) -> str:
-        return (
-            f"{self._interlock.label} = {value:.6g} {self._unit} is outside of "
-            f"{self._interlock.low:g} to {self._interlock.high:g} {self._unit} (for {t - since:.1f} s)"
-        )
+        allowed = self._display.between(self._interlock.low, self._interlock.high)
+        return f"{self._reading(value)} is outside of {allowed} (for {t - since:.1f} s)"
 
 
 class _Near(_Criterion):
@@ -68,8 +73,8 @@ class _Near(_Criterion):
 
     over = "is far from its interlock again"
 
-    def __init__(self, interlock: Interlock, units: Mapping[str, str]) -> None:
-        super().__init__(interlock, units, 0.0)
+    def __init__(self, interlock: Interlock, displays: Mapping[str, Display]) -> None:
+        super().__init__(interlock, displays, 0.0)
         self._low, self._high = low, high = interlock.unwarned
         half = 0.5 * interlock.warn
         low += half * abs(interlock.low) if math.isfinite(low) else 0.0
@@ -91,17 +96,17 @@ class _Near(_Criterion):
         below = value < self._low
         edge, limit = (self._low, interlock.low) if below else (self._high, interlock.high)
         return (
-            f"{interlock.label} = {value:.6g} {self._unit} is {'below' if below else 'above'} {edge:g} {self._unit}; "
-            f"the interlock acts at {limit:g} {self._unit} (level {interlock.level})"
+            f"{self._reading(value)} is {'below' if below else 'above'} {self._shown(edge)}; "
+            f"the interlock acts at {self._shown(limit)} (level {interlock.level})"
         )
 
 
 class _Rate(_Criterion):
     """Mean rate from the newest reading that is as old as the window, or older, to the present one."""
 
-    def __init__(self, interlock: Interlock, units: Mapping[str, str], fastest: float) -> None:
-        super().__init__(interlock, units, interlock.seconds)
-        self._unit = _of_difference(self._unit)
+    def __init__(self, interlock: Interlock, displays: Mapping[str, Display], fastest: float) -> None:
+        super().__init__(interlock, displays, interlock.seconds)
+        self._display = _of_difference(self._display)
         self._fastest = fastest
         self._readings: deque[tuple[float, float]] = deque()
         self._rate, self._span = 0.0, math.nan
@@ -128,12 +133,15 @@ class _Rate(_Criterion):
 
     def seen(self, t: float, since: float, value: float) -> str:  # noqa: ARG002 - as of all
         return (
-            f"{self._interlock.label} changes by {self._rate:.3g} {self._unit}/s over {self._span:.3g} s; "
-            f"{self._fastest:g} {self._unit}/s is allowed (for {t - since:.1f} s)"
+            f"{self._interlock.label} changes by {self._per_second()} over {self._span:.3g} s; "
+            f"{self._shown(self._fastest)}/s is allowed (for {t - since:.1f} s)"
         )
 
     def back(self, t: float, since: float, value: float) -> str:  # noqa: ARG002 - as of all
-        return f"{self._interlock.label} changes by {self._rate:.3g} {self._unit}/s again (after {t - since:.1f} s)"
+        return f"{self._interlock.label} changes by {self._per_second()} again (after {t - since:.1f} s)"
+
+    def _per_second(self) -> str:
+        return f"{self._display.factor * self._rate:.3g} {self._display.unit}/s"
 
 
 class _Stale(_Criterion):
@@ -141,8 +149,8 @@ class _Stale(_Criterion):
 
     over = "moves again"
 
-    def __init__(self, interlock: Interlock, units: Mapping[str, str], stale: float) -> None:
-        super().__init__(interlock, units, stale)
+    def __init__(self, interlock: Interlock, displays: Mapping[str, Display], stale: float) -> None:
+        super().__init__(interlock, displays, stale)
         self.last: float | None = None
         self.first = math.nan
 
@@ -157,7 +165,7 @@ class _Stale(_Criterion):
 
     def seen(self, t: float, since: float, value: float) -> str:
         return (
-            f"{self._interlock.label} = {value:.6g} {self._unit} stands still: all readings of the last "
+            f"{self._reading(value)} stands still: all readings of the last "
             f"{t - since:.1f} s are equal to the last bit; {self.seconds:g} s is allowed"
         )
 
@@ -167,10 +175,10 @@ class _Follows(_Criterion):
 
     over = "follows again"
 
-    def __init__(self, interlock: Interlock, units: Mapping[str, str], stuck: Stuck) -> None:
-        super().__init__(interlock, units, stuck.within)
+    def __init__(self, interlock: Interlock, displays: Mapping[str, Display], stuck: Stuck) -> None:
+        super().__init__(interlock, displays, stuck.within)
         self._stuck = stuck
-        self._setpoint_unit = units.get(f"{interlock.setpoint}{SETPOINT}", "")
+        self._setpoint_display = displays[f"{interlock.setpoint}{SETPOINT}"]
         # Set-point and signal where they last were at rest together.
         self._rest: tuple[float, float] | None = None
         self._setpoint = math.nan
@@ -198,17 +206,18 @@ class _Follows(_Criterion):
 
     def seen(self, t: float, since: float, value: float) -> str:
         start = math.nan if self._rest is None else self._rest[1]
-        stuck = self._stuck
+        setpoint, change = self._setpoint_display, _of_difference(self._display)
         return (
-            f"{self._interlock.label} = {value:.6g} {self._unit} is stuck: {t - since:.1f} s after "
-            f"{self._interlock.setpoint} was set to {self._setpoint:g} {self._setpoint_unit} it has moved by "
-            f"{abs(value - start):.3g}; at least {stuck.follows:g} is expected within {stuck.within:g} s"
+            f"{self._reading(value)} is stuck: {t - since:.1f} s after {self._interlock.setpoint} was set to "
+            f"{setpoint.bare(self._setpoint)} {setpoint.unit} it has moved by "
+            f"{change.factor * abs(value - start):.3g} {change.unit}; "
+            f"at least {change.bare(self._stuck.follows)} {change.unit} is expected within {self._stuck.within:g} s"
         )
 
 
-def _of_difference(unit: str) -> str:
-    """Return the unit of a difference of two values."""
-    return "K" if unit == "°C" else unit
+def _of_difference(display: Display) -> Display:
+    """Return how the difference of two values is shown."""
+    return replace(display, unit="K") if display.unit == "°C" else display
 
 
 _bits = struct.Struct("<d").pack

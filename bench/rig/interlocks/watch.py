@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 
-from bench.base import ConfigurationError, InterlockError
+from bench.base import ConfigurationError, Display, InterlockError, closest
 from bench.rig.interlocks.config import SETPOINT, Interlock, Level
 from bench.rig.interlocks.criteria import (
     _SAME_INSTANT,
@@ -58,8 +58,8 @@ class InterlockWatch:
     ----------
     interlocks : iterable of Interlock
         What to watch.
-    units : mapping of str to str
-        Unit by name, of all signals and set-points that there are.
+    displays : mapping of str to Display
+        How values are shown, by name, of all signals and set-points that there are.
 
     Raises
     ------
@@ -67,20 +67,18 @@ class InterlockWatch:
         If there is no such signal as an interlock names.
     """
 
-    def __init__(self, interlocks: Iterable[Interlock], units: Mapping[str, str]) -> None:
-        self._courses = tuple(_Course(interlock, units) for interlock in interlocks)
+    def __init__(self, interlocks: Iterable[Interlock], displays: Mapping[str, Display]) -> None:
+        watched = tuple(interlocks)
+        self._names = {name for each in watched for name in (each.signal, each.minus) if name}
+        self._names |= {f"{each.setpoint}{SETPOINT}" for each in watched if each.setpoint}
+        if missing := sorted(self._names - displays.keys()):
+            raise ConfigurationError(f"interlocks: there is no signal {missing[0]}; {closest(missing[0], displays)}")
+        self._courses = tuple(_Course(interlock, displays) for interlock in watched)
         self._plain = tuple((each, each.plain, *each.quiet, each.stale) for each in self._courses)
         # Those with something that may act or is not over: mostly none.
         self._restless: list[_Course] = []
         self._latest = -math.inf
         self._tripped: InterlockFinding | None = None
-        watched = [course.interlock for course in self._courses]
-        self._names = {name for each in watched for name in (each.signal, each.minus) if name}
-        self._names |= {f"{each.setpoint}{SETPOINT}" for each in watched if each.setpoint}
-        if missing := sorted(self._names - units.keys()):
-            raise ConfigurationError(
-                f"interlocks: there is no signal {', '.join(missing)}; there are: {', '.join(units)}"
-            )
 
     @property
     def signals(self) -> frozenset[str]:
@@ -204,11 +202,11 @@ class _Settling:
 class _Course:
     """The course of one interlock: its criteria, which of them have acted, and what they found."""
 
-    def __init__(self, interlock: Interlock, units: Mapping[str, str]) -> None:
+    def __init__(self, interlock: Interlock, displays: Mapping[str, Display]) -> None:
         self.interlock = interlock
         self.restless = False
         """Whether a criterion is violated, or has acted and is not over."""
-        self._units = units
+        self._displays = displays
         self._signal = interlock.signal
         self._settling = _Settling(interlock) if interlock.settle else None
         self._follows = f"{interlock.setpoint}{SETPOINT}" if interlock.stuck is not None else ""
@@ -224,18 +222,18 @@ class _Course:
         self._acted = [math.nan] * len(self._criteria)
 
     def _make_criteria(self) -> None:
-        interlock, units = self.interlock, self._units
+        interlock, displays = self.interlock, self._displays
         # Of any interlock, as nan is outside of an infinite range too.
-        criteria: list[_Criterion] = [_Range(interlock, units, interlock.seconds)]
+        criteria: list[_Criterion] = [_Range(interlock, displays, interlock.seconds)]
         if interlock.unwarned != (-math.inf, math.inf):
-            criteria.append(_Near(interlock, units))
+            criteria.append(_Near(interlock, displays))
         of_range = len(criteria)
         if interlock.fastest is not None:
-            criteria.append(_Rate(interlock, units, interlock.fastest))
+            criteria.append(_Rate(interlock, displays, interlock.fastest))
         if interlock.stale is not None:
-            criteria.append(_Stale(interlock, units, interlock.stale))
+            criteria.append(_Stale(interlock, displays, interlock.stale))
         if interlock.stuck is not None:
-            criteria.append(_Follows(interlock, units, interlock.stuck))
+            criteria.append(_Follows(interlock, displays, interlock.stuck))
         self._criteria, self._further = tuple(criteria), tuple(criteria[of_range:])
 
     def due(self) -> float:

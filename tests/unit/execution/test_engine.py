@@ -251,7 +251,7 @@ class TestFaults:
             assert np.all(ticks["probe_temperature"][:-1] <= 41.0)
             (event,) = [event for event in run.events() if event.level == "ERROR"]
             assert event.kind == "interlock"
-            assert "is outside of -inf to 41 °C" in event.text
+            assert "is outside of ≤ 41 °C" in event.text
 
     def test_interlock_before_the_first_step(self, bench):
         b = bench(("high = 90.0", "high = 20.0"))

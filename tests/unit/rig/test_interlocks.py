@@ -7,17 +7,23 @@ from cases import cases
 from hypothesis import given, strategies as st
 from pydantic import ValidationError
 
-from bench.base import ConfigurationError, InterlockError
+from bench.base import ConfigurationError, Display, InterlockError
 from bench.rig import Interlock, InterlockWatch, Level
 
-UNITS = {"sink": "°C", "force": "N", "plate_setpoint": "°C", "supply_setpoint": "V"}
+DISPLAYS = {
+    "sink": Display.of("°C", 3),
+    "force": Display.of("N", 3, 5.0),
+    "plate_setpoint": Display.of("°C", 3),
+    "supply_setpoint": Display.of("V", 3, 10.0),
+    "tip": Display.of("m", 9, 5e-5),
+}
 
 
 def watch(*interlocks):
     """Watch interlocks, with a warning band only where a test gives one."""
     silent = {"warn": 0.0}
     return InterlockWatch(
-        (each if "warn" in each.model_fields_set else each.model_copy(update=silent) for each in interlocks), UNITS
+        (each if "warn" in each.model_fields_set else each.model_copy(update=silent) for each in interlocks), DISPLAYS
     )
 
 
@@ -95,7 +101,7 @@ class TestWatch:
     def test_two_interlocks_on_one_signal(self):
         guard = watch(Interlock(signal="sink", high=60.0, seconds=100.0), Interlock(signal="sink", high=80.0))
         guard.check(0.0, {"sink": 70.0})
-        with pytest.raises(InterlockError, match="to 80"):
+        with pytest.raises(InterlockError, match="≤ 80"):
             guard.check(1.0, {"sink": 81.0})
 
     @given(
@@ -155,6 +161,14 @@ class TestLooks:
         with pytest.raises(ConfigurationError, match="no signal skin"):
             watch(Interlock(high=1.0, **keys))
 
+    def test_it_says_lengths_in_the_unit_that_the_signal_is_shown_in(self):
+        (finding,) = watch(Interlock(signal="tip", high=2e-5)).look(0.0, {"tip": 2.01e-5})
+        assert finding.text == "interlock: tip = 20.1 µm is outside of ≤ 20 µm (for 0.0 s)"
+
+    def test_it_helps_with_a_signal_that_does_not_exist(self):
+        with pytest.raises(ConfigurationError, match="no signal sinc; did you mean sink"):
+            watch(Interlock(signal="sinc", high=1.0))
+
     def test_one_of_level_safe_is_never_over(self):
         guard = watch(Interlock(signal="sink", high=60.0))
         assert looks(guard, [(0.0, 61.0), (1.0, 20.0), (2.0, 61.0)]) == [(0.0, "safe", False)]
@@ -165,7 +179,7 @@ class TestLooks:
         guard = watch(Interlock(signal="sink", high=60.0, level="warn"), Interlock(signal="force", high=1.0))
         (finding,) = guard.check(0.0, {"sink": 61.0, "force": 0.0})
         assert finding.level is Level.WARN
-        assert finding.text == "interlock: sink = 61 °C is outside of -inf to 60 °C (for 0.0 s)"
+        assert finding.text == "interlock: sink = 61 °C is outside of ≤ 60 °C (for 0.0 s)"
         with pytest.raises(InterlockError, match="force"):
             guard.check(1.0, {"sink": 61.0, "force": 2.0})
 
@@ -290,7 +304,7 @@ class TestLevels:
         (finding,) = guard.look(31.0, {"sink": 62.0})
         assert (finding.level, finding.since, finding.over) == (Level.SAFE, 1.0, False)
         assert finding.text == (
-            "interlock: sink = 62 °C is outside of -inf to 60 °C (for 30.0 s); it was not back 30 s after"
+            "interlock: sink = 62 °C is outside of ≤ 60 °C (for 30.0 s); it was not back 30 s after"
         )
         with pytest.raises(InterlockError, match="not back 30 s after"):
             guard.check(32.0, {"sink": 20.0})
@@ -506,8 +520,8 @@ class TestStuck:
         (finding,) = guard.look(12.0, {"sink": 20.9}, {"plate": 30.0})
         assert finding.since == 2.0
         assert finding.text == (
-            "interlock: sink = 20.9 °C is stuck: 10.0 s after plate was set to 30 °C it has moved by 0.9; "
-            "at least 1 is expected within 10 s"
+            "interlock: sink = 20.9 °C is stuck: 10.0 s after plate was set to 30 °C it has moved by 0.9 K; "
+            "at least 1 K is expected within 10 s"
         )
 
     def test_one_that_follows_late_enough(self):

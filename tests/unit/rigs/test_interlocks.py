@@ -5,16 +5,18 @@ import math
 import pytest
 from cases import cases
 
-from bench.base import VirtualClock
+from bench.base import Display, VirtualClock
 from bench.rig import InterlockWatch, Rig, load_rig, packaged_rigs
 
 RIGS = sorted(name for name in packaged_rigs() if "hardware" not in name)
 LOOKS = 5.0  # Hz
 
 
-def units(file):
+def displays(file):
     names = [name for lock in file.interlocks for name in (lock.signal, lock.minus) if name]
-    return dict.fromkeys([*names, *(f"{lock.setpoint}_setpoint" for lock in file.interlocks if lock.setpoint)], "1")
+    return dict.fromkeys(
+        [*names, *(f"{lock.setpoint}_setpoint" for lock in file.interlocks if lock.setpoint)], Display.of("1", 3)
+    )
 
 
 @pytest.mark.slow
@@ -26,7 +28,7 @@ def test_none_acts_in_hours_without_a_fault(name):
     clock = VirtualClock()
     rig = Rig(file, clock, seed=0)
     try:
-        watch = InterlockWatch(file.interlocks, {signal.name: signal.unit for signal in rig.signals})
+        watch = InterlockWatch(file.interlocks, {signal.name: signal.display for signal in rig.signals})
         drive = file.roles["drive"]
         low, high = drive.range
         hours, period, minutes = 2.0, 2.0, 10.0
@@ -53,7 +55,7 @@ def test_each_limit_acts_within_a_period_and_its_seconds(name):
         outside = limit + math.copysign(1e-3, 1.0 if limit == lock.high else -1.0)
         for crossing in (10.0, 10.03, 10.17):
             # On the limit it warns already.
-            watch = InterlockWatch([lock.model_copy(update={"warn": 0.0})], units(file))
+            watch = InterlockWatch([lock.model_copy(update={"warn": 0.0})], displays(file))
             t = 0.0
             while not watch.look(t, {lock.signal: limit if t < crossing else outside}):
                 t = min(t + 1.0 / LOOKS, watch.due)

@@ -7,7 +7,7 @@ from cases import cases
 from hypothesis import settings, strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from bench.base import DeviceError, GuardianError, InterlockError
+from bench.base import DeviceError, Display, GuardianError, InterlockError
 from bench.execution.station.core import State, StationCore
 from bench.rig import Interlock, InterlockWatch, Level
 
@@ -26,7 +26,8 @@ ALLOWED = {"at_once": 0.0, "after": SECONDS, "held": HOLD}
 
 
 def core(interval=INTERVAL, interlocks=INTERLOCKS):
-    return StationCore(InterlockWatch(interlocks, dict.fromkeys((each.signal for each in interlocks), "1")), interval)
+    displays = dict.fromkeys((each.signal for each in interlocks), Display.of("1", 3))
+    return StationCore(InterlockWatch(interlocks, displays), interval)
 
 
 class Bench(RuleBasedStateMachine):

@@ -229,15 +229,9 @@ def _difference(steps: Table, summary: TelemetrySummary, signal: str, minus: str
 
 
 def _allowed(interlock: Interlock, display: Display) -> str:
-    shown, factor = f" {display.unit}" if display.unit else "", display.factor
-    low, high = f"{factor * interlock.low:g}", f"{factor * interlock.high:g}"
-    found = []
-    if math.isfinite(interlock.low) and math.isfinite(interlock.high):
-        found.append(f"{low} to {high}{shown}")
-    elif math.isfinite(interlock.high):
-        found.append(f"≤ {high}{shown}")
-    elif math.isfinite(interlock.low):
-        found.append(f"≥ {low}{shown}")
+    shown, factor, found = f" {display.unit}" if display.unit else "", display.factor, []
+    if math.isfinite(interlock.low) or math.isfinite(interlock.high):
+        found.append(display.between(interlock.low, interlock.high))
     if interlock.fastest is not None:
         found.append(f"at most {factor * interlock.fastest:g}{shown}/s over {interlock.over:g} s")
     if interlock.stale is not None:
