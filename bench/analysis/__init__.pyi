@@ -122,6 +122,7 @@ from .session_recalibration import (
 from .tables.data import (
     Quantity as Quantity,
     input_and_output as input_and_output,
+    is_run as is_run,
     read_columns as read_columns,
     write_csv as write_csv,
 )

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from bench.base import ConfigurationError, percent, print_plain, show_patience
+from bench.base import ConfigurationError, DataError, percent, print_plain, show_patience
 from bench.cli.band_options import BandOption, Recalibrating, print_band, print_examined
 from bench.cli.choice_options import (
     Comparing,
@@ -30,6 +30,7 @@ from bench.cli.written import print_figures, write_rows
 
 if TYPE_CHECKING:
     from bench.analysis import FitOptions, WholeIdentification
+    from bench.identification import ModelFile
 
 
 DataArgument = Annotated[
@@ -164,7 +165,13 @@ class Fitting:
 class FitOutputs:
     """What `bench identify` writes: its options."""
 
-    out: Annotated[Path | None, typer.Option(metavar="model.json", help="Model file to write.")] = None
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="model.json",
+            help="Model file to write. Without it, the model of a run is kept with the run, for `bench report`.",
+        ),
+    ] = None
     card: Annotated[
         Path | None,
         typer.Option(metavar="FILE.md", help="Model card to write."),
@@ -207,6 +214,7 @@ def identify_(
         fit_sentence,
         identify_model,
         input_and_output,
+        is_run,
         whole_identification,
     )
     from bench.identification import ONE_RUN
@@ -254,6 +262,8 @@ def identify_(
         print_band(found.band)
     if out is not None:
         print_plain(console, f"model: {out}")
+    elif len(files) == 1 and is_run(files[0]):
+        _keep(found.file, files[0])
     tested = print_test(found, comparing, test)
     drawn: list[Path] = []
     if outputs.figures is not None:
@@ -269,6 +279,20 @@ def identify_(
     more = {"test": tested.to_json()} if tested else {}
     more |= {"selection": selected.to_json()} if selected else {}
     write_json(outputs.json_file, found.summary() | more)
+
+
+def _keep(file: ModelFile, run: Path) -> None:
+    """Keep a model with the run that it was identified from, if that can be written."""
+    from bench.record import Record, add_model
+
+    with Record(run) as record:
+        reached = float(record.meta.get("finished", 0.0))
+    try:
+        add_model(run, file.name, reached, file.to_json())
+    except DataError as error:
+        warn(f"the model is not kept with the run: {error}")
+    else:
+        print_plain(console, f"model: {file.name}, kept with the run for `bench report`; --out FILE writes a file")
 
 
 def _identify_whole(

@@ -33,8 +33,9 @@ def report(
 ) -> None:
     """Tables, figures and a page of a run: what happened, extremes, margins, and how models do on it.
 
-    The page is one HTML file that needs nothing else: for a log book, or to hand out. Models that were identified
-    from this run are compared without being named. Works while the run goes on; the page then says so.
+    The page is one HTML file that needs nothing else: for a log book, or to hand out. Models that are kept with the
+    run are compared without being named: those of `bench identify` without --out, and what the run itself corrected.
+    Works while the run goes on; the page then says so.
     """
     from bench.analysis import PAGE_NAME, report_run
     from bench.batch import published_of

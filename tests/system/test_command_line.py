@@ -1,7 +1,9 @@
 """The command line as a newcomer meets it: mistakes with their cures, limits of the help, and runs by name."""
 
+import json
 import re
 import shlex
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -169,6 +171,19 @@ def test_the_columns_of_a_run_are_those_of_its_slots(bench, folder):
     named = ("--input", "tec_temperature", "--output", "curvature")
     assert bench("identify", reference, *named, "--model", "polynomial", "--out", "named.json")[0] == 0
     assert Path("model.json").read_text() == Path("named.json").read_text()
+
+
+def test_a_model_without_a_file_is_kept_with_its_run_and_reported(bench, folder):
+    run = folder / "run"
+    shutil.copytree(ROOT / "recordings" / "reference" / "vo2-damped-oscillation", run)
+    code, out, err = bench("identify", run, "--model", "polynomial")
+    assert code == 0, err
+    assert "polynomial, kept with the run" in out
+    code, out, err = bench("report", run, "--json", "report.json")
+    assert code == 0, err
+    assert [*json.loads(Path("report.json").read_text())["models"]] == ["polynomial"]
+    assert bench("identify", run, "--model", "preisach", "--levels", "6", "--out", "model.json")[0] == 0
+    assert [path.name for path in run.glob("models/*")] == ["polynomial.json"]
 
 
 def test_a_newcomer_gets_a_report_of_his_own_identification_by_the_words_of_the_readme(bench, folder):
