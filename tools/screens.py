@@ -80,7 +80,7 @@ def draw_terminal(out: Path, measured: Path, controlled: Path, page: Any) -> Ite
     }
     for name, arguments in commands.items():
         for width in COLUMNS:
-            environment = {**os.environ, "COLUMNS": str(width), "FORCE_COLOR": "1"}
+            environment = {**os.environ, "COLUMNS": str(width), "FORCE_COLOR": "1", "TTY_INTERACTIVE": "0"}
             command = [sys.executable, "-P", "-m", "bench", *arguments]
             done = subprocess.run(command, capture_output=True, text=True, check=False, env=environment)
             screen = Text.from_ansi((done.stdout + done.stderr).rstrip())

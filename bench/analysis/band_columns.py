@@ -10,7 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.analysis.tables.dataset import Dataset
-from bench.base import header_with_unit
+from bench.base import header_with_unit, prefixed
 from bench.identification import (
     Band,
     Identification,
@@ -64,7 +64,7 @@ class BandedPrediction:
 
     def text(self, residuals: Floats | None = None) -> str:
         """Return the band in a line, with its coverage of measured outputs if their residuals are given."""
-        width = f"± {np.median(self.half_widths):.4g} {self.unit}".rstrip()
+        width = f"± {prefixed(float(np.median(self.half_widths)), self.unit)}"
         covered = "" if residuals is None else f"; covers {100 * self.coverage(residuals):.1f} % of the rows measured"
         return f"{100 * self.band.level:g} % band: {width} (median); holds for inputs of {self.holds_for}{covered}"
 
@@ -76,7 +76,7 @@ class BandedPrediction:
         ]
         return [
             ("level", f"{100.0 * self.band.level:g} %"),
-            *((name, f"{value:.4g} {self.unit}".rstrip()) for name, value in widths),
+            *((name, prefixed(float(value), self.unit)) for name, value in widths),
             ("holds for inputs", self.holds_for),
         ]
 

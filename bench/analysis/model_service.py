@@ -24,7 +24,7 @@ from bench.analysis.transients.transient_dynamics import (
     read_transients,
 )
 from bench.analysis.uncertain_models import PROVENANCE, ModelUncertainty, identified_uncertainty
-from bench.base import ConfigurationError, closest, html_table, percent
+from bench.base import ConfigurationError, closest, html_table, percent, prefixed
 from bench.identification import (
     ONE_RUN,
     Advice,
@@ -580,7 +580,7 @@ def fit_sentence(identified: IdentifiedFile, left_out: float | None = None) -> s
 def certificate_lines(identified: IdentifiedFile, *, verbose: bool = True) -> Sequence[tuple[str, str]]:
     """Return what a person should know of a fit, as (name, text) pairs; the numerics only if `verbose`."""
     found, operator = identified.identification, identified.file.response
-    unit = f" {operator.output_unit}" if operator.output_unit else ""
+    unit = operator.output_unit
     errors, certificate, largest = found.errors, found.certificate, _largest(found.uncertainties)
     whose = "operator " if isinstance(operator, TimedModel) else ""
     rows = identified.inputs.size - found.skip
@@ -617,8 +617,11 @@ def certificate_lines(identified: IdentifiedFile, *, verbose: bool = True) -> Se
 
 def _error_lines(errors: Errors, unit: str, which: str = "") -> list[tuple[str, str]]:
     return [
-        (f"largest error{which}", f"{errors.maximum:.4g}{unit} ({percent(errors.maximum_percent)} of the range)"),
-        (f"RMS error{which}", f"{errors.rms:.4g}{unit} ({percent(errors.rms_percent)} of the range)"),
+        (
+            f"largest error{which}",
+            f"{prefixed(errors.maximum, unit)} ({percent(errors.maximum_percent)} of the range)",
+        ),
+        (f"RMS error{which}", f"{prefixed(errors.rms, unit)} ({percent(errors.rms_percent)} of the range)"),
     ]
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from bench.analysis.figures.fits import plot_fit, plot_loops
 from bench.analysis.predictions import Predictions
-from bench.base import percent, with_unit
+from bench.base import percent, prefixed, with_unit
 from bench.identification import Errors
 
 
@@ -46,7 +46,5 @@ def draw_predictions(found: Predictions, folder: Path, prefix: str) -> list[Path
 
 def errors_text(errors: Errors, unit: str) -> str:
     """Return largest and RMS error, with the digits of the tables."""
-    shown = f" {unit}" if unit not in ("", "1") else ""
-    return (
-        f"max {errors.maximum:.4g}{shown}, RMS {errors.rms:.4g}{shown} ({percent(errors.rms_percent)} of the range)"
-    )
+    largest, rms = prefixed(errors.maximum, unit), prefixed(errors.rms, unit)
+    return f"max {largest}, RMS {rms} ({percent(errors.rms_percent)} of the range)"

@@ -123,6 +123,7 @@ from .units import (
     is_quantity as is_quantity,
     per_square as per_square,
     percent as percent,
+    prefixed as prefixed,
     quantity as quantity,
     read_quantity as read_quantity,
     unit_registry as unit_registry,

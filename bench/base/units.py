@@ -33,6 +33,12 @@ def fitting_prefix(unit: str, *numbers: float, least: float = 1.0) -> tuple[floa
     return 1.0, unit
 
 
+def prefixed(value: float, unit: str, digits: int = 4) -> str:
+    """Return a value in `unit` with so many significant digits, its own prefix and its unit, as of an error."""
+    factor, shown = fitting_prefix(unit, value)
+    return f"{factor * value:.{digits}g} {'' if shown == '1' else shown}".rstrip()
+
+
 def format_numbers(numbers: Sequence[float | None], unit: str, precision: int) -> list[str]:
     """Return numbers as texts with one common prefix, and at the end their unit, empty for plain numbers.
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bench.base import percent, print_plain
+from bench.base import fitting_prefix, percent, prefixed, print_plain
 from bench.cli.model_options import ModelOptions
 from bench.cli.printing import console, print_rows, warn
 
@@ -112,7 +112,8 @@ def print_choice(found: SelectedModel, comparing: Comparing) -> None:
 def _print_table(found: SelectedModel) -> None:
     """Print the best models, a line each; cells are never cut off."""
     selection = found.selection
-    unit, of_runs = found.unit or "units", selection.on_runs > 0.0
+    of_runs = selection.on_runs > 0.0
+    factor, unit = fitting_prefix(found.unit or "units", selection.on_blocks)
     left_out = "runs" if of_runs else "blocks"
     heads = [
         ("", "", "deg. of", "training", "score", "% of", left_out, "unseen", "", "CPU"),
@@ -127,11 +128,11 @@ def _print_table(found: SelectedModel) -> None:
             "*" if score is selection.chosen else "",
             _describe(score.candidate),
             f"{score.freedom:.1f}",
-            f"{score.training:.3g}",
-            f"{score.error:.4g}",
+            f"{factor * score.training:.3g}",
+            f"{factor * score.error:.4g}",
             f"{100.0 * score.error / selection.span:.3g}",
-            f"{score.blocks_rms:.3g}",
-            f"{score.cycles_rms:.3g}" if score.cycles else "-",
+            f"{factor * score.blocks_rms:.3g}",
+            f"{factor * score.cycles_rms:.3g}" if score.cycles else "-",
             str(score.rows),
             f"{score.seconds:.1f}",
         )
@@ -157,8 +158,8 @@ def _print_table(found: SelectedModel) -> None:
         )
     blocks = f"contiguous blocks of the {selection.rows} rows compared, with gaps of {selection.gap},"
     _print_line(f"left out: {'whole files' if of_runs else blocks} and whole kinds of cycles")
-    errors = f"error of the chosen model: {selection.on_blocks:.3g} {unit} on blocks"
-    _print_line(f"{errors}, {selection.on_runs:.3g} {unit} on another run" if of_runs else errors)
+    errors = f"error of the chosen model: {factor * selection.on_blocks:.3g} {unit} on blocks"
+    _print_line(f"{errors}, {factor * selection.on_runs:.3g} {unit} on another run" if of_runs else errors)
 
 
 def _on_bounded(found: SelectedModel) -> str:
@@ -246,9 +247,12 @@ def print_test(found: IdentifiedFile, comparing: Comparing, test: Dataset | None
     print_rows(
         f"on {tested.source}{skipped}",
         (
-            ("largest error", f"{raw.maximum:.4g} {unit} ({percent(raw.maximum_percent)} of the range)"),
-            ("RMS error", f"{raw.rms:.4g} {unit} ({percent(raw.rms_percent)} of the range)"),
-            ("RMS, offset removed", f"{rezeroed.rms:.4g} {unit} (offset {tested.comparison.offset:+.4g})"),
+            ("largest error", f"{prefixed(raw.maximum, unit)} ({percent(raw.maximum_percent)} of the range)"),
+            ("RMS error", f"{prefixed(raw.rms, unit)} ({percent(raw.rms_percent)} of the range)"),
+            (
+                "RMS, offset removed",
+                f"{prefixed(rezeroed.rms, unit)} (offset {prefixed(tested.comparison.offset, unit)})",
+            ),
         ),
     )
     return tested

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from bench.base import ConfigurationError, DataError, percent, print_plain, show_patience
+from bench.base import ConfigurationError, DataError, percent, prefixed, print_plain, show_patience
 from bench.cli.band_options import BandOption, Recalibrating, print_band, print_examined
 from bench.cli.choice_options import (
     Comparing,
@@ -385,8 +385,11 @@ def predict_(
             f"{model.name} on {file.name}",
             (
                 ("samples", f"{inputs.size - found.first} (skipped: {found.first})"),
-                ("largest error", f"{errors.maximum:.4g} {unit} ({percent(errors.maximum_percent)} of the range)"),
-                ("RMS error", f"{errors.rms:.4g} {unit} ({percent(errors.rms_percent)} of the range)"),
+                (
+                    "largest error",
+                    f"{prefixed(errors.maximum, unit)} ({percent(errors.maximum_percent)} of the range)",
+                ),
+                ("RMS error", f"{prefixed(errors.rms, unit)} ({percent(errors.rms_percent)} of the range)"),
             ),
         )
     write_rows(out, rows)

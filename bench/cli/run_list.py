@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.text import Text
 
-from bench.base import ConfigurationError
+from bench.base import ConfigurationError, format_duration
 from bench.cli.command_support import JsonOption, parse_assignments, write_json
 from bench.cli.printing import console
 
@@ -85,7 +85,7 @@ def _print_runs(folder: Path, runs: list[ListedRun]) -> None:
     """Print a line of short columns a run, and below it what is long."""
     rows = [("started (UTC)", "status", "protocol", "rig", "duration", "steps")]
     for run in runs:
-        duration = "" if run.seconds is None else f"{run.seconds:.0f} s"
+        duration = "" if run.seconds is None else format_duration(run.seconds)
         started = run.started[:16].replace("T", " ")
         rows.append((started, run.status, run.protocol, run.rig, duration, str(run.steps)))
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]

@@ -100,8 +100,8 @@ def plots_by_unit(signals: Sequence[Signal], omitted: Collection[str]) -> list[S
         }
         path = rr.escape_entity_path_part(quantity)
         headline = f"{title[:1].upper()}{title[1:]}" + (f" [{shown}]" if shown else "")
-        if len(members) > 1:
-            headline += f": {_legend(signals, columns)}"
+        if legend := _legend(signals, columns, quantity):
+            headline += f": {legend}"
         plots.append(SignalPlot(path, headline, columns, factor, styles))
     return plots
 
@@ -114,20 +114,21 @@ def find_column(signals: Sequence[Signal], key: str, name: str) -> int:
     return names.index(name)
 
 
-def _legend(signals: Sequence[Signal], columns: Sequence[int]) -> str:
-    """Return which signal has which colour, without the device that all are of."""
+def _legend(signals: Sequence[Signal], columns: Sequence[int], quantity: str) -> str:
+    """Return which signal has which colour, as short as the tab of a view is; empty if there is one only.
+
+    A set-point is the pale line below what follows it. The device that all are of, and the quantity, are left out.
+    """
+    columns = [i for i in columns if _follower(signals, i) == i]
     names = [signals[i].name for i in columns]
+    if len(names) < 2:
+        return ""
     device = names[0].partition("_")[0] + "_"
     if all(name.startswith(device) for name in names):
-        names = [name.removeprefix(device).replace("_", " ") for name in names]
+        names = [name.removeprefix(device) for name in names]
+    names = [name.removesuffix(f"_{quantity}").replace("_", " ") for name in names]
     named = zip(names, columns, strict=True)
-    return ", ".join(f"{name} ({_colour_name(signals, column)})" for name, column in named)
-
-
-def _colour_name(signals: Sequence[Signal], column: int) -> str:
-    follower = _follower(signals, column)
-    pale = "pale " if signals[column].name.endswith(SETPOINT) else ""
-    return pale + _COLOUR_NAMES[follower % len(_COLOUR_NAMES)]
+    return ", ".join(f"{name} {_COLOUR_NAMES[column % len(_COLOUR_NAMES)]}" for name, column in named)
 
 
 def _colour(signals: Sequence[Signal], column: int) -> Colour:

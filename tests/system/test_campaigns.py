@@ -178,9 +178,9 @@ class TestFile:
     @cases(
         ("old", "new", "said"),
         [
-            ("@density", "@densty", r"runs\.1 \(track\): parameters\.model = '@densty': .* there are: @density"),
+            ("@density", "@densty", r"runs\.1 \(track\): parameters\.model = '@densty': .* did you mean @density"),
             ('runs = "characterize"', 'runs = "charac"', r"models\.0 \(density\): runs = 'charac': .* characterize"),
-            ("preisach-nonmonotonic", "preisak", r"model = 'preisak': there is no such model; there are: .*preisach"),
+            ("preisach-nonmonotonic", "preisak", r"model = 'preisak': there is no such model; did you mean preisach"),
             ("levels = 6", "levels = 6\nseed = 9", r"models\.0 \(density\): seed = 9: .* it has: 0, 1"),
             (
                 '"0..1"\nseed_',
@@ -354,7 +354,7 @@ class TestTasks:
         [
             (
                 'runs = "charac"\nmodels = "density"',
-                r"comparisons\.0 \(c\): runs = 'charac': .* there are: characterize",
+                r"comparisons\.0 \(c\): runs = 'charac': .* did you mean characterize",
             ),
             ('runs = "track"\nmodels = "densty"', r"models = 'densty': there is no table of models .*density"),
             ('runs = "track"\nmodels = "density"\nrecalibrate = "of"', "recalibrate"),

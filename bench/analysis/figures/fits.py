@@ -238,6 +238,9 @@ def _draw_band(axes: Axes, horizontal: Floats, label: str, widths: Floats, color
         parts = np.clip(np.searchsorted(edges, horizontal, side="right") - 1, 0, edges.size - 2)
         widest = np.zeros(edges.size - 1)
         np.maximum.at(widest, parts, widths)
+        # Between the inputs of two samples the band goes on.
+        seen = np.unique(parts)
+        widest = np.interp(np.arange(widest.size), seen, widest[seen])
         horizontal, widths = np.repeat(edges, 2)[1:-1], np.repeat(widest, 2)
     places, upper = outline(horizontal, widths)
     axes.fill_between(places, -upper, upper, color=color, alpha=0.15, linewidth=0.0, label=label, zorder=1.0)

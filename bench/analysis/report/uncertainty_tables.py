@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 
 from bench.analysis.uncertain_results import ControlUncertainty
-from bench.base import fitting_prefix
+from bench.base import fitting_prefix, prefixed
 from bench.rig import Budget
 
 SIGNAL_HEADS = ("signal", "at", "U (95 %)", "k", "unit", "largest component")
@@ -60,7 +60,7 @@ def budget_rows(budget: Budget) -> list[tuple[str, ...]]:
         (
             row.label,
             f"{row.type} {row.distribution}",
-            f"{row.standard:.3g} {row.unit}",
+            prefixed(row.standard, row.unit, 3),
             f"{row.sensitivity:.3g}",
             _freedom(row.freedom),
             f"{row.contribution:.3g}",

@@ -20,7 +20,7 @@ from bench.analysis.tables.reading.spreadsheet import read_spreadsheet
 from bench.analysis.tables.reading.table import ReadColumns
 from bench.analysis.tables.reading.text import reading_errors
 from bench.analysis.tables.reading.text_table import read_text
-from bench.base import ConfigurationError, DataError, header_with_unit, whole_file
+from bench.base import ConfigurationError, DataError, closest, header_with_unit, whole_file
 from bench.record import Record
 
 _OVERLOAD = 9.9e37
@@ -376,7 +376,7 @@ def _from_run(path: Path, names: Sequence[str], chosen: str, at_least: int, time
         known = [name for name in table.columns if name != "settled"]
         for name in names:
             if name not in known:
-                raise DataError(f"{path}: has no column {name!r}; it has: {', '.join(known)}")
+                raise DataError(f"{path}: has no column {name!r}; {closest(name, known)}")
         own = [name for name in times if name in known and record.unit(name) in SECONDS]
         own = [name for name in own if np.isfinite(table[name]).all()]
         names = [*names, *own[:1]]

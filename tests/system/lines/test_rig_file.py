@@ -83,7 +83,8 @@ def test_a_line_without_a_device_and_a_device_without_a_line_are_refused(tmp_pat
         load_rig(str(file))
     file.write_text(f'extends = "{buses}"\nwithout = ["lines"]\n')
     with pytest.raises(
-        ConfigurationError, match=r"devices\.load1\.line = 'cells': there is no such line; there are: none"
+        ConfigurationError,
+        match=r"devices\.load1\.line = 'cells': there is no such line; the rig has no \[lines\.NAME\]",
     ):
         load_rig(str(file))
 

@@ -55,7 +55,7 @@ class TestNamesAndValues:
         said = "2 tables, of rows × columns: 1 from line 2 (10 × 2), 2 from line 14 (40 × 3)"
         assert refused(tmp_path, content, ("1",)) == f"data.txt: has {said}; choose one with --format table=N, 1 to 2"
         message = refused(tmp_path, content)
-        assert f"has no column 'U'; it has: a, b (or a number, 1 to 2); the file has {said}: choose" in message
+        assert f"has no column 'U'; there are: a, b (or a number, 1 to 2); the file has {said}: choose" in message
         assert message.endswith(
             "another one with --format table=N, or leave out the lines above it with --format skip=N"
         )

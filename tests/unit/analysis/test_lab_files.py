@@ -282,7 +282,7 @@ LAYOUTS = {
     ),
     "no numbers of MATLAB": (matlab(note="x"), "has no vector, matrix or table of numbers", {"file": "d.mat", **NOT}),
     "structures of MATLAB": (
-        matlab(a={"U": U, "y": Y}, b={"U": Y, "y": U}), r"no column 'U'; it has: a\.U",
+        matlab(a={"U": U, "y": Y}, b={"U": Y, "y": U}), r"no column 'U'; there are: a\.U",
         {"file": "d.mat", "by": ("U", "y"), "table": "a"},
     ),
     "no such variable": (matlab(a={"U": U, "y": Y}), "has: a .2 parts", {"file": "d.mat", "table": "b", **NOT}),

@@ -73,7 +73,7 @@ class TestTrouble:
         assert len(read_columns(path, ["force"], at_least=9).values["force"]) == 9
 
     def test_a_missing_column_lists_those_that_are_there(self, table):
-        wrong(table("Force [N],length\n1,2\n"), "has no column 'force'; it has: Force [N], length")
+        wrong(table("Force [N],length\n1,2\n"), "has no column 'force'; did you mean Force [N]?")
 
     def test_no_header_says_how_columns_are_named(self, table):
         wrong(table(" , ,\n1,2.5,3\n"), "has no header line; name columns by number, 1 to 3")
@@ -151,7 +151,7 @@ class TestRuns:
     def test_a_missing_column(self, run):
         path = run((21.0, 0.0))
         with pytest.raises(
-            DataError, match="has no column 'force'; it has: step, started, finished, tec_temperature"
+            DataError, match="has no column 'force'; there are: step, started, finished, tec_temperature"
         ):
             read_columns(path, ["force"])
 

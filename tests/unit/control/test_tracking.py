@@ -687,7 +687,7 @@ class TestTuning:
     @cases(
         ("options", "words"),
         [
-            ({"closenough": 1.0}, "closenough: there is no such number; there are: close_enough"),
+            ({"closenough": 1.0}, "closenough: there is no such number; did you mean close_enough?"),
             ({"close_enough": "near"}, "close_enough = 'near': expected a number"),
             ({"close_enough": -1.0}, "close_enough: expected a positive number"),
             ({"arrival": 3.0}, "arrival"),

@@ -77,12 +77,12 @@ class TestRefused:
     @cases(
         ("old", "new", "expected"),
         [
-            ('"tec"', '"oven"', "roles.drive.device = 'oven' is not a device of this rig; allowed: tec"),
-            ('"tec"', '"probe"', "roles.drive.device = 'probe' takes no set-point; allowed: tec"),
+            ('"tec"', '"oven"', "roles.drive.device = 'oven' is not a device of this rig; there are: tec"),
+            ('"tec"', '"probe"', "roles.drive.device = 'probe' takes no set-point; there are: tec"),
             (
                 '"tec_temperature"',
                 '"tec_temp"',
-                "roles.drive.reading = 'tec_temp': there is no such signal; there are: ",
+                "roles.drive.reading = 'tec_temp': there is no such signal; did you mean tec_temperature?",
             ),
             ('"probe_temperature"', '"spot"', "roles.response.signal = 'spot': there is no such signal; there are: "),
             ('"°C"\nrange', '"K"\nrange', "roles.drive.unit = 'K': tec_temperature is in °C"),

@@ -194,7 +194,10 @@ class TestInterlocks:
     @pytest.mark.parametrize(
         ("keys", "expected"),
         [
-            ({"signal": "tec_temp", "high": 5.0}, "signal = 'tec_temp': there is no such signal; there are: tec_set"),
+            (
+                {"signal": "tec_temp", "high": 5.0},
+                "signal = 'tec_temp': there is no such signal; did you mean tec_temperature?",
+            ),
             ({"signal": "curvature", "minus": "curve", "high": 5.0}, "minus = 'curve': there is no such signal"),
             (
                 {"signal": "tec_temperature", "minus": "tec_current", "high": 5.0},

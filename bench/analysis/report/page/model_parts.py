@@ -9,6 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.analysis.figures.fits import plot_fit
+from bench.analysis.figures.panels import time_axis
 from bench.analysis.figures.planes import plot_coverage, plot_densities
 from bench.analysis.models_on_run import ModelOnRun
 from bench.analysis.prediction_figures import errors_text
@@ -101,9 +102,10 @@ def _fits(models: Sequence[ModelOnRun], times: Floats, scratch: Path, number: in
     titles = {model.file.name: f"{model.file.name}: {errors_text(model.errors, model.unit)}" for model in models}
     factor, unit = fitting_prefix(first.unit, float(np.abs(first.measured.values).max(initial=0.0)))
     input_factor, input_unit = fitting_prefix(first.inputs.unit, float(np.abs(first.inputs.values).max(initial=0.0)))
+    per_second, time_label = time_axis(float(times.max(initial=0.0)))
     for kind, horizontal, label in (
         ("loops", input_factor * first.inputs.values, with_unit(first.inputs.title, input_unit)),
-        ("time", times / 3600.0, "laboratory time / h"),
+        ("time", per_second * times, time_label),
     ):
         path = scratch / f"{kind}-{number}.svg"
         plot_fit(
@@ -183,14 +185,15 @@ def _coefficients(model: ModelOnRun, found: CoefficientUncertainties, cells: int
         if k < cells and value == 0.0:
             continue
         sigma = "–" if found.sigmas is None or not np.isfinite(found.sigmas[k]) else f"{found.sigmas[k]:.2g}"
-        rows.append((_coefficient_name(model, k, cells), f"{value:.6g}", sigma))
+        rows.append((_coefficient_name(model, k, cells), f"{value:.4g}", sigma))
     shape = operator.shape_parameters()
     rows += [(name, f"{value:.6g}", "") for name, value in zip(shape.names, shape.values, strict=True)]
     zeros = int(np.count_nonzero(values[:cells] == 0.0))
     note = f"{found.text}. {zeros} cells with zero density are left out." if zeros else f"{found.text}."
+    shown = 2 if found.sigmas is None else 3
     return PageTable(
-        ("coefficient", "value", "σ"),
-        rows,
+        ("coefficient", "value", "σ")[:shown],
+        [row[:shown] for row in rows],
         title=f"coefficients of {model.file.name}",
         note=note,
         folded=len(rows) > _FEW_COEFFICIENTS,

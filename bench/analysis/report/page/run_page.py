@@ -94,8 +94,8 @@ def run_page(
             sections.append(models_section(models, steps["finished"], scratch))
         elif (loops := _loops_section(record, steps, summary, found, scratch)) is not None:
             sections.append(loops)
-        if stated:
-            sections.append(published_section(stated, result))
+        if (compared := published_section(stated, result)) is not None:
+            sections.append(compared)
         if given := models_among(record.files(), str(record.path)):
             sections.append(given_section(list(given.items()), scratch))
         sections += [

@@ -259,11 +259,13 @@ def requests_section(events: Sequence[Event]) -> PageSection | None:
     return PageSection("Requests", (PageTable(("device", "requests"), rows),)) if rows else None
 
 
-def published_section(published: Sequence[Published], result: Mapping[str, Any]) -> PageSection:
-    """Return what papers state beside the same of the run."""
+def published_section(published: Sequence[Published], result: Mapping[str, Any]) -> PageSection | None:
+    """Return what papers state beside the same of the run; None if the run has nothing of it."""
     rows = []
-    for each in published:
-        ours = each.measured(result)
+    measured = [each.measured(result) for each in published]
+    if all(ours is None for ours in measured):
+        return None
+    for each, ours in zip(published, measured, strict=True):
         rows.append((each.quantity, each.value, "–" if ours is None else f"{ours:.4g}", each.unit, each.source))
     return PageSection("Numbers of the paper", (PageTable(("", "paper", "this run", "unit", "source"), rows),))
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from bench.base import DataError
+from bench.base import DataError, closest
 
 _SYMBOL = (
     r"(?:[yzafpnµμumcdhkMGTP]?(?:m|g|s|A|K|mol|cd|V|N|W|J|Pa|Hz|Ω|Ω|[Oo]hm|C|F|T|H|bar|eV|Oe|G|Wb|S|rad|l|L|strain)"
@@ -188,7 +188,7 @@ def find_place(path: Path, heads: Sequence[Head], columns: int, name: str) -> in
         )
     known = [head.text for head in heads if head.text]
     raise NoColumnError(
-        f"{path}: has no column {name!r}; it has: {', '.join(known)} (or a number, 1 to {columns})", known
+        f"{path}: has no column {name!r}; {closest(name, known)} (or a number, 1 to {columns})", known
     )
 
 

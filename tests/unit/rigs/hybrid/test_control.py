@@ -600,7 +600,7 @@ def folded():
             lambda: settings(noise={"heat": 2e-3}),
             "nothing says of this cantilever: noise.thermistor, noise.deflection",
         ),
-        (lambda: settings(stork=9e-6), "stork: there is no such number; there are: gain, "),
+        (lambda: settings(stork=9e-6), "stork: there is no such number; did you mean .*stroke"),
         (
             lambda: MidRangingParameters.at_rate(200.0, {"noise": MID_RANGING["noise"]}, maximum_current=0.1),
             r"gain, .*, stroke, approach; give them in the rig file, \[protocols\.hybrid-control\.tuning",
