@@ -55,6 +55,7 @@ from .model_service import (
     IdentifiedFile as IdentifiedFile,
     certificate_lines as certificate_lines,
     check_template as check_template,
+    error_lines as error_lines,
     fit_sentence as fit_sentence,
     identify_model as identify_model,
     option_names as option_names,

@@ -602,8 +602,8 @@ def certificate_lines(identified: IdentifiedFile, *, verbose: bool = True) -> Se
     return (
         *own,
         ("samples", f"{rows if identified.fitted is None else partly} (skipped: {found.skip})"),
-        *_error_lines(errors, unit),
-        *([] if identified.fitted is None else _error_lines(identified.all_errors, unit, " of all rows")),
+        *error_lines(errors, unit),
+        *([] if identified.fitted is None else error_lines(identified.all_errors, unit, " of all rows")),
         *_uniqueness(found, identified.resolution, verbose=verbose),
         *([("penalties", found.regularization.summary(unit))] if found.regularization else []),
         *([("orientation", f"{whose}{found.orientation} with the input")] if found.orientation else []),
@@ -615,7 +615,8 @@ def certificate_lines(identified: IdentifiedFile, *, verbose: bool = True) -> Se
     )
 
 
-def _error_lines(errors: Errors, unit: str, which: str = "") -> list[tuple[str, str]]:
+def error_lines(errors: Errors, unit: str, which: str = "") -> list[tuple[str, str]]:
+    """Return largest and RMS error as (name, text) pairs; `which` says of which rows."""
     return [
         (
             f"largest error{which}",

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bench.base import fitting_prefix, percent, prefixed, print_plain
+from bench.base import fitting_prefix, prefixed, print_plain
 from bench.cli.model_options import ModelOptions
 from bench.cli.printing import console, print_rows, warn
 
@@ -234,7 +234,7 @@ def _describe(one: Candidate) -> str:
 
 def print_test(found: IdentifiedFile, comparing: Comparing, test: Dataset | None) -> TestedModel | None:
     """Print the errors of a model on the test rows or file, if there are any, and return them."""
-    from bench.analysis import evaluate_on, evaluate_on_rows
+    from bench.analysis import error_lines, evaluate_on, evaluate_on_rows
 
     if comparing.test is None:
         return None
@@ -247,8 +247,7 @@ def print_test(found: IdentifiedFile, comparing: Comparing, test: Dataset | None
     print_rows(
         f"on {tested.source}{skipped}",
         (
-            ("largest error", f"{prefixed(raw.maximum, unit)} ({percent(raw.maximum_percent)} of the range)"),
-            ("RMS error", f"{prefixed(raw.rms, unit)} ({percent(raw.rms_percent)} of the range)"),
+            *error_lines(raw, unit),
             (
                 "RMS, offset removed",
                 f"{prefixed(rezeroed.rms, unit)} (offset {prefixed(tested.comparison.offset, unit)})",

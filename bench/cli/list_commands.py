@@ -11,7 +11,7 @@ from rich.padding import Padding
 from bench.base import ConfigurationError, closest
 from bench.cli.command_support import JsonOption, write_json
 from bench.cli.listing import listing
-from bench.cli.printing import console, print_table, warn
+from bench.cli.printing import console, print_rows, warn
 
 
 def list_(json_file: JsonOption = None) -> None:
@@ -82,12 +82,14 @@ def _print_listing(listed: Mapping[str, Any]) -> None:
     for rig, title in titles("rigs").items():
         alike.setdefault(tuple(listed["fitting"][rig]), {})[rig] = title
     for protocols, rigs in alike.items():
-        print_table("rigs", rigs)
+        print_rows("rigs", rigs.items())
         names = ", ".join(name + "*" * (name in listed["take_a_model"]) for name in protocols) or "none"
         text = f"[dim]protocols (*: takes a model file):[/] {names}"
-        console.print(Padding(text, (0, 0, 1, 4), expand=False), highlight=False)
+        console.print(Padding(text, (1, 0, 1, 4), expand=False), highlight=False)
     for group in ("protocols", "models", "controllers"):
-        print_table(group, titles(group))
-    print_table("studies, for `bench study`", titles("studies"))
+        print_rows(group, titles(group).items())
+        console.print()
+    print_rows("studies, for `bench study`", titles("studies").items())
+    console.print()
     for problem in listed["problems"]:
         warn(f"left out: {problem}")

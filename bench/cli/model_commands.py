@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from bench.base import ConfigurationError, DataError, percent, prefixed, print_plain, show_patience
+from bench.base import ConfigurationError, DataError, print_plain, show_patience
 from bench.cli.band_options import BandOption, Recalibrating, print_band, print_examined
 from bench.cli.choice_options import (
     Comparing,
@@ -355,6 +355,7 @@ def predict_(
     from bench.analysis import (
         ColumnNames,
         Predictions,
+        error_lines,
         examine,
         foreign_drift,
         read_for,
@@ -385,11 +386,7 @@ def predict_(
             f"{model.name} on {file.name}",
             (
                 ("samples", f"{inputs.size - found.first} (skipped: {found.first})"),
-                (
-                    "largest error",
-                    f"{prefixed(errors.maximum, unit)} ({percent(errors.maximum_percent)} of the range)",
-                ),
-                ("RMS error", f"{prefixed(errors.rms, unit)} ({percent(errors.rms_percent)} of the range)"),
+                *error_lines(errors, unit),
             ),
         )
     write_rows(out, rows)

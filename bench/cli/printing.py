@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 from rich.markup import escape
@@ -35,20 +35,11 @@ def show_compilation() -> Iterator[None]:
         yield
 
 
-def print_table(title: str, rows: dict[str, str]) -> None:
-    """Print names and what they stand for under a title."""
+def print_rows(title: str, rows: Iterable[tuple[str, str]]) -> None:
+    """Print (name, text) pairs under a title."""
     table = Table(title=title, title_justify="left", show_header=False, box=None, padding=(0, 2))
     table.add_column(style="bold", no_wrap=True)
     table.add_column()
-    for name, text in rows.items():
-        table.add_row(name, text)
-    show_table(console, table)
-    console.print()
-
-
-def print_rows(title: str, rows: Sequence[tuple[str, str]]) -> None:
-    """Print (name, text) pairs under a title."""
-    table = Table(title=title, title_justify="left", show_header=False, box=None, padding=(0, 2))
     for name, text in rows:
         table.add_row(name, text)
     show_table(console, table)
