@@ -133,6 +133,22 @@ SettingsOption = Annotated[
         autocompletion=complete_setting,
     ),
 ]
+OverrideOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--override",
+        metavar="KEY=VALUE",
+        help="Replace a value of the rig file, such as devices.NAME.port=/dev/ttyUSB1; repeatable.",
+    ),
+]
+AttachOption = Annotated[
+    Path | None,
+    typer.Option(
+        metavar="FILE",
+        help="Endpoints file of `bench rig emulate --json`: use the instruments served there, on their clock.",
+    ),
+]
+SeedOption = Annotated[int, typer.Option(min=0, help="Seed of all random numbers of an emulated laboratory.")]
 
 
 @contextmanager

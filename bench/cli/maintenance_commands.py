@@ -6,7 +6,6 @@ import math
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
-from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -14,7 +13,14 @@ from rich.markup import escape
 from rich.table import Table
 
 from bench.base import AbortError, ConfigurationError, DeviceError, show_table
-from bench.cli.command_support import JsonOption, complete_rig, parse_assignments, write_json
+from bench.cli.command_support import (
+    AttachOption,
+    JsonOption,
+    OverrideOption,
+    complete_rig,
+    parse_assignments,
+    write_json,
+)
 from bench.cli.printing import console, show_compilation, warn
 
 UNSAFE_EXIT_CODE = 7
@@ -24,14 +30,6 @@ RigArgument = Annotated[
     typer.Argument(
         metavar="RIG", help="A packaged rig, or a rig file: path/to/rig.toml.", autocompletion=complete_rig
     ),
-]
-OverrideOption = Annotated[
-    list[str] | None,
-    typer.Option("--override", metavar="KEY=VALUE", help="Replace a value of the rig file; repeatable."),
-]
-AttachOption = Annotated[
-    Path | None,
-    typer.Option(metavar="FILE", help="Endpoints file of `bench rig emulate --json`: use the instruments there."),
 ]
 
 

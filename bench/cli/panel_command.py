@@ -9,8 +9,7 @@ from typing import Annotated
 import typer
 
 from bench.base import ConfigurationError, check_extra, needed_for
-from bench.cli.command_support import parse_assignments
-from bench.cli.maintenance_commands import AttachOption, OverrideOption
+from bench.cli.command_support import AttachOption, OverrideOption, SeedOption, parse_assignments
 from bench.cli.printing import print_error
 from bench.cli.run_commands import print_result
 
@@ -19,7 +18,7 @@ def panel(
     rig: Annotated[
         str, typer.Argument(metavar="RIG|RUN", help="A packaged rig, a rig file, or the folder of a run in progress.")
     ],
-    seed: Annotated[int, typer.Option(min=0, help="Seed of an emulated laboratory.")] = 0,
+    seed: SeedOption = 0,
     clock: Annotated[str, typer.Option(help="wall; on emulated rigs also xN, N times as fast.")] = "wall",
     attach: AttachOption = None,
     overrides: OverrideOption = None,

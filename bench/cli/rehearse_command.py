@@ -5,17 +5,18 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
-import typer
 from rich.markup import escape
 from rich.table import Column, Table
 
 from bench.base import ConfigurationError, show_table
 from bench.cli.command_support import (
     JsonOption,
+    OverrideOption,
     ProtocolArgument,
     RigOption,
+    SeedOption,
     SettingsOption,
     parse_assignments,
     write_json,
@@ -30,11 +31,8 @@ def rehearse(
     protocol: ProtocolArgument = None,
     rig: RigOption = None,
     settings: SettingsOption = None,
-    overrides: Annotated[
-        list[str] | None,
-        typer.Option("--override", metavar="KEY=VALUE", help="Replace a value of the rig file; repeatable."),
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers of the emulated laboratory.")] = 0,
+    overrides: OverrideOption = None,
+    seed: SeedOption = 0,
     json_file: JsonOption = None,
 ) -> None:
     """Carry a protocol out on the emulated twin of a rig, on the virtual clock, and say what a run would do.

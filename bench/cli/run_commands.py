@@ -14,11 +14,14 @@ from rich.table import Table
 
 from bench.base import BenchError, ConfigurationError, format_duration, print_plain, show_table
 from bench.cli.command_support import (
+    AttachOption,
     JsonOption,
     LiveOption,
     NotifyOption,
+    OverrideOption,
     ProtocolArgument,
     RigOption,
+    SeedOption,
     SettingsOption,
     check_given,
     check_outputs,
@@ -49,15 +52,8 @@ def run(
         ),
     ] = None,
     settings: SettingsOption = None,
-    overrides: Annotated[
-        list[str] | None,
-        typer.Option(
-            "--override",
-            metavar="KEY=VALUE",
-            help="Replace a value of the rig file, such as devices.NAME.port=/dev/ttyUSB1; may come several times.",
-        ),
-    ] = None,
-    seed: Annotated[int, typer.Option(min=0, help="Seed of all random numbers of an emulated laboratory.")] = 0,
+    overrides: OverrideOption = None,
+    seed: SeedOption = 0,
     clock: Annotated[
         str | None,
         typer.Option(
@@ -67,13 +63,7 @@ def run(
             "recorded). Hardware has wall alone.",
         ),
     ] = None,
-    attach: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE",
-            help="Endpoints file of `bench rig emulate --json`: use the instruments served there, on their clock.",
-        ),
-    ] = None,
+    attach: AttachOption = None,
     faults: Annotated[
         Path | None,
         typer.Option(
