@@ -6,11 +6,12 @@ import importlib
 from collections.abc import Callable, Mapping
 from difflib import get_close_matches
 from fnmatch import fnmatchcase
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 
 from bench.base import ConfigurationError, closest, registry
 
@@ -38,7 +39,37 @@ class Command(NamedTuple):
     has_help: bool = False
 
 
-class Group(TyperGroup):
+class _PlainParameters:
+    """A command whose help names no Python types, and which converts no value that was not given.
+
+    To convert any value typer imports pydantic, which takes as long as the rest of `bench list`.
+    """
+
+    def get_params(self, ctx: Any) -> list[Any]:  # noqa: ANN401 - the types of click are a private part of typer
+        """Return arguments and options."""
+        parameters: list[Any] = super().get_params(ctx)  # type: ignore[misc]
+        for each in parameters:
+            if "process_value" in vars(each):
+                continue
+            each.process_value = partial(_process_value, each, each.process_value)
+            if each.param_type_name == "argument":
+                each.display_type = lambda _: ""
+            elif each.metavar is None and not each.is_flag and not each.type_descriptor.is_choice:
+                each.metavar = "NUMBER" if each.type_descriptor.is_ranged else "TEXT"
+        return parameters
+
+
+def _process_value(parameter: Any, convert: Callable[..., Any], ctx: Any, value: Any) -> Any:  # noqa: ANN401
+    if value is not None or parameter.required or parameter.nargs != 1 or getattr(parameter, "multiple", False):
+        return convert(ctx, value)
+    return None if parameter.callback is None else parameter.callback(ctx, parameter, None)
+
+
+class _OneCommand(_PlainParameters, TyperCommand):
+    pass
+
+
+class Group(_PlainParameters, TyperGroup):
     """A group of commands, each imported when it is asked for.
 
     Attributes
@@ -211,16 +242,5 @@ class StudyGroup(Group):
 
 def _command(name: str, function: Callable[..., None], *, add_help_option: bool = True) -> Any:  # noqa: ANN401
     one = typer.Typer(add_completion=False, rich_markup_mode=None, pretty_exceptions_enable=False)
-    one.command(name, context_settings=HELP_OPTIONS, add_help_option=add_help_option)(function)
-    command: Any = typer.main.get_command(one)
-    for parameter in command.params:
-        _show_no_python(parameter)
-    return command
-
-
-def _show_no_python(parameter: Any) -> None:  # noqa: ANN401 - of typer
-    """Leave the Python types out that typer writes beside arguments, and in place of the value of an option."""
-    if parameter.param_type_name == "argument":
-        parameter.display_type = lambda _: ""
-    elif parameter.metavar is None and not parameter.is_flag and not parameter.type_descriptor.is_choice:
-        parameter.metavar = "NUMBER" if parameter.type_descriptor.is_ranged else "TEXT"
+    one.command(name, cls=_OneCommand, context_settings=HELP_OPTIONS, add_help_option=add_help_option)(function)
+    return typer.main.get_command(one)
