@@ -25,7 +25,13 @@ REMARKS = {".pyc", ".nbi", ".nbc"}
 
 def done(command, folder, environment=None):
     result = subprocess.run(
-        list(map(str, command)), cwd=folder, env=environment, capture_output=True, text=True, timeout=280, check=False
+        list(map(str, command)),
+        cwd=folder,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=1100,
+        check=False,
     )
     assert result.returncode == 0, (command, result.stdout[-2000:], result.stderr[-2000:])
     return result.stdout
@@ -97,6 +103,7 @@ def test_it_runs_without_the_checkout(environment, tmp_path):
 
 
 @pytest.mark.seeds
+# Its kernels are compiled anew.
 @pytest.mark.timeout(1200)
 def test_the_words_of_the_readme_lead_to_reports(environment, tmp_path):
     bench, variables = environment
