@@ -6,7 +6,7 @@ import sqlite3
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field
-from itertools import islice
+from itertools import chain, islice
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from bench.record.opening import OpenedJournal
 from bench.record.rows import (
     FILE_NAME,
     FIRST,
+    HEADING,
     IDENTITY,
     NUMBERS,
     RECOVERED_NAME,
@@ -28,11 +29,9 @@ from bench.record.rows import (
     table_definitions,
 )
 from bench.record.second_file import NAME as SECOND_NAME, read_second_file, second_files
-from bench.record.store import insert
+from bench.record.store import copied_heading, copy_heading, insert
 from bench.record.write_ahead_log import log_damage
 
-_HEADING = ("meta", "signals")
-"""Tables without which the others cannot be understood."""
 _KEYS = {"meta": "key", "signals": "position", "files": "rowid", **NUMBERS}
 _BLOCK = 4096
 """Rows that are held at a time. Chosen: one takes some 1 kB."""
@@ -47,7 +46,7 @@ class TableState:
     good : int
         Rows of the journal whose checksums fit.
     added : int
-        Rows that only a second file has.
+        Rows that only a second file or the copy of the heading has.
     missing : int
         Rows that are nowhere; where not all of them can be known, those that are, 1 at least.
     first_bad : str
@@ -108,7 +107,8 @@ def recover(path: Path, others: Sequence[Path] = (), out: Path | None = None) ->
     Raises
     ------
     DataError
-        If it is no journal, its schema is of another version, or its metadata or signals are lost.
+        If it is no journal, its schema is of another version, or its metadata or signals and the copy of them are
+        lost.
     ConfigurationError
         If the copy exists already or cannot be written, or there is no second file that was named.
     """
@@ -134,6 +134,7 @@ def recover(path: Path, others: Sequence[Path] = (), out: Path | None = None) ->
             if lost and meta.get("status") == "completed":
                 more |= {"status": "failed", "reason": "rows of the record were lost"}
             insert(db, meta_rows(more))
+            copy_heading(db)
             meta |= more
             if copy.exists():
                 raise ConfigurationError(
@@ -159,7 +160,7 @@ class _Left:
     good : dict of str to int
         By table the number of its good rows.
     bad, added : dict of str to list
-        By table the keys of its bad rows, and of those that only second files have.
+        By table the keys of its bad rows, and of those that the journal's own tables lack.
     cut : set of str
         Tables of which there may be more rows than are known.
     """
@@ -177,11 +178,16 @@ def _gathered(journal: Path, seconds: Sequence[Path], db: sqlite3.Connection) ->
     opened, problem = _opened(journal)
     left = _Left(problem)
     try:
-        own = {table: [] if opened is None else [*_good_rows(opened, table, left)] for table in _HEADING}
-        heading = {row.key: row for rows in own.values() for row in rows}
+        own = {table: [] if opened is None else [*_good_rows(opened, table, left)] for table in HEADING}
+        copied = [] if opened is None else copied_heading(opened.db)
+        heading = {row.key: row for row in chain(copied, *own.values())}
         identity = _identity(heading, seconds)
-        beside = [row for second in seconds for row in read_second_file(second, identity)]
-        heading = {row.key: row for row in beside if row.table in _HEADING} | heading
+        beside = [*chain.from_iterable(read_second_file(second, identity) for second in seconds), *copied]
+        heading = {row.key: row for row in chain(reversed(beside), *own.values()) if row.table in HEADING}
+        if copied:
+            # It has every row of these tables.
+            left.cut.difference_update(HEADING)
+            left.bad.update((table, []) for table in HEADING)
         left.meta.update(
             (key, parse_json(row.columns[1])) for (table, key), row in heading.items() if table == "meta"
         )
@@ -189,11 +195,11 @@ def _gathered(journal: Path, seconds: Sequence[Path], db: sqlite3.Connection) ->
             raise DataError(f"{journal} has schema version {left.meta['schema']}; this bench reads version {SCHEMA}")
         lost = [
             f"row {key} of table {table}"
-            for table in _HEADING
+            for table in HEADING
             for key in left.bad[table]
             if (table, key) not in heading
         ]
-        lost += [f"table {table}" for table in _HEADING if table in left.cut]
+        lost += [f"table {table}" for table in HEADING if table in left.cut]
         if lost or "schema" not in left.meta:
             raise DataError(_hopeless(journal, problem, lost, seconds))
         names = [row.columns[1] for _, row in sorted(heading.items()) if row.table == "signals"]

@@ -40,6 +40,9 @@ _TABLES = (
 
 TABLES = ("meta", "signals", "steps", "telemetry", "events", "files")
 
+HEADING = ("meta", "signals")
+"""Tables without which the others cannot be understood."""
+
 FIRST = {"steps": 0, "telemetry": 1, "events": 1}
 """The tables whose rows are numbered without a gap, by their first column, and the first number of each."""
 

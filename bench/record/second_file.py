@@ -64,7 +64,7 @@ class SecondFile:
 
     def append(self, rows: Iterable[Row]) -> None:
         """Append rows, all or none; they are durable after `sync` only."""
-        data = b"".join(map(_encoded, rows))
+        data = b"".join(map(encoded, rows))
         try:
             if os.write(self._file, data) != len(data):
                 raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(self.path))
@@ -105,7 +105,7 @@ def read_second_file(path: Path, identity: str | None = None) -> Iterator[Row]:
     wanted = None if identity is None else meta({IDENTITY: identity})[0]
     try:
         with os.fdopen(_open(path, os.O_RDONLY), "rb") as file:
-            rows = filter(None, map(_decoded, file))
+            rows = filter(None, map(decoded, file))
             first = next(rows, None)
             if first is not None and first.key == ("meta", IDENTITY) and wanted in (None, first):
                 yield from chain((first,), rows)
@@ -167,12 +167,13 @@ def _open(path: Path, flags: int) -> int:
     return file
 
 
-def _encoded(row: Row) -> bytes:
+def encoded(row: Row) -> bytes:
+    """Return a row as a line."""
     content = json.dumps([row.table, *row.columns], default=lambda value: base64.b64encode(value).decode()).encode()
     return b"%08x %s\n" % (zlib.crc32(content), content)
 
 
-def _decoded(line: bytes) -> Row | None:
+def decoded(line: bytes) -> Row | None:
     """Return the row of a line, None if it is damaged."""
     total, _, content = line.removesuffix(b"\n").partition(b" ")
     try:

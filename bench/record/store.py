@@ -8,7 +8,8 @@ from contextlib import closing, suppress
 from itertools import groupby
 from pathlib import Path
 
-from bench.record.rows import TABLES, Row, sealed, table_definitions
+from bench.record.rows import HEADING, TABLES, Row, sealed, table_definitions
+from bench.record.second_file import decoded, encoded
 
 OTHERS = 5.0
 """Wall-clock time that the beginning and the end of a run wait for a program that has the journal locked, s: as long
@@ -58,6 +59,7 @@ class Store:
         for statement in table_definitions(signals):
             self._db.execute(statement)
         insert(self._db, rows)
+        copy_heading(self._db)
         self._db.execute("COMMIT")
 
     def write(self, rows: Sequence[Row]) -> None:
@@ -65,6 +67,8 @@ class Store:
         self._db.execute("BEGIN IMMEDIATE")
         try:
             insert(self._db, rows)
+            if any(row.table in HEADING for row in rows):
+                copy_heading(self._db)
             self._db.execute("COMMIT")
         except sqlite3.Error:
             # SQLite itself may have done so.
@@ -74,7 +78,10 @@ class Store:
 
     def forget(self, keys: Iterable[str]) -> None:
         """Remove entries of the metadata."""
+        self._db.execute("BEGIN IMMEDIATE")
         self._db.executemany("DELETE FROM meta WHERE key = ?", [(key,) for key in keys])
+        copy_heading(self._db)
+        self._db.execute("COMMIT")
 
     def wait_for_others(self, seconds: float) -> None:
         """Wait for other programs from now on, each time for so long at most, s of wall-clock time."""
@@ -133,3 +140,21 @@ def insert(db: sqlite3.Connection, rows: Iterable[Row], otherwise: str = "REPLAC
         stored = list(sealed(table, [row.columns for row in several]))
         marks = ", ".join("?" * len(stored[0]))
         db.executemany(f"INSERT OR {otherwise} INTO {table} VALUES ({marks})", stored)  # noqa: S608 - own names
+
+
+def copy_heading(db: sqlite3.Connection) -> None:
+    """Write the rows of the heading a second time, onto other pages, as without them no row can be understood."""
+    db.execute("CREATE TABLE IF NOT EXISTS heading (line BLOB NOT NULL)")
+    db.execute("DELETE FROM heading")
+    for table in HEADING:
+        rows = db.execute(f"SELECT * FROM {table}").fetchall()  # noqa: S608 - own names
+        db.executemany("INSERT INTO heading VALUES (?)", [(encoded(Row(table, row[:-1])),) for row in rows])
+
+
+def copied_heading(db: sqlite3.Connection) -> list[Row]:
+    """Return the rows that `copy_heading` has written; none if they are not all readable."""
+    try:
+        rows = [decoded(line) for (line,) in db.execute("SELECT line FROM heading")]
+    except sqlite3.DatabaseError:
+        return []
+    return [row for row in rows if row is not None] if all(rows) else []

@@ -22,7 +22,7 @@ from bench.record.model_files import add_model
 from bench.record.reading import Record
 from bench.record.rows import FIRST, IDENTITY, SCHEMA, Event, Row, StepRecord, meta as meta_rows
 from bench.record.second_file import places, read_second_file, remove
-from bench.record.store import OTHERS, Store, insert
+from bench.record.store import OTHERS, Store, copy_heading, insert
 
 _LAST_WORDS = 1.0
 """Wall-clock time for which a run whose own thread hangs waits for a program that has its journal locked, s: as long
@@ -337,3 +337,4 @@ def abandon(path: Path, ending: Ending) -> None:
     """
     with suppress(sqlite3.Error), closing(sqlite3.connect(path, timeout=_LAST_WORDS)) as db, db:
         insert(db, meta_rows(asdict(ending)), otherwise="IGNORE")
+        copy_heading(db)

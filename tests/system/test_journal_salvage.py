@@ -4,6 +4,7 @@ import json
 import random
 import shutil
 import sqlite3
+import warnings
 from contextlib import closing
 from pathlib import Path
 
@@ -82,13 +83,45 @@ class TestAnOverwrittenPage:
         assert code == 2
         assert "exists already" in err
 
-    @pytest.mark.parametrize("table", ["meta", "signals"])
-    def test_that_has_the_heading_leaves_nothing_and_says_so(self, bench, folder, table):
+    @pytest.mark.parametrize("table", ["meta", "signals", "heading"])
+    def test_that_has_the_heading_takes_nothing_as_there_is_a_copy_of_it(self, bench, completed, folder, table):
         overwrite(folder, table)
+        code, out, err = bench("runs", "repair", folder)
+        assert (code, err) == (0, "")
+        assert "status: completed" in out
+        copy = folder / RECOVERED_NAME
+        assert rows_of(copy) == rows_of(completed)
+        with Record(completed) as before, Record(copy) as after:
+            assert after.signals == before.signals
+            assert after.meta == before.meta | {"recovered": after.meta["recovered"]}
+        # The copy has its heading twice as well.
+        shutil.move(copy, folder / FILE_NAME)
+        overwrite(folder, "meta")
+        assert recover(folder).status == "completed"
+
+    def test_with_another_that_has_the_copy_leaves_nothing_and_says_so(self, bench, folder):
+        for table in ("heading", "meta"):
+            overwrite(folder, table)
         code, _, err = bench("runs", "repair", folder)
         assert code == 3
-        assert f"has lost its heading (table {table})" in err
+        assert "has lost its heading (table meta)" in err
         assert not (folder / RECOVERED_NAME).exists()
+
+    def test_takes_the_rows_on_it_alone_wherever_it_is(self, completed, folder):
+        """Whichever page but the first two are overwritten: all rows of other tables are read again."""
+        whole = (folder / FILE_NAME).read_bytes()
+        tables = ("steps", "telemetry", "events", "files")
+        for first in range(1, len(whole) // 4096 - 1):
+            damaged = bytearray(whole)
+            damaged[4096 * first : 4096 * (first + 2)] = b"\xa5" * 8192
+            (folder / FILE_NAME).write_bytes(damaged)
+            found = recover(folder, out=folder / f"{first}.sqlite")
+            with warnings.catch_warnings(action="ignore", category=IncompleteRecordWarning):
+                after = rows_of(found.copy)
+            for table, mine, theirs in zip(tables, after, rows_of(completed), strict=True):
+                if not found.tables[table].missing:
+                    assert mine == theirs, (first, table)
+            assert len([table for table in found.tables.values() if table.missing]) <= 2
 
     def test_that_is_the_first_leaves_nothing_and_says_so(self, bench, folder):
         overwrite(folder, None)

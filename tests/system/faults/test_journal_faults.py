@@ -27,7 +27,7 @@ def faults():
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
-@pytest.mark.parametrize(("rig", "fault"), [("vo2", "file"), ("sma", "removed"), ("hybrid", "eio")])
+@pytest.mark.parametrize(("rig", "fault"), [("vo2", "page"), ("sma", "removed"), ("hybrid", "eio")])
 def test_no_acknowledged_row_is_lost_and_the_rig_is_safe(faults, monkeypatch, rig, fault):
     # What the fault replaces is put back afterwards.
     for owner, name in ((Journal, "step"), (Store, "_connect"), (tempfile, "tempdir")):
