@@ -53,6 +53,26 @@ class TestRefused:
         np.testing.assert_array_equal(columns.values["target"], [0.5, 1.25])
         assert columns.assumptions == "one column, decimal comma"
 
+    @cases("head", ["Kraft, N", "Kraft,N", "a,b", "x, y, z", "1 May, by me", ""])
+    def test_one_column_of_decimal_commas_below_a_comma(self, tmp_path, head):
+        text = f"{head}\n1,05\n2\n3,15\n"
+        self.refused(tmp_path, text, "a comma may stand between columns or be the decimal sign", names=("1",))
+        columns = read_columns(write(tmp_path, text), ("1",), options=ReadingOptions(decimal="comma"))
+        np.testing.assert_array_equal(columns.values["1"], [1.05, 2.0, 3.15])
+
+    @cases("head", ["time,force", "t,counts", "U (V),y (mm)", "t,y\ns,mm"])
+    def test_whole_numbers_below_two_names_are_two_columns(self, tmp_path, head):
+        columns = read_columns(write(tmp_path, f"{head}\n1,5\n2,10\n0,15\n"), ("1", "2"))
+        np.testing.assert_array_equal(columns.values["2"], [5.0, 10.0, 15.0])
+
+    @cases("head", ["x, y, z", "time,force,position", "Weg, mm; Kraft, N", "made on 3 May, by me", ""])
+    @cases("delimiter", [";", "\t", "|", "  "])
+    def test_commas_of_a_head_delimit_no_decimal_commas(self, tmp_path, head, delimiter):
+        rows = [(0.5, 1.05), (2.5, 2.15), (1.5, 3.25)]
+        body = "".join(delimiter.join(map(str, row)).replace(".", ",") + "\n" for row in rows)
+        columns = read_columns(write(tmp_path, f"{head}\n{body}"), ("1", "2"))
+        np.testing.assert_array_equal(np.transpose([*columns.values.values()]), rows)
+
     def test_a_decimal_comma_after_whole_numbers(self, tmp_path):
         text = "U;y\n" + "1;2\n" * 2000 + "1,5;2\n"
         self.refused(tmp_path, text, "line 2002, row 2001, column U: '1,5' is not a number", "--format decimal=,")

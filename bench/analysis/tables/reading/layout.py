@@ -207,18 +207,18 @@ def find_layout(path: Path, lines: Sequence[str], options: ReadingOptions, first
     DataError
         If the lines can be read in several ways: names the option that decides.
     """
-    found: list[tuple[tuple[int, bool, int, float], Layout]] = []
+    found: list[tuple[tuple[bool, int, int, float], Layout]] = []
     for delimiter in [options.delimiter] if options.delimiter else list(DELIMITERS):
         assert delimiter is not None
         rows = list(split_rows(lines, delimiter, first))
-        signs: list[tuple[tuple[int, bool, int, float], Layout]] = []
+        signs: list[tuple[tuple[bool, int, int, float], Layout]] = []
         for decimal in [options.decimal] if options.decimal else [".", ","]:
             assert decimal is not None
             header = find_header(rows, decimal, delimiter, in_order=options.table is not None)
             if header is None or (delimiter == decimal and not _quoted(rows, lines, options)):
                 continue
             # A blank within a cell delimits nothing where another character does.
-            if delimiter == " " and any(rank[1] and other.columns == header.columns for rank, other in found):
+            if delimiter == " " and any(rank[0] and other.columns == header.columns for rank, other in found):
                 continue
             if not header.heads and header.fit == 1:
                 header = _header_in_comment(lines, first, header, delimiter)
@@ -234,7 +234,7 @@ def find_layout(path: Path, lines: Sequence[str], options: ReadingOptions, first
                 header.numbers, header.figures, comments,
             )  # fmt: skip
             share = len(numbers) / len(filled)
-            signs.append(((header.fit, share >= _MOSTLY, len(numbers), share), layout))
+            signs.append(((share >= _MOSTLY, header.fit, len(numbers), share), layout))
         # The decimal sign is the one with which more are numbers, whether or not a header fits.
         found += sorted(signs, key=lambda entry: -entry[0][2])[:1]
     if not found:
@@ -248,8 +248,7 @@ def find_layout(path: Path, lines: Sequence[str], options: ReadingOptions, first
             if same == rank and other.columns != layout.columns and "," in (layout.delimiter, other.delimiter)
         ]
         cells = [row for row in split_rows(lines, layout.delimiter, first) if row.line > layout.start]
-        has_names = rank[0] == 2 and not any(is_number(head.text, ".") for head in layout.heads)
-        if rivals or (layout.delimiter == "," and not has_names and _may_be_decimal(cells, layout)):
+        if rivals or (layout.delimiter == "," and _may_be_decimal(cells, layout)):
             raise DataError(
                 f"{path}: line {cells[0].line}: a comma may stand between columns or be the decimal sign: say "
                 "--format delimiter=comma, or --format decimal=comma; where it is both, save the file with another "
@@ -490,11 +489,16 @@ def _quoted(rows: Sequence[Row], lines: Sequence[str], options: ReadingOptions) 
 
 
 def _may_be_decimal(rows: Sequence[Row], layout: Layout) -> bool:
-    """Return whether commas between whole numbers may be decimal signs: each second cell has digits only."""
-    cells = [[cell.strip() for cell in row.cells] for row in rows]
-    return layout.columns % 2 == 0 and all(
-        len(row) % 2 == 0
-        and all(cell.lstrip("+-").isdecimal() for cell in row[::2])
-        and all(cell.isdecimal() for cell in row[1::2])
-        for row in cells
-    )
+    """Return whether commas between whole numbers may be decimal signs.
+
+    Each second cell has digits only then. It is the fraction of a number if one begins with a zero, as in `1,05`, or
+    if the heads do not name each column: `Kraft, N` may be one name with its unit.
+    """
+    whole = [cell.strip().lstrip("+-") for row in rows for cell in row.cells[::2]]
+    rest = [cell.strip() for row in rows for cell in row.cells[1::2]]
+    if layout.columns % 2 or not all(map(str.isdecimal, whole + rest)):
+        return False
+    names = [head.text for head in layout.heads]
+    units = [is_unit(name) and not name.startswith("count") for name in names[1::2]]
+    are_names = len(names) == layout.columns and not all(units) and not any(is_number(name, ".") for name in names)
+    return not are_names or any(len(cell) > 1 and cell.startswith("0") for cell in rest)
