@@ -1,6 +1,7 @@
 """`bench run --attach`: a protocol against served instruments gives what it gives in process."""
 
 import json
+import os
 import subprocess
 import sys
 
@@ -27,6 +28,10 @@ SMA = overrides({
     "supply.watchdog": 60, "supply.heartbeat": 60, "supply.timeout": 10, "load_cell.timeout": 10,
     "wire_end.timeout": 60, "stage.watchdog": 0, "stage.timeout": 10, "fan.watchdog": 600, "fan.timeout": 60,
 })  # fmt: skip
+
+
+def terminal(path, flags):
+    return os.open(path, flags | os.O_NOCTTY)
 
 
 def readings(folder):
@@ -108,8 +113,10 @@ def test_a_run_ends_when_its_server_is_killed(emulate, tmp_path):
             while not control.state()["tec_output"]:
                 assert run.poll() is None
                 control.wait(control.time() + 0.1)
-        server.kill()
-        _, err = run.communicate(timeout=240)
+        # A terminal that is open keeps its name from the servers of other tests, at which the run would arrive.
+        with open(endpoints["instruments"]["tec"]["port"], opener=terminal):
+            server.kill()
+            _, err = run.communicate(timeout=240)
     # Nothing answers any more, so that the safe state cannot be confirmed.
     assert run.returncode == 7
     assert "tec is NOT in its safe state" in err
