@@ -113,6 +113,16 @@ def read_second_file(path: Path, identity: str | None = None) -> Iterator[Row]:
         return
 
 
+def is_second_file(path: Path, identity: str) -> bool:
+    """Return whether a file is the second file of a journal; also if its process died before a row was in it."""
+    start = encoded(*meta({IDENTITY: identity}))
+    try:
+        with os.fdopen(_open(path, os.O_RDONLY), "rb") as file:
+            return start.startswith(file.read(len(start)))
+    except OSError:
+        return False
+
+
 def second_files(journal: Path) -> list[Path]:
     """Return the second files that are there and believed; whose rows they have is not looked at."""
     return [path for path in places(journal) if not _refusal(path)]

@@ -21,7 +21,7 @@ from bench.record.keeping import Keeper
 from bench.record.model_files import add_model
 from bench.record.reading import Record
 from bench.record.rows import FIRST, IDENTITY, SCHEMA, Event, Row, StepRecord, meta as meta_rows
-from bench.record.second_file import places, read_second_file, remove
+from bench.record.second_file import is_second_file, places, read_second_file, remove
 from bench.record.store import OTHERS, Store, copy_heading, insert
 
 _LAST_WORDS = 1.0
@@ -289,7 +289,7 @@ def take_in(path: Path) -> tuple[Path, tuple[Signal, ...], dict[str, int], dict[
     with Record(path) as record:
         file, identity = record.path, record.identity
         _check_can_be_written_on(record)
-    seconds = [each for each in places(file) if any(read_second_file(each, identity))]
+    seconds = [each for each in places(file) if is_second_file(each, identity)]
     if seconds:
         try:
             with closing(Store(file, OTHERS)) as store:

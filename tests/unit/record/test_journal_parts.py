@@ -296,6 +296,20 @@ class TestWritingOn:
         with Record(tmp_path) as record:
             assert len(record.steps()) == 3
 
+    @cases("length", [0, 1, 40])
+    def test_a_second_file_that_a_kill_cut_off_at_its_beginning_goes(self, tmp_path, length):
+        unfinished(tmp_path, step_row(2))
+        path = tmp_path / SECOND_NAME
+        path.write_bytes(path.read_bytes()[:length])
+        Journal.reopen(tmp_path).close()
+        assert [each.name for each in tmp_path.iterdir()] == [FILE_NAME]
+
+    def test_a_second_file_of_another_journal_stays(self, tmp_path):
+        unfinished(tmp_path)
+        SecondFile(tmp_path / SECOND_NAME, "two").close()
+        Journal.reopen(tmp_path).close()
+        assert (tmp_path / SECOND_NAME).exists()
+
     @pytest.mark.filterwarnings("ignore::bench.base.IncompleteRecordWarning")
     @pytest.mark.parametrize("waits", [True, False])
     def test_one_that_cannot_be_written_on(self, tmp_path, monkeypatch, waits):
