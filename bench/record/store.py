@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import closing, suppress
+from contextlib import closing, contextmanager, suppress
 from itertools import groupby
 from pathlib import Path
 
-from bench.record.rows import HEADING, TABLES, Row, sealed, table_definitions
+from bench.record.rows import HEADING, TABLES, Row, is_good, sealed, table_definitions
 from bench.record.second_file import decoded, encoded
 
 OTHERS = 5.0
@@ -55,33 +55,36 @@ class Store:
 
     def create(self, signals: Sequence[str], rows: Sequence[Row]) -> None:
         """Make the tables, with their first rows."""
-        self._db.execute("BEGIN IMMEDIATE")
-        for statement in table_definitions(signals):
-            self._db.execute(statement)
-        insert(self._db, rows)
-        copy_heading(self._db)
-        self._db.execute("COMMIT")
+        with self._transaction():
+            for statement in table_definitions(signals):
+                self._db.execute(statement)
+            insert(self._db, rows)
+            copy_heading(self._db)
 
     def write(self, rows: Sequence[Row]) -> None:
         """Commit rows, all or none."""
-        self._db.execute("BEGIN IMMEDIATE")
-        try:
+        with self._transaction():
             insert(self._db, rows)
             if any(row.table in HEADING for row in rows):
                 copy_heading(self._db)
+
+    def forget(self, keys: Iterable[str]) -> None:
+        """Remove entries of the metadata."""
+        with self._transaction():
+            self._db.executemany("DELETE FROM meta WHERE key = ?", [(key,) for key in keys])
+            copy_heading(self._db)
+
+    @contextmanager
+    def _transaction(self) -> Iterator[None]:
+        self._db.execute("BEGIN IMMEDIATE")
+        try:
+            yield
             self._db.execute("COMMIT")
         except sqlite3.Error:
             # SQLite itself may have done so.
             with suppress(sqlite3.Error):
                 self._db.execute("ROLLBACK")
             raise
-
-    def forget(self, keys: Iterable[str]) -> None:
-        """Remove entries of the metadata."""
-        self._db.execute("BEGIN IMMEDIATE")
-        self._db.executemany("DELETE FROM meta WHERE key = ?", [(key,) for key in keys])
-        copy_heading(self._db)
-        self._db.execute("COMMIT")
 
     def wait_for_others(self, seconds: float) -> None:
         """Wait for other programs from now on, each time for so long at most, s of wall-clock time."""
@@ -144,11 +147,13 @@ def insert(db: sqlite3.Connection, rows: Iterable[Row], otherwise: str = "REPLAC
 
 def copy_heading(db: sqlite3.Connection) -> None:
     """Write the rows of the heading a second time, onto other pages, as without them no row can be understood."""
-    db.execute("CREATE TABLE IF NOT EXISTS heading (line BLOB NOT NULL)")
-    db.execute("DELETE FROM heading")
-    for table in HEADING:
-        rows = db.execute(f"SELECT * FROM {table}").fetchall()  # noqa: S608 - own names
-        db.executemany("INSERT INTO heading VALUES (?)", [(encoded(Row(table, row[:-1])),) for row in rows])
+    rows = [(table, row) for table in HEADING for row in db.execute(f"SELECT * FROM {table}")]  # noqa: S608 - own names
+    # The copy that is there is better than one of a damaged row.
+    if all(is_good(table, row) for table, row in rows):
+        db.execute("CREATE TABLE IF NOT EXISTS heading (line BLOB NOT NULL)")
+        db.execute("DELETE FROM heading")
+        lines = [(encoded(Row(table, row[:-1])),) for table, row in rows]
+        db.executemany("INSERT INTO heading VALUES (?)", lines)
 
 
 def copied_heading(db: sqlite3.Connection) -> list[Row]:

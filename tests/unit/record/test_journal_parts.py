@@ -398,6 +398,15 @@ class TestRecovering:
         with pytest.raises(DataError, match="has schema version 2; this bench reads version 3"):
             recover(tmp_path)
 
+    def test_a_damaged_row_is_not_copied(self, tmp_path):
+        journal = Journal(tmp_path / FILE_NAME, SIGNALS, {"rig": "vo2"})
+        with closing(sqlite3.connect(tmp_path / FILE_NAME)) as db, db:
+            db.execute("""UPDATE meta SET value = '"vo3"' WHERE key = 'rig'""")
+        journal.finish(**STATUS)
+        journal.close()
+        with Record(recover(tmp_path).copy) as record:
+            assert (record.meta["rig"], record.status) == ("vo2", "completed")
+
     def test_a_copy_that_cannot_be_written(self, tmp_path):
         unfinished(tmp_path, step_row(2))
         with pytest.raises(ConfigurationError, match=r"cannot be written: .*name another one by --out"):
