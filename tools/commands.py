@@ -14,7 +14,8 @@ in_a_process = False
 
 
 READING = ("list", "predict", "runs", "run", "study")
-"""Commands that may be carried out twice."""
+"""Commands that may be carried out twice, but for these of the group `runs`."""
+WRITING = ("import", "repair")
 
 
 CODES = (*range(11), 130)
@@ -38,7 +39,7 @@ def call(*words: object) -> Ended:
     from bench.cli import main
 
     # A second command may find what the first has written.
-    words_of_process = [*words] if in_a_process and words[0] in READING else None
+    words_of_process = [*words] if in_a_process and words[0] in READING and words[1] not in WRITING else None
     out, err = io.StringIO(), io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
