@@ -335,6 +335,9 @@ def abandon(path: Path, ending: Ending) -> None:
 
     What stands there already stays.
     """
-    with suppress(sqlite3.Error), closing(sqlite3.connect(path, timeout=_LAST_WORDS)) as db, db:
-        insert(db, meta_rows(asdict(ending)), otherwise="IGNORE")
-        copy_heading(db)
+    with suppress(sqlite3.Error), closing(sqlite3.connect(path, timeout=_LAST_WORDS)) as db:
+        with db:
+            insert(db, meta_rows(asdict(ending)), otherwise="IGNORE")
+        # By itself, as it fails where the heading cannot be read.
+        with db:
+            copy_heading(db)

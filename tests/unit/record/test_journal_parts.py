@@ -407,6 +407,17 @@ class TestRecovering:
         with Record(recover(tmp_path).copy) as record:
             assert (record.meta["rig"], record.status) == ("vo2", "completed")
 
+    def test_the_end_is_recorded_though_the_signals_cannot_be_read(self, tmp_path):
+        Journal(tmp_path / FILE_NAME, SIGNALS, {"rig": "vo2"}).close()
+        with closing(sqlite3.connect(tmp_path / FILE_NAME)) as db:
+            (page,) = db.execute("SELECT rootpage FROM sqlite_master WHERE name = 'signals'").fetchone()
+        with (tmp_path / FILE_NAME).open("r+b") as file:
+            file.seek(4096 * (page - 1))
+            file.write(b"\xa5" * 4096)
+        abandon(tmp_path / FILE_NAME, Ending("aborted", "it hangs", {}))
+        with Record(recover(tmp_path).copy) as record:
+            assert (record.signals, record.status) == (SIGNALS, "aborted")
+
     def test_a_copy_that_cannot_be_written(self, tmp_path):
         unfinished(tmp_path, step_row(2))
         with pytest.raises(ConfigurationError, match=r"cannot be written: .*name another one by --out"):
