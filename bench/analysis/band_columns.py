@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,14 +27,12 @@ Floats = npt.NDArray[np.float64]
 
 @dataclass(frozen=True)
 class BandedPrediction:
-    """The band about the predictions of a model for one sequence of inputs.
+    """The band about the predictions of a model.
 
     Attributes
     ----------
     band : Band
         The model's band.
-    half_widths : ndarray, shape (N,)
-        Half-width at each row, output units.
     unit : str
         Unit of the output.
     holds_for : str
@@ -42,15 +40,19 @@ class BandedPrediction:
     """
 
     band: Band
-    half_widths: Floats
     unit: str
     holds_for: str
+
+    @property
+    def half_width(self) -> float:
+        """Half-width about each prediction, output units."""
+        return self.band.half_width
 
     def columns(self, predicted: Floats) -> list[tuple[str, Floats]]:
         """Return heads and values of the lower and the upper end of the band, shape (N,) each."""
         return [
-            (header_with_unit("predicted lower", self.unit), predicted - self.half_widths),
-            (header_with_unit("predicted upper", self.unit), predicted + self.half_widths),
+            (header_with_unit("predicted lower", self.unit), predicted - self.half_width),
+            (header_with_unit("predicted upper", self.unit), predicted + self.half_width),
         ]
 
     @property
@@ -59,24 +61,20 @@ class BandedPrediction:
         return f"{100 * self.band.level:g} % prediction band"
 
     def coverage(self, residuals: Floats) -> float:
-        """Return the share of residuals, shape (n,), of the last n rows that lie within the band, 0 to 1."""
-        return float((np.abs(residuals) <= self.half_widths[self.half_widths.size - residuals.size :]).mean())
+        """Return the share of residuals, shape (N,), that lie within the band, 0 to 1."""
+        return float((np.abs(residuals) <= self.half_width).mean())
 
     def text(self, residuals: Floats | None = None) -> str:
         """Return the band in a line, with its coverage of measured outputs if their residuals are given."""
-        width = f"± {prefixed(float(np.median(self.half_widths)), self.unit)}"
+        width = f"± {prefixed(self.half_width, self.unit)}"
         covered = "" if residuals is None else f"; covers {100 * self.coverage(residuals):.1f} % of the rows measured"
-        return f"{100 * self.band.level:g} % band: {width} (median); holds for inputs of {self.holds_for}{covered}"
+        return f"{100 * self.band.level:g} % band: {width}; holds for inputs of {self.holds_for}{covered}"
 
     def rows(self) -> list[tuple[str, str]]:
         """Return what the band is: name and value of each row of a table."""
-        widths = [
-            ("half-width, median", np.median(self.half_widths)),
-            ("half-width, largest", self.half_widths.max()),
-        ]
         return [
             ("level", f"{100.0 * self.band.level:g} %"),
-            *((name, prefixed(float(value), self.unit)) for name, value in widths),
+            ("half-width", prefixed(self.half_width, self.unit)),
             ("holds for inputs", self.holds_for),
         ]
 
@@ -84,33 +82,16 @@ class BandedPrediction:
         """Return the band for programs; `coverage` is None without residuals of measured outputs."""
         return {
             "level": self.band.level,
-            "half_width": float(np.median(self.half_widths)),
-            "largest_half_width": float(self.half_widths.max()),
+            "half_width": self.half_width,
             "coverage": None if residuals is None else self.coverage(residuals),
         }
 
 
-def predict_band(
-    model: ModelFile,
-    inputs: Floats,
-    state: Any = None,  # noqa: ANN401 - each operator has its own
-) -> BandedPrediction | None:
-    """Return the band of a model's predictions for inputs, shape (N,); None if its file has none.
-
-    Parameters
-    ----------
-    model : ModelFile
-        The model.
-    inputs : ndarray, shape (N,)
-        In the unit of the model, finite.
-    state : object
-        State before the first row; None is the initial one.
-    """
-    band, response = model.band, model.response
-    if band is None:
+def band_of(model: ModelFile) -> BandedPrediction | None:
+    """Return the band of a model's predictions; None if its file has none."""
+    if model.band is None:
         return None
-    holds_for = model.valid.text(response.input_unit)
-    return BandedPrediction(band, band.half_widths(response, inputs, state), response.output_unit, holds_for)
+    return BandedPrediction(model.band, model.response.output_unit, model.valid.text(model.response.input_unit))
 
 
 @dataclass(frozen=True)
@@ -167,20 +148,15 @@ def invert_band(
     times : ndarray, shape (N,), or None
         s, for a model with time.
     """
-    if model.band is None:
+    found = band_of(model)
+    if found is None:
         return None
     if times is not None:
-        outputs = predict_band(model, setpoints, state)
-        assert outputs is not None
-        return BandedTargets(outputs, None)
+        return BandedTargets(found, None)
     both = np.column_stack([passing, setpoints]).ravel()
     taken = np.isfinite(both)
     places = (np.cumsum(taken) - 1)[1::2]
-    path = both[taken]
-    found = predict_band(model, path, state)
-    assert found is not None
-    widths = input_half_widths(model.operator, path, found.half_widths, state)[places]
-    return BandedTargets(replace(found, half_widths=found.half_widths[places]), widths)
+    return BandedTargets(found, input_half_widths(model.operator, both[taken], found.half_width, state)[places])
 
 
 def calibrate(

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bench.analysis.band_columns import BandedPrediction, predict_band
+from bench.analysis.band_columns import BandedPrediction, band_of
 from bench.analysis.predictions import Predictions, check_finite
 from bench.analysis.session_recalibration import Session
 from bench.analysis.tables.dataset import Dataset
@@ -148,8 +148,7 @@ def examine(
         )
     check_finite(model.name, "output", predicted, units[1], inputs, "input", units[0])
     moved = 0.0 if found is None else found.values.get("input-offset", 0.0)
-    band = predict_band(model, inputs + moved, state)
-    return Examined(predicted, measured, found, band, units, first, model.beyond(inputs + moved, times))
+    return Examined(predicted, measured, found, band_of(model), units, first, model.beyond(inputs + moved, times))
 
 
 def predict(

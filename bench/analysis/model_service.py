@@ -6,13 +6,13 @@ import inspect
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
-from functools import cached_property, partial
+from functools import partial
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from bench.analysis.band_columns import BandedPrediction, calibrate, predict_band
+from bench.analysis.band_columns import BandedPrediction, band_of, calibrate
 from bench.analysis.picture import Picture
 from bench.analysis.predictions import Predictions
 from bench.analysis.tables.data import check_variation, is_run
@@ -230,10 +230,10 @@ class IdentifiedFile:
         provenance = {**self.file.provenance, PROVENANCE: found.to_json()}
         return replace(self, file=replace(self.file, provenance=provenance), uncertainty=found)
 
-    @cached_property
+    @property
     def band(self) -> BandedPrediction | None:
-        """The prediction band at the measurements; None if none was calibrated."""
-        return predict_band(self.file, self.inputs, self.identification.initial_state)
+        """The prediction band; None if none was calibrated."""
+        return band_of(self.file)
 
     def predictions(self) -> Predictions:
         """Return the outputs of the model beside the measurements, as the fit has them."""

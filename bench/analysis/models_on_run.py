@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bench.analysis.band_columns import BandedPrediction, predict_band
+from bench.analysis.band_columns import BandedPrediction, band_of
 from bench.analysis.tables.data import Quantity
 from bench.analysis.tables.starting_state import bind_times, starting_state
 from bench.base import DataError
@@ -103,7 +103,6 @@ def apply_models(record: Record, steps: Table, models: Sequence[ModelFile]) -> l
         clock = str(model.provenance.get("time"))
         times = steps[clock if clock in steps.columns else "finished"]
         predicted = bind_times(model, times).evaluate(driven.values, start.state)
-        band = predict_band(model, driven.values, start.state)
         beyond = model.beyond(driven.values, times)
-        found.append(ModelOnRun(model, driven, response, predicted, start.state, skip, band, beyond))
+        found.append(ModelOnRun(model, driven, response, predicted, start.state, skip, band_of(model), beyond))
     return found

@@ -39,7 +39,7 @@ def draw_predictions(found: Predictions, folder: Path, prefix: str) -> list[Path
             error_label=with_unit("residual", found.unit),
             titles=titles,
             skip=found.skip,
-            bands={name: (band.label, band.half_widths) for name, band in found.bands.items()},
+            bands={name: (band.label, band.half_width) for name, band in found.bands.items()},
         )
     return [loops, errors]
 

@@ -49,10 +49,9 @@ class _Row(NamedTuple):
 
 
 class _Standing(NamedTuple):
-    """How it stands at a time: half-width, readings so far, those within the band, rows beyond the inputs fitted."""
+    """Counts at a time: readings so far, those within the band, and rows beyond the inputs fitted."""
 
     t: float
-    half_width: float
     readings: int
     covered: int
     beyond: int
@@ -174,13 +173,12 @@ class ModelBand:
             return
         inputs = np.array([row.input for row in rows])
         predicted = self._operator.evaluate(inputs, self._state)
-        widths = self._band.half_widths(self._operator, inputs, self._state)
         self._state = self._operator.advance(self._state, inputs)
         beyond = (inputs < self._validity.low) | (inputs > self._validity.high)
-        self._stand(rows, predicted, widths, beyond)
+        self._stand(rows, predicted, beyond)
         when = times([row.t for row in rows], [row.step for row in rows])
         about = predicted - np.array([row.reference for row in rows])
-        table = np.column_stack([*_parted(about, widths, beyond), about])
+        table = np.column_stack([*_parted(about, self._band.half_width, beyond), about])
         self._drawn.append((f"{self._response.path}/band", when, self._response.factor * table))
         if self._setpoint is not None:
             setpoints = np.array([row.setpoint for row in rows])
@@ -200,8 +198,8 @@ class ModelBand:
             return
         standing = self._standings[place]
         level = f"{100.0 * self._band.level:g} % band"
-        factor, unit = fitting_prefix(self._operator.output_unit, standing.half_width)
-        width = f"± {factor * standing.half_width:.3g} {unit}".rstrip()
+        factor, unit = fitting_prefix(self._operator.output_unit, self._band.half_width)
+        width = f"± {factor * self._band.half_width:.3g} {unit}".rstrip()
         yield f"{level} of {self._name}", width
         if standing.readings:
             share = 100.0 * standing.covered / standing.readings
@@ -234,18 +232,16 @@ class ModelBand:
                 row = _Row(t, entry.step, values[self._drive], output, setpoint, self._last_reference, is_reading)
                 yield row, at_work
 
-    def _stand(self, rows: Sequence[_Row], predicted: Floats, widths: Floats, beyond: npt.NDArray[np.bool_]) -> None:
+    def _stand(self, rows: Sequence[_Row], predicted: Floats, beyond: npt.NDArray[np.bool_]) -> None:
         """Note how it stands at each row; what stood before the last row of the last call is forgotten."""
         del self._standings[:-1]
-        readings, covered, count = self._standings[-1][2:5] if self._standings else (0, 0, 0)
-        for row, output, width, is_beyond in zip(
-            rows, predicted.tolist(), widths.tolist(), beyond.tolist(), strict=True
-        ):
+        readings, covered, count = self._standings[-1][1:4] if self._standings else (0, 0, 0)
+        for row, output, is_beyond in zip(rows, predicted.tolist(), beyond.tolist(), strict=True):
             count += is_beyond
             if row.is_reading and math.isfinite(row.output):
                 readings += 1
-                covered += abs(row.output - output) <= width
-            self._standings.append(_Standing(row.t, width, readings, covered, count))
+                covered += abs(row.output - output) <= self._band.half_width
+            self._standings.append(_Standing(row.t, readings, covered, count))
 
     def _setpoint_widths(self, rows: Sequence[_Row], *, seen: bool = True) -> Floats:
         """Return the half-width about the set-point of each row, if it is `seen`, and move the memory by them.
@@ -260,8 +256,7 @@ class ModelBand:
         if moved.size:
             path = setpoints[moved]
             if seen:
-                about = self._band.half_widths(self._operator, path, self._set_state)
-                found = input_half_widths(self._operator, path, about, self._set_state)
+                found = input_half_widths(self._operator, path, self._band.half_width, self._set_state)
                 widths = np.append(self._set_width, found)[np.searchsorted(moved, np.arange(len(rows)), side="right")]
             self._set_state = self._operator.advance(self._set_state, path)
             self._set = float(path[-1])
@@ -271,6 +266,6 @@ class ModelBand:
         return widths
 
 
-def _parted(middle: Floats, widths: Floats, beyond: npt.NDArray[np.bool_]) -> list[Floats]:
+def _parted(middle: Floats, widths: Floats | float, beyond: npt.NDArray[np.bool_]) -> list[Floats]:
     """Return lower and upper ends, each shape (N,), within the inputs that were fitted, then beyond them."""
     return [np.where(where, middle + sign * widths, np.nan) for where in (~beyond, beyond) for sign in (-1.0, 1.0)]

@@ -1,21 +1,19 @@
 """Prediction bands: how far a model's prediction may be from what is measured, calibrated on blocks left out.
 
-Split-conformal prediction by blocks. The samples are cut into blocks of successive ones, at turning points of the
-input where there is one near; the input record is never cut, as what is left out of the cost still drives the memory.
-Each block is predicted by a fit without it and without a gap on both sides, and gives scores |y - ŷ| / v, where v² is
-the variance of the residuals and of the prediction (`PredictionVariance`). The half-width of the band is q v: q is
-the ⌈(n + 1) level⌉-th of n scores. n is the number of independent ones, as many as the gap goes into the samples
-(Chernozhukov, Wüthrich and Zhu, PMLR 75:732, 2018).
+The method is split-conformal prediction by blocks. The samples are cut into blocks of successive ones, at turning
+points of the input where there is one near. The input record is never cut, as samples left out of the cost still
+drive the memory. A fit without a block, and without a gap on both sides of it, predicts the block. The half-width of
+the band is the ⌈(n + 1) level⌉-th of n such errors |y - ŷ|. n counts independent errors: the number of gaps that go
+into the samples (Chernozhukov, Wüthrich and Zhu, PMLR 75:732, 2018).
 
-A band holds for inputs like those of its record, and not beyond the validity of the model (`Validity`). Of a model
-with time each fit without a block is one of the whole model, its times and shape too, and v is that of the residuals.
+A band holds for inputs like those of its record, and not beyond the validity of the model (`Validity`).
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
@@ -25,10 +23,9 @@ from bench.identification.branches import turns_beyond_noise
 from bench.identification.by_name import FitProblem, Identification
 from bench.identification.choose.splits import near
 from bench.identification.fit.cell_layout import Flags, Indices
-from bench.identification.fit.covariance import PredictionVariance, prediction_variance
 from bench.identification.fit.least_squares import Fit
 from bench.identification.timed.identify_in_time import identify_in_time
-from bench.models import Operator, TimedModel
+from bench.models import Operator
 
 LEVEL = 0.9
 """Nominal coverage of a band, unless another is asked for. Derivation: a quantile of it needs nine independent scores
@@ -44,7 +41,7 @@ _FEWEST_ROWS = 5
 _STEP = 1e-3
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class Band:
     """A prediction band of one model.
 
@@ -52,55 +49,25 @@ class Band:
     ----------
     level : float
         Nominal coverage, 0 to 1.
-    pointwise : float
-        Factor of the half-width at which this share of the samples is covered.
+    half_width : float
+        Half-width of the band about each prediction, output units.
     rows : int
         Samples on which the band was calibrated.
     independent : int
-        Number of them that count as independent. Below level / (1 - level) `pointwise` is the greatest score.
+        Number of them that count as independent. Below level / (1 - level) the half-width is the greatest error.
     held_out : float
         RMS error of the samples, each predicted by a fit without its block; output units.
-    variance : PredictionVariance
-        Variance of residuals and predictions.
     """
 
     level: float
-    pointwise: float
+    half_width: float
     rows: int
     independent: int
     held_out: float
-    variance: PredictionVariance
-
-    def half_widths(
-        self,
-        model: Operator[Any] | TimedModel[Any],
-        inputs: Floats,
-        state: Any = None,  # noqa: ANN401 - each operator has its own
-    ) -> Floats:
-        """Return the half-width of the band about each prediction, shape (N,), output units.
-
-        Parameters
-        ----------
-        model : Operator or TimedModel
-            The model to which the band belongs; of one with time the half-width is the same everywhere.
-        inputs : ndarray, shape (N,)
-            Input units.
-        state : object
-            State before the first sample; None is the operator's initial one.
-
-        Raises
-        ------
-        ValueError
-            If the inputs are empty or not finite, or the model has fewer coefficients than that of the band.
-        """
-        if isinstance(model, TimedModel):
-            return np.full(inputs.size, self.pointwise * self.variance.residual)
-        variance = self.variance.of(model.regressor(inputs, state))
-        return np.asarray(self.pointwise * np.sqrt(self.variance.residual**2 + variance))
 
     def to_json(self) -> dict[str, Any]:
         """Return the band as a JSON object."""
-        return {**{name: getattr(self, name) for name in _NUMBERS}, "variance": self.variance.to_json()}
+        return asdict(self)
 
     @classmethod
     def from_json(cls, document: Mapping[str, Any]) -> Band:
@@ -108,26 +75,15 @@ class Band:
 
         Raises ValueError if a key is missing or a value cannot be.
         """
-        values: dict[str, Any] = {}
-        for name, kind in _NUMBERS.items():
-            value = _checks.json_field(document, name, "band")
-            values[name] = kind(_checks.number(f"band: {name}", value))
-            if values[name] < 0:
+        values = {
+            field.name: _checks.number(f"band: {field.name}", _checks.json_field(document, field.name, "band"))
+            for field in fields(cls)
+        }
+        for name, value in values.items():
+            if value < 0.0:
                 raise ValueError(f"band: {name}: expected a number >= 0, got {value!r}")
         _check_level(values["level"])
-        variance = _checks.json_field(document, "variance", "band")
-        if not isinstance(variance, dict):
-            raise ValueError(f"band: variance: expected an object, got {variance!r}")
-        return cls(**values, variance=PredictionVariance.from_json(variance))
-
-
-_NUMBERS: Mapping[str, type[int] | type[float]] = {
-    "level": float,
-    "pointwise": float,
-    "rows": int,
-    "independent": int,
-    "held_out": float,
-}
+        return cls(**values | {name: int(values[name]) for name in ("rows", "independent")})  # type: ignore[arg-type]
 
 
 def calibrate_band(problem: FitProblem, smoothing: float = 0.0, ridge: float = 0.0, *, level: float = LEVEL) -> Band:
@@ -154,16 +110,16 @@ def calibrate_band(problem: FitProblem, smoothing: float = 0.0, ridge: float = 0
     used = np.flatnonzero(problem.weights > 0.0)
     used = used[used >= problem.skip]
     found = problem.fit(smoothing, ridge=ridge)
-    variance = prediction_variance(problem, found, smoothing, ridge)
-    spread = np.sqrt(variance.residual**2 + variance.of(problem.regressor))
+    residuals = _residuals(problem, found)
+    scale = float(np.sqrt(np.mean(residuals[used] ** 2)))
 
     def leave_out(left_out: Flags) -> Floats:
         weights = np.where(left_out, 0.0, problem.weights)
         other = problem.fit(smoothing, weights, ridge)
-        unknown = _extrapolated(problem, found, other, weights, variance.residual)
+        unknown = _extrapolated(problem, found, other, weights, scale)
         return np.where(unknown, np.nan, _residuals(problem, other))
 
-    return _calibrated(problem.inputs, used, _residuals(problem, found), spread, leave_out, variance, level)
+    return _calibrated(problem.inputs, used, residuals, leave_out, level)
 
 
 def calibrate_band_in_time(
@@ -203,13 +159,6 @@ def calibrate_band_in_time(
     counted = np.ones(inputs.size) if weights is None else weights
     used = np.flatnonzero(counted > 0.0)
     used = used[used >= found.skip]
-    freedom = found.certificate.passive + 1.0
-    if used.size <= freedom:
-        raise ValueError(
-            f"band: {used.size} samples on {freedom:.0f} free coefficients leave nothing to judge the fit by; "
-            "take fewer of them or more samples"
-        )
-    deviation = float(np.sqrt(np.sum(found.residuals[used] ** 2) / (used.size - freedom)))
     fixed = options | found.model.structure()
     if found.regularization is not None:
         fixed["smoothing"] = found.regularization.smoothing
@@ -218,24 +167,13 @@ def calibrate_band_in_time(
         kept = np.where(left_out, 0.0, counted)
         return identify_in_time(found.model_name, times, inputs, outputs, weights=kept, **fixed).residuals
 
-    nothing = np.empty(0)
-    variance = PredictionVariance(deviation, 0.0, freedom, 0.0, nothing.astype(np.int64), nothing, nothing[:, None])
-    return _calibrated(inputs, used, found.residuals, np.full(inputs.size, deviation), leave_out, variance, level)
+    return _calibrated(inputs, used, found.residuals, leave_out, level)
 
 
 def _calibrated(
-    inputs: Floats,
-    used: Indices,
-    residuals: Floats,
-    spread: Floats,
-    leave_out: Callable[[Flags], Floats],
-    variance: PredictionVariance,
-    level: float,
+    inputs: Floats, used: Indices, residuals: Floats, leave_out: Callable[[Flags], Floats], level: float
 ) -> Band:
-    """Return the band from the residuals of the fit to the samples used, and what a fit without some of them leaves.
-
-    `leave_out` returns nan where such a fit extrapolates; `spread` is v.
-    """
+    """Return the band; `leave_out` returns the residuals of a fit without some samples, nan where it extrapolates."""
     _check_level(level)
     count = min(_BLOCKS, used.size // _FEWEST_ROWS)
     if count < 2:
@@ -258,17 +196,11 @@ def _calibrated(
     scored = np.isfinite(errors)
     if not scored.any():
         raise ValueError("band: each block of the samples moves parts of the model that no other moves")
-    scores = np.sort((np.abs(errors) / np.maximum(spread, 1e-300))[scored])
-    independent = max(1, scores.size // lag)
+    sizes = np.sort(np.abs(errors[scored]))
+    independent = max(1, sizes.size // lag)
     share = min(math.ceil((independent + 1) * level) / independent, 1.0)
-    return Band(
-        level=level,
-        pointwise=float(scores[math.ceil(share * scores.size) - 1]),
-        rows=scores.size,
-        independent=independent,
-        held_out=float(np.sqrt(np.mean(errors[scored] ** 2))),
-        variance=variance,
-    )
+    half_width = float(sizes[math.ceil(share * sizes.size) - 1])
+    return Band(level, half_width, sizes.size, independent, float(np.sqrt(np.mean(sizes**2))))
 
 
 def _check_level(level: float) -> None:
@@ -276,7 +208,12 @@ def _check_level(level: float) -> None:
         raise ValueError(f"band: level: expected a number between 0 and 1, got {level}")
 
 
-def input_half_widths(operator: Operator[Any], path: Floats, half_widths: Floats, state: Any = None) -> Floats:  # noqa: ANN401
+def input_half_widths(
+    operator: Operator[Any],
+    path: Floats,
+    half_widths: Floats | float,
+    state: Any = None,  # noqa: ANN401 - each operator has its own
+) -> Floats:
     """Return the half-width about each input of a path within which its output is met, shape (N,), input units.
 
     That of the output over the local slope in the direction of arrival, which an input that stays keeps; nan where
@@ -288,7 +225,7 @@ def input_half_widths(operator: Operator[Any], path: Floats, half_widths: Floats
         The model.
     path : ndarray, shape (N,)
         Input units.
-    half_widths : ndarray, shape (N,)
+    half_widths : ndarray, shape (N,), or float
         Half-widths about the outputs there, output units.
     state : object
         State before the first input; None is the operator's initial one.

@@ -92,7 +92,7 @@ def plot_errors(
     skip: int = 0,
     names: Mapping[str, str] | None = None,
     published: Mapping[str, float] | None = None,
-    bands: Mapping[str, tuple[str, Floats]] | None = None,
+    bands: Mapping[str, tuple[str, float]] | None = None,
 ) -> None:
     """Draw each error (measured minus modelled, shape (N,)) over the index, one panel a model, on one scale.
 
@@ -106,7 +106,7 @@ def plot_errors(
         Names of the models by their titles, which decide the colours; the title itself if not given.
     published : mapping of str to float, optional
         Largest error that a paper states of a model, by its title: drawn as two lines.
-    bands : mapping of str to (str, ndarray), optional
+    bands : mapping of str to (str, float), optional
         As in `plot_fit`, by the titles.
     """
     with drawn(path, (6.0, 1.0 + 1.7 * len(errors))) as figure:
@@ -123,7 +123,7 @@ def plot_errors(
             axes.set_title(f"{title}: max {most:.3g}, RMS {rms:.3g}", fontsize=9, loc="left")
             draw_published(axes, (published or {}).get(title), color)
             if bands and title in bands:
-                _draw_band(axes, indices, *bands[title], color)
+                _draw_band(axes, *bands[title], color)
                 axes.set_title(f"{axes.get_title(loc='left')}; shaded: {bands[title][0]}", fontsize=9, loc="left")
         panels[-1].set_xlabel("index of the set-point")
 
@@ -152,7 +152,7 @@ def plot_fit(
     titles: Mapping[str, str],
     skip: int = 0,
     names: Mapping[str, str] | None = None,
-    bands: Mapping[str, tuple[str, Floats]] | None = None,
+    bands: Mapping[str, tuple[str, float]] | None = None,
 ) -> None:
     """Draw measured and modelled outputs, and below them what each model leaves, on one scale.
 
@@ -168,8 +168,8 @@ def plot_fit(
         First samples, which count in no error: drawn in grey.
     names : mapping of str to str, optional
         Registered names by those of `modelled`, where they differ; they decide the colours.
-    bands : mapping of str to (str, ndarray), optional
-        Labels and half-widths of prediction bands by the same names, shape (N,) each; drawn about the residuals.
+    bands : mapping of str to (str, float), optional
+        Labels and half-widths of prediction bands by the same names; drawn about the residuals.
     """
     apiece = len(modelled) <= _MOST_PANELS
     rows = len(modelled) if apiece else 1
@@ -190,7 +190,7 @@ def plot_fit(
                 bottom.plot(*outline(horizontal[early], residuals[early]), color=SKIPPED, linewidth=0.7, label="_")
                 top.plot(*outline(horizontal[early], values[early]), color=SKIPPED, label="_", **_MODEL)
             if bands and name in bands:
-                _draw_band(bottom, horizontal, *bands[name], color)
+                _draw_band(bottom, *bands[name], color)
             if horizontal.size <= _DENSE or not (np.diff(horizontal) >= 0.0).all():
                 draw_residuals(bottom, horizontal[skip:], residuals[skip:], color, titles[name])
             else:
@@ -208,7 +208,7 @@ def plot_fit(
                 legend_above(axes)
         # Of what counts; the samples before may be far off.
         counted = np.concatenate([(measured - values)[skip:] for values in modelled.values()])
-        widths = [float(np.nanmax(width[skip:])) for _, width in (bands or {}).values()]
+        widths = [width for _, width in (bands or {}).values()]
         least, most = (
             min([0.0, float(counted.min()), *(-w for w in widths)]),
             max([0.0, float(counted.max()), *widths]),
@@ -231,19 +231,8 @@ def draw_residuals(axes: Axes, horizontal: Floats, residuals: Floats, color: str
     )
 
 
-def _draw_band(axes: Axes, horizontal: Floats, label: str, widths: Floats, color: str) -> None:
-    """Draw a band about zero: over rows or time as it is, over an input as the widest of each of many parts."""
-    if not (np.diff(horizontal) >= 0.0).all():
-        edges = np.linspace(float(horizontal.min()), float(horizontal.max()), 101)
-        parts = np.clip(np.searchsorted(edges, horizontal, side="right") - 1, 0, edges.size - 2)
-        widest = np.zeros(edges.size - 1)
-        np.maximum.at(widest, parts, widths)
-        # Between the inputs of two samples the band goes on.
-        seen = np.unique(parts)
-        widest = np.interp(np.arange(widest.size), seen, widest[seen])
-        horizontal, widths = np.repeat(edges, 2)[1:-1], np.repeat(widest, 2)
-    places, upper = outline(horizontal, widths)
-    axes.fill_between(places, -upper, upper, color=color, alpha=0.15, linewidth=0.0, label=label, zorder=1.0)
+def _draw_band(axes: Axes, label: str, width: float, color: str) -> None:
+    axes.axhspan(-width, width, color=color, alpha=0.15, linewidth=0.0, label=label, zorder=1.0)
 
 
 def plot_sequence_and_errors(

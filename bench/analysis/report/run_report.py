@@ -260,7 +260,7 @@ def _draw_errors(models: Sequence[ModelOnRun], folder: Path, figure_format: str)
         residuals,
         error_label=with_unit("error", models[0].unit),
         skip=models[0].skip,
-        bands={each.file.name: (each.band.label, each.band.half_widths) for each in models if each.band is not None},
+        bands={each.file.name: (each.band.label, each.band.half_width) for each in models if each.band is not None},
     )
     return [path]
 

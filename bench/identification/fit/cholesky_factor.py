@@ -140,13 +140,6 @@ class CholeskyFactor:
         """Return the condition number of the columns, given the greatest sum of magnitudes over a Gram row."""
         return float(np.sqrt(norm * estimated_norm(self.solve, self.size)))
 
-    def dense(self) -> Floats:
-        """Return L, shape (size, size)."""
-        result = np.zeros((self.size, self.size))
-        for first, last, block in self._blocks(self.size):
-            result[first:last, :last] = block
-        return np.tril(result)
-
     def invert(self) -> None:
         """Replace L by its inverse: the factor is used up."""
         for first, last, block in self._blocks(self.size):

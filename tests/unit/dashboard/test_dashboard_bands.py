@@ -9,7 +9,6 @@ from rerun.chunk import RrdReader
 
 import bench as bench_functions
 from bench.analysis import invert_band
-from bench.analysis.band_columns import predict_band
 from bench.dashboard.entries import End, Tick
 from bench.dashboard.writer import Writer
 from bench.devices import Signal
@@ -128,15 +127,14 @@ def test_the_band_beside_the_readings_is_that_of_predict(tmp_path, model):
     found = written(tmp_path / "run.rrd", controlled(inputs, outputs), [model])
     # A tick without a measured input is left out; a reading after the controller is one row more.
     seen = np.delete(inputs, 7)
-    expected = predict_band(model, seen, model.operator.advance(model.operator.initial_state(), [0.8, -1.0]))
     predicted = model.operator.evaluate(seen, model.operator.advance(model.operator.initial_state(), [0.8, -1.0]))
     ticks = ticks_of(found[BAND], inputs)
     lower, upper, own = merged(found[BAND][ticks])
     # As the error: less the reference, in the unit of its plot.
     about = predicted - np.delete(outputs + 0.1, 7)
     np.testing.assert_allclose(found[BAND][ticks, 4], about, atol=1e-12)
-    np.testing.assert_allclose(lower, about - expected.half_widths, atol=1e-9)
-    np.testing.assert_allclose(upper, about + expected.half_widths, atol=1e-9)
+    np.testing.assert_allclose(lower, about - model.band.half_width, atol=1e-9)
+    np.testing.assert_allclose(upper, about + model.band.half_width, atol=1e-9)
     assert own.all()
 
 
@@ -170,11 +168,10 @@ def test_a_run_without_control_has_it_at_the_readings(tmp_path, model):
     rng = np.random.default_rng(4)
     inputs = random_reversals(rng)
     found = written(tmp_path / "run.rrd", readings(inputs, measured("duhem", inputs, rng)), [model], control=False)
-    expected = predict_band(model, inputs)
     lines = found["/signals/mm/band", "scalars"]
     lower, upper, _ = merged(lines)
     # What a hold shows on the way to a reading moves no memory here, as in the identification.
-    np.testing.assert_allclose(0.5 * (upper - lower), expected.half_widths, rtol=1e-9)
+    np.testing.assert_allclose(0.5 * (upper - lower), model.band.half_width, rtol=1e-9)
 
 
 def test_the_band_about_the_setpoints_is_that_of_invert(tmp_path, model):

@@ -55,7 +55,7 @@ def test_nine_of_ten_are_covered_at_the_rates_of_the_calibration(name, options, 
         record, other = reversals(rng), reversals(rng)
         found, band = calibrated(name, *record, lagging(*record, rng), **options)
         residuals = lagging(*other, rng) - found.model.evaluate(*other, found.initial_state)
-        covered.append(float((np.abs(residuals) <= band.half_widths(found.model, other[1]))[50:].mean()))
+        covered.append(float((np.abs(residuals) <= band.half_width)[50:].mean()))
     assert 0.85 <= np.mean(covered) <= 0.96
 
 
@@ -67,7 +67,7 @@ def test_what_the_fit_chose_is_kept_without_a_block():
     found, band = calibrated("hammerstein", times, inputs, outputs, **free)
     again, same = calibrated("hammerstein", times, inputs, outputs, **free, **found.model.structure())
     np.testing.assert_allclose(again.residuals, found.residuals, atol=1e-3)
-    assert same.pointwise == pytest.approx(band.pointwise, rel=0.05)
+    assert same.half_width == pytest.approx(band.half_width, rel=0.05)
 
 
 @cases("dynamics", ["none", "lag", "resonance,drift", "lag,delay,creep", "resonance,kelvin-voigt", "fading-drift"])
@@ -116,7 +116,7 @@ def test_commands_write_the_band_and_judge_the_rate(bench, tmp_path):
     assert "90 %" in card.read_text(encoding="utf-8")
     band = Band.from_json(json.loads(model.read_text(encoding="utf-8"))["band"])
     fit = json.loads((tmp_path / "fit.json").read_text(encoding="utf-8"))
-    assert fit["band"]["half_width"] == pytest.approx(band.pointwise * band.variance.residual)
+    assert fit["band"]["half_width"] == pytest.approx(band.half_width)
     for path, is_flagged in ((data, False), (faster, True)):
         arguments = (*COLUMNS, "--out", tmp_path / "predicted.csv", "--json", tmp_path / "predicted.json")
         code, out, text = bench("predict", model, path, *arguments)
@@ -126,7 +126,7 @@ def test_commands_write_the_band_and_judge_the_rate(bench, tmp_path):
         assert ("faster than those fitted" in " ".join(text.split())) is is_flagged
         rows = np.genfromtxt(tmp_path / "predicted.csv", delimiter=",", names=True)
         widths = rows["predicted_upper_µm"] - rows["predicted_lower_µm"]
-        np.testing.assert_allclose(widths, 2.0 * band.pointwise * band.variance.residual, rtol=1e-9)
+        np.testing.assert_allclose(widths, 2.0 * band.half_width, rtol=1e-9)
     code, out, text = bench("model", "test", model, "--data", data, "--bands")
     assert (code, "covers" in out) == (0, True), text
     targets = tmp_path / "targets.csv"

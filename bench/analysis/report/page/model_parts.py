@@ -119,7 +119,7 @@ def _fits(models: Sequence[ModelOnRun], times: Floats, scratch: Path, number: in
             titles=titles,
             skip=first.skip,
             bands={
-                model.file.name: (model.band.label, factor * model.band.half_widths)
+                model.file.name: (model.band.label, factor * model.band.half_width)
                 for model in models
                 if model.band is not None
             },
