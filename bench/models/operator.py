@@ -79,6 +79,25 @@ class Operator(Model, ABC, Generic[S]):
         Raises ValueError if their number is wrong or one is not finite or not possible.
         """
 
+    def _coefficients(self, values: ArrayLike) -> Floats:
+        """Return coefficients as `_checks.samples` does; ValueError if they are not as many as the present ones."""
+        numbers = _checks.samples("coefficients", values)
+        if numbers.size != self.coefficients.size:
+            raise ValueError(f"coefficients: expected {self.coefficients.size} values, got {numbers.size}")
+        return numbers
+
+    def _settle(self, *numbers: str, span: tuple[float, float] | None = None, **checked: Floats | float) -> None:
+        """Set `checked` fields, arrays read-only, and finite `numbers`, the bias and the range (default `span`)."""
+        values: dict[str, Any] = dict(checked)
+        for name in ("bias", *numbers):
+            values[name] = _checks.number(name, getattr(self, name))
+        given: Any = self.input_range
+        given = span if given is None else given
+        low, high = _checks.increasing("input_range", given).tolist()
+        values["input_range"] = (low, high)
+        for name, value in values.items():
+            object.__setattr__(self, name, _checks.frozen(value) if isinstance(value, np.ndarray) else value)
+
     @abstractmethod
     def initial_state(self) -> S:
         """Return the state from which identification starts."""
@@ -193,14 +212,7 @@ class Operator(Model, ABC, Generic[S]):
 
     def rises(self) -> bool:
         """Return whether the output never falls while the input rises; by default as sampled from the start."""
-        return self._never_falls(1.0)
-
-    def falls(self) -> bool:
-        """Return whether the output never rises while the input rises; by default as sampled from the start."""
-        return self._never_falls(-1.0)
-
-    def _never_falls(self, sign: float) -> bool:
-        outputs = sign * self.evaluate(np.linspace(*self.input_range, _SAMPLES))
+        outputs = self.evaluate(np.linspace(*self.input_range, _SAMPLES))
         return not (np.diff(outputs) < -1e-14 * np.abs(outputs).max()).any()
 
     def inverse(self, policy: Policy = "nearest") -> Inverse[S]:

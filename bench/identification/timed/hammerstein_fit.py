@@ -178,10 +178,7 @@ def identify_hammerstein(
 
 
 def _elements(text: str) -> tuple[str, ...]:
-    """Return the elements that a text names.
-
-    Raises ValueError if one is unknown or two exclude each other.
-    """
+    """Return the elements that a text names; ValueError if one is unknown or two exclude each other."""
     names = tuple(name.strip() for name in text.split(",") if name.strip() not in ("", "none"))
     if unknown := [name for name in names if name not in ELEMENTS]:
         raise ValueError(f"dynamics: expected none or {', '.join(ELEMENTS)}, got {', '.join(unknown)}")

@@ -151,25 +151,12 @@ def identify_preisach_oscillator(
 
     Parameters
     ----------
-    times : array_like, shape (N,)
-        s, strictly increasing; even if the sequence is periodic.
-    inputs, outputs : array_like, shape (N,)
-        The force, and the displacement that follows from it, or what stands for them.
-    weights : array_like, shape (N,), or None
-        Weight per sample, >= 0; default 1.
-    skip : int
-        Number of first samples left out of the cost.
-    initial : {"rest", "periodic"} or None
-        Before the first sample: at rest, or the steady state of a sequence that repeats itself. None takes what fits
-        better.
+    times, inputs, outputs, weights, skip, initial, interpolation, input_unit, output_unit
+        As `identify_bouc_wen_oscillator`.
     orientation : {"auto", "rising", "falling"}
         Sign of the density beside the spring: falling if the force is stiffer after a reversal.
     levels : int
         Number of intervals of the plane, 2 to 40.
-    interpolation : {"smooth", "linear", "held"}
-        The input between samples.
-    input_unit, output_unit : str
-        Units, for labels.
 
     Raises
     ------

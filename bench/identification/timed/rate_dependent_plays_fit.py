@@ -219,12 +219,8 @@ def identify_rate_dependent_plays(
 
     Parameters
     ----------
-    times : array_like, shape (N,)
-        s, strictly increasing.
-    inputs, outputs : array_like, shape (N,)
-        The measured sequence.
-    weights, skip, initial, orientation
-        As `identify`.
+    times, inputs, outputs, weights, skip, initial, orientation
+        As `identify_hammerstein`.
     plays : int
         Number of thresholds; there is a play of each without a time constant and with each.
     maximum : float or None

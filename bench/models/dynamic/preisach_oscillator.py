@@ -64,12 +64,8 @@ class PreisachOscillator(TimedModel[State]):
         F: from y, output units, to a force, input units.
     offset : float
         Output at y = 0, output units.
-    input_range : tuple of float
-        Range of the inputs from which it was identified, input units.
-    interpolation : {"smooth", "linear", "held"}
-        The input between samples; see `BoucWenOscillator`.
-    input_unit, output_unit : str
-        Units, for labels.
+    input_range, interpolation, input_unit, output_unit
+        As `BoucWenOscillator`.
 
     Raises
     ------

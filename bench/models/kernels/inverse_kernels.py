@@ -29,10 +29,7 @@ _INTERPOLATED = 6
 
 @inlined
 def _first_root(a: float, b: float, r: float, length: float, tolerance: float) -> float:
-    """Return the least d in [0, length] with A d² + B d = r, or -1.
-
-    A maximum that touches r within the tolerance counts.
-    """
+    """Return the least d in [0, length] with A d² + B d = r, or -1; a maximum that touches r counts."""
     if abs(a) * length * length <= 1e-3 * tolerance:
         if b == 0.0:
             return -1.0

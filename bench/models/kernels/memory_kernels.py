@@ -369,10 +369,7 @@ def _span(axis: Axis, low: float, high: float) -> tuple[int, int]:
 def _rectangle(
     axis: Axis, b0: float, b1: float, a0: float, a1: float, factor: float, entries: Entries, end: int
 ) -> int:
-    """Append factor * overlap with [b0, b1] x [a0, a1] (above the diagonal) for each cell touched.
-
-    Without room for any entry they are only counted.
-    """
+    """Append factor * overlap with [b0, b1] x [a0, a1] for each cell touched; without room, only count them."""
     levels, _ = axis
     cells, changes = entries
     if b1 <= b0 or a1 <= a0:

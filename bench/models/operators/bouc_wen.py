@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bench.base import Floats, checks as _checks
 from bench.models.operator import Shape
-from bench.models.operators.elements import CompiledStep, ElementOperator, checked_coefficients
+from bench.models.operators.elements import CompiledStep, ElementOperator
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,8 +28,6 @@ class BoucWen(ElementOperator):
     ----------
     stiffness, hysteretic : float
         Output units per input unit, of either sign.
-    bias : float
-        Constant, output units.
     beta : float
         Loss, >= 0.
     gamma : float
@@ -41,10 +39,8 @@ class BoucWen(ElementOperator):
         Unit of z, input units, > 0; half the operating range unless chosen.
     origin : float
         Input of the relaxed state, z = 0, input units.
-    input_range : tuple of float
-        Operating range of the input.
-    input_unit, output_unit : str
-        Units, for labels.
+    bias, input_range, input_unit, output_unit
+        As `Operator`.
 
     Raises
     ------
@@ -66,15 +62,12 @@ class BoucWen(ElementOperator):
     output_unit: str = ""
 
     def __post_init__(self) -> None:
-        for name in ("stiffness", "hysteretic", "bias", "beta", "gamma", "exponent", "origin"):
-            object.__setattr__(self, name, _checks.number(name, getattr(self, name)))
-        object.__setattr__(self, "scale", _checks.positive("scale", self.scale))
+        numbers = "stiffness", "hysteretic", "beta", "gamma", "exponent", "origin"
+        self._settle(*numbers, scale=_checks.positive("scale", self.scale))
         if self.beta < 0.0:
             raise ValueError(f"beta: expected a number >= 0, got {self.beta}")
         if self.exponent < 1.0:
             raise ValueError(f"exponent: expected a number >= 1, got {self.exponent}")
-        low, high = _checks.increasing("input_range", self.input_range).tolist()
-        object.__setattr__(self, "input_range", (low, high))
 
     @property
     def coefficients(self) -> Floats:
@@ -83,7 +76,7 @@ class BoucWen(ElementOperator):
 
     def with_coefficients(self, coefficients: ArrayLike, bias: float) -> BoucWen:
         """Return the same operator with another stiffness, hysteretic part and bias."""
-        stiffness, hysteretic = checked_coefficients(coefficients, 2).tolist()
+        stiffness, hysteretic = self._coefficients(coefficients).tolist()
         return replace(self, stiffness=stiffness, hysteretic=hysteretic, bias=bias)
 
     def nonnegative(self) -> NDArray[np.bool_]:

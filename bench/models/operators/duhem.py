@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bench.base import Floats, checks as _checks
 from bench.models.operator import Shape
-from bench.models.operators.elements import CompiledStep, ElementOperator, checked_coefficients
+from bench.models.operators.elements import CompiledStep, ElementOperator
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,14 +31,10 @@ class Duhem(ElementOperator):
         Coefficients of T_0 ... T_(n - 1) in g, output units.
     rate : float
         Of relaxation per half operating range, > 0.
-    bias : float
-        Constant, output units.
     origin : float
         Input of the relaxed state, y = f(x), input units.
-    input_range : tuple of float
-        Operating range of the input.
-    input_unit, output_unit : str
-        Units, for labels.
+    bias, input_range, input_unit, output_unit
+        As `Operator`.
 
     Raises
     ------
@@ -62,13 +58,8 @@ class Duhem(ElementOperator):
         slope = _checks.samples("slope", self.slope)
         if slope.size != anhysteretic.size:
             raise ValueError(f"slope: expected {anhysteretic.size} values, as of anhysteretic, got {slope.size}")
-        low, high = _checks.increasing("input_range", self.input_range).tolist()
-        object.__setattr__(self, "anhysteretic", _checks.frozen(anhysteretic))
-        object.__setattr__(self, "slope", _checks.frozen(slope))
-        object.__setattr__(self, "rate", _checks.positive("rate", self.rate))
-        object.__setattr__(self, "bias", _checks.number("bias", self.bias))
-        object.__setattr__(self, "origin", _checks.number("origin", self.origin))
-        object.__setattr__(self, "input_range", (low, high))
+        rate = _checks.positive("rate", self.rate)
+        self._settle("origin", anhysteretic=anhysteretic, slope=slope, rate=rate)
 
     @property
     def degree(self) -> int:
@@ -82,7 +73,7 @@ class Duhem(ElementOperator):
 
     def with_coefficients(self, coefficients: ArrayLike, bias: float) -> Duhem:
         """Return the same operator with other polynomials, shape (2 n,), and bias."""
-        values = checked_coefficients(coefficients, 2 * self.degree)
+        values = self._coefficients(coefficients)
         return replace(self, anhysteretic=values[: self.degree], slope=values[self.degree :], bias=bias)
 
     def nonnegative(self) -> NDArray[np.bool_]:

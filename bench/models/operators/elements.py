@@ -201,11 +201,3 @@ def _compiled(name: str) -> Step:
 
     step: Step = getattr(kernels, name).prepare()
     return step
-
-
-def checked_coefficients(values: ArrayLike, count: int) -> Floats:
-    """Return coefficients as `_checks.samples` does; raise ValueError if they are not as many as there should be."""
-    numbers = _checks.samples("coefficients", values)
-    if numbers.size != count:
-        raise ValueError(f"coefficients: expected {count} values, got {numbers.size}")
-    return numbers

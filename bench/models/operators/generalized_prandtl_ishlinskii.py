@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from bench.base import Floats, checks as _checks
 from bench.models.operator import Shape
-from bench.models.operators.elements import CompiledStep, ElementOperator, ElementState, checked_coefficients
+from bench.models.operators.elements import CompiledStep, ElementOperator, ElementState
 
 if TYPE_CHECKING:
     from bench.models.inverses.branch_inverse import Branch
@@ -76,14 +76,12 @@ class GeneralizedPrandtlIshlinskii(ElementOperator):
         Of γ_r, in x: steepness > 0.
     falling_steepness, falling_offset : float
         Of γ_l.
-    bias : float
-        Constant, output units.
     origin : float
         Input of the relaxed state, in which every play stands between the envelopes, input units.
     input_range : tuple of float
         Operating range of the input, mapped to [-1, 1].
-    input_unit, output_unit : str
-        Units, for labels.
+    bias, input_unit, output_unit
+        As `Operator`.
 
     Raises
     ------
@@ -108,14 +106,15 @@ class GeneralizedPrandtlIshlinskii(ElementOperator):
 
     def __post_init__(self) -> None:
         thresholds, weights = _checks.plays(self.thresholds, self.weights)
-        low, high = _checks.increasing("input_range", self.input_range).tolist()
-        object.__setattr__(self, "thresholds", _checks.frozen(thresholds))
-        object.__setattr__(self, "weights", _checks.frozen(weights))
-        for name in ("rising_steepness", "falling_steepness"):
-            object.__setattr__(self, name, _checks.positive(name, getattr(self, name)))
-        for name in ("rising_offset", "falling_offset", "bias", "origin"):
-            object.__setattr__(self, name, _checks.number(name, getattr(self, name)))
-        object.__setattr__(self, "input_range", (low, high))
+        self._settle(
+            "rising_offset",
+            "falling_offset",
+            "origin",
+            thresholds=thresholds,
+            weights=weights,
+            rising_steepness=_checks.positive("rising_steepness", self.rising_steepness),
+            falling_steepness=_checks.positive("falling_steepness", self.falling_steepness),
+        )
 
     @cached_property
     def rising(self) -> Envelope:
@@ -140,7 +139,7 @@ class GeneralizedPrandtlIshlinskii(ElementOperator):
 
     def with_coefficients(self, coefficients: ArrayLike, bias: float) -> GeneralizedPrandtlIshlinskii:
         """Return the same operator with other weights, shape (n,), and bias."""
-        return replace(self, weights=checked_coefficients(coefficients, self.weights.size), bias=bias)
+        return replace(self, weights=self._coefficients(coefficients), bias=bias)
 
     def shape_parameters(self) -> Shape:
         """Return the four parameters of the envelopes."""

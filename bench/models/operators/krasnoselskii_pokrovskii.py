@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bench.base import Floats, checks as _checks
-from bench.models.operators.elements import CompiledStep, ElementOperator, ElementState, checked_coefficients
+from bench.models.operators.elements import CompiledStep, ElementOperator, ElementState
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,12 +31,10 @@ class KrasnoselskiiPokrovskii(ElementOperator):
         Output units.
     width : float
         Of the ramps, input units, > 0.
-    bias : float
-        Constant, output units.
     input_range : tuple of float or None
         Operating range of the input. Default: from the first node to the end of the last ramp.
-    input_unit, output_unit : str
-        Units, for labels.
+    bias, input_unit, output_unit
+        As `Operator`.
 
     Raises
     ------
@@ -63,13 +61,7 @@ class KrasnoselskiiPokrovskii(ElementOperator):
                 f"{weights.size}"
             )
         width = _checks.positive("width", self.width)
-        span = (nodes[0], nodes[-1] + width) if self.input_range is None else self.input_range
-        low, high = _checks.increasing("input_range", span).tolist()
-        object.__setattr__(self, "nodes", _checks.frozen(nodes))
-        object.__setattr__(self, "weights", _checks.frozen(weights))
-        object.__setattr__(self, "width", width)
-        object.__setattr__(self, "bias", _checks.number("bias", self.bias))
-        object.__setattr__(self, "input_range", (low, high))
+        self._settle(span=(nodes[0], nodes[-1] + width), nodes=nodes, weights=weights, width=width)
 
     @property
     def coefficients(self) -> Floats:
@@ -78,7 +70,7 @@ class KrasnoselskiiPokrovskii(ElementOperator):
 
     def with_coefficients(self, coefficients: ArrayLike, bias: float) -> KrasnoselskiiPokrovskii:
         """Return the same operator with other weights and bias."""
-        return replace(self, weights=checked_coefficients(coefficients, self.weights.size), bias=bias)
+        return replace(self, weights=self._coefficients(coefficients), bias=bias)
 
     @cached_property
     def _ramps(self) -> tuple[Floats, Floats]:

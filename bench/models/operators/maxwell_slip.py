@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bench.base import Floats, checks as _checks
-from bench.models.operators.elements import CompiledStep, ElementOperator, ElementState, checked_coefficients
+from bench.models.operators.elements import CompiledStep, ElementOperator, ElementState
 
 if TYPE_CHECKING:
     from bench.models.inverses.branch_inverse import Branch
@@ -33,14 +33,12 @@ class MaxwellSlip(ElementOperator):
         Of the elements, output units per input unit.
     spring : float
         Stiffness of the spring that never slips, output units per input unit.
-    bias : float
-        Constant, output units.
     origin : float
         Input of the relaxed state, input units.
     input_range : tuple of float or None
         Operating range of the input. Default: origin ± the last slip.
-    input_unit, output_unit : str
-        Units, for labels.
+    bias, input_unit, output_unit
+        As `Operator`.
 
     Raises
     ------
@@ -68,19 +66,8 @@ class MaxwellSlip(ElementOperator):
         if stiffnesses.size != slips.size:
             raise ValueError(f"stiffnesses: expected {slips.size} values, one for each slip, got {stiffnesses.size}")
         origin = _checks.number("origin", self.origin)
-        span = (origin - slips[-1], origin + slips[-1]) if self.input_range is None else self.input_range
-        low, high = _checks.increasing("input_range", span).tolist()
-        object.__setattr__(self, "slips", _checks.frozen(slips))
-        object.__setattr__(self, "stiffnesses", _checks.frozen(stiffnesses))
-        object.__setattr__(self, "spring", _checks.number("spring", self.spring))
-        object.__setattr__(self, "bias", _checks.number("bias", self.bias))
-        object.__setattr__(self, "origin", origin)
-        object.__setattr__(self, "input_range", (low, high))
-
-    @property
-    def slip_forces(self) -> Floats:
-        """Force at which each element slips, output units, shape (n,)."""
-        return np.asarray(self.stiffnesses * self.slips)
+        span = origin - slips[-1], origin + slips[-1]
+        self._settle("spring", "origin", span=span, slips=slips, stiffnesses=stiffnesses)
 
     @property
     def coefficients(self) -> Floats:
@@ -89,7 +76,7 @@ class MaxwellSlip(ElementOperator):
 
     def with_coefficients(self, coefficients: ArrayLike, bias: float) -> MaxwellSlip:
         """Return the same operator with other stiffnesses, shape (n + 1,), and bias."""
-        values = checked_coefficients(coefficients, self.slips.size + 1)
+        values = self._coefficients(coefficients)
         return replace(self, stiffnesses=values[:-1], spring=float(values[-1]), bias=bias)
 
     def at_rest(self) -> tuple[float, Floats]:

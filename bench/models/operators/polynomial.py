@@ -29,8 +29,8 @@ class Polynomial(Operator[None]):
         The range mapped to [-1, 1], input units.
     bias : float
         Coefficient of T0, output units.
-    input_unit, output_unit : str
-        Units, for labels.
+    input_unit, output_unit
+        As `Operator`.
 
     Raises
     ------
@@ -48,10 +48,7 @@ class Polynomial(Operator[None]):
     output_unit: str = ""
 
     def __post_init__(self) -> None:
-        low, high = _checks.increasing("input_range", self.input_range).tolist()
-        object.__setattr__(self, "series", _checks.frozen(_checks.samples("series", self.series)))
-        object.__setattr__(self, "input_range", (low, high))
-        object.__setattr__(self, "bias", _checks.number("bias", self.bias))
+        self._settle(series=_checks.samples("series", self.series))
 
     @property
     def degree(self) -> int:
@@ -65,10 +62,7 @@ class Polynomial(Operator[None]):
 
     def with_coefficients(self, coefficients: ArrayLike, bias: float) -> Polynomial:
         """Return the same polynomial with other coefficients, shape (degree,)."""
-        values = _checks.samples("coefficients", coefficients)
-        if values.size != self.degree:
-            raise ValueError(f"coefficients: expected {self.degree} values, got {values.size}")
-        return Polynomial(values, self.input_range, bias, self.input_unit, self.output_unit)
+        return Polynomial(self._coefficients(coefficients), self.input_range, bias, self.input_unit, self.output_unit)
 
     def initial_state(self) -> None:
         """Return None: a polynomial remembers nothing."""

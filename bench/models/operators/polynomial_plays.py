@@ -38,14 +38,12 @@ class PolynomialPlays(Operator[State]):
         A play of threshold r is mapped from the range less r at both ends to [-1, 1].
     input_range : tuple of float
         The range mapped to [-1, 1], input units; half of it exceeds the thresholds of plays with powers.
-    bias : float
-        Constant part, output units.
     powers : int
         Degree of the series of each play, >= 1.
     origin : float or None
         Input of the relaxed state, in which all plays stand at the input; None for the state of negative saturation.
-    input_unit, output_unit : str
-        Units, for labels.
+    bias, input_unit, output_unit
+        As `Operator`.
 
     Raises
     ------
@@ -78,19 +76,15 @@ class PolynomialPlays(Operator[State]):
                 f"weights: expected {self.powers * thresholds.size} values, {self.powers} for each play, got "
                 f"{weights.size}"
             )
-        low, high = _checks.increasing("input_range", self.input_range).tolist()
+        series = _checks.samples("series", self.series)
+        origin = () if self.origin is None else ("origin",)
+        self._settle(*origin, series=series, thresholds=thresholds, weights=weights)
+        low, high = self.input_range
         if self.powers > 1 and not thresholds[-1] < 0.5 * (high - low):
             raise ValueError(
                 f"thresholds: expected values below half the input range, {0.5 * (high - low):g}, for powers of "
                 f"plays; got {thresholds[-1]:g}"
             )
-        if self.origin is not None:
-            object.__setattr__(self, "origin", _checks.number("origin", self.origin))
-        object.__setattr__(self, "series", _checks.frozen(_checks.samples("series", self.series)))
-        object.__setattr__(self, "thresholds", _checks.frozen(thresholds))
-        object.__setattr__(self, "weights", _checks.frozen(weights))
-        object.__setattr__(self, "input_range", (low, high))
-        object.__setattr__(self, "bias", _checks.number("bias", self.bias))
 
     @property
     def coefficients(self) -> Floats:
@@ -99,11 +93,8 @@ class PolynomialPlays(Operator[State]):
 
     def with_coefficients(self, coefficients: ArrayLike, bias: float) -> PolynomialPlays:
         """Return the same operator with other coefficients, shape (powers n + degree,), and bias."""
-        values = _checks.samples("coefficients", coefficients)
-        plays = self.weights.size
-        if values.size != plays + self.series.size:
-            raise ValueError(f"coefficients: expected {plays + self.series.size} values, got {values.size}")
-        return replace(self, weights=values[:plays], series=values[plays:], bias=bias)
+        weights, series = np.split(self._coefficients(coefficients), [self.weights.size])
+        return replace(self, weights=weights, series=series, bias=bias)
 
     def initial_state(self) -> State:
         """Return the relaxed state; that of negative saturation if the operator has no origin."""

@@ -145,16 +145,14 @@ class PrandtlIshlinskii(Operator[PlayState]):
         Increasing, from 0 on, in the units of x.
     weights : array_like, shape (n,)
         Output per unit of x, of either sign, every running sum >= 0 (for instance all >= 0), or every one <= 0.
-    bias : float
-        Constant, output units.
     origin : float
         Input of x = 0, input units.
     before, after : DeadZones or None
         The single-valued maps; None is the identity.
     input_range : tuple of float or None
         Operating range of the input. Default: origin ± the last threshold (± 1 if that is zero).
-    input_unit, output_unit : str
-        Units, for labels.
+    bias, input_unit, output_unit
+        As `Operator`.
 
     Raises
     ------
@@ -187,13 +185,8 @@ class PrandtlIshlinskii(Operator[PlayState]):
             raise ValueError(f"weights: expected running sums >= 0, or all <= 0, got {sums.min()} and {sums.max()}")
         origin = _checks.number("origin", self.origin)
         reach = float(thresholds[-1]) or 1.0
-        span = (origin - reach, origin + reach) if self.input_range is None else self.input_range
-        low, high = _checks.increasing("input_range", span).tolist()
-        object.__setattr__(self, "thresholds", _checks.frozen(thresholds))
-        object.__setattr__(self, "weights", _checks.frozen(weights))
-        object.__setattr__(self, "bias", _checks.number("bias", self.bias))
-        object.__setattr__(self, "origin", origin)
-        object.__setattr__(self, "input_range", (low, high))
+        span = origin - reach, origin + reach
+        self._settle("origin", span=span, thresholds=thresholds, weights=weights)
 
     @property
     def coefficients(self) -> Floats:
@@ -205,9 +198,7 @@ class PrandtlIshlinskii(Operator[PlayState]):
 
         Raises ValueError if their number is wrong, one is not finite, or the output would not be monotone.
         """
-        values = _checks.samples("coefficients", coefficients)
-        if values.size != self.coefficients.size:
-            raise ValueError(f"coefficients: expected {self.coefficients.size} values, got {values.size}")
+        values = self._coefficients(coefficients)
         if self.after is None:
             return replace(self, weights=values, bias=bias)
         return replace(self, after=DeadZones(self.after.thresholds, values), bias=bias)
@@ -414,10 +405,6 @@ class PrandtlIshlinskii(Operator[PlayState]):
     def rises(self) -> bool:
         """Return whether the running sums of the weights and the slopes of the dead zones make the output rise."""
         return self._direction > 0
-
-    def falls(self) -> bool:
-        """Return whether they make it fall."""
-        return self._direction < 0
 
     def inverse(self, policy: Policy = "nearest") -> Inverse[PlayState]:
         """Return the exact inverse, or the numerical one if the operator has a plateau."""

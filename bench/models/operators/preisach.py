@@ -83,14 +83,12 @@ class Preisach(Operator[MemoryCurve]):
     density : array_like, shape (K,)
         Density per cell, output units per input unit squared, of either sign. Cell (row i of α, column j of
         β, j <= i) is at i (i + 1) / 2 + j.
-    bias : float
-        Constant, output units.
     reversible : Reversible or None
         The part without memory.
     input_range : tuple of float or None
         Operating range of the input; contains the plane. Default: the plane's range.
-    input_unit, output_unit : str
-        Units, for labels.
+    bias, input_unit, output_unit
+        As `Operator`.
 
     Raises
     ------
@@ -118,16 +116,12 @@ class Preisach(Operator[MemoryCurve]):
             raise ValueError(
                 f"density: expected {order * (order + 1) // 2} values for {order} intervals, got {density.size}"
             )
-        span = (levels[0], levels[-1]) if self.input_range is None else self.input_range
-        low, high = _checks.increasing("input_range", span).tolist()
+        self._settle(span=(levels[0], levels[-1]), levels=levels, density=density)
+        low, high = self.input_range
         if low > levels[0] or high < levels[-1]:
             raise ValueError(
                 f"input_range: expected it to contain the plane [{levels[0]}, {levels[-1]}], got [{low}, {high}]"
             )
-        object.__setattr__(self, "levels", _checks.frozen(levels))
-        object.__setattr__(self, "density", _checks.frozen(density))
-        object.__setattr__(self, "bias", _checks.number("bias", self.bias))
-        object.__setattr__(self, "input_range", (low, high))
 
     @property
     def order(self) -> int:
@@ -146,10 +140,7 @@ class Preisach(Operator[MemoryCurve]):
 
         Raises ValueError if there are not K + q coefficients or one is not finite.
         """
-        values = _checks.samples("coefficients", coefficients)
-        cells = self.density.size
-        if values.size != self.coefficients.size:
-            raise ValueError(f"coefficients: expected {self.coefficients.size} values, got {values.size}")
+        values, cells = self._coefficients(coefficients), self.density.size
         term = self.reversible
         if term is not None:
             term = term.with_coefficients(values[cells:].tolist())
@@ -368,10 +359,6 @@ class Preisach(Operator[MemoryCurve]):
         That of the reversible part, >= 0, in output units by input unit; infinity if a density is negative.
         """
         return float(-min(self._reversible_slopes())) if (self.density >= 0.0).all() else math.inf
-
-    def falls(self) -> bool:
-        """Return whether the output can only fall while the input rises, with every memory."""
-        return bool((self.density <= 0.0).all() and max(self._reversible_slopes()) <= 0.0)
 
     def _reversible_slopes(self) -> list[float]:
         """Return the slopes of the reversible part at the ends of its pieces, and 0."""

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,47 +14,53 @@ from bench.base import Floats, checks as _checks
 from bench.models.documents import Document
 
 
-class Reversible(Protocol):
-    """A term without memory, linear in its coefficients and piecewise quadratic in the input."""
+class Reversible(Document, ABC):
+    """A term without memory, linear in its coefficients and piecewise quadratic in the input.
+
+    Attributes
+    ----------
+    input_units : tuple of str
+        The units of the inputs that the term is for, the usual one first; none if it is for any.
+    nonnegative : bool
+        Whether physics demands coefficients >= 0.
+    """
+
+    input_units: ClassVar[tuple[str, ...]] = ()
+    nonnegative: ClassVar[bool] = False
 
     @property
+    @abstractmethod
     def coefficients(self) -> Floats:
         """The coefficients that identification may change, shape (q,)."""
-        ...
 
-    @property
-    def nonnegative(self) -> bool:
-        """Whether physics demands coefficients >= 0."""
-        ...
+    def with_coefficients(self, coefficients: Sequence[float]) -> Self:
+        """Return the same term with other coefficients, shape (q,).
 
-    @property
-    def input_units(self) -> tuple[str, ...]:
-        """The units of the inputs that the term is for, the usual one first; none if it is for any."""
-        ...
+        Raises ValueError if their number is wrong or one is not finite.
+        """
+        values = _checks.samples("coefficients", coefficients)
+        if values.size != self.coefficients.size:
+            raise ValueError(f"coefficients: expected {self.coefficients.size} values, got {values.size}")
+        return self._with(values.tolist())
 
-    def with_coefficients(self, coefficients: Sequence[float]) -> Reversible:
-        """Return the same term with other coefficients."""
-        ...
+    @abstractmethod
+    def _with(self, values: list[float]) -> Self: ...
 
-    def shifted(self, offset: float) -> Reversible:
+    @abstractmethod
+    def shifted(self, offset: float) -> Self:
         """Return the term whose value at an input u is that of this one at u + offset."""
-        ...
 
+    @abstractmethod
     def columns(self, inputs: ArrayLike) -> Floats:
         """Return the regressor's columns, shape (N, q)."""
-        ...
 
+    @abstractmethod
     def pieces(self) -> tuple[Floats, Floats]:
         """Return breakpoints (n,) and quadratics (n + 1, 3): c0 + c1 u + c2 u² between them."""
-        ...
-
-    def to_json(self) -> dict[str, Any]:
-        """Return the term as a JSON object."""
-        ...
 
 
 @dataclass(frozen=True)
-class QuadraticTerm(Document):
+class QuadraticTerm(Reversible):
     """The reversible term linear (u - origin) + quadratic (u - origin)².
 
     Parameters
@@ -72,7 +79,6 @@ class QuadraticTerm(Document):
     """
 
     kind: ClassVar[str] = "quadratic"
-    input_units: ClassVar[tuple[str, ...]] = ()
     linear: float = 0.0
     quadratic: float | None = None
     origin: float = 0.0
@@ -87,20 +93,11 @@ class QuadraticTerm(Document):
         """Linear, and quadratic if present, shape (1,) or (2,)."""
         return np.array([self.linear] if self.quadratic is None else [self.linear, self.quadratic])
 
-    @property
-    def nonnegative(self) -> bool:
-        """The signs are free."""
-        return False
-
-    def with_coefficients(self, coefficients: Sequence[float]) -> QuadraticTerm:
-        """Return the same term with other coefficients, as many as it has."""
-        values = _checks.samples("coefficients", coefficients)
-        if values.size != self.coefficients.size:
-            raise ValueError(f"coefficients: expected {self.coefficients.size} values, got {values.size}")
-        return QuadraticTerm(float(values[0]), None if self.quadratic is None else float(values[1]), self.origin)
+    def _with(self, values: list[float]) -> QuadraticTerm:
+        return QuadraticTerm(values[0], None if self.quadratic is None else values[1], self.origin)
 
     def shifted(self, offset: float) -> QuadraticTerm:
-        """Return the term whose value at an input u is that of this one at u + offset."""
+        """Return the term moved by an offset; see `Reversible.shifted`."""
         return replace(self, origin=self.origin - offset)
 
     def columns(self, inputs: ArrayLike) -> Floats:
@@ -115,7 +112,7 @@ class QuadraticTerm(Document):
 
 
 @dataclass(frozen=True)
-class PolynomialTerm(Document):
+class PolynomialTerm(Reversible):
     """A reversible term that follows a polynomial of the input, quadratic from knot to knot.
 
     The term is sum over k of series_k T_k(x), with x the input mapped to [-1, 1] and T_k the Chebyshev polynomials,
@@ -139,7 +136,6 @@ class PolynomialTerm(Document):
     """
 
     kind: ClassVar[str] = "polynomial"
-    input_units: ClassVar[tuple[str, ...]] = ()
     series: tuple[float, ...]
     low: float
     high: float
@@ -157,20 +153,11 @@ class PolynomialTerm(Document):
         """The series, shape (n,)."""
         return np.array(self.series)
 
-    @property
-    def nonnegative(self) -> bool:
-        """The signs are free."""
-        return False
-
-    def with_coefficients(self, coefficients: Sequence[float]) -> PolynomialTerm:
-        """Return the same term with another series of the same degree."""
-        values = _checks.samples("coefficients", coefficients)
-        if values.size != len(self.series):
-            raise ValueError(f"coefficients: expected {len(self.series)} values, got {values.size}")
-        return PolynomialTerm(tuple(values.tolist()), self.low, self.high, self.knots)
+    def _with(self, values: list[float]) -> PolynomialTerm:
+        return replace(self, series=tuple(values))
 
     def shifted(self, offset: float) -> PolynomialTerm:
-        """Return the term whose value at an input u is that of this one at u + offset."""
+        """Return the term moved by an offset; see `Reversible.shifted`."""
         return replace(self, low=self.low - offset, high=self.high - offset)
 
     def columns(self, inputs: ArrayLike) -> Floats:
@@ -208,7 +195,7 @@ class PolynomialTerm(Document):
 
 
 @dataclass(frozen=True)
-class ThermalExpansion(Document):
+class ThermalExpansion(Reversible):
     """The thermal term of a film whose phase fraction θ is a ramp: -[k0 (1 - θ) + k1 θ] (T - reference).
 
     θ = clip((T - low) / (high - low), 0, 1): Zhang et al. 2013, eqs. 6, 7 and 11. The input T is a temperature.
@@ -230,6 +217,7 @@ class ThermalExpansion(Document):
 
     kind: ClassVar[str] = "thermal-expansion"
     input_units: ClassVar[tuple[str, ...]] = ("°C", "degC", "C", "℃", "K")
+    nonnegative: ClassVar[bool] = True
     k0: float
     k1: float
     low: float
@@ -246,20 +234,11 @@ class ThermalExpansion(Document):
         """K0 and k1, shape (2,)."""
         return np.array([self.k0, self.k1])
 
-    @property
-    def nonnegative(self) -> bool:
-        """Both are differences of expansion coefficients, known to be >= 0."""
-        return True
-
-    def with_coefficients(self, coefficients: Sequence[float]) -> ThermalExpansion:
-        """Return the same term with other k0, k1."""
-        values = _checks.samples("coefficients", coefficients)
-        if values.size != 2:
-            raise ValueError(f"coefficients: expected k0 and k1, got {values.size} values")
-        return ThermalExpansion(float(values[0]), float(values[1]), self.low, self.high, self.reference)
+    def _with(self, values: list[float]) -> ThermalExpansion:
+        return replace(self, k0=values[0], k1=values[1])
 
     def shifted(self, offset: float) -> ThermalExpansion:
-        """Return the term whose value at an input u is that of this one at u + offset."""
+        """Return the term moved by an offset; see `Reversible.shifted`."""
         low, high, reference = (value - offset for value in (self.low, self.high, self.reference))
         return replace(self, low=low, high=high, reference=reference)
 

@@ -49,7 +49,6 @@ def test_the_opposite_output_gives_the_opposite_model(name, options):
     assert falling.skip == rising.skip
     assert falling.model.output_range() == pytest.approx([-end for end in rising.model.output_range()[::-1]])
     if rising.model.rises():
-        assert falling.model.falls()
         assert not falling.model.rises()
     asked = identify(name, INPUTS, -measured(), orientation="falling", **options)
     np.testing.assert_array_equal(asked.model.coefficients, falling.model.coefficients)
@@ -123,7 +122,6 @@ def make_falling(kind, seed):
 def test_the_inverse_of_a_falling_operator_is_exact(kind, seed, history, shares, policy):
     operator = make_falling(kind, seed)
     if kind in ("plays", "density", "linear"):
-        assert operator.falls()
         assert not operator.rises()
     state = operator.advance(operator.initial_state(), history)
     inverse = operator.inverse(policy)
@@ -173,7 +171,6 @@ def test_the_nearest_input_of_a_falling_operator_meets_the_target(kind, seed, hi
 
 def test_the_nearest_input_of_a_falling_polynomial():
     line = Polynomial([-2.0], (0.0, 10.0), 1.0)
-    assert line.falls()
     inverse = line.inverse()
     for wanted in (0.5, 3.0, 7.0):
         assert inverse.nearest_input(None, 3.0, line.step(None, wanted)[1]) == pytest.approx(wanted)
