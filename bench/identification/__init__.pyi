@@ -52,7 +52,6 @@ from .design.sequences import (
     assess as assess,
     covering_sequence as covering_sequence,
     first_order_reversals as first_order_reversals,
-    laboratory_time as laboratory_time,
 )
 from .fit.covariance import (
     CoefficientUncertainties as CoefficientUncertainties,
@@ -85,7 +84,6 @@ from .fit.two_stage_fit import (
     identify_linear as identify_linear,
     identify_second_stage as identify_second_stage,
     identify_summed as identify_summed,
-    identify_two_stage as identify_two_stage,
     measure_series as measure_series,
     predict_series as predict_series,
     voltage_steps as voltage_steps,

@@ -21,14 +21,12 @@ _JUMP = 0.1
 _STILL, _MOVED, _REPEATED = 0.02, 0.2, 0.1
 
 
-def check_data(
-    inputs: ArrayLike, outputs: ArrayLike | None = None, *, plane: tuple[float, float] | None = None
-) -> list[Advice]:
+def check_data(inputs: ArrayLike, outputs: ArrayLike | None = None) -> list[Advice]:
     """Return what is odd about a measured sequence; nothing if it is as usual.
 
-    Looked for are plateaus (inputs repeated, which add weight but no information), branches in one direction that
-    are missing or made in one jump, a plane whose ends the inputs never reach, outputs that do not change, and
-    those that stand still for a while, as of a frozen sensor.
+    It looks for plateaus (repeated inputs, which add weight but no information), for branches in one direction that
+    are missing or made in one jump, and for outputs that do not change or stand still for a while, as of a frozen
+    sensor.
 
     Parameters
     ----------
@@ -36,8 +34,6 @@ def check_data(
         The measured inputs.
     outputs : array_like, shape (N,), or None
         The measured outputs.
-    plane : tuple of float or None
-        Range in which hysterons are sought, input units.
 
     Raises
     ------
@@ -52,13 +48,6 @@ def check_data(
     if span == 0.0:
         return [Advice("constant-input", f"the input is {u[0]:g} throughout, so nothing can be identified")]
     found = _plateaus(u, y) + _branches(u, span)
-    if plane is not None:
-        low, high = _checks.increasing("plane", plane).tolist()
-        for end, missed, word in ((low, u.min() > low, "low"), (high, u.max() < high, "high")):
-            if missed:
-                reached = u.min() if word == "low" else u.max()
-                text = f"the inputs never reach the {word} end of the plane ({reached:g} instead of {end:g}): "
-                found.append(Advice(f"{word}-end", f"{text}the cells beyond are not identified"))
     if y is not None and np.ptp(y) == 0.0:
         found.append(Advice("constant-output", f"the output is {y[0]:g} throughout"))
     elif y is not None:

@@ -20,9 +20,10 @@ from bench.identification.measures import Errors, measure_errors
 
 Complexes: TypeAlias = NDArray[np.complex128]
 
-# Points per period, and per time constant, at which a step response is searched for its peak and settling.
-# Derivation: between two of 40 points of a period a sine changes by 16 % of its amplitude, 2 π / 40, at most.
-_RESOLUTION = 40
+# Points per period, and per time constant, at which a step response is searched for its peak, and time constants that
+# are searched. Derivation: between two of 40 points of a period a sine changes by 16 % of its amplitude, 2 π / 40, at
+# most; after five time constants less than 1 % of a mode is left.
+_RESOLUTION, _SETTLED = 40, 5.0
 # Least ratio of a resonance to the median of the spectrum. Derivation: amplitudes of noise follow Rayleigh's law, by
 # which one exceeds x times their median with the probability 2^(-x²): here 2^-100.
 _PROMINENCE = 10.0
@@ -37,30 +38,6 @@ _EARLIER, _LATER = 4, 2
 # A search for the poles and the delay. Derivation: an exact record is followed down to the rounding of its numbers,
 # 1e-16, but for two digits.
 _SEARCH = Stage(1, 1e-14, 400)
-
-
-@dataclass(frozen=True)
-class StepMeasures:
-    """Response to a unit step.
-
-    Parameters
-    ----------
-    final : float
-        Value in the end, output per input units.
-    peak, peak_time : float
-        Extreme value in the direction of the final one, same units, and its time, s; infinite if it is the final
-        value itself.
-    overshoot : float
-        (peak - final) / final.
-    settling_time : float
-        Time from which the response stays in the band about its final value, s.
-    """
-
-    final: float
-    peak: float
-    peak_time: float
-    overshoot: float
-    settling_time: float
 
 
 @dataclass(frozen=True)
@@ -146,43 +123,22 @@ class ThirdOrder:
         rise = np.expm1(poles * np.maximum(t, 0.0)[:, None]) * (residues / poles)
         return np.asarray(rise[:, 0].real + 2.0 * rise[:, 1].real)
 
-    def measure_step(self, band: float = 0.02) -> StepMeasures:
-        """Return final value, peak, overshoot and settling time of the step response.
+    def overshoot(self) -> float:
+        """Return by how much the step response exceeds its final value, as a share of it; 0 if it does not."""
+        from scipy.optimize import minimize_scalar
 
-        Parameters
-        ----------
-        band : float
-            Half the width of the band that it settles in, as part of the final value, between 0 and 1.
-
-        Raises
-        ------
-        ValueError
-            If the band is not between 0 and 1.
-        """
-        from scipy.optimize import brentq, minimize_scalar
-
-        if not 0.0 < _checks.number("band", band) < 1.0:
-            raise ValueError(f"band: expected a number between 0 and 1, got {band}")
-        poles, residues = self._modes
-        size = float(np.abs(residues / poles / self.gain) @ (1.0, 2.0))
         slowest = min(self.real_pole, self.damping * self.frequency)
-        end = max(math.log(2.0 * size / band), 1.0) / slowest
         step = 1.0 / (_RESOLUTION * max(self.frequency / (2.0 * math.pi), self.real_pole))
-        times = np.linspace(0.0, end, math.ceil(end / step) + 1)
-
-        def value(t: float) -> float:
-            return float(self.step_response([t])[0] / self.gain)
-
-        values = self.step_response(times) / self.gain
-        top = int(np.argmax(values))
-        peak, peak_time = 1.0, math.inf
-        if values[top] > 1.0:
-            near = times[top - 1], times[min(top + 1, times.size - 1)]
-            best = minimize_scalar(lambda t: -value(t), bounds=near, method="bounded", options={"xatol": 1e-12})
-            peak, peak_time = -float(best.fun), float(best.x)
-        last = int(np.flatnonzero(np.abs(values - 1.0) > band)[-1])
-        settling = brentq(lambda t: abs(value(t) - 1.0) - band, times[last], times[last + 1])
-        return StepMeasures(self.gain, self.gain * peak, peak_time, peak - 1.0, float(settling))
+        times = np.arange(0.0, _SETTLED / slowest + step, step)
+        top = int(np.argmax(self.step_response(times) / self.gain))
+        near = times[max(top - 1, 0)], times[min(top + 1, times.size - 1)]
+        best = minimize_scalar(
+            lambda t: -float(self.step_response([t])[0] / self.gain),
+            bounds=near,
+            method="bounded",
+            options={"xatol": 1e-12},
+        )
+        return max(-float(best.fun) - 1.0, 0.0)
 
     def bandwidth(self) -> float:
         """Return the first frequency at which the response has fallen by 3 dB, Hz."""

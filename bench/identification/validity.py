@@ -267,11 +267,7 @@ class Validity:
         }
 
     def _is_chance(self, beyond: int, of: int) -> bool:
-        """Return whether so many of some further moves may be beyond all that were fitted by chance.
-
-        Of moves that might be exchanged for each other, the k least all belong to the m further ones beside n fitted
-        with the probability m! (n + m - k)! / ((m - k)! (n + m)!).
-        """
+        """Return whether so many of some further moves may be beyond all that were fitted by chance."""
         further = of - np.arange(beyond)
         return bool(np.prod(further / (self.count + further)) > _CHANCE)
 

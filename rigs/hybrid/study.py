@@ -387,7 +387,7 @@ def _dynamics(found: HybridIdentification) -> dict[str, Any]:
     return {
         "poles_Hz": [dynamics.real_pole / (2.0 * np.pi), dynamics.frequency / (2.0 * np.pi)],
         "dc_gain": dynamics.gain * top / static,
-        "overshoot_percent": dynamics.measure_step().overshoot * 100.0,
+        "overshoot_percent": dynamics.overshoot() * 100.0,
         "gain_um_per_V": dynamics.gain * 1e6,
     }
 

@@ -43,8 +43,6 @@ class SmoothingTrial:
         Standard error of `rms`, from the scatter of the folds.
     training_rms : float
         RMS error over the samples that were fitted, mean over the folds.
-    folds : tuple of float
-        RMS error of each fold.
     """
 
     smoothing: float
@@ -52,7 +50,6 @@ class SmoothingTrial:
     rms: float
     spread: float
     training_rms: float
-    folds: tuple[float, ...]
 
 
 @dataclass(frozen=True)
@@ -92,8 +89,6 @@ def cross_validate(
     *,
     smoothing: Sequence[float] = (0.0,),
     levels: Sequence[int] | None = None,
-    folds: int = FOLDS,
-    blocks: int = _BLOCKS,
     weights: ArrayLike | None = None,
     skip: int = 0,
     ridge: float = 0.0,
@@ -103,9 +98,9 @@ def cross_validate(
 ) -> CrossValidation:
     """Return how well a model predicts parts of the sequence that were left out of its fit.
 
-    The samples that count are cut into blocks, see `block_folds`: neighbours are nearly the same measurement, and
-    samples left out one by one would be predicted by them. What is left out of the cost still drives the memory. An
-    estimated initial memory (`initial="estimate"`) is that of the whole sequence, and so is the orientation.
+    The samples that count are cut into contiguous blocks, see `block_folds`: single samples left out would be
+    predicted by their neighbours, which are nearly the same measurement. Samples left out of the cost still drive the
+    memory. The orientation, and an estimated initial memory, are those of the whole sequence.
 
     Parameters
     ----------
@@ -117,8 +112,6 @@ def cross_validate(
         Weight of the penalty on the size of the density.
     levels : sequence of int or None
         Numbers of intervals to try, for Preisach models; None keeps that of the model or the options.
-    folds, blocks : int
-        As `compare_smoothing`.
 
     Raises
     ------
@@ -137,9 +130,7 @@ def cross_validate(
         counts = np.where(np.arange(problem.outputs.size) < problem.skip, 0.0, problem.weights)
 
         fit = partial(problem.fit, ridge=ridge)
-        compared = compare_smoothing(
-            fit, problem.regressor, problem.outputs, counts, smoothing, counts=counts, folds=folds, blocks=blocks
-        )
+        compared = compare_smoothing(fit, problem.regressor, problem.outputs, counts, smoothing)
         trials += [replace(trial, levels=order) for trial in compared.trials]
     return CrossValidation(tuple(trials))
 
@@ -150,10 +141,6 @@ def compare_smoothing(
     outputs: Floats,
     weights: Floats,
     smoothing: Sequence[float],
-    *,
-    counts: Floats | None = None,
-    folds: int = FOLDS,
-    blocks: int = _BLOCKS,
 ) -> CrossValidation:
     """Return how well fits of given smoothing predict parts of their own data that were left out of them.
 
@@ -164,34 +151,23 @@ def compare_smoothing(
     regressor : Regressor
         That of the coefficients of the fits, shape (N, K + q).
     outputs, weights : ndarray, shape (N,)
-        Measured outputs, and the weight of each sample in the fit; 0 for those that do not count.
+        Measured outputs, and the weight of each sample in the fit and in the errors; 0 for those that do not count.
     smoothing : sequence of float
         Weights to try.
-    counts : ndarray, shape (N,), or None
-        Weight of each sample in the errors; None counts all once that are fitted.
-    folds, blocks : int
-        Number of folds, >= 2, and of blocks, >= folds; with fewer samples than blocks each sample is one.
 
     Raises
     ------
     ValueError
-        If there is nothing to try, a weight is wrong, folds or blocks are too few, or samples fewer than folds.
+        If there is nothing to try, a weight is wrong, or there are fewer samples than folds.
     """
     if not len(smoothing):
         raise ValueError("smoothing: expected at least one weight, got none")
-    if folds < 2:
-        raise ValueError(f"folds: expected at least 2, got {folds}")
-    if blocks < folds:
-        raise ValueError(f"blocks: expected at least {folds}, one for each fold, got {blocks}")
     usable = counted_weights(regressor.shape[0], weights, 0) > 0.0
     used = int(usable.sum())
-    if used < folds:
-        raise ValueError(f"weights: expected a positive weight in each of {folds} folds, got {used} in all")
-    parts = block_folds(usable, folds=folds, blocks=min(blocks, used))
-    counted = usable.astype(np.float64) if counts is None else counts
-    return CrossValidation(
-        tuple(_trial(each, fit, regressor, outputs, weights, counted, parts) for each in smoothing)
-    )
+    if used < FOLDS:
+        raise ValueError(f"weights: expected a positive weight in each of {FOLDS} folds, got {used} in all")
+    parts = block_folds(usable, blocks=min(_BLOCKS, used))
+    return CrossValidation(tuple(_trial(each, fit, regressor, outputs, weights, parts) for each in smoothing))
 
 
 def _trial(
@@ -200,7 +176,6 @@ def _trial(
     regressor: Regressor,
     outputs: Floats,
     weights: Floats,
-    counts: Floats,
     parts: Sequence[Fold],
 ) -> SmoothingTrial:
     """Return how well fits predict what was left out of them."""
@@ -209,17 +184,16 @@ def _trial(
         found = fit(smoothing, np.where(part.tested, 0.0, weights))
         errors = (outputs - found.bias - regressor.product(found.coefficients)) ** 2
         squares[part.tested] = errors[part.tested]
-        rms.append(_rms(errors, counts, part.tested))
-        training.append(_rms(errors, counts, part.trained))
+        rms.append(_rms(errors, weights, part.tested))
+        training.append(_rms(errors, weights, part.trained))
     return SmoothingTrial(
         smoothing=float(smoothing),
         levels=None,
-        rms=_rms(squares, counts, counts > 0.0),
+        rms=_rms(squares, weights, weights > 0.0),
         spread=float(np.std(rms, ddof=1) / np.sqrt(len(rms))),
         training_rms=float(np.mean(training)),
-        folds=tuple(rms),
     )
 
 
-def _rms(squares: Floats, counts: Floats, rows: Flags) -> float:
-    return float(np.sqrt(np.average(squares[rows], weights=counts[rows])))
+def _rms(squares: Floats, weights: Floats, rows: Flags) -> float:
+    return float(np.sqrt(np.average(squares[rows], weights=weights[rows])))

@@ -270,10 +270,7 @@ class _Search:
             going = [score for score in going if score.error <= _BEHIND * least]
 
     def once_more(self, models: Sequence[str]) -> None:
-        """Try the other structures of the best candidate of all, then its other memories.
-
-        Its structure was found from another memory, and without what follows it.
-        """
+        """Try the other structures of the best of all, as its own was found before its memory, then its memories."""
         for others in (self._other_structures, self._other_memories):
             best = min(self._best(models), key=lambda score: score.error, default=None)
             if best is not None:
@@ -318,10 +315,7 @@ class _Search:
         return self._reshape(what, better)
 
     def _reshape(self, what: str, found: Sequence[Score]) -> list[Score]:
-        """Return scores, those with a shape as they are if it is found for their own settings, if that is better.
-
-        A shape that was found from another memory, or without what follows the operator, has made up for that.
-        """
+        """Return scores, each with the shape that is found for its own settings where that is better."""
         shaped = [[replace(one.candidate, shape=())] if one.candidate.shape else [] for one in found]
         again = self._evaluate(what, shaped)
         return [min([one, *more], key=lambda score: score.error) for one, more in zip(found, again, strict=True)]

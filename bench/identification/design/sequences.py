@@ -17,12 +17,10 @@ from bench.identification.design.information import (
     mean_variance,
     random_reversals,
 )
-from bench.models import MemoryCurve, Preisach
+from bench.models import Preisach
 
 
-def first_order_reversals(
-    levels: ArrayLike, input_range: tuple[float, float] | None = None, *, per_cell: int = 1
-) -> Floats:
+def first_order_reversals(levels: ArrayLike, input_range: tuple[float, float] | None = None) -> Floats:
     """Return set-points of first-order reversal curves on a grid, from positive saturation.
 
     For each level from the top downwards: down to it in one step, then up again level by level to saturation
@@ -35,25 +33,23 @@ def first_order_reversals(
         Increasing levels, input units: those of the model, or finer.
     input_range : tuple of float or None
         Operating range whose ends are visited once too, for a reversible part; default none.
-    per_cell : int
-        Set-points on the way from one level to the next, >= 1.
 
     Returns
     -------
     ndarray, shape (N,)
-        Set-points; without an input range and with one set-point per cell N = K + M + 1.
+        Set-points; without an input range N = K + M + 1.
 
     Raises
     ------
     ValueError
-        If the levels do not increase, the range does not contain them, or `per_cell` is not positive.
+        If the levels do not increase, or the range does not contain them.
     """
-    grid, ends = _grid(levels, input_range, per_cell)
+    grid, ends = _grid(levels, input_range)
     top = grid.size - 1
     parts = [np.array([*ends[1:], grid[top]])]
     for j in range(top - 1, -1, -1):
         down = [grid[j]] if j else [grid[0], *ends[:1], *(grid[:1] if ends else ())]
-        parts += [np.array(down), _ramp(grid[j:], per_cell)]
+        parts += [np.array(down), grid[j + 1 :]]
     return np.concatenate(parts)
 
 
@@ -71,8 +67,10 @@ def covering_sequence(
 
     Parameters
     ----------
-    levels, input_range, per_cell
-        As in `first_order_reversals`; more set-points in a cell average noise.
+    levels, input_range
+        As in `first_order_reversals`.
+    per_cell : int
+        Set-points on the way from one level to the next, >= 1; several average noise.
 
     Returns
     -------
@@ -84,7 +82,9 @@ def covering_sequence(
     ValueError
         If the levels do not increase, the range does not contain them, or `per_cell` is not positive.
     """
-    grid, ends = _grid(levels, input_range, per_cell)
+    grid, ends = _grid(levels, input_range)
+    if per_cell < 1:
+        raise ValueError(f"per_cell: expected at least 1, got {per_cell}")
     low, high = 0, grid.size - 1
     parts = [np.array([*ends[1:], grid[high]]), _ramp(grid[::-1], per_cell), np.array(ends[:1])]
     rising = True
@@ -99,13 +99,9 @@ def covering_sequence(
     return np.concatenate(parts)
 
 
-def _grid(
-    levels: ArrayLike, input_range: tuple[float, float] | None, per_cell: int
-) -> tuple[Floats, tuple[float, ...]]:
+def _grid(levels: ArrayLike, input_range: tuple[float, float] | None) -> tuple[Floats, tuple[float, ...]]:
     """Return the levels, and the ends of the operating range if given."""
     grid = _checks.increasing("levels", levels)
-    if per_cell < 1:
-        raise ValueError(f"per_cell: expected at least 1, got {per_cell}")
     if input_range is None:
         return grid, ()
     low, high = _checks.increasing("input_range", input_range).tolist()
@@ -122,31 +118,6 @@ def _ramp(path: Floats, per_cell: int) -> Floats:
         part[-1] = stop
         parts.append(part)
     return np.concatenate(parts)
-
-
-def laboratory_time(inputs: ArrayLike, dwell: float, rate: float = math.inf) -> float:
-    """Return the time that a sequence takes, s: a dwell at each set-point, and the moves in between.
-
-    Parameters
-    ----------
-    inputs : array_like, shape (N,)
-        Set-points.
-    dwell : float
-        Settling time at each set-point, s, >= 0.
-    rate : float
-        Speed of the moves, input units per second, > 0.
-
-    Raises
-    ------
-    ValueError
-        If a number is out of its range, or the sequence is empty or not finite.
-    """
-    sequence = _checks.samples("inputs", inputs)
-    if not _checks.number("dwell", dwell) >= 0.0:
-        raise ValueError(f"dwell: expected a number >= 0, got {dwell}")
-    if not rate > 0.0:
-        raise ValueError(f"rate: expected a positive number, got {rate}")
-    return float(sequence.size * dwell + np.abs(np.diff(sequence)).sum() / rate)
 
 
 @dataclass(frozen=True)
@@ -195,15 +166,8 @@ class Assessment:
         )
 
 
-def assess(
-    operator: Preisach,
-    inputs: ArrayLike,
-    *,
-    dwell: float,
-    rate: float = math.inf,
-    state: MemoryCurve | None = None,
-) -> Assessment:
-    """Return what a sequence tells about the coefficients of an operator, and its laboratory time.
+def assess(operator: Preisach, inputs: ArrayLike, *, dwell: float) -> Assessment:
+    """Return what a sequence tells about the coefficients of an operator, from negative saturation on.
 
     The regressor is formed densely, 8 N (K + q) bytes, for its singular values.
 
@@ -213,10 +177,8 @@ def assess(
         Its levels and reversible part say what is to be found; their values do not matter.
     inputs : array_like, shape (N,)
         Set-points.
-    dwell, rate : float
-        As `laboratory_time`.
-    state : MemoryCurve or None
-        Memory before the first set-point; default negative saturation.
+    dwell : float
+        Settling time at each set-point, s, >= 0.
 
     Raises
     ------
@@ -225,9 +187,11 @@ def assess(
     """
     from scipy.linalg import svdvals
 
-    time = laboratory_time(inputs, dwell, rate)
-    coverage = operator.coverage(inputs, state)
-    matrix = operator.regressor(inputs, state).dense()
+    if not _checks.number("dwell", dwell) >= 0.0:
+        raise ValueError(f"dwell: expected a number >= 0, got {dwell}")
+    coverage = operator.coverage(inputs)
+    matrix = operator.regressor(inputs).dense()
+    time = dwell * matrix.shape[0]
     scaling = Scaling.of(operator)
     rows = scaling.scaled(matrix)
     reversals = random_reversals(operator.input_range, float(np.diff(operator.levels).mean()))

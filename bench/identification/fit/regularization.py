@@ -28,6 +28,9 @@ RIDGE = (0.0, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
 """Weights of the penalty on the size of the density that are tried; see `fit`. Derivation: none of it, and the
 decades of the roughness up to where the size costs a tenth of what the data weigh."""
 
+# Folds and blocks, four in each fold. Source: 5 to 10 folds are usual (Hastie, Tibshirani and Friedman 2009, section
+# 7.10).
+_FOLDS, _BLOCKS = 5, 20
 # Samples of a block, as far as there are so many. Derivation: three of four have no neighbour in another block.
 _SHORTEST = 8
 # The weights belong to the density, not to the plane: they are chosen on one of at most this order. Derivation: it
@@ -75,14 +78,12 @@ def choose_regularization(
     skip: int,
     smoothing: float | None = None,
     ridge: float | None = None,
-    *,
-    folds: int = 5,
-    blocks: int = 20,
 ) -> Regularization:
     """Return the weights of the least cross-validated error; a weight that is given is kept.
 
-    The samples are cut into blocks, and block b belongs to fold b modulo `folds`. The memory runs through all of
-    them. On a fine plane the weights are chosen with cells merged two by two until at most 24 levels are left.
+    The samples are cut into 20 blocks, and block b belongs to fold b modulo 5. Of few samples there are fewer blocks,
+    of at least 8 samples each as long as each fold has one. The memory runs through all of them. On a fine plane the
+    weights are chosen with cells merged two by two until at most 24 levels are left.
 
     Parameters
     ----------
@@ -94,9 +95,6 @@ def choose_regularization(
         Number of first samples left out.
     smoothing, ridge : float or None
         Weights that are given; not both 0.
-    folds, blocks : int
-        Number of folds, >= 2, and of blocks; of few samples there are fewer, of at least 8 each as long as each fold
-        has one.
 
     Raises
     ------
@@ -105,7 +103,7 @@ def choose_regularization(
     """
     check_penalties(smoothing or 0.0, ridge or 0.0)
     used = outputs.size - skip
-    blocks = min(blocks, max(folds, used // _SHORTEST))
+    folds, blocks = _FOLDS, min(_BLOCKS, max(_FOLDS, used // _SHORTEST))
     fold = (np.maximum(np.arange(-skip, used), 0) * min(blocks, used) // used) % folds
     layout = CellLayout.of(regressor.base.size)
     coarse, layout, factor, size = _coarse(regressor, layout)

@@ -95,21 +95,11 @@ class Series:
         return cls("length-voltage", values, np.full(values.size, _checks.number("load", load)), lengths)  # type: ignore[arg-type]
 
     @classmethod
-    def at_voltage(cls, voltage: float, forces: ArrayLike, lengths: ArrayLike, *, cold: float = 0.0) -> Series:
-        """Return lengths over the force at a voltage that is set after the reset, while the force is zero.
-
-        Parameters
-        ----------
-        voltage : float
-            Constant voltage.
-        forces, lengths : array_like, shape (N,)
-            Samples.
-        cold : float
-            Voltage at the end of the reset, at which the force is taken off.
-        """
+    def at_voltage(cls, voltage: float, forces: ArrayLike, lengths: ArrayLike) -> Series:
+        """Return lengths over the force at a voltage that is set after the reset, while the force is zero."""
         values, constant = _checks.samples("forces", forces), _checks.number("voltage", voltage)
         held = np.full(values.size, constant)
-        return cls("length-force", held, values, lengths, ((cold, 0.0), (constant, 0.0)))  # type: ignore[arg-type]
+        return cls("length-force", held, values, lengths, ((0.0, 0.0), (constant, 0.0)))  # type: ignore[arg-type]
 
 
 @dataclass(frozen=True, eq=False)
@@ -166,81 +156,6 @@ class FirstStage:
     modelled: Floats
 
 
-def identify_two_stage(
-    voltages: ArrayLike,
-    forces: ArrayLike,
-    series: Iterable[Series],
-    *,
-    weights: ArrayLike | None = None,
-    first: Stage | None = None,
-    second: Stage | None = None,
-    order: int = 20,
-    voltage_range: tuple[float, float] = (0.0, 3.0),
-    force_limit: float = 11.2,
-    pretension: float = 0.3,
-    smoothing: Smoothing = 0.0,
-    units: tuple[str, str, str] = ("V", "N", "mm"),
-) -> CoupledIdentification[TwoStage]:
-    """Return the two-stage model that fits best, one stage after the other.
-
-    H1 is fitted to the force over the voltage at resting length, starting from its initial state. H2 then is
-    fitted to all series at once, each with its own memory: reset under the pretension, preparation, samples
-    (Zhang and Yip 2017, eq. 7). Weights are nonnegative, offsets free.
-
-    Parameters
-    ----------
-    voltages, forces : array_like, shape (N,)
-        Series at resting length, from the cold wire on. The low end of the voltage range must be
-        among the voltages: H1 there fixes where the second stage starts.
-    series : iterable of Series
-        Measured lengths.
-    weights : array_like, shape (N,), or None
-        Weight per sample at resting length, >= 0; default 1. A great one at the first sample holds H1 of the cold
-        wire to what was measured there.
-    first, second : Operator or None
-        Stages before the fit; default Preisach operators, H1 on `voltage_range` and H2 on [-U, U], where U is
-        the greater of `force_limit` and H1's greatest output, plus 0.3.
-    order : int
-        Intervals of the default planes.
-    voltage_range : tuple of float
-        Plane of the default H1.
-    force_limit : float
-        Greatest force expected, force units.
-    pretension : float
-        Force during resets, force units.
-    smoothing : float or sequence of float
-        Weight of the roughness penalty, see `fit`, for both stages. Of several each stage has the greatest of those
-        with the least error, within 2 %, on blocks of its own samples left out; see `compare_smoothing`.
-    units : tuple of str
-        Units of voltage, force and length of the default stages, for labels.
-
-    Raises
-    ------
-    ValueError
-        If a sequence is wrong, the lowest voltage is missing or there is no series.
-    """
-    stage = identify_first_stage(
-        voltages,
-        forces,
-        weights=weights,
-        operator=first,
-        order=order,
-        voltage_range=voltage_range,
-        smoothing=smoothing,
-        units=units,
-    )
-    return identify_second_stage(
-        stage,
-        series,
-        operator=second,
-        order=order,
-        force_limit=force_limit,
-        pretension=pretension,
-        smoothing=smoothing,
-        units=units,
-    )
-
-
 def identify_first_stage(
     voltages: ArrayLike,
     forces: ArrayLike,
@@ -252,14 +167,29 @@ def identify_first_stage(
     smoothing: Smoothing = 0.0,
     units: tuple[str, str, str] = ("V", "N", "mm"),
 ) -> FirstStage:
-    """Return the first stage of `identify_two_stage`, which needs no lengths.
+    """Return the first stage H1 of a two-stage model, which needs no lengths.
+
+    Its weights are nonnegative, its offset is free. It starts from its initial state.
 
     Parameters
     ----------
-    voltages, forces, weights, order, voltage_range, smoothing, units
-        As in `identify_two_stage`.
+    voltages, forces : array_like, shape (N,)
+        Series at resting length, from the cold wire on. The low end of the voltage range must be
+        among the voltages: H1 there fixes where the second stage starts.
+    weights : array_like, shape (N,), or None
+        Weight per sample, >= 0; default 1. A great one at the first sample holds H1 of the cold wire to what was
+        measured there.
     operator : Operator or None
-        H1 before the fit.
+        H1 before the fit; default a Preisach operator on `voltage_range`.
+    order : int
+        Intervals of the default plane.
+    voltage_range : tuple of float
+        Plane of the default H1.
+    smoothing : float or sequence of float
+        Weight of the roughness penalty, see `fit`. Of several the greatest of those with the least error, within 2 %,
+        on blocks of the samples left out; see `compare_smoothing`.
+    units : tuple of str
+        Units of voltage, force and length of the default stages, for labels.
 
     Raises
     ------
@@ -287,16 +217,26 @@ def identify_second_stage(
     smoothing: Smoothing = 0.0,
     units: tuple[str, str, str] = ("V", "N", "mm"),
 ) -> CoupledIdentification[TwoStage]:
-    """Return the two-stage model of a first stage, as `identify_two_stage`.
+    """Return the two-stage model of a first stage that fits best.
+
+    H2 is fitted to all series at once, each with its own memory: reset under the pretension, preparation, samples
+    (Zhang and Yip 2017, eq. 7). Weights are nonnegative, offsets free.
 
     Parameters
     ----------
     first : FirstStage
         What `identify_first_stage` found.
-    series, order, force_limit, pretension, smoothing, units
-        As in `identify_two_stage`.
+    series : iterable of Series
+        Measured lengths.
     operator : Operator or None
-        H2 before the fit.
+        H2 before the fit; default a Preisach operator on [-U, U], where U is the greater of `force_limit` and H1's
+        greatest output, plus 0.3.
+    force_limit : float
+        Greatest force expected, force units.
+    pretension : float
+        Force during resets, force units.
+    order, smoothing, units
+        As in `identify_first_stage`.
 
     Raises
     ------
@@ -332,14 +272,14 @@ def identify_linear(
     Parameters
     ----------
     voltages, forces, series, order, voltage_range, force_limit, pretension, smoothing, units
-        As in `identify_two_stage`.
+        As in `identify_first_stage` and `identify_second_stage`.
     operator : Operator or None
         H5 before the fit.
 
     Raises
     ------
     ValueError
-        As `identify_two_stage`, or if the force falls with the voltage.
+        As `identify_first_stage` and `identify_second_stage`, or if the force falls with the voltage.
     """
     measured = _all(series)
     v, f = _resting(voltages, forces, _checks.increasing("voltage_range", voltage_range).item(0))
@@ -379,14 +319,14 @@ def identify_summed(
     Parameters
     ----------
     series, order, voltage_range, force_limit, pretension, smoothing, units
-        As in `identify_two_stage`; one weight of the penalty serves both operators.
+        As in `identify_second_stage`; one weight of the penalty serves both operators.
     by_force, by_voltage : Operator or None
         H3 and H4 before the fit.
 
     Raises
     ------
     ValueError
-        As `identify_two_stage`.
+        As `identify_second_stage`.
     """
     measured = _all(series)
     if by_force is None:
@@ -435,27 +375,13 @@ def measure_series(model: Coupled[Any], series: Iterable[Series]) -> Errors:
     )
 
 
-def voltage_steps(
-    extrema: Sequence[float] = (0.0, 3.0, 0.3, 2.7, 0.6, 2.4, 0.9, 2.1, 1.2, 1.8, 1.5), count: int = 37
-) -> Floats:
-    """Return a damped oscillation with its longest step as short as the samples allow (Zhang and Yip 2017, Fig. 5).
+def voltage_steps(count: int = 37) -> Floats:
+    """Return a damped oscillation from 0 to 3 V with its longest step as short as `count` samples allow.
 
-    Parameters
-    ----------
-    extrema : sequence of float
-        Turning points, each of which is a sample; two at least, no two in a row equal.
-    count : int
-        Number of samples, at least that of the extrema.
-
-    Raises
-    ------
-    ValueError
-        If the extrema do not turn or there are too few samples.
+    Zhang and Yip 2017, Fig. 5. Raises ValueError if there are fewer samples than the 11 turning points.
     """
-    points = _checks.samples("extrema", extrema)
+    points = np.array([0.0, 3.0, 0.3, 2.7, 0.6, 2.4, 0.9, 2.1, 1.2, 1.8, 1.5])
     travel = np.abs(np.diff(points))
-    if points.size < 2 or not (travel > 0.0).all():
-        raise ValueError("extrema: expected at least two values, each other than the one before")
     if count < points.size:
         raise ValueError(f"count: expected at least {points.size}, got {count}")
     steps = np.ones(travel.size, dtype=np.int64)

@@ -200,7 +200,6 @@ def test_ramps_divide_evenly_and_keep_the_extrema():
         (lambda: damped_oscillation(21.0, 84.0, 54.0, 36, 0.0), "step"),
         (lambda: ramps([], 1.0), "extrema"),
         (lambda: random_validation(np.random.default_rng(0), 0, **FRESH), "count"),
-        (lambda: random_validation(np.random.default_rng(0), 600, **FRESH, inside=1.5), "inside"),
         (
             lambda: random_validation(np.random.default_rng(0), 600, **(FRESH | {"operating": (1.0, 0.0)})),
             "operating",

@@ -10,7 +10,7 @@ from hypothesis import given, strategies as st
 
 from bench.base import ConfigurationError, DataError
 from bench.control import ControllerSetup, ReachTarget
-from bench.identification import ModelFile, Series, identify_two_stage, voltage_steps
+from bench.identification import ModelFile, Series, identify_first_stage, identify_second_stage, voltage_steps
 from bench.models import IdentifiedDynamics, Preisach, Reach, ResponseDynamics, TwoStage, uniform_levels
 from rigs.muscles.control import (
     FORCE_OPEN_LOOP,
@@ -145,7 +145,8 @@ def inverse():
             wire.load(force)
             lengths.append(wire.length())
         series.append(Series.at_voltage(voltage, FORCES, lengths))
-    return TwoStageInverse(identify_two_stage(VOLTAGES, forces, series, units=("V", "N", "m")).model)
+    first = identify_first_stage(VOLTAGES, forces, units=("V", "N", "m"))
+    return TwoStageInverse(identify_second_stage(first, series, units=("V", "N", "m")).model)
 
 
 def output_range(load=None):
