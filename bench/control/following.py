@@ -53,10 +53,7 @@ class _Follower(ControllerBase, ABC):
     """What the followers share: one step at a fixed rate."""
 
     def update(self, t: float, measured_input: float, output: float, reference: float) -> float:
-        """Take in a reading and return the set-point for the coming period; see `Follower.update`.
-
-        A missing reading is nan. Raises ValueError if the reference is not finite.
-        """
+        """Return the set-point for the coming period; see `Follower.update`."""
         before, self._reference = self._reference, _checks.number("reference", reference)
         step = 0.0 if math.isnan(before) else reference - before
         if self._observe(t, measured_input):

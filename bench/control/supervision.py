@@ -66,18 +66,7 @@ class Rules:
 
 
 class _Supervision:
-    """What the supervision of targets and of a moving reference have in common: the rules, and what follows of them.
-
-    Parameters
-    ----------
-    controller : object
-        The controller.
-    rules : Rules
-        By which errors it is given up.
-    fallback : callable or None
-        Makes the controller that goes on, from the memory of the one that is given up. Without it a
-        `ConvergenceError` ends the run in the safe state.
-    """
+    """What the supervision of targets and of a moving reference share: the rules, and what follows from them."""
 
     def __init__(
         self,

@@ -460,10 +460,7 @@ class Scripted(ControllerBase, ABC):
             yield Command(self._setpoint, wait, done=True)
 
     def _head_for(self, setpoint: float) -> Generator[Command, Sample, Passing]:
-        """Go the first part of the way to a set-point, to the peak there, if the input would overshoot otherwise.
-
-        Returns what goes on to note how far the input passes the set-point.
-        """
+        """Go the first part of the way to a set-point, to the peak there, if the input would overshoot otherwise."""
         start, way = self._input, self._clip(setpoint) - self._input
         share = self._overshoot.share(way)
         if share:
@@ -484,10 +481,7 @@ class Scripted(ControllerBase, ABC):
         return abs(float(self._model.evaluate((measured_input,), self.state)[-1]) - self._modelled())
 
     def _arrive(self, setpoint: float, arrival: Arrival, at_rest: float = math.inf) -> Move:
-        """Go to a set-point and return the reading with which the actuator has arrived.
-
-        The specimen has, too, to `at_rest` of its output.
-        """
+        """Return the reading with which the actuator has arrived at a set-point and the output is `at_rest`."""
         passing = yield from self._head_for(setpoint)
         # Clocks start with the first reading: until then readings may have been missing.
         started = since = math.nan

@@ -244,10 +244,7 @@ class ModelBand:
             self._standings.append(_Standing(row.t, readings, covered, count))
 
     def _setpoint_widths(self, rows: Sequence[_Row], *, seen: bool = True) -> Floats:
-        """Return the half-width about the set-point of each row, if it is `seen`, and move the memory by them.
-
-        It is that of the last move, nan before the first one.
-        """
+        """Return the half-width about the set-point of each row, that of the last move; moves the memory."""
         setpoints = np.array([row.setpoint for row in rows])
         known = np.isfinite(setpoints)
         places = np.flatnonzero(known)

@@ -190,10 +190,7 @@ _FADED = {colour: _pale(colour) for colour in (_RISING, _FALLING)}
 
 
 class _Track:
-    """One plot of column y over column x below the entity `path`, and the line since the point drawn last.
-
-    `_VISIBLE` is a part of `extent`, a range of the input. The frame grows with the data.
-    """
+    """One plot of column y over column x below the entity `path`, and the line since the point drawn last."""
 
     def __init__(self, path: str, frame: Frame, x: int, y: int, extent: tuple[float, float]) -> None:
         self.path, self.frame, self.x, self.y = path, frame, x, y

@@ -134,10 +134,7 @@ def _emulation(twin: IdentifiedTwin, file: RigFile) -> Iterator[str]:
 
 
 def _delay(twin: IdentifiedTwin, file: RigFile) -> float:
-    """Return the delay of the drive, s, without what the lines of the twin take by themselves.
-
-    What was identified counts from when a set-point was about to be sent until all devices had been read.
-    """
+    """Return the delay of the drive, s, from sending a set-point: without what the lines of the twin take."""
     delay, time = twin.dynamics.actuator.delay, twin.reading_time
     if time is not None:
         names = [each.name for each in file.devices]

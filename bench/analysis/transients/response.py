@@ -214,10 +214,7 @@ def refine_lag(
 
 
 def _shapes_of_holds(recording: TransientRecording, end: float) -> list[tuple[slice, Floats, Floats]]:
-    """Return the rows of each hold up to an instant, s, that has enough of them, their weights and their response.
-
-    The response is weighted.
-    """
+    """Return the rows of each hold that has enough of them up to an instant, their weights and weighted response."""
     last = recording.last_change[recording.times <= end]
     weights = _weights(recording)
     found = []

@@ -196,10 +196,7 @@ class TuningRuns:
 
 
 def _score(results: TargetResults | None, nominal: TargetResults | None) -> tuple[float, float]:
-    """Return RMS error and seconds a target of a run, by the targets that the specimen can reach.
-
-    Another model may draw targets beyond them: the range is that of the run with the model as it is.
-    """
+    """Return RMS error and seconds a target of a run, over the targets within the range of the model as it is."""
     if results is None or nominal is None:
         return math.inf, math.nan
     low, high = float(nominal.targets.min()), float(nominal.targets.max())

@@ -100,13 +100,12 @@ def saw(t):
     return float(np.interp(t % 24.0, [0.0, 8.0, 12.0, 18.0, 24.0], [-40.0, 40.0, 40.0, -10.0, -40.0]))
 
 
-@pytest.mark.parametrize("reference", [sine, saw])
 @pytest.mark.parametrize(
-    "dynamics",
+    ("dynamics", "reference"),
     [
-        IdentifiedDynamics(SECOND_ORDER),
-        IdentifiedDynamics(ActuatorDynamics(delay=0.8, frequency=3.0)),
-        IdentifiedDynamics(response=ResponseDynamics(lag=2.0, power=2.0)),
+        (IdentifiedDynamics(SECOND_ORDER), saw),
+        (IdentifiedDynamics(ActuatorDynamics(delay=0.8, frequency=3.0)), sine),
+        (IdentifiedDynamics(response=ResponseDynamics(lag=2.0, power=2.0)), saw),
     ],
     ids=["second order", "first order with delay", "lag of a square"],
 )

@@ -109,7 +109,7 @@ class ColderActuator(IdealActuator):
 class TestGoals:
     """What each controller reaches on a plant that is not of the model's structure."""
 
-    SEEDS = (0, 1)
+    SEEDS = (0, pytest.param(1, marks=pytest.mark.seeds))
 
     @staticmethod
     def run(laboratory, controller, seed):
@@ -155,7 +155,7 @@ class TestGoals:
         assert look_up > 5.0 * inverse
 
     @pytest.mark.parametrize("seed", SEEDS)
-    @pytest.mark.parametrize(("period", "limit"), [(200.0, 5.0), (60.0, 8.0)])
+    @pytest.mark.parametrize(("period", "limit"), [pytest.param(200.0, 5.0, marks=pytest.mark.seeds), (60.0, 8.0)])
     def test_closed_loop_follower(self, models, laboratory, seed, period, limit):
         times = np.arange(0.0, 4.0 * period, 0.5)
         reference = modulated_sine(times, 200.0, 1500.0, period)
@@ -182,9 +182,9 @@ readings = st.one_of(
 
 
 class TestLimits:
-    @pytest.mark.parametrize("limits", [(LOW, HIGH), NARROW, (0.0, 200.0)])
+    @pytest.mark.parametrize("limits", [NARROW, (0.0, 200.0)])
     @pytest.mark.parametrize("name", TARGETS)
-    @settings(max_examples=40)
+    @settings(max_examples=20)
     @given(
         moves=st.lists(
             st.tuples(st.floats(-3e3, 3e3), st.lists(st.tuples(readings, readings), max_size=12)), max_size=4
@@ -204,7 +204,7 @@ class TestLimits:
             assert controller.trace.reference == target
 
     @pytest.mark.parametrize("name", FOLLOWERS)
-    @settings(max_examples=40)
+    @settings(max_examples=20)
     @given(calls=st.lists(st.tuples(readings, readings, st.floats(-3e3, 3e3)), max_size=30))
     def test_nor_of_a_follower(self, models, name, calls):
         follower = make(name, models, NARROW)
@@ -288,7 +288,7 @@ class TestMissingReadings:
             return commands
 
         undisturbed = run()
-        for gap in range(1, 60):
+        for gap in (1, 2, 3, 5, 8, 13, 21, 34, 55):
             assert run(gap) == undisturbed
 
     @pytest.mark.parametrize("name", TARGETS)

@@ -111,10 +111,7 @@ def read_tables(file: TextFile, names: Sequence[str], options: ReadingOptions, t
 
 
 def _find_table(file: TextFile, options: ReadingOptions, lines: Sequence[str]) -> Layout:
-    """Return the layout of the table that is chosen, or of the first.
-
-    Raises DataError if there is no such table.
-    """
+    """Return the layout of the table that is chosen, or of the first; DataError if there is no such table."""
     start = options.skip_lines
     if options.table is None:
         layout = find_layout(file.path, lines, options, start)
@@ -143,10 +140,7 @@ def _read_table(
     lines: Sequence[str],
     ending: Ending | None = None,
 ) -> ReadColumns:
-    """Read columns of a table, of which the end may be known.
-
-    Raises _SeveralError if it is not, other tables follow and none was chosen.
-    """
+    """Read columns of a table; _SeveralError if its end is unknown and other tables follow."""
     names = with_times(names, times, layout.heads, lambda name: _place(file, layout, name))
     layout, places = _find_places(file, names, options, layout, lines)
     body = _Body(file, layout, names, places)
@@ -187,10 +181,7 @@ def _read_table(
 def _find_places(
     file: TextFile, names: Sequence[str], options: ReadingOptions, layout: Layout, lines: Sequence[str]
 ) -> tuple[Layout, list[int]]:
-    """Return the indices of the columns that are asked for, and the layout whose heads have them.
-
-    Raises DataError that says what may help if there is no such column.
-    """
+    """Return the indices of the columns asked for, and the layout whose heads have them; DataError if none does."""
     missing: tuple[NoColumnError, str] | None = None
     above = split_rows(lines[: layout.start - options.skip_lines], layout.delimiter, options.skip_lines)
     for other in (layout, *other_heads(list(above), layout)):
@@ -208,17 +199,7 @@ def _find_places(
 
 
 class _Body:
-    """The data of a table.
-
-    Attributes
-    ----------
-    ending : Ending or None
-        End of the table; None as long as it was not looked for.
-    comments : int
-        Number of lines of comment within it.
-    moments : frozenset of int
-        Indices of the columns that have dates and times, by their first row.
-    """
+    """The data of a table: its end if known, its lines of comment, and which columns hold dates and times."""
 
     def __init__(self, file: TextFile, layout: Layout, names: Sequence[str], places: Sequence[int]) -> None:
         self._file, self._layout, self._names, self._places = file, layout, names, places
@@ -228,10 +209,7 @@ class _Body:
         self.moments: frozenset[int] = frozenset()
 
     def at_once(self) -> list[Floats]:
-        """Return the columns by numpy's reader, shape (rows,) each.
-
-        Raises ValueError, DataError or _BreakError if cells are not all numbers, or moments.
-        """
+        """Return the columns by numpy's reader; ValueError, DataError or _BreakError if it cannot."""
         layout = self._layout
         if layout.decimal == layout.delimiter:
             raise ValueError("cells are in quotes")
@@ -254,10 +232,7 @@ class _Body:
         return [np.ascontiguousarray(array[:, wanted.index(place)]) for place in self._places]
 
     def cell_by_cell(self) -> list[Floats]:
-        """Return the columns by looking at each cell.
-
-        Raises DataError that names the first that is not a finite number.
-        """
+        """Return the columns cell by cell; DataError names the first that is not a finite number."""
         layout, path = self._layout, self._file.path
         values: list[list[float]] = [[] for _ in self._places]
         lines = self._closed(self._file.lines(layout.start, self._end()))
@@ -289,10 +264,7 @@ class _Body:
         return None if self.ending is None else self.ending.end
 
     def _lines(self) -> Iterator[str]:
-        """Yield the lines of data as numpy reads numbers.
-
-        Raises _BreakError where what follows may not be of the table.
-        """
+        """Yield the lines of data as numpy reads numbers; _BreakError where what follows may not be of the table."""
         marks, comma = self._layout.marks, self._layout.decimal == ","
         exponents = D_EXPONENTS in self._layout.notes
         self.comments = blank = 0
