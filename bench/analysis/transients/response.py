@@ -100,8 +100,6 @@ def identify_lag(
     `models` has one for each recording: what comes of the drive at rest, from the first row on. Of each recording as
     long a part is used, s.
     """
-    from scipy.optimize import minimize_scalar
-
     ends = [min(longest, float(r.times[-1])) for r in recordings]
     parts = list(zip(recordings, ends, strict=True))
     drives = [SimulatedDrive(r, actuator, end) for r, end in parts]
@@ -138,14 +136,8 @@ def identify_lag(
 
     candidates = [(score(fitted(columns_of(ResponseDynamics(), ()), True)[0], 0), ResponseDynamics())]
     for power in POWERS:
-        best = minimize_scalar(
-            squares_of,
-            args=(power,),
-            bounds=(math.log(2.0 * step), math.log(100.0)),
-            method="bounded",
-            options={"xatol": 0.01, "maxiter": 30},
-        )
-        candidates.append((score(float(best.fun), 1), ResponseDynamics(math.exp(float(best.x)), power)))
+        squares, response = _best_lag(squares_of, power, (math.log(2.0 * step), math.log(100.0)), 0.01)
+        candidates.append((score(squares, 1), response))
     lagged = min(candidates, key=lambda each: each[0])[1]
     longest = max(ends) / 2.0
     every = tuple(time for time in _LATE if step < time < longest)
@@ -176,8 +168,6 @@ def refine_lag(
     Within each hold the model may be off by an offset and a factor of its own, so that its error at rest, which is
     another from hold to hold, is not taken for a lag. Parameters as in `identify_lag`, and the powers that are tried.
     """
-    from scipy.optimize import minimize_scalar
-
     parts = []
     for r, model in zip(recordings, models, strict=True):
         end = min(longest, float(r.times[-1]))
@@ -197,20 +187,22 @@ def refine_lag(
         return total
 
     middle = math.log(found.lag)
-    trials = []
-    for power in powers:
-        best = minimize_scalar(
-            squares_of,
-            args=(power,),
-            bounds=(middle - _FACTOR, middle + _FACTOR),
-            method="bounded",
-            options={"xatol": 0.005, "maxiter": 30},
-        )
-        trials.append((float(best.fun), ResponseDynamics(math.exp(float(best.x)), power)))
+    trials = [_best_lag(squares_of, power, (middle - _FACTOR, middle + _FACTOR), 0.005) for power in powers]
     _, better = min(trials, key=lambda each: each[0])
     if rows == 0:
         return found, 0.0
     return replace(found, lag=better.lag, power=better.power), _uncertainty(squares_of, better, rows)
+
+
+def _best_lag(
+    squares_of: Callable[[float, float], float], power: float, logarithms: tuple[float, float], tolerance: float
+) -> tuple[float, ResponseDynamics]:
+    """Return the least sum of squares between two logarithms of a lag, to a tolerance, and that lag."""
+    from scipy.optimize import minimize_scalar
+
+    options = {"xatol": tolerance, "maxiter": 30}
+    best = minimize_scalar(squares_of, args=(power,), bounds=logarithms, method="bounded", options=options)
+    return float(best.fun), ResponseDynamics(math.exp(float(best.x)), power)
 
 
 def _shapes_of_holds(recording: TransientRecording, end: float) -> list[tuple[slice, Floats, Floats]]:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
 import numpy as np
@@ -161,7 +160,6 @@ def identify_first_stage(
     forces: ArrayLike,
     *,
     weights: ArrayLike | None = None,
-    operator: Stage | None = None,
     order: int = 20,
     voltage_range: tuple[float, float] = (0.0, 3.0),
     smoothing: Smoothing = 0.0,
@@ -179,24 +177,22 @@ def identify_first_stage(
     weights : array_like, shape (N,), or None
         Weight per sample, >= 0; default 1. A great one at the first sample holds H1 of the cold wire to what was
         measured there.
-    operator : Operator or None
-        H1 before the fit; default a Preisach operator on `voltage_range`.
     order : int
-        Intervals of the default plane.
+        Intervals of its Preisach plane.
     voltage_range : tuple of float
-        Plane of the default H1.
+        The plane.
     smoothing : float or sequence of float
         Weight of the roughness penalty, see `fit`. Of several the greatest of those with the least error, within 2 %,
         on blocks of the samples left out; see `compare_smoothing`.
     units : tuple of str
-        Units of voltage, force and length of the default stages, for labels.
+        Units of voltage, force and length, for labels.
 
     Raises
     ------
     ValueError
         If a sequence is wrong or the lowest voltage is missing.
     """
-    template = _plane(*voltage_range, order, units[0], units[1]) if operator is None else operator
+    template = _plane(*voltage_range, order, units[0], units[1])
     v, f = _resting(voltages, forces, template.input_range[0])
     start = template.initial_state()
     held = np.ones(v.size) if weights is None else _checks.samples("weights", weights)
@@ -256,7 +252,6 @@ def identify_linear(
     forces: ArrayLike,
     series: Iterable[Series],
     *,
-    operator: Stage | None = None,
     order: int = 20,
     voltage_range: tuple[float, float] = (0.0, 3.0),
     force_limit: float = 11.2,
@@ -266,15 +261,13 @@ def identify_linear(
 ) -> CoupledIdentification[Linear]:
     """Return the model with a straight line as first stage (Zhang and Yip 2017, eq. 9), fitted as the two-stage one.
 
-    Slope and offset are the regression line of the force over the voltage. The default plane of H5 is [-U, U],
-    where U is the greatest of `force_limit` and |u| over all samples, plus 0.3.
+    Slope and offset are the regression line of the force over the voltage. The plane of H5 is [-U, U], where U is the
+    greatest of `force_limit` and |u| over all samples, plus 0.3.
 
     Parameters
     ----------
     voltages, forces, series, order, voltage_range, force_limit, pretension, smoothing, units
         As in `identify_first_stage` and `identify_second_stage`.
-    operator : Operator or None
-        H5 before the fit.
 
     Raises
     ------
@@ -286,24 +279,20 @@ def identify_linear(
     middle = v - v.mean()
     slope = float(middle @ f / max(float(middle @ middle), 1e-300))
     offset = float(f.mean() - slope * v.mean())
-    inner = operator
-    if inner is None:
-        greatest = max(float(np.abs(s.forces - slope * s.voltages - offset).max()) for s in measured)
-        limit = max(_checks.number("force_limit", force_limit), greatest) + _MARGIN
-        inner = _plane(-limit, limit, order, units[1], units[2])
+    greatest = max(float(np.abs(s.forces - slope * s.voltages - offset).max()) for s in measured)
+    limit = max(_checks.number("force_limit", force_limit), greatest) + _MARGIN
 
     def line(stage: Stage) -> Linear:
         return Linear(slope, offset, stage, voltage_range, pretension, units[0])
 
-    found, inner, chosen = _fit_second(line(inner).two_stage, measured, smoothing)
+    template = line(_plane(-limit, limit, order, units[1], units[2]))
+    found, inner, chosen = _fit_second(template.two_stage, measured, smoothing)
     return _identification(line(inner), measured, {"second": (found, chosen)}, f, slope * v + offset)
 
 
 def identify_summed(
     series: Iterable[Series],
     *,
-    by_force: Stage | None = None,
-    by_voltage: Stage | None = None,
     order: int = 20,
     voltage_range: tuple[float, float] = (0.0, 3.0),
     force_limit: float = 11.2,
@@ -313,15 +302,13 @@ def identify_summed(
 ) -> CoupledIdentification[Summed]:
     """Return the difference of two operators that fits best (Zhang and Yip 2017, eq. 8), both fitted at once.
 
-    The default plane of H3 is [0, F], where F is the greater of `force_limit` and all forces, plus 0.3; that
-    of H4 is `voltage_range`. One offset serves both: it is given to H3.
+    The plane of H3 is [0, F], where F is the greater of `force_limit` and all forces, plus 0.3; that of H4 is
+    `voltage_range`. One offset serves both: it is given to H3.
 
     Parameters
     ----------
     series, order, voltage_range, force_limit, pretension, smoothing, units
         As in `identify_second_stage`; one weight of the penalty serves both operators.
-    by_force, by_voltage : Operator or None
-        H3 and H4 before the fit.
 
     Raises
     ------
@@ -329,30 +316,25 @@ def identify_summed(
         As `identify_second_stage`.
     """
     measured = _all(series)
-    if by_force is None:
-        greatest = max(float(s.forces.max()) for s in measured)
-        limit = max(_checks.number("force_limit", force_limit), greatest) + _MARGIN
-        by_force = _plane(0.0, limit, order, units[1], units[2])
-    if by_voltage is None:
-        by_voltage = _plane(*voltage_range, order, units[0], units[2])
+    greatest = max(float(s.forces.max()) for s in measured)
+    limit = max(_checks.number("force_limit", force_limit), greatest) + _MARGIN
+    by_force = _plane(0.0, limit, order, units[1], units[2])
+    by_voltage = _plane(*voltage_range, order, units[0], units[2])
     start = Summed(by_force, by_voltage, pretension).initial_state()
     parts, weights, outputs = [], [], []
     for s in measured:
         v, f = _path(s)
-        pair = by_force.regressor(f, start.by_force), by_voltage.regressor(v, start.by_voltage)
-        cells = [r.base.size for r in pair]
-        parts.append(_beside(*pair))
+        parts.append(_beside(by_force.regressor(f, start.by_force), by_voltage.regressor(v, start.by_voltage)))
         # The preparation drives the memory and counts for nothing.
         skipped = np.zeros(len(s.preparation))
         weights.append(np.append(skipped, np.ones(s.lengths.size)))
         outputs.append(np.append(skipped, s.lengths))
-    layout = PlanesBeside.of_planes(*(CellLayout.of(count) for count in cells))
+    cells = by_force.density.size
+    layout = PlanesBeside.of_planes(CellLayout.of(cells), CellLayout.of(by_voltage.density.size))
     found, chosen = _fit(layout, _chained(parts), np.concatenate(outputs), np.concatenate(weights), smoothing)
-    dense = by_force.coefficients.size - cells[0]
-    kinds = np.split(found.coefficients, np.cumsum([*cells, dense]))
     model = Summed(
-        by_force.with_coefficients(np.append(kinds[0], kinds[2]), found.bias),
-        by_voltage.with_coefficients(np.append(kinds[1], kinds[3]), 0.0),
+        by_force.with_coefficients(found.coefficients[:cells], found.bias),
+        by_voltage.with_coefficients(found.coefficients[cells:], 0.0),
         pretension,
     )
     return _identification(model, measured, {"second": (found, chosen)})
@@ -373,23 +355,6 @@ def measure_series(model: Coupled[Any], series: Iterable[Series]) -> Errors:
     return measure_errors(
         np.concatenate([s.lengths for s in measured]), np.concatenate([predict_series(model, s) for s in measured])
     )
-
-
-def voltage_steps(count: int = 37) -> Floats:
-    """Return a damped oscillation from 0 to 3 V with its longest step as short as `count` samples allow.
-
-    Zhang and Yip 2017, Fig. 5. Raises ValueError if there are fewer samples than the 11 turning points.
-    """
-    points = np.array([0.0, 3.0, 0.3, 2.7, 0.6, 2.4, 0.9, 2.1, 1.2, 1.8, 1.5])
-    travel = np.abs(np.diff(points))
-    if count < points.size:
-        raise ValueError(f"count: expected at least {points.size}, got {count}")
-    steps = np.ones(travel.size, dtype=np.int64)
-    # One sample after another goes to the ramp with the longest steps.
-    for _ in range(count - points.size):
-        steps[np.argmax(travel / steps)] += 1
-    ramps = [np.linspace(a, b, n + 1)[1:] for (a, b), n in zip(pairwise(points), steps, strict=True)]
-    return np.concatenate([points[:1], *ramps])
 
 
 def _plane(low: float, high: float, order: int, input_unit: str, output_unit: str) -> Preisach:
