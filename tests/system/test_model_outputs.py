@@ -285,7 +285,7 @@ class TestCard:
         card, fit = read_card(tmp_path / "card.md"), json.loads(result.read_text())
         band = card["Prediction band"]
         assert band["level"] == ["90 %"]
-        assert band["half-width, median"] == [f"{fit['band']['half_width']:.4g} µm"]
+        assert band["half-width"] == [f"{fit['band']['half_width']:.4g} µm"]
         compared = card["Models compared"]
         chosen = [row for row in fit["selection"]["table"] if row["note"] == "chosen"]
         marked = [key for key, cells in compared.items() if cells[-1] == "chosen"]

@@ -200,8 +200,9 @@ def _best_lag(
     """Return the least sum of squares between two logarithms of a lag, to a tolerance, and that lag."""
     from scipy.optimize import minimize_scalar
 
-    options = {"xatol": tolerance, "maxiter": 30}
-    best = minimize_scalar(squares_of, args=(power,), bounds=logarithms, method="bounded", options=options)
+    best = minimize_scalar(
+        squares_of, args=(power,), bounds=logarithms, method="bounded", options={"xatol": tolerance, "maxiter": 30}
+    )
     return float(best.fun), ResponseDynamics(math.exp(float(best.x)), power)
 
 

@@ -79,7 +79,7 @@ def test_the_least_score_wins_and_of_ties_the_fewest_degrees_of_freedom(scores, 
 def test_the_choice_errs_less_than_a_cubic_with_plays_on_other_inputs(plant):
     rng = np.random.default_rng(5)
     respond = PLANTS[plant]
-    inputs, others = random_reversals(rng, 600, 30), random_reversals(rng, 600, 30)
+    inputs, others = random_reversals(rng, 300, 30), random_reversals(rng, 300, 30)
     outputs, truth = settled(respond, inputs), settled(respond, others)
     noisy = outputs + 0.01 * np.ptp(outputs) * rng.standard_normal(outputs.size)
     found = select(Measurements.of(inputs, noisy), FAST).chosen.candidate
@@ -168,8 +168,8 @@ def test_models_of_one_input_are_compared_by_default():
 
 
 def test_of_many_rows_the_best_of_two_models_are_scored_on_all():
-    inputs = random_reversals(np.random.default_rng(1), 5000, 40)
-    outputs = settled(PLANTS["duhem"], inputs) + 0.01 * np.random.default_rng(2).standard_normal(5000)
+    inputs = random_reversals(np.random.default_rng(1), 2500, 40)
+    outputs = settled(PLANTS["duhem"], inputs) + 0.01 * np.random.default_rng(2).standard_normal(2500)
     found = select(Measurements.of(inputs, outputs), ("polynomial", "polynomial-plays"))
     decided = [score for score in found.scores if score.rows > found.rows]
     assert found.rows <= 2000 < found.of

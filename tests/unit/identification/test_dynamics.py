@@ -139,7 +139,7 @@ def test_exact_step_gives_the_exact_system():
 
 @pytest.mark.slow
 def test_uncertainties_are_the_scatter_of_the_estimates():
-    found = [identify_dynamics(*measured(PIEZO, 1e4, seed=seed, delay=5e-5)) for seed in range(30)]
+    found = [identify_dynamics(*measured(PIEZO, 1e4, seed=seed, delay=5e-5)) for seed in range(15)]
     for name in ("real_pole", "frequency", "damping", "gain"):
         scatter = np.std([getattr(each.model, name) for each in found], ddof=1)
         assert scatter == pytest.approx(np.mean([each.uncertainties[name] for each in found]), rel=0.5), name

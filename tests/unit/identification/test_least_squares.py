@@ -171,7 +171,7 @@ def test_uncertainties_are_those_of_repeated_measurements():
     clean = operator.evaluate(inputs)
     regressor = operator.regressor(inputs)
     rng = np.random.default_rng(5)
-    fits = [fit(regressor, clean + 0.01 * rng.normal(size=clean.size)) for _ in range(200)]
+    fits = [fit(regressor, clean + 0.01 * rng.normal(size=clean.size)) for _ in range(80)]
     spread = np.std([f.coefficients for f in fits], axis=0)
     claimed = np.mean([f.uncertainties for f in fits], axis=0)
     np.testing.assert_allclose(claimed, spread, rtol=0.25)

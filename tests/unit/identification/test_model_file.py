@@ -425,11 +425,12 @@ class TestUnregistered:
 
 
 def places_of_numbers(document, path=()):
+    """Yield the paths of all numbers, of a sequence that of the first."""
     items = document.items() if isinstance(document, dict) else enumerate(document)
     for key, value in items:
         if isinstance(value, dict | list):
             yield from places_of_numbers(value, (*path, key))
-        elif isinstance(value, int | float) and not isinstance(value, bool):
+        elif isinstance(value, int | float) and not isinstance(value, bool) and (isinstance(key, str) or key == 0):
             yield *path, key
 
 
