@@ -31,6 +31,9 @@ PARTS = {
 }
 
 
+DRIFTS = [{}, {"drift": 0.2}, {"drift": -0.3, "drift_time": 0.4}]
+
+
 def preisach(rng):
     return Preisach(uniform_levels(-1.0, 1.0, 6), rng.random(21) + 0.2, 0.3)
 
@@ -51,9 +54,7 @@ def span(model):
     return float(np.ptp(model.static.output_range()))
 
 
-@cases("drift", [{}, {"drift": 0.2}, {"drift": -0.3, "drift_time": 0.4}])
-@cases("make", [preisach, plays])
-@cases("part", PARTS)
+@cases(("part", "make", "drift"), zip(PARTS, [preisach, plays] * 3, DRIFTS * 2, strict=True))
 def test_the_prediction_of_the_setpoints_is_the_targets(part, make, drift):
     rng = np.random.default_rng(0)
     model = Hammerstein(make(rng), LinearPart(**PARTS[part]), **drift)
@@ -117,7 +118,7 @@ def test_what_cannot_be_inverted_is_refused(linear, step, message):
         invert_targets(ModelFile("m", model), np.linspace(0.0, 0.1, 20), times=step * np.arange(20))
 
 
-@cases("drift", [{}, {"drift": 0.2}, {"drift": -0.3, "drift_time": 0.4}])
+@cases("drift", DRIFTS)
 def test_what_is_ahead_is_the_output_a_delay_later(drift):
     rng = np.random.default_rng(4)
     model = Hammerstein(preisach(rng), LinearPart(0.014, **PARTS["lag and creep"]), **drift)
@@ -131,8 +132,7 @@ def test_what_is_ahead_is_the_output_a_delay_later(drift):
     np.testing.assert_allclose(prompt.evaluate(t[100:], u[100:], state)[:-7], outputs[7:], rtol=0.0, atol=1e-12)
 
 
-@cases("drift", [{}, {"drift": 0.2}, {"drift": -0.3, "drift_time": 0.4}])
-@cases("part", ["none", "lag", "lag and creep"])
+@cases(("part", "drift"), zip(["none", "lag", "lag and creep"], DRIFTS, strict=True))
 def test_targets_behind_a_delay_of_whole_steps_are_met_after_it(part, drift):
     rng = np.random.default_rng(0)
     model = Hammerstein(preisach(rng), LinearPart(0.014, **PARTS[part]), **drift)
