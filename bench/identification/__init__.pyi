@@ -86,6 +86,7 @@ from .fit.two_stage_fit import (
     identify_summed as identify_summed,
     measure_series as measure_series,
     predict_series as predict_series,
+    voltage_steps as voltage_steps,
 )
 from .fit.variable_projection import (
     Evidence as Evidence,

@@ -20,7 +20,9 @@ from bench.identification.design.information import (
 from bench.models import Preisach
 
 
-def first_order_reversals(levels: ArrayLike, input_range: tuple[float, float] | None = None) -> Floats:
+def first_order_reversals(
+    levels: ArrayLike, input_range: tuple[float, float] | None = None, *, per_cell: int = 1
+) -> Floats:
     """Return set-points of first-order reversal curves on a grid, from positive saturation.
 
     For each level from the top downwards: down to it in one step, then up again level by level to saturation
@@ -33,23 +35,25 @@ def first_order_reversals(levels: ArrayLike, input_range: tuple[float, float] | 
         Increasing levels, input units: those of the model, or finer.
     input_range : tuple of float or None
         Operating range whose ends are visited once too, for a reversible part; default none.
+    per_cell : int
+        Set-points on the way from one level to the next, >= 1.
 
     Returns
     -------
     ndarray, shape (N,)
-        Set-points; without an input range N = K + M + 1.
+        Set-points; without an input range and with one set-point per cell N = K + M + 1.
 
     Raises
     ------
     ValueError
-        If the levels do not increase, or the range does not contain them.
+        If the levels do not increase, the range does not contain them, or `per_cell` is not positive.
     """
-    grid, ends = _grid(levels, input_range)
+    grid, ends = _grid(levels, input_range, per_cell)
     top = grid.size - 1
     parts = [np.array([*ends[1:], grid[top]])]
     for j in range(top - 1, -1, -1):
         down = [grid[j]] if j else [grid[0], *ends[:1], *(grid[:1] if ends else ())]
-        parts += [np.array(down), grid[j + 1 :]]
+        parts += [np.array(down), _ramp(grid[j:], per_cell)]
     return np.concatenate(parts)
 
 
@@ -67,10 +71,8 @@ def covering_sequence(
 
     Parameters
     ----------
-    levels, input_range
-        As in `first_order_reversals`.
-    per_cell : int
-        Set-points on the way from one level to the next, >= 1; several average noise.
+    levels, input_range, per_cell
+        As in `first_order_reversals`; more set-points in a cell average noise.
 
     Returns
     -------
@@ -82,9 +84,7 @@ def covering_sequence(
     ValueError
         If the levels do not increase, the range does not contain them, or `per_cell` is not positive.
     """
-    grid, ends = _grid(levels, input_range)
-    if per_cell < 1:
-        raise ValueError(f"per_cell: expected at least 1, got {per_cell}")
+    grid, ends = _grid(levels, input_range, per_cell)
     low, high = 0, grid.size - 1
     parts = [np.array([*ends[1:], grid[high]]), _ramp(grid[::-1], per_cell), np.array(ends[:1])]
     rising = True
@@ -99,9 +99,13 @@ def covering_sequence(
     return np.concatenate(parts)
 
 
-def _grid(levels: ArrayLike, input_range: tuple[float, float] | None) -> tuple[Floats, tuple[float, ...]]:
+def _grid(
+    levels: ArrayLike, input_range: tuple[float, float] | None, per_cell: int
+) -> tuple[Floats, tuple[float, ...]]:
     """Return the levels, and the ends of the operating range if given."""
     grid = _checks.increasing("levels", levels)
+    if per_cell < 1:
+        raise ValueError(f"per_cell: expected at least 1, got {per_cell}")
     if input_range is None:
         return grid, ()
     low, high = _checks.increasing("input_range", input_range).tolist()

@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
 import numpy as np
@@ -355,6 +356,23 @@ def measure_series(model: Coupled[Any], series: Iterable[Series]) -> Errors:
     return measure_errors(
         np.concatenate([s.lengths for s in measured]), np.concatenate([predict_series(model, s) for s in measured])
     )
+
+
+def voltage_steps(count: int = 37) -> Floats:
+    """Return a damped oscillation from 0 to 3 V with its longest step as short as `count` samples allow.
+
+    Zhang and Yip 2017, Fig. 5. Raises ValueError if there are fewer samples than the 11 turning points.
+    """
+    points = np.array([0.0, 3.0, 0.3, 2.7, 0.6, 2.4, 0.9, 2.1, 1.2, 1.8, 1.5])
+    travel = np.abs(np.diff(points))
+    if count < points.size:
+        raise ValueError(f"count: expected at least {points.size}, got {count}")
+    steps = np.ones(travel.size, dtype=np.int64)
+    # One sample after another goes to the ramp with the longest steps.
+    for _ in range(count - points.size):
+        steps[np.argmax(travel / steps)] += 1
+    ramps = [np.linspace(a, b, n + 1)[1:] for (a, b), n in zip(pairwise(points), steps, strict=True)]
+    return np.concatenate([points[:1], *ramps])
 
 
 def _plane(low: float, high: float, order: int, input_unit: str, output_unit: str) -> Preisach:

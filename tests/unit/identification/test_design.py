@@ -48,12 +48,12 @@ def test_covering_sequence_determines_every_cell_with_no_set_point_to_spare(seed
     )
 
 
-@given(st.integers(0, 1000), st.integers(1, 12))
-def test_first_order_reversals_measure_every_pair_of_levels(seed, order):
+@given(st.integers(0, 1000), st.integers(1, 12), st.integers(1, 3))
+def test_first_order_reversals_measure_every_pair_of_levels(seed, order, per_cell):
     operator = plane(uneven(seed, order))
-    inputs = first_order_reversals(operator.levels)
+    inputs = first_order_reversals(operator.levels, per_cell=per_cell)
     cells = operator.density.size
-    assert inputs.size == cells + order + 1
+    assert inputs.size == per_cell * cells + order + 1
     assert assess(operator, inputs, dwell=1.0).rank == cells
     assert inputs[0] == inputs[-1] == operator.levels[-1]
 
@@ -62,7 +62,7 @@ def test_first_order_reversals_measure_every_pair_of_levels(seed, order):
 @cases("term", [QuadraticTerm(0.0), QuadraticTerm(0.0, 0.0), ThermalExpansion(0.0, 0.0, 30.0, 70.0, 20.0)])
 def test_reversible_part_is_determined_too(design, term):
     operator = plane(uniform_levels(30.0, 70.0, 10), term, (21.0, 84.0))
-    inputs = design(operator.levels, (21.0, 84.0))
+    inputs = design(operator.levels, (21.0, 84.0), per_cell=2)
     found = assess(operator, inputs, dwell=8.0)
     assert found.rank == found.coefficients == 55 + term.coefficients.size
     assert inputs.min() == 21.0

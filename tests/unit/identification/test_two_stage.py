@@ -15,7 +15,7 @@ from bench.identification import (
     identify_summed,
     measure_series,
     predict_series,
-    ramps,
+    voltage_steps,
 )
 from bench.identification.fit.cell_layout import CellLayout, PlanesBeside
 from bench.identification.fit.two_stage_fit import _beside, _chained
@@ -24,7 +24,7 @@ from bench.models import Linear, PrandtlIshlinskii, Preisach, Summed, TwoStage, 
 LOADS = (0.98, 2.94, 4.90, 6.86, 8.82)
 HELD = (0.0, 0.6, 1.2, 1.8, 2.4, 3.0)
 FORCES = np.concatenate([np.linspace(0.0, 10.5, 12), np.linspace(10.5, 0.0, 12)[1:]])
-VOLTAGES = ramps([0.0, 3.0, 0.3, 2.7, 0.6, 2.4, 0.9, 2.1, 1.2, 1.8, 1.5], 0.525)
+VOLTAGES = voltage_steps()
 
 
 def preisach(low, high, least, greatest, seed, order=20, zeros=0.85, units=("", "")):
@@ -327,6 +327,16 @@ def test_chained_and_paired_regressors(make):
     assert both.dense() == pytest.approx(np.hstack([mine[:, :cells], -theirs, mine[:, cells:]]), abs=1e-12)
 
 
+def test_voltage_steps():
+    steps = voltage_steps()
+    assert steps.size == 37
+    assert steps[0] == 0.0
+    assert {3.0, 0.3, 2.7, 0.6, 2.4, 0.9, 2.1, 1.2, 1.8, 1.5} <= set(steps)
+    assert np.abs(np.diff(steps)).max() == pytest.approx(0.525)
+    assert steps[-1] == 1.5
+    assert voltage_steps(12).size == 12
+
+
 def data():
     return Series.under_load(1.0, [0.0, 1.0, 2.0], [0.0, -1.0, -2.0])
 
@@ -346,6 +356,7 @@ def data():
         (lambda: identify_linear([0.0, 3.0], [3.0, 1.0], [data()]), "slope: expected a number >= 0"),
         (lambda: identify_summed([]), "series: expected at least one"),
         (lambda: measure_series(two_stage(), []), "series: expected at least one"),
+        (lambda: voltage_steps(count=5), "count: expected at least 11"),
     ],
 )
 def test_wrong_input_is_named(make, message):

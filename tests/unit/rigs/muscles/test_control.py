@@ -10,7 +10,7 @@ from hypothesis import given, strategies as st
 
 from bench.base import ConfigurationError, DataError
 from bench.control import ControllerSetup, ReachTarget
-from bench.identification import ModelFile, Series, identify_first_stage, identify_second_stage, ramps
+from bench.identification import ModelFile, Series, identify_first_stage, identify_second_stage, voltage_steps
 from bench.models import IdentifiedDynamics, Preisach, Reach, ResponseDynamics, TwoStage, uniform_levels
 from rigs.muscles.control import (
     FORCE_OPEN_LOOP,
@@ -31,7 +31,7 @@ LIMITS = (0.0, 3.0)
 LOADS = (0.98, 2.94, 4.90, 6.86, 8.82)
 HELD = (0.0, 0.6, 1.2, 1.8, 2.4, 3.0)
 FORCES = np.concatenate([np.linspace(0.0, 10.5, 12), np.linspace(10.5, 0.0, 12)[1:]])
-VOLTAGES = ramps([0.0, 3.0, 0.3, 2.7, 0.6, 2.4, 0.9, 2.1, 1.2, 1.8, 1.5], 0.525)
+VOLTAGES = voltage_steps()
 
 
 class Wire:
