@@ -4,13 +4,13 @@ import socket
 from contextlib import ExitStack
 
 import pytest
+from modbus_tcp import ModbusTcpServer
 
 from bench.base import VirtualClock
 from bench.rig import Rig, load_rig
 from drivers.labjack_t7.device import T7Device
 from rigs.hybrid.laboratory import HybridLaboratory
 from rigs.muscles.laboratory import SMALaboratory
-from sim_devices.serving.modbus_tcp_server import ModbusTcpServer
 
 ON_THE_T7 = {"hybrid": ["displacement", "base", "tip", "piezo"], "sma": ["wire_end", "fan"]}
 READ_TEST = bytes.fromhex("0001 0000 0006 01 03 d73c 0002")
