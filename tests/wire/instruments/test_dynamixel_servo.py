@@ -11,11 +11,8 @@ import serial
 from cases import cases
 from hypothesis import example, given, strategies as st
 
-from bench.base import DeviceConnectionError, DeviceError, VirtualClock
+from bench.base import DeviceConnectionError, VirtualClock
 from sim_devices.instruments.dynamixel import (
-    FULL_LOAD_HEATING,
-    HEATING_TIME,
-    OVERLOAD_TIME,
     REBOOT_TIME,
     EmulatedMX28,
 )
@@ -179,14 +176,6 @@ def test_clearing_of_the_maker():
     assert servo.read_item(132) == servo.read_item(116) == 10000 % 4096
 
 
-def test_clearing_needs_its_key_and_a_firmware():
-    old, new = make_servos({"bus_id": 1, "firmware": 41}, {"bus_id": 2})
-    server = Dynamixel2Server([old, new])
-    assert server.receive(frame(1, 0x10, bytes.fromhex("0144584C22"))) == status(1, ErrorNumber.INSTRUCTION)
-    assert server.receive(frame(2, 0x10, bytes.fromhex("0144584C23"))) == status(2, ErrorNumber.DATA_RANGE)
-    assert server.receive(frame(2, 0x10, b"\x01")) == status(2, ErrorNumber.DATA_LENGTH)
-
-
 def test_fast_reads_of_the_maker():
     three, seven, four = make_servos(
         {"bus_id": 3, "position": 166 * COUNT},
@@ -252,20 +241,6 @@ def test_damaged_packets_are_passed_over_in_silence(pair):
         assert server.receive(ping) == packet("01 07 00 55 00 06 04 26 65 5D")
 
 
-def test_packet_that_was_cut_off_does_not_hide_the_next(pair):
-    server = pair[0]
-    ping = packet("01 03 00 01 19 4E")
-    for length in range(len(ping)):
-        assert server.receive(ping[:length] + ping) == packet("01 07 00 55 00 06 04 26 65 5D")
-
-
-def test_packets_may_come_in_pieces_and_together(pair):
-    server = pair[0]
-    ping, answer = packet("01 03 00 01 19 4E"), packet("01 07 00 55 00 06 04 26 65 5D")
-    assert b"".join(server.receive(bytes((byte,))) for byte in ping) == answer
-    assert server.receive(b"noise" + ping + b"\xff\xff" + ping + b"\xff\xff\xfd") == answer * 2
-
-
 def test_others_are_not_answered_for(pair):
     server = pair[0]
     assert server.receive(frame(9, Instruction.PING)) == b""
@@ -303,7 +278,7 @@ def test_write_to_all_and_bulk_write(pair):
     assert (first.read_item(65), second.read_item(65)) == (1, 0)
 
 
-@pytest.mark.parametrize(
+@cases(
     ("instruction", "parameters"),
     [
         (0x82, ""),
@@ -325,15 +300,6 @@ def test_packets_for_several_that_make_no_sense(pair, instruction, parameters):
     assert first.read_item(65) == 0
 
 
-@pytest.mark.parametrize(
-    ("instruction", "parameters"),
-    [(1, "00"), (2, "840004"), (3, "7400"), (5, "00"), (6, ""), (8, "00"), (2, "84000000")],
-)
-def test_parameters_of_a_wrong_length(pair, instruction, parameters):
-    answer = pair[0].receive(frame(1, instruction, bytes.fromhex(parameters)))
-    assert answer == status(1, ErrorNumber.DATA_LENGTH)
-
-
 def test_new_id_counts_from_the_next_packet_on():
     (servo,) = make_servos({})
     server = Dynamixel2Server([servo])
@@ -349,30 +315,6 @@ def test_alert_comes_with_every_answer():
     assert server.receive(frame(1, 1))[8] == 0x80
     assert server.receive(frame(1, 2, bytes.fromhex("46000100"))) == status(1, 0x80, b"\x20")
     assert server.receive(frame(1, 3, bytes.fromhex("410009"))) == status(1, 0x84)
-
-
-def test_faults_of_the_line():
-    (servo,) = make_servos({})
-    server = Dynamixel2Server([servo])
-    good = server.receive(frame(1, 1))
-    servo.drop_next_answer()
-    assert server.receive(frame(1, 1)) == b""
-    servo.corrupt_next_answer()
-    corrupt = server.receive(frame(1, 1))
-    assert sum((a ^ b).bit_count() for a, b in zip(good, corrupt, strict=True)) == 1
-    servo.unplug()
-    assert not servo.plugged_in
-    assert server.receive(frame(1, 1)) == b""
-    servo.plug_in()
-    assert server.receive(frame(1, 1)) == good
-
-
-def test_servers_need_servos_of_one_world_with_ids_of_their_own():
-    one, two = make_servos({}, {})
-    (elsewhere,) = make_servos({"bus_id": 9})
-    for servos in ([], [one, two], [one, elsewhere]):
-        with pytest.raises(ValueError, match="servos: expected"):
-            Dynamixel2Server(servos)
 
 
 def whole_packets():
@@ -489,24 +431,6 @@ def test_sdk_reads_writes_and_is_refused(bus):
     assert servos[2].read_item(116) == 3000
 
 
-def test_sdk_takes_stuffing_off(bus):
-    # It puts none on what it sends (dynamixel-sdk 4.1.0), so that only this way can be tried.
-    sdk, handler, port, servos, _ = bus
-    servos[1]._values[116] = 0x00FDFFFF
-    read, result, error = handler.readTxRx(port, 1, 116, 4)
-    assert (bytes(read), result, error) == (b"\xff\xff\xfd\x00", sdk.COMM_SUCCESS, 0)
-
-
-def test_sdk_registered_write_and_action(bus):
-    sdk, handler, port, servos, _ = bus
-    for number in (1, 2):
-        data = list((100 * number).to_bytes(4, "little"))
-        assert handler.regWriteTxRx(port, number, 116, 4, data) == (sdk.COMM_SUCCESS, 0)
-    assert servos[1].read_item(116) == 1000
-    assert handler.action(port, sdk.BROADCAST_ID) == sdk.COMM_SUCCESS
-    assert [servos[number].read_item(116) for number in (1, 2, 3)] == [100, 200, 3000]
-
-
 @pytest.mark.parametrize("how", ["txRxPacket", "fastSyncRead"])
 def test_sdk_sync_read(bus, how):
     sdk, handler, port, _, _ = bus
@@ -571,24 +495,6 @@ def test_defaults_of_the_maker():
     assert servo.read_item(132) == servo.read_item(116) == 2048
 
 
-def test_feedback_block_is_one_read():
-    (servo,) = make_servos({})
-    load, velocity, position, _, trajectory, voltage, temperature = struct.unpack(
-        "<hiiiiHB", servo.read_bytes(126, 21)
-    )
-    assert (load, velocity, position, trajectory, voltage, temperature) == (0, 0, 2048, 2048, 120, 25)
-    assert servo.read_bytes(133, 2) == b"\x08\x00"
-
-
-def test_indirect_addresses_as_delivered():
-    (servo,) = make_servos({})
-    for first, data, number in ((168, 224, 28), (578, 634, 28)):
-        for place in range(number):
-            assert servo.read_item(first + 2 * place) == data + place
-        servo.write_bytes(data, bytes(range(number)))
-        assert servo.read_bytes(data, number) == bytes(range(number))
-
-
 def test_example_of_the_maker_for_indirect_data():
     """E-Manual, Indirect Address, Indirect Data: the LED, then a goal position in four bytes."""
     servo = make_servo()
@@ -603,48 +509,12 @@ def test_example_of_the_maker_for_indirect_data():
     assert (servo.read_item(65), servo.read_item(116)) == (0, -5)
 
 
-def test_indirect_data_has_the_properties_of_what_it_stands_for():
-    servo = make_servo()
-    for first, data in ((168, 224), (578, 634)):
-        for place, address in enumerate((116, 117, 118, 119, 132, 133, 98, 147)):
-            servo.write_item(first + 2 * place, address)
-        assert servo.read_bytes(data, 6) == servo.read_bytes(116, 4) + servo.read_bytes(132, 2)
-        assert refused(servo, data, struct.pack("<i", 2_000_000)) is ErrorNumber.DATA_RANGE
-        assert refused(servo, data, b"\x00\x00") is ErrorNumber.DATA_LENGTH
-        assert refused(servo, data + 1, b"\x00\x00\x00\x00") is ErrorNumber.DATA_LENGTH
-        assert refused(servo, data + 4, b"\x00\x00") is ErrorNumber.ACCESS
-        assert refused(servo, data + 6, b"\x80") is ErrorNumber.DATA_RANGE
-        with pytest.raises(RequestRefusedError) as caught:
-            servo.read_bytes(data, 8)
-        assert caught.value.reason is ErrorNumber.ACCESS
-
-
-@cases("value", [0, 63, 662, 65535])
-def test_eeprom_cannot_be_reached_indirectly(value):
-    assert refused_item(make_servo(), 168, value) is ErrorNumber.DATA_RANGE
-
-
 def test_indirect_addresses_are_lost_in_a_restart():
     servo = make_servo()
     servo.write_item(168, 65)
     servo.power_cycle()
     wait(servo, REBOOT_TIME)
     assert servo.read_item(168) == 224
-
-
-def test_power_cycle_is_a_reboot_without_being_asked():
-    servo = make_servo()
-    server = Dynamixel2Server([servo])
-    servo.write_item(64, 1)
-    servo.write_item(116, 20_000)
-    wait(servo, 10.0)
-    servo.write_item(98, 10)
-    turned = servo.read_item(132)
-    servo.power_cycle()
-    assert server.receive(frame(1, Instruction.PING)) == b""
-    wait(servo, REBOOT_TIME)
-    assert (servo.read_item(64), servo.read_item(98)) == (0, 0)
-    assert servo.read_item(132) == turned % 4096 != turned
 
 
 @cases(
@@ -750,14 +620,6 @@ def test_factory_reset(option, kept):
         servo.factory_reset(3)
 
 
-def test_factory_reset_of_all_does_not_take_the_ids():
-    new, old = make_servos({"bus_id": 5}, {"bus_id": 6, "firmware": 41})
-    server = Dynamixel2Server([new, old])
-    assert server.receive(frame(0xFE, 6, b"\xff")) == b""
-    wait(new, REBOOT_TIME)
-    assert (new.bus_id, old.bus_id) == (5, 1)
-
-
 def test_homing_offset_and_reverse_mode():
     servo = make_servo()
     servo.write_item(20, 100)
@@ -772,44 +634,6 @@ def test_homing_offset_and_reverse_mode():
     wait(servo, 5.0)
     assert servo.read_item(132) == 3148
     assert servo.position == pytest.approx(math.pi - 1000 * COUNT)
-
-
-def test_change_of_mode_resets_the_profile():
-    servo = make_servo(position=20.0)
-    servo.write_item(108, 5)
-    servo.write_item(112, 50)
-    servo.write_item(100, 400)
-    servo.write_item(11, 3)
-    assert [servo.read_item(address) for address in (108, 112, 100)] == [0, 0, 885]
-    assert 0 <= servo.read_item(132) < 4096
-
-
-def test_position_mode_counts_one_turn():
-    servo = make_servo(position=0.0)
-    servo.write_item(64, 1)
-    servo.write_item(116, 10_000)
-    wait(servo, 5.0)
-    servo.write_item(64, 0)
-    assert servo.read_item(132) == 10_000
-    servo.write_item(11, 3)
-    assert servo.read_item(132) == 10_000 % 4096
-
-
-def test_realtime_tick_and_led():
-    servo = make_servo()
-    wait(servo, 40.0)
-    assert servo.read_item(120) == 40_000 % 32768
-
-
-def test_encoder_noise_is_that_of_the_generator():
-    readings = []
-    for seed in (3, 3, None):
-        rng = None if seed is None else np.random.default_rng(seed)
-        servo = make_servo(position=(1000.5 - 1e-6) * COUNT, rng=rng)
-        readings.append([servo.read_item(132) for _ in range(200)])
-    assert readings[0] == readings[1]
-    assert {1000, 1001} <= set(readings[0]) <= {999, 1000, 1001, 1002}
-    assert set(readings[2]) == {1000}
 
 
 # Motion.
@@ -837,18 +661,6 @@ def test_profiles_are_smooth_and_keep_their_limits(origin, initial, target, velo
     fastest = max(velocity, abs(initial))
     for instant in np.linspace(10.0, trajectory.end, 50):
         assert abs(trajectory.at(instant)[1]) <= fastest * (1.0 + 1e-9) + 1e-9
-
-
-@given(
-    st.floats(-5.0, 5.0),
-    st.floats(-6.0, 6.0),
-    st.floats(-6.0, 6.0),
-    st.one_of(st.floats(0.3, 100.0), st.just(math.inf)),
-)
-def test_ramps_to_a_velocity(origin, initial, velocity, acceleration):
-    trajectory = Trajectory.at_velocity(2.0, origin, initial, velocity, acceleration)
-    assert trajectory.at(1000.0)[1] == velocity
-    assert trajectory.at(2.0)[0] == pytest.approx(origin, abs=1e-9)
 
 
 def test_trapezoidal_motion_takes_its_time_to_the_digit():
@@ -890,140 +702,6 @@ def test_kinds_of_profile(acceleration, velocity, distance, profile, seconds):
     assert servo.read_item(123) == profile | 0x01
 
 
-def test_plant_may_look_ahead():
-    servo = make_servo()
-    for address, value in ((112, 42), (64, 1), (116, 9000)):
-        servo.write_item(address, value)
-    assert servo.position_after(0.5) == pytest.approx(math.pi + 0.5 * 42 * VELOCITY_UNIT)
-    assert servo.position == pytest.approx(math.pi)
-    servo.write_item(64, 0)
-    assert servo.position_after(0.5) == servo.position
-
-
-def test_torque_goes_to_the_goal_that_is_there():
-    servo = make_servo()
-    servo.write_item(116, 3000)
-    wait(servo, 5.0)
-    assert servo.read_item(132) == 2048
-    servo.write_item(64, 1)
-    wait(servo, 5.0)
-    assert servo.read_item(132) == 3000
-
-
-def test_velocity_and_pwm_mode():
-    servo = make_servo()
-    servo.write_item(11, 1)
-    servo.write_item(108, 10)
-    servo.write_item(104, -50)
-    assert servo.read_item(128) == 0
-    servo.write_item(64, 1)
-    wait(servo, 3.0)
-    assert servo.read_item(128) == -50
-    assert servo.read_item(122) == 1
-    assert servo.read_item(123) == 0
-    servo.write_item(104, 0)
-    wait(servo, 3.0)
-    assert (servo.read_item(128), servo.read_item(122)) == (0, 0)
-    servo.write_item(64, 0)
-    servo.write_item(11, 16)
-    servo.write_item(100, 442)
-    servo.write_item(64, 1)
-    wait(servo, 1.0)
-    assert servo.read_item(124) == 442
-    assert servo.read_item(128) == round(TOP_SPEED * 442 / 885 / VELOCITY_UNIT)
-    servo.write_item(100, 0)
-    wait(servo, 1.0)
-    assert servo.read_item(128) == 0
-
-
-def test_without_output_nothing_moves():
-    servo = make_servo()
-    for address, value in ((64, 1), (100, 0), (116, 4000)):
-        servo.write_item(address, value)
-    wait(servo, 5.0)
-    assert servo.read_item(132) == 2048
-    servo.write_item(100, 885)
-    wait(servo, 5.0)
-    assert servo.read_item(132) == 4000
-
-
-def test_moving_flag_follows_the_profile_and_the_velocity():
-    servo = make_servo()
-    for address, value in ((24, 1023), (112, 40), (64, 1), (116, 3000)):
-        servo.write_item(address, value)
-    wait(servo, 0.1)
-    assert servo.read_item(122) == 1
-
-
-# The load.
-
-
-def test_spring_is_balanced():
-    servo = make_servo(Spring(0.5))
-    for address, value in ((112, 42), (64, 1), (116, 2048 + 652)):
-        servo.write_item(address, value)
-    wait(servo, 5.0)
-    stiffness = 2.5 * 850 / 128 / (885 * COUNT)
-    deflection = 652 * COUNT * stiffness / (stiffness + 0.5)
-    assert servo.position == pytest.approx(math.pi + deflection, abs=1e-5)
-    assert servo.read_item(126) == round(1000 * 0.5 * deflection / 2.5)
-    assert servo.read_item(124) == pytest.approx(885 * 0.5 * deflection / 2.5, abs=1)
-    assert servo.read_item(122) == 0
-
-
-def test_load_that_is_too_much_is_an_overload_after_its_time():
-    servo = make_servo(Spring(1e5, rest=math.pi))
-    for address, value in ((112, 42), (64, 1), (116, 3000)):
-        servo.write_item(address, value)
-    # Full output is 133 counts away from where it is held.
-    begin = 133 * COUNT / (42 * VELOCITY_UNIT)
-    wait(servo, begin + 0.04 + 0.9 * OVERLOAD_TIME)
-    assert not servo.alert
-    wait(servo, 0.15 * OVERLOAD_TIME)
-    assert servo.alert
-    assert servo.read_item(70) == HardwareError.OVERLOAD
-    assert servo.read_item(64) == 0
-    assert refused_item(servo, 64, 1) is ErrorNumber.RESULT_FAIL
-
-
-def test_short_overload_is_none():
-    spring = Spring(1e5)
-    servo = make_servo(spring)
-    for address, value in ((112, 42), (64, 1), (116, 3000)):
-        servo.write_item(address, value)
-    wait(servo, 1.0)
-    spring.rate = 0.0
-    wait(servo, 5.0)
-    assert not servo.alert
-    assert servo.read_item(132) == 3000
-
-
-def test_friction_holds_a_small_load():
-    spring = Spring(0.09, rest=math.pi + 1.0)
-    servo = make_servo(spring)
-    wait(servo, 5.0)
-    assert servo.position == math.pi
-    spring.rate = 1.0
-    wait(servo, 0.1)
-    assert servo.position == pytest.approx(math.pi + 0.1 * TOP_SPEED, abs=1e-6)
-    wait(servo, 5.0)
-    assert servo.position == pytest.approx(math.pi + 0.9, abs=1e-5)
-
-
-def test_work_heats():
-    servo = make_servo(Spring(2.0, rest=math.pi))
-    for address, value in ((112, 42), (64, 1), (116, 2048 + 600)):
-        servo.write_item(address, value)
-    wait(servo, HEATING_TIME)
-    share = servo.read_item(126) * 1e-3
-    assert 0.5 < share < 1.0
-    expected = 25.0 + FULL_LOAD_HEATING * share**2 * (1.0 - math.exp(-1.0))
-    assert servo.read_item(146) == pytest.approx(expected, abs=1.0)
-    servo.write_item(64, 0)
-    wait(servo, 10.0 * HEATING_TIME)
-    assert servo.read_item(146) == 25
-
-
 # Protections and the watchdog.
 
 
@@ -1032,25 +710,6 @@ def arm(servo, units):
     for address, value in ((112, 42), (98, units), (64, 1), (116, 500_000)):
         servo.write_item(address, value)
     return 42 * VELOCITY_UNIT
-
-
-@cases("units", [1, 5, 127])
-def test_watchdog_stops_the_shaft_at_its_instant(units):
-    servo = make_servo()
-    velocity = arm(servo, units)
-    silence = units * 0.02
-    clock = servo.world.clock
-    clock.sleep(silence - 1e-9)
-    servo.world.advance()
-    assert servo._values[98] == units
-    clock.sleep(1000.0)
-    servo.world.advance()
-    assert servo.position == pytest.approx(math.pi + velocity * silence, abs=1e-9)
-    assert servo.read_bytes(98, 1) == b"\xff"
-    assert servo.read_item(98) == -1
-    assert servo.read_item(64) == 1
-    assert servo.read_item(116) == servo.read_item(132)
-    assert (servo.read_item(122), servo.read_item(128)) == (0, 0)
 
 
 def test_expired_watchdog_takes_no_goals_until_it_is_cleared():
@@ -1111,30 +770,6 @@ def test_any_packet_on_the_bus_feeds_the_watchdog():
     assert [servo._values[98] for servo in servos] == [-1, -1]
 
 
-def test_watchdog_is_idle_without_torque():
-    servo = make_servo()
-    servo.write_item(98, 5)
-    wait(servo, 10.0)
-    assert servo.read_item(98) == 5
-    assert servo.deadline() == math.inf
-
-
-@cases("volts", [9.0, 16.5])
-def test_voltage_is_an_alert_and_a_shutdown_only_if_asked_for(volts):
-    for mask, torque in ((52, 1), (53, 0)):
-        servo = make_servo()
-        servo.write_item(63, mask)
-        servo.write_item(64, 1)
-        servo.supply(volts)
-        assert servo.read_item(70) == HardwareError.INPUT_VOLTAGE
-        assert servo.read_item(144) == round(10 * volts)
-        assert servo.read_item(64) == torque
-        servo.supply(12.0)
-        assert servo.alert
-    with pytest.raises(ValueError, match="positive"):
-        servo.supply(0.0)
-
-
 def test_overheating_shuts_down():
     servo = make_servo()
     servo.write_item(64, 1)
@@ -1150,15 +785,3 @@ def test_overheating_shuts_down():
     servo.reboot()
     wait(servo, REBOOT_TIME)
     assert not servo.alert
-
-
-def test_modes_without_a_position_refuse_the_role():
-    servo = make_servo()
-    servo.write_item(11, 1)
-    with pytest.raises(DeviceError, match="operating mode 1 takes no position"):
-        servo.set(1.0)
-    servo.write_item(11, 3)
-    assert (servo.limits.low, servo.limits.high) == (0.0, 4095 * COUNT)
-    assert servo.identity.model == "MX-28"
-    servo.set(1.0).wait()
-    servo.close()
