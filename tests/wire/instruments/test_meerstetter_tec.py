@@ -2,11 +2,8 @@
 
 import math
 
-import numpy as np
 import pytest
 
-from bench.base import DeviceConnectionError, DeviceError, VirtualClock
-from bench.devices import TECMode
 from sim_devices.instruments.emulated import RequestRefusedError
 from sim_devices.instruments.meerstetter_table import PARAMETERS, DeviceStatus, ServerError
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC
@@ -104,65 +101,6 @@ def test_every_writable_parameter_takes_its_bounds_and_nothing_beyond(tec):
             tec.write_parameter(number, row.low)
 
 
-def test_unknown_parameter_instance_and_numbers_that_are_none(tec):
-    assert refusal(lambda: tec.read_parameter(1234)) is ServerError.PARAMETER_NOT_AVAILABLE
-    for number, instance in ((1000, 3), (1000, 0), (104, 2), (6100, 9)):
-        assert refusal(lambda n=number, i=instance: tec.read_parameter(n, i)) is ServerError.INSTANCE_NOT_AVAILABLE
-    assert refusal(lambda: tec.write_parameter(3000, math.nan)) is ServerError.OUT_OF_RANGE
-    assert refusal(lambda: tec.write_parameter(3000, 1e300)) is ServerError.OUT_OF_RANGE
-    assert refusal(lambda: tec.write_parameter(2060, 0.05)) is ServerError.OUT_OF_RANGE
-
-
-def test_reals_are_of_single_precision(tec):
-    tec.write_parameter(3000, 20.1)
-    assert tec.read_parameter(3000) == float(np.float32(20.1)) != 20.1
-
-
-def test_identity_is_what_the_parameters_say(tec):
-    assert [tec.read_parameter(number) for number in (100, 102, 103)] == [1091, 10910042, 410]
-    assert tec.identity.model == "TEC-1091"
-    assert tec.identity.firmware == "4.10"
-    assert len(tec.identification) == 20
-
-
-def test_a_channel_that_is_not_there_keeps_settings_and_measures_nothing(tec, plate):
-    assert math.isnan(tec.read_parameter(1000, 2))
-    assert math.isnan(tec.read_parameter(1001, 2))
-    assert tec.read_parameter(1021, 2) == 0.0
-    for number, value in ((50012, 60.0), (50011, 1), (2010, 2), (50000, 1)):
-        tec.write_parameter(number, value, 2)
-        assert tec.read_parameter(number, 2) == value
-    assert tec.status is DeviceStatus.READY
-    assert plate.calls == []
-    assert tec.read_parameter(50012) == 0.0
-
-
-def test_ranges_of_the_makers_documents(tec):
-    tec.write_parameter(2052, 1_000_000)
-    assert refusal(lambda: tec.write_parameter(2052, 1_000_001)) is ServerError.OUT_OF_RANGE
-    for value, taken in ((0.0, True), (0.0999, False), (0.1, True), (600.0, True), (600.1, False)):
-        if taken:
-            tec.write_parameter(2060, value)
-        else:
-            assert refusal(lambda v=value: tec.write_parameter(2060, v)) is ServerError.OUT_OF_RANGE
-    assert refusal(lambda: tec.write_parameter(52103, 1)) is ServerError.READ_ONLY
-    for line in range(1, 9):
-        tec.write_parameter(6100, 13 + line, line)
-    assert [tec.read_parameter(6100, line) for line in range(1, 9)] == list(range(14, 22))
-
-
-def test_runs_ready_run_and_back(tec, clock, plate):
-    assert tec.status is DeviceStatus.READY
-    run(tec)
-    assert tec.status is DeviceStatus.RUN
-    clock.sleep(10.0)
-    assert tec.read_parameter(1000) == pytest.approx(40.0, abs=1e-3)
-    assert tec.read_parameter(1011) == 40.0
-    tec.write_parameter(50000, 0)
-    assert tec.status is DeviceStatus.READY
-    assert plate.calls[-1] == (pytest.approx(10.0), "release")
-
-
 @pytest.mark.parametrize(("enable", "live", "on"), [(0, 1, False), (1, 0, True), (2, 0, False), (3, 1, False)])
 def test_enable_decides_whether_live_enable_counts(tec, enable, live, on):
     tec.write_parameter(2010, enable)
@@ -187,23 +125,6 @@ def test_current_is_limited_and_static_current_is_another_source(tec, plate):
     assert plate.calls[-1] == (0.0, "drive", 0.5)
 
 
-def test_polarity_turns_the_sign_of_the_wire_and_not_of_the_role(tec, plate):
-    tec.write_parameter(3034, 0)
-    tec.select_mode(TECMode.CURRENT)
-    tec.set(1.0)
-    assert plate.current == 1.0
-    assert tec.read_parameter(50001) == -1.0
-    assert tec.read_parameter(1020) == -1.0
-    assert tec.measure()["tec_current"] == 1.0
-
-
-def test_same_command_again_does_not_disturb_the_loop(tec, plate):
-    run(tec)
-    before = len(plate.calls)
-    run(tec)
-    assert len(plate.calls) == before
-
-
 def test_stability_is_off_searching_and_stable(tec, clock):
     assert tec.read_parameter(1200) == 0
     run(tec)
@@ -224,19 +145,6 @@ def test_not_stable_in_time_is_error_182(tec, clock):
     assert tec.read_parameter(105) == 182
 
 
-def test_watchdog_expires_at_its_own_instant(tec, clock, plate):
-    tec.write_parameter(2060, 1.5)
-    run(tec)
-    clock.sleep(1.0)
-    tec.read_parameter(1000)
-    clock.sleep(3600.0)
-    assert tec.status is DeviceStatus.ERROR
-    assert plate.calls[-1] == (pytest.approx(2.5, abs=1e-9), "release")
-    assert [tec.read_parameter(number) for number in (105, 106, 107)] == [183, 1, 2060]
-    assert [tec.read_parameter(number) for number in (50000, 50011, 50012)] == [1, 1, 40.0]
-    assert plate.plate_temperature == pytest.approx(AMBIENT, abs=0.01)
-
-
 def test_watchdog_is_fed_by_any_request_and_not_by_looking_on(tec, clock):
     tec.write_parameter(2060, 1.0)
     run(tec)
@@ -248,14 +156,6 @@ def test_watchdog_is_fed_by_any_request_and_not_by_looking_on(tec, clock):
         clock.sleep(0.5)
         _ = tec.status
     assert tec.status is DeviceStatus.ERROR
-
-
-def test_watchdog_can_be_switched_off(tec, clock):
-    tec.write_parameter(2060, 1.0)
-    run(tec)
-    tec.write_parameter(2060, 0.0)
-    clock.sleep(100.0)
-    assert tec.status is DeviceStatus.RUN
 
 
 def test_reset_restores_the_flash_after_200_ms(tec, clock):
@@ -290,13 +190,6 @@ def test_a_power_cycle_loses_what_is_in_ram_and_switches_off(tec, clock, plate):
     assert (tec.status, tec.read_parameter(105)) == (DeviceStatus.READY, 0)
 
 
-def test_a_power_cycle_of_an_output_that_the_flash_switches_on_interrupts_it(tec, plate):
-    tec.write_parameter(2010, 1)
-    tec.power_cycle()
-    assert [call[1] for call in plate.calls] == ["regulate", "release", "regulate"]
-    assert tec.status is DeviceStatus.RUN
-
-
 def test_saving_writes_to_the_flash_what_differs(tec):
     tec.write_parameter(108, 1)
     tec.write_parameter(3000, 31.0)
@@ -312,15 +205,6 @@ def test_saving_writes_to_the_flash_what_differs(tec):
     assert tec.read_parameter(50012) == 0.0
 
 
-def test_flash_writes_are_counted_while_saving_is_on(tec):
-    tec.write_parameter(3000, 30.0)
-    tec.write_parameter(50012, 30.0)
-    assert (tec.flash_writes, tec.read_parameter(109)) == (1, 0)
-    tec.write_parameter(108, 1)
-    tec.write_parameter(3000, 31.0)
-    assert (tec.flash_writes, tec.read_parameter(109)) == (1, 2)
-
-
 def test_emergency_stop_is_error_11_and_stays(tec, clock, plate):
     run(tec)
     tec.emergency_stop()
@@ -331,25 +215,6 @@ def test_emergency_stop_is_error_11_and_stays(tec, clock, plate):
     clock.sleep(10.0)
     assert tec.status is DeviceStatus.ERROR
     assert plate.calls[-1][1] == "release"
-
-
-def test_first_error_stays(tec):
-    tec.trip(60)
-    tec.trip(138)
-    assert tec.read_parameter(105) == 60
-
-
-def test_an_error_that_resets_itself_brings_the_output_back(tec, clock, plate):
-    tec.write_parameter(6310, 3.0)
-    run(tec)
-    tec.trip(138)
-    assert plate.calls[-1][1] == "release"
-    clock.sleep(2.9)
-    assert tec.status is DeviceStatus.ERROR
-    clock.sleep(0.2)
-    assert tec.status is DeviceStatus.RUN
-    assert plate.calls[-1] == (pytest.approx(3.0), "regulate", 40.0, 4.0)
-    assert tec.read_parameter(105) == 0
 
 
 def test_an_automatic_restart_takes_time_while_its_cause_stays(tec, clock):
@@ -402,62 +267,3 @@ def test_saturation_is_error_108_after_its_delay(tec, clock, plate):
     clock.sleep(10.0)
     assert tec.read_parameter(105) == 108
     assert 0.7 < plate.calls[-1][0] <= 1.0
-
-
-def test_saturation_can_be_ignored(tec, clock, plate):
-    tec.write_parameter(2033, 25.0)
-    tec.write_parameter(6320, -1)
-    plate.RESISTANCE = 24.5
-    for number, value in ((2000, 1), (50001, 1.0), (4011, 500.0), (2010, 2), (50000, 1)):
-        tec.write_parameter(number, value)
-    clock.sleep(1.0)
-    assert tec.status is DeviceStatus.RUN
-
-
-def test_noise_is_small_seeded_and_on_the_object_alone(clock, plate):
-    def readings(seed, number):
-        tec = EmulatedTEC("tec", World(plate, clock), plate, rng=np.random.default_rng(seed))
-        return [tec.read_parameter(number) for _ in range(400)]
-
-    assert readings(1, 1000) == readings(1, 1000) != readings(2, 1000)
-    assert np.std(readings(1, 1000)) == pytest.approx(0.002, rel=0.15)
-    assert np.mean(readings(1, 1000)) == pytest.approx(AMBIENT, abs=5e-4)
-    assert len(set(readings(1, 1001))) == 1
-
-
-def test_unplugged_it_says_so_and_its_watchdog_expires(tec, clock, plate):
-    tec.write_parameter(2060, 1.0)
-    tec.set(40.0)
-    tec.unplug()
-    for call in (tec.measure, tec.safe, lambda: tec.set(30.0), lambda: tec.output_enabled):
-        with pytest.raises(DeviceConnectionError, match="tec: does not answer"):
-            call()
-    clock.sleep(5.0)
-    tec.plug_in()
-    with pytest.raises(DeviceError, match="error 183"):
-        tec.measure()
-    assert plate.calls[-1][:2] == (pytest.approx(1.0), "release")
-
-
-def test_splitting_the_time_does_not_matter_to_what_happens():
-    def release_time(pieces):
-        clock, plate = VirtualClock(), Plate()
-        tec = EmulatedTEC("tec", World(plate, clock), plate)
-        tec.write_parameter(4011, 39.0)
-        run(tec)
-        for _ in range(pieces):
-            clock.sleep(8.0 / pieces)
-            _ = tec.status
-        return plate.calls[-1]
-
-    assert release_time(1) == release_time(7) == release_time(160)
-
-
-def test_current_heats_and_cools_the_plate(tec, clock):
-    tec.select_mode(TECMode.CURRENT)
-    tec.set(0.5)
-    clock.sleep(60.0)
-    warm = tec.measure()["tec_temperature"]
-    tec.set(-0.5)
-    clock.sleep(60.0)
-    assert tec.measure()["tec_temperature"] < AMBIENT < warm
