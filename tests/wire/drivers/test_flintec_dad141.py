@@ -2,7 +2,6 @@
 
 import logging
 import math
-import socket
 import struct
 import sys
 import threading
@@ -15,7 +14,7 @@ from hypothesis import HealthCheck, given, settings, strategies as st
 from refusals import blamed
 
 from bench.base import DeviceConnectionError, DeviceError, DeviceRestartedError, VirtualClock, WallClock
-from drivers.flintec_dad141 import CUTOFF_HZ, FlintecDAD141
+from drivers.flintec_dad141 import FlintecDAD141
 from drivers.pymodbus_client import SerialClient
 from sim_devices import protocol_emulated
 from sim_devices.instruments.flintec_dad141 import EmulatedDAD141
@@ -155,16 +154,6 @@ def test_byte_vectors(bench):
     ]
 
 
-def test_connecting_sets_filter_and_tare_and_saves_nothing(bench):
-    bench.put(1.0)
-    bench.instrument.tare()
-    bench.instrument.write_registers(0x2110, [0, 1])
-    bench.cell(filter=5)
-    assert (bench.word(0x2106), bench.word(0x2110)) == (5, 0)
-    assert not bench.instrument.read_registers(0x2060, 1)[0] & 0x20
-    assert not any(frame[1:4] == bytes.fromhex("06 20 66") for frame in bench.tap.sent)
-
-
 def test_a_tare_may_be_kept(bench):
     bench.put(4.0)
     bench.instrument.tare()
@@ -173,13 +162,6 @@ def test_a_tare_may_be_kept(bench):
     assert cell.measure()["load_force"] == pytest.approx(1.0)
     cell.clear_tare()
     assert bench.cell(keep_tare=True).measure()["load_force"] == pytest.approx(5.0)
-
-
-def test_one_request_a_reading(bench):
-    cell = bench.cell(samples=7)
-    bench.tap.sent.clear()
-    cell.measure()
-    assert bench.tap.sent == [READ_INPUT, READ] * 3 + [READ_INPUT]
 
 
 def test_after_a_pause_the_filter_is_looked_at_once_and_costs_a_measurement_no_time(bench):
@@ -192,23 +174,6 @@ def test_after_a_pause_the_filter_is_looked_at_once_and_costs_a_measurement_no_t
         assert sum(frame in LOOK_AT_FILTER for frame in bench.tap.sent) == looks
         assert len(bench.tap.sent) == 3 + looks
         assert bench.clock.now() - begin == pytest.approx(0.25 + 23 * 10 / 115200)
-
-
-def test_a_look_at_the_filter_leaves_the_noise_as_it_was():
-    records = []
-    for looks in (0, 5):
-        bench = Bench(noise=0.1)
-        record = []
-        for _ in range(10):
-            bench.clock.sleep(0.1)
-            record += bench.instrument.read_registers(0x3500, 5)
-            for _ in range(looks):
-                bench.clock.sleep(0.01)
-                assert bench.instrument.read_registers(0x2106, 2) == [0, 3]
-            bench.clock.sleep(0.05 - 0.01 * looks)
-        records.append(record)
-        protocol_emulated.unregister("load")
-    assert records[0] == records[1]
 
 
 @cases(
@@ -252,13 +217,6 @@ def test_the_interval_of_a_measurement(bench, settings, interval):
     assert bench.clock.now() - begin == pytest.approx(3 * interval, abs=0.01)
 
 
-def test_no_interval_is_as_fast_as_the_line(bench):
-    cell = bench.cell(samples=4, interval=0.0)
-    begin = bench.clock.now()
-    cell.measure()
-    assert bench.clock.now() - begin < 0.02
-
-
 # Other lines
 
 
@@ -292,31 +250,6 @@ def test_a_line_that_is_pulled_out(bench, pseudo_terminal):
     cell.close()
     with pytest.raises(DeviceConnectionError, match="closed"):
         cell.glance()
-
-
-@on_a_real_line
-def test_over_tcp(bench):
-    bench.put(-3.5)
-    with socket.create_server(("127.0.0.1", 0)) as listener:
-        clients = []
-
-        def serve() -> None:
-            client, _ = listener.accept()
-            with client:
-                while data := client.recv(4096):
-                    reply = bench.tap.server.receive(data)
-                    clients.append(reply)
-                    client.sendall(reply[:3])
-                    client.sendall(reply[3:])
-
-        thread = threading.Thread(target=serve)
-        thread.start()
-        url = f"socket://127.0.0.1:{listener.getsockname()[1]}"
-        cell = FlintecDAD141.connect("load", Settings(port=url, timeout=10.0, force_limits=WIDE), WallClock())
-        assert cell.glance() == {"load_force": -3.5}
-        cell.close()
-        thread.join()
-    assert len(clients) > 5
 
 
 # Wrong devices
@@ -391,13 +324,6 @@ def test_a_load_that_moves_does_not_make_a_wrong_device(bench):
         bench.cell().close()
 
 
-def test_a_noisy_cell_does_not_make_a_wrong_device():
-    for seed in range(50):
-        bench = Bench(noise=0.5, decimals=3, rng=np.random.default_rng(seed))
-        bench.cell().close()
-        protocol_emulated.unregister("load")
-
-
 @cases("tracking", [1, 100])
 def test_zero_tracking_is_refused_and_nothing_is_changed(tracking):
     bench = Bench(zero_tracking=tracking)
@@ -429,17 +355,6 @@ def test_another_address_is_silent(bench):
 
 
 # Bad lines
-
-
-def test_a_port_that_does_not_exist(caplog, capfd):
-    settings = Settings(port="/dev/does-not-exist", force_limits=WIDE)
-    with (
-        caplog.at_level(logging.DEBUG),
-        pytest.raises(DeviceConnectionError, match=r"^load: cannot open /dev/does-not-exist: "),
-    ):
-        FlintecDAD141.connect("load", settings, VirtualClock())
-    assert not caplog.records
-    assert capfd.readouterr() == ("", "")
 
 
 def test_an_instrument_that_falls_silent_and_comes_back(bench, caplog, capfd):
@@ -522,19 +437,6 @@ def test_a_late_reply_is_not_taken_for_the_next(bench, pseudo_terminal):
         cell.close()
 
 
-def test_a_failure_in_the_instrument_is_passed_on(bench):
-    cell = bench.cell()
-
-    def fail(address: int, words: list[int]) -> list[int]:
-        raise RegisterError(4, "no")
-
-    bench.bank.alter = fail
-    with pytest.raises(DeviceError, match=r"^load: Modbus exception 4 \(device failure\) on reading register 0x3500"):
-        cell.measure()
-    bench.bank.alter = lambda _, words: words
-    assert cell.measure() == {"load_force": 0.0}
-
-
 # Bad readings
 
 
@@ -561,14 +463,6 @@ def test_a_weight_that_is_no_number(bench, position, value):
             take()
 
 
-def test_one_bad_reading_spoils_a_mean(bench):
-    cell = bench.cell()
-    readings = iter([0x10] * 3 + [0x12] + [0x10] * 5)
-    bench.bank.alter = lambda address, words: [*words[:4], next(readings)] if address == 0x3500 else words
-    with pytest.raises(DeviceError, match="over its range"):
-        cell.measure()
-
-
 def test_a_tare_that_is_lost_is_noticed(bench):
     cell = bench.cell()
     bench.put(5.0)
@@ -579,16 +473,6 @@ def test_a_tare_that_is_lost_is_noticed(bench):
             take()
     cell.clear_tare()
     assert cell.glance()["load_force"] == pytest.approx(5.0)
-
-
-def test_a_tare_of_somebody_else_is_noticed(bench):
-    cell = bench.cell()
-    bench.put(5.0)
-    bench.instrument.tare()
-    with pytest.raises(DeviceError, match="was tared by its keys"):
-        cell.measure()
-    cell.tare()
-    assert cell.glance()["load_force"] == pytest.approx(0.0)
 
 
 def test_another_tare_of_somebody_else_is_noticed(bench):
@@ -604,16 +488,6 @@ def test_another_tare_of_somebody_else_is_noticed(bench):
     cell.tare()
     bench.put(8.5)
     assert cell.glance()["load_force"] == pytest.approx(1.5)
-
-
-@cases("weight", [1e-3, 0.123, 59.999, -59.999])
-def test_a_tare_is_the_same_whatever_the_digits_of_the_weights(bench, weight):
-    cell = bench.cell()
-    bench.put(weight)
-    cell.tare()
-    for step in range(50):
-        bench.put(-50.0 + 2.017 * step)
-        cell.glance()
 
 
 @pytest.mark.parametrize(("action", "message"), [("tare", "took no tare"), ("clear_tare", "keeps its tare")])
@@ -671,14 +545,6 @@ def test_a_quiet_load_is_not_stale(bench):
     assert set(readings) == {5.0}
 
 
-def test_watching_for_stale_readings_can_be_left_out(bench):
-    cell = bench.cell(stale_after=0.0)
-    bench.instrument.frozen = True
-    for _ in range(5):
-        bench.clock.sleep(1e5)
-        cell.glance()
-
-
 # Anything at all
 
 
@@ -703,19 +569,6 @@ def test_any_reply_is_a_reading_or_an_error(bench, reply, whole, head):
     assert math.isfinite(force)
 
 
-@cases("function", [*range(8), 15, 16, 22, 23, 43, 0x80, 0x83, 0x84, 0x90, 0xFF])
-def test_a_reply_of_another_form_is_an_error(bench, function):
-    for length in (0, 1, 2, 3, 4, 5, 9, 10, 12):
-        cell = bench.cell()
-        frame = sealed(f"01 {function:02X} {length:02X}" + length * " 01")
-        bench.tap.alter = lambda _, frame=frame: frame
-        if (function, length) != (3, 10):
-            with pytest.raises(DeviceError):
-                cell.glance()
-        bench.tap.alter = lambda reply: reply
-        cell.close()
-
-
 # What stands in the manual, and what time takes
 
 
@@ -734,12 +587,6 @@ def test_requests_of_connecting(bench):
         sealed("01 06 2061 0004"),  # reset of the tare
         sealed("01 03 3500 0005"),  # gross, net and qualifier
     ]
-
-
-def test_cutoffs_of_the_manual(bench):
-    assert CUTOFF_HZ == (17.0, 18.0, 8.0, 4.0, 3.0, 2.0, 1.0, 0.5, 0.25)
-    for number, cutoff in enumerate(CUTOFF_HZ):
-        assert bench.cell(filter=number)._interval == 0.5 / cutoff
 
 
 def test_after_a_lost_reply_a_request_like_no_other_brings_the_line_into_step(bench):
