@@ -13,16 +13,23 @@ class FaultyLine(WireServer):
     Parameters
     ----------
     kinds : sequence of str
-        Ways among `KINDS`.
+        Ways among `KINDS`, and "cut" for an answer that ends too early.
     share : float
         Share of the answers that are spoilt, 0 to 1.
     latest : float
         Longest delay of an answer, s.
     overtaking : bool
         Whether an answer may come before one that was given earlier.
+    corrupted : callable, optional
+        Damages an answer, with a generator of random numbers; by default one bit is wrong.
+
+    Attributes
+    ----------
+    spoilt, repeats : int
+        How many answers were spoilt, and how many requests were those of before once more.
     """
 
-    def __init__(self, server, clock, rng, *, kinds=KINDS, share=0.5, latest=0.5, overtaking=False):
+    def __init__(self, server, clock, rng, *, kinds=KINDS, share=0.5, latest=0.5, overtaking=False, corrupted=None):
         self.server = server
         self.clock = clock
         self.rng = rng
@@ -30,10 +37,14 @@ class FaultyLine(WireServer):
         self.share = share
         self.latest = latest
         self.overtaking = overtaking
-        self.spoilt = 0
+        self.spoilt = self.repeats = 0
+        self._corrupted = corrupted or server.corrupted
         self._due = []
+        self._last = b""
 
     def receive(self, data):
+        self.repeats += data == self._last
+        self._last = data
         answer = self.server.receive(data)
         now = self.clock.now()
         if not answer:
@@ -45,10 +56,9 @@ class FaultyLine(WireServer):
             if kind == "drop":
                 answer = b""
             elif kind == "corrupt":
-                place = int(self.rng.integers(len(answer)))
-                answer = (
-                    answer[:place] + bytes([answer[place] ^ 1 << int(self.rng.integers(8))]) + answer[place + 1 :]
-                )
+                answer = self._corrupted(answer, self.rng)
+            elif kind == "cut":
+                answer = answer[: self.rng.integers(len(answer))]
             elif kind == "double":
                 self._put(now + self.rng.random() * self.latest, answer)
             else:
@@ -56,7 +66,7 @@ class FaultyLine(WireServer):
         if not self._due and not delay:
             return answer
         self._put(now + delay, answer)
-        return self.unsolicited()
+        return self._ripe()
 
     def _put(self, instant, answer):
         if self._due and not self.overtaking:
@@ -64,14 +74,17 @@ class FaultyLine(WireServer):
         self._due.append((instant, answer))
         self._due.sort(key=lambda each: each[0])
 
-    def unsolicited(self):
+    def _ripe(self):
         sent = b""
         while self._due and self._due[0][0] <= self.clock.now():
             sent += self._due.pop(0)[1]
         return sent
 
+    def unsolicited(self):
+        return self._ripe() + self.server.unsolicited()
+
     def next_unsolicited(self):
-        return self._due[0][0] if self._due else math.inf
+        return min([self.server.next_unsolicited(), *(instant for instant, _ in self._due[:1])])
 
 
 class InPieces(WireServer):

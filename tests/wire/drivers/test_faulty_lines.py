@@ -8,8 +8,10 @@ import random
 from collections import Counter
 from contextlib import contextmanager
 
+import numpy as np
 import pytest
 from cases import cases
+from faulty_line import KINDS, FaultyLine
 
 from bench.base import DeviceError, VirtualClock
 from drivers.dynamixel import DynamixelMX28
@@ -18,7 +20,6 @@ from sim_devices.instruments.dynamixel import EmulatedMX28
 from sim_devices.instruments.dynamixel_table import COUNT
 from sim_devices.instruments.roboteq import EmulatedRoboteq
 from sim_devices.protocol_emulated import register, unregister
-from sim_devices.wire import WireServer
 from sim_devices.wire.canopen_slcan import CanopenSlcanServer
 from sim_devices.wire.dynamixel2 import Dynamixel2Server
 from sim_devices.world import World
@@ -26,60 +27,13 @@ from sim_devices.world import World
 CALLS = 300
 TIMEOUT = 0.1
 LATEST = 2.8 * TIMEOUT
-FAULTS = {
-    "lost": ["lost"],
-    "damaged": ["damaged"],
-    "doubled": ["doubled"],
-    "late": ["late"],
-    "doubled late": ["doubled late"],
-    "all": ["lost", "damaged", "doubled", "late", "doubled late"],
-}
 
 
-class FaultyServer(WireServer):
-    """The line of an instrument on which a share of the answers is spoilt.
-
-    Attributes
-    ----------
-    spoilt : int
-        How many answers were spoilt.
-    """
-
-    def __init__(self, server, clock, faults, share, seed):
-        self.server = server
-        self.clock = clock
-        self.faults = faults
-        self.share = share
-        self.rng = random.Random(seed)
-        self.spoilt = 0
-        self.late = []
-
-    def receive(self, data):
-        answer = self.server.receive(data)
-        if not answer or self.rng.random() >= self.share:
-            return answer
-        self.spoilt += 1
-        fault = self.rng.choice(self.faults)
-        if "late" in fault:
-            self.late.append((self.clock.now() + self.rng.uniform(0.0, LATEST), answer))
-        if fault == "damaged":
-            return self.damaged(answer)
-        return {"lost": b"", "late": b"", "doubled": 2 * answer, "doubled late": answer}[fault]
-
-    def damaged(self, answer):
-        """Return the answer with one character that is another one, a digit for a digit as a rule."""
-        place = self.rng.randrange(len(answer))
-        other = self.rng.choice(b"0123456789ABCDEF") if self.rng.random() < 0.8 else self.rng.randrange(256)
-        return answer[:place] + bytes((other,)) + answer[place + 1 :]
-
-    def unsolicited(self):
-        now = self.clock.now()
-        due = [answer for instant, answer in self.late if instant <= now]
-        self.late = [row for row in self.late if row[0] > now]
-        return b"".join(due) + self.server.unsolicited()
-
-    def next_unsolicited(self):
-        return min([self.server.next_unsolicited(), *(instant for instant, _ in self.late)])
+def damaged(answer, rng):
+    """Return the answer with one character that is another one, a digit for a digit as a rule."""
+    place = rng.integers(len(answer))
+    other = rng.choice([*b"0123456789ABCDEF"]) if rng.random() < 0.8 else rng.integers(256)
+    return answer[:place] + bytes((other,)) + answer[place + 1 :]
 
 
 class Load:
@@ -100,11 +54,12 @@ class Load:
 
 
 @contextmanager
-def on_a_faulty_line(server, clock, faults, share, seed):
-    line = FaultyServer(server, clock, faults, 0.0, seed)
+def on_a_faulty_line(server, clock, faults, seed):
+    rng = np.random.default_rng(seed)
+    line = FaultyLine(server, clock, rng, kinds=faults, share=0.0, latest=LATEST, overtaking=True, corrupted=damaged)
     address = register("faulty", line, clock)
     try:
-        yield line, address, share
+        yield line, address
     finally:
         unregister(address)
 
@@ -114,7 +69,7 @@ def count_supply(faults, share, seed=0, calls=CALLS):
     clock, load, rng = VirtualClock(), Load(), random.Random(seed)
     instrument = EmulatedRoboteq("supply", World(load, clock), load, watchdog=0.0, amps_limit=100.0)
     counts = Counter()
-    with on_a_faulty_line(CanopenSlcanServer(instrument), clock, faults, share, seed) as (line, port, share):
+    with on_a_faulty_line(CanopenSlcanServer(instrument), clock, faults, seed) as (line, port):
         settings = RoboteqSupply.Settings(
             port=port, output="average", voltage_limits=(0, 12), watchdog=0, timeout=TIMEOUT, heartbeat=60
         )
@@ -158,7 +113,7 @@ def count_servo(faults, share, seed=0, calls=CALLS):
     clock, rng = VirtualClock(), random.Random(seed)
     instrument = EmulatedMX28("servo", World(Load(), clock))
     counts = Counter()
-    with on_a_faulty_line(Dynamixel2Server([instrument]), clock, faults, share, seed) as (line, port, share):
+    with on_a_faulty_line(Dynamixel2Server([instrument]), clock, faults, seed) as (line, port):
         settings = DynamixelMX28.Settings(
             port=port, position_limits=(-9.0, 9.0), watchdog=0, timeout=TIMEOUT, profile_velocity=9.0,
             profile_acceleration=12_000.0,
@@ -194,17 +149,17 @@ def count_servo(faults, share, seed=0, calls=CALLS):
     return counts
 
 
-@cases("faults", FAULTS.values())
+@cases("faults", [*((kind,) for kind in KINDS), KINDS])
 @cases("count", [count_supply, count_servo])
 def test_no_answer_is_taken_for_what_it_is_not(count, faults):
     counts = count(faults, 0.35)
     assert counts["wrong"] == 0
     assert counts["right"] > CALLS / 4
-    assert counts["repeats"] > 0 or faults in (["doubled"], ["doubled late"])
+    assert counts["repeats"] > 0 or faults == ("double",)
 
 
 def test_a_line_without_faults_repeats_nothing():
     for count in (count_supply, count_servo):
-        counts = count(["lost"], 0.0, calls=200)
+        counts = count(("drop",), 0.0, calls=200)
         assert counts == Counter(right=200)
     assert math.isfinite(sum(counts.values()))
