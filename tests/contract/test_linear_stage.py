@@ -7,7 +7,7 @@ import pytest
 from cases import cases
 from emulated_bench import Bench, OnABench, OnALine, OnAServo, OnATorque, over_the_wire, serial_port
 
-from bench.base import DeviceConnectionError, DeviceError, VirtualClock
+from bench.base import DeviceConnectionError, VirtualClock
 from bench.contracts import (
     ActuatorLineLostContract,
     LinearStageContract,
@@ -132,31 +132,6 @@ def test_arrives_and_holds(kind, stack, goal):
     assert bench.drum.position == pytest.approx(bench.where(), abs=1e-12)
 
 
-def test_plant_sees_where_the_wire_is_going(bench):
-    bench.device.set(0.05)
-    bench.clock.sleep(1.0)
-    before, ahead = bench.where(), bench.drum.position_after(1.0)
-    assert ahead == pytest.approx(before + VELOCITY, abs=1e-6)
-    bench.clock.sleep(1.0)
-    assert bench.where() == pytest.approx(ahead, abs=1e-6)
-
-
-def test_stop_holds_the_position_of_the_moment(bench):
-    bench.device.stop()
-    assert not bench.device.force_enabled
-    status = bench.device.set(0.1)
-    bench.clock.sleep(2.0)
-    bench.device.stop()
-    held = bench.device.setpoint
-    assert VELOCITY < held < 2.1 * VELOCITY
-    for _ in range(3):
-        bench.clock.sleep(1.0)
-        assert bench.device.measure()["stage_position"] == pytest.approx(held, abs=0.02 * RADIUS)
-    assert bench.device.force_enabled
-    with pytest.raises(DeviceError, match=r"stage: .*replaced"):
-        status.wait()
-
-
 def never_moved(bench):
     pass
 
@@ -198,32 +173,6 @@ def test_safe_from_any_state_and_again_changes_nothing(kind, stack, state):
     assert not bench.device.force_enabled
 
 
-def test_every_call_tells_of_a_hardware_error(bench):
-    status = bench.device.set(0.1)
-    bench.instrument.trip(HardwareError.OVERHEATING)
-    device = bench.device
-    for call in (device.measure, device.glance, device.read, lambda: device.set(0.0), status.wait):
-        with pytest.raises(DeviceError, match=r"^stage: hardware error 0x04 \(overheating") as caught:
-            call()
-        assert "\n" not in str(caught.value)
-    assert status.done
-    assert not status.success
-
-
-def test_silence_of_the_host_stops_the_stage(bench):
-    status = bench.device.set(0.15)
-    bench.device.glance()
-    bench.clock.sleep(3600.0)
-    assert bench.where() == pytest.approx(VELOCITY * WATCHDOG, abs=0.3 * RADIUS)
-    for call in (bench.device.measure, bench.device.glance, lambda: bench.device.set(0.0), status.wait):
-        with pytest.raises(DeviceError, match=r"stage: .*bus watchdog"):
-            call()
-    assert bench.device.force_enabled
-    bench.device.safe()
-    bench.device.measure()
-    bench.device.set(0.01).wait()
-
-
 # What only a wire can do.
 
 
@@ -255,30 +204,6 @@ class TestLineLost(OnADrumLine, ActuatorLineLostContract):
 @over_the_wire
 class TestSafeOverAFreshLine(OnADrumLine, SafeOverAFreshLineContract):
     pass
-
-
-@over_the_wire
-def test_a_reading_is_one_transaction(bench):
-    bench.device.set(0.01).wait()
-    for call in (bench.device.measure, bench.device.glance):
-        bench.requests.clear()
-        call()
-        assert len(bench.requests) == 1
-
-
-@over_the_wire
-def test_error_is_cleared_by_a_reboot_and_by_recover(bench):
-    bench.instrument.trip(HardwareError.OVERLOAD)
-    bench.device.reboot()
-    bench.device.set(0.01).wait()
-    bench.instrument.trip(HardwareError.OVERLOAD)
-    bench.device.close()
-    with pytest.raises(DeviceError, match=r"stage: .*overload.*off and on"):
-        bench.connect()
-    device = bench.connect(DynamixelDrum.recover)
-    device.set(-0.01).wait()
-    assert bench.where() == pytest.approx(-0.01, abs=RESOLUTION)
-    device.close()
 
 
 @over_the_wire

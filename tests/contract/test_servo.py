@@ -151,23 +151,6 @@ def test_where_it_stands_already_it_has_arrived_at_once(bench):
     assert status.success
 
 
-def test_velocity_on_the_way_is_that_of_the_profile(bench):
-    for goal, sign in ((9.0, 1), (-3.0, -1)):
-        status = bench.device.set(goal)
-        bench.clock.sleep(1.0)
-        values = bench.device.measure()
-        assert values["servo_velocity"] == pytest.approx(sign * VELOCITY, abs=VELOCITY_UNIT)
-        status.wait()
-
-
-def test_plant_sees_the_way_in_small_steps(bench):
-    bench.device.set(5.0).wait()
-    positions = [position for _, position in bench.plant.seen]
-    steps = [after - before for before, after in itertools.pairwise(positions)]
-    assert all(0.0 <= step <= 0.0201 * VELOCITY for step in steps)
-    assert positions[-1] == pytest.approx(5.0, abs=COUNT)
-
-
 def test_new_goal_on_the_way_turns_round_without_a_jump(bench):
     first = bench.device.set(9.0)
     bench.clock.sleep(1.5)
@@ -177,33 +160,6 @@ def test_new_goal_on_the_way_turns_round_without_a_jump(bench):
         first.wait()
     steps = [b - a for (_, a), (_, b) in itertools.pairwise(bench.plant.seen)]
     assert max(map(abs, steps)) <= 0.0201 * VELOCITY
-
-
-def test_stop_holds_the_angle_of_the_moment(bench):
-    status = bench.device.set(9.0)
-    bench.clock.sleep(2.0)
-    bench.device.stop()
-    held = bench.device.setpoint
-    assert math.pi + 1.0 < held < math.pi + 2.1
-    for _ in range(3):
-        bench.clock.sleep(1.0)
-        assert bench.device.measure()["servo_position"] == pytest.approx(held, abs=0.02)
-    assert bench.device.torque_enabled
-    with pytest.raises(DeviceError, match="replaced"):
-        status.wait()
-
-
-def test_safe_switches_the_torque_off_and_again_changes_nothing(bench):
-    bench.device.set(9.0)
-    bench.clock.sleep(1.0)
-    bench.device.safe()
-    assert not bench.device.torque_enabled
-    where = bench.where()
-    bench.device.safe()
-    bench.clock.sleep(10.0)
-    assert bench.where() == where
-    assert not bench.device.torque_enabled
-    assert bench.device.measure()["servo_velocity"] == 0.0
 
 
 def test_no_jump_to_the_goal_of_before(bench):
@@ -455,21 +411,6 @@ def test_watchdog_is_idle_while_the_torque_is_off(bench):
     bench.clock.sleep(100.0)
     bench.device.measure()
     bench.device.set(4.0).wait()
-
-
-@over_the_wire
-def test_zero_and_direction(bench):
-    device = bench.connect(zero_counts=2048, direction=-1, position_limits=(-3.0, 3.0))
-    assert device.measure()["servo_position"] == 0.0
-    status = device.set(1.0)
-    bench.clock.sleep(0.6)
-    assert device.measure()["servo_velocity"] == pytest.approx(VELOCITY, abs=VELOCITY_UNIT)
-    status.wait()
-    assert bench.where() == pytest.approx(math.pi - 1.0, abs=COUNT)
-    assert device.measure()["servo_position"] == pytest.approx(1.0, abs=COUNT)
-    device.stop()
-    assert device.setpoint == pytest.approx(1.0, abs=COUNT)
-    device.close()
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pty")

@@ -149,20 +149,6 @@ def test_currents_of_both_signs_flow_and_have_limits(bench):
         device.set(limit)
 
 
-def test_change_of_mode_switches_off(bench):
-    device = bench.device
-    device.set(45.0).wait()
-    device.select_mode(TECMode.CURRENT)
-    assert not device.output_enabled
-    assert math.isnan(device.setpoint)
-    device.set(1.0)
-    assert device.output_enabled
-    device.select_mode(TECMode.TEMPERATURE)
-    assert not device.output_enabled
-    assert device.limits.unit == device.setpoint_signal.unit == "°C"
-    device.set(40.0).wait()
-
-
 def test_old_current_does_not_come_back_with_the_mode(bench):
     device = bench.device
     device.select_mode(TECMode.CURRENT)
@@ -191,18 +177,6 @@ def test_stop_keeps_the_current(bench):
     bench.device.stop(success=False)
     assert bench.device.setpoint == 0.5
     assert bench.instrument.status is DeviceStatus.RUN
-
-
-def test_safe_releases_the_plate(bench):
-    bench.device.set(60.0).wait()
-    bench.device.safe()
-    assert bench.plant.commands[-1][1] == "release"
-    commands = len(bench.plant.commands)
-    bench.device.safe()
-    bench.clock.sleep(1.0)
-    assert len(bench.plant.commands) == commands
-    assert bench.device.measure()["tec_current"] == pytest.approx(0.0, abs=5e-3)
-    bench.device.set(50.0).wait()
 
 
 @cases("number", [11, 30, 60, 100, 108, 134, 137, 138, 139, 143, 176, 182, 183])
@@ -318,16 +292,6 @@ def test_error_of_before_is_refused_and_recovered(bench):
 
 
 @over_the_wire
-def test_reset_of_a_connected_device(bench):
-    bench.device.set(60.0)
-    bench.instrument.trip(138)
-    bench.device.reset()
-    assert math.isnan(bench.device.setpoint)
-    assert not bench.device.output_enabled
-    bench.device.set(45.0).wait()
-
-
-@over_the_wire
 def test_connecting_to_an_output_that_is_on_switches_it_off(bench):
     bench.device.set(60.0)
     bench.device.close()
@@ -335,16 +299,3 @@ def test_connecting_to_an_output_that_is_on_switches_it_off(bench):
     assert not device.output_enabled
     assert bench.plant.commands[-1][1] == "release"
     device.close()
-
-
-def test_two_runs_are_equal_to_the_last_digit(kind, stack):
-    def run():
-        device = connected(kind, stack).device
-        readings = []
-        for target in (30.0, 60.0, 45.0):
-            device.set(target).wait()
-            readings.append(device.read())
-        device.safe()
-        return readings
-
-    assert run() == run()

@@ -11,7 +11,6 @@ from bench.base import DeviceError, VirtualClock
 from bench.contracts import TemperatureSensorContract
 from drivers.labjack_t7 import T7Thermistor
 from sim_devices.instruments.labjack_t7 import EmulatedT7
-from sim_devices.serving.modbus_tcp_server import ModbusTcpServer
 from sim_devices.transducers.thermistor import Thermistor
 from sim_devices.world import World
 
@@ -30,25 +29,21 @@ class SensorBench(Bench):
         return self.device.measure, self.device.glance, self.device.read
 
 
-def connected(kind, stack, seed=1):
+def connected(stack, seed=1):
     plate, clock = Given(22.0), VirtualClock()
     streams = np.random.default_rng(seed).spawn(2)
     thermistor = Thermistor(lambda: plate.value, noise=NOISE, rng=streams[0])
     inputs = {CHANNELS[0]: thermistor.divider, CHANNELS[1]: thermistor.excitation}
     instrument = EmulatedT7(World(plate, clock), inputs, rng=streams[1])
-    if kind == "socket":
-        port = stack.enter_context(ModbusTcpServer(instrument)).address
-    else:
-        port = tcp_port(stack, instrument, clock)
-    settings = T7Thermistor.Settings(port=port, channels=CHANNELS)
+    settings = T7Thermistor.Settings(port=tcp_port(stack, instrument, clock), channels=CHANNELS)
     sensor = T7Thermistor.connect("base", settings, clock)
     stack.callback(sensor.close)
     return SensorBench(clock=clock, device=sensor, instrument=instrument, plant=plate, thermistor=thermistor)
 
 
 @pytest.fixture
-def kind():
-    return "driver"
+def bench(stack):
+    return connected(stack)
 
 
 class TestContract(OnABench, TemperatureSensorContract):
@@ -110,20 +105,12 @@ def test_a_measurement_takes_the_time_of_its_conversions(bench):
     assert bench.clock.now() == begin
 
 
-def test_one_seed_gives_one_record(kind, stack):
+def test_one_seed_gives_one_record(stack):
     def record(seed):
-        bench = connected(kind, stack, seed)
+        bench = connected(stack, seed)
         values = []
         for bench.plant.value in TEMPERATURES:
             values += [*bench.device.measure().values(), *bench.device.glance().values()]
         return values
 
     check_reproducible(record)
-
-
-def test_a_socket_changes_nothing(stack):
-    def record(kind):
-        bench = connected(kind, stack)
-        return [bench.device.measure()["base_temperature"] for _ in range(5)]
-
-    assert record("driver") == record("socket")
