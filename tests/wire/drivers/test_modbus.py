@@ -158,16 +158,6 @@ def test_a_refusal_of_tcp(clock, plug, expected):
     assert clock.now() == pytest.approx(begin, abs=1e-3)
 
 
-def test_transactions_of_tcp_begin_again(plug):
-    server = Answers("FFFF 0000 0007 01 03 04 1234 5678", "0000 0000 0007 01 03 04 1234 5678")
-    client = TcpClient(plug(server))
-    client._transaction = 0xFFFE
-    for _ in range(2):
-        client.read(0, 2)
-    assert [request[:2].hex() for request in server.received] == ["ffff", "0000"]
-    assert server.received[0][2:] == bytes.fromhex("0000 0006 01 03 0000 0002")
-
-
 def test_echo_of_a_write(plug):
     echoes = "0001 0001", "0002 0001", "0001 0002"
     answers = [f"000{number} 0000 0006 01 10 {echo}" for number, echo in enumerate(echoes, 1)]
@@ -176,22 +166,6 @@ def test_echo_of_a_write(plug):
     for _ in range(2):
         with pytest.raises(OSError, match="is none to the request 10 00 01 00 01 02 00 01"):
             client.write(1, b"\0\1")
-
-
-def test_a_port_that_is_gone(plug):
-    port = plug(Answers())
-    client = TcpClient(port)
-    assert client.is_open
-    client.wait_for(0.7)
-    assert port.timeout == 0.7
-    client.close()
-    assert not client.is_open
-
-
-def test_a_port_that_was_unplugged(plug):
-    client = TcpClient(plug(Answers()))
-    unregister("modbus")
-    assert not client.is_open
 
 
 # Modbus RTU, by either client
@@ -315,12 +289,3 @@ def test_a_line_that_was_closed_stays_closed(client, clock):
     if isinstance(made, SerialClient):
         with pytest.raises(ConnectionError, match="the line is closed"):
             made.settle(0.05)
-
-
-def test_pymodbus_waits_as_long_as_it_is_told(plug, clock):
-    plug(Answers())
-    settings = SerialSettings(port="emulated://modbus", baudrate=9600, timeout=0.2)
-    made = SerialClient(open_port("load", settings), settings, 1, "E")
-    made.wait_for(0.7)
-    assert made._line.comm_params.timeout_connect == 0.7
-    made.close()

@@ -104,15 +104,6 @@ def test_what_is_no_number_is_an_error(exchange, text):
             meter.measure()
 
 
-def test_a_set_point_that_is_not_taken_is_an_error():
-    exchange = [("OUTPut 0", None), (":SOUR:CURR 1.5", None), (":SOUR:VOLT 12", None), (":SOUR:VOLT?", "5")]
-    with (
-        expected_protocol(exchange) as instrument,
-        pytest.raises(DeviceError, match="reads its set-point back as 5 V, not 12 V"),
-    ):
-        on_protocol(instrument).set(12.0)
-
-
 def test_errors_of_the_instrument_are_one_message():
     exchange = [
         (":MEAS:VOLT?", "1"),
@@ -290,17 +281,6 @@ class TestLineLost(ActuatorLineLostContract):
         return 1e-6
 
 
-def test_the_safe_state_is_reached_over_a_fresh_line(supply, instrument):
-    for found_before in (False, True):
-        supply.set(5.0)
-        supply._line.instrument.adapter.connection.close()
-        if found_before:
-            with pytest.raises(DeviceConnectionError):
-                supply.measure()
-        supply.safe()
-        assert instrument.output == 0.0
-
-
 def test_an_output_that_goes_off_is_found(supply, instrument):
     supply.set(5.0)
     instrument.switch(False)
@@ -312,13 +292,6 @@ def test_an_instrument_of_another_kind_is_refused(connect, instrument, monkeypat
     monkeypatch.setitem(instrument._actions, "*IDN?", lambda: "OTHER,METER,1,1")
     with pytest.raises(DeviceConnectionError, match=r"is 'OTHER,METER,1,1', expected 'EXAMPLE,2260B,\{any\}'"):
         connect()
-
-
-def test_a_line_that_is_lost_is_a_connection_error(connect):
-    supply = connect()
-    supply._line.instrument.adapter.connection.close()
-    with pytest.raises(DeviceConnectionError, match=r"^supply: reading voltage: "):
-        supply.measure()
 
 
 RIG = """
@@ -445,22 +418,6 @@ def instruments(monkeypatch):
     return opened
 
 
-def test_an_output_is_switched_on_after_what_comes_before_it(instruments):
-    device = instruments.connect()
-    assert device.identity.serial_number == "7"
-    instruments[0].done.clear()
-    device.set(12.0)
-    assert instruments[0].done == [
-        ("output_enabled", False),
-        ("current_limit", 1.5),
-        ("voltage_setpoint", 12.0),
-        ("output_enabled", True),
-    ]
-    instruments[0].done.clear()
-    device.set(6.0)
-    assert instruments[0].done == [("voltage_setpoint", 6.0)]
-
-
 def test_a_set_point_is_scaled_and_its_read_back_too(instruments):
     from drivers.pymeasure import PropertySetpointTable
 
@@ -488,18 +445,6 @@ def test_what_is_not_read_back_is_not_compared(instruments):
     assert not isinstance(caught.value, DeviceRestartedError)
 
 
-def test_a_restart_is_told_until_it_is_connected_again(instruments):
-    device = instruments.connect()
-    device.set(5.0)
-    instruments[0].values |= {"output_enabled": False, "voltage_setpoint": 0.0}
-    instruments[0].done.clear()
-    for action in (device.measure, lambda: device.set(1.0), device.measure, device.reconnect):
-        with pytest.raises(DeviceRestartedError, match="set-point is lost: it has restarted"):
-            action()
-    assert instruments[0].done == []
-    device.safe()
-
-
 def test_a_line_that_failed_is_opened_again_by_the_next_call(instruments):
     device = instruments.connect()
     device.set(5.0)
@@ -516,15 +461,6 @@ def test_a_line_that_failed_is_opened_again_by_the_next_call(instruments):
     instruments[1].values["voltage_setpoint"] = 4.0
     with pytest.raises(DeviceError, match="reads its set-point back as 4 V, not 5 V"):
         device.measure()
-
-
-def test_a_sensor_is_read_when_its_line_is_opened_again(instruments):
-    settings = instruments.connect()._settings
-    clock = VirtualClock()
-    meter = SensorAdapter("meter", settings, clock, SensorAdapter.Line("meter", settings, clock))
-    instruments[-1].failing["voltage"] = OSError("timeout")
-    with pytest.raises(DeviceConnectionError):
-        meter._check_unchanged()
 
 
 def test_another_error_is_none_of_the_line(instruments):
@@ -592,24 +528,6 @@ def test_an_arrival_is_read_from_the_signals(instruments):
     assert not status.update()
     instruments[0].values["voltage"] = 4.75
     assert status.update()
-
-
-@pytest.mark.parametrize("number", [9.9e37, -9.9e37, math.nan, math.inf])
-def test_numbers_that_are_none(instruments, number):
-    device = instruments.connect()
-    instruments[0].values["voltage"] = number
-    with pytest.raises(DeviceError, match=r"voltage is .*; is it out of its range"):
-        device.measure()
-    instruments[0].values["voltage"] = 9.8e37
-    device.measure()
-
-
-def test_errors_are_asked_for_if_the_rig_file_says_so(instruments):
-    device = instruments.connect(check_errors=True)
-    instruments[0].errors = ["-222", "-113"]
-    with pytest.raises(DeviceError, match="reports after set-point 5 V: -222; -113"):
-        device.set(5.0)
-    instruments.connect().measure()
 
 
 def test_a_module_that_may_not_be_imported_is_refused():

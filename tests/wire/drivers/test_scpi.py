@@ -12,7 +12,6 @@ from text_laboratory import SUPPLY, Laboratory
 from bench.base import ConfigurationError, DeviceConnectionError, DeviceError, VirtualClock
 from bench.contracts import ActuatorContract, SilentInstrumentContract
 from drivers.scpi import SCPIActuator, SCPISensor, SCPIVoltageSupply
-from sim_devices import protocol_emulated
 from sim_devices.wire.text import TextServer
 
 
@@ -196,13 +195,6 @@ def test_commands_are_sent_once(lab):
     assert device.measure()["supply_voltage"] == 5.0
 
 
-def test_silence_is_an_error_that_names_address_and_question(lab):
-    device = lab.connect()
-    lab.instrument.unplug()
-    with pytest.raises(DeviceConnectionError, match=r"no answer to 'MEAS:VOLT\?' within 1 s at emulated://scpi-test"):
-        device.glance()
-
-
 @pytest.mark.parametrize("answer", [b"9.9E37\n", b"9.91E37\n", b"OL\n", b"\n", b"\xff\xfe\n"])
 def test_an_answer_that_is_no_number_is_an_error(lab, answer):
     device = lab.connect()
@@ -349,18 +341,6 @@ class TestPyVISA:
         manager.close()
         assert lab.delivered[-1] == 0.0
 
-    def test_the_driver_reaches_it_by_visa(self, served):
-        pytest.importorskip("pyvisa_py")
-        port, lab = served()
-        settings = SCPIActuator.Settings(
-            port=f"visa://TCPIP0::127.0.0.1::{port}::SOCKET", visa_library="@py", timeout=20.0, **SUPPLY
-        )
-        device = SCPIActuator.connect("supply", settings, lab.clock)
-        device.set(4.0).wait()
-        assert device.measure()["supply_voltage"] == 4.0
-        device.safe()
-        device.close()
-
 
 class TestSilence(SilentInstrumentContract):
     @pytest.fixture
@@ -405,12 +385,6 @@ COMMA = {
     "setpoint": {**SUPPLY["setpoint"], "reply": "{value:.4f}{unit}", "range_queries": ["VOLT? MIN", "VOLT? MAX"]},
 }
 """What an instrument with a decimal comma, and units with prefixes, has instead."""
-
-
-class TestContractWithCommasAndUnits(TestContract):
-    @pytest.fixture
-    def lab(self, stack):
-        return Laboratory(stack, **COMMA)
 
 
 def test_numbers_and_units_are_those_of_the_instrument_both_ways(stack):
@@ -463,18 +437,6 @@ def test_longest_time_of_the_safe_state(stack):
     assert device.safe_within == pytest.approx(2.0 + 4 * 0.6)
 
 
-def test_a_set_point_at_the_ends_of_the_instrument(stack):
-    setpoint = {**SUPPLY["setpoint"], "range_queries": ["VOLT? MIN", "VOLT? MAX"]}
-    lab = Laboratory(stack, setpoint=setpoint)
-    lab.answer = lambda data, usual: (
-        b"30\n" if b"MIN" in data else b"0\n" if b"MAX" in data else usual(data)
-    )  # either way round
-    lab.connect()
-    lab.answer = lambda data, usual: b"0.001\n" if b"MIN" in data else b"40\n" if b"MAX" in data else usual(data)
-    with pytest.raises(ConfigurationError, match=r"takes 0\.001 to 40 V"):
-        lab.connect()
-
-
 def test_a_set_point_in_another_unit_of_the_instrument(stack):
     """The instrument is set in mV, and reads back what it was set to, to a digit of its message."""
     setpoint = {"command": "VOLT {value:.0f}", "query": "VOLT?", "unit": "V", "scale": 1e-3, "limits": [0.0, 0.03]}
@@ -498,12 +460,6 @@ def test_an_instrument_without_a_question_for_its_set_point(stack):
     device.measure()
     device.reconnect()
     assert "VOLT?" not in lab.requests
-
-
-def test_errors_without_a_queue_are_not_asked_for(stack):
-    lab = Laboratory(stack, error_query="")
-    lab.connect().measure()
-    assert not any("ERR" in request for request in lab.requests)
 
 
 @pytest.mark.parametrize(
@@ -531,29 +487,11 @@ def test_what_the_queue_answers_when_it_is_empty(stack, no_error, answer, is_err
         device.measure()
 
 
-def test_a_message_that_the_encoding_lacks(lab):
-    device = lab.connect()
-    with pytest.raises(DeviceError, match="'UNIT °C' cannot be written in ascii"):
-        device._line.tell("UNIT °C")
-
-
 def test_a_line_that_never_falls_silent(lab):
     device = lab.connect()
     lab.answer = lambda *_: b"nonsense\n" * 100
     with pytest.raises(DeviceConnectionError, match="the line emulated://scpi-test does not fall silent"):
         device.glance()
-
-
-@pytest.mark.parametrize(("strays", "is_good"), [(63, True), (64, False)])
-def test_so_many_late_answers_are_passed_over(lab, strays, is_good):
-    device = lab.connect()
-    answers = [b"nonsense\n" * (strays + 1)]
-    lab.answer = lambda data, usual: answers.pop(0) if answers else usual(data)
-    if is_good:
-        assert device.glance()["supply_voltage"] == 0.0
-    else:
-        with pytest.raises(DeviceConnectionError, match="does not fall silent"):
-            device.glance()
 
 
 def test_an_instrument_without_an_identity_comes_into_step_by_silence(stack):
@@ -581,51 +519,6 @@ def test_questions_are_sent_three_times_at_most_and_those_to_reconnect_once(lab)
     with pytest.raises(DeviceConnectionError, match="after 1 request;"):
         device.reconnect()
     assert lab.requests == ["*IDN?"]
-
-
-def test_a_line_that_is_lost_is_opened_again_by_the_next_call(lab):
-    device = lab.connect()
-    device.set(5.0)
-    protocol_emulated.unregister("scpi-test")
-    for action in (device.glance, lambda: device._line.tell("*CLS"), device._line.errors):
-        device._line.lost = False
-        with pytest.raises(DeviceConnectionError, match="lost the line"):
-            action()
-        assert device._line.lost
-    before = device._line
-    protocol_emulated.register("scpi-test", lab.server, lab.clock)
-    assert device.measure()["supply_voltage"] == 5.0
-    assert device._line is not before
-    device.close()
-    assert not device._line.lost
-    assert not device._line._transport.port.is_open
-
-
-def test_lost_while_reading(lab):
-    device = lab.connect()
-
-    def pull_out(data, usual):
-        protocol_emulated.unregister("scpi-test")
-        return b""
-
-    lab.answer = pull_out
-    with pytest.raises(DeviceConnectionError, match="lost the line"):
-        device.glance()
-    assert device._line.lost
-    protocol_emulated.register("scpi-test", lab.server, lab.clock)
-
-
-@pytest.mark.parametrize("length", [1024, 1025])
-def test_an_answer_without_an_end_is_none(stack, length):
-    lab = Laboratory(stack, signals={"voltage": {"query": "MEAS:VOLT?", "unit": "V", "reply": "{any},{value}"}})
-    device = lab.connect()
-    answers = [b"x" * (length - 3) + b",5\n"]
-
-    def answer(data, usual):
-        return usual(data) if b"MEAS" not in data else answers.pop(0) if answers else b"x,7\n"
-
-    lab.answer = answer
-    assert device.glance() == {"supply_voltage": 5.0 if length <= 1024 else 7.0}
 
 
 @cases(
@@ -666,14 +559,6 @@ def test_a_serial_port_is_set_up_as_the_rig_file_says(stack, changes, options):
     assert {key: getattr(port, key) for key in options} == options
 
 
-def test_a_sensor_that_is_connected_again_is_read(stack):
-    meter = {"identity": "EXAMPLE,DMM,{any}", "signals": {"current": {"query": "READ?", "unit": "A"}}}
-    lab = Laboratory(stack, meter, SCPISensor)
-    device = lab.connect()
-    device.reconnect()
-    assert lab.requests == ["*IDN?", "READ?"]
-
-
 def test_a_visa_address_needs_the_library(monkeypatch):
     monkeypatch.setattr("drivers.scpi.transport.importlib.util.find_spec", lambda _: None)
     with pytest.raises(ValueError, match=r"pip install '.+\[visa\]'"):
@@ -696,13 +581,3 @@ def test_the_safe_state_is_asked_for_once_a_line(lab):
     with pytest.raises(DeviceConnectionError, match="after 3 requests"):
         device.glance()
     assert lab.requests.count("OUTP?") == 3
-
-
-def test_an_identity_that_may_be_anything_is_not_asked_for_to_come_into_step(stack):
-    lab = Laboratory(stack, identity="{any}")
-    device = lab.connect()
-    answers = [b""]
-    lab.answer = lambda data, usual: answers.pop(0) if answers else usual(data)
-    device.glance()
-    assert "*IDN?" not in lab.requests
-    assert device.repeats == 1

@@ -13,7 +13,6 @@ from drivers.serial_line import (
     RESENDS,
     PatientPort,
     SerialSettings,
-    forget_received,
     open_port,
     patient,
     settle_line,
@@ -128,23 +127,6 @@ def test_a_line_that_never_falls_silent_is_an_error(chatter):
     assert port.timeout == 0.7
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="needs pseudo-terminals")
-def test_what_a_port_has_received_cannot_be_forgotten_once_it_is_gone():
-    master, slave = os.openpty()
-    port = opened(os.ttyname(slave))
-    os.write(master, b"abc")
-    forget_received(port)
-    assert port.in_waiting == 0
-    os.close(master)
-    os.close(slave)
-    # termios raises an error of its own here, which is no OSError.
-    with pytest.raises(OSError, match=r"5|error"):
-        forget_received(port)
-    port.close()
-    with pytest.raises(OSError, match="not open"):
-        forget_received(port)
-
-
 class LatePort:
     """A port whose answer comes some seconds of waiting after the request, whatever the machine does meanwhile."""
 
@@ -187,12 +169,6 @@ class TestPatience:
         assert read(port) == (b"yes\n" if comes else b"")
         assert late_port.timeout == port.timeout == 0.1
         assert late_port.waited <= 1.0 + 1e-9
-
-    def test_what_has_come_in_part_is_completed(self):
-        late_port = LatePort(b"", 0.0)
-        pieces = [b"ye", b"s\n"]
-        late_port.read = lambda _: pieces.pop(0)
-        assert PatientPort(late_port, 1.0, lambda: 5.0).read(4) == b"yes\n"
 
     @pytest.mark.parametrize(("watchdog", "longest"), [(5.0, 1.0), (1.0, 0.2), (0.0, 1.0)])
     def test_a_request_and_its_repetitions_stay_within_the_watchdog(self, watchdog, longest):

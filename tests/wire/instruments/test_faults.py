@@ -126,29 +126,6 @@ def test_a_late_answer_comes_at_its_instant_of_laboratory_time(vo2, ask):
     assert clock.now() == pytest.approx(begun + 1.5, abs=0.02)
 
 
-def test_what_follows_a_late_answer_does_not_overtake_it(vo2, ask):
-    laboratory, _, ports = vo2
-    right = ask()
-    laboratory.inject("tec.delay", {"seconds": 0.5})
-    with serial.serial_for_url(ports["tec"], baudrate=57600, timeout=0.1) as line:
-        line.write(IDENTIFY)
-        line.write(b"#0115AB?VR03E801F53C\r")
-        line.timeout = 2.0
-        assert line.read_until(b"\r") == right
-
-
-def test_an_answer_of_another_address_is_whole(vo2, ask):
-    from binascii import crc_hqx
-
-    laboratory, _, _ = vo2
-    right = ask()
-    laboratory.inject("tec.readdress")
-    wrong = ask()
-    assert wrong[1:3] != right[1:3]
-    assert wrong[3:-5] == right[3:-5]
-    assert wrong[-5:-1] == b"%04X" % crc_hqx(wrong[:-5], 0)
-
-
 @cases("rig", RIGS)
 def test_each_protocol_with_addresses_readdresses_its_answers(rig):
     laboratory, _ = make(rig)
@@ -210,19 +187,6 @@ def test_an_instrument_without_power_is_off_and_starts_anew(vo2, ask):
     clock.sleep(1.0)
     assert ask().startswith(b"!0115AA8065")
     assert laboratory.tec.read_parameter(50000) == 0
-
-
-def test_a_frozen_instrument_answers_and_obeys_but_its_values_stand(vo2):
-    laboratory, clock, _ = vo2
-    tec = laboratory.tec
-    laboratory.inject("tec.freeze", duration=30.0)
-    before = tec.read_parameter(1000)
-    tec.set(60.0)
-    clock.sleep(20.0)
-    assert tec.read_parameter(1000) == before
-    assert laboratory.truth()["plate_temperature"].value > before + 10
-    clock.sleep(11.0)
-    assert tec.read_parameter(1000) == pytest.approx(60.0, abs=1.0)
 
 
 @cases(
@@ -395,17 +359,6 @@ def test_a_rate_gives_the_same_instants_for_one_seed_and_about_as_many_as_it_say
     assert max(instants(1)) <= 3600.0
 
 
-def test_which_answers_are_disturbed_comes_from_the_seed():
-    def answers(seed):
-        laboratory, _ = make(seed=seed)
-        laboratory.inject("tec.drop", {"probability": 0.5}, duration=1000.0)
-        server = laboratory.servers["tec"]
-        return [bool(server.receive(IDENTIFY)) for _ in range(200)]
-
-    assert answers(3) == answers(3) != answers(4)
-    assert 60 < sum(answers(3)) < 140
-
-
 @cases(
     ("entry", "words"),
     [
@@ -481,11 +434,6 @@ def test_a_wrong_file_of_faults_is_one_message(tmp_path, name, text, words):
     assert words in line
 
 
-def test_a_file_of_faults_that_is_not_there_is_one_message(tmp_path):
-    with pytest.raises(ConfigurationError, match="cannot be read: No such file"):
-        read_schedule(tmp_path / "none.toml")
-
-
 def test_a_run_with_a_schedule_fails_at_its_instant_and_ends_safe(bench, tmp_path):
     (tmp_path / "faults.toml").write_text("[[fault]]\nat = 12.5\nfault = 'tec-over-current'\n")
     code, out, err = bench(
@@ -498,20 +446,6 @@ def test_a_run_with_a_schedule_fails_at_its_instant_and_ends_safe(bench, tmp_pat
     result = json.loads((tmp_path / "result.json").read_text())
     assert result["is_safe"]
     assert 12.5 < result["laboratory_seconds"] < 16.0
-
-
-def test_a_wrong_schedule_is_one_message_before_anything_moves(bench, tmp_path):
-    (tmp_path / "faults.toml").write_text("[[fault]]\nat = 12.5\nfault = 'tec.melt'\n")
-    code, out, err = bench(
-        "run", "creep", "--rig", "vo2", "--clock", "virtual", "--out", tmp_path / "runs",
-        "--faults", tmp_path / "faults.toml",
-    )  # fmt: skip
-    assert (code, out) == (2, "")
-    assert (
-        "fault 1 of the schedule: the VO2 laboratory has no fault 'tec.melt'; it has: tec-over-current"
-        in " ".join(err.split())
-    )
-    assert not (tmp_path / "runs").exists()
 
 
 LABORATORIES = {rig: make(rig) for rig in RIGS}
