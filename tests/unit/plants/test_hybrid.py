@@ -87,17 +87,8 @@ class TestGeometry:
         volts = strip.piezo_coefficient / ep / (3.3e-6 - 17e-6)
         assert piezo_sensitivity(strip) == pytest.approx(-volts * thermal_sensitivity(strip), rel=1e-9)
 
-    @cases("wrong", [{"length": 0.0}, {"passive_heat": -1.0}, {"piezo_coefficient": math.nan}])
-    def test_wrong_strips_are_refused(self, wrong):
-        with pytest.raises(ValueError, match=next(iter(wrong))):
-            Bimorph(**wrong)
-
 
 class TestParameters:
-    def test_parameters_are_frozen(self):
-        with pytest.raises(dataclasses.FrozenInstanceError):
-            PLAIN.seebeck = 2.0
-
     def test_wrong_commands_are_refused_and_change_nothing(self):
         plant = make()
         before = snapshot(plant)
@@ -199,24 +190,6 @@ class TestHeat:
             temperatures = exact[:, -1]
         assert worst < 5e-4
 
-    def test_error_falls_with_the_square_of_the_step(self):
-        errors = []
-        exact = solve_ivp(
-            lambda _, y: slope(y, 0.15, PLAIN), (0.0, 4.0), np.full(14, 22.0), method="LSODA", rtol=1e-12, atol=1e-12
-        ).y[:, -1]
-        for step in (0.04, 0.02, 0.01):
-            plant = make(dataclasses.replace(PLAIN, step=step))
-            plant.drive(0.15)
-            plant.advance(4.0)
-            errors.append(np.abs(plant._rise + 22.0 - exact).max())
-        assert errors[0] > 3.0 * errors[1] > 9.0 * errors[2]
-
-    @cases("current", [-0.3, 0.1])
-    def test_settled_heat_to_air_is_the_electrical_power(self, current):
-        plant = settled(current)
-        assert plant.current * plant.tec_voltage > 1e-4
-        assert abs(plant.heat_to_air - plant.current * plant.tec_voltage) < 1e-9
-
     def test_energy_is_kept_on_the_way(self):
         plant = make()
         stored = plant.stored_heat
@@ -255,14 +228,6 @@ class TestRoom:
         deviation = values - values.mean()
         correlation = np.mean(deviation[20:] * deviation[:-20]) / values.var()
         assert correlation == pytest.approx(math.exp(-1.0), abs=0.05)
-
-    def test_sessions_differ_and_leave_the_rng_alone(self):
-        first, second = make(LIVELY, 1), make(LIVELY, 2)
-        assert first.ambient_temperature != second.ambient_temperature
-        assert first.base_temperature == first.ambient_temperature
-        rng, untouched = np.random.default_rng(5), np.random.default_rng(5)
-        HybridCantilever(LIVELY, rng).advance(100.0)
-        assert rng.standard_normal() == untouched.standard_normal()
 
     def test_a_step_of_the_room_moves_everything_in_the_end(self):
         plant = make()
@@ -436,11 +401,6 @@ class TestTime:
         assert np.allclose(snapshot(whole), snapshot(cut), rtol=1e-12, atol=1e-15)
         assert whole.deflection == pytest.approx(cut.deflection, abs=1e-15)
 
-    def test_a_fast_loop_s_steps_do_not_change_the_trajectory(self):
-        whole = play(LIVELY, [])
-        cut = play(LIVELY, [50e-6 * n for n in range(24_000)])
-        assert np.allclose(snapshot(whole), snapshot(cut), rtol=1e-10, atol=1e-15)
-
     def test_a_voltage_that_is_led_goes_in_even_steps_at_the_middles_of_the_lag(self):
         led, by_hand, cut = make(LIVELY), make(LIVELY), make(LIVELY)
         for plant in (led, by_hand, cut):
@@ -478,16 +438,6 @@ class TestTime:
         assert plant.piezo_voltage == 5.0
         with pytest.raises(ValueError, match="voltage must lie within"):
             plant.lead(0.0, 61.0, 1, 20e-6)
-
-    def test_hours_at_once_or_in_pieces(self):
-        whole, cut = make(LIVELY), make(LIVELY)
-        for plant in (whole, cut):
-            plant.drive(0.1)
-            plant.apply(10.0)
-        whole.advance(2 * 3600.0)
-        for _ in range(7200):
-            cut.advance(1.0)
-        assert np.allclose(snapshot(whole), snapshot(cut), rtol=1e-12, atol=1e-15)
 
     def test_a_current_acts_at_once_on_the_grid_and_else_from_the_next_point(self):
         plant = make()
@@ -534,11 +484,6 @@ class TestTime:
         assert np.abs(np.diff(moves)).max() < 1e-11
         assert moves.min() > 0.0
 
-    def test_snapshot_is_every_output(self):
-        plant = play(LIVELY, [])
-        for name, value in snapshot(plant)._asdict().items():
-            assert getattr(plant, name) == value
-
 
 class TestTemperatureControl:
     def test_reaches_the_target_from_either_side(self):
@@ -564,11 +509,6 @@ class TestTemperatureControl:
         plant.regulate(-100.0)
         plant.advance(300.0)
         assert abs(plant.current) <= PLAIN.maximum_current
-
-    def test_takes_over_without_a_jump(self):
-        plant = settled(0.05)
-        plant.regulate(plant.base_temperature)
-        assert plant.current == pytest.approx(0.05, rel=1e-9)
 
 
 class TestBehindAController:
@@ -599,13 +539,3 @@ class TestBehindAController:
         for asked, held in ((4.0, PLAIN.maximum_current), (-4.0, -PLAIN.maximum_current)):
             tec.set(asked)
             assert plant.current == held
-
-    def test_temperature_mode(self):
-        plant, tec, clock = self.make()
-        tec.write_parameter(2030, 0.15)
-        tec.select_mode(TECMode.TEMPERATURE)
-        status = tec.set(32.0)
-        clock.sleep(120.0)
-        assert tec.measure()["tec_temperature"] == pytest.approx(32.0, abs=0.02)
-        status.wait()
-        assert plant.current == pytest.approx(0.05, abs=0.02)

@@ -1,12 +1,9 @@
 import copy
-import dataclasses
 import math
 
 import numpy as np
 import pytest
-from cases import cases
 from hypothesis import given, settings, strategies as st
-from plant_outputs import snapshot
 
 from sim_devices.plants import _sma_kernels as kernels
 from sim_devices.plants.sma import SMAParameters, SMAWire, grain_table
@@ -76,14 +73,6 @@ class TestSpecimen:
         assert width.min() == 3.0
         assert detwin.min() == 5.0
         assert np.all(retwin <= detwin - 10.0)
-
-    def test_another_seed_is_another_specimen(self):
-        other = grain_table(dataclasses.replace(PLAIN, specimen_seed=7))
-        assert not np.array_equal(other, grain_table(PLAIN))
-
-    def test_starts_mostly_oriented(self):
-        wire = make()
-        assert 0.5 < wire.oriented_fraction < wire.martensite_fraction < 1.0
 
 
 class TestRanges:
@@ -179,18 +168,6 @@ class TestGrains:
             assert np.array_equal(oriented, expected[1])
             assert counts == (expected[0].sum(), expected[1].sum())
 
-    @given(st.floats(0.0, 140.0), st.floats(0.0, 600.0), st.integers(0, 20))
-    @settings(max_examples=60, deadline=None)
-    def test_nothing_changes_while_nothing_changes(self, temperature, stress, seed):
-        grains, martensite, oriented = random_grains(seed)
-        # Twice: a grain that has lost its orientation is less stable, which the next update sees.
-        for _ in range(2):
-            kernels.update_grains(temperature, stress, 0.4, grains, martensite, oriented)
-        before = martensite.copy(), oriented.copy()
-        kernels.update_grains(temperature, stress, 0.4, grains, martensite, oriented)
-        assert np.array_equal(martensite, before[0])
-        assert np.array_equal(oriented, before[1])
-
     @given(st.floats(0.0, 140.0), st.lists(st.floats(0.0, 600.0), min_size=2, max_size=30), st.integers(0, 20))
     @settings(max_examples=60, deadline=None)
     def test_trial_length_never_falls_with_stress(self, temperature, stresses, seed):
@@ -234,20 +211,6 @@ class TestGrains:
         # A trial leaves the committed state alone.
         assert np.array_equal(martensite, before[0])
         assert np.array_equal(oriented, before[1])
-
-    @cases("celsius_volt", [0.0, 1.2, 1.8, 3.0])
-    def test_length_is_monotone_along_a_monotone_load(self, celsius_volt):
-        wire = make()
-        wire.apply(celsius_volt)
-        wire.advance(100.0)
-        loads = np.linspace(0.0, 18.0, 120)
-        for path in (loads, loads[::-1]):
-            lengths = []
-            for load in path:
-                wire.hang(float(load))
-                wire.advance(0.1)
-                lengths.append(wire.length)
-            assert np.all(np.diff(lengths) * (path[-1] - path[0]) >= -1e-12)
 
     def test_plant_equals_a_brute_force_of_all_grains(self):
         """Follow a wire under dead loads through every sub-step."""
@@ -310,16 +273,6 @@ class TestGrains:
                 assert np.array_equal(wire._parts.oriented, thorough._parts.oriented)
         assert used > 40
 
-    def test_memory_of_a_large_step_is_that_of_small_ones(self):
-        once, bit_by_bit = make(), make()
-        once.hang(9.0)
-        once.advance(0.1)
-        for load in np.linspace(0.0, 9.0, 73):
-            bit_by_bit.hang(float(load))
-            bit_by_bit.advance(0.1)
-        assert np.array_equal(once._parts.oriented, bit_by_bit._parts.oriented)
-        assert once.length == bit_by_bit.length
-
 
 class TestClamped:
     def test_finer_grains_meet_the_length_more_closely(self):
@@ -332,36 +285,6 @@ class TestClamped:
             # One grain's worth of transformation strain: closer the imposed length cannot be met.
             one_grain = parameters.transformation_strain * parameters.rest_length / parameters.grain_count
             assert abs(wire.position - wire.length - wire.force / parameters.series_stiffness) <= 1.01 * one_grain
-
-    @cases("voltage", [0.0, 1.4])
-    def test_solution_stays_the_solution(self, voltage):
-        """A solved state, solved again, is the same: on the way out and back, at every grain's switch."""
-        wire = make()
-        wire.apply(voltage)
-        wire.advance(200.0)
-        out = np.linspace(0.0, 4e-3, 60)
-        for place in [*out, *out[::-1]]:
-            wire.clamp(float(place))
-            wire.advance(0.1)
-            stress = float(wire._state[kernels.STRESS])
-            again = kernels.solve_stress(
-                float(wire._state[kernels.POSITION]),
-                wire.temperature,
-                stress,
-                wire._parts,
-            )
-            assert again == pytest.approx(stress, abs=1e-7)
-
-    def test_holding_still_holds_the_force(self):
-        wire = make()
-        wire.clamp(1.5e-3)
-        wire.apply(1.6)
-        wire.advance(300.0)
-        before = snapshot(wire)
-        wire.advance(600.0)
-        after = snapshot(wire)
-        assert after.force == pytest.approx(before.force, abs=1e-6)
-        assert after.oriented_fraction == before.oriented_fraction
 
 
 class TestConditioning:

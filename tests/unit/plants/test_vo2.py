@@ -1,6 +1,5 @@
 import dataclasses
 import math
-import time
 
 import numpy as np
 import pytest
@@ -89,22 +88,12 @@ class TestSpecimen:
         other = relay_thresholds(dataclasses.replace(QUIET, specimen_seed=7))
         assert not np.array_equal(other[0], relay_thresholds(QUIET)[0])
 
-    def test_parameters_are_frozen(self):
-        with pytest.raises(dataclasses.FrozenInstanceError):
-            QUIET.coupling = 2.0
-
 
 class TestHysteresis:
     def test_range_of_the_major_loop(self, major_loop):
         curvature = np.concatenate([branch[:, 1] for branch in major_loop])
         assert curvature.min() == pytest.approx(-96.0, abs=1.5)
         assert curvature.max() == pytest.approx(1838.0, abs=2.5)
-
-    def test_ends_are_saturated(self, major_loop):
-        up, down = major_loop
-        assert up[0, 2] == down[-1, 2] == 0.0
-        assert up[-1, 2] == 1.0
-        assert up[-1, 1] == pytest.approx(8.0 + 2034.0 - 4.25 * 64.0)
 
     def test_loop_is_not_monotone(self, major_loop):
         # Expansion bends against the transition at both ends of either branch.
@@ -113,12 +102,6 @@ class TestHysteresis:
             assert slopes[0] < 0.0
             assert slopes[-1] < 0.0
             assert slopes.max() > 200.0
-
-    def test_steepest_slope(self, major_loop):
-        steepest = max(
-            np.max((branch[10:, 1] - branch[:-10, 1]) / (branch[10:, 0] - branch[:-10, 0])) for branch in major_loop
-        )
-        assert 260.0 < steepest < 305.0
 
     @cases("turn", [60.0, 63.0, 66.0])
     def test_curve_is_locked_after_a_reversal(self, turn):
@@ -129,13 +112,6 @@ class TestHysteresis:
         assert -4.3 < locked < -2.0
         # By 4 K the transition runs back and the curvature falls below where it turned.
         assert back[-1, 1] < back[:, 1].max() - 5.0
-
-    def test_reversal_on_the_cooling_branch_locks_too(self):
-        plant = make()
-        quasi_static(plant, [84.0])
-        quasi_static(plant, staircase(84.0, 60.0, 0.1), dwell=2.0)
-        back = quasi_static(plant, staircase(60.0, 61.0, 0.1))
-        assert -4.3 < back[-1, 1] - back[0, 1] < -2.0
 
     def test_coupling_breaks_congruency(self):
         """Minor loops between the same temperatures differ in height: no Preisach operator does that."""
@@ -249,30 +225,6 @@ class TestRegulatedPlate:
             exact = 52.0 - 2.0 * math.exp(-damping * frequency * t) * wave
             assert plant.plate_temperature == pytest.approx(exact, abs=1e-9)
 
-    def test_slew_limit(self):
-        plant = make()
-        rates = []
-        for target in (84.0, 21.0):
-            plant.regulate(target)
-            for _ in range(300):
-                plant.advance(0.05)
-                rates.append(plant.plate_rate)
-        assert max(rates) == pytest.approx(15.0)
-        assert min(rates) == pytest.approx(-15.0)
-
-    def test_current_limit_saturates_the_slew(self):
-        plant = make()
-        plant.regulate(84.0, current_limit=1.5)
-        current, rate = [], []
-        for _ in range(1200):
-            plant.advance(0.05)
-            current.append(plant.current)
-            rate.append(plant.plate_rate)
-        assert max(np.abs(current)) <= 1.5 + 1e-9
-        assert max(current) == pytest.approx(1.5)
-        assert 5.0 < max(rate) < 12.0
-        assert plant.plate_temperature == pytest.approx(84.0, abs=1e-3)
-
     def test_target_out_of_reach_of_the_limit(self):
         plant = make()
         plant.regulate(84.0, current_limit=0.5)
@@ -320,15 +272,6 @@ class TestPeltier:
         plant.advance(600.0)
         assert plant.plate_temperature == pytest.approx(target, abs=0.01)
 
-    def test_range_within_four_ampere(self):
-        warm, cold = make(), make()
-        warm.drive(4.0)
-        cold.drive(-4.0)
-        warm.advance(10.0)
-        cold.advance(10.0)
-        assert warm.plate_temperature > 84.0
-        assert cold.plate_temperature < 15.0
-
     @cases("mode", ["drive", "regulate"])
     def test_energy_is_conserved(self, mode):
         """Electrical work equals the heat stored in plate and sink plus what went into the room."""
@@ -358,18 +301,6 @@ class TestPeltier:
         assert work > 1000.0
         assert stored + loss == pytest.approx(work, rel=0.01)
 
-    def test_current_explains_temperature_and_rate(self):
-        plant = make()
-        p = plant.parameters
-        for command in (lambda: plant.regulate(70.0), lambda: plant.drive(-2.0), plant.release):
-            command()
-            for _ in range(40):
-                plant.advance(0.05)
-                plate, sink, current = plant.plate_temperature, plant.sink_temperature, plant.current
-                heat = p.seebeck * (plate + 273.15) * current + 0.5 * p.resistance * current**2
-                heat -= p.conductance * (plate - sink) + p.plate_loss * (plate - p.ambient_temperature)
-                assert plant.plate_rate == pytest.approx(heat / p.plate_capacity, abs=1e-9)
-
     def test_release_relaxes_to_ambient(self):
         plant = make()
         plant.regulate(84.0)
@@ -388,12 +319,6 @@ class TestPeltier:
         plant.advance(3600.0)
         assert plant.plate_temperature == pytest.approx(22.0, abs=1e-3)
         assert plant.sink_temperature == pytest.approx(22.0, abs=1e-3)
-
-    def test_untouched_plant_stays_at_ambient(self):
-        plant = make()
-        plant.advance(3600.0)
-        assert plant.plate_temperature == plant.sink_temperature == 22.0
-        assert plant.current == 0.0
 
     def test_changing_modes_is_bumpless(self):
         plant = make()
@@ -458,18 +383,6 @@ class TestNoise:
         lagged = np.mean(drift[:-3] * drift[3:]) / drift.var()
         assert lagged == pytest.approx(math.exp(-1.0), abs=0.12)
 
-    def test_wander_is_stationary_from_the_start_and_drift_begins_at_the_offset(self):
-        starts = [make(SMALL, seed=s).film_temperature - 22.0 for s in range(300)]
-        assert np.std(starts) == pytest.approx(0.03, rel=0.15)
-
-    def test_wander_does_not_show_on_the_plate(self):
-        noisy, quiet = make(VO2Parameters()), make(QUIET)
-        for plant in (noisy, quiet):
-            plant.regulate(60.0)
-            plant.advance(7.3)
-        assert noisy.plate_temperature == quiet.plate_temperature
-        assert noisy.current == quiet.current
-
     def test_session_offset_shifts_the_film(self):
         path = [64.0, 60.0, 65.5]
         plain, shifted = (make(VO2Parameters(session_offset=x), seed=4) for x in (0.0, 0.2))
@@ -495,13 +408,6 @@ class TestOutputs:
             assert deflection == pytest.approx(exact, rel=1e-8)
         assert abs(deflection) <= abs(curvature) * length**2 / 2 * (1 + 1e-12) + 1e-300
 
-    def test_series_joins_smoothly(self):
-        length = 300e-6
-        edge = 2e-4 / length
-        below = arc_deflection(edge * (1 - 1e-12), length)
-        assert below == pytest.approx(arc_deflection(edge * (1 + 1e-12), length), rel=1e-11)
-        assert arc_deflection(0.0, length) == 0.0
-
     def test_hot_deflection(self):
         assert arc_deflection(1846.0, 300e-6) == pytest.approx(80.97e-6, rel=1e-4)
         for residual in (0.0, 500.0):
@@ -511,20 +417,6 @@ class TestOutputs:
             expected = arc_deflection(total, 300e-6) - arc_deflection(residual, 300e-6)
             assert plant.tip_deflection == expected
             assert plant.tip_deflection > 7e-5
-
-    def test_residual_curvature_lowers_the_deflection(self):
-        straight, bent = make(QUIET), make(dataclasses.replace(QUIET, residual_curvature=1000.0))
-        for plant in (straight, bent):
-            quasi_static(plant, [70.0], dwell=20.0)
-        assert bent.curvature == straight.curvature
-        assert bent.tip_deflection < straight.tip_deflection
-
-    def test_snapshot_agrees_with_the_outputs(self):
-        plant = make(VO2Parameters())
-        quasi_static(plant, [64.0])
-        for name, value in snapshot(plant)._asdict().items():
-            assert value == getattr(plant, name)
-            assert type(value) is float
 
 
 class TestTime:
@@ -548,64 +440,10 @@ class TestTime:
                 split.advance(part * 1e-6)
             assert snapshot(split) == snapshot(whole)
 
-    @cases("part", [0.01, 0.0123, 1.0 / 3.0, 0.7, 60.0])
-    def test_hours_in_parts(self, part):
-        """Rounding does not add up, and blocks of noise are used up alike."""
-        whole, split = make(SMALL), make(SMALL)
-        parts = min(20000, round(3600.0 / part))
-        for plant in (whole, split):
-            plant.regulate(62.0)
-        for _ in range(parts):
-            split.advance(part)
-        whole.advance(part * parts)
-        assert snapshot(split) == snapshot(whole)
-
-    def test_time_stamps_of_a_real_clock(self):
-        """Differences of a clock that counts from 1970 are rounded to a quarter of a microsecond."""
-        first, second = make(SMALL), make(SMALL)
-        begin = now = 1_700_000_000.0
-        for k in range(1, 2001):
-            later = begin + 0.05 * k
-            first.regulate(30.0 + k % 40)
-            first.advance(later - now)
-            now = later
-            second.regulate(30.0 + k % 40)
-            second.advance(0.05)
-            assert snapshot(first) == snapshot(second)
-
-    def test_outputs_are_held_between_grid_points(self):
-        plant = make()
-        plant.regulate(60.0)
-        begin = snapshot(plant)
-        plant.advance(0.03)
-        assert snapshot(plant) == begin
-        plant.advance(0.02)
-        assert snapshot(plant) != begin
-
     def test_one_seed_one_trajectory(self):
         runs = [quasi_static(make(VO2Parameters(), seed=s), [60.0, 66.0, 62.0]) for s in (1, 1, 2)]
         assert np.array_equal(runs[0], runs[1])
         assert not np.array_equal(runs[0], runs[2])
-
-    def test_other_users_of_the_generator_do_not_disturb(self):
-        rng = np.random.default_rng(1)
-        plant = VO2Cantilever(SMALL, rng)
-        rng.standard_normal(1000)
-        reference = make(SMALL, seed=1)
-        for each in (plant, reference):
-            each.advance(1000.0)
-        assert snapshot(plant) == snapshot(reference)
-
-    def test_nine_hours_take_seconds(self):
-        plant = make(VO2Parameters())
-        plant.regulate(63.0)
-        plant.advance(1.0)
-        begin = time.perf_counter()
-        for k in range(4000):
-            plant.regulate(54.0 + 30.0 * math.sin(0.02 * k))
-            plant.advance(8.0)
-        # Measured 0.15 s; the bound is for a busy machine.
-        assert time.perf_counter() - begin < 30.0
 
 
 class TestRefusals:
