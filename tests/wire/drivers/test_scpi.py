@@ -12,6 +12,7 @@ from text_laboratory import SUPPLY, Laboratory
 from bench.base import ConfigurationError, DeviceConnectionError, DeviceError, VirtualClock
 from bench.contracts import ActuatorContract, SilentInstrumentContract
 from drivers.scpi import SCPIActuator, SCPISensor, SCPIVoltageSupply
+from sim_devices import protocol_emulated
 from sim_devices.wire.text import TextServer
 
 
@@ -487,6 +488,12 @@ def test_what_the_queue_answers_when_it_is_empty(stack, no_error, answer, is_err
         device.measure()
 
 
+def test_a_message_that_the_encoding_lacks(lab):
+    device = lab.connect()
+    with pytest.raises(DeviceError, match="'UNIT °C' cannot be written in ascii"):
+        device._line.tell("UNIT °C")
+
+
 def test_a_line_that_never_falls_silent(lab):
     device = lab.connect()
     lab.answer = lambda *_: b"nonsense\n" * 100
@@ -519,6 +526,20 @@ def test_questions_are_sent_three_times_at_most_and_those_to_reconnect_once(lab)
     with pytest.raises(DeviceConnectionError, match="after 1 request;"):
         device.reconnect()
     assert lab.requests == ["*IDN?"]
+
+
+def test_lost_while_reading(lab):
+    device = lab.connect()
+
+    def pull_out(data, usual):
+        protocol_emulated.unregister("scpi-test")
+        return b""
+
+    lab.answer = pull_out
+    with pytest.raises(DeviceConnectionError, match="lost the line"):
+        device.glance()
+    assert device._line.lost
+    protocol_emulated.register("scpi-test", lab.server, lab.clock)
 
 
 @cases(

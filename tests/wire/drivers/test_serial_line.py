@@ -13,6 +13,7 @@ from drivers.serial_line import (
     RESENDS,
     PatientPort,
     SerialSettings,
+    forget_received,
     open_port,
     patient,
     settle_line,
@@ -125,6 +126,23 @@ def test_a_line_that_never_falls_silent_is_an_error(chatter):
     with pytest.raises(OSError, match="does not fall silent"):
         settle_line(port, 0.25)
     assert port.timeout == 0.7
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs pseudo-terminals")
+def test_what_a_port_has_received_cannot_be_forgotten_once_it_is_gone():
+    master, slave = os.openpty()
+    port = opened(os.ttyname(slave))
+    os.write(master, b"abc")
+    forget_received(port)
+    assert port.in_waiting == 0
+    os.close(master)
+    os.close(slave)
+    # termios raises an error of its own here, which is no OSError.
+    with pytest.raises(OSError, match=r"5|error"):
+        forget_received(port)
+    port.close()
+    with pytest.raises(OSError, match="not open"):
+        forget_received(port)
 
 
 class LatePort:
