@@ -59,14 +59,6 @@ class TestStatus:
         status.wait()
         assert len(asked) == 1
 
-    def test_completed_is_complete_at_once(self):
-        clock = VirtualClock()
-        status = Status.completed("tec", clock)
-        assert status.done
-        assert status.success
-        status.wait()
-        assert clock.now() == 0.0
-
     def test_a_fault_of_the_device_fails_it(self):
         def arrived():
             raise DeviceError("tec", "sensor open")
@@ -84,12 +76,6 @@ class TestStatus:
         with pytest.raises(DeviceError, match="did not arrive within 30 s"):
             status.wait()
         assert clock.now() == 30.0
-
-    def test_arriving_at_the_very_deadline_counts(self):
-        clock = VirtualClock()
-        status = Status("tec", clock, lambda: clock.now() >= 30.0, timeout=30.0, interval=30.0)
-        status.wait()
-        assert status.success
 
     def test_callback_after_completion_comes_at_once(self):
         status = Status.completed("tec", VirtualClock())
@@ -187,11 +173,6 @@ class TestSetpoints:
         assert caught.value.device == "tec"
         assert tec.calls == []
         assert math.isnan(tec.setpoint)
-
-    @pytest.mark.parametrize("value", [10.0, 95.0])
-    def test_the_ends_are_allowed(self, rig, value):
-        rig.devices["tec"].set(value)
-        assert rig.devices["tec"].sent == [value]
 
 
 class TestRoles:

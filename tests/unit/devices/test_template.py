@@ -7,7 +7,7 @@ import pytest
 from cases import cases
 from hypothesis import assume, given, strategies as st
 
-from bench.devices import Template, template, written_number
+from bench.devices import Template, template
 
 finite = st.floats(-1e30, 1e30)
 
@@ -70,16 +70,6 @@ def test_any_answer_is_a_number_or_none(message, form):
     if numbers is None and form == "{value}":
         text = message.strip()
         assert not re.fullmatch(r"[-+]?[0-9]{1,9}(\.[0-9]{1,9})?([eE][-+]?[0-9])?", text)
-
-
-@given(value=finite)
-def test_a_number_in_any_notation_of_the_standard_is_read(value):
-    for text in (f"{value:.6E}", f"{value:+.6E}", f"{value:.3f}", f"{value:.0f}", repr(value)):
-        assert Template("{value}").match(text) == {"value": float(text)}
-
-
-def test_a_command_rounds_to_its_digits():
-    assert written_number(Template("VOLT {value:.1f}"), 1.26) == 1.3
 
 
 BESIDE = st.text("0123456789.,;:eE+- \tmVuA%°x", max_size=6)
