@@ -9,12 +9,11 @@ from short_runs import record_run
 
 from bench.base import DataError
 from bench.models import PrandtlIshlinskii
-from bench.record import FILE_NAME, Record, Table
+from bench.record import FILE_NAME, Table
 from rigs.hybrid.identification import (
     BASE,
     CURRENT,
     DEFLECTION,
-    TIP,
     VOLTAGE,
     Samples,
     bandwidth_of,
@@ -88,12 +87,6 @@ class TestReading:
         assert samples[BASE][299] < 20.0 < samples[BASE][0]
         assert samples[DEFLECTION][299] > 30e-6
 
-    def test_a_fast_one(self, runs):
-        samples = read_loop(runs["piezo-step"])
-        assert samples.period == pytest.approx(50e-6, rel=1e-9)
-        assert len(samples.times) == round(0.17 * 20e3)
-        assert np.flatnonzero(samples[VOLTAGE])[0] == 400
-
     def test_several_by_their_labels(self, runs):
         loops = read_loops(runs["current-sine"])
         assert list(loops) == ["0.003 Hz", "0.006 Hz"]
@@ -102,14 +95,6 @@ class TestReading:
             assert samples.period == pytest.approx(2.0, rel=1e-12)
         with pytest.raises(DataError, match=r"current-sine.*: expected one fast loop, found 2"):
             read_loop(runs["current-sine"])
-
-    def test_ticks_are_no_samples(self, tmp_path):
-        result = record_short_run(tmp_path, "current-sine", frequencies="0.01", rate="0.1")
-        with Record(result.folder) as record:
-            assert len(record.telemetry()) > 50
-        samples = read_loop(result.folder)
-        assert len(samples.times) == 20
-        assert samples.period == pytest.approx(10.0)
 
     def test_two_loops_of_one_label_are_refused(self, tmp_path):
         result = record_short_run(tmp_path, "current-sine", frequencies="0.01, 0.01")
@@ -161,13 +146,6 @@ class TestSine:
         values = np.sin(2 * np.pi * 0.1 * times) + np.where(times < 10.0, 5.0 * (10.0 - times), 0.0)
         assert sine_at(made_up(0.1, y=values), "y", 0.1) == pytest.approx(1.0, abs=1e-12)
 
-    def test_noise_averages_out(self):
-        times = np.arange(20_000) / 10.0
-        noise = np.random.default_rng(1).standard_normal(times.size)
-        found = sine_at(made_up(0.1, y=np.cos(2 * np.pi * 0.1 * times) + noise), "y", 0.1)
-        # Standard deviation of each part: the square root of 2 / N.
-        assert abs(found - 1j) < 5 * math.sqrt(2 / times.size)
-
     def test_a_period_need_not_be_a_whole_number_of_samples(self):
         """Two periods of 3 mHz at 0.5 Hz are 333 samples and a third."""
         for periods in (2, 3, 4, 5):
@@ -208,10 +186,6 @@ class TestBandwidth:
         frequencies = np.array([1.0, 2.0, 8.0])
         gains = np.array([1.0, 1.0, 0.25])
         assert bandwidth_of(frequencies, gains) == pytest.approx(2.0 * math.sqrt(2.0), rel=1e-12)
-
-    def test_at_one_of_the_frequencies(self):
-        frequencies = np.array([1.0, 3.0, 10.0])
-        assert bandwidth_of(frequencies, np.array([1.0, math.sqrt(0.5), 0.1])) == pytest.approx(3.0)
 
     def test_a_bump_that_stays_above_does_not_count(self):
         gains = np.array([1.0, 0.8, 1.5, 0.6, 0.9])
@@ -261,16 +235,6 @@ class TestPiezo:
         assert found.voltages[0] == 0.0
         np.testing.assert_array_equal(found.voltages[1:], samples[VOLTAGE][:-1])
 
-    @cases("plays", [1, 5, 30])
-    def test_as_many_plays_as_wanted(self, plays):
-        found = identify_piezo(self.samples(np.zeros_like), plays)
-        assert found.operator.thresholds.size == plays
-
-    def test_of_a_run(self, runs, found):
-        again = identify_piezo(read_loop(runs["piezo-loops"]))
-        np.testing.assert_array_equal(again.operator.weights, found.piezo.operator.weights)
-        assert again.errors.rms_percent <= 1.0
-
 
 class TestIdentifying:
     def test_each_part(self, found):
@@ -294,10 +258,6 @@ class TestIdentifying:
         measured = samples[DEFLECTION] - samples[DEFLECTION][0]
         assert np.ptp(measured) > 10e-6
         assert np.std(measured - response.deflections) < 0.05 * np.ptp(measured)
-
-    def test_other_numbers_of_plays(self, runs):
-        found = identify_hybrid(*(runs[name] for name in PARTS), plays=4)
-        assert found.model.hysteresis.thresholds.size == 4
 
     @cases("place", range(4))
     @cases("other", [*PARTS, "hybrid-excitation"])
@@ -335,8 +295,3 @@ class TestIdentifying:
         empty = record_short_run(tmp_path, protocol, **settings).folder
         with pytest.raises(DataError, match=words):
             identify_hybrid(*(empty if name == protocol else runs[name] for name in PARTS))
-
-    def test_tip_and_base_are_not_taken_for_each_other(self, runs):
-        samples = read_loop(runs["current-steps"])
-        # The base goes first and farther.
-        assert np.ptp(samples[BASE]) > np.ptp(samples[TIP]) > 10.0

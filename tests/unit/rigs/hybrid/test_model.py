@@ -11,7 +11,6 @@ from hypothesis import given, strategies as st
 from scipy import signal
 from scipy.integrate import solve_ivp
 
-from bench.identification import ThirdOrder
 from bench.models import Polynomial, PrandtlIshlinskii
 from rigs.hybrid.design import Design
 from rigs.hybrid.model import PUBLISHED_DYNAMICS, HybridModel, choose_order, identify_pi, identify_polynomial
@@ -97,13 +96,6 @@ def test_equals_an_independent_integration():
     assert (response.deflections == response.thermal + response.piezo).all()
 
 
-def test_does_not_depend_on_the_time_step():
-    currents, voltages = np.repeat([0.1, -0.1, 0.02], 4), np.tile([10.0, -30.0, 35.0, 0.0], 3)
-    coarse = model().simulate(currents, voltages, 0.5)
-    fine = model().simulate(np.repeat(currents, 500), np.repeat(voltages, 500), 1e-3)
-    assert fine.deflections[::500] == pytest.approx(coarse.deflections, abs=1e-8 * MICRO)
-
-
 def test_settles_at_polynomial_and_hysteresis():
     response = model().simulate(np.full(400, 0.1), np.full(400, 30.0), 20.0)
     rise = NETWORK.steady_rises(0.1)[TIP]
@@ -123,40 +115,12 @@ def test_rests_at_zero_whatever_the_zero_of_the_sensor():
     assert driven.deflections == pytest.approx(plain.deflections, abs=1e-9 * MICRO)
 
 
-def test_gain_of_the_dynamics_does_not_count():
-    other = ThirdOrder(
-        0.3,
-        PUBLISHED_DYNAMICS.real_pole,
-        PUBLISHED_DYNAMICS.frequency,
-        PUBLISHED_DYNAMICS.damping,
-        PUBLISHED_DYNAMICS.numerator,
-    )
-    inputs = np.zeros(50), np.full(50, 20.0), 1e-3
-    one, two = model().simulate(*inputs), model(dynamics=other).simulate(*inputs)
-    assert (one.deflections == two.deflections).all()
-    peak = model().simulate(np.zeros(400), np.full(400, 40.0), 2.5e-5).piezo.max()
-    assert peak / plays().evaluate([40.0])[0] == pytest.approx(1.265, abs=1e-3)
-
-
 def test_room_that_warms_bends_the_cantilever():
     air = np.where(np.arange(200) < 5, 22.0, 24.0)
     response = model().simulate(np.zeros(200), np.zeros(200), 30.0, air)
     assert (response.deflections[:6] == 0.0).all()
     assert response.thermal[-1] == pytest.approx(quartic(2.0), rel=1e-3)
     assert model(reference=24.0).simulate([0.0], [0.0], 1.0, 24.0).deflections[0] == 0.0
-
-
-def test_bandwidth_of_the_deflection():
-    assert 4e-3 < model().bandwidth() < 5e-3
-    # A small sine at that frequency about no current: 3 dB less than at rest.
-    frequency = model().bandwidth()
-    dt = 1.0 / (200.0 * frequency)
-    # 20 periods are 10 time constants of the block.
-    sine = 1e-4 * np.sin(2.0 * np.pi * frequency * dt * np.arange(200 * 20))
-    swing = 0.5 * np.ptp(model().simulate(sine, np.zeros(sine.size), dt).thermal[-200:])
-    slope = abs(quartic(1e-4) - quartic(-1e-4)) / 2e-4
-    steady = NETWORK.steady_rises(1e-4)[TIP]
-    assert swing / (slope * steady) == pytest.approx(math.sqrt(0.5), rel=3e-3)
 
 
 def test_json():
@@ -185,15 +149,6 @@ def test_order_is_four_for_a_fourth_order_curve():
     assert found.rms[0] == pytest.approx(np.sqrt(np.mean((curve - expected) ** 2)), rel=0.01)
 
 
-def test_order_choice_is_not_stopped_by_an_order_that_does_not_help():
-    rises = np.linspace(-10.0, 10.0, 41)
-    odd = MICRO * (rises + 0.02 * rises**3)
-    assert choose_order(rises, odd).order == 3
-    assert choose_order(rises, MICRO * rises).order == 1
-    # With a coarser idea of substantial, fewer.
-    assert choose_order(rises, odd, fraction=0.2).order == 1
-
-
 def test_polynomial_is_found_and_its_offset_is_the_sensors():
     rng = np.random.default_rng(1)
     rises = rng.uniform(-16.0, 24.0, 200)
@@ -219,26 +174,6 @@ def test_plays_are_found():
     assert found.model.input_range == pytest.approx((-40.0, 40.0))
     assert found.errors.rms == pytest.approx(1e-9, rel=0.1)
     assert found.certificate.converged
-
-
-def test_plays_fit_another_hysteresis_within_a_percent():
-    voltages = loop()
-    measured = MICRO * bouc_wen(voltages)
-    found = identify_pi(voltages, measured)
-    assert found.errors.rms_percent <= 1.0
-    line = np.polynomial.Polynomial.fit(voltages, measured, 1)(voltages)
-    assert found.errors.rms < 0.25 * np.sqrt(np.mean((measured - line) ** 2))
-
-
-def test_memory_before_the_first_sample():
-    truth = plays()
-    state = truth.advance(truth.initial_state(), [-40.0])
-    voltages = -40.0 + 40.0 * (1.0 - np.cos(4.0 * np.pi * np.arange(1500) / 1500))
-    measured = truth.evaluate(voltages, state)
-    found = identify_pi(voltages, measured, initial="skip")
-    assert found.skip > 0
-    assert found.errors.maximum < 1e-3 * MICRO
-    assert found.model.weights[:8] == pytest.approx(truth.weights[:8], abs=1e-3 * MICRO)
 
 
 @given(

@@ -1,7 +1,7 @@
 """Controllers of the wire's length and force: the thermal lag, the bookkeeping, and how well they do on the plant."""
 
 import math
-from dataclasses import MISSING, fields, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -208,14 +208,6 @@ def test_lag_does_not_depend_on_how_time_is_split(level, time_constant, voltage,
     assert whole.voltage == pytest.approx(math.sqrt(expected), abs=1e-9)
 
 
-def test_lag_settles_and_holds():
-    lag = Lag(5.0, 4.0)
-    assert lag.advance(1000.0, 2.0).level == 4.0
-    assert lag.advance(0.0, 3.0) == lag
-    assert Lag(5.0).advance(5.0, 3.0).level == pytest.approx(9.0 * (1.0 - math.exp(-1.0)))
-    assert Lag(5.0).advance(1e4, 1.5).voltage == pytest.approx(1.5)
-
-
 @given(st.floats(0.0, 9.0), st.floats(0.5, 20.0), st.floats(0.0, 3.0), st.floats(0.2, 20.0))
 def test_lead_meets_its_target_unless_clipped(level, time_constant, target, horizon):
     lag = Lag(time_constant, level)
@@ -228,15 +220,6 @@ def test_lead_meets_its_target_unless_clipped(level, time_constant, target, hori
     else:
         assert arrived**2 == pytest.approx(target**2, abs=1e-9)
         assert LIMITS[0] <= voltage <= LIMITS[1]
-
-
-def test_lead_of_a_cold_and_of_a_hot_wire():
-    share = 1.0 - math.exp(-0.4)
-    assert Lag(5.0).lead(1.0, 2.0, LIMITS) == (pytest.approx(1.0 / math.sqrt(share)), False)
-    assert Lag(5.0).lead(2.5, 2.0, LIMITS) == (3.0, True)
-    assert Lag(5.0, 9.0).lead(1.0, 2.0, LIMITS) == (0.0, True)
-    assert Lag(5.0, 9.0).lead(1.0, 2.0, (0.5, 3.0)) == (0.5, True)
-    assert Lag(5.0, 4.0).lead(2.0, 2.0, LIMITS) == (2.0, False)
 
 
 # On the plant.
@@ -385,20 +368,6 @@ def test_the_argument_stays_between_fixed_ends(inverse):
     assert controller.trace.reference == 5.0
     assert controller.trace.predicted == controller.state.force
     assert math.isnan(controller.trace.disturbance)
-
-
-def test_trace_of_the_closed_loop(inverse):
-    controller = MuscleClosedLoop(task(inverse, 4.9), KNOWN)
-    controller.aim(1e-3, 0.0, 0.0, 2e-3, 4.9)
-    model = inverse.model.step(inverse.model.initial_state(), 0.0, 4.9)[1]
-    trace = controller.trace
-    assert trace.reference == 1e-3
-    # The first reading fixes the disturbance.
-    assert trace.disturbance == pytest.approx(2e-3 - model, abs=1e-9)
-    assert trace.predicted == pytest.approx(2e-3, abs=1e-9)
-    assert 0.0 < trace.uncertainty < 0.02 * MILLIMETRE
-    loop = ReachTarget(controller, 1e-3)
-    assert loop.trace == trace
 
 
 def test_an_exact_model_is_led_to_the_target(inverse):
@@ -613,12 +582,6 @@ def test_no_number_of_a_specimen_stands_in_the_controllers():
     gains = [ProportionalIntegralParameters.of_lag(-1e-3, each) for each in (fast, slow)]
     assert gains[1].integral_time == pytest.approx(10.0 * gains[0].integral_time)
     assert gains[1].gain == pytest.approx(gains[0].gain)
-
-
-def test_what_nothing_says_has_no_default():
-    for kind in (InverseControlParameters, ProportionalIntegralParameters, ForceTask, LengthTask):
-        defaults = {each.name for each in fields(kind) if each.default is not MISSING}
-        assert defaults <= {"power", "duration", "rise", "caution", "model_error"}
 
 
 def test_a_model_without_dynamics_is_refused_unless_the_rig_file_gives_them(inverse):

@@ -10,7 +10,7 @@ from short_runs import record_run
 
 from bench.base import DataError
 from bench.identification import load_model, measure_series, predict_series
-from bench.models import Linear, PrandtlIshlinskii, Preisach, Summed, TwoStage
+from bench.models import Linear, Summed, TwoStage
 from bench.record import FILE_NAME, Record
 from protocols.muscles.force_voltage import scaled_steps
 from rigs.muscles.identification import (
@@ -186,27 +186,6 @@ class TestIdentifying:
         for one in series:
             np.testing.assert_array_equal(predict_series(again.model, one), predict_series(found.model, one))
         assert again.model.to_json() == found.model.to_json()
-
-    def test_stages_are_those_that_the_name_says(self, fitted):
-        two_stage = fitted("two-stage").model
-        assert isinstance(two_stage.first, Preisach)
-        assert isinstance(two_stage.second, Preisach)
-        assert (two_stage.voltage_unit, two_stage.force_unit, two_stage.length_unit) == ("V", "N", "m")
-        plays = fitted("two-stage-prandtl-ishlinskii").model
-        assert plays.first.to_json() == two_stage.first.to_json()
-        assert isinstance(plays.second, PrandtlIshlinskii)
-
-    def test_a_first_stage_identified_before_gives_the_same_models(self, resting, series, fitted):
-        first = identify_resting(resting)
-        for name in ("two-stage", "two-stage-prandtl-ishlinskii"):
-            alone, known = fitted(name), identify_muscle(name, resting, series, first)
-            assert known.model.to_json() == alone.model.to_json()
-            assert known.errors == alone.errors
-
-    def test_the_force_of_the_cold_muscle_is_held(self, resting, fitted):
-        model = fitted("two-stage").model
-        cold = model.first.evaluate(np.zeros(1))[0]
-        assert cold == pytest.approx(resting.forces[0], abs=0.05)
 
     def test_errors_say_what_predictions_miss(self, series, fitted):
         found = fitted("two-stage")

@@ -14,11 +14,7 @@ from rigs.muscles.laboratory import (
     FAN_LINE,
     LOAD,
     STAGE,
-    CoiledPolymerLaboratory,
     Frame,
-    McKibbenLaboratory,
-    MuscleLaboratory,
-    MuscleLaboratorySettings,
     SMALaboratory,
     SMALaboratorySettings,
 )
@@ -71,13 +67,6 @@ class TestFrame:
             assert frame.muscle.force == pytest.approx(load, abs=1e-6)
             positions.append(frame.muscle.position)
         assert positions[0] < positions[1] - 0.5e-3 < positions[2] - 1e-3
-
-    def test_without_a_stage_there_is_nothing_to_be_fastened_to(self):
-        frame = Frame(SMAWire(SMAParameters(), np.random.default_rng(1)))
-        frame.hang(4.9)
-        frame.fasten()
-        frame.advance(1.0)
-        assert frame.muscle.force == pytest.approx(4.9, abs=1e-6)
 
     def test_the_stage_pulls_the_muscle_along(self):
         bench = laboratory()
@@ -149,16 +138,6 @@ class TestFrame:
         for force, position in standing[1:]:
             assert force == pytest.approx(standing[0][0], abs=0.01)
             assert position == pytest.approx(standing[0][1], abs=1e-9)
-
-    def test_how_time_is_split_does_not_matter_under_a_load(self):
-        found = []
-        for pieces in (1, 13):
-            bench = laboratory()
-            bench.operate(LOAD, 4.9)
-            bench.muscle.apply(2.0)
-            wait(bench, 10.0, pieces)
-            found.append((bench.muscle.force, bench.muscle.position))
-        assert found[0] == pytest.approx(found[1], rel=1e-9)
 
     def test_a_line_of_the_t7_switches_the_fan(self):
         with rig() as bench:
@@ -244,25 +223,6 @@ class TestFaults:
         wait(bench, 1.0)
         assert bench.muscle.position == pytest.approx(bench.frame.drum.position, abs=1e-9)
 
-    def test_an_overloaded_servo_lets_go_at_its_instant(self):
-        bench = laboratory(fault="servo-overload", fault_time=2.0)
-        bench.operate(STAGE, 0.0)
-        wait(bench, 1.9)
-        bench.frame.drum.set(5e-3)
-        wait(bench, 10.0)
-        position = bench.frame.drum.position
-        assert 0.0 < position < 4.5e-3
-        wait(bench, 5.0)
-        assert bench.frame.drum.position == position
-
-    def test_it_happens_once(self):
-        bench = laboratory(fault="unplugged-sensor", fault_time=2.0)
-        wait(bench, 3.0)
-        assert bench.magnet.supply_volts == 0.0
-        bench.magnet.supply_volts = 5.0
-        wait(bench, 5.0)
-        assert bench.magnet.supply_volts == 5.0
-
 
 class TestPorts:
     def test_none_is_left_and_they_can_be_opened_again(self):
@@ -277,11 +237,6 @@ class TestPorts:
                 with pytest.raises(serial.SerialException, match="there are: none"):
                     serial.serial_for_url(port)
 
-    def test_closing_what_was_never_opened_does_no_harm(self):
-        with rig() as bench:
-            laboratory().close()
-            assert bench.glance()["load_cell_force"] == pytest.approx(0.0, abs=0.5)
-
     def test_a_second_one_has_ports_of_its_own(self):
         with rig(seed=1) as bench:
             second = laboratory(seed=2)
@@ -292,18 +247,6 @@ class TestPorts:
             assert bench.glance()["load_cell_force"] == pytest.approx(0.0, abs=0.5)
         with rig(seed=2) as bench:
             assert bench.glance()["load_cell_force"] == pytest.approx(0.0, abs=0.5)
-
-    def test_two_in_one_process_do_not_disturb_each_other(self):
-        with rig(seed=1) as first, rig(seed=2) as second:
-            first.laboratory.operate(LOAD, 2.0)
-            second.devices["supply"].set(1.0)
-            for bench in (first, second):
-                bench.clock.sleep_until(5.0)
-            ours, theirs = first.glance(), second.glance()
-            assert ours["load_cell_force"] == pytest.approx(2.0, abs=0.5)
-            assert theirs["load_cell_force"] == pytest.approx(0.0, abs=0.5)
-            assert ours["supply_voltage"] == 0.0
-            assert theirs["supply_voltage"] == pytest.approx(1.0, abs=0.1)
 
 
 class TestNoise:
@@ -350,26 +293,6 @@ class TestSettings:
         with pytest.raises(ConfigurationError, match=f"{name}.toml: emulation.{key} = -1: "):
             load_rig(name, {f"emulation.{key}": "-1"})
         assert getattr(load_rig(name, {f"emulation.{key}": "0"}).laboratory_settings, key) == 0.0
-
-    @cases("kind", [SMALaboratory, McKibbenLaboratory, CoiledPolymerLaboratory])
-    def test_those_of_another_laboratory_are_refused(self, kind):
-        other = SMALaboratory if kind is McKibbenLaboratory else McKibbenLaboratory
-        with pytest.raises(TypeError, match=f"settings: expected {kind.Settings.__name__}"):
-            kind(other.Settings(), VirtualClock(), 1)
-
-    def test_which_muscle_it_is_must_be_said(self):
-        with pytest.raises(TypeError, match="make_muscle"):
-            MuscleLaboratory(MuscleLaboratorySettings(), VirtualClock(), 1)
-
-    def test_another_specimen_answers_otherwise(self):
-        positions = []
-        for specimen in (1, 2):
-            bench = laboratory(specimen_seed=specimen, ambient_deviation=0.0)
-            bench.operate(LOAD, 4.9)
-            bench.muscle.apply(2.0)
-            wait(bench, 20.0)
-            positions.append(bench.muscle.position)
-        assert abs(positions[0] - positions[1]) > 1e-6
 
     def test_the_hardware_rig_is_the_emulated_one_but_for_its_ports(self):
         emulated, real = load_rig("sma"), load_rig("sma-hardware")

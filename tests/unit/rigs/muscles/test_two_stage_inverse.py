@@ -10,7 +10,6 @@ from hypothesis import given, settings, strategies as st
 
 from bench.models import (
     DeadZones,
-    Linear,
     Polynomial,
     PrandtlIshlinskii,
     Preisach,
@@ -19,7 +18,6 @@ from bench.models import (
     TwoStage,
     uniform_levels,
 )
-from rigs.muscles import two_stage_inverse
 from rigs.muscles.two_stage_inverse import TwoStageInverse
 
 
@@ -247,31 +245,12 @@ def test_clamps_and_flags():
     assert stretched.length == pytest.approx(model.second.output_range()[1])
 
 
-def test_force_first_in_the_inverse_too():
-    model = wire(3)
-    inverse = TwoStageInverse(model)
-    state = model.advance([2.0, 1.0], [2.0, 2.0])
-    loaded = model.step(state, 1.0, 8.0)[0]
-    target = np.mean(reachable_lengths(model, state, 8.0))
-    found, again = inverse.voltage_for_length(state, target, 8.0), inverse.voltage_for_length(loaded, target)
-    assert found == again
-
-
 def test_argument_beyond_the_plane():
     model = wire(2)
     inverse = TwoStageInverse(model)
     state = model.advance([1.0, 0.0], [3.0, 20.0])
     assert state.argument > 11.5
     assert inverse.voltage_for_length(state, state.length).voltage == 0.0
-
-
-def test_linear_model_is_inverted_as_a_two_stage_model():
-    model = Linear(3.83, -2.95, preisach(-13.5, 13.5, -1.0, 5.0, 1), (0.0, 3.0), 0.3)
-    inverse = TwoStageInverse(model.two_stage)
-    state = model.advance([2.0, 1.0], [2.0, 4.0])
-    target = np.mean(reachable_lengths(model.two_stage, state))
-    found = inverse.voltage_for_length(state, target)
-    assert model.step(state, found.voltage, 4.0)[1] == pytest.approx(target, abs=1e-9)
 
 
 def signed():
@@ -309,14 +288,3 @@ def test_wrong_input_is_named(make, message):
 def ask(task, *arguments):
     model = wire()
     return getattr(TwoStageInverse(model), task)(model.initial_state(), *arguments)
-
-
-def test_what_counts_as_met_is_a_part_of_the_spans():
-    model = wire()
-    inverse = TwoStageInverse(model)
-    spans = [float(np.ptp(stage.output_range())) for stage in (model.first, model.second)]
-    forces = spans[0] + float(np.ptp(model.second.input_range))
-    assert inverse._tolerances == pytest.approx((1e-10 * forces, 1e-10 * spans[1]), rel=1e-9)
-    assert [two_stage_inverse._flag(5.0 + off, 5.0, 0.25).name for off in (0.25, -0.25, 0.26, -0.26)] == [
-        "MET", "MET", "TOO_LOW", "TOO_HIGH",
-    ]  # fmt: skip

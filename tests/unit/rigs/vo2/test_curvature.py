@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 from cases import cases
-from hypothesis import assume, given, strategies as st
+from hypothesis import given, strategies as st
 from pydantic import ValidationError
 
 from bench.base import DeviceError
@@ -29,11 +29,6 @@ class TestForward:
         assert float(curvature_to_deflection(1846.0, LENGTH)) == pytest.approx(80.97e-6, abs=0.005e-6)
         assert pytest.approx(83.07e-6, abs=0.005e-6) == 1846.0 * LENGTH**2 / 2
 
-    @given(st.floats(1e-12, 1e-3))
-    def test_small_angle_limit(self, curvature):
-        expected = curvature * LENGTH**2 / 2
-        assert float(curvature_to_deflection(curvature, LENGTH)) == pytest.approx(expected, rel=1e-9)
-
     @cases("residual", [0.0, 200.0, -500.0, 1000.0])
     def test_no_change_no_deflection(self, residual):
         assert float(curvature_to_deflection(0.0, LENGTH, residual)) == 0.0
@@ -41,12 +36,6 @@ class TestForward:
     def test_counts_from_the_residual_curvature(self):
         got = float(curvature_to_deflection(1500.0, LENGTH, 400.0))
         assert got == pytest.approx(arc(1900.0) - arc(400.0), rel=1e-12)
-
-    def test_keeps_the_shape(self):
-        assert curvature_to_deflection(np.ones((2, 3)), LENGTH).shape == (2, 3)
-        assert deflection_to_curvature(np.zeros((4, 1)), LENGTH).shape == (4, 1)
-        assert deflection_to_curvature(1e-6, LENGTH).shape == ()
-        assert deflection_to_curvature([], LENGTH).shape == (0,)
 
 
 class TestInverse:
@@ -62,21 +51,6 @@ class TestInverse:
         deflection = curvature_to_deflection(change, length, residual)
         back = float(deflection_to_curvature(deflection, length, residual))
         assert back == pytest.approx(change, rel=1e-10, abs=1e-10 / length)
-
-    @given(st.floats(-0.72, 0.72), st.sampled_from([0.0, 200.0, 500.0, 1000.0]))
-    def test_is_undone_by_the_forward_way(self, share, residual):
-        deflection = share * LENGTH
-        curvature = deflection_to_curvature(deflection, LENGTH, residual)
-        assume(np.isfinite(curvature))
-        back = float(curvature_to_deflection(curvature, LENGTH, residual))
-        assert back == pytest.approx(deflection, rel=1e-12, abs=1e-15)
-
-    @given(st.floats(1e-12, 0.72))
-    def test_is_odd(self, share):
-        up = float(deflection_to_curvature(share * LENGTH, LENGTH))
-        down = float(deflection_to_curvature(-share * LENGTH, LENGTH))
-        assert up > 0
-        assert down == -up
 
     def test_grows_up_to_the_end_of_the_range(self):
         deflections = np.linspace(-1.0, 1.0, 20001)[1:-1] * LARGEST_DEFLECTION * LENGTH
@@ -101,10 +75,6 @@ class TestInverse:
         curvatures = deflection_to_curvature([80.97e-6, 299e-6, math.nan, -10e-6], LENGTH)
         np.testing.assert_array_equal(np.isnan(curvatures), [False, True, True, False])
         assert curvatures[0] == pytest.approx(1846.0, abs=0.2)
-
-    def test_small_angle_limit(self):
-        assert float(deflection_to_curvature(1e-15, LENGTH)) == pytest.approx(2e-15 / LENGTH**2, rel=1e-9)
-        assert float(deflection_to_curvature(0.0, LENGTH)) == 0.0
 
     @cases(("at", "gain"), [(0.0, 22.2), (1846.0, 24.1)])
     def test_local_gain(self, at, gain):
