@@ -2,6 +2,7 @@
 
 import json
 import math
+from functools import cache
 
 import pytest
 import serial
@@ -448,13 +449,18 @@ def test_a_run_with_a_schedule_fails_at_its_instant_and_ends_safe(bench, tmp_pat
     assert 12.5 < result["laboratory_seconds"] < 16.0
 
 
-LABORATORIES = {rig: make(rig) for rig in RIGS}
+@cache
+def laboratory_of(rig):
+    """The laboratory of a rig, and its clock, for all examples."""
+    return make(rig)
+
+
 STREAMS = {}
 
 
 def streams(rig):
     """The lines of a laboratory; on TCP a connection that is opened again once it is over."""
-    laboratory, _ = LABORATORIES[rig]
+    laboratory, _ = laboratory_of(rig)
     for name, server in laboratory.servers.items():
         if isinstance(server, WireServer):
             yield name, server
@@ -477,7 +483,7 @@ def streams(rig):
     ),
 )
 def test_no_fault_makes_a_server_raise_or_hang(rig, acts):
-    laboratory, clock = LABORATORIES[rig]
+    laboratory, clock = laboratory_of(rig)
     known = list(laboratory.faults)
     for number, what, garbage in acts:
         name = known[number % len(known)]
