@@ -38,7 +38,7 @@ def shuffled(file, rig, seed):
     return load_rig(str(file), overrides), truly
 
 
-@pytest.mark.parametrize("seed", [0, 1, pytest.param(2, marks=pytest.mark.seeds)])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.seeds) for seed in (1, 2))])
 def test_every_instrument_of_a_desk_is_found_in_any_order_of_ports(desk, seed):
     file, rig = desk
     before = rig.control.state()
@@ -124,7 +124,7 @@ def test_instruments_on_a_shared_line_are_found_and_their_port_is_that_of_the_li
     assert tomllib.loads(mine.read_text())["lines"]["bus"]["port"] == port
 
 
-@pytest.mark.slow
+@pytest.mark.seeds
 def test_an_instrument_at_another_speed_is_found(desk, tmp_path):
     file, rig = desk
     slow = load_rig(str(file), {f"devices.{name}.baudrate": "9600" for name in ("tec_a", "tec_b")})
