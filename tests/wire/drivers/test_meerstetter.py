@@ -207,6 +207,13 @@ def test_values_of_the_maker():
     assert encode(driver._TARGET, 21.75) == "41AE0000"
 
 
+def test_sequence_number_turns_over(script, line):
+    line._sequence = 0xFFFE
+    for _ in range(3):
+        line.ask("?VR006801", 8)
+    assert [data[3:7] for data in script.received] == [b"FFFF", b"0000", b"0001"]
+
+
 @given(st.floats(width=32, allow_nan=False), st.integers(-(2**31), 2**31 - 1))
 def test_values_survive_coding(real, integer):
     for parameter, value in ((driver._TARGET, real), (driver._STATUS, integer)):

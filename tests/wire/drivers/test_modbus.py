@@ -158,6 +158,16 @@ def test_a_refusal_of_tcp(clock, plug, expected):
     assert clock.now() == pytest.approx(begin, abs=1e-3)
 
 
+def test_transactions_of_tcp_begin_again(plug):
+    server = Answers("FFFF 0000 0007 01 03 04 1234 5678", "0000 0000 0007 01 03 04 1234 5678")
+    client = TcpClient(plug(server))
+    client._transaction = 0xFFFE
+    for _ in range(2):
+        client.read(0, 2)
+    assert [request[:2].hex() for request in server.received] == ["ffff", "0000"]
+    assert server.received[0][2:] == bytes.fromhex("0000 0006 01 03 0000 0002")
+
+
 def test_echo_of_a_write(plug):
     echoes = "0001 0001", "0002 0001", "0001 0002"
     answers = [f"000{number} 0000 0006 01 10 {echo}" for number, echo in enumerate(echoes, 1)]

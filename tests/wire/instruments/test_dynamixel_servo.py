@@ -636,6 +636,16 @@ def test_homing_offset_and_reverse_mode():
     assert servo.position == pytest.approx(math.pi - 1000 * COUNT)
 
 
+def test_change_of_mode_resets_the_profile():
+    servo = make_servo(position=20.0)
+    servo.write_item(108, 5)
+    servo.write_item(112, 50)
+    servo.write_item(100, 400)
+    servo.write_item(11, 3)
+    assert [servo.read_item(address) for address in (108, 112, 100)] == [0, 0, 885]
+    assert 0 <= servo.read_item(132) < 4096
+
+
 # Motion.
 
 
@@ -710,6 +720,25 @@ def arm(servo, units):
     for address, value in ((112, 42), (98, units), (64, 1), (116, 500_000)):
         servo.write_item(address, value)
     return 42 * VELOCITY_UNIT
+
+
+@cases("units", [1, 5, 127])
+def test_watchdog_stops_the_shaft_at_its_instant(units):
+    servo = make_servo()
+    velocity = arm(servo, units)
+    silence = units * 0.02
+    clock = servo.world.clock
+    clock.sleep(silence - 1e-9)
+    servo.world.advance()
+    assert servo._values[98] == units
+    clock.sleep(1000.0)
+    servo.world.advance()
+    assert servo.position == pytest.approx(math.pi + velocity * silence, abs=1e-9)
+    assert servo.read_bytes(98, 1) == b"\xff"
+    assert servo.read_item(98) == -1
+    assert servo.read_item(64) == 1
+    assert servo.read_item(116) == servo.read_item(132)
+    assert (servo.read_item(122), servo.read_item(128)) == (0, 0)
 
 
 def test_expired_watchdog_takes_no_goals_until_it_is_cleared():
