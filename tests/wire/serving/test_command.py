@@ -69,16 +69,6 @@ def test_several_rigs_have_a_name_each(emulate):
             assert light.state()["force"] != pytest.approx(4.9, rel=1e-4)
 
 
-def test_two_processes_serve_the_same_rig(emulate, tmp_path):
-    with (
-        emulate("vo2", file=tmp_path / "one.json") as (_, one),
-        emulate("vo2", file=tmp_path / "two.json") as (_, two),
-    ):
-        assert {each["port"] for each in one["instruments"].values()}.isdisjoint(
-            each["port"] for each in two["instruments"].values()
-        )
-
-
 def test_the_state_is_logged_each_period_and_at_each_change_of_an_output(emulate, tmp_path):
     log = tmp_path / "state.jsonl"
     with emulate("sma", "--clock", "x1", "--state", log, "--state-period", "100") as (_, endpoints):
