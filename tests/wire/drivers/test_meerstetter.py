@@ -207,6 +207,13 @@ def test_values_of_the_maker():
     assert encode(driver._TARGET, 21.75) == "41AE0000"
 
 
+def test_first_frame_of_a_connection_is_whole(script, clock):
+    settings = make_settings()
+    line = TECLine("tec", settings)
+    line.order("VS07E401BF000000")
+    assert script.received == [b"#010001VS07E401BF000000E796\r"]
+
+
 def test_sequence_number_turns_over(script, line):
     line._sequence = 0xFFFE
     for _ in range(3):
@@ -839,6 +846,18 @@ def test_safe_state_is_reached_in_haste_and_patience_comes_back(script, clock):
 def test_a_rescue_switches_off_and_disarms_the_watchdog(script, clock):
     MeerstetterTEC.rescue("tec", make_settings(), clock)
     assert script.orders() == ["VSC3500100000000", "VS07DA0100000000", "VS080C0100000000"]
+
+
+def test_another_line_goes_on_counting(script, tec):
+    script.instead = [b""]
+    tec.measure()
+    last = int(script.received[-1][3:7], 16)
+    script.received.clear()
+    before = tec._line
+    tec.reconnect()
+    assert tec._line is not before
+    assert int(script.received[0][3:7], 16) == last + 1
+    assert tec.repeats == 1
 
 
 @cases("place", range(21))
