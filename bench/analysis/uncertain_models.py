@@ -47,7 +47,7 @@ class ModelUncertainty:
     coefficients : ndarray, shape (K,)
         Standard uncertainties of the coefficients of the model, such as the cells of its density.
     outputs, standard : ndarray, shape (33,)
-        Values of the output, and its standard uncertainty there but for noise; both in its unit.
+        Values of the output, and the standard uncertainty that readings share there; both in its unit.
     """
 
     quantities: Mapping[str, Budget]
@@ -202,14 +202,15 @@ def identified_uncertainty(
     }
     quantities = propagated(signals, {names[0]: inputs, names[1]: outputs}, nominal, spreads, refit)
     places = np.linspace(outputs.min(), outputs.max(), _PLACES)
-    standard = np.array([signals.at(names[1], value, noise=False).standard for value in places.tolist()])
+    shared = [signals.at(names[1], value).contributions(shared=True) for value in places.tolist()]
+    standard = np.array([math.hypot(*(contribution for _, contribution in each)) for each in shared])
     return ModelUncertainty(quantities, np.sqrt(squares), places, standard)
 
 
 def _moved(signals: UncertainSignals, name: str, values: Floats) -> list[tuple[BudgetRow, Floats]]:
     """Return readings that each component common to all of them has moved by its standard uncertainty."""
     places = np.linspace(values.min(), values.max(), _PLACES)
-    table = [signals.at(name, value, noise=False).contributions() for value in places.tolist()]
+    table = [signals.at(name, value).contributions(shared=True) for value in places.tolist()]
     return [
         (part.row, values + np.interp(values, places, [row[i][1] for row in table]))
         for i, (part, _) in enumerate(table[0])

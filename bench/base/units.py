@@ -210,7 +210,7 @@ def read_quantity(text: str, unit: str) -> float:
             given = "degC" if given in ("C", "°C") else given
         else:
             given = re.sub("°?C\\b|degC", "K", given) if unit.startswith("K") else given
-        wanted = "degC" if unit == "°C" else unit or "1"
+        wanted = "degC" if unit == "°C" else unit.replace("%", "percent") or "1"
         return float(unit_registry().Quantity(number, given.replace("%", "percent")).to(wanted).magnitude)
     except Exception:
         shown = "a plain number" if unit in ("", "1") else f"a number in {unit}, or one with a unit of this kind"

@@ -47,7 +47,7 @@ def check_accuracy(
     unit = description.unit(signal)
     try:
         # It is a difference.
-        wanted = read_quantity(asked, "K" if unit == "°C" else unit)
+        wanted = read_quantity(asked, unit.replace("°C", "K"))
     except ValueError as error:
         raise ConfigurationError(f"{option}: {error}") from None
     if not 0.0 < wanted < np.inf:

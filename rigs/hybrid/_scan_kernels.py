@@ -8,7 +8,7 @@ from sim_devices.plants._hybrid_kernels import FACE, INCREMENT, NODES, deflectio
 from sim_devices.transducers._imperfect_kernels import shown
 from sim_devices.transducers._voltage_kernels import displacement_volts, divider_volts
 
-CHARACTERISTIC_SIZE = 7
+CHARACTERISTIC_SIZE = 8
 DISPLACEMENT_SIZE = 4
 THERMISTOR_SIZE = 5
 _BASE = 1 + CHARACTERISTIC_SIZE + DISPLACEMENT_SIZE
@@ -22,7 +22,7 @@ takes."""
 @inner
 def _shown(quantity: float, numbers: Floats, at: int) -> float:
     n = numbers[at : at + CHARACTERISTIC_SIZE]
-    value: float = shown(quantity, n[0], n[1], n[2], n[3], n[4], n[5], n[6])
+    value: float = shown(quantity, n[0], n[1], n[2], n[3], n[4], n[5], n[6], n[7])
     return value
 
 

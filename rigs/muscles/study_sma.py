@@ -266,7 +266,7 @@ STUDY = Study(
 )
 
 
-def true_quantities(rig: str) -> Mapping[str, Callable[[Floats], Floats]]:
+def true_quantities(rig: str, overrides: Mapping[str, str] | None = None) -> Mapping[str, Callable[[Floats], Floats]]:
     """Return by signals what gives the quantities behind readings of an emulated rig, but for noise.
 
     There is none for a rig with another laboratory.
@@ -275,7 +275,7 @@ def true_quantities(rig: str) -> Mapping[str, Callable[[Floats], Floats]]:
     from rigs.muscles.laboratory import MuscleLaboratorySettings
     from sim_devices.transducers.data_sheets import LOAD_CELL, POSITION
 
-    settings = load_rig(rig).laboratory_settings
+    settings = load_rig(rig, overrides).laboratory_settings
     if not isinstance(settings, MuscleLaboratorySettings):
         return {}
     return {

@@ -20,13 +20,14 @@ def shown(
     wave: float,
     scale: float,
     middle: float,
+    phase: float,
     most: float,
     resolution: float,
 ) -> float:
     """Return what `Characteristic.value` makes of a quantity, to the last bit."""
     value = gain * quantity + offset
     if wave:
-        value += wave * math.sin(min(max(scale * (quantity - middle), -most), most))
+        value += wave * math.sin(min(max(scale * (quantity - middle), -most), most) + phase)
     if resolution:
         value = np.round(value / resolution) * resolution
     return value
@@ -40,9 +41,10 @@ def show(
     wave: float,
     scale: float,
     middle: float,
+    phase: float,
     most: float,
     resolution: float,
 ) -> None:
     """Replace quantities by what `Characteristic.value` makes of them, to the last bit."""
     for i in range(values.size):
-        values[i] = shown(values[i], gain, offset, wave, scale, middle, most, resolution)
+        values[i] = shown(values[i], gain, offset, wave, scale, middle, phase, most, resolution)

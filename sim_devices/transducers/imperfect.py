@@ -45,6 +45,9 @@ class SensorErrors(CheckedTable):
         le=0.1,
         description="largest deviation from the best line, as a share of the range",
     )
+    phase: float = Field(
+        default=0.0, ge=-10, le=10, description="phase of the nonlinearity's wave at the middle of the range, rad"
+    )
     lag: float = Field(default=0.0, ge=0, le=60, description="time constant of the first order, s")
     latency: float = Field(default=0.0, ge=0, le=10, description="time by which the reading is late, s")
     resolution: float = Field(
@@ -142,6 +145,7 @@ class Characteristic:
         self._offset = errors.offset
         self._wave = errors.nonlinearity * (high - low)
         self._middle, self._scale = 0.5 * (low + high), 2.0 * _WAVE / (high - low)
+        self._phase = errors.phase
         self._resolution = errors.resolution
         # Compiled when a laboratory opens.
         self.show(np.empty(0))
@@ -151,7 +155,8 @@ class Characteristic:
         value = self._gain * quantity + self._offset
         if self._wave:
             angle = self._scale * (quantity - self._middle)
-            value += self._wave * math.sin(-_WAVE if angle < -_WAVE else _WAVE if angle > _WAVE else angle)
+            angle = -_WAVE if angle < -_WAVE else _WAVE if angle > _WAVE else angle
+            value += self._wave * math.sin(angle + self._phase)
         return round(value / self._resolution) * self._resolution if self._resolution else value
 
     def course(self, quantities: Floats) -> Floats:
@@ -175,9 +180,11 @@ class Characteristic:
         return found
 
     @property
-    def numbers(self) -> tuple[float, float, float, float, float, float, float]:
+    def numbers(self) -> tuple[float, float, float, float, float, float, float, float]:
         """What `_imperfect_kernels.shown` takes besides the quantity."""
-        return self._gain, self._offset, self._wave, self._scale, self._middle, _WAVE, self._resolution
+        return (
+            self._gain, self._offset, self._wave, self._scale, self._middle, self._phase, _WAVE, self._resolution
+        )  # fmt: skip
 
     def _replace(self, quantities: Floats, resolution: float) -> None:
         from sim_devices.transducers import _imperfect_kernels as kernels

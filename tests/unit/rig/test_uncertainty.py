@@ -111,6 +111,15 @@ def test_what_readings_have_in_common_is_not_in_their_difference():
     assert apart.u > 1e-4 * 0.005 / math.sqrt(3)
 
 
+def test_a_mean_of_readings_keeps_the_resolution_of_its_sensor():
+    steps = {"acts": "resolution", "half_width": 40e-9, "unit": "m"}
+    mean = signals(spot={**PSD, "steps": steps}).reading("spot", {"spot": 5e-5}, noise=False).repeated(1e-9, 9, "ten")
+    parts = {each.component: each.contribution for each in mean.budget().rows}
+    assert parts["steps"] == pytest.approx(40e-9 / math.sqrt(3.0))
+    assert parts["repeatability"] == pytest.approx(1e-9)
+    assert "noise" not in parts
+
+
 @cases(
     "expression, constants",
     [

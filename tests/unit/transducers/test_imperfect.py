@@ -62,6 +62,20 @@ def test_nonlinearity_is_the_deviation_from_the_best_straight_line():
     assert np.abs(deviation).max() == pytest.approx(5e-4 * 20.0, rel=1e-3)
 
 
+def test_the_phase_turns_a_nonlinearity_into_the_even_one_without_changing_its_size():
+    values = np.linspace(-10.0, 10.0, 41)
+    even = np.array([static(each, nonlinearity=5e-4, phase=0.5 * math.pi) for each in values]) - values
+    assert even == pytest.approx(even[::-1], abs=1e-12)
+    assert np.abs(even).max() == pytest.approx(5e-4 * 20.0)
+
+
+def test_a_course_is_what_its_values_are():
+    errors = SensorErrors(gain_error=0.01, offset=0.2, nonlinearity=1e-3, phase=0.7, resolution=0.01)
+    sensor = Characteristic(errors, -10.0, 10.0)
+    values = np.linspace(-12.0, 12.0, 49)
+    assert sensor.course(values) == pytest.approx([sensor.value(each) for each in values], abs=1e-12)
+
+
 def test_the_quantity_is_found_behind_what_is_made_of_it():
     sensor = Characteristic(SensorErrors(gain_error=0.01, offset=0.2, nonlinearity=4e-3), -10.0, 10.0)
     values = np.linspace(-12.0, 12.0, 49)
