@@ -99,6 +99,7 @@ def run(
     seed: int = 0,
     clock: str | None = None,
     overrides: Mapping[str, str] | None = None,
+    accuracy: float | str | None = None,
     live: bool = False,
     recording: bool = False,
     progress: bool = False,
@@ -116,6 +117,9 @@ def run(
         Where the folder of the run is made.
     seed, clock, overrides
         As for `open_rig`.
+    accuracy : float or str, optional
+        Largest expanded uncertainty (95 %) of the controlled signal that is accepted, in its unit or with one, such
+        as `'20 µm'`. A run whose uncertainty budget does not support it is refused before anything moves.
     live : bool
         Whether to serve the live view on the loopback interface.
     recording : bool
@@ -150,6 +154,7 @@ def run(
             overrides=overrides or {},
             seed=seed,
             clock=clock,
+            accuracy="" if accuracy is None else str(accuracy),
             live=live,
             recording=recording,
         ),

@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.analysis import FOLLOW, ColumnNames, read_columns, read_dataset
+from bench.base import Floats
 from bench.control import (
     ControllerSetup,
     FollowReference,
@@ -60,7 +61,11 @@ class Parameters(SessionParameters, SupervisedParameters):
     )
 
 
-@protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD, controls="response", views=LOOP)
+def _targets(parameters: Parameters, slots: Slots) -> Floats:
+    return _reference(parameters, slots["response"].unit)[1]
+
+
+@protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD, controls="response", views=LOOP, targets=_targets)
 def following(parameters: Parameters, slots: Slots) -> Messages:
     """Make the response follow a reference, set-point by set-point at a fixed rate.
 
@@ -127,7 +132,7 @@ def following(parameters: Parameters, slots: Slots) -> Messages:
     yield from keep_adapted(follower, model)
 
 
-def _reference(parameters: Parameters, unit: str) -> tuple[np.ndarray, np.ndarray]:
+def _reference(parameters: Parameters, unit: str) -> tuple[Floats, Floats]:
     if not parameters.reference:
         check_order(parameters, "low < high", unit)
         if parameters.duration * parameters.rate > _MOST:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.analysis import REACH, READING, read_columns
+from bench.base import Floats
 from bench.control import (
     ControllerSetup,
     ReachTarget,
@@ -68,7 +69,15 @@ class Parameters(SessionParameters, SupervisedParameters):
     )
 
 
-@protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD, controls="response", views=LOOP)
+def _targets(parameters: Parameters, slots: Slots) -> Floats:
+    if parameters.targets:
+        return read_columns(Path(parameters.targets), ["target"], at_least=1).values["target"]
+    check_order(parameters, "low < high", slots["response"].unit)
+    rng = np.random.default_rng(parameters.sequence_seed)
+    return tracking_targets(rng, parameters.low, parameters.high, parameters.count)
+
+
+@protocol(needs=DRIVE_AND_RESPONSE, may_use=LOAD, controls="response", views=LOOP, targets=_targets)
 def tracking(parameters: Parameters, slots: Slots) -> Messages:
     """Bring the response to a sequence of targets.
 
@@ -81,12 +90,7 @@ def tracking(parameters: Parameters, slots: Slots) -> Messages:
     drive, response = slots["drive"], slots["response"]
     model = load_checked_model(parameters, slots)
     kinds = session_kinds(parameters)
-    if parameters.targets:
-        targets = read_columns(Path(parameters.targets), ["target"], at_least=1).values["target"]
-    else:
-        check_order(parameters, "low < high", response.unit)
-        rng = np.random.default_rng(parameters.sequence_seed)
-        targets = tracking_targets(rng, parameters.low, parameters.high, parameters.count)
+    targets = _targets(parameters, slots)
     limits = (parameters.reset, parameters.hottest)
 
     reading, model = yield from begin_session(parameters, slots, model, kinds)

@@ -48,7 +48,7 @@ from rigs.vo2.study import GONIOMETER
 from sim_devices.plants.vo2 import VO2Parameters
 from sim_devices.transducers.data_sheets import DISPLACEMENT, PSD
 
-READINGS = 12
+READINGS = 4
 """Raw readings of a session."""
 PERIOD = 2.0
 """Time between two glances at a rig, s. Watchdogs want to hear of somebody."""
@@ -231,14 +231,16 @@ class Identified:
         What is tried.
     folder : Path
         Where runs are recorded, and the model `model.json`.
+    ideals : int
+        Number of runs whose mean is the truth.
     """
 
-    def __init__(self, trial: Trial, folder: Path) -> None:
+    def __init__(self, trial: Trial, folder: Path, ideals: int) -> None:
         self._trial, self._folder = trial, folder
         # They are for advice, and take longer than the fit.
         self._transients = None
         ideal = {f"emulation.{key}": value for key, value in {"sensors": "ideal", **trial.ideal}.items()}
-        runs = [self.quantities(seed, ideal) for seed in range(IDEALS)]
+        runs = [self.quantities(seed, ideal) for seed in range(ideals)]
         self.truth = {name: float(np.mean([run[name].value for run in runs])) for name in runs[0]}
 
     def quantities(self, seed: int, overrides: Mapping[str, str]) -> dict[str, Budget]:
@@ -311,7 +313,9 @@ def main(trial: Trial, sessions: int, parts: list[str]) -> None:
     found: Found = defaultdict(list)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        identified = Identified(trial, folder) if {"identified", "tracking"} & {*parts} else None
+        # Tracking needs the model only.
+        ideals = IDEALS if "identified" in parts else int("tracking" in parts)
+        identified = Identified(trial, folder, ideals) if ideals else None
         for session in range(sessions):
             if "raw" in parts:
                 read(trial, session, found)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -25,7 +24,7 @@ def check_accuracy(
 ) -> dict[str, Any]:
     """Check that the budget of the controlled signal supports an accuracy; return both for the record of the run.
 
-    It is looked at from `low` to `high` of the protocol, otherwise over the range of the slot that it controls.
+    It is looked at from the lowest to the highest target of the protocol, otherwise over the range of the slot.
 
     Parameters
     ----------
@@ -40,7 +39,7 @@ def check_accuracy(
         If it is no positive number with a unit of the signal, the protocol controls nothing, the uncertainty is not
         stated, or it is larger; names the component that limits it.
     """
-    option = f"--accuracy {asked}"
+    option = f"accuracy {asked}"
     signal = definition.controlled(slots)
     if not signal:
         raise ConfigurationError(f"{option}: protocol {definition.name} controls no signal; leave it out")
@@ -69,9 +68,9 @@ def check_accuracy(
 def _range(
     definition: ProtocolDefinition, parameters: ProtocolParameters, slots: Slots, option: str
 ) -> tuple[float, float]:
-    given: Mapping[str, Any] = parameters.model_dump()
-    if isinstance(low := given.get("low"), float) and isinstance(high := given.get("high"), float):
-        return low, high
+    if definition.targets is not None:
+        targets = definition.targets(parameters, slots)
+        return float(targets.min()), float(targets.max())
     slot = slots.get(definition.controls)
     if slot is None or slot.table.range is None:
         raise ConfigurationError(f"{option}: the rig file gives no range of {definition.controls}")

@@ -10,7 +10,16 @@ from typing import Any, Literal, cast, get_args, get_origin, get_type_hints
 from pydantic import Field, ValidationError
 from pydantic_core import PydanticUndefined
 
-from bench.base import CheckedTable, ConfigurationError, closest, comma_remark, explain, is_quantity, read_quantity
+from bench.base import (
+    CheckedTable,
+    ConfigurationError,
+    Floats,
+    closest,
+    comma_remark,
+    explain,
+    is_quantity,
+    read_quantity,
+)
 from bench.devices import Device, Signal
 from bench.protocol.changes import ParameterChange
 from bench.protocol.views import Views
@@ -155,6 +164,8 @@ class ProtocolDefinition:
         Takes the parameters, and the slots where it asks for some.
     views : Views or None
         What the dashboard shows of it; None for all that the rig file lays out.
+    targets : callable or None
+        Takes parameters and slots; returns the values to which the controlled signal is brought, shape (N,).
     """
 
     name: str
@@ -166,6 +177,7 @@ class ProtocolDefinition:
     generator: Callable[..., Messages]
     may_use: Mapping[str, type[Device] | type[Signal]] = field(default_factory=dict)
     views: Views | None = None
+    targets: Callable[[Any, Slots], Floats] | None = None
 
     @property
     def slots(self) -> Mapping[str, type[Device] | type[Signal]]:
@@ -489,6 +501,7 @@ def protocol(
     may_use: Mapping[str, type[Device] | type[Signal]] | None = None,
     controls: str = "",
     views: Views | None = None,
+    targets: Callable[[Any, Slots], Floats] | None = None,
 ) -> Callable[[Callable[..., Messages]], ProtocolDefinition]:
     """Make a generator function a protocol.
 
@@ -507,6 +520,9 @@ def protocol(
         then recorded beside the rig's signals.
     views : Views, optional
         What the dashboard shows of it, by its slots; all that the rig file lays out if not given.
+    targets : callable, optional
+        Takes parameters and slots; returns the values to which the controlled signal is brought, shape (N,). An
+        accuracy that is asked of a run is checked there, otherwise over the range of the slot.
 
     Raises
     ------
@@ -542,6 +558,7 @@ def protocol(
             generator=function,
             may_use=dict(may_use or {}),
             views=views,
+            targets=targets,
         )
 
     return define

@@ -6,6 +6,9 @@ import math
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
+from bench.base import Floats
 from bench.control import AddedSine, ControllerSetup, Reference, SmoothMoves, Tuning, make_controller, staircase
 from bench.identification import load_model
 from bench.protocol import (
@@ -31,6 +34,8 @@ REST = 5.0
 """Time at the start before the reference begins to move, s."""
 APPROACH = 200.0
 """Longest time in which the tip comes from where it rests to the beginning of the reference, s."""
+_PLACES = 2001
+"""Instants at which an accuracy is checked. Derivation: many for each move of a reference."""
 MID_RANGING = "mid-ranging"
 """Table of `tuning` with the numbers that the controllers of both parts share."""
 
@@ -74,7 +79,12 @@ class Parameters(ProtocolParameters):
     )
 
 
-@protocol(needs=THERMAL | FINE, may_use=WITNESS, controls="response", views=BOTH_LOOPS)
+def _places(parameters: Parameters, _: Slots) -> Floats:
+    reference, duration = _reference(parameters)
+    return np.array([reference(t) for t in np.linspace(0.0, duration, _PLACES).tolist()])
+
+
+@protocol(needs=THERMAL | FINE, may_use=WITNESS, controls="response", views=BOTH_LOOPS, targets=_places)
 def hybrid_control(parameters: Parameters, slots: Slots) -> Messages:
     """Make the tip follow a reference by the thermal and the piezo part together.
 
@@ -132,7 +142,11 @@ class StepParameters(ProtocolParameters):
     witness: bool = parameter(False, unit="", help="whether the sensor `witness` beside the loop is recorded too")
 
 
-@protocol(needs=FINE, may_use=WITNESS, controls="response", views=FINE_OVER_TIME)
+def _step(parameters: StepParameters, _: Slots) -> Floats:
+    return np.array([0.0, parameters.step])
+
+
+@protocol(needs=FINE, may_use=WITNESS, controls="response", views=FINE_OVER_TIME, targets=_step)
 def fine_step(parameters: StepParameters, slots: Slots) -> Messages:
     """Make the piezo part alone follow a step, at a rate that sees its resonance.
 

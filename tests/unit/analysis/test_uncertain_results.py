@@ -10,6 +10,7 @@ import bench
 from bench.analysis import export_run
 from bench.analysis.uncertain_models import predicted_uncertainty
 from bench.analysis.uncertain_results import control_uncertainties, draw_errors, signal_budgets, uncertain_signals
+from bench.base import ConfigurationError
 from bench.cli import app
 from bench.record import Record
 
@@ -108,3 +109,19 @@ def test_an_accuracy_that_the_budget_does_not_support_is_refused(run, tmp_path, 
     assert result.exit_code != 0
     assert text in " ".join(str(result.exception or result.output).split())
     assert not (tmp_path / "runs").exists()
+
+
+def test_an_accuracy_is_checked_at_the_targets_of_a_file(run, tmp_path):
+    targets = tmp_path / "targets.csv"
+    targets.write_text("target\n150\n250\n")
+    model = tmp_path / "model.json"
+    bench.identify(run, "polynomial", degree=3).file.save(model)
+    asked = {"out": tmp_path / "runs", "model": str(model), "controller": "integral", "readings": 2}
+    with pytest.raises(ConfigurationError, match="accuracy 14: the budget of curvature supports"):
+        bench.run("tracking", "vo2", accuracy=14, **asked)
+    assert not (tmp_path / "runs").exists()
+    done = bench.run("tracking", "vo2", accuracy="0.014 1/mm", targets=str(targets), **asked)
+    with Record(done.folder) as record:
+        found = record.meta["accuracy"]
+    assert found["asked"] == pytest.approx(14.0)
+    assert 12.0 < found["supported"] < 14.0
