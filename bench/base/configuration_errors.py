@@ -50,7 +50,8 @@ def problems(error: ValidationError, model: type[BaseModel], prefix: str = "") -
     """
     for problem in error.errors():
         location = problem["loc"]
-        key = prefix + ".".join(str(part) for part in location)
+        # The model itself has no key: its message names one.
+        key = (prefix + ".".join(str(part) for part in location)).rstrip(".")
         owner, field = _find(model, location)
         if problem["type"] == "extra_forbidden":
             known = closest(str(location[-1]), owner.model_fields if owner else ())
@@ -61,8 +62,8 @@ def problems(error: ValidationError, model: type[BaseModel], prefix: str = "") -
         else:
             meaning = f" ({field.description})" if field and field.description else ""
             value = problem["input"]
-            shown = f" = {value!r}" if not isinstance(value, dict) else ""
-            yield f"{key or 'file'}{shown}: {explain(problem)}{meaning}{comma_remark(value)}"
+            shown = f"{key or 'file'} = {value!r}: " if not isinstance(value, dict) else key and f"{key}: "
+            yield f"{shown}{explain(problem)}{meaning}{comma_remark(value)}"
 
 
 def _find(model: type[BaseModel], location: Sequence[Any]) -> tuple[type[BaseModel] | None, FieldInfo | None]:
