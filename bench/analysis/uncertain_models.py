@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bench.analysis.uncertain_results import uncertain_signals
+from bench.analysis.uncertain_results import rounded, uncertain_signals
 from bench.base import header_with_unit
 from bench.identification import ModelFile, input_half_widths
 from bench.models import Operator
@@ -71,11 +71,10 @@ class ModelUncertainty:
 
 def quantity_text(budget: Budget) -> str:
     """Return a quantity with its expanded uncertainty, the coverage factor and the largest component."""
-    expanded = f"{budget.expanded:.1e}"
-    digits = max(1 - int(expanded.partition("e")[2]), 0)
+    value, expanded = rounded(budget.value, budget.expanded)
     largest = f"95 %, k = {budget.factor:.2f}, largest part: {budget.rows[0].label}"
     unit = f" {budget.unit}" if budget.unit else ""
-    return f"{budget.value:.{digits}f} ± {float(expanded):.{digits}f}{unit} ({largest})"
+    return f"{value} ± {expanded}{unit} ({largest})"
 
 
 def quantities_of(operator: Operator[Any]) -> dict[str, tuple[float, str]]:

@@ -120,6 +120,18 @@ class RunUncertainty:
         }
 
 
+def rounded(value: float, expanded: float) -> tuple[str, str]:
+    """Return a value and its uncertainty as texts: the latter with two significant digits (GUM 7.2.6)."""
+    shown = two_digits(expanded)
+    return f"{value:.{len(shown.partition('.')[2])}f}", shown
+
+
+def two_digits(value: float) -> str:
+    """Return a positive number with two significant digits, as an uncertainty is given."""
+    digits = max(1 - math.floor(math.log10(float(f"{value:.1e}"))), 0) if value else 0
+    return f"{value:.{digits}f}"
+
+
 def uncertain_signals(record: Record) -> UncertainSignals:
     """Return the signals of a run as uncertain numbers, as the rig file of the run states them."""
     units = {signal.name: signal.unit for signal in record.signals}
@@ -198,14 +210,19 @@ def _of_samples(
     signals: UncertainSignals, record: Record, output: str, reference: Floats, outputs: Floats
 ) -> ControlUncertainty | None:
     """Return what is known of the errors of samples, or of 200 of them over the range of the output."""
-    order = np.argsort(outputs, kind="stable")
-    chosen = order[np.linspace(0, order.size - 1, min(order.size, _MOST_ROWS)).round().astype(np.intp)]
+    chosen = _over_range(outputs)
     try:
         readings = [signals.at(output, value) for value in outputs[chosen].tolist()]
     except ConfigurationError:
         # It is derived from several signals.
         return None
     return _control(readings, (outputs - reference)[chosen], record.unit(output))
+
+
+def _over_range(values: Floats) -> npt.NDArray[np.intp]:
+    """Return the numbers of up to 200 rows over the range of values, in their order."""
+    order = np.argsort(values, kind="stable")
+    return np.asarray(order[np.linspace(0, order.size - 1, min(order.size, _MOST_ROWS)).round().astype(np.intp)])
 
 
 def _control(
@@ -288,9 +305,8 @@ def reading_uncertainties(record: Record) -> Callable[[Mapping[str, Floats]], di
             values = rows[name]
             uncertainties = np.full(values.size, np.nan)
             known = np.flatnonzero(np.isfinite(values))
-            order = known[np.argsort(values[known], kind="stable")]
-            chosen = order[np.linspace(0, order.size - 1, min(order.size, _MOST_ROWS)).round().astype(np.intp)]
-            if order.size:
+            if known.size:
+                chosen = known[_over_range(values[known])]
                 each = [
                     signals.reading(name, {key: float(rows[key][row]) for key in names}).standard for row in chosen
                 ]

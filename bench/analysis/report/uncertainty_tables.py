@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 
-from bench.analysis.uncertain_results import ControlUncertainty
+from bench.analysis.uncertain_results import ControlUncertainty, rounded, two_digits
 from bench.base import fitting_prefix, prefixed
 from bench.rig import Budget
 
@@ -22,8 +21,7 @@ def signal_rows(budgets: Mapping[str, Budget]) -> list[tuple[str, ...]]:
     for name, budget in budgets.items():
         if budget.stated:
             factor, unit = fitting_prefix(budget.unit, budget.value, least=0.1)
-            expanded = two_digits(factor * budget.expanded)
-            value = f"{factor * budget.value:.{_digits(expanded)}f}"
+            value, expanded = rounded(factor * budget.value, factor * budget.expanded)
             rows.append((name, value, expanded, f"{budget.factor:.2f}", unit, budget.rows[0].label))
     return rows
 
@@ -37,8 +35,7 @@ def not_stated(budgets: Mapping[str, Budget]) -> str:
 def budget_title(budget: Budget) -> str:
     """Return the value of a budget with its expanded uncertainty."""
     factor, unit = fitting_prefix(budget.unit, budget.value, least=0.1)
-    expanded = two_digits(factor * budget.expanded)
-    value = f"{factor * budget.value:.{_digits(expanded)}f}"
+    value, expanded = rounded(factor * budget.value, factor * budget.expanded)
     shown = "" if unit == "1" else f" {unit}"
     return (
         f"budget of {budget.signal}: ({value} ± {expanded}){shown}; 95 %, k = {budget.factor:.2f}, "
@@ -86,19 +83,3 @@ def control_lines(found: ControlUncertainty) -> list[str]:
         f"accuracy: {two_digits(factor * found.accuracy)} {unit}, RMS of the true errors that is expected; the "
         f"readings alone say {two_digits(factor * found.rms)} {unit}; for 95 % it is between {low} and {high} {unit}",
     ]
-
-
-def two_digits(value: float) -> str:
-    """Return a positive number with two significant digits, as an uncertainty is given (GUM 7.2.6)."""
-    return f"{value:.{_decimals(value)}f}"
-
-
-def _decimals(value: float) -> int:
-    if not value:
-        return 0
-    rounded = float(f"{value:.1e}")
-    return max(1 - math.floor(math.log10(abs(rounded))), 0)
-
-
-def _digits(text: str) -> int:
-    return len(text.partition(".")[2])
