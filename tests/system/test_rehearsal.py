@@ -430,4 +430,4 @@ class TestCommand:
         foresee(make(), console)
         shown = console.file.getvalue()
         assert "rehearsing stairs on heater" in shown
-        assert ("Ctrl-C ends" in shown) == terminal
+        assert ("laboratory 0:00:08" in shown) == terminal

@@ -66,11 +66,12 @@ def test_it_is_of_the_rows_that_were_fitted(bench, files, tmp_path):
     assert content["test"]["beyond"]["rows"][0][0] > SMALL.size
     known = content["validity"]
     assert (known["low"], known["high"], known["rows"], known["left_out"]) == (-4.0, 4.0, SMALL.size, LARGE.size)
-    # A set-point within the operating range, which is that of the file.
+    # The operating range is that of the rows that were fitted, so that no set-point lies beyond it.
     (tmp_path / "targets.csv").write_text("y [mm]\n0\n10\n1\n")
     arguments = ("--column", "y", "--out", tmp_path / "s.csv", "--json", tmp_path / "result.json")
     assert bench("invert", out, tmp_path / "targets.csv", *arguments)[0] == 0
-    assert json.loads((tmp_path / "result.json").read_text())["beyond"]["rows"] == [[2, 2]]
+    inverted = json.loads((tmp_path / "result.json").read_text())
+    assert (inverted["met"], inverted["too_high"], inverted["beyond"]["count"]) == (2, 1, 0)
 
 
 def test_it_is_saved_with_the_model_and_named_where_it_is_damaged(bench, files, tmp_path):

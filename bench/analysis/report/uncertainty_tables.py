@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from bench.analysis.uncertain_results import ControlUncertainty, rounded, two_digits
-from bench.base import fitting_prefix, prefixed
+from bench.base import fitting_prefix
 from bench.rig import Budget
 
 SIGNAL_HEADS = ("signal", "at", "U (95 %)", "k", "unit", "largest component")
@@ -57,7 +57,7 @@ def budget_rows(budget: Budget) -> list[tuple[str, ...]]:
         (
             row.label,
             f"{row.type} {row.distribution}",
-            prefixed(row.standard, row.unit, 3),
+            f"{row.standard:.3g} {row.unit}",
             f"{row.sensitivity:.3g}",
             _freedom(row.freedom),
             f"{row.contribution:.3g}",

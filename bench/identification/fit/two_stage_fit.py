@@ -412,10 +412,12 @@ def _fit(
         chosen = smoothing
     elif layout.order:
 
-        def fit(weight: float, of: Floats) -> Fit:
-            return fit_cells(layout, regressor, outputs, weights=of, smoothing=weight)
+        def fit(weight: float, rows: Floats) -> Fit:
+            return fit_cells(layout, regressor, outputs, weights=rows * weights, smoothing=weight)
 
-        chosen = compare_smoothing(fit, regressor, outputs, weights, smoothing).smoothest.smoothing
+        # A great weight holds the model to a sample; its error counts as that of any other.
+        rows = (weights > 0.0).astype(np.float64)
+        chosen = compare_smoothing(fit, regressor, outputs, rows, smoothing).smoothest.smoothing
     else:
         # Columns that have no place in a plane have no roughness.
         chosen = 0.0

@@ -160,9 +160,9 @@ def test_a_restart_of_its_source_is_found_and_nothing_is_set_after_it(python):
 WRONG = {
     '[roles.response]\nsignal = "stain"': ("roles.response.signal = 'stain': there is no such signal", "strain"),
     '[roles.drive]\nunit = "mA"': ("roles.drive.unit = 'mA': coil_current is in A",),
-    '[roles.drive]\ndevice = "bridge"': ("roles.drive.device = 'bridge' takes no set-point; allowed: coil",),
+    '[roles.drive]\ndevice = "bridge"': ("roles.drive.device = 'bridge' takes no set-point; there are: coil",),
     '[derived.strain]\nexpression = "2 * bridge_voltage_c / (5 * gauge_factor)"': (
-        "derived.strain.expression: 'bridge_voltage_c': there is no such signal", "bridge_voltage_a",
+        "derived.strain.expression: 'bridge_voltage_c': there is no such signal", "bridge_voltage_b",
     ),
     '[derived.strain]\nunit = "mm"': ("derived.strain.expression = ", "not in unit = 'mm'"),
 }  # fmt: skip

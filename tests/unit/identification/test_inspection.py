@@ -105,14 +105,16 @@ def test_cross_validation_chooses_a_smoothing_that_predicts_better():
 
 def test_each_fold_is_predicted_without_it():
     _, inputs, outputs = noisy(order=4)
-    table = cross_validate("preisach", inputs, outputs, levels=(3, 4), skip=10)
+    # The plane is given, as that of a fit is the range of the rows that are fitted.
+    plane = inputs.min(), inputs.max()
+    table = cross_validate("preisach", inputs, outputs, levels=(3, 4), skip=10, plane=plane)
     assert [trial.levels for trial in table.trials] == [3, 4]
-    problem = set_up_problem("preisach", inputs, outputs, None, 10, 0.0, None, {"levels": 4})
+    problem = set_up_problem("preisach", inputs, outputs, None, 10, 0.0, None, {"levels": 4, "plane": plane})
     block = np.arange(inputs.size - 10) * 20 // (inputs.size - 10)
     squares = np.empty(inputs.size - 10)
     for fold in range(5):
         left_out = np.concatenate([np.zeros(10, dtype=bool), block % 5 == fold])
-        found = identify("preisach", inputs, outputs, levels=4, skip=10, weights=~left_out)
+        found = identify("preisach", inputs, outputs, levels=4, plane=plane, skip=10, weights=~left_out)
         squares[left_out[10:]] = found.residuals[left_out] ** 2
     assert table.trials[1].rms == pytest.approx(np.sqrt(np.mean(squares)))
     assert problem.skip == 10

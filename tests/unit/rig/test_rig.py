@@ -247,7 +247,7 @@ class TestWrongValues:
             (
                 '"probe_temperature"',
                 '"prob_temperature"',
-                ("interlocks.0.signal = 'prob_temperature'", "tec_current"),
+                ("interlocks.0.signal = 'prob_temperature'", "probe_temperature"),
             ),
         ],
     )

@@ -416,7 +416,7 @@ def test_a_schedule_is_toml_or_lines_of_json(tmp_path):
         ("a.jsonl", "{", "is not JSON lines"),
         ("a.toml", "x = 1", "x: expected tables [[fault]] only"),
         ("a.toml", "fault = 1", "fault: expected tables [[fault]] only"),
-        ("a.toml", "[[fault]]\nfault = 'a'", "fault 1: file: needs at (s) or rate (1/h)"),
+        ("a.toml", "[[fault]]\nfault = 'a'", "fault 1: needs at (s) or rate (1/h)"),
         ("a.toml", "[[fault]]\nfault = 'a'\nat = 1\nrate = 2", "needs at (s) or rate (1/h), and not both"),
         ("a.toml", "[[fault]]\nfault = 'a'\nat = 1\nseed = 2", "seed and until belong to a rate"),
         ("a.toml", "[[fault]]\nfault = 'a'\nat = -1", "at = -1"),
