@@ -297,6 +297,8 @@ def _as_text(cell: object) -> object:
 
 def _reader(path: Path) -> Callable[[Path, Sequence[str], ReadingOptions, Sequence[str]], ReadColumns]:
     """Return what reads a kind of file, by its first bytes."""
+    if path.exists() and not path.is_file():
+        raise DataError(f"{path} is a pipe or a device, and a table is read more than once: save it to a file first")
     with reading_errors(path), path.open("rb") as file:
         start = file.read(512)
     # Text may have the ending of a spreadsheet, or of MATLAB, whose version 4 has numbers of four bytes first.

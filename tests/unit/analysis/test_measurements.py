@@ -1,4 +1,6 @@
+import os
 import struct
+import sys
 
 import numpy as np
 import pytest
@@ -58,6 +60,11 @@ class TestRight:
 class TestTrouble:
     def test_no_file(self, tmp_path):
         wrong(tmp_path / "absent.csv", "does not exist")
+
+    @pytest.mark.skipif(sys.platform == "win32", reason="Windows has no named pipes among files")
+    def test_a_pipe_gives_its_rows_only_once(self, tmp_path):
+        os.mkfifo(tmp_path / "pipe.csv")
+        wrong(tmp_path / "pipe.csv", "is a pipe or a device")
 
     @cases("text", ["", "\n", " , ,\n", "\ufeff"])
     def test_empty(self, table, text):
