@@ -153,7 +153,7 @@ TRIALS = {
         },
         true_calibrated={"displacement": "deflection"},
         ranges={"tec": (-0.08, 0.06), "piezo": (-40, 40)},
-        hold=40,
+        hold=1200,
         sensors=("displacement_sensor",),
         settings={"half_cycles": 16},
         model="preisach",
