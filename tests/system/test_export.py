@@ -233,9 +233,9 @@ def peak(work):
 class TestLongRuns:
     @pytest.mark.slow
     @pytest.mark.parametrize("kind", ["csv", "parquet"])
-    def test_an_export_takes_no_more_memory_for_more_rows(self, long_runs, tmp_path, kind):
-        export_run(long_runs[0], kind, tmp_path / "first")
-        short, long = (peak(lambda run=run: export_run(run, kind, tmp_path / run.name)) for run in long_runs)
+    def test_an_export_takes_no_more_memory_for_more_rows(self, run, long_runs, tmp_path, kind):
+        export_run(run, kind, tmp_path / "first")
+        short, long = (peak(lambda each=each: export_run(each, kind, tmp_path / each.name)) for each in long_runs)
         assert long - short < 10 * 20_000
 
     def test_a_summary_of_the_telemetry_has_its_extremes_and_no_more_rows(self, long_runs):

@@ -278,7 +278,7 @@ class TestCard:
     def test_a_card_has_the_band_and_the_models_that_were_compared(self, bench, tmp_path, loop):
         result = tmp_path / "fit.json"
         code, _, err = bench(
-            "identify", loop, *COLUMNS, "--model", "polynomial,polynomial-plays,prandtl-ishlinskii", "--band",
+            "identify", loop, *COLUMNS, "--model", "polynomial,prandtl-ishlinskii", "--band",
             "--card", tmp_path / "card.md", "--json", result,
         )  # fmt: skip
         assert code == 0, err

@@ -7,14 +7,17 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
-PAGE = Path(__file__).parents[3] / "docs" / "how-to" / "use-a-notebook.md"
+PAGE = (Path(__file__).parents[3] / "docs" / "how-to" / "use-a-notebook.md").read_text(encoding="utf-8")
+CODE, PRINTED = (
+    re.findall(rf"^```{kind}\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL) for kind in ("python", "text")
+)
 
 
 @pytest.fixture(scope="module")
 def cells(tmp_path_factory):
-    """Execute the first block of the page; return the outputs by the last line of their cell."""
-    code = re.findall(r"^```python\n(.*?)^```$", PAGE.read_text(encoding="utf-8"), re.MULTILINE | re.DOTALL)[0]
-    notebook = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(cell) for cell in code.split("\n\n")])
+    """Execute the blocks of the page; return the outputs by the last line of their cell."""
+    code = [nbformat.v4.new_code_cell(cell) for block in CODE for cell in block.split("\n\n")]
+    notebook = nbformat.v4.new_notebook(cells=code)
     folder = tmp_path_factory.mktemp("notebook")
     NotebookClient(
         notebook, timeout=600, kernel_name="python3", resources={"metadata": {"path": str(folder)}}
@@ -42,6 +45,14 @@ def shown(outputs, kind):
 def test_a_result_is_a_table_or_a_page(cells, line, said):
     (html,) = shown(cells[line], "text/html")
     assert said in html
+
+
+@pytest.mark.slow
+def test_what_is_printed_stands_on_the_page(cells):
+    printed = "".join(each.text for outputs in cells.values() for each in outputs if each.output_type == "stream")
+    assert len(PRINTED) == len(CODE)
+    for line in "".join(PRINTED).splitlines():
+        assert line in printed
 
 
 @pytest.mark.slow

@@ -203,7 +203,7 @@ class TestCommands:
     def test_report_shows_it(self, bench, tmp_path):
         bench(
             "run", "damped-oscillation", "--rig", "vo2", "--clock", "virtual", "--set", "half_cycles=2",
-            "--set", "increment=6", "--out", tmp_path, "--json", tmp_path / "run.json",
+            "--set", "increment=12", "--out", tmp_path, "--json", tmp_path / "run.json",
         )  # fmt: skip
         folder = json.loads((tmp_path / "run.json").read_text())["folder"]
         model = tmp_path / "normalised-bouc-wen.json"

@@ -79,7 +79,7 @@ def test_the_least_score_wins_and_of_ties_the_fewest_degrees_of_freedom(scores, 
 def test_the_choice_errs_less_than_a_cubic_with_plays_on_other_inputs(plant):
     rng = np.random.default_rng(5)
     respond = PLANTS[plant]
-    inputs, others = random_reversals(rng, 300, 30), random_reversals(rng, 300, 30)
+    inputs, others = random_reversals(rng, 200, 25), random_reversals(rng, 200, 25)
     outputs, truth = settled(respond, inputs), settled(respond, others)
     noisy = outputs + 0.01 * np.ptp(outputs) * rng.standard_normal(outputs.size)
     found = select(Measurements.of(inputs, noisy), FAST).chosen.candidate
@@ -152,7 +152,7 @@ def test_what_fails_is_kept_with_its_reason_and_ends_nothing():
 )
 def test_what_the_record_cannot_decide_is_said(inputs, codes):
     outputs = inputs + 0.001 * np.random.default_rng(0).standard_normal(inputs.size)
-    found = select(Measurements.of(inputs, outputs), ("polynomial", "preisach"))
+    found = select(Measurements.of(inputs, outputs), ("polynomial",))
     assert {advice.code for advice in found.advice} == codes
 
 
@@ -168,8 +168,8 @@ def test_models_of_one_input_are_compared_by_default():
 
 
 def test_of_many_rows_the_best_of_two_models_are_scored_on_all():
-    inputs = random_reversals(np.random.default_rng(1), 2500, 40)
-    outputs = settled(PLANTS["duhem"], inputs) + 0.01 * np.random.default_rng(2).standard_normal(2500)
+    inputs = random_reversals(np.random.default_rng(1), 2200, 40)
+    outputs = settled(PLANTS["duhem"], inputs) + 0.01 * np.random.default_rng(2).standard_normal(2200)
     found = select(Measurements.of(inputs, outputs), ("polynomial", "polynomial-plays"))
     decided = [score for score in found.scores if score.rows > found.rows]
     assert found.rows <= 2000 < found.of
