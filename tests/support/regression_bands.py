@@ -16,7 +16,7 @@ ERRORS = {"rms", "max", "median", "average", "settling", "seconds"}
 BAND = 1.5
 RECORDED_SEED = 0
 SHORT = {
-    "vo2": ("tracking.count=20", "following.duration=400"),
+    "vo2": ("tracking.count=12", "following.duration=400"),
     "sma": (
         "length-voltage.points=19",
         "length-verification.points=9",
@@ -33,9 +33,16 @@ SHORT = {
         "length-force.dwell=30",
         "force-voltage.dwell=30",
     ),
-    "hybrid": ("hybrid-control.positions=90e-6, -120e-6",),
+    "hybrid": (
+        "hybrid-control.positions=90e-6, -120e-6",
+        "hybrid-control.steps=2",
+        "hybrid-control.rate=100",
+        "hybrid-control.record_rate=25",
+        "calibration-displacement.rate=4",
+        "fine-step.duration=0.08",
+    ),
 }
-"""Settings with which a study takes less time: fewer targets, points and moves."""
+"""Settings with which a study takes less time: fewer targets, points, moves and samples a second."""
 
 
 def options_of(study):
