@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import os
 import sys
+import threading
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
@@ -65,8 +67,15 @@ def _describe(rig: Rig) -> dict[str, Any]:
     return {"devices": devices, "signals": [asdict(signal) for signal in rig.signals]}
 
 
+def _leave(failed: threading.ExceptHookArgs) -> None:
+    """End this process, as the safe state may need the thread that has failed; the rescuer takes over."""
+    threading.__excepthook__(failed)
+    os._exit(1)
+
+
 def main() -> int:
     """Hold the rig that the bench names until its run has ended and every device is safe; tell if it hung or died."""
+    threading.excepthook = _leave
     channel = Channel(inherited(sys.argv[1:]))
     with ExitStack() as stack:
         try:

@@ -98,7 +98,7 @@ class Report:
     path: Path
 
     def is_ready(self) -> bool:
-        """Return whether a rescuer is ready, or has been needed already."""
+        """Return whether a rescuer is ready or at work; not once it has left without an action."""
         return self.path.exists()
 
     def states(self) -> dict[str, str]:
@@ -155,6 +155,8 @@ def main() -> int:
     threading.Thread(target=_read, args=(pipe, signs), daemon=True).start()
     report.write({})
     if not is_needed(signs):
+        # A bench that has lost its guardian since then must not wait for this one.
+        report.path.unlink(missing_ok=True)
         return 0
     # A stopped guardian keeps its lines and locks.
     guardian.send(SIGKILL)

@@ -59,4 +59,5 @@ def test_one_that_is_released_before_it_is_ready_does_nothing(tmp_path):
     command = [sys.executable, "-P", "-m", "bench.execution.guardian.rescuer"]
     done = subprocess.run(command, input=json.dumps(content).encode() + b"\n.!", check=False)
     assert done.returncode == 0
-    assert json.loads(report.read_text())["devices"] == {}
+    # Nobody waits for what it reports.
+    assert not report.exists()
