@@ -54,25 +54,19 @@ def _leave(station: RemoteStation, rescuer: int) -> None:
     seconds_until(lambda: not is_alive(rescuer))
 
 
-def children(process: int) -> list[int]:
-    """Return the processes that one has started and that live."""
-    found = []
-    for entry in Path("/proc").iterdir():
-        with suppress(OSError, ValueError):
-            if int((entry / "stat").read_text().rpartition(")")[2].split()[1]) == process:
-                found.append(int(entry.name))
-    return found
-
-
 def rescuer_of(guardian: int) -> int:
-    """Return the process that a guardian has started to make safe what it cannot; 0 if there is none."""
-    return next((each for each in children(guardian) if _is_rescuer(each)), 0)
+    """Return the process that makes safe what a guardian cannot: it reads a pipe of the guardian's; 0 if there is none."""
+    pipes = {
+        link for link in map(_link, (Path("/proc") / str(guardian) / "fd").iterdir()) if link.startswith("pipe:")
+    }
+    readers = (entry for entry in Path("/proc").glob("[0-9]*") if _link(entry / "fd" / "0") in pipes)
+    return next((int(each.name) for each in readers if int(each.name) != guardian), 0)
 
 
-def _is_rescuer(process: int) -> bool:
+def _link(descriptor: Path) -> str:
     with suppress(OSError):
-        return b"bench.execution.guardian.rescuer" in (Path("/proc") / str(process) / "cmdline").read_bytes()
-    return False
+        return str(descriptor.readlink())
+    return ""
 
 
 def is_alive(process: int) -> bool:

@@ -17,8 +17,9 @@ from tempfile import TemporaryDirectory
 from types import TracebackType
 from typing import Any, Self
 
-from benches import children, is_alive, rescuer_of, seconds_until
+from benches import is_alive, rescuer_of, seconds_until
 
+from bench.record import BLACK_BOX_NAME
 from sim_devices.serving.process import EmulatedRig
 
 PROTOCOLS = Path(__file__).with_name("hanging_protocols.py")
@@ -132,7 +133,7 @@ class GuardedRun:
         """Wait until everything is on, and find the guardian; then the protocol may go wrong."""
         self.await_note("everything is on")
         assert len(found := outputs_on(self._rig)) >= count, f"only {found} is on"
-        self.guardian = find_guardian(self.process.pid)
+        self.guardian = find_guardian(self.folder)
         self.rescuer = rescuer_of(self.guardian)
         self.let_it_go_wrong()
 
@@ -195,13 +196,10 @@ class GuardedRun:
         seconds_until(lambda: not is_alive(self.rescuer))
 
 
-def find_guardian(process: int) -> int:
-    """Return the guardian that a bench has started."""
-    for child in children(process):
-        with suppress(OSError):
-            if b"bench.execution.guardian" in (Path("/proc") / str(child) / "cmdline").read_bytes():
-                return child
-    raise AssertionError("the bench has no guardian")
+def find_guardian(folder: Path) -> int:
+    """Return the guardian of the run in a folder, by its own record."""
+    with (folder / BLACK_BOX_NAME).open(encoding="utf-8") as record:
+        return int(json.loads(record.readline())["process"])
 
 
 def start_busy(count: int, stack: ExitStack) -> None:

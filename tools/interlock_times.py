@@ -266,7 +266,7 @@ def carry_out(rig: EmulatedRig, case: Case, protocol: str) -> Found:
                 events = [each for each in rig.control.events() if each["fault"] == case.fault]
                 crossed = float(events[-1]["time"])
         late, problem = _watch(rig, case, crossed)
-        run.guardian = run.guardian or find_guardian(run.process.pid)
+        run.guardian = run.guardian or find_guardian(run.folder)
         since = time.monotonic()
         while not (cause := run.cause) and time.monotonic() - since < 10.0:
             time.sleep(0.05)

@@ -19,9 +19,10 @@ def start_warm(path, request, descriptors):
     path : path-like
         The socket of `warm_start`.
     request : dict
-        `arguments`, `folder`, `environment`, and perhaps `new_session` and `group`, as for `subprocess.Popen`.
+        `arguments`, `folder`, `environment`, and perhaps `new_session` and `group`, as for `subprocess.Popen`;
+        perhaps `parent`, the number that `os.getppid` gives, and `passed`, descriptors that keep their numbers.
     descriptors : list of int
-        Descriptors of standard input, output and error.
+        Descriptors of standard input, output and error, and those of `passed`.
     """
     connection = socket.socket(socket.AF_UNIX)
     connection.connect(str(path))

@@ -9,9 +9,9 @@ from warm_client import exit_code, start_warm
 
 
 class WarmPopen(subprocess.Popen):
-    """A process; what is not Python with a module, a text or a script, or inherits descriptors, is started as ever.
+    """A process; what is not Python with a module, a text or a script is started as ever.
 
-    It is no child of this one: the server that forked it waits for it and says how it ended.
+    The server forks it, waits for it and says how it ended. Within it, `os.getppid` gives this process.
     """
 
     server = None
@@ -24,7 +24,7 @@ class WarmPopen(subprocess.Popen):
         python, *arguments = arguments or [""]
         program = next((each for each in arguments if each != "-P"), "-")
         is_program = program in ("-m", "-c") or not program.startswith("-")
-        if python != sys.executable or not is_program or passed or preexec or executable:
+        if python != sys.executable or not is_program or preexec or executable:
             self._connection = None
             super()._execute_child(args, *settings)
             return
@@ -34,11 +34,13 @@ class WarmPopen(subprocess.Popen):
             "environment": dict(os.environ if environment is None else environment),
             "new_session": session,
             "group": group,
+            "parent": os.getpid(),
+            "passed": list(passed),
         }
         theirs = [pipes[0], pipes[3], pipes[5]]
         descriptors = [end if end >= 0 else standard for standard, end in enumerate(theirs)]
         try:
-            self.pid, self._connection = start_warm(self.server, request, descriptors)
+            self.pid, self._connection = start_warm(self.server, request, [*descriptors, *passed])
             self._child_created = True
         finally:
             self._close_pipe_fds(*pipes)

@@ -1,13 +1,13 @@
 """Starts Python programs as forks of this process, which has imported the libraries: 30 ms, not two seconds.
 
-A request is a connection to the Unix socket that the first argument names: arguments of `python`, folder,
-environment, and the session or group of processes that it gets as a line of JSON, with the descriptors of its
-standard streams.
+A request is a connection to the Unix socket that the first argument names: a line of JSON as `warm_client.start_warm`
+describes it, with the descriptors of the standard streams. The processes that a program starts are forks as well.
 The answers are the process id, and at its end the exit code. The server goes on in the background when it is ready,
 and ends with its standard input.
 """
 
 import atexit
+import fcntl
 import gc
 import importlib
 import json
@@ -15,6 +15,7 @@ import os
 import runpy
 import select
 import socket
+import subprocess
 import sys
 import traceback
 from contextlib import suppress
@@ -50,7 +51,7 @@ LIBRARIES = (
 
 def receive(connection):
     """Return a request, and the descriptors that came with it."""
-    content, descriptors, _, _ = socket.recv_fds(connection, 1 << 16, 3)
+    content, descriptors, _, _ = socket.recv_fds(connection, 1 << 16, 16)
     while not content.endswith(b"\n"):
         content += connection.recv(1 << 16)
     return json.loads(content), descriptors
@@ -58,9 +59,15 @@ def receive(connection):
 
 def begin(request, streams):
     """Make this process what `python` is at its start."""
-    for number, opened in enumerate(streams):
+    # First out of the way of those numbers.
+    moved = [fcntl.fcntl(each, fcntl.F_DUPFD, 1000) for each in streams]
+    for each in streams:
+        os.close(each)
+    for number, opened in zip([0, 1, 2, *request.get("passed", ())], moved, strict=True):
         os.dup2(opened, number)
         os.close(opened)
+    if "parent" in request:
+        take_parent(request["parent"])
     if request.get("new_session"):
         os.setsid()
     if request.get("group", -1) >= 0:
@@ -78,6 +85,13 @@ def begin(request, streams):
         sys.path.insert(0, str(Path(program[0]).parent))
     importlib.invalidate_caches()
     registry.forget()
+
+
+def take_parent(number):
+    """Let a process be the parent of this one for `os.getppid`, as long as it lives."""
+    descriptor, getppid = os.pidfd_open(number), os.getppid
+    os.register_at_fork(after_in_child=lambda: setattr(os, "getppid", getppid))
+    os.getppid = lambda: 1 if select.select([descriptor], [], [], 0)[0] else number
 
 
 def carry_out(option, *rest):
@@ -136,6 +150,12 @@ def main():
     for kernel in kernels_of(packages):
         kernel.prepare()
     packaged_protocols()
+    sys.path.append(str(Path(__file__).parent))
+    from warm_popen import WarmPopen
+
+    sys.path.pop()
+    WarmPopen.server = sys.argv[1]
+    subprocess.Popen = WarmPopen
     # The pages of what is never collected stay shared.
     gc.freeze()
     server = socket.socket(socket.AF_UNIX)

@@ -1,5 +1,6 @@
 import os
 import signal
+from functools import partial
 
 import pytest
 from benches import is_on, rescuer_of, seconds_until
@@ -25,8 +26,9 @@ def served():
         yield rig
 
 
-def kill_both(bench):
-    guardian = find_guardian(bench.pid)
+def kill_both(folder, bench):
+    (journal,) = folder.glob("*/journal.sqlite")
+    guardian = find_guardian(journal.parent)
     # Held first: a bench that lives on for a moment makes safe what its guardian left, and has the locks meanwhile.
     os.kill(bench.pid, signal.SIGSTOP)
     os.kill(rescuer_of(guardian), signal.SIGKILL)
@@ -39,7 +41,7 @@ def test_clears_what_the_watchdogs_left_and_goes_on(served, tmp_path, capsys):
     command = ["run", "damped-oscillation", "--rig", "vo2", "--attach", str(served.endpoints_file)]
     command += ["--no-rehearse", "--out", str(tmp_path), *(f"--set={setting}" for setting in settings)]
     command += [f"--override={key}={value}" for key, value in PATIENT.items()]
-    folder = kill_after(1, tmp_path, *command, kill=kill_both)
+    folder = kill_after(1, tmp_path, *command, kill=partial(kill_both, tmp_path))
     with Record(folder) as record:
         total = record.meta["plan"]["steps"]
         before = len(record.steps())

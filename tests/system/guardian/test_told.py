@@ -125,7 +125,7 @@ def test_a_bench_that_hangs_before_it_has_set_anything_is_told_and_ended(started
     _, told = listener
     with started("think") as run:
         run.await_note("computing")
-        run.guardian = find_guardian(run.process.pid)
+        run.guardian = find_guardian(run.folder)
         run.let_it_go_wrong()
         if sent is not None:
             run.process.send_signal(sent)
