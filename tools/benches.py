@@ -55,7 +55,7 @@ def _leave(station: RemoteStation, rescuer: int) -> None:
 
 
 def rescuer_of(guardian: int) -> int:
-    """Return the process that makes safe what a guardian cannot: it reads a pipe of the guardian's; 0 if there is none."""
+    """Return the process that makes safe what a guardian cannot, by the pipe between them; 0 if there is none."""
     pipes = {
         link for link in map(_link, (Path("/proc") / str(guardian) / "fd").iterdir()) if link.startswith("pipe:")
     }

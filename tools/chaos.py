@@ -177,7 +177,9 @@ def trial(title: str, endpoints: Path, control: ControlClient) -> dict:
         seconds_until(lambda: not is_alive(rescuer))
         os.close(noted)
         os.close(note)
-        control.power_cycle("tec")
+        # Whoever opens a T7 next waits for 3 s if it was not released.
+        for instrument in ("tec", "psd"):
+            control.power_cycle(instrument)
     return found
 
 

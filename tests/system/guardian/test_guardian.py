@@ -37,7 +37,9 @@ SAFE = {"tec": "safe", "psd": "safe"}
 def station(vo2):
     """A station whose TEC is on; its guardian is gone at the end, and the laboratory as it was."""
     with contextlib.ExitStack() as stack:
-        # The watchdog of the TEC would have to be cleared by hand.
+        # The watchdog of the TEC would have to be cleared by hand, and whoever opens a T7 next waits for 3 s if it
+        # was not released.
+        stack.callback(vo2.control.power_cycle, "psd")
         stack.callback(vo2.control.power_cycle, "tec")
 
         def make(file=None, **overrides):
