@@ -20,7 +20,7 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.analysis.uncertain_results import rounded, uncertain_signals
-from bench.base import header_with_unit
+from bench.base import difference_unit, header_with_unit
 from bench.identification import ModelFile, input_half_widths
 from bench.models import Operator
 from bench.record import Record
@@ -252,5 +252,5 @@ def setpoint_uncertainty(
         return []
     widths = input_half_widths(model.operator, setpoints, standard, state)
     cells: list[object] = ["" if width != width else width for width in widths.tolist()]
-    units = model.operator.input_unit.replace("°C", "K"), model.operator.output_unit
+    units = difference_unit(model.operator.input_unit), model.operator.output_unit
     return [(header_with_unit("u_setpoint", units[0]), cells), (header_with_unit("u_predicted", units[1]), standard)]

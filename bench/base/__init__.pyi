@@ -114,6 +114,7 @@ from .shares import (
 from .units import (
     Display as Display,
     check_unit as check_unit,
+    difference_unit as difference_unit,
     fitting_prefix as fitting_prefix,
     format_duration as format_duration,
     format_numbers as format_numbers,

@@ -33,6 +33,11 @@ def fitting_prefix(unit: str, *numbers: float, least: float = 1.0) -> tuple[floa
     return 1.0, unit
 
 
+def difference_unit(unit: str) -> str:
+    """Return the unit of differences of a quantity: a difference of temperatures is in K."""
+    return unit.replace("°C", "K")
+
+
 def prefixed(value: float, unit: str, digits: int = 4) -> str:
     """Return a value in `unit` with so many significant digits, its own prefix and its unit, as of an error."""
     factor, shown = fitting_prefix(unit, value)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.base import ConfigurationError, read_quantity
+from bench.base import ConfigurationError, difference_unit, read_quantity
 from bench.protocol import ProtocolDefinition, ProtocolParameters
 from bench.rig import LEVEL, RigDescription, Slots
 
@@ -45,8 +45,7 @@ def check_accuracy(
         raise ConfigurationError(f"{option}: protocol {definition.name} controls no signal; leave it out")
     unit = description.unit(signal)
     try:
-        # It is a difference.
-        wanted = read_quantity(asked, unit.replace("°C", "K"))
+        wanted = read_quantity(asked, difference_unit(unit))
     except ValueError as error:
         raise ConfigurationError(f"{option}: {error}") from None
     if not 0.0 < wanted < np.inf:

@@ -18,6 +18,7 @@ from bench.base import (
     Display,
     Interrupts,
     VirtualClock,
+    difference_unit,
     format_duration,
     html_table,
 )
@@ -459,8 +460,7 @@ def _bounded(name: str, range_: tuple[float, float], description: RigDescription
     low, high = range_
     unit, display = signal.unit, signal.display
     if signal.name != name:
-        # Of a difference.
-        unit, display = unit.replace("°C", "K"), replace(display, unit=display.unit.replace("°C", "K"))
+        unit, display = difference_unit(unit), replace(display, unit=difference_unit(display.unit))
     return Extremes(float(low), float(high), unit, tuple(bounds), display)
 
 

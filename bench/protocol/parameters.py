@@ -16,6 +16,7 @@ from bench.base import (
     Floats,
     closest,
     comma_remark,
+    difference_unit,
     explain,
     is_quantity,
     read_quantity,
@@ -425,7 +426,7 @@ class ProtocolDefinition:
         difference, _, slot = unit.partition("@")
         slot, slash, _ = slot.partition("/")
         unit = (roles[slot].unit if slot in roles else None) or f"{_UNIT_OF}{slot}"
-        return rate_unit(unit) if slash else unit.replace("°C", "K") if difference else unit
+        return rate_unit(unit) if slash else difference_unit(unit) if difference else unit
 
     def _allowed(self, name: str, roles: Mapping[str, RoleTable]) -> str:
         """Return what a parameter may be, with its unit, for a message."""

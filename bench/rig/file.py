@@ -83,6 +83,7 @@ from bench.base import (
     Clock,
     ConfigurationError,
     closest,
+    difference_unit,
     in_si,
     is_quantity,
     parse_toml,
@@ -478,7 +479,7 @@ def _in_unit_of(content: Mapping[str, Any], parents: Sequence[str], key: str, te
     tables = [_table(content, parents[:count]) or {} for count in range(len(parents), 0, -1)]
     own = next((table["unit"] for table in tables if isinstance(table.get("unit"), str)), "")
     # Of a difference of temperatures K are °C.
-    units = (own.replace("°C", "K"),) if key.rpartition(".")[2] in _DIFFERENCES else (own, own and rate_unit(own))
+    units = (difference_unit(own),) if key.rpartition(".")[2] in _DIFFERENCES else (own, own and rate_unit(own))
     for unit in filter(None, units):
         with suppress(ValueError):
             return read_quantity(text, unit)

@@ -29,7 +29,7 @@ from typing import Protocol, Self
 
 from pydantic import Field, field_validator, model_validator
 
-from bench.base import CheckedTable, ConfigurationError, Display, closest
+from bench.base import CheckedTable, ConfigurationError, Display, closest, difference_unit
 from bench.devices import Device, DeviceDescription, Dwell, Settle, Signal, UntilSteady
 from bench.rig.layout import Range
 
@@ -184,7 +184,7 @@ class Slot:
 
 def rate_unit(unit: str) -> str:
     """Return the unit of a rate of change: a difference of temperatures is in K."""
-    return f"{unit.replace('°C', 'K')}/s"
+    return f"{difference_unit(unit)}/s"
 
 
 Slots = Mapping[str, Slot]

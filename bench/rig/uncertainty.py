@@ -35,7 +35,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from bench.base import CheckedTable, ConfigurationError, DeferredModule, DeviceError, read_quantity
+from bench.base import CheckedTable, ConfigurationError, DeferredModule, DeviceError, difference_unit, read_quantity
 from bench.rig.calibration import Calibrated, Calibration
 from bench.rig.derived import DerivedSignal
 from bench.rig.layout import Range
@@ -434,8 +434,7 @@ class UncertainSignals:
             value, wanted = keys[acts]
             if unit == "%":
                 wanted, scale = unit, 0.01 * abs(value)
-        # It is a difference.
-        difference = wanted.replace("°C", "K")
+        difference = difference_unit(wanted)
         try:
             # The library of units takes a second to load.
             factor = 1.0 if unit in (wanted, difference) else read_quantity(f"1 {unit}", difference)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from bench.analysis import TransientRecording, grid_step, identify_actuator
-from bench.base import DataError
+from bench.base import DataError, difference_unit
 from bench.devices import Signal
 from bench.identification import load_model
 from bench.models import ActuatorDynamics, Operator
@@ -22,7 +22,7 @@ from bench.specimen.reading_time import time_readings
 from bench.specimen.response import identify_response
 from bench.specimen.specimen import Dynamics
 from bench.specimen.suitability import doubts, raise_if_wrong
-from bench.specimen.twin import IdentifiedTwin, difference
+from bench.specimen.twin import IdentifiedTwin
 
 _NODES = 65
 """Pairs by which a derived signal and what it comes from follow from each other; between them it is linear.
@@ -71,7 +71,7 @@ def identify_twin(paths: Sequence[Path], file: RigFile, model: Path | None) -> I
     if steps:
         recordings = tuple(replace(r, setpoints=np.round(r.setpoints / steps) * steps) for r in recordings)
     response = identify_response(recordings, actuator.dynamics, operator)
-    output = difference(units[first.response])
+    output = difference_unit(units[first.response])
     raise_if_wrong(recordings, response, name, output)
     dynamics = Dynamics(of_drive.step, actuator.dynamics, response.dynamics)
     # A model errs less on the run that it is from than on another history.

@@ -11,6 +11,7 @@ import numpy as np
 from pydantic import BaseModel
 
 from bench.analysis import IdentifiedActuator, TransientRecording
+from bench.base import difference_unit
 from bench.models import Operator
 from bench.specimen.device import TwinSettings
 from bench.specimen.disturbances import Noise
@@ -95,8 +96,8 @@ class IdentifiedTwin:
         """Return what was identified, as the rig file describes it, and the warnings, as (name, text) pairs."""
         first, found = self.recordings[0], self.dynamics
         units = {
-            "input units": difference(self.units[first.drive]),
-            "output units": difference(self.units[first.response]),
+            "input units": difference_unit(self.units[first.drive]),
+            "output units": difference_unit(self.units[first.response]),
         }
         order = ("follows at once", "first order", "second order")[found.actuator.order]
         rows = [
@@ -162,8 +163,3 @@ class IdentifiedTwin:
             "reading_time": None if self.reading_time is None else vars(self.reading_time),
             "warnings": list(self.warnings),
         }
-
-
-def difference(unit: str) -> str:
-    """Return the unit of differences of a quantity."""
-    return unit.replace("°C", "K")

@@ -9,7 +9,7 @@ from collections import deque
 from collections.abc import Mapping
 from dataclasses import replace
 
-from bench.base import Display
+from bench.base import Display, difference_unit
 from bench.rig.interlocks.config import SETPOINT, Interlock, Stuck
 
 _SAME_INSTANT = 1e-6
@@ -217,7 +217,7 @@ class _Follows(_Criterion):
 
 def _of_difference(display: Display) -> Display:
     """Return how the difference of two values is shown."""
-    return replace(display, unit="K") if display.unit == "°C" else display
+    return replace(display, unit=difference_unit(display.unit))
 
 
 _bits = struct.Struct("<d").pack
