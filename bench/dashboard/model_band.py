@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
-from bench.base import fitting_prefix
+from bench.base import prefixed
 from bench.control import widened
 from bench.dashboard.drawing import CAUTION, Colour
 from bench.dashboard.entries import Part, Tick, Ticks, single
@@ -198,9 +198,7 @@ class ModelBand:
             return
         standing = self._standings[place]
         level = f"{100.0 * self._band.level:g} % band"
-        factor, unit = fitting_prefix(self._operator.output_unit, self._band.half_width)
-        width = f"± {factor * self._band.half_width:.3g} {unit}".rstrip()
-        yield f"{level} of {self._name}", width
+        yield f"{level} of {self._name}", f"± {prefixed(self._band.half_width, self._operator.output_unit, 3)}"
         if standing.readings:
             share = 100.0 * standing.covered / standing.readings
             yield f"of {standing.readings} readings within it", f"{share:.0f} %"

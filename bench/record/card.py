@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from bench.base import fitting_prefix, format_duration
+from bench.base import format_duration, prefixed
 
 
 def run_card(meta: Mapping[str, Any]) -> str:
@@ -57,7 +57,7 @@ def _expected(meta: Mapping[str, Any]) -> dict[str, str]:
     if (most := rehearsal["at_most"]) is not None:
         length += f", at most {format_duration(most)}"
     margins = [
-        f"{name} {_in_prefixed(each['margin'], each['unit'])}"
+        f"{name} {prefixed(each['margin'], each['unit'], 3)}"
         for name, each in rehearsal["extremes"].items()
         if each["margin"] is not None
     ]
@@ -65,11 +65,6 @@ def _expected(meta: Mapping[str, Any]) -> dict[str, str]:
     if margins:
         rows["least margins"] = ", ".join(margins)
     return rows
-
-
-def _in_prefixed(value: float, unit: str) -> str:
-    factor, shown = fitting_prefix(unit, value)
-    return f"{factor * value:.3g} {'' if shown == '1' else shown}".rstrip()
 
 
 def _between(seconds: float, most: float | None) -> str:
