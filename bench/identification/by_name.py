@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
-import numpy as np
 from numpy.typing import ArrayLike
 
 from bench.base import Floats, checks as _checks
@@ -260,14 +259,13 @@ def set_up_problem(
     measured = _checks.samples("outputs", outputs)
     if measured.size != sequence.size:
         raise ValueError(f"outputs: expected {sequence.size} values, one for each input, got {measured.size}")
-    w = np.ones(sequence.size) if weights is None else _checks.samples("weights", weights)
+    w = counted_weights(sequence.size, weights, skip=0)
     check_words(initial, orientation)
     if initial == "estimate" and spec.estimate_state is None:
         raise ValueError(f"initial: 'estimate' needs a nonnegative Preisach density, not {model_name}")
     check_options(model_name, options)
     # Its range is that of the rows that are fitted: nothing is known of the output beyond it.
-    rows = counted_weights(sequence.size, w, skip=0) > 0.0
-    template: Operator[Any] = spec.template(sequence[rows], **options)
+    template: Operator[Any] = spec.template(sequence[w > 0.0], **options)
     if initial == "skip":
         skip = max(skip, template.unknown_until(sequence))
         check_skipped(sequence.size, skip, template.coefficients.size, spec.estimate_state is not None)

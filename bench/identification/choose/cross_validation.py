@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from bench.base import Floats
 from bench.identification.by_name import Initial, set_up_problem
-from bench.identification.choose.splits import FOLDS, Flags, Fold, block_folds
+from bench.identification.choose.splits import FOLDS, SMOOTHING_BLOCKS, Flags, Fold, block_folds
 from bench.identification.fit.least_squares import Fit, counted_weights
 from bench.identification.fit.orientation import Orientation
 from bench.models import Regressor
@@ -20,8 +20,6 @@ from bench.models import Regressor
 EQUAL = 1.02
 """Ratio of errors that are no difference: the greatest smoothing, or the fewest degrees of freedom, is taken then.
 Derivation: the standard error of the RMS of 1,000 independent errors is 1 / √2,000 of it, 2 %."""
-_BLOCKS = 20
-"""Blocks that are dealt out to the folds. Derivation: four in each test four parts of the record."""
 
 FitOf: TypeAlias = Callable[[float, Floats], Fit]
 """Takes a smoothing weight and the weights of the samples, shape (N,); returns the fit."""
@@ -166,7 +164,7 @@ def compare_smoothing(
     used = int(usable.sum())
     if used < FOLDS:
         raise ValueError(f"weights: expected a positive weight in each of {FOLDS} folds, got {used} in all")
-    parts = block_folds(usable, blocks=min(_BLOCKS, used))
+    parts = block_folds(usable, blocks=min(SMOOTHING_BLOCKS, used))
     return CrossValidation(tuple(_trial(each, fit, regressor, outputs, weights, parts) for each in smoothing))
 
 

@@ -20,6 +20,8 @@ Flags = NDArray[np.bool_]
 FOLDS, BLOCKS = 5, 10
 """Folds, and contiguous blocks that are dealt out to them. Source: 5 to 10 folds are usual (Hastie, Tibshirani and
 Friedman 2009, section 7.10); two blocks in each test two parts of the record."""
+SMOOTHING_BLOCKS = 20
+"""The same where the weight of a penalty is chosen. Derivation: four in each fold test four parts of the record."""
 GAP = 0.01
 """Part of the rows on either side of a block that is neither fitted nor tested. Source: a choice,
 with which a trial on nine files did well."""

@@ -645,7 +645,7 @@ class _ActiveSet:
         return g
 
     def variances(self) -> tuple[Floats, float]:
-        """Return the diagonal of the inverse of the passive Gram block, and its rank; this uses up the factor."""
+        """Return the inverse Gram block's diagonal and the effective number of columns; this uses up the factor."""
         passive, penalty = self.passive, self.columns.penalty
         self.factor.invert()
         diagonal = self.factor.inverse_diagonal()

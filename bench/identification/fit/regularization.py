@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from bench.base import Floats
+from bench.identification.choose.splits import FOLDS, SMOOTHING_BLOCKS
 from bench.identification.fit.cell_layout import CellLayout
 from bench.identification.fit.least_squares import check_penalties, one_thread
 from bench.identification.fit.normal_equations import normal_equations
@@ -28,9 +29,6 @@ RIDGE = (0.0, 1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
 """Weights of the penalty on the size of the density that are tried; see `fit`. Derivation: none of it, and the
 decades of the roughness up to where the size costs a tenth of what the data weigh."""
 
-# Folds and blocks, four in each fold. Source: 5 to 10 folds are usual (Hastie, Tibshirani and Friedman 2009, section
-# 7.10).
-_FOLDS, _BLOCKS = 5, 20
 # Samples of a block, as far as there are so many. Derivation: three of four have no neighbour in another block.
 _SHORTEST = 8
 # The weights belong to the density, not to the plane: they are chosen on one of at most this order. Derivation: it
@@ -103,11 +101,11 @@ def choose_regularization(
     """
     check_penalties(smoothing or 0.0, ridge or 0.0)
     used = outputs.size - skip
-    folds, blocks = _FOLDS, min(_BLOCKS, max(_FOLDS, used // _SHORTEST))
-    fold = (np.maximum(np.arange(-skip, used), 0) * min(blocks, used) // used) % folds
+    blocks = min(SMOOTHING_BLOCKS, max(FOLDS, used // _SHORTEST))
+    fold = (np.maximum(np.arange(-skip, used), 0) * min(blocks, used) // used) % FOLDS
     layout = CellLayout.of(regressor.base.size)
     coarse, layout, factor, size = _coarse(regressor, layout)
-    grams = normal_equations(coarse, outputs, weights, skip, fold, folds)
+    grams = normal_equations(coarse, outputs, weights, skip, fold, FOLDS)
     # Each fold needs samples that count.
     grams = grams[grams[:, -2, -2] > 0.0]
     if len(grams) < 2:
