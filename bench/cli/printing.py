@@ -1,4 +1,4 @@
-"""What the commands print: errors, warnings and tables, on the two consoles."""
+"""Printing of errors, warnings and tables on the two consoles of the commands."""
 
 from __future__ import annotations
 

@@ -103,7 +103,7 @@ def test_it_runs_without_the_checkout(environment, tmp_path):
 
 
 @pytest.mark.seeds
-# Its kernels are compiled anew.
+# A new environment compiles the kernels again.
 @pytest.mark.timeout(1200)
 def test_the_words_of_the_readme_lead_to_reports(environment, tmp_path):
     bench, variables = environment

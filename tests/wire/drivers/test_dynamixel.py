@@ -754,7 +754,7 @@ def test_servo_without_feedback_is_not_connected(script, clock):
             connect(clock)
 
 
-# What is held, and what is not.
+# Readings that stand still, and goals whose answer is lost.
 
 
 def test_tick_that_stands_still(script, servo, clock):
