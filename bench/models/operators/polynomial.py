@@ -77,8 +77,10 @@ class Polynomial(Operator[None]):
     def evaluate(self, inputs: ArrayLike, state: None = None) -> Floats:  # noqa: ARG002
         """Return the outputs, shape (N,)."""
         mapped = self._mapped(_checks.samples("inputs", inputs))
-        # A sum for each input by itself: a product of matrices may round the rows of a sequence otherwise.
-        return np.asarray(self.bias + (chebyshev_terms(mapped, self.degree) * self.series).sum(axis=-1))
+        # By Clenshaw's recurrence, input by input: a product of matrices may round the rows of a sequence otherwise.
+        inside, coefficients = np.clip(mapped, -1.0, 1.0), np.append(self.bias, self.series)
+        slopes = chebyshev.chebval(np.sign(mapped), chebyshev.chebder(coefficients))
+        return np.asarray(chebyshev.chebval(inside, coefficients) + slopes * (mapped - inside), dtype=np.float64)
 
     def step(self, state: None, value: float) -> tuple[None, float]:  # noqa: ARG002
         """Return None and the output at `value`."""
