@@ -335,8 +335,8 @@ class _Search:
         if inner != SCORING:
             return
         text = f"comparing models: {what}" + (f" {done + 1} of {count}" if count > 1 else "")
-        if usable := _usable(self.scores):
-            best = usable[0]
+        best = min(self.scores, key=lambda score: score.error, default=None)
+        if best is not None and not best.failure:
             percent = 100.0 * best.error / max(float(np.ptp(self.measured.outputs)), 1e-300)
             text += f", best so far {' with '.join(filter(None, (best.candidate.model, best.candidate.dynamics)))}"
             text += f" {percent:.2g} %"

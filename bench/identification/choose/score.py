@@ -215,7 +215,7 @@ class Score:
     seconds: float = 0.0
     failure: str = ""
 
-    @property
+    @cached_property
     def error(self) -> float:
         """The score, output units: RMS error over what was left out, cycles counting as much as blocks."""
         parts = [float(np.mean(part)) for part in (self.blocks, self.cycles) if part]
