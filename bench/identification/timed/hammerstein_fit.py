@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -290,8 +291,11 @@ def reshape(search: Search, found: Found, tolerance: float = 1e-10) -> tuple[Sea
     high = np.array([*shape.high, *(each.high for each in parameters)])
     sign = search.sign(found.fit)
 
+    # The operator is computed once for all differences of what follows it.
+    shaped = lru_cache(maxsize=count + 1)(search.static.with_shape)
+
     def at(values: Floats) -> tuple[FitProblem, Fit, Floats]:
-        static = search.static.with_shape(values[:count].tolist())
+        static = shaped(tuple(values[:count].tolist()))
         follows = search.linear(parameters, values[count:])
         columns = follows.part.respond(search.times, static.regressor.dense())[0]
         others = search.beside(found.elements, follows)
