@@ -213,6 +213,11 @@ def _usable(scores: Sequence[Score]) -> list[Score]:
     return sorted((score for score in scores if not score.failure), key=lambda score: score.error)
 
 
+def _unshaped(candidate: Candidate) -> Candidate:
+    """Return a candidate whose shape is to be found: that of the operator alone anew, with dynamics from its own."""
+    return candidate if candidate.dynamics else replace(candidate, shape=())
+
+
 class _Search:
     """The candidates of the choice, step by step; `scores` are those evaluated so far."""
 
@@ -274,7 +279,8 @@ class _Search:
         for others in (self._other_structures, self._other_memories):
             best = min(self._best(models), key=lambda score: score.error, default=None)
             if best is not None:
-                self._evaluate("the best once more", [[replace(one, shape=())] for one in others(best.candidate)])
+                batches = [[_unshaped(one)] for one in others(best.candidate)]
+                self._evaluate("the best once more", batches, reshaped=True)
 
     def all_rows(self, measured: Measurements, order: Sequence[Score]) -> list[Score]:
         """Return the scores on all rows of the first candidates of two models, the least first."""
@@ -290,8 +296,8 @@ class _Search:
 
     def _other_structures(self, best: Candidate) -> list[Candidate]:
         most = _MOST_IN_TIME if best.dynamics else None
-        made = [replace(best, options=options) for options in self.made[best.model]]
-        return [one for one in made if one != best and self._has_at_most(one, most)]
+        made = [replace(best, options=options, shape=()) for options in self.made[best.model]]
+        return [one for one in made if one.options != best.options and self._has_at_most(one, most)]
 
     def _other_memories(self, best: Candidate) -> list[Candidate]:
         """Return a candidate from the initial memories with which it was not tried yet."""
@@ -316,18 +322,20 @@ class _Search:
 
     def _reshape(self, what: str, found: Sequence[Score]) -> list[Score]:
         """Return scores, each with the shape that is found for its own settings where that is better."""
-        shaped = [[replace(one.candidate, shape=())] if one.candidate.shape else [] for one in found]
-        again = self._evaluate(what, shaped)
+        shaped = [[_unshaped(one.candidate)] if one.candidate.shape else [] for one in found]
+        again = self._evaluate(what, shaped, reshaped=True)
         return [min([one, *more], key=lambda score: score.error) for one, more in zip(found, again, strict=True)]
 
-    def _evaluate(self, what: str, batches: Sequence[Sequence[Candidate]]) -> list[list[Score]]:
+    def _evaluate(
+        self, what: str, batches: Sequence[Sequence[Candidate]], *, reshaped: bool = False
+    ) -> list[list[Score]]:
         """Return the scores of batches of candidates."""
         found: list[list[Score]] = []
         for batch in batches:
             say = partial(self._say, what, len(found), len(batches))
             say(SCORING, 0.0)
             with shares_to(say):
-                found.append(evaluate(self.measured, batch))
+                found.append(evaluate(self.measured, batch, reshaped=reshaped))
             self.scores += found[-1]
         return found
 

@@ -239,12 +239,12 @@ class Score:
         return float(np.std(self.blocks, ddof=1) / np.sqrt(len(self.blocks)) / (2.0 * self.blocks_rms))
 
 
-def evaluate(measured: Measurements, candidates: Sequence[Candidate]) -> list[Score]:
+def evaluate(measured: Measurements, candidates: Sequence[Candidate], *, reshaped: bool = False) -> list[Score]:
     """Return the scores of candidates.
 
     Candidates that differ in their penalties alone are set up once, and so is an operator with several dynamics.
     Shape parameters, time constants, the orientation and an estimated memory are found from all rows; coefficients
-    are fitted without each fold.
+    are fitted without each fold. If `reshaped`, the shape of a candidate with dynamics is where its search starts.
     """
     folds = measured.blocks, measured.cycles
     scores: list[Score] = []
@@ -258,7 +258,7 @@ def evaluate(measured: Measurements, candidates: Sequence[Candidate]) -> list[Sc
             with one_thread():
                 if key not in fitters:
                     fitters[key] = (
-                        _set_up_in_time(measured, candidate, searches)
+                        _set_up_in_time(measured, candidate, searches, reshaped=reshaped)
                         if candidate.dynamics
                         else _set_up(measured, candidate)
                     )
@@ -351,7 +351,7 @@ def _set_up(measured: Measurements, candidate: Candidate) -> _Fitter:
 
 
 def _set_up_in_time(
-    measured: Measurements, candidate: Candidate, searches: dict[str, tuple[FitProblem, Search]]
+    measured: Measurements, candidate: Candidate, searches: dict[str, tuple[FitProblem, Search]], *, reshaped: bool
 ) -> _Fitter:
     assert measured.times is not None
     static = repr(replace(candidate, dynamics=""))
@@ -373,7 +373,7 @@ def _set_up_in_time(
     problem, search = searches[static]
     _check_skipped(measured, problem)
     found = find_best(search, tuple(candidate.dynamics.split(",")), rounds=1)
-    if not candidate.shape:
+    if reshaped or not candidate.shape:
         search, found = reshape(search, found, _SHAPE)
     columns, others = search.responses(found.elements, found.values)
     together = np.column_stack([columns, others])
