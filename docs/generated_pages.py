@@ -247,8 +247,8 @@ def journal_schema() -> Iterator[str]:
     """Yield the lines of the page about the tables of a journal."""
     yield "# Tables of a journal\n"
     yield f"`{rows.FILE_NAME}`, schema {rows.SCHEMA}."
-    yield "Times are laboratory time in s from the start of the run. `checksum` covers the row"
-    yield "([journal](../journal.md)).\n"
+    yield "Times are laboratory time in s from the start of the run. `checksum` is the CRC-32 of the"
+    yield "other columns of the row. [Records](../records.md) says what is kept.\n"
     connection = sqlite3.connect(":memory:")
     for statement in rows.table_definitions(["SIGNAL"]):
         connection.execute(statement)

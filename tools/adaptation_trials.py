@@ -2,7 +2,7 @@
 
 Run as a script, some minutes: `.venv/bin/python tools/adaptation_trials.py [SESSIONS]`. It prints the RMS
 error of targets 1 to 60 and 61 to 120, median and worst over the sessions (5 if not given), for
-docs/reference/adaptation.md.
+docs/reference/tuning.md.
 """
 
 import sys
