@@ -53,7 +53,7 @@ def resume(
     same zero of time.
 
     A run without a finished step, or one that goes on or is completed, is refused; so is one whose protocol, rig or
-    versions have changed. docs/reference/resume.md says what is fed back, what is not, and what is refused.
+    versions have changed. docs/reference/resume.md says how the specimen is brought back, and what is refused.
 
     Exit codes: those of `bench run`; 9 the specimen is not as the record left it, and every device is safe.
     """

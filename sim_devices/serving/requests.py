@@ -1,6 +1,6 @@
 """What the control socket takes: each request is a line of JSON, and is parsed strictly.
 
-A request names itself under `do`; `docs/reference/emulate.md` describes each.
+A request names itself under `do`; `docs/reference/emulate.md` shows some.
 """
 
 from __future__ import annotations

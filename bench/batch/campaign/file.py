@@ -1,6 +1,6 @@
 """A campaign file: which protocols run on which rigs, with which parameters, seeds and faults.
 
-A campaign file is TOML; `docs/reference/campaign.md` describes each key::
+A campaign file is TOML; `docs/reference/campaign.md` describes it::
 
     [[runs]]                                # a grid: each protocol × rig × override × parameter × faults × seed
     name = "characterize"
