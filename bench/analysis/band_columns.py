@@ -7,10 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from bench.analysis.tables.dataset import Dataset
-from bench.base import header_with_unit, prefixed
+from bench.base import Floats, header_with_unit, prefixed
 from bench.identification import (
     Band,
     Identification,
@@ -21,8 +20,6 @@ from bench.identification import (
     input_half_widths,
     set_up_problem,
 )
-
-Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

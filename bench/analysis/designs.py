@@ -6,12 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from bench.analysis.tables.data import write_csv
 from bench.analysis.tables.dataset import ColumnNames, check_unit, read_for
 from bench.analysis.tables.reading.options import ReadingOptions
-from bench.base import ConfigurationError, DataError, header_with_unit
+from bench.base import ConfigurationError, DataError, Floats, header_with_unit
 from bench.identification import (
     NOISE,
     Assessment,
@@ -24,8 +23,6 @@ from bench.identification import (
     first_order_reversals,
 )
 from bench.models import Preisach, ThermalExpansion, uniform_levels
-
-Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

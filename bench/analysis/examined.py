@@ -8,14 +8,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from bench.analysis.band_columns import BandedPrediction, band_of
 from bench.analysis.predictions import Predictions, check_finite
 from bench.analysis.session_recalibration import Session
 from bench.analysis.tables.dataset import Dataset
 from bench.analysis.tables.starting_state import StartingState, bind_times, foreign_drift, starting_state
-from bench.base import ConfigurationError
+from bench.base import ConfigurationError, Floats
 from bench.identification import (
     Beyond,
     Comparison,
@@ -27,8 +26,6 @@ from bench.identification import (
     measure_errors,
 )
 from bench.models import Operator, TimedSequence
-
-Floats = npt.NDArray[np.float64]
 
 # Derivation: of a hundred rows a tenth is ten, beside which one stray reading does not count; random errors of ninety
 # rows reach 2.6 standard deviations, those of the others three times that by no chance.

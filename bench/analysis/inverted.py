@@ -10,11 +10,9 @@ import numpy.typing as npt
 
 from bench.analysis.predictions import check_finite
 from bench.analysis.tables.starting_state import bind_times, starting_state
-from bench.base import ConfigurationError, DataError
+from bench.base import ConfigurationError, DataError, Floats
 from bench.identification import Beyond, ModelFile
 from bench.models import Policy, Reach, TimedSequence
-
-Floats = npt.NDArray[np.float64]
 
 # Part of the span of all outputs and targets within which a target over time counts as met, and of a time step within
 # which two times are the same. Derivation: a million times the rounding of one number, less than any sensor tells.

@@ -10,7 +10,6 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from bench.analysis.band_columns import BandedPrediction, band_of, calibrate
 from bench.analysis.picture import Picture
@@ -24,7 +23,7 @@ from bench.analysis.transients.transient_dynamics import (
     read_transients,
 )
 from bench.analysis.uncertain_models import PROVENANCE, ModelUncertainty, identified_uncertainty
-from bench.base import ConfigurationError, closest, html_table, percent, prefixed
+from bench.base import ConfigurationError, Floats, closest, html_table, percent, prefixed
 from bench.identification import (
     ONE_RUN,
     Advice,
@@ -58,9 +57,6 @@ from bench.models import (
     timed_models,
 )
 from bench.record import Record
-
-Floats = npt.NDArray[np.float64]
-
 
 _OF_ALL = ("initial", "orientation")
 """Options that every model takes, though they are not its own."""

@@ -6,18 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
 from bench.analysis.band_columns import BandedPrediction, band_of
 from bench.analysis.tables.data import Quantity
 from bench.analysis.tables.starting_state import bind_times, starting_state
-from bench.base import DataError
+from bench.base import DataError, Floats
 from bench.identification import Beyond, Errors, ModelFile, measure_errors, parse_model
 from bench.models import Operator, TimedModel
 from bench.record import Record, Table
-
-Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

@@ -6,16 +6,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-import numpy.typing as npt
 
 from bench.analysis.band_columns import BandedPrediction
 from bench.analysis.tables.data import Quantity
 from bench.analysis.tables.dataset import Dataset
 from bench.analysis.uncertain_models import predicted_uncertainty
-from bench.base import DataError, header_with_unit
+from bench.base import DataError, Floats, header_with_unit
 from bench.identification import Errors, ModelFile, measure_errors
-
-Floats = npt.NDArray[np.float64]
 
 
 def check_finite(

@@ -6,14 +6,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
-
-from bench.base import ConfigurationError
+from bench.base import ConfigurationError, Floats
 from bench.identification import Kind, Recalibration, parse_kinds, recalibrate
 from bench.models import Operator, TimedSequence
-
-Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

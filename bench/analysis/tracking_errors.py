@@ -7,12 +7,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
+from bench.base import Floats
 from bench.protocol import LATENESS
 from bench.record import Record, Table
-
-Floats = npt.NDArray[np.float64]
 
 REACH = "reach"
 READING = "reading"

@@ -17,16 +17,13 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from bench.analysis.uncertain_results import rounded, uncertain_signals
-from bench.base import difference_unit, header_with_unit
+from bench.base import Floats, difference_unit, header_with_unit
 from bench.identification import ModelFile, input_half_widths
 from bench.models import Operator
 from bench.record import Record
 from bench.rig import Budget, BudgetRow, UncertainSignals, effective_freedom
-
-Floats = npt.NDArray[np.float64]
 
 _FITS = 20
 """Fits with other noise. Derivation: their deviation has 19 degrees of freedom, and k is 2.09 instead of 1.96."""

@@ -19,12 +19,10 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.analysis.tracking_errors import following_result, loop_results, targets_visited
-from bench.base import ConfigurationError
+from bench.base import ConfigurationError, Floats
 from bench.protocol import TRACES
 from bench.record import Record, Table
 from bench.rig import LEVEL, SETPOINT, Budget, Part, UncertainReading, UncertainSignals, rig_of_content
-
-Floats = npt.NDArray[np.float64]
 
 _DRAWS = 20_000
 """Draws of all components. Derivation: the coverage of an interval of 95 % is then good to 0.002."""

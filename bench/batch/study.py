@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Concatenate, ParamSpec
 
 import numpy as np
-import numpy.typing as npt
 from rich.console import Console
 from rich.table import Table
 
@@ -23,6 +22,7 @@ from bench.base import (
     BenchError,
     ConfigurationError,
     DataError,
+    Floats,
     MissingExtraError,
     Stopwatch,
     check_extra,
@@ -486,7 +486,7 @@ def reached_targets(run: RunResult, signal: str) -> TargetResults:
     return results
 
 
-def true_errors(errors: npt.NDArray[np.float64]) -> dict[str, float]:
+def true_errors(errors: Floats) -> dict[str, float]:
     """Return `true_max` and `true_rms` of errors against a true quantity, in its unit."""
     return {"true_max": float(np.abs(errors).max()), "true_rms": float(np.sqrt(np.mean(errors**2)))}
 

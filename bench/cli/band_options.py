@@ -7,13 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bench.base import print_plain
+from bench.base import Floats, print_plain
 from bench.cli.printing import console, print_rows, warn
 
 if TYPE_CHECKING:
-    import numpy as np
-    import numpy.typing as npt
-
     from bench.analysis import BandedPrediction, Examined, Session
 
 BandOption = Annotated[
@@ -55,7 +52,7 @@ class Recalibrating:
         return Session.parse(self.recalibrate, self.recalibrate_rows)
 
 
-def print_band(found: BandedPrediction, residuals: npt.NDArray[np.float64] | None = None, name: str = "") -> None:
+def print_band(found: BandedPrediction, residuals: Floats | None = None, name: str = "") -> None:
     """Print a band in a line, with its coverage if there are residuals."""
     print_plain(console, (f"{name}: " if name else "") + found.text(residuals))
 

@@ -10,8 +10,9 @@ from typing import Any
 import numpy as np
 import rerun as rr
 
+from bench.base import Floats
 from bench.dashboard.drawing import ALARM, CAUTION, LIMIT, Colour
-from bench.dashboard.rerun_recording import Floats, Ints, RerunRecording, times
+from bench.dashboard.rerun_recording import Ints, RerunRecording, times
 from bench.devices import Signal
 from bench.rig import SETPOINT, Interlock, Level
 

@@ -12,11 +12,11 @@ import numpy.typing as npt
 import rerun as rr
 import rerun.blueprint as rrb
 
-from bench.base import fitting_prefix
+from bench.base import Floats, fitting_prefix
 from bench.dashboard.arrangement import seldom
 from bench.dashboard.drawing import FAINT, Colour, time_view
 from bench.dashboard.entries import End, Part, Ticks
-from bench.dashboard.rerun_recording import Floats, RerunRecording, times
+from bench.dashboard.rerun_recording import RerunRecording, times
 from bench.dashboard.signal_plots import find_column
 from bench.devices import Settled, Signal
 from bench.protocol import TRACES

@@ -20,8 +20,8 @@ import rerun.blueprint as rrb
 from rerun.components import LineStrip2DBatch
 from rerun.encodings import Vec2DBatch
 
-from bench.base import fitting_prefix
-from bench.dashboard.rerun_recording import Floats, RerunRecording
+from bench.base import Floats, fitting_prefix
+from bench.dashboard.rerun_recording import RerunRecording
 from bench.devices import Signal
 from bench.rig import XYPlot
 

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
-from bench.dashboard.rerun_recording import Floats, Ints
+from bench.base import Floats
+from bench.dashboard.rerun_recording import Ints
 from bench.identification import ModelFile
 from bench.models import Density, Model
 from bench.record import Event, StepRecord

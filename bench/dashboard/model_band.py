@@ -15,11 +15,11 @@ import numpy as np
 import numpy.typing as npt
 import rerun as rr
 
-from bench.base import prefixed
+from bench.base import Floats, prefixed
 from bench.control import widened
 from bench.dashboard.drawing import CAUTION, Colour
 from bench.dashboard.entries import Part, Tick, Ticks, single
-from bench.dashboard.rerun_recording import Floats, RerunRecording, times
+from bench.dashboard.rerun_recording import RerunRecording, times
 from bench.devices import Settled, Signal
 from bench.identification import Band, ModelFile, Validity, input_half_widths
 from bench.models import Operator

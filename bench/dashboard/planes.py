@@ -8,11 +8,11 @@ import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
 
-from bench.base import fitting_prefix
+from bench.base import Floats, fitting_prefix
 from bench.dashboard.drawing import FAINT, INK, MARKER, Frame, line_style, lines, point_style, texts, xy_view
 from bench.dashboard.entries import ModelDensity
 from bench.dashboard.memories import SignalMemory, StageMemory, memory_of
-from bench.dashboard.rerun_recording import Floats, RerunRecording, times
+from bench.dashboard.rerun_recording import RerunRecording, times
 from bench.dashboard.xy_plots import Points
 from bench.devices import Signal
 from bench.models import density_unit

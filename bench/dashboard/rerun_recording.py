@@ -17,9 +17,8 @@ import numpy.typing as npt
 import rerun as rr
 import rerun.blueprint as rrb
 
-from bench.base import ConfigurationError, WallClock
+from bench.base import ConfigurationError, Floats, WallClock
 
-Floats = npt.NDArray[np.float64]
 Ints = npt.NDArray[np.int64]
 
 LOOPBACK = "127.0.0.1"

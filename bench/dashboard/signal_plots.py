@@ -9,9 +9,8 @@ from typing import Any
 import rerun as rr
 import rerun.blueprint as rrb
 
-from bench.base import ConfigurationError, closest
+from bench.base import ConfigurationError, Floats, closest
 from bench.dashboard.drawing import Colour, time_view
-from bench.dashboard.rerun_recording import Floats
 from bench.devices import Signal
 from bench.rig import SETPOINT
 

@@ -18,10 +18,11 @@ import numpy.typing as npt
 import rerun as rr
 import rerun.blueprint as rrb
 
+from bench.base import Floats
 from bench.dashboard.bounds import Bound
 from bench.dashboard.drawing import Colour, Frame, line_style, lines, point_style, strips_at_once, xy_view
 from bench.dashboard.entries import Ticks
-from bench.dashboard.rerun_recording import Floats, RerunRecording, times
+from bench.dashboard.rerun_recording import RerunRecording, times
 from bench.dashboard.signal_plots import find_column
 from bench.devices import Signal
 from bench.rig import DashboardLayout

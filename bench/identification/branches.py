@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from bench.base import checks as _checks
+from bench.base import Floats, checks as _checks
 
 NOISE = 0.02
 """Moves of at most this part of the range are noise of a measured input. Derivation: six standard deviations, within
@@ -38,12 +38,12 @@ def turning_points(inputs: ArrayLike, least: float = 0.0) -> NDArray[np.int64]:
     return _without_short_moves(u, turns, least)
 
 
-def turns_beyond_noise(inputs: NDArray[np.float64]) -> NDArray[np.int64]:
+def turns_beyond_noise(inputs: Floats) -> NDArray[np.int64]:
     """Return the turning points of inputs, shape (N,), without moves of at most `NOISE` of their range."""
     return turning_points(inputs, NOISE * float(np.ptp(inputs)))
 
 
-def _without_short_moves(u: NDArray[np.float64], turns: NDArray[np.int64], least: float) -> NDArray[np.int64]:
+def _without_short_moves(u: Floats, turns: NDArray[np.int64], least: float) -> NDArray[np.int64]:
     """Return the turning points that are left when moves of at most `least` are not counted."""
     values = u[turns].tolist()
     kept: list[int] = []

@@ -9,15 +9,13 @@ from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
-from bench.base import DataError, needed_for
+from bench.base import DataError, Floats, needed_for
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-Floats = npt.NDArray[np.float64]
 
 FORMATS = ("png", "pdf", "svg")
 """Endings of files that figures can be drawn to."""

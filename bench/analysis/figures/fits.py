@@ -7,15 +7,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import numpy.typing as npt
 
 from bench.analysis.figures.canvas import apart, drawn, legend_above, outline
 from bench.analysis.figures.colors import MEASURED, SKIPPED, color_of, series_color
+from bench.base import Floats
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Floats = npt.NDArray[np.float64]
 
 _MODEL: dict[str, Any] = {"linewidth": 1.3, "alpha": 0.75}
 """Wide lines: the points of what was measured are drawn onto them."""

@@ -8,14 +8,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from bench.analysis.figures.canvas import apart, drawn, legend_above, outline
 from bench.analysis.figures.colors import MEASURED, color_of, series_color
 from bench.analysis.figures.fits import MOST_PHASES
-
-Floats = npt.NDArray[np.float64]
-
+from bench.base import Floats
 
 _MARKED = 200
 """Most points that are joined by a thin line."""

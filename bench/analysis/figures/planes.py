@@ -10,13 +10,12 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.analysis.figures.canvas import drawn
-from bench.base import per_square, with_unit
+from bench.base import Floats, per_square, with_unit
 from bench.models import Density, MemoryCurve
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-Floats = npt.NDArray[np.float64]
 
 _MOST_CELLS = 2500
 """Beyond so many cells a plane is a picture in a figure of lines."""

@@ -6,13 +6,11 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from bench.analysis.figures.canvas import drawn, legend_above, outline
 from bench.analysis.figures.colors import REFERENCE, color_of
 from bench.analysis.figures.fits import draw_published
-
-Floats = npt.NDArray[np.float64]
+from bench.base import Floats
 
 _START = 0.2
 """Share of a record that may belong to the start, in which the controller finds the reference."""

@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from bench.analysis.model_service import IdentifiedFile, certificate_lines
 from bench.analysis.predictions import Predictions
@@ -19,8 +18,6 @@ from bench.base import DataError, percent, write_whole
 from bench.identification import Errors
 from bench.models import MemoryCurve, Operator, TimedModel
 from bench.record import Record
-
-Floats = npt.NDArray[np.float64]
 
 # Models in the table of those that were compared; all are in the model file.
 _SHOWN = 10

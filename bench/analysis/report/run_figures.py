@@ -7,16 +7,13 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-import numpy.typing as npt
 
 from bench.analysis.figures.fits import plot_loops
 from bench.analysis.figures.panels import Curve, plot_signals, time_axis
 from bench.analysis.report.telemetry_summary import TelemetrySummary
-from bench.base import with_unit
+from bench.base import Floats, with_unit
 from bench.devices import Signal
 from bench.record import Event, Record, Table
-
-Floats = npt.NDArray[np.float64]
 
 _RESET = "reset"
 """Begins the names of phases that only bring the memory into a known state."""

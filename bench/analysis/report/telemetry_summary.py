@@ -6,12 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
+from bench.base import Floats
 from bench.protocol import TRACES
 from bench.record import Record, Table
 
-Floats = npt.NDArray[np.float64]
 Extremes = tuple[float | None, float | None]
 
 _MOST_WHOLE = 20_000

@@ -10,7 +10,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from bench.analysis.tables.reading.heads import SECONDS, NoColumnError
 from bench.analysis.tables.reading.library_files import HDF5
@@ -20,7 +19,7 @@ from bench.analysis.tables.reading.spreadsheet import read_spreadsheet
 from bench.analysis.tables.reading.table import ReadColumns
 from bench.analysis.tables.reading.text import reading_errors
 from bench.analysis.tables.reading.text_table import read_text
-from bench.base import ConfigurationError, DataError, closest, header_with_unit, whole_file
+from bench.base import ConfigurationError, DataError, Floats, closest, header_with_unit, whole_file
 from bench.record import Record
 
 _OVERLOAD = 9.9e37
@@ -35,8 +34,6 @@ _STEPS, _TELEMETRY = "steps", "telemetry"
 
 _FORMULAS = ("=", "+", "-", "@", "\t", "\r")
 """What a text begins with that a spreadsheet takes for a formula."""
-
-Floats = npt.NDArray[np.float64]
 
 
 @dataclass(frozen=True)

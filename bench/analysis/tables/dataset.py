@@ -17,11 +17,10 @@ from bench.analysis.tables.data import Quantity, check_variation, is_run, read_c
 from bench.analysis.tables.reading.options import ReadingOptions
 from bench.analysis.tables.reading.table import FEWEST_ROWS
 from bench.analysis.tables.times import rows_in_time, seconds_of
-from bench.base import ConfigurationError, DataError
+from bench.base import ConfigurationError, DataError, Floats
 from bench.identification import Advice, ModelFile
 from bench.models import PolynomialPlays, TimedModel
 
-Floats = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
 _ROWS = re.compile(r"(\d*):(\d*)")

@@ -11,17 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from bench.analysis.tables.data import find_elsewhere, is_run
 from bench.analysis.tables.dataset import ColumnNames, read_dataset, time_names
 from bench.analysis.tables.reading.heads import split_unit
 from bench.analysis.tables.reading.options import ReadingOptions
-from bench.base import ConfigurationError, DataError, redacted_command, wall_time
+from bench.base import ConfigurationError, DataError, Floats, redacted_command, wall_time
 from bench.devices import Settled, Signal
 from bench.record import FILE_NAME, Event, Journal, StepRecord, current_user, make_folder, version_of
-
-Floats = npt.NDArray[np.float64]
 
 PROTOCOL = "imported"
 """What an imported run has in the place of a protocol."""

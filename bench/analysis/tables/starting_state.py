@@ -5,15 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias, get_args
 
-import numpy as np
-import numpy.typing as npt
-
 from bench.analysis.tables.dataset import digest
-from bench.base import ConfigurationError
+from bench.base import ConfigurationError, Floats
 from bench.identification import ModelFile
 from bench.models import Hammerstein, Operator, TimedModel, TimedSequence
 
-Floats = npt.NDArray[np.float64]
 Start: TypeAlias = Literal["file", "negative", "positive", "skip"]
 
 

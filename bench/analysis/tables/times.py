@@ -10,9 +10,8 @@ import numpy.typing as npt
 
 from bench.analysis.tables.data import Quantity
 from bench.analysis.tables.reading.heads import SECONDS, spelled
-from bench.base import ConfigurationError, DataError
+from bench.base import ConfigurationError, DataError, Floats
 
-Floats = npt.NDArray[np.float64]
 Flags = npt.NDArray[np.bool_]
 
 _DAYS = {"Excel": (20_000.0, 80_000.0), "MATLAB": (700_000.0, 800_000.0)}

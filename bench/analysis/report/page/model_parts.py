@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from bench.analysis.figures.fits import plot_fit
 from bench.analysis.figures.panels import time_axis
@@ -15,11 +14,9 @@ from bench.analysis.models_on_run import ModelOnRun
 from bench.analysis.prediction_figures import errors_text
 from bench.analysis.report.page.elements import PageFigure, PageSection, PageTable, PageText
 from bench.analysis.report.page.svg import inlined
-from bench.base import fitting_prefix, percent, with_unit
+from bench.base import Floats, fitting_prefix, percent, with_unit
 from bench.identification import CoefficientUncertainties, ModelFile, coefficient_uncertainties
 from bench.models import MemoryCurve, TimedModel
-
-Floats = npt.NDArray[np.float64]
 
 _FEW_COEFFICIENTS = 30
 """So many coefficients are listed one by one without being asked for."""

@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from bench.analysis.figures.panels import plot_histogram
 from bench.analysis.figures.targets import plot_tracking
@@ -42,12 +41,10 @@ from bench.analysis.report.uncertainty_tables import (
 )
 from bench.analysis.tracking_errors import FollowingResult, following_result, target_results, ticks_with
 from bench.analysis.uncertain_results import RunUncertainty
-from bench.base import Display, format_duration, percent, with_unit
+from bench.base import Display, Floats, format_duration, percent, with_unit
 from bench.devices import Signal
 from bench.identification import models_among
 from bench.record import Event, Record, Table, expected_steps
-
-Floats = npt.NDArray[np.float64]
 
 _STYLES = {"completed": "good", "unfinished": "open"}
 _LATENESS = "lateness"

@@ -10,8 +10,6 @@ from datetime import date, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import numpy.typing as npt
 from pydantic import ValidationError
 
 from bench.analysis.report.page.elements import PageSection, PageTable, PageText
@@ -22,8 +20,6 @@ from bench.base import BenchError, Display, format_duration
 from bench.protocol import ParameterHelp, find_protocol
 from bench.record import Event, Record, Table
 from bench.rig import SETPOINT, Interlock, RoleTable
-
-Floats = npt.NDArray[np.float64]
 
 _MOST_EVENTS = 1000
 """Events that a page lists; a record of a long run may have more."""

@@ -8,11 +8,8 @@ from contextlib import suppress
 from datetime import UTC, datetime
 
 import numpy as np
-import numpy.typing as npt
 
-from bench.base import DataError
-
-Floats = npt.NDArray[np.float64]
+from bench.base import DataError, Floats
 
 _DAY = 86400.0
 """Seconds of a day."""

@@ -5,11 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numpy as np
-import numpy.typing as npt
-
 from bench.analysis.tables.reading.layout import is_number
-from bench.base import DataError
+from bench.base import DataError, Floats
 
 FEWEST_ROWS = 10
 """Fewer samples than this identify nothing."""
@@ -38,7 +35,7 @@ class ReadColumns:
     """
 
     names: list[str]
-    values: list[npt.NDArray[np.float64]]
+    values: list[Floats]
     units: list[str]
     notes: tuple[str, ...]
 

@@ -11,7 +11,6 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-import numpy.typing as npt
 
 from bench.analysis.tables.reading.formats import check_format
 from bench.analysis.tables.reading.heads import NoColumnError, find_place, with_times
@@ -44,9 +43,7 @@ from bench.analysis.tables.reading.tables import (
     walk_tables,
 )
 from bench.analysis.tables.reading.text import TextFile, open_text
-from bench.base import ConfigurationError, DataError
-
-Floats = npt.NDArray[np.float64]
+from bench.base import ConfigurationError, DataError, Floats
 
 _LETTER = re.compile(r"[^\x00-@E\[-`e{-\x7f]")
 """A letter but for that of an exponent."""
