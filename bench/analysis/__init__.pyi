@@ -101,6 +101,7 @@ from .report.run_report import (
     report_run as report_run,
 )
 from .run_comparison import (
+    SIGNAL_HEADS as SIGNAL_HEADS,
     RunComparison as RunComparison,
     compare_runs as compare_runs,
 )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -11,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from bench.analysis.model_service import FitOptions, IdentifiedFile
-from bench.analysis.tables.data import check_variation
+from bench.analysis.tables.data import check_variation, write_csv
 from bench.analysis.tables.dataset import Dataset, check_rows, overwritten_from, parse_rows
 from bench.analysis.tables.reading.table import FEWEST_ROWS
 from bench.analysis.tables.starting_state import bind_times, left_out
-from bench.base import ConfigurationError, DataError, closest, whole_file
+from bench.base import ConfigurationError, DataError, closest
 from bench.identification import (
     Beyond,
     Comparison,
@@ -155,13 +154,8 @@ class SelectedModel:
 
         Raises DataError if it cannot be written.
         """
-        try:
-            with whole_file(path) as part, part.open("w", newline="", encoding="utf-8") as file:
-                writer = csv.DictWriter(file, COLUMNS)
-                writer.writeheader()
-                writer.writerows(self.rows())
-        except OSError as error:
-            raise DataError(f"{path} cannot be written: {error.strerror or error}") from None
+        rows = self.rows()
+        write_csv(path, COLUMNS, [[row[name] for row in rows] for name in COLUMNS])
 
 
 def named_models(text: str) -> tuple[str, ...]:

@@ -23,7 +23,7 @@ def draw_predictions(found: Predictions, folder: Path, prefix: str) -> list[Path
     if found.measured is None:
         for values in found.predicted.values():
             label = with_unit("predicted", found.unit)
-            plot_loops(loops, found.input.values, values, None, input_label=over_input, output_label=label)
+            plot_loops(loops, found.input.values, values, input_label=over_input, output_label=label)
         return [loops]
     rows = np.arange(1.0, found.input.values.size + 1.0)
     over_rows = (rows, "row") if found.time is None else (found.time.values, with_unit("time", found.time.unit))

@@ -5,18 +5,22 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
 
 from bench.analysis.run_list import main_result
 from bench.analysis.tracking_errors import results_json, target_results
-from bench.base import Display, html_table
+from bench.base import fitting_prefix, format_duration, html_table
 from bench.protocol import PARAMETER
 from bench.record import Difference, Record, Table, differences
 
 _OF_THE_WALL_CLOCK = ("clock", "observer", "suspended", "notify", "pause", "resume", "remark", PARAMETER)
 """Kinds of events that say how fast a machine was, and when an operator did something."""
+
+
+SIGNAL_HEADS = ("signal", "RMS", "max", "unit", "at step")
 
 
 @dataclass(frozen=True)
@@ -98,16 +102,44 @@ class RunComparison:
         """Return it for programs."""
         return asdict(self)
 
+    def outcome_rows(self) -> list[tuple[str, str, str]]:
+        """Return how both ended: name, first and second of each row of a table."""
+        rows = [
+            (name, *("" if value is None else str(value) for value in map(attrgetter(name), self.outcomes)))
+            for name in ("run", "status", "reason", "steps", "result")
+        ]
+        lasted = ("" if each.seconds is None else format_duration(each.seconds) for each in self.outcomes)
+        rows.insert(4, ("duration", *lasted))
+        for kind in ("tracking", "following"):
+            errors = [each.errors.get(kind, {}) for each in self.outcomes]
+            for key in {**errors[0], **errors[1]}:
+                rows.append((f"{kind}, {key}", *(f"{each[key]:.4g}" if key in each else "–" for each in errors)))
+        return [(name, first, second) for name, first, second in rows if first or second]
+
+    def difference_rows(self) -> list[tuple[str, str, str]]:
+        """Return what differs: key, first and second of each row of a table."""
+        shown = {each.key: ["none" if v is None else str(v) for v in (each.first, each.second)]
+                 for each in self.differences}  # fmt: skip
+        return [(key, first, second) for key, (first, second) in shown.items()]
+
+    def signal_rows(self) -> list[tuple[str, ...]]:
+        """Return how far signals are apart: signal, RMS, maximum, unit and step of each row of a table."""
+        rows = []
+        for name, apart in self.signals.items():
+            factor, unit = fitting_prefix(apart.unit, apart.maximum)
+            numbers = [f"{factor * value:.3g}" for value in (apart.rms, apart.maximum)]
+            rows.append((name, *numbers, "" if unit == "1" else unit, str(apart.step)))
+        return rows
+
+    @property
+    def signals_title(self) -> str:
+        """Title of the table of signals."""
+        return f"second less first, {self.common_steps} common steps"
+
     def _repr_html_(self) -> str:
-        names = [each.run for each in self.outcomes]
-        rows = [(each.key, *("none" if v is None else str(v) for v in (each.first, each.second)))
-                for each in self.differences]  # fmt: skip
-        apart = []
-        for name, each in self.signals.items():
-            shown = Display.of(each.unit, 9, each.maximum)
-            apart.append((name, shown.text(each.rms), shown.text(each.maximum), str(each.step)))
-        title = f"second less first, {self.common_steps} common steps"
-        return html_table(("differs", *names), rows) + html_table(("signal", "RMS", "max", "at step"), apart, title)
+        outcomes = html_table(("", "first", "second"), self.outcome_rows())
+        apart = html_table(SIGNAL_HEADS, self.signal_rows(), self.signals_title)
+        return outcomes + html_table(("differs", "first", "second"), self.difference_rows()) + apart
 
 
 def compare_runs(first: Record, second: Record) -> RunComparison:

@@ -131,7 +131,9 @@ from .units import (
     with_unit as with_unit,
 )
 from .whole_files import (
+    result_file as result_file,
     whole_file as whole_file,
+    write_result as write_result,
     write_whole as write_whole,
 )
 from .workers.display import (

@@ -14,8 +14,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from bench.base.errors import DataError
-from bench.base.whole_files import write_whole
+from bench.base.whole_files import write_result
 
 _TOO_DEEP = "it is nested too deeply"
 _WITH_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
@@ -98,10 +97,7 @@ def json_text(content: Any, *, indent: int | None = None) -> str:  # noqa: ANN40
 
 def write_json_file(path: Path, content: Any) -> None:  # noqa: ANN401 - anything that JSON can hold
     """Write a file of JSON for people too; raises DataError if that cannot be."""
-    try:
-        write_whole(path, f"{json_text(content, indent=1)}\n")
-    except OSError as error:
-        raise DataError(f"{path} cannot be written: {error.strerror or error}") from None
+    write_result(path, f"{json_text(content, indent=1)}\n")
 
 
 def _finite(content: Any) -> Any:  # noqa: ANN401 - anything that JSON can hold

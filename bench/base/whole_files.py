@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from bench.base.errors import DataError
+
 
 @contextmanager
 def whole_file(path: Path) -> Iterator[Path]:
@@ -45,4 +47,23 @@ def whole_file(path: Path) -> Iterator[Path]:
 def write_whole(path: Path, text: str) -> None:
     """Write a text as UTF-8 to a file that is never seen half written; raise OSError if that cannot be."""
     with whole_file(path) as part:
+        part.write_text(text, encoding="utf-8")
+
+
+@contextmanager
+def result_file(path: Path) -> Iterator[Path]:
+    """Give another name to write a file of results under, as `whole_file`.
+
+    Raises DataError if it cannot be written.
+    """
+    try:
+        with whole_file(path) as part:
+            yield part
+    except OSError as error:
+        raise DataError(f"{path} cannot be written: {error.strerror or error}") from None
+
+
+def write_result(path: Path, text: str) -> None:
+    """Write a text of results as UTF-8; raise DataError if it cannot be written."""
+    with result_file(path) as part:
         part.write_text(text, encoding="utf-8")

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Self
 
 import typer
 
-from bench.base import AbortError, print_plain, write_whole
+from bench.base import AbortError, print_plain, write_result
 from bench.cli.command_support import JsonOption, check_outputs, write_json
 from bench.cli.printing import console, error_console, show_compilation
 
@@ -193,7 +193,7 @@ def _announce(expansion: Expansion, before: dict[str, Done], cores: int) -> None
     estimate = expansion.estimate(left)
     counts = dict.fromkeys(("run", "model", "comparison", "study"), 0)
     for name in left:
-        counts[expansion.tasks[name].describe()["kind"]] += 1
+        counts[expansion.tasks[name].kind] += 1
     plural = {"run": "runs", "model": "models", "comparison": "comparisons", "study": "studies"}
     text = ", ".join(f"{count} {kind if count == 1 else plural[kind]}" for kind, count in counts.items() if count)
     line = f"{text or 'nothing'} to do" + (f", {len(before)} done before" if before else "")
@@ -260,7 +260,7 @@ def _show(expansion: Expansion, done: dict[str, Done], folder: Path) -> list[Pat
             print_over_seeds(name, [folder / task for task in tasks], console)
             for name, tasks in studies_of(expansion, done).items()
         ]
-        write_whole(folder / MARKDOWN_NAME, "\n\n".join(texts) + "\n")
+        write_result(folder / MARKDOWN_NAME, "\n\n".join(texts) + "\n")
         print_plain(console, f"every number: {folder / 'studies.csv'}")
         files |= {"studies": studies, "study-values": study_values(expansion, done)}
     return write_tables(files, folder, console)

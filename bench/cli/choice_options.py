@@ -103,7 +103,7 @@ def choose_model(data: Dataset, model: str, options: ModelOptions, fit: FitOptio
 def print_choice(found: SelectedModel, comparing: Comparing) -> None:
     """Print the table of a comparison, and write all of it if there is a file for it."""
     _print_table(found)
-    _print_line(_on_times(found))
+    print_plain(console, _on_times(found))
     if comparing.table_out is not None:
         found.save(comparing.table_out)
         print_plain(console, f"table: {comparing.table_out}")
@@ -139,27 +139,28 @@ def _print_table(found: SelectedModel) -> None:
         for score in shown
     ]
     widths = [max(map(len, column)) for column in zip(*heads, *rows, strict=True)]
-    _print_line("models by their score, the RMS error on what was left out of the fit")
+    print_plain(console, "models by their score, the RMS error on what was left out of the fit")
     for row in (*heads, *rows):
         # Marks and names begin a column, numbers end it.
         cells = [
             text.ljust(width) if place < 2 else text.rjust(width)
             for place, (text, width) in enumerate(zip(row, widths, strict=True))
         ]
-        _print_line(f"{cells[0]} {'  '.join(cells[1:])}".rstrip())
+        print_plain(console, f"{cells[0]} {'  '.join(cells[1:])}".rstrip())
     more = len(selection.scores) - len(shown)
-    _print_line("* chosen: the fewest degrees of freedom within 2 % of the least score" + _on_bounded(found))
+    print_plain(console, "* chosen: the fewest degrees of freedom within 2 % of the least score" + _on_bounded(found))
     if more > 0:
-        _print_line(f"{more} more were tried; --table-out FILE.csv writes all")
+        print_plain(console, f"{more} more were tried; --table-out FILE.csv writes all")
     if decided:
-        _print_line(
+        print_plain(
+            console,
             f"compared were {selection.rows} of {selection.of} rows; the best of two models were then scored on all "
-            "rows, and one of these was chosen"
+            "rows, and one of these was chosen",
         )
     blocks = f"contiguous blocks of the {selection.rows} rows compared, with gaps of {selection.gap},"
-    _print_line(f"left out: {'whole files' if of_runs else blocks} and whole kinds of cycles")
+    print_plain(console, f"left out: {'whole files' if of_runs else blocks} and whole kinds of cycles")
     errors = f"error of the chosen model: {factor * selection.on_blocks:.3g} {unit} on blocks"
-    _print_line(f"{errors}, {factor * selection.on_runs:.3g} {unit} on another run" if of_runs else errors)
+    print_plain(console, f"{errors}, {factor * selection.on_runs:.3g} {unit} on another run" if of_runs else errors)
 
 
 def _on_bounded(found: SelectedModel) -> str:
@@ -213,10 +214,6 @@ def _on_times(found: SelectedModel) -> str:
     if found.is_timed:
         return "the chosen model takes the times of the rows; --time none leaves them out"
     return "no lag, creep, drift, viscosity or friction lowers the score: the chosen model takes no times"
-
-
-def _print_line(text: str) -> None:
-    console.print(text, highlight=False, markup=False, soft_wrap=True)
 
 
 def _describe(one: Candidate) -> str:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import shlex
-from collections.abc import Iterable
-from enum import Enum
 from typing import Any
 
 import typer
@@ -23,7 +21,7 @@ def command_line(context: typer.Context) -> str:
         if parameter.param_type_name == "option":
             options += _option(parameter, value)
         else:
-            arguments += _texts(value if parameter.nargs != 1 else [value])
+            arguments += map(str, value if parameter.nargs != 1 else [value])
     return shlex.join(["bench", context.info_name or "", *arguments, *options])
 
 
@@ -31,8 +29,4 @@ def _option(option: Any, value: Any) -> list[str]:  # noqa: ANN401 - an option o
     if option.is_flag:
         return [(option.opts if value else option.secondary_opts)[0]]
     given = value if option.multiple else [value]
-    return [word for each in given for word in (option.opts[0], *_texts(each if option.nargs != 1 else [each]))]
-
-
-def _texts(values: Iterable[Any]) -> list[str]:
-    return [str(value.value if isinstance(value, Enum) else value) for value in values]
+    return [word for each in given for word in (option.opts[0], *map(str, each if option.nargs != 1 else [each]))]

@@ -9,9 +9,8 @@ import os
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any, TextIO
+from typing import Annotated, Any, Literal, TextIO
 
 import typer
 
@@ -25,18 +24,11 @@ from bench.base import (
 )
 from bench.cli.streams import write_out
 
-
-class FigureFormat(StrEnum):
-    """Formats of figures."""
-
-    PNG = "png"
-    PDF = "pdf"
-    SVG = "svg"
-
-
 FigureFormatOption = Annotated[
-    FigureFormat, typer.Option("--figures", help="Format of the figures; pdf and svg for papers.")
+    Literal["png", "pdf", "svg"], typer.Option("--figures", help="Format of the figures; pdf and svg for papers.")
 ]
+
+UNSAFE_EXIT_CODE = 7
 
 STANDARD_OUTPUT = Path("-")
 """What `--json` takes for the standard output."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -135,31 +136,14 @@ def compare(
 
 
 def _print_runs(found: RunComparison) -> None:
-    first, second = found.outcomes
-    table = Table("", "first", "second", title="outcome", title_justify="left")
-    for name in ("run", "status", "reason", "steps", "seconds", "result"):
-        values = getattr(first, name), getattr(second, name)
-        if values != ("", ""):
-            known = ("" if value is None else value for value in values)
-            texts = (f"{value:.1f} s" if name == "seconds" and value != "" else str(value) for value in known)
-            table.add_row("duration" if name == "seconds" else name, *map(Text, texts))
-    show_table(console, table)
+    from bench.analysis import SIGNAL_HEADS
+
+    _print_table("outcome", ("", "first", "second"), found.outcome_rows())
     if found.differences:
-        table = Table("key", "first", "second", title="what differs", title_justify="left")
-        for each in found.differences:
-            table.add_row(
-                *(Text("none" if text is None else str(text)) for text in (each.key, each.first, each.second))
-            )
-        show_table(console, table)
+        _print_table("what differs", ("key", "first", "second"), found.difference_rows())
     else:
         console.print("nothing differs in what they were given", highlight=False)
-    table = Table(
-        "signal", "RMS", "max", "unit", "at step", title=f"second less first, {found.common_steps} common steps",
-        title_justify="left",
-    )  # fmt: skip
-    for signal, apart in found.signals.items():
-        table.add_row(signal, f"{apart.rms:.3g}", f"{apart.maximum:.3g}", apart.unit, str(apart.step))
-    show_table(console, table)
+    _print_table(found.signals_title, SIGNAL_HEADS, found.signal_rows())
     for signal, deviation in found.reproducibility.items():
         console.print(
             f"reproducibility of {signal}: {deviation:.2g} {found.signals[signal].unit}, standard deviation of what "
@@ -168,3 +152,10 @@ def _print_runs(found: RunComparison) -> None:
         )
     same = [name for name, equal in found.equal.items() if equal]
     console.print(f"equal to the last bit: {', '.join(same) or 'nothing'}", highlight=False)
+
+
+def _print_table(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    table = Table(*heads, title=title, title_justify="left")
+    for row in rows:
+        table.add_row(*map(Text, row))
+    show_table(console, table)

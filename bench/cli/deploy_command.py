@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -13,32 +12,18 @@ from bench.cli.command_support import JsonOption, check_outputs, write_json
 from bench.cli.printing import console, print_rows, show_compilation
 
 
-class RealType(StrEnum):
-    """Types of the numbers in C."""
-
-    FLOAT = "float"
-    DOUBLE = "double"
-
-
-class FmiVersion(StrEnum):
-    """Versions of FMI."""
-
-    TWO = "2.0"
-    THREE = "3.0"
-
-
 @show_compilation()
 def deploy_(
     model: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.")],
     c: Annotated[
         Path | None, typer.Option("--c", metavar="FOLDER", help="Write a header, a C99 source, main.c and a README.")
     ] = None,
-    real: Annotated[RealType, typer.Option("--real", help="Type of the numbers.")] = RealType.FLOAT,
+    real: Annotated[Literal["float", "double"], typer.Option("--real", help="Type of the numbers.")] = "float",
     fmu: Annotated[
         Path | None,
         typer.Option("--fmu", metavar="FILE.fmu", help="Write a functional mock-up unit for co-simulation."),
     ] = None,
-    fmi: Annotated[FmiVersion, typer.Option("--fmi", help="Version of FMI.")] = FmiVersion.TWO,
+    fmi: Annotated[Literal["2.0", "3.0"], typer.Option("--fmi", help="Version of FMI.")] = "2.0",
     inverse: Annotated[
         bool, typer.Option("--inverse", help="Let the unit be the inverse: from target to input.")
     ] = False,
@@ -85,17 +70,17 @@ def deploy_(
     if fmu is not None:
         if fmu.suffix != ".fmu":
             raise ConfigurationError(f"--fmu {fmu}: expected a name that ends with .fmu")
-        write_fmu(file, fmu, what="inverse" if inverse else "operator", version=fmi.value, period=period)
+        write_fmu(file, fmu, what="inverse" if inverse else "operator", version=fmi, period=period)
         print_plain(console, f"FMU: {fmu}")
     if c is None:
-        write_json(json_file, {"fmu": str(fmu), "fmi": fmi.value})
+        write_json(json_file, {"fmu": str(fmu), "fmi": fmi})
         return
     follower = None
     if controller is not None and rig is not None:
         follower, period = controller_of_rig(controller, rig, period, tuning), None
-    found = deploy(file, name=name, real=real.value, period=period, max_bytes=max_bytes, controller=follower)
+    found = deploy(file, name=name, real=real, period=period, max_bytes=max_bytes, controller=follower)
     found.write(c)
     rows = {"constants": found.constants, "code": found.code, "state": found.state}
-    print_rows(f"{model.name} in {real.value}", [(what, f"{count} bytes") for what, count in rows.items()])
+    print_rows(f"{model.name} in {real}", [(what, f"{count} bytes") for what, count in rows.items()])
     print_plain(console, f"C: {c}")
     write_json(json_file, {"folder": str(c), "files": sorted(found.files), "sha256": found.digest, **rows})

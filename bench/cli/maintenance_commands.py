@@ -14,6 +14,7 @@ from rich.table import Table
 
 from bench.base import AbortError, ConfigurationError, DeviceError, show_table
 from bench.cli.command_support import (
+    UNSAFE_EXIT_CODE,
     AttachOption,
     JsonOption,
     OverrideOption,
@@ -22,8 +23,6 @@ from bench.cli.command_support import (
     write_json,
 )
 from bench.cli.printing import console, show_compilation, warn
-
-UNSAFE_EXIT_CODE = 7
 
 RigArgument = Annotated[
     str,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
@@ -397,13 +396,6 @@ def predict_(
     write_json(json_file, result)
 
 
-class PolicyOption(Enum):
-    """Which answer of an inverse is taken."""
-
-    NEAREST: Literal["nearest"] = "nearest"  # type: ignore[misc]  # so that its value is of a literal type
-    PAPER: Literal["paper"] = "paper"  # type: ignore[misc]
-
-
 @offer_groups
 @show_compilation()
 def invert(
@@ -416,9 +408,9 @@ def invert(
     out: Annotated[Path, typer.Option(metavar="FILE.csv", help="File for the set-points.")] = Path("setpoints.csv"),
     time_column: TimeColumn = None,
     policy: Annotated[
-        PolicyOption,
+        Literal["nearest", "paper"],
         typer.Option(help="Choice among several solutions: nearest, or the paper's direction rule."),
-    ] = PolicyOption.NEAREST,
+    ] = "nearest",
     initial: InitialOption = None,
     continue_memory: ContinueMemory = False,
     json_file: JsonOption = None,
@@ -460,7 +452,7 @@ def invert(
     found = invert_targets(
         model,
         data.inputs,
-        policy=policy.value,
+        policy=policy,
         initial=initial,
         continue_memory=continue_memory,
         times=data.times,

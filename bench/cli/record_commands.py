@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
 from bench.base import print_plain
-from bench.cli.command_support import FigureFormat, FigureFormatOption, JsonOption, write_json
+from bench.cli.command_support import FigureFormatOption, JsonOption, write_json
 from bench.cli.printing import console, show_compilation
 from bench.cli.run_names import NEWEST, RunArgument
 
@@ -28,7 +27,7 @@ def report(
             help="Folder for figures and page; if not given, `report` and `report.html` in the folder of the run.",
         ),
     ] = None,
-    figures: FigureFormatOption = FigureFormat.PNG,
+    figures: FigureFormatOption = "png",
     json_file: JsonOption = None,
 ) -> None:
     """Tables, figures and a page of a run: what happened, extremes, margins, and how models do on it.
@@ -44,25 +43,17 @@ def report(
     files = [load_model(path) for path in models or []]
     published = published_of(run)
     page = (out or (run if run.is_dir() else run.parent)) / PAGE_NAME
-    result = report_run(run, files, out, console, page=page, figure_format=figures.value, published=published)
+    result = report_run(run, files, out, console, page=page, figure_format=figures, published=published)
     write_json(json_file, result)
-
-
-class ExportFormat(StrEnum):
-    """What a run can be exported to."""
-
-    CSV = "csv"
-    PARQUET = "parquet"
-    BLUESKY = "bluesky"
-    RRD = "rrd"
-    PNG = "png"
 
 
 @show_compilation()
 def export(
     run: RunArgument = NEWEST,
     *,
-    format_: Annotated[ExportFormat, typer.Option("--format", help="Format of the files.")],
+    format_: Annotated[
+        Literal["csv", "parquet", "bluesky", "rrd", "png"], typer.Option("--format", help="Format of the files.")
+    ],
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder to write to; the folder of the run if not given.")
     ] = None,
@@ -85,7 +76,7 @@ def export(
     """
     from bench.analysis import export_run
 
-    paths = export_run(run, format_.value, out, escape_formulas=escape_formulas)
+    paths = export_run(run, format_, out, escape_formulas=escape_formulas)
     for path in paths:
         print_plain(console, f"{path}")
     write_json(json_file, {"files": [str(path) for path in paths]})

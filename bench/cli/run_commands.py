@@ -14,6 +14,7 @@ from rich.table import Table
 
 from bench.base import BenchError, ConfigurationError, format_duration, print_plain, show_table
 from bench.cli.command_support import (
+    UNSAFE_EXIT_CODE,
     AttachOption,
     JsonOption,
     LiveOption,
@@ -34,8 +35,6 @@ from bench.cli.run_names import find_run
 
 if TYPE_CHECKING:
     from bench.execution import RunResult
-
-UNSAFE_EXIT_CODE = 7
 
 
 def run(

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from rich.text import Text
@@ -16,17 +15,6 @@ from bench.cli.printing import console
 
 if TYPE_CHECKING:
     from bench.analysis import ListedRun
-
-
-class Status(StrEnum):
-    """How a run ended, or has not."""
-
-    COMPLETED = "completed"
-    ABORTED = "aborted"
-    FAILED = "failed"
-    RUNNING = "running"
-    UNFINISHED = "unfinished"
-    DAMAGED = "damaged"
 
 
 _STYLES = {"completed": "", "running": "green", "unfinished": "yellow"}
@@ -43,7 +31,7 @@ def runs_(
         ),
     ] = None,
     status: Annotated[
-        Status | None,
+        Literal["completed", "aborted", "failed", "running", "unfinished", "damaged"] | None,
         typer.Option(metavar="STATUS", help="Only completed, aborted, failed, running, unfinished or damaged ones."),
     ] = None,
     protocol: Annotated[str | None, typer.Option(metavar="PROTOCOL", help="Only runs of this protocol.")] = None,
@@ -65,7 +53,7 @@ def runs_(
     found = select_runs(
         runs,
         parse_assignments("--where", where or []),
-        status=None if status is None else status.value,
+        status=status,
         protocol=protocol,
         rig=rig,
     )

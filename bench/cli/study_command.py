@@ -10,7 +10,6 @@ import typer
 
 from bench.base import ConfigurationError
 from bench.cli.command_support import (
-    FigureFormat,
     FigureFormatOption,
     JsonOption,
     LiveOption,
@@ -48,7 +47,7 @@ def command_of(name: str, study: Any) -> Callable[..., None]:  # noqa: ANN401 - 
             int | None,
             typer.Option(min=1, help="Runs that go on beside each other; as many as there are cores if not given."),
         ] = None,
-        figures: FigureFormatOption = FigureFormat.PNG,
+        figures: FigureFormatOption = "png",
         json_file: JsonOption = None,
     ) -> None:
         from bench.batch import reproduce
@@ -69,7 +68,7 @@ def command_of(name: str, study: Any) -> Callable[..., None]:  # noqa: ANN401 - 
             live=live,
             console=console,
             workers=workers,
-            figure_format=figures.value,
+            figure_format=figures,
             settings=settings,
         )
         write_json(json_file, result)

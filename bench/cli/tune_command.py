@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from bench.base import print_plain, write_whole
+from bench.base import print_plain, write_result
 from bench.cli.command_support import JsonOption, check_outputs, write_json
 from bench.cli.printing import console, print_rows, show_compilation
 
@@ -62,7 +62,7 @@ def tune_(
         model, rig, twin=twin, controller=controller, protocol=protocol, settings=settings or [], seeds=seeds,
         checks=checks, rounds=rounds, time_weight=time_weight, workers=workers, folder=runs, console=console,
     )  # fmt: skip
-    write_whole(out, found.text())
+    write_result(out, found.text())
     print_rows(f"{controller} on {found.twin}", found.rows())
     print_plain(console, f"tuning: {out}")
     write_json(json_file, found.summary())

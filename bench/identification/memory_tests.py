@@ -104,9 +104,7 @@ def check_return_points(inputs: ArrayLike, outputs: ArrayLike) -> MemoryTest:
     name = "return-point memory"
     visited = [each for each in _visits(u, y) if len(each.outputs) > 1]
     if not visited:
-        return MemoryTest(
-            name, None, float("nan"), float("nan"), 0, f"{name}: not tested, as no extremum is visited twice"
-        )
+        return _untested(name, "no extremum is visited twice")
     deviations = np.concatenate([np.array(each.outputs) - np.mean(each.outputs) for each in visited])
     # Of two visits the difference; of many that move on slowly the whole way counts.
     spare = deviations.size - len(visited)

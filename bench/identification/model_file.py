@@ -39,7 +39,7 @@ from typing import TYPE_CHECKING, Any
 
 from numpy.typing import ArrayLike
 
-from bench.base import DataError, Floats, json_text, parse_json, write_whole
+from bench.base import DataError, Floats, json_text, parse_json, write_result
 from bench.identification.validity import Beyond, Validity
 from bench.models import IdentifiedDynamics, Operator, TimedModel, model_class, model_from_json
 
@@ -196,10 +196,7 @@ class ModelFile:
             raise DataError(
                 f"model file {path} is not written: {reference} does not read what it writes (to_json, from_json)"
             )
-        try:
-            write_whole(Path(path), text + "\n")
-        except OSError as error:
-            raise DataError(f"model file {path} cannot be written: {error.strerror or error}") from None
+        write_result(Path(path), text + "\n")
 
 
 def load_model(path: Path, kind: str | None = None) -> ModelFile:

@@ -500,7 +500,7 @@ def test_a_cluster_gives_the_same(campaign, tmp_path, rig_file):
     assert done_before(expansion.tasks, tmp_path / "there").done == there
     for name, task in expansion.tasks.items():
         assert there[name].identity == here[name].identity
-        if task.describe()["kind"] == "run":
+        if task.kind == "run":
             assert content(tmp_path / "there" / name) == content(tmp_path / "here" / name)
 
 

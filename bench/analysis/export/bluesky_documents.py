@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from bench.analysis.export.typed_tables import Column, TypedTable, epoch_of, plain, typed_tables
-from bench.base import DataError, json_text, whole_file
+from bench.base import json_text, result_file
 from bench.record import Record
 from bench.rig import SETPOINT
 
@@ -159,8 +159,5 @@ def write_documents(record: Record, path: Path) -> None:
 
     Raises DataError if the file cannot be written.
     """
-    try:
-        with whole_file(path) as part, part.open("w", encoding="utf-8") as file:
-            file.writelines(json_text(document) + "\n" for document in documents(record))
-    except OSError as error:
-        raise DataError(f"{path} cannot be written: {error.strerror}") from None
+    with result_file(path) as part, part.open("w", encoding="utf-8") as file:
+        file.writelines(json_text(document) + "\n" for document in documents(record))

@@ -10,7 +10,7 @@ from typing import Any
 from bench.analysis.export.bluesky_documents import write_documents
 from bench.analysis.export.typed_tables import TypedTable, metadata_of, typed_tables
 from bench.analysis.tables.data import write_blocks
-from bench.base import ConfigurationError, DataError, json_text, needed_for, whole_file, write_json_file
+from bench.base import ConfigurationError, DataError, json_text, needed_for, result_file, write_json_file
 from bench.execution import RECORDING_NAME
 from bench.record import Record
 
@@ -132,10 +132,7 @@ def _write_parquet(path: Path, table: TypedTable, metadata: dict[str, Any]) -> N
         for column in table.columns
     ]
     schema = pa.schema(fields, metadata={"bench": json_text(metadata)})
-    try:
-        with whole_file(path) as part, pa.parquet.ParquetWriter(part, schema) as writer:
-            for block in table.blocks:
-                arrays = [pa.array(values, type=field.type) for values, field in zip(block, fields, strict=True)]
-                writer.write_table(pa.table(arrays, schema=schema))
-    except OSError as error:
-        raise DataError(f"{path} cannot be written: {error.strerror or error}") from None
+    with result_file(path) as part, pa.parquet.ParquetWriter(part, schema) as writer:
+        for block in table.blocks:
+            arrays = [pa.array(values, type=field.type) for values, field in zip(block, fields, strict=True)]
+            writer.write_table(pa.table(arrays, schema=schema))

@@ -17,9 +17,6 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-FORMATS = ("png", "pdf", "svg")
-"""Endings of files that figures can be drawn to."""
-
 _STYLE: dict[Any, Any] = {
     "font.size": 9.0,
     "axes.grid": True,
@@ -74,11 +71,12 @@ def drawn(path: Path, size: tuple[float, float], *, grid: bool = True) -> Iterat
             raise DataError(f"figure {path} cannot be written: {error.strerror or error}") from None
 
 
-def legend_above(axes: Axes, size: float = 7.5, markers: float = 3.0) -> None:
+def legend_above(axes: Axes, markers: float = 3.0) -> None:
     """Put the legend above the axes, where it covers no data, in as many columns as its texts leave room for."""
     handles, labels = axes.get_legend_handles_labels()
     if not handles:
         return
+    size = 7.5
     # Of a character, and of what stands beside a text, in inches.
     width, beside = 0.58 * size / 72.0, 0.45
     room = float(axes.figure.bbox.width / axes.figure.dpi) - 0.9

@@ -41,46 +41,24 @@ def draw_measured(
 
 
 def plot_loops(
-    path: Path,
-    inputs: Floats,
-    measured: Floats,
-    modelled: Floats | None,
-    *,
-    input_label: str,
-    output_label: str,
-    phases: Sequence[str] = (),
+    path: Path, inputs: Floats, outputs: Floats, *, input_label: str, output_label: str, phases: Sequence[str] = ()
 ) -> None:
-    """Draw measured loops, one sample a step, and what a model leaves of them below; arrays of shape (N,).
-
-    With the phase of each sample, a few phases have colours of their own.
-    """
-    if modelled is None:
-        names = list(dict.fromkeys(phases))
-        with drawn(path, (6.0, 4.2)) as figure:
-            axes = figure.subplots()
-            if 1 < len(names) <= MOST_PHASES:
-                of = np.array([names.index(name) for name in phases])
-                for i, name in enumerate(names):
-                    # What follows another phase is not joined to what comes before it.
-                    part = np.where(of == i, measured, np.nan)
-                    axes.plot(inputs, part, "-", color=series_color(i), linewidth=0.5, alpha=0.6, label="_")
-                    draw_measured(axes, inputs, part, label=name, color=series_color(i))
-                legend_above(axes)
-            else:
-                axes.plot(inputs, measured, "-", color=SKIPPED, linewidth=0.5)
-                draw_measured(axes, inputs, measured)
-            axes.set(xlabel=input_label, ylabel=output_label)
-        return
-    plot_fit(
-        path,
-        inputs,
-        measured,
-        {"model": modelled},
-        horizontal_label=input_label,
-        output_label=output_label,
-        error_label="residual" + output_label[output_label.find(" / ") :] if " / " in output_label else "residual",
-        titles={"model": ""},
-    )
+    """Draw loops, one sample a step, shape (N,); a few phases have colours of their own."""
+    names = list(dict.fromkeys(phases))
+    with drawn(path, (6.0, 4.2)) as figure:
+        axes = figure.subplots()
+        if 1 < len(names) <= MOST_PHASES:
+            of = np.array([names.index(name) for name in phases])
+            for i, name in enumerate(names):
+                # What follows another phase is not joined to what comes before it.
+                part = np.where(of == i, outputs, np.nan)
+                axes.plot(inputs, part, "-", color=series_color(i), linewidth=0.5, alpha=0.6, label="_")
+                draw_measured(axes, inputs, part, label=name, color=series_color(i))
+            legend_above(axes)
+        else:
+            axes.plot(inputs, outputs, "-", color=SKIPPED, linewidth=0.5)
+            draw_measured(axes, inputs, outputs)
+        axes.set(xlabel=input_label, ylabel=output_label)
 
 
 def plot_errors(
@@ -203,8 +181,7 @@ def plot_fit(
         for axes in panels[1:]:
             axes.axhline(0.0, color="black", linewidth=0.5)
             axes.set_ylabel(error_label)
-            if any(titles.values()):
-                legend_above(axes)
+            legend_above(axes)
         # Of what counts; the samples before may be far off.
         counted = np.concatenate([(measured - values)[skip:] for values in modelled.values()])
         widths = [width for _, width in (bands or {}).values()]

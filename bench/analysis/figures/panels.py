@@ -121,12 +121,9 @@ _FEW_POINTS = 60
 """Points that are drawn as such, as some may have no neighbour."""
 
 
-def plot_histogram(path: Path, values: Floats, *, label: str, limit: float | None = None) -> None:
-    """Draw how often values of shape (N,) occur, on a logarithmic scale of counts; `limit` is drawn as a line."""
+def plot_histogram(path: Path, values: Floats, *, label: str) -> None:
+    """Draw how often values of shape (N,) occur, on a logarithmic scale of counts."""
     with drawn(path, (6.0, 2.8)) as figure:
         axes = figure.subplots()
         axes.hist(values, bins=60, color=series_color(1), log=True)
-        if limit is not None:
-            axes.axvline(limit, color="black", linestyle="--", linewidth=0.8, label="period")
-            legend_above(axes)
         axes.set(xlabel=label, ylabel="samples")

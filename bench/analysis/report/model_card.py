@@ -14,7 +14,7 @@ import numpy as np
 from bench.analysis.model_service import IdentifiedFile, certificate_lines
 from bench.analysis.predictions import Predictions
 from bench.analysis.tables.data import Quantity
-from bench.base import DataError, percent, write_whole
+from bench.base import DataError, percent, write_result
 from bench.identification import Errors
 from bench.models import MemoryCurve, Operator, TimedModel
 from bench.record import Record
@@ -54,10 +54,7 @@ def write_card(
         model="" if model is None else model.name,
         figures=[Path(os.path.relpath(each, path.parent)).as_posix() for each in figures],
     )
-    try:
-        write_whole(path, text)
-    except OSError as error:
-        raise DataError(f"model card {path} cannot be written: {error.strerror}") from None
+    write_result(path, text)
 
 
 def sha256_of(data: Path) -> str:

@@ -97,9 +97,7 @@ def draw_loops(
         path = folder / f"loop{f'-{i}' if i else ''}.{ending}"
         labels = [with_unit(each.name, each.display.unit) for each in ends]
         named = [found[k].name for k in phase[rows]]
-        plot_loops(
-            path, inputs[rows], outputs[rows], None, input_label=labels[0], output_label=labels[1], phases=named
-        )
+        plot_loops(path, inputs[rows], outputs[rows], input_label=labels[0], output_label=labels[1], phases=named)
         left_out = " Resets are left out." if (known & ~rows).any() else ""
         yield path, f"{ends[1].name} over {ends[0].name}, one point a reading.{left_out} {remark}".rstrip()
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from rich.console import Console
 from rich.table import Table as Columns
+from rich.text import Text
 
 from bench.analysis.examined import ComparedModels
 from bench.analysis.export.run_export import make_folder
@@ -19,24 +20,18 @@ from bench.analysis.model_service import IdentifiedFile
 from bench.analysis.models_on_run import ModelOnRun, apply_models, models_of
 from bench.analysis.prediction_figures import draw_predictions
 from bench.analysis.predictions import Predictions
+from bench.analysis.report.page.elements import PagePart, PageTable, PageText
+from bench.analysis.report.page.model_parts import errors_parts
 from bench.analysis.report.page.render import write_page
 from bench.analysis.report.page.run_page import run_page
-from bench.analysis.report.page.run_parts import watched_pairs
+from bench.analysis.report.page.run_parts import signals_table, watched_pairs
 from bench.analysis.report.published import Published
 from bench.analysis.report.run_figures import draw_loops, draw_signals, phases
 from bench.analysis.report.telemetry_summary import TelemetrySummary, summarize, wider, without_priors
-from bench.analysis.report.uncertainty_tables import (
-    BUDGET_HEADS,
-    SIGNAL_HEADS,
-    budget_rows,
-    budget_title,
-    control_lines,
-    not_stated,
-    signal_rows,
-)
+from bench.analysis.report.uncertainty_tables import uncertainty_parts
 from bench.analysis.tracking_errors import results_json
 from bench.analysis.uncertain_results import RunUncertainty
-from bench.base import format_duration, percent, print_plain, with_unit
+from bench.base import format_duration, print_plain, show_table, with_unit
 from bench.identification import ModelFile, models_among
 from bench.models import MemoryCurve
 from bench.record import Record, Table, expected_steps, lateness_lines, run_card
@@ -100,7 +95,7 @@ def report_run(
             signal if signal.extent else replace(signal, extent=_greatest(extremes[signal.name]))
             for signal in record.signals
         )
-        _print_extremes(record, extremes, console)
+        _print_parts([signals_table(record, extremes)], console)
         _print_events(record, console)
         for line in lateness_lines(record.meta.get("lateness", {})):
             print_plain(console, line)
@@ -121,8 +116,8 @@ def report_run(
         control = results_json(record, controlled) if controlled else {}
         _print_control(control, record, controlled, console)
         uncertainty = RunUncertainty.of(record, steps)
-        _print_uncertainty(uncertainty, console)
-        _print_comparison(comparison, applied, record, console)
+        _print_parts(uncertainty_parts(uncertainty), console)
+        _print_parts(errors_parts(applied) if applied else [], console)
         found = {"extremes": extremes, "models": comparison, "uncertainty": uncertainty, **control}
         if page is not None:
             write_page(page, run_page(record, steps, summary, applied, found, published))
@@ -208,17 +203,16 @@ def _greatest(extremes: Mapping[str, Any]) -> float | None:
     return None if low is None else max(abs(low), abs(high)) or None
 
 
-def _print_extremes(record: Record, extremes: Mapping[str, Mapping[str, Any]], console: Console) -> None:
-    table = Columns(
-        "signal", "lowest", "highest", "unit", title="signals, readings and telemetry", title_justify="left"
-    )
-    for signal in record.signals:
-        entry = extremes[signal.name]
-        if entry["low"] is None:
-            continue
-        shown = signal.display
-        table.add_row(signal.name, shown.number(entry["low"]), shown.number(entry["high"]), shown.unit)
-    console.print(table)
+def _print_parts(parts: Sequence[PagePart], console: Console) -> None:
+    """Print tables and texts of the page."""
+    for part in parts:
+        if isinstance(part, PageTable):
+            table = Columns(*part.heads, title=part.title, title_justify="left")
+            for row in part.rows:
+                table.add_row(*map(Text, row))
+            show_table(console, table)
+        elif isinstance(part, PageText):
+            print_plain(console, part.text)
 
 
 def _print_events(record: Record, console: Console) -> None:
@@ -265,23 +259,6 @@ def _draw_errors(models: Sequence[ModelOnRun], folder: Path, figure_format: str)
     return [path]
 
 
-def _print_comparison(
-    comparison: Mapping[str, Mapping[str, Any]], models: Sequence[ModelOnRun], record: Record, console: Console
-) -> None:
-    if not comparison:
-        return
-    table = Columns("model", "max", "RMS", "RMS of the range", title="models on this run", title_justify="left")
-    displays = {signal.name: signal.display for signal in record.signals}
-    outputs = {each.file.name: each.measured.name for each in models}
-    for name, entry in comparison.items():
-        shown = displays[outputs[name]]
-        table.add_row(name, shown.text(entry["max"]), shown.text(entry["rms"]), percent(entry["rms_percent"]))
-    console.print(table)
-    for each in models:
-        if text := each.beyond.text():
-            print_plain(console, f"{each.file.name}: {text}")
-
-
 def _print_control(
     results: Mapping[str, Mapping[str, float]], record: Record, controlled: str, console: Console
 ) -> None:
@@ -292,22 +269,3 @@ def _print_control(
         if "seconds_per_target" in entry:
             parts.append(f"{entry['seconds_per_target']:.1f} s a target")
         console.print(f"{name}: {', '.join(parts)}", highlight=False)
-
-
-def _print_uncertainty(found: RunUncertainty, console: Console) -> None:
-    if rows := signal_rows(found.signals):
-        table = Columns(*SIGNAL_HEADS, title="uncertainty at the farthest reading from 0", title_justify="left")
-        for row in rows:
-            table.add_row(*row)
-        console.print(table)
-    if text := not_stated(found.signals):
-        print_plain(console, text)
-    if (budget := found.shown) is not None:
-        table = Columns(*BUDGET_HEADS, title=budget_title(budget), title_justify="left")
-        for row in budget_rows(budget):
-            table.add_row(*row)
-        console.print(table)
-        print_plain(console, budget.advice())
-    for name, each in found.control.items():
-        for line in control_lines(each):
-            print_plain(console, f"{name}: {line}")

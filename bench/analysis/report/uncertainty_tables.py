@@ -4,18 +4,35 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from bench.analysis.uncertain_results import ControlUncertainty, rounded, two_digits
+from bench.analysis.report.page.elements import PageTable, PageText
+from bench.analysis.uncertain_results import ControlUncertainty, RunUncertainty, rounded, two_digits
 from bench.base import fitting_prefix
 from bench.rig import Budget
 
-SIGNAL_HEADS = ("signal", "at", "U (95 %)", "k", "unit", "largest component")
 BUDGET_HEADS = ("component", "type", "u", "sensitivity", "ν", "part", "%")
 
 _MANY = 1000.0
 """Degrees of freedom that count as infinite. Derivation: Student's t then differs from the normal one by 0.1 %."""
 
 
-def signal_rows(budgets: Mapping[str, Budget]) -> list[tuple[str, ...]]:
+def uncertainty_parts(found: RunUncertainty) -> list[PageTable | PageText]:
+    """Return what is known of the uncertainties of a run, for the terminal and for the page."""
+    parts: list[PageTable | PageText] = []
+    for name, each in found.control.items():
+        parts += [PageText(f"{name}: {line}") for line in _control_lines(each)]
+    if (budget := found.shown) is not None:
+        parts.append(PageTable(BUDGET_HEADS, budget_rows(budget), title=budget_title(budget)))
+        parts.append(PageText(budget.advice()))
+    if rows := _signal_rows(found.signals):
+        heads = ("signal", "at", "U (95 %)", "k", "unit", "largest component")
+        title = "uncertainty of signals, at the reading farthest from 0"
+        parts.append(PageTable(heads, rows, title=title, numbers_from=1))
+    if names := [name for name, each in found.signals.items() if not each.stated]:
+        parts.append(PageText(f"uncertainty not stated: {', '.join(names)}"))
+    return parts
+
+
+def _signal_rows(budgets: Mapping[str, Budget]) -> list[tuple[str, ...]]:
     """Return a row for each signal whose uncertainty is stated: at its reading farthest from 0."""
     rows: list[tuple[str, ...]] = []
     for name, budget in budgets.items():
@@ -24,12 +41,6 @@ def signal_rows(budgets: Mapping[str, Budget]) -> list[tuple[str, ...]]:
             value, expanded = rounded(factor * budget.value, factor * budget.expanded)
             rows.append((name, value, expanded, f"{budget.factor:.2f}", unit, budget.rows[0].label))
     return rows
-
-
-def not_stated(budgets: Mapping[str, Budget]) -> str:
-    """Return in one sentence of which signals no uncertainty is stated; empty if there are none."""
-    names = [name for name, budget in budgets.items() if not budget.stated]
-    return f"uncertainty not stated: {', '.join(names)}" if names else ""
 
 
 def budget_title(budget: Budget) -> str:
@@ -48,11 +59,7 @@ def _freedom(freedom: float) -> str:
 
 
 def budget_rows(budget: Budget) -> list[tuple[str, ...]]:
-    """Return the components of a budget, the largest first.
-
-    u is the standard uncertainty, ν has the degrees of freedom; `part` is the sensitivity times u, in the unit of the
-    budget, and its square a share in % of the variance.
-    """
+    """Return the components of a budget, the largest first; `part` is the sensitivity times u, in its unit."""
     return [
         (
             row.label,
@@ -67,7 +74,7 @@ def budget_rows(budget: Budget) -> list[tuple[str, ...]]:
     ]
 
 
-def control_lines(found: ControlUncertainty) -> list[str]:
+def _control_lines(found: ControlUncertainty) -> list[str]:
     """Return repeatability, reproducibility and accuracy of a run under control, a sentence each."""
     factor, unit = fitting_prefix(found.unit, found.accuracy, least=0.1)
     low, high = (two_digits(factor * each) for each in found.intervals["rms"])

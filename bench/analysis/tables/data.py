@@ -19,7 +19,7 @@ from bench.analysis.tables.reading.spreadsheet import read_spreadsheet
 from bench.analysis.tables.reading.table import ReadColumns
 from bench.analysis.tables.reading.text import reading_errors
 from bench.analysis.tables.reading.text_table import read_text
-from bench.base import ConfigurationError, DataError, Floats, closest, header_with_unit, whole_file
+from bench.base import ConfigurationError, DataError, Floats, closest, header_with_unit, result_file
 from bench.record import Record
 
 _OVERLOAD = 9.9e37
@@ -262,23 +262,15 @@ def write_blocks(
     DataError
         If the file cannot be written.
     """
-    shown = _as_text if escape_formulas else _as_it_is
-    try:
-        with whole_file(path) as part, part.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.writer(file)
-            writer.writerow(map(shown, header))
-            for columns in blocks:
-                plain = [
-                    column.tolist() if isinstance(column, np.ndarray) else list(map(shown, column))
-                    for column in columns
-                ]
-                writer.writerows(zip(*plain, strict=True))
-    except OSError as error:
-        raise DataError(f"{path} cannot be written: {error.strerror or error}") from None
-
-
-def _as_it_is(cell: object) -> object:
-    return cell
+    shown = _as_text if escape_formulas else lambda cell: cell
+    with result_file(path) as part, part.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow(map(shown, header))
+        for columns in blocks:
+            plain = [
+                column.tolist() if isinstance(column, np.ndarray) else list(map(shown, column)) for column in columns
+            ]
+            writer.writerows(zip(*plain, strict=True))
 
 
 def _as_text(cell: object) -> object:

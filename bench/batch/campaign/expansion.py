@@ -307,19 +307,23 @@ class _Expander:
         self, where: str, referred: Mapping[str, str], rig: str, seed: int
     ) -> Iterator[Mapping[str, ModelTask]]:
         """Yield the models that a run takes, one set a run: those of its rig and seed."""
-        tables = {table.name: table for table in self._file.models}
-        found: dict[str, list[ModelTask]] = {}
-        for key, name in referred.items():
-            wanted = seed if tables[name].seed is None else tables[name].seed
-            found[key] = self._models[name].get((rig, wanted or 0), [])
-            if not found[key]:
-                raise ConfigurationError(
-                    f"{where}: parameters.{key} = '{REFERENCE}{name}': {', '.join(tables[name].runs)} has no run on "
-                    f"{rig} with seed {wanted}; expected the same rigs and seeds there, or `seed` in the table of "
-                    "models"
-                )
+        found = {
+            key: self._models_of(f"{where}: parameters.{key} = '{REFERENCE}{name}'", name, rig, seed)
+            for key, name in referred.items()
+        }
         for chosen in itertools.product(*found.values()):
             yield dict(zip(found, chosen, strict=True))
+
+    def _models_of(self, where: str, name: str, rig: str, seed: int) -> list[ModelTask]:
+        """Return the models of a table for a rig and a seed; raise ConfigurationError if there are none."""
+        table = next(each for each in self._file.models if each.name == name)
+        wanted = seed if table.seed is None else table.seed
+        if not (found := self._models[name].get((rig, wanted), [])):
+            raise ConfigurationError(
+                f"{where}: {', '.join(table.runs)} has no run on {rig} with seed {wanted}; expected the same rigs "
+                "and seeds there, or `seed` in the table of models"
+            )
+        return found
 
     def _add_models(self, where: str, table: ModelsTable) -> None:
         self._models[table.name] = {}
@@ -415,16 +419,11 @@ class _Expander:
         ((input_column, output_column),) = columns
         for run in self._runs[table.runs]:
             rig = self._rig_as_given(table.runs, run)
-            found: dict[str, ModelTask] = {}
-            for name in table.models:
-                wanted = run.seed if tables[name].seed is None else tables[name].seed
-                for task in self._models[name].get((rig, wanted or 0), []):
-                    found[task.label] = task
-                if not any(task.table == name for task in found.values()):
-                    raise ConfigurationError(
-                        f"{where}: models = {name!r}: {', '.join(tables[name].runs)} has no run on {rig} with seed "
-                        f"{wanted}; expected the same rigs and seeds there, or `seed` in the table of models"
-                    )
+            found = {
+                task.label: task
+                for name in table.models
+                for task in self._models_of(f"{where}: models = {name!r}", name, rig, run.seed)
+            }
             content = table.model_dump(exclude={"name", "runs", "models"})
             identity = digest({"run": run.identity, **content, "models": {k: t.identity for k, t in found.items()}})
             base = run.name.rpartition("/")[2].rpartition("-")[0]

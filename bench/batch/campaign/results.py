@@ -19,6 +19,8 @@ from bench.batch.campaign.expansion import Expansion
 from bench.batch.campaign.tasks import ComparisonTask, Done, ModelTask, RunTask, StudyTask
 
 Cell: TypeAlias = float | int | str | None
+Row: TypeAlias = dict[tuple[str, str], Cell]
+"""Cells by name and unit of their column."""
 
 MOST_ROWS = 40
 """Rows of a table that are printed; files have all of them."""
@@ -43,7 +45,7 @@ class ResultsTable:
     columns: Mapping[tuple[str, str], Sequence[Cell]]
 
     @classmethod
-    def of(cls, rows: Sequence[Mapping[tuple[str, str], Cell]]) -> ResultsTable:
+    def of(cls, rows: Sequence[Row]) -> ResultsTable:
         """Make a table of rows, each a mapping of (name, unit) to a cell."""
         keys = dict.fromkeys(key for row in rows for key in row)
         return cls({key: [row.get(key) for row in rows] for key in keys})
@@ -104,24 +106,20 @@ def runs_table(expansion: Expansion, done: Mapping[str, Done], table: str) -> Re
     for task in expansion.tasks.values():
         if isinstance(task, ModelTask):
             models.setdefault(task.sources[0], []).append(task)
-    rows: list[dict[tuple[str, str], Cell]] = []
+    rows: list[Row] = []
     for task in expansion.tasks.values():
         if not isinstance(task, RunTask) or task.table != table:
             continue
         found = done[task.name]
-        row: dict[tuple[str, str], Cell] = {("table", ""): table, ("protocol", ""): Path(task.protocol).name}
-        row[("rig", "")] = Path(task.rig).stem
+        row = _without_units(table=table, protocol=Path(task.protocol).name, rig=Path(task.rig).stem)
         for key in expansion.varying[table]:
             if key not in ("protocol", "rig", "seed", "faults"):
                 row[(key, expansion.units.get((table, key), ""))] = _setting(task, key)
-        row |= {("faults", ""): Path(task.faults).stem, ("seed", ""): task.seed}
-        row |= {("status", ""): found.status, ("reason", ""): found.reason}
+        row |= _without_units(faults=Path(task.faults).stem, seed=task.seed, status=found.status, reason=found.reason)
         row |= {(name, unit): value for name, (value, unit) in found.results.items()}
         for model in models.get(task.name, ()):
-            if model.name in done:
-                row |= {
-                    (f"{model.table}_{name}", unit): value for name, (value, unit) in done[model.name].results.items()
-                }
+            left = done[model.name].results if model.name in done else {}
+            row |= {(f"{model.table}_{name}", unit): value for name, (value, unit) in left.items()}
         row[("folder", "")] = task.name
         rows.append(row)
     return ResultsTable.of(rows)
@@ -142,12 +140,11 @@ def over_seeds(table: ResultsTable, varying: Sequence[str]) -> ResultsTable:
     groups: dict[tuple[Cell, ...], list[int]] = {}
     for i in range(len(table)):
         groups.setdefault(tuple(table.columns[key][i] for key in keys), []).append(i)
-    rows: list[dict[tuple[str, str], Cell]] = []
+    rows: list[Row] = []
     for group, members in groups.items():
-        row: dict[tuple[str, str], Cell] = {("table", ""): table.columns[("table", "")][members[0]]}
-        row |= dict(zip(keys, group, strict=True))
-        row[("runs", "")] = len(members)
-        row[("completed", "")] = sum(table.columns[("status", "")][i] == "completed" for i in members)
+        completed = sum(table.columns[("status", "")][i] == "completed" for i in members)
+        row = _without_units(table=table.columns[("table", "")][members[0]])
+        row |= dict(zip(keys, group, strict=True)) | _without_units(runs=len(members), completed=completed)
         for name, unit in results:
             row |= _statistics(name, unit, (table.columns[(name, unit)][i] for i in members))
         rows.append(row)
@@ -156,13 +153,12 @@ def over_seeds(table: ResultsTable, varying: Sequence[str]) -> ResultsTable:
 
 def comparisons_table(expansion: Expansion, done: Mapping[str, Done]) -> ResultsTable:
     """Return the errors of each model on each run that it was compared on, a row each."""
-    rows: list[dict[tuple[str, str], Cell]] = []
+    rows: list[Row] = []
     for task in expansion.tasks.values():
         if not isinstance(task, ComparisonTask) or not (found := done[task.name].results):
             continue
         for model in task.models:
-            row: dict[tuple[str, str], Cell] = {("comparison", ""): task.table, ("model", ""): model}
-            row |= {("run", ""): task.source}
+            row = _without_units(comparison=task.table, model=model, run=task.source)
             for what in ERRORS:
                 value, unit = found[f"{model}_{what}"]
                 row[(what, unit)] = value
@@ -176,10 +172,9 @@ def over_runs(comparisons: ResultsTable) -> ResultsTable:
     heads = zip(comparisons.columns[("comparison", "")], comparisons.columns[("model", "")], strict=True)
     for i, key in enumerate(heads):
         groups.setdefault(key, []).append(i)
-    rows: list[dict[tuple[str, str], Cell]] = []
+    rows: list[Row] = []
     for (comparison, model), members in groups.items():
-        row: dict[tuple[str, str], Cell] = {("comparison", ""): comparison, ("model", ""): model}
-        row[("runs", "")] = len(members)
+        row = _without_units(comparison=comparison, model=model, runs=len(members))
         for name, unit in comparisons.columns:
             if name in ERRORS:
                 row |= _statistics(name, unit, (comparisons.columns[(name, unit)][i] for i in members))
@@ -227,38 +222,39 @@ def studies_table(expansion: Expansion, done: Mapping[str, Done]) -> ResultsTabl
         if isinstance(task, StudyTask):
             for name, (value, _) in done[task.name].results.items():
                 found.setdefault((task.study, Path(task.rig).stem, name), []).append(value)
-    rows: list[dict[tuple[str, str], Cell]] = []
-    for (study, rig, name), values in found.items():
-        rows.append(
-            {
-                ("study", ""): study,
-                ("rig", ""): rig,
-                ("number", ""): name,
-                ("seeds", ""): len(values),
-                ("median", ""): statistics.median(values),
-                ("worst", ""): max(values, key=abs),
-                ("spread", ""): max(values) - min(values),
-            }
-        )
-    return ResultsTable.of(rows)
+    return ResultsTable.of(
+        [
+            _without_units(
+                study=study,
+                rig=rig,
+                number=name,
+                seeds=len(values),
+                median=statistics.median(values),
+                worst=max(values, key=abs),
+                spread=max(values) - min(values),
+            )
+            for (study, rig, name), values in found.items()
+        ]
+    )
 
 
 def study_values(expansion: Expansion, done: Mapping[str, Done]) -> ResultsTable:
     """Return each number of each study and seed, a row each."""
-    rows: list[dict[tuple[str, str], Cell]] = [
-        {
-            ("study", ""): task.study,
-            ("rig", ""): Path(task.rig).stem,
-            ("seed", ""): task.seed,
-            ("status", ""): done[task.name].status,
-            ("number", ""): name,
-            ("value", ""): value,
-        }
-        for task in expansion.tasks.values()
-        if isinstance(task, StudyTask)
-        for name, (value, _) in done[task.name].results.items()
-    ]
-    return ResultsTable.of(rows)
+    return ResultsTable.of(
+        [
+            _without_units(
+                study=task.study,
+                rig=Path(task.rig).stem,
+                seed=task.seed,
+                status=done[task.name].status,
+                number=name,
+                value=value,
+            )
+            for task in expansion.tasks.values()
+            if isinstance(task, StudyTask)
+            for name, (value, _) in done[task.name].results.items()
+        ]
+    )
 
 
 def write_tables(tables: Mapping[str, ResultsTable], folder: Path, console: Console) -> list[Path]:
@@ -282,7 +278,11 @@ def together(tables: Iterable[ResultsTable]) -> ResultsTable:
     return ResultsTable.of(rows)
 
 
-def _statistics(name: str, unit: str, cells: Iterable[Cell]) -> dict[tuple[str, str], Cell]:
+def _without_units(**cells: Cell) -> Row:
+    return {(name, ""): cell for name, cell in cells.items()}
+
+
+def _statistics(name: str, unit: str, cells: Iterable[Cell]) -> Row:
     """Return median, worst (the greatest) and spread of cells as columns; None where there is no number."""
     values = _numbers(cells)
     return {

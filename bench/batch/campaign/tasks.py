@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 
 from rich.console import Console
 
@@ -86,6 +86,9 @@ class CampaignTask(ABC):
     identity : str
         Hash of all that determines its results.
     """
+
+    kind: ClassVar[str]
+    _not_described: ClassVar[tuple[str, ...]] = ()
 
     name: str
     identity: str
@@ -169,9 +172,10 @@ class CampaignTask(ABC):
             return None
         return found if found.identity == self.identity and found.carried_out else None
 
-    @abstractmethod
     def describe(self) -> dict[str, Any]:
         """Return what it is, for programs."""
+        left_out = {"name", "identity", *self._not_described}
+        return {"kind": self.kind, **{key: value for key, value in asdict(self).items() if key not in left_out}}
 
     @abstractmethod
     def _work(self, campaign: Path, scratch: Path) -> tuple[Path, Done]:
@@ -205,6 +209,8 @@ class RunTask(CampaignTask):
     model_labels : mapping of str to str
         What tells the models apart, by the parameter, for people.
     """
+
+    kind = "run"
 
     table: str
     protocol: str
@@ -269,10 +275,6 @@ class RunTask(CampaignTask):
             faults=Path(self.faults) if self.faults else None,
         )
 
-    def describe(self) -> dict[str, Any]:
-        """Return what it is, for programs."""
-        return {"kind": "run", **_own_fields(self)}
-
     def _work(self, campaign: Path, scratch: Path) -> tuple[Path, Done]:
         result = carry_out(self.run(campaign, scratch), Console(quiet=True))
         outcome = result.outcome
@@ -312,6 +314,9 @@ class ModelTask(CampaignTask):
         What tells it from the others of its rig and seed.
     """
 
+    kind = "model"
+    _not_described = ("input", "output", "label")
+
     table: str
     sources: tuple[str, ...]
     model: str
@@ -329,16 +334,6 @@ class ModelTask(CampaignTask):
     def leaves(self) -> tuple[str, ...]:
         """The model."""
         return (MODEL_NAME,)
-
-    def describe(self) -> dict[str, Any]:
-        """Return what it is, for programs."""
-        return {
-            "kind": "model",
-            "table": self.table,
-            "sources": self.sources,
-            "model": self.model,
-            "options": self.options,
-        }
 
     def _work(self, campaign: Path, scratch: Path) -> tuple[Path, Done]:
         made = scratch / "made"
@@ -379,6 +374,8 @@ class ComparisonTask(CampaignTask):
         First rows for that; they do not count in the errors.
     """
 
+    kind = "comparison"
+
     table: str
     source: str
     models: Mapping[str, str]
@@ -391,10 +388,6 @@ class ComparisonTask(CampaignTask):
     def needs(self) -> tuple[str, ...]:
         """The run and the identifications."""
         return (self.source, *self.models.values())
-
-    def describe(self) -> dict[str, Any]:
-        """Return what it is, for programs."""
-        return {"kind": "comparison", **_own_fields(self)}
 
     def _work(self, campaign: Path, scratch: Path) -> tuple[Path, Done]:
         source = completed_run(campaign, self.source)
@@ -427,6 +420,8 @@ class StudyTask(CampaignTask):
         From which the seeds of its runs come.
     """
 
+    kind = "study"
+
     study: str
     rig: str
     seed: int
@@ -435,10 +430,6 @@ class StudyTask(CampaignTask):
     def leaves(self) -> tuple[str, ...]:
         """Values and tables."""
         return (STUDY_NAME,)
-
-    def describe(self) -> dict[str, Any]:
-        """Return what it is, for programs."""
-        return {"kind": "study", "study": self.study, "rig": self.rig, "seed": self.seed}
 
     def _work(self, campaign: Path, scratch: Path) -> tuple[Path, Done]:
         del campaign
@@ -457,11 +448,6 @@ def completed_run(campaign: Path, name: str) -> RunFolder:
     if run.status != "completed":
         raise DataError(f"the run {name} was not completed")
     return run
-
-
-def _own_fields(task: RunTask | ComparisonTask) -> dict[str, Any]:
-    """Return the fields of a task but those that all tasks have."""
-    return {key: value for key, value in asdict(task).items() if key not in ("name", "identity")}
 
 
 def identification_options(options: Mapping[str, Any]) -> dict[str, Any]:

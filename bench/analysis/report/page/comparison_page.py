@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from bench.analysis.figures.panels import Curve, plot_panels, plot_signals
-from bench.analysis.report.page.elements import Page, PageFigure, PageSection, PageTable, PageText
+from bench.analysis.report.page.elements import Page, PageFigure, PageSection, PageTable
 from bench.analysis.report.page.svg import inlined
-from bench.analysis.run_comparison import RunComparison
-from bench.base import fitting_prefix, format_duration, with_unit
+from bench.analysis.run_comparison import SIGNAL_HEADS, RunComparison
+from bench.base import fitting_prefix, with_unit
 from bench.record import Record, Table
 
 
@@ -23,8 +23,8 @@ def comparison_page(first: Record, second: Record, found: RunComparison) -> Page
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder)
         sections = [
-            PageSection("Outcome", (_outcomes(found),)),
-            PageSection("What differs", (_differences(found),)),
+            PageSection("Outcome", (PageTable(("", "first", "second"), found.outcome_rows()),)),
+            PageSection("What differs", _differences(found)),
             PageSection("Loops", _loops(first, tables, scratch)),
             PageSection("Signals", _signals(found, tables, scratch)),
         ]
@@ -56,29 +56,8 @@ def _lead(found: RunComparison) -> list[str]:
     return lead
 
 
-def _outcomes(found: RunComparison) -> PageTable:
-    rows = []
-    for key, name in (("run", "run"), ("status", "status"), ("reason", "reason"), ("steps", "steps"),
-                      ("seconds", "duration / h:mm:ss"), ("result", "result")):  # fmt: skip
-        cells = [getattr(outcome, key) for outcome in found.outcomes]
-        texts = ["" if cell is None else format_duration(cell) if key == "seconds" else str(cell) for cell in cells]
-        if any(texts):
-            rows.append((name, *texts))
-    for kind in ("tracking", "following"):
-        errors = [outcome.errors.get(kind, {}) for outcome in found.outcomes]
-        for key in {**errors[0], **errors[1]}:
-            rows.append((f"{kind}, {key}", *(f"{each[key]:.4g}" if key in each else "–" for each in errors)))
-    return PageTable(("", "first", "second"), rows)
-
-
-def _differences(found: RunComparison) -> PageTable | PageText:
-    if not found.differences:
-        return PageText("Nothing differs in parameters, rig, instruments, versions and files.")
-    rows = [
-        (each.key, *("none" if value is None else str(value) for value in (each.first, each.second)))
-        for each in found.differences
-    ]
-    return PageTable(("key", "first", "second"), rows)
+def _differences(found: RunComparison) -> list[PageTable]:
+    return [PageTable(("key", "first", "second"), found.difference_rows())] if found.differences else []
 
 
 def _loops(record: Record, tables: Sequence[Table], scratch: Path) -> list[PageFigure]:
@@ -114,14 +93,9 @@ def _loops(record: Record, tables: Sequence[Table], scratch: Path) -> list[PageF
 
 
 def _signals(found: RunComparison, tables: Sequence[Table], scratch: Path) -> list[PageTable | PageFigure]:
-    rows = []
-    for name, apart in found.signals.items():
-        factor, unit = fitting_prefix(apart.unit, apart.maximum)
-        numbers = [f"{factor * value:.3g}" for value in (apart.rms, apart.maximum)]
-        rows.append((name, *numbers, "" if unit == "1" else unit, str(apart.step)))
-    heads = ("signal", "RMS", "max", "unit", "at step")
-    title = f"second less first, {found.common_steps} common steps"
-    parts: list[PageTable | PageFigure] = [PageTable(heads, rows, title=title, numbers_from=1)]
+    parts: list[PageTable | PageFigure] = [
+        PageTable(SIGNAL_HEADS, found.signal_rows(), title=found.signals_title, numbers_from=1)
+    ]
     common, ours, theirs = np.intersect1d(tables[0]["step"], tables[1]["step"], return_indices=True)
     curves = []
     for name, apart in found.signals.items():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import TypeAlias
 
 
 @dataclass(frozen=True)
@@ -62,12 +63,15 @@ class PageFigure:
     kind = "figure"
 
 
+PagePart: TypeAlias = PageText | PageTable | PageFigure
+
+
 @dataclass(frozen=True)
 class PageSection:
     """A part of a page under a head."""
 
     title: str
-    parts: Sequence[PageText | PageTable | PageFigure]
+    parts: Sequence[PagePart]
 
     @property
     def anchor(self) -> str:

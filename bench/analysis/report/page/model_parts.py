@@ -12,7 +12,7 @@ from bench.analysis.figures.panels import time_axis
 from bench.analysis.figures.planes import plot_coverage, plot_densities
 from bench.analysis.models_on_run import ModelOnRun
 from bench.analysis.prediction_figures import errors_text
-from bench.analysis.report.page.elements import PageFigure, PageSection, PageTable, PageText
+from bench.analysis.report.page.elements import PageFigure, PagePart, PageSection, PageTable, PageText
 from bench.analysis.report.page.svg import inlined
 from bench.base import Floats, fitting_prefix, percent, with_unit
 from bench.identification import CoefficientUncertainties, ModelFile, coefficient_uncertainties
@@ -34,11 +34,7 @@ def models_section(models: Sequence[ModelOnRun], times: Floats, scratch: Path) -
     scratch : Path
         Folder for files that are not kept.
     """
-    parts: list[PageFigure | PageTable | PageText] = [_errors_table(models)]
-    skip = models[0].skip
-    if skip:
-        parts.append(PageText(f"Readings 1 to {skip} drive the memory of the models and count in no error."))
-    parts += [PageText(f"{model.file.name}: {text}.") for model in models if (text := model.beyond.text())]
+    parts: list[PagePart] = [*errors_parts(models)]
     for i, group in enumerate(_by_signals(models)):
         parts += _fits(group, times, scratch, i)
     parts += [part for model in models for part in _bands(model)]
@@ -66,7 +62,8 @@ def given_section(files: Sequence[tuple[str, ModelFile]], scratch: Path) -> Page
     return PageSection("Models that the run was given", (PageTable(heads, rows), *figures))
 
 
-def _errors_table(models: Sequence[ModelOnRun]) -> PageTable:
+def errors_parts(models: Sequence[ModelOnRun]) -> list[PageTable | PageText]:
+    """Return the errors of models, one at least, and what a reader should know of them."""
     rows = []
     for model in models:
         errors = model.errors
@@ -83,7 +80,11 @@ def _errors_table(models: Sequence[ModelOnRun]) -> PageTable:
             )
         )
     heads = ("model", "kind", "max", "RMS", "mean absolute", "unit", "RMS / % of range")
-    return PageTable(heads, rows, title="errors on this run", numbers_from=2)
+    table = PageTable(heads, rows, title="models on this run", numbers_from=2)
+    skip = models[0].skip
+    skipped = [f"readings 1 to {skip} drive the memory of the models and count in no error"] if skip else []
+    remarks = [f"{model.file.name}: {text}" for model in models if (text := model.beyond.text())]
+    return [table, *map(PageText, [*skipped, *remarks])]
 
 
 def _by_signals(models: Sequence[ModelOnRun]) -> list[list[ModelOnRun]]:
@@ -139,7 +140,7 @@ def _bands(model: ModelOnRun) -> Iterator[PageTable | PageText]:
     yield PageTable(("", ""), rows, title=f"prediction band of {model.file.name}")
 
 
-def _details(model: ModelOnRun, scratch: Path, number: int) -> Iterator[PageFigure | PageTable | PageText]:
+def _details(model: ModelOnRun, scratch: Path, number: int) -> Iterator[PagePart]:
     operator, name = model.file.operator, model.file.name
     inputs = model.inputs.values
     found = coefficient_uncertainties(operator, inputs, model.residuals, model.state, model.skip)

@@ -6,7 +6,7 @@ import importlib.metadata
 from pathlib import Path
 
 from bench.analysis.report.page.elements import Page
-from bench.base import DataError, needed_for, write_whole
+from bench.base import needed_for, write_result
 
 _HERE = Path(__file__).parent
 
@@ -33,7 +33,4 @@ def write_page(path: Path, page: Page) -> None:
 
     Raises DataError if it cannot be written.
     """
-    try:
-        write_whole(path, render(page))
-    except OSError as error:
-        raise DataError(f"{path} cannot be written: {error.strerror}") from None
+    write_result(path, render(page))

@@ -12,7 +12,7 @@ import numpy as np
 from bench.analysis.figures.panels import plot_histogram
 from bench.analysis.figures.targets import plot_tracking
 from bench.analysis.models_on_run import ModelOnRun
-from bench.analysis.report.page.elements import Page, PageFigure, PageSection, PageTable, PageText
+from bench.analysis.report.page.elements import Page, PageFigure, PagePart, PageSection, PageTable
 from bench.analysis.report.page.model_parts import given_section, models_section
 from bench.analysis.report.page.run_parts import (
     devices_section,
@@ -30,17 +30,8 @@ from bench.analysis.report.page.svg import inlined
 from bench.analysis.report.published import Published, concerning
 from bench.analysis.report.run_figures import Phase, draw_loops, draw_signals, phases
 from bench.analysis.report.telemetry_summary import TelemetrySummary
-from bench.analysis.report.uncertainty_tables import (
-    BUDGET_HEADS,
-    SIGNAL_HEADS,
-    budget_rows,
-    budget_title,
-    control_lines,
-    not_stated,
-    signal_rows,
-)
+from bench.analysis.report.uncertainty_tables import uncertainty_parts
 from bench.analysis.tracking_errors import FollowingResult, following_result, target_results, ticks_with
-from bench.analysis.uncertain_results import RunUncertainty
 from bench.base import Display, Floats, format_duration, percent, with_unit
 from bench.devices import Signal
 from bench.identification import models_among
@@ -85,8 +76,8 @@ def run_page(
         scratch = Path(folder)
         if (control := _control_section(record, result, stated, scratch)) is not None:
             sections.append(control)
-        if (uncertain := _uncertainty_section(result["uncertainty"])) is not None:
-            sections.append(uncertain)
+        if uncertain := uncertainty_parts(result["uncertainty"]):
+            sections.append(PageSection("Uncertainty", uncertain))
         if models:
             sections.append(models_section(models, steps["finished"], scratch))
         elif (loops := _loops_section(record, steps, summary, found, scratch)) is not None:
@@ -189,7 +180,7 @@ def _control_section(
         return None
     display = _signal(record, controlled).display
     controller = str(record.meta["parameters"].get("controller", "output"))
-    parts: list[PageFigure | PageTable | PageText] = []
+    parts: list[PagePart] = []
     rows = []
     for key in ("tracking", "following"):
         for name, value in result.get(key, {}).items():
@@ -230,19 +221,6 @@ def _control_section(
         caption = f"Reference (grey) and output under {controller}; below, the error."
         parts.append(PageFigure(inlined(path, caption), caption))
     return PageSection("Control", parts)
-
-
-def _uncertainty_section(found: RunUncertainty) -> PageSection | None:
-    parts: list[PageFigure | PageTable | PageText] = []
-    for name, each in found.control.items():
-        parts += [PageText(f"{name}: {line}.") for line in control_lines(each)]
-    if (budget := found.shown) is not None:
-        parts.append(PageTable(BUDGET_HEADS, budget_rows(budget), title=budget_title(budget), note=budget.advice()))
-    if rows := signal_rows(found.signals):
-        parts.append(PageTable(SIGNAL_HEADS, rows, title="signals, at the reading farthest from 0", numbers_from=1))
-    if text := not_stated(found.signals):
-        parts.append(PageText(f"{text}."))
-    return PageSection("Uncertainty", parts) if parts else None
 
 
 def _followed(record: Record, controlled: str) -> FollowingResult | None:
@@ -291,7 +269,7 @@ def _signals_section(
     found: Sequence[Phase],
     scratch: Path,
 ) -> PageSection:
-    parts: list[PageFigure | PageTable | PageText] = [signals_table(record, extremes)]
+    parts: list[PagePart] = [signals_table(record, extremes)]
     path = scratch / "signals.svg"
     if caption := draw_signals(path, record, steps, summary, found):
         parts.append(PageFigure(inlined(path, caption), caption))
@@ -299,7 +277,7 @@ def _signals_section(
 
 
 def _lateness_section(record: Record, scratch: Path) -> PageSection | None:
-    parts: list[PageFigure | PageTable | PageText] = []
+    parts: list[PagePart] = []
     for label, each in record.meta.get("lateness", {}).items():
         rate = f" at {each['rate']:g} Hz" if each["rate"] is not None else ""
         ends = [*(f"≤ {1e3 * edge:g}" for edge in each["edges"]), f"> {1e3 * each['edges'][-1]:g}"]

@@ -133,8 +133,9 @@ def signals_table(record: Record, extremes: Mapping[str, Mapping[str, Any]]) -> 
         rows.append((signal.name, *numbers, shown.unit, "–" if margin is None else shown.text(margin)))
     return PageTable(
         ("signal", "lowest", "highest", "unit", "least margin"),
-        [(name, low, high, unit, margin) for name, low, high, unit, margin in rows],
-        note="Readings and telemetry. The margin is the distance to the nearest limit of the device or interlock.",
+        rows,
+        title="signals, readings and telemetry",
+        note="The margin is the distance to the nearest limit of the device or interlock.",
         numbers_from=1,
     )
 
