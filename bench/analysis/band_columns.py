@@ -93,19 +93,12 @@ def band_of(model: ModelFile) -> BandedPrediction | None:
 
 @dataclass(frozen=True)
 class BandedTargets:
-    """The band at inverted set-points.
+    """The band at inverted set-points."""
 
-    Attributes
-    ----------
-    outputs : BandedPrediction
-        The band of the output at each set-point.
-    setpoints : ndarray, shape (N,), or None
-        Half-width about each set-point within which the target is met: that of the output over the local slope, in
-        input units; nan where that is more than the operating range, as the output hardly moves with the input. None
-        of a model with time, whose output depends on more than the last set-point.
-    """
-
-    outputs: BandedPrediction
+    outputs: BandedPrediction  # the band of the output at each set-point
+    # Shape (N,); half-width about each set-point within which the target is met: that of the output over the local
+    # slope, in input units; nan where that is more than the operating range, as the output hardly moves with the
+    # input. None of a model with time, whose output depends on more than the last set-point.
     setpoints: Floats | None
 
     def columns(self, setpoints: Floats, predicted: Floats, unit: str) -> list[tuple[str, Floats | list[object]]]:

@@ -27,18 +27,10 @@ from bench.models import Preisach, ThermalExpansion, uniform_levels
 
 @dataclass(frozen=True)
 class Design:
-    """A sequence of set-points, and what it tells.
+    """A sequence of set-points, and what it tells."""
 
-    Attributes
-    ----------
-    setpoints : ndarray, shape (N,)
-        Input units.
-    assessment : Assessment
-        What it tells about a plane, and what it costs.
-    """
-
-    setpoints: Floats
-    assessment: Assessment
+    setpoints: Floats  # shape (N,); input units
+    assessment: Assessment  # what it tells about a plane, and what it costs
 
 
 def assess_designs(

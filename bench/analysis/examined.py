@@ -180,24 +180,13 @@ def predict(
 
 @dataclass(frozen=True)
 class ComparedModels:
-    """How several models do on one set of measurements.
+    """How several models do on one set of measurements."""
 
-    Attributes
-    ----------
-    comparisons : mapping of str to Comparison
-        By the model file's name.
-    predictions : Predictions
-        What each model gives, row by row.
-    examined : mapping of str to Examined
-        The session recalibrated and the band of each model, by the same names.
-    warnings : tuple of str
-        What of a model belongs to its own record only.
-    """
-
-    comparisons: Mapping[str, Comparison]
-    predictions: Predictions
+    comparisons: Mapping[str, Comparison]  # by the model file's name
+    predictions: Predictions  # what each model gives, row by row
+    # The session recalibrated and the band of each model, by the same names.
     examined: Mapping[str, Examined] = field(default_factory=dict)
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[str, ...] = ()  # what of a model belongs to its own record only
 
     @property
     def unit(self) -> str:

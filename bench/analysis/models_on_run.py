@@ -17,34 +17,17 @@ from bench.record import Record, Table
 
 @dataclass(frozen=True)
 class ModelOnRun:
-    """A model of one input, and what it predicts of the readings of a run.
-
-    Attributes
-    ----------
-    file : ModelFile
-        The model.
-    inputs, measured : Quantity
-        The readings of the signals from which it was identified, shape (N,).
-    predicted : ndarray, shape (N,)
-        Outputs of the model, output units.
-    state : object
-        Its state before the first reading.
-    skip : int
-        First readings that count in no error: the same of all models that are compared.
-    band : BandedPrediction or None
-        Its prediction band, if its file has one.
-    beyond : Beyond
-        How far the readings of the input lie beyond those that were fitted.
-    """
+    """A model of one input, and what it predicts of the readings of a run."""
 
     file: ModelFile
+    # The readings of the signals from which it was identified, shape (N,).
     inputs: Quantity
     measured: Quantity
-    predicted: Floats
-    state: Any
-    skip: int
-    band: BandedPrediction | None
-    beyond: Beyond
+    predicted: Floats  # shape (N,); outputs of the model, output units
+    state: Any  # its state before the first reading
+    skip: int  # first readings that count in no error: the same of all models that are compared
+    band: BandedPrediction | None  # its prediction band, if its file has one
+    beyond: Beyond  # how far the readings of the input lie beyond those that were fitted
 
     @property
     def unit(self) -> str:
@@ -76,10 +59,7 @@ def apply_models(record: Record, steps: Table, models: Sequence[ModelFile]) -> l
 
     The time of a reading is the end of its step, unless a model with time was identified with another column.
 
-    Raises
-    ------
-    DataError
-        If the run lacks a signal from which a model was identified, or a model has several inputs.
+    Raises DataError if the run lacks a signal from which a model was identified, or a model has several inputs.
     """
     prepared = []
     for model in models:

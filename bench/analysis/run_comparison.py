@@ -25,48 +25,27 @@ SIGNAL_HEADS = ("signal", "RMS", "max", "unit", "at step")
 
 @dataclass(frozen=True)
 class SignalDifference:
-    """How far a signal of the second run is from that of the first, over the readings of equal steps.
+    """How far a signal of the second run is from that of the first, over the readings of equal steps."""
 
-    Attributes
-    ----------
-    rms, maximum : float
-        Of the absolute difference, in the unit of the signal.
-    step : int
-        Step of the greatest difference.
-    unit : str
-        Unit of the signal in the first run.
-    """
-
+    # Of the absolute difference, in the unit of the signal.
     rms: float
     maximum: float
-    step: int
-    unit: str
+    step: int  # step of the greatest difference
+    unit: str  # unit of the signal in the first run
 
 
 @dataclass(frozen=True)
 class Outcomes:
-    """How a run ended, for a table.
+    """How a run ended, for a table."""
 
-    Attributes
-    ----------
-    run, status, reason : str
-        Its name, and how it ended.
-    steps : int
-        Finished steps.
-    seconds : float or None
-        Laboratory time, s; None of a run that has not ended.
-    result : str
-        Main result, as its protocol noted it.
-    errors : mapping
-        Errors of a run under control, as `bench.analysis.tracking_errors.results_json` gives them.
-    """
-
+    # Its name, and how it ended.
     run: str
     status: str
     reason: str
-    steps: int
-    seconds: float | None
-    result: str
+    steps: int  # finished steps
+    seconds: float | None  # laboratory time, s; None of a run that has not ended
+    result: str  # main result, as its protocol noted it
+    # Errors of a run under control, as `bench.analysis.tracking_errors.results_json` gives them.
     errors: Mapping[str, Any]
 
 

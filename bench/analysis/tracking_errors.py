@@ -68,14 +68,9 @@ class FollowingResult:
 
 @dataclass(frozen=True)
 class LoopResult:
-    """The reference of a loop at a fixed rate, and the output.
+    """The reference of a loop at a fixed rate, and the output."""
 
-    Attributes
-    ----------
-    reference, output : ndarray, shape (N,)
-        At each recorded sample, output units.
-    """
-
+    # Shape (N,); at each recorded sample, output units.
     reference: Floats
     output: Floats
 

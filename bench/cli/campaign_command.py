@@ -133,16 +133,7 @@ def campaign(
 class SayingExecutor:
     """An executor that prints a line now and then: how many tasks are done, where no terminal draws it.
 
-    Parameters
-    ----------
-    executor : Executor
-        What carries the tasks out.
-    tasks : int
-        Number of all of them.
-    console : Console
-        Where the lines go.
-    every : float
-        Wall-clock time between two lines, s.
+    `every` is the wall-clock time between two lines, s.
     """
 
     def __init__(self, executor: Executor, tasks: int, console: Console, every: float = SAID_EVERY) -> None:

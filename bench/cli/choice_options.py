@@ -70,21 +70,9 @@ def is_comparison(model: str) -> bool:
 def choose_model(data: Dataset, model: str, options: ModelOptions, fit: FitOptions) -> SelectedModel:
     """Compare models on measurements.
 
-    Parameters
-    ----------
-    data : Dataset
-        The measurements.
-    model : str
-        `all`, or names with commas between them.
-    options : ModelOptions
-        Options of models that are given.
-    fit : FitOptions
-        How they are fitted, as far as it is given.
+    `model` is `all`, or names with commas between them.
 
-    Raises
-    ------
-    ConfigurationError
-        If none can be fitted.
+    Raises ConfigurationError if none can be fitted.
     """
     from bench.analysis import named_models, select_model
     from bench.identification import Given

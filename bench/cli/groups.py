@@ -19,24 +19,12 @@ HELP_OPTIONS = {"help_option_names": ["-h", "--help"]}
 
 
 class Command(NamedTuple):
-    """A command of the bench.
+    """A command of the bench."""
 
-    Attributes
-    ----------
-    summary : str
-        What it does, in a line.
-    function : str
-        `module:name` in `bench.cli`, which is imported when the command or its help is asked for.
-    panel : str
-        Heading under which help shows it.
-    has_help : bool
-        Whether it has an option `--help` of its own.
-    """
-
-    summary: str
-    function: str
-    panel: str = "Commands"
-    has_help: bool = False
+    summary: str  # what it does, in a line
+    function: str  # `module:name` in `bench.cli`, which is imported when the command or its help is asked for
+    panel: str = "Commands"  # heading under which help shows it
+    has_help: bool = False  # whether it has an option `--help` of its own
 
 
 class _PlainParameters:

@@ -26,15 +26,9 @@ class Output(io.TextIOBase):
 
     After the first failure, what is written is dropped. Characters that the encoding lacks become escapes.
 
-    Parameters
-    ----------
-    stream : text stream or None
-        Where to write; None for a descriptor that is closed.
+    The stream is None for a descriptor that is closed.
 
-    Attributes
-    ----------
-    failure : str
-        Why something could not be written; empty if all was.
+    `failure` says why something could not be written; it is empty if all was.
     """
 
     def __init__(self, stream: TextIO | None) -> None:

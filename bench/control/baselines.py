@@ -68,23 +68,14 @@ class LookUp(Scripted):
 
 @dataclass(frozen=True)
 class IntegralParameters:
-    """Numbers of the integral controllers.
+    """Numbers of the integral controllers."""
 
-    Parameters
-    ----------
-    gain : float
-        Input units per second for one output unit of error; negative for an actuator whose output falls.
-        On a branch of slope s the closed loop has the time constant 1 / (gain s), which should not be
-        shorter than the input takes to follow.
-    period : float
-        Time between two corrections, s.
-    duration : float
-        Time for each target, s; not used where the reference moves.
-    """
-
+    # Input units per second for one output unit of error; negative for an actuator whose output falls. On a branch of
+    # slope s the closed loop has the time constant 1 / (gain s), which should not be shorter than the input takes to
+    # follow.
     gain: float
-    period: float
-    duration: float
+    period: float  # time between two corrections, s
+    duration: float  # time for each target, s; not used where the reference moves
 
     def __post_init__(self) -> None:
         check_positive(self, "period", "duration")

@@ -174,10 +174,7 @@ class Latched(Correcting):
     correction : CorrectionParameters
         Numbers of the incremental inverse, where that is used.
 
-    Raises
-    ------
-    ValueError
-        If the model has no reversible part.
+    Raises ValueError if the model has no reversible part.
     """
 
     @staticmethod

@@ -224,11 +224,6 @@ class SessionFilter(ModelFilter):
 
     With the identified model f the corrected one is offset + gain f_w(u + input offset), where f_w is f with loops
     that are w times as wide (`widened`).
-
-    Parameters
-    ----------
-    identified : Operator
-        The model to begin with.
     """
 
     name = "session"
@@ -292,11 +287,6 @@ class DensityFilter(ModelFilter):
     Before the first reading the density may differ from the identified one as a session does (gain, shift of both
     thresholds, width of the loops), and from that by a random field which is smooth in the plane and in proportion to
     the density about. A density that was identified without a negative value keeps none.
-
-    Parameters
-    ----------
-    identified : Preisach
-        The model to begin with.
     """
 
     name = "density"

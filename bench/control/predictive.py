@@ -66,35 +66,20 @@ one of two such costs little, and without a threshold they would take turns.
 
 @dataclass(frozen=True)
 class PredictionParameters:
-    """Numbers of the predictive follower.
+    """Numbers of the predictive follower."""
 
-    Parameters
-    ----------
-    period : float
-        Time between two set-points, s.
-    walk_variance, reading_variance : float
-        As in `FollowingParameters`, output units squared.
-    smoothness : float
-        Weight of the set-points' second difference beside the output's error, in spans of output and input.
-    searches : int
-        Steps of the search in a period.
-    fewest, most : int
-        Least and greatest number of periods of the horizon; computing time grows with its square.
-    between : float
-        Weight of the output's error between the ends of two periods, where the reference counts.
-    longest_step : float
-        Longest step of the search, in spans of the input.
-    """
-
+    # As in `FollowingParameters`, output units squared.
     walk_variance: float
     reading_variance: float
-    period: float = 0.5
+    period: float = 0.5  # time between two set-points, s
+    # Weight of the set-points' second difference beside the output's error, in spans of output and input.
     smoothness: float = 0.05
-    searches: int = 1
+    searches: int = 1  # steps of the search in a period
+    # Least and greatest number of periods of the horizon; computing time grows with its square.
     fewest: int = 6
     most: int = 24
-    between: float = 0.1
-    longest_step: float = 0.25
+    between: float = 0.1  # weight of the output's error between the ends of two periods, where the reference counts
+    longest_step: float = 0.25  # longest step of the search, in spans of the input
 
     def __post_init__(self) -> None:
         check_positive(self)

@@ -267,21 +267,12 @@ class ApproachedReference:
 
 @dataclass(frozen=True)
 class Slope:
-    """How fast the input must move for a reference.
+    """How fast the input must move for a reference."""
 
-    Parameters
-    ----------
-    rate : float
-        Greatest rate of the input on continuous stretches, input units per second.
-    time : float
-        When that is, s.
-    jump : float
-        Greatest move of the input within one sample where it is not continuous: a reversal must first cross
-        the stretch on which the output hardly answers, or goes the wrong way. Input units.
-    """
-
-    rate: float
-    time: float
+    rate: float  # greatest rate of the input on continuous stretches, input units per second
+    time: float  # when that is, s
+    # Greatest move of the input within one sample where it is not continuous: a reversal must first cross the stretch
+    # on which the output hardly answers, or goes the wrong way. Input units.
     jump: float
 
     def within(self, limit: float) -> bool:

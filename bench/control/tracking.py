@@ -186,23 +186,12 @@ Move = Generator[Command, Sample, Sample]
 
 @dataclass(frozen=True)
 class Arrival:
-    """When an input has arrived at its set-point.
+    """When an input has arrived at its set-point."""
 
-    Parameters
-    ----------
-    tolerance : float
-        Greatest difference between measured input and set-point, input units.
-    hold : float
-        Time for which the difference must stay within the tolerance, s.
-    poll : float
-        Time between two readings, s.
-    patience : float
-        Time after which to go on without arrival, s. The estimators need none: they go by the measured input.
-    """
-
-    tolerance: float
-    hold: float = 0.4
-    poll: float = 0.1
+    tolerance: float  # greatest difference between measured input and set-point, input units
+    hold: float = 0.4  # time for which the difference must stay within the tolerance, s
+    poll: float = 0.1  # time between two readings, s
+    # Time after which to go on without arrival, s. The estimators need none: they go by the measured input.
     patience: float = 15.0
 
     def __post_init__(self) -> None:
@@ -416,10 +405,7 @@ class Scripted(ControllerBase, ABC):
         output : float
             One reading of the output; nan if missing.
 
-        Raises
-        ------
-        ValueError
-            If the target is not finite.
+        Raises ValueError if the target is not finite.
         """
         self._reference = _checks.number("target", target)
         self._script, self._done, self._reach = None, False, Reach.MET
@@ -563,30 +549,19 @@ class OpenLoopInverse(Scripted):
 
 @dataclass(frozen=True)
 class CorrectionParameters:
-    """Numbers of the closed-loop inverse.
+    """Numbers of the closed-loop inverse."""
 
-    Parameters
-    ----------
-    corrections : int
-        Greatest number of corrections after the first move.
-    close_enough : float
-        Error below which no further correction is made, output units: a correction that must turn back
-        crosses a loop of the hysteresis, and then may well end further off.
-    walk_variance : float
-        Variance by which the model's error changes between two corrections, output units squared. Three times
-        the other lets the gain settle at 0.8; results change little over a decade.
-    reading_variance : float
-        Variance of one value of the disturbance, output units squared: noise of the sensor, and what the
-        input wanders unseen while it is read.
-    arrival : Arrival
-        When the actuator has arrived at a set-point.
-    """
-
+    # Error below which no further correction is made, output units: a correction that must turn back crosses a loop
+    # of the hysteresis, and then may well end further off.
     close_enough: float
+    # Variance by which the model's error changes between two corrections, output units squared. Three times the other
+    # lets the gain settle at 0.8; results change little over a decade.
     walk_variance: float
+    # Variance of one value of the disturbance, output units squared: noise of the sensor, and what the input wanders
+    # unseen while it is read.
     reading_variance: float
-    arrival: Arrival
-    corrections: int = 4
+    arrival: Arrival  # when the actuator has arrived at a set-point
+    corrections: int = 4  # greatest number of corrections after the first move
 
     def __post_init__(self) -> None:
         check_positive(self, "close_enough", "walk_variance", "reading_variance")

@@ -18,37 +18,18 @@ View = rrb.View | rrb.Container
 
 @dataclass(frozen=True)
 class Arranged:
-    """The views of a run.
+    """The views of a run."""
 
-    Attributes
-    ----------
-    control : sequence of TimeSeriesView
-        Of a run under control.
-    control_shares : sequence of int
-        Their heights.
-    over_time : sequence of TimeSeriesView
-        Those that are always visible.
-    others : sequence of TimeSeriesView
-        Further ones, in tabs.
-    plots, planes : sequence
-        Loops, and Preisach planes.
-    lateness : Spatial2DView or None
-        How late the samples of loops were.
-    state : str
-        What the run is doing, or how it ended.
-    lanes : sequence of str
-        Entities that show phases and states over time.
-    """
-
-    control: Sequence[rrb.TimeSeriesView]
-    control_shares: Sequence[int]
-    over_time: Sequence[rrb.TimeSeriesView]
-    others: Sequence[rrb.TimeSeriesView]
+    control: Sequence[rrb.TimeSeriesView]  # of a run under control
+    control_shares: Sequence[int]  # their heights
+    over_time: Sequence[rrb.TimeSeriesView]  # those that are always visible
+    others: Sequence[rrb.TimeSeriesView]  # further ones, in tabs
+    # Loops, and Preisach planes.
     plots: Sequence[rrb.Spatial2DView]
     planes: Sequence[View]
-    lateness: rrb.Spatial2DView | None
-    state: str
-    lanes: Sequence[str]
+    lateness: rrb.Spatial2DView | None  # how late the samples of loops were
+    state: str  # what the run is doing, or how it ended
+    lanes: Sequence[str]  # entities that show phases and states over time
 
 
 def blueprint(views: Arranged) -> rrb.Blueprint:

@@ -19,33 +19,16 @@ from bench.rig import SETPOINT, Interlock, Level
 
 @dataclass(frozen=True)
 class Bound:
-    """What a signal may not pass.
+    """What a signal may not pass."""
 
-    Attributes
-    ----------
-    column : int
-        The signal's.
-    value : float
-        In its unit.
-    is_high : bool
-        Whether the signal has to stay below.
-    span : float
-        Distance to the bound on the other side, or the size of the value where there is none; the signal's unit.
-    name : str
-        Signal and value, in words.
-    kind : str
-        `limit` of a set-point, `interlock`, or `warning`, for legends.
-    colour : Colour
-        Red where an interlock acts, amber for a warning, violet for the limit of a set-point.
-    """
-
-    column: int
-    value: float
-    is_high: bool
+    column: int  # the signal's
+    value: float  # in its unit
+    is_high: bool  # whether the signal has to stay below
+    # Distance to the bound on the other side, or the size of the value where there is none; the signal's unit.
     span: float
-    name: str
-    kind: str
-    colour: Colour
+    name: str  # signal and value, in words
+    kind: str  # `limit` of a set-point, `interlock`, or `warning`, for legends
+    colour: Colour  # red where an interlock acts, amber for a warning, violet for the limit of a set-point
 
     def margin(self, value: float) -> float:
         """Return how far a value is from the bound, in its unit; negative beyond it."""
@@ -87,14 +70,7 @@ def nearest(bounds: Sequence[Bound], values: Sequence[float]) -> Bound | None:
 class BoundLines:
     """Draws the bounds of some signals over time, as lines below the entity `path`, as far as the data go.
 
-    Parameters
-    ----------
-    path : str
-        Of the plot.
-    bounds : sequence of Bound
-        Of the signals in the plot.
-    factor : float
-        From their unit to that of the plot.
+    `factor` leads from their unit to that of the plot.
     """
 
     def __init__(self, path: str, bounds: Sequence[Bound], factor: float) -> None:

@@ -49,32 +49,18 @@ _BAND: Colour = (132, 142, 158)
 
 @dataclass(frozen=True)
 class ControlPlots:
-    """Columns of the controlled signal and of `TRACES`, the range of the former, and the units shown.
+    """Columns of the controlled signal and of `TRACES`, the range of the former, and the units shown."""
 
-    Attributes
-    ----------
-    output : int
-        Column of the controlled signal.
-    traces : tuple of int
-        Columns of reference, predicted output, disturbance and its uncertainty.
-    extent : tuple of float or None
-        Range of the output.
-    factor, unit
-        Of outputs.
-    error_factor, error_unit
-        Of errors, which are smaller.
-    witness : int or None
-        Column of a further sensor of the controlled quantity.
-    """
-
-    output: int
-    traces: tuple[int, ...]
-    extent: tuple[float, float] | None
+    output: int  # column of the controlled signal
+    traces: tuple[int, ...]  # columns of reference, predicted output, disturbance and its uncertainty
+    extent: tuple[float, float] | None  # range of the output
+    # Of outputs.
     factor: float
     unit: str
+    # Of errors, which are smaller.
     error_factor: float
     error_unit: str
-    witness: int | None = None
+    witness: int | None = None  # column of a further sensor of the controlled quantity
 
     @classmethod
     def of(
@@ -171,14 +157,7 @@ class ErrorPlot:
     A target ends with the readings that follow while no controller is at work; their mean less the last reference is
     the error at the target. A reference that moves has no targets: the error of every tick counts.
 
-    Attributes
-    ----------
-    now : float
-        Present error, in the unit of the output; nan before a controller was at work.
-    target : float
-        Present reference, likewise.
-    output : int
-        Column of the controlled signal.
+    `now` is the present error, in the unit of the output; nan before a controller was at work.
     """
 
     def __init__(self, plots: ControlPlots) -> None:

@@ -28,17 +28,11 @@ class Tick(NamedTuple):
 class Ticks:
     """Ticks that follow one another, as columns.
 
-    Attributes
-    ----------
-    t : ndarray, shape (ticks,)
-        Laboratory time, s.
-    step : ndarray of int64, shape (ticks,)
-        Step number.
     values : ndarray, shape (ticks, signals)
     """
 
-    t: Floats
-    step: Ints
+    t: Floats  # shape (ticks,); laboratory time, s
+    step: Ints  # shape (ticks,); step number
     values: Floats
 
     @classmethod

@@ -29,10 +29,7 @@ Derivation: within the view, which is from −0.3 to 1.3 wide; texts hang from t
 class LatenessPlot:
     """Draws the histograms of the loops of a run, one below the other.
 
-    Parameters
-    ----------
-    meta : mapping
-        The run's metadata: on a virtual clock no time passes while a sample is taken, and nothing is drawn.
+    On a virtual clock no time passes while a sample is taken, and nothing is drawn.
     """
 
     def __init__(self, meta: Mapping[str, Any]) -> None:

@@ -29,12 +29,7 @@ class SignalMemory:
 class StageMemory:
     """The memory curve of the second stage of a model, whose input is no signal: the model follows the readings.
 
-    Parameters
-    ----------
-    model : Coupled
-        Of voltage and force; starts as after a reset.
-    columns : tuple of int
-        Columns of its voltage and its force.
+    The model, of voltage and force, starts as after a reset.
     """
 
     def __init__(self, model: Coupled[Any], columns: tuple[int, int]) -> None:
@@ -52,17 +47,7 @@ class StageMemory:
 
 
 def memory_of(model: ModelDensity, signals: Sequence[Signal], drive: int) -> SignalMemory | StageMemory | None:
-    """Return what follows the memory on the plane of a density that is not over the first input; None if nothing can.
-
-    Parameters
-    ----------
-    model : ModelDensity
-        The density.
-    signals : sequence of Signal
-        What is measured.
-    drive : int
-        Column of the first input.
-    """
+    """Return what follows the memory on the plane of a density over another input; None if nothing can."""
 
     def column(unit: str) -> int | None:
         if signals[drive].unit == unit:

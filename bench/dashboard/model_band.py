@@ -63,27 +63,8 @@ class ModelBand:
     In a run under control it is there from the first tick of a controller on; in another one at every reading. Rows
     without a plausible input are left out.
 
-    Parameters
-    ----------
-    name : str
-        Of the model.
-    operator : Operator
-        The model.
-    band : Band
-        Its band.
-    validity : Validity
-        The inputs that were fitted.
-    state : object
-        Its state at the start of the run.
-    drive : int
-        Column of its input.
-    response : Plotted
-        Its output.
-    setpoint : Plotted or None
-        The set-point of the input.
-    reference : int or None
-        Column of the reference, finite while a controller is at work: then outputs are drawn less the last reference.
-        None in a run without one.
+    `reference` is the column of the reference, which is finite while a controller is at work: outputs are then drawn
+    less the last reference. It is None in a run without one.
     """
 
     def __init__(

@@ -45,15 +45,7 @@ T = TypeVar("T")
 class Camera:
     """A viewer without a screen, which takes pictures of recordings; a context manager.
 
-    Parameters
-    ----------
-    size : tuple of int
-        Width and height, pixels.
-
-    Raises
-    ------
-    ConfigurationError
-        If the viewer does not start, for lack of a graphics driver for instance.
+    Raises ConfigurationError if the viewer does not start, for lack of a graphics driver for instance.
     """
 
     def __init__(self, size: tuple[int, int] = (1600, 1000)) -> None:
@@ -88,12 +80,7 @@ class Camera:
 
         The menu bar of the viewer is left out.
 
-        Raises
-        ------
-        DataError
-            If there is no such recording.
-        ConfigurationError
-            If the viewer does not answer.
+        Raises DataError if there is no such recording; ConfigurationError if the viewer does not answer.
         """
         if not rrd.is_file():
             raise DataError(f"there is no recording {rrd}")

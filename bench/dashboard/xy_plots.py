@@ -48,17 +48,10 @@ _Line = list[tuple[float, float]]
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Points of the plots.
+    """Points of the plots."""
 
-    Attributes
-    ----------
-    rows : Ticks
-        One a point.
-    is_reading : ndarray of bool, shape (points,)
-        Whether it is a reading after settling, not a tick under control.
-    """
-
-    rows: Ticks
+    rows: Ticks  # one a point
+    # Shape (points,); whether it is a reading after settling, not a tick under control.
     is_reading: npt.NDArray[np.bool_]
 
 

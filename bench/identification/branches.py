@@ -15,17 +15,9 @@ which some hundred readings lie, of a noise of 0.33 % of the range."""
 def turning_points(inputs: ArrayLike, least: float = 0.0) -> NDArray[np.int64]:
     """Return the samples at which the input turns, with the first and the last sample.
 
-    Parameters
-    ----------
-    inputs : array_like, shape (N,)
-        The inputs.
-    least : float
-        Shortest move that counts, input units, >= 0: a reversal by no more, such as noise, is no turn.
+    A reversal of the inputs, shape (N,), by no more than `least` (input units), such as noise, is no turn.
 
-    Raises
-    ------
-    ValueError
-        If `inputs` is empty, not one-dimensional or not finite.
+    Raises ValueError if `inputs` is empty, not one-dimensional or not finite.
     """
     u = _checks.samples("inputs", inputs)
     moving = np.flatnonzero(np.append(True, np.diff(u) != 0.0))

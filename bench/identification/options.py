@@ -19,40 +19,20 @@ _OF_ALL = ("weights", "skip", "initial", "orientation")
 
 @dataclass(frozen=True)
 class OptionHelp:
-    """What an option of a template means: metadata of its annotation, `Annotated[float, OptionHelp("…")]`.
+    """What an option of a template means: metadata of its annotation, `Annotated[float, OptionHelp("…")]`."""
 
-    Parameters
-    ----------
-    text : str
-        Meaning and unit, in a line.
-    default : str
-        The default in words, where its value is None.
-    """
-
-    text: str
-    default: str = ""
+    text: str  # meaning and unit, in a line
+    default: str = ""  # the default in words, where its value is None
 
 
 @dataclass(frozen=True)
 class ModelOption:
-    """An option that identification of a model takes.
+    """An option that identification of a model takes."""
 
-    Parameters
-    ----------
-    name : str
-        Keyword of the template.
-    default : str
-        The default as text; empty if there is none.
-    text : str
-        Meaning and unit; empty if the template does not say.
-    kinds : tuple
-        The types that its annotation allows; empty if any.
-    """
-
-    name: str
-    default: str
-    text: str
-    kinds: tuple[Any, ...]
+    name: str  # keyword of the template
+    default: str  # the default as text; empty if there is none
+    text: str  # meaning and unit; empty if the template does not say
+    kinds: tuple[Any, ...]  # the types that its annotation allows; empty if any
 
 
 def model_options(spec: ModelSpec) -> tuple[ModelOption, ...]:

@@ -90,18 +90,7 @@ def judge_fit(
 ) -> list[Advice]:
     """Return why a fit should not be trusted; nothing if there is no reason.
 
-    Parameters
-    ----------
-    problem : FitProblem
-        What was fitted.
-    found : Fit
-        The coefficients.
-    errors : ndarray, shape (N,)
-        Measured less modelled outputs, of the skipped samples too, output units.
-    initial : str or None
-        What was asked for of the initial memory.
-    smoothing : float
-        Weight of the roughness penalty.
+    `errors`, shape (N,), are the measured less the modelled outputs, output units; those of skipped samples too.
     """
     weights = problem.weights[problem.skip :]
     measured, left = problem.outputs[problem.skip :], errors[problem.skip :]

@@ -28,22 +28,13 @@ Kind: TypeAlias = Literal["smaller", "larger", "slower", "faster"]
 
 @dataclass(frozen=True)
 class BeyondMoves:
-    """Moves of an input that are smaller, larger, slower or faster than all that were fitted.
+    """Moves of an input that are smaller, larger, slower or faster than all that were fitted."""
 
-    Attributes
-    ----------
-    count, of : int
-        How many, and of how many moves.
-    farthest : float
-        The smallest or greatest of them, input units, or their mean speed, input units a second.
-    by_chance : bool
-        Whether another record of one kind with that of the fit has so many.
-    """
-
+    # How many, and of how many moves.
     count: int
     of: int
-    farthest: float
-    by_chance: bool
+    farthest: float  # the smallest or greatest of them, input units, or their mean speed, input units a second
+    by_chance: bool  # whether another record of one kind with that of the fit has so many
 
 
 @dataclass(frozen=True)

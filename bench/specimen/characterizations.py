@@ -33,10 +33,7 @@ def slots_of_twin(file: RigFile) -> tuple[RoleTable, RoleTable]:
 def read_recording(path: Path, file: RigFile) -> TransientRecording:
     """Read a run of a rig.
 
-    Raises
-    ------
-    DataError
-        If it is no run or not of this rig, or says too little: names run and reason.
+    Raises DataError if it is no run or not of this rig, or says too little: names run and reason.
     """
     drive, response = slots_of_twin(file)
     with Record(path) as record:

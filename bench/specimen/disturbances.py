@@ -40,19 +40,12 @@ smooth curve leaves its tangent by a millionth of its range."""
 
 @dataclass(frozen=True)
 class Noise:
-    """White noise of a signal, in its unit.
+    """White noise of a signal, in its unit."""
 
-    Attributes
-    ----------
-    reading, quick : float
-        Standard deviation of a reading, and of a quick one.
-    resolution : float
-        Last digit; 0 for none.
-    """
-
+    # Standard deviation of a reading, and of a quick one.
     reading: float = 0.0
     quick: float = 0.0
-    resolution: float = 0.0
+    resolution: float = 0.0  # last digit; 0 for none
 
 
 def noise_of(recordings: Sequence[TransientRecording], signal: str, dynamics: Dynamics) -> Noise | None:
@@ -60,15 +53,6 @@ def noise_of(recordings: Sequence[TransientRecording], signal: str, dynamics: Dy
 
     It is the Allan deviation at the shortest time, from neighbouring rows (Allan, Proceedings of the IEEE 54, 221,
     1966). Where one kind of rows has no neighbours, it is that of the other.
-
-    Parameters
-    ----------
-    recordings : sequence of TransientRecording
-        The runs.
-    signal : str
-        One of their signals.
-    dynamics : Dynamics
-        Of the specimen: what is settled when.
     """
     values = np.concatenate([r.columns[signal] for r in recordings])
     digit = _resolution(values[np.isfinite(values)])

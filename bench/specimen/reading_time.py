@@ -23,21 +23,11 @@ _FEWEST = 3
 
 @dataclass(frozen=True)
 class ReadingTime:
-    """What takes time on the lines of a rig, s.
+    """What takes time on the lines of a rig, s."""
 
-    Attributes
-    ----------
-    reading : float
-        A reading of all signals.
-    quick : float
-        A quick reading of all signals.
-    setpoint : float
-        A set-point of the drive.
-    """
-
-    reading: float = 0.0
-    quick: float = 0.0
-    setpoint: float = 0.0
+    reading: float = 0.0  # a reading of all signals
+    quick: float = 0.0  # a quick reading of all signals
+    setpoint: float = 0.0  # a set-point of the drive
 
 
 def time_readings(recordings: Sequence[TransientRecording], file: RigFile) -> ReadingTime | None:

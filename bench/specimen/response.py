@@ -15,27 +15,14 @@ from bench.models import ActuatorDynamics, Operator, ResponseDynamics
 
 @dataclass(frozen=True)
 class IdentifiedResponse:
-    """The response of a specimen with the evidence for it.
+    """The response of a specimen with the evidence for it."""
 
-    Attributes
-    ----------
-    dynamics : ResponseDynamics
-        Lag and late parts.
-    lag_uncertainty : float
-        Standard uncertainty of the lag, s; 0 without one.
-    offsets : tuple of float
-        Of the response in each run, output units.
-    errors : tuple of ndarray, shape (N,)
-        By run, measured less modelled response at each row, without the offset, output units.
-    rms : float
-        Of the errors at the readings of steps, output units.
-    """
-
-    dynamics: ResponseDynamics
-    lag_uncertainty: float
-    offsets: tuple[float, ...]
+    dynamics: ResponseDynamics  # lag and late parts
+    lag_uncertainty: float  # standard uncertainty of the lag, s; 0 without one
+    offsets: tuple[float, ...]  # of the response in each run, output units
+    # Shape (N,); by run, measured less modelled response at each row, without the offset, output units.
     errors: tuple[Floats, ...]
-    rms: float
+    rms: float  # of the errors at the readings of steps, output units
 
 
 def identify_response(

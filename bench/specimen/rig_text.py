@@ -24,16 +24,7 @@ takes 10 µs."""
 def rig_text(twin: IdentifiedTwin, file: RigFile, rig: str, out: Path) -> str:
     """Return the rig file of a twin.
 
-    Parameters
-    ----------
-    twin : IdentifiedTwin
-        What was identified.
-    file : RigFile
-        The rig that it is a twin of.
-    rig : str
-        How that was named: a packaged rig, or a path.
-    out : Path
-        Where the text will stand.
+    `rig` is the name of a packaged rig, or a path.
     """
     lines = [
         f"# A twin of the present specimen on the rig {file.name}, made by `bench model twin` from the runs",

@@ -37,29 +37,15 @@ class Unevenness(CheckedTable):
 
 @dataclass(frozen=True)
 class Dynamics:
-    """All that a specimen has beside its hysteresis.
+    """All that a specimen has beside its hysteresis."""
 
-    Attributes
-    ----------
-    step : float
-        Step of the time grid, s.
-    actuator : ActuatorDynamics
-        From the set-point to the drive.
-    response : ResponseDynamics
-        From the drive to the response.
-    wander : Wander
-        Of the drive as the specimen sees it, beside what is read of it, input units.
-    unevenness : Unevenness
-        Of the drive as the specimen sees it.
-    drift : float
-        Random walk of the response (rate random walk of IEEE Std 952-1997), output units per root of a second.
-    """
-
-    step: float
-    actuator: ActuatorDynamics = field(default_factory=ActuatorDynamics)
-    response: ResponseDynamics = field(default_factory=ResponseDynamics)
+    step: float  # step of the time grid, s
+    actuator: ActuatorDynamics = field(default_factory=ActuatorDynamics)  # from the set-point to the drive
+    response: ResponseDynamics = field(default_factory=ResponseDynamics)  # from the drive to the response
+    # Of the drive as the specimen sees it, beside what is read of it, input units.
     wander: Wander = field(default_factory=Wander)
-    unevenness: Unevenness = field(default_factory=Unevenness)
+    unevenness: Unevenness = field(default_factory=Unevenness)  # of the drive as the specimen sees it
+    # Random walk of the response (rate random walk of IEEE Std 952-1997), output units per root of a second.
     drift: float = 0.0
 
 

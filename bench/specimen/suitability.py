@@ -24,19 +24,7 @@ _MODEL = "or give a model by --model FILE"
 def raise_if_wrong(
     recordings: Sequence[TransientRecording], response: IdentifiedResponse, model: str, unit: str
 ) -> None:
-    """Raise DataError if a model says less of the response than a constant in each run would.
-
-    Parameters
-    ----------
-    recordings : sequence of TransientRecording
-        The runs.
-    response : IdentifiedResponse
-        With the errors of the model.
-    model : str
-        Its name.
-    unit : str
-        Of differences of the response.
-    """
+    """Raise DataError if a model says less of the response than a constant in each run would."""
     still = [r.responded[r.is_reading] for r in recordings]
     deviation = float(np.sqrt(np.mean(np.concatenate([each - each.mean() for each in still]) ** 2)))
     if response.rms < deviation:

@@ -23,54 +23,23 @@ from bench.specimen.tables import DriveTable, NoiseTable, ResponseTable, TwinTab
 
 @dataclass(frozen=True, eq=False)
 class IdentifiedTwin:
-    """All that a twin has, with the evidence for it.
+    """All that a twin has, with the evidence for it."""
 
-    Attributes
-    ----------
-    recordings : tuple of TransientRecording
-        What it was identified from.
-    model_name : str
-        Name of the model, or of its file.
-    model : Operator
-        The hysteresis.
-    actuator : IdentifiedActuator
-        From the set-point to the drive.
-    response : IdentifiedResponse
-        From the drive to the response.
-    noise : tuple of Noise
-        Of the readings of drive and response, in input and output units.
-    steps : float
-        In which the drive carries out its set-points, input units; 0 for none.
-    dynamics : Dynamics
-        Actuator and response, with wander, unevenness and drift.
-    offset : float
-        Standard deviation of the response from session to session, output units.
-    reading_time : ReadingTime or None
-        What the lines take; None if it is not known.
-    signals : mapping of str to dict
-        How each signal of a device is read; see `NoiseTable`.
-    conversion : tuple of pairs
-        The model's output and the signal of the device, where the response is derived from that.
-    source : str
-        That signal; the response itself if it is not derived.
-    warnings : tuple of str
-        What the runs could not say, each with what to record instead, in a sentence.
-    """
-
-    recordings: tuple[TransientRecording, ...]
-    model_name: str
+    recordings: tuple[TransientRecording, ...]  # what it was identified from
+    model_name: str  # name of the model, or of its file
     model: Operator[Any]
-    actuator: IdentifiedActuator
-    response: IdentifiedResponse
-    noise: tuple[Noise, Noise]
-    steps: float
-    dynamics: Dynamics
-    offset: float
-    reading_time: ReadingTime | None
-    signals: Mapping[str, dict[str, Any]]
+    actuator: IdentifiedActuator  # from the set-point to the drive
+    response: IdentifiedResponse  # from the drive to the response
+    noise: tuple[Noise, Noise]  # of the readings of drive and response, in input and output units
+    steps: float  # in which the drive carries out its set-points, input units; 0 for none
+    dynamics: Dynamics  # actuator and response, with wander, unevenness and drift
+    offset: float  # standard deviation of the response from session to session, output units
+    reading_time: ReadingTime | None  # what the lines take; None if it is not known
+    signals: Mapping[str, dict[str, Any]]  # how each signal of a device is read; see `NoiseTable`
+    # The model's output and the signal of the device, where the response is derived from that.
     conversion: tuple[tuple[float, float], ...]
-    source: str
-    warnings: tuple[str, ...] = ()
+    source: str  # that signal; the response itself if it is not derived
+    warnings: tuple[str, ...] = ()  # what the runs could not say, each with what to record instead, in a sentence
 
     @property
     def units(self) -> dict[str, str]:

@@ -25,22 +25,13 @@ _PORTION = 4096
 
 @dataclass(frozen=True)
 class Column:
-    """One column.
+    """One column."""
 
-    Attributes
-    ----------
-    name, unit : str
-        The unit is empty for what has none.
-    kind : {"integer", "number", "truth", "text", "time"}
-        Type of its values; a time is a `datetime` in UTC.
-    description : str
-        What it is, in a few words.
-    """
-
+    # The unit is empty for what has none.
     name: str
     unit: str
-    kind: Kind
-    description: str
+    kind: Kind  # {"integer", "number", "truth", "text", "time"}; type of its values; a time is a `datetime` in UTC
+    description: str  # what it is, in a few words
 
     @property
     def head(self) -> str:
@@ -54,18 +45,11 @@ Block: TypeAlias = Sequence[Sequence[Any]]
 
 @dataclass(frozen=True)
 class TypedTable:
-    """A table that is read in blocks, as it may be longer than the memory.
-
-    Attributes
-    ----------
-    columns : tuple of Column
-        Its columns.
-    blocks : iterator of blocks
-        Its rows in their order, each block a list of values a column; read once. Raises DataError if the record is
-        damaged.
-    """
+    """A table that is read in blocks, as it may be longer than the memory."""
 
     columns: tuple[Column, ...]
+    # Its rows in their order, each block a list of values a column; read once. Raises DataError if the record is
+    # damaged.
     blocks: Iterator[Block]
 
 

@@ -77,18 +77,8 @@ def model_card(
 ) -> str:
     """Return the card of an identified model as Markdown.
 
-    Parameters
-    ----------
-    found : IdentifiedFile
-        The model and the fit behind it.
-    source, digest : str
-        Name of the data, and their SHA-256 digest.
-    command : str
-        Command line that identifies the model again.
-    model : str
-        Name of the model file; empty if there is none.
-    figures : iterable of str
-        Links to figures.
+    `source` and `digest` are the name of the data and their SHA-256 digest; `model` is the name of the model file,
+    empty if there is none.
     """
     rows = found.predictions()
     measured = rows.measured

@@ -22,25 +22,14 @@ _STRETCHES = 700
 
 @dataclass(frozen=True)
 class TelemetrySummary:
-    """The telemetry of a run in a size that does not grow with it.
+    """The telemetry of a run in a size that does not grow with it."""
 
-    Attributes
-    ----------
-    count : int
-        Ticks of the run.
-    shown : Table
-        Ticks for figures, columns as of `Record.telemetry`: all of them, or of a long run those of each of 700
-        stretches that have the least and the greatest value of a signal, and its first and last one.
-    extremes : mapping of str to (float or None, float or None)
-        Least and greatest value of each signal; None where there is no finite one.
-    differences : mapping of (str, str) to (float or None, float or None)
-        The same of the differences of signals that were asked for.
-    """
-
-    count: int
+    count: int  # ticks of the run
+    # Ticks for figures, columns as of `Record.telemetry`: all of them, or of a long run those of each of 700
+    # stretches that have the least and the greatest value of a signal, and its first and last one.
     shown: Table
-    extremes: Mapping[str, Extremes]
-    differences: Mapping[tuple[str, str], Extremes]
+    extremes: Mapping[str, Extremes]  # least and greatest value of each signal; None where there is no finite one
+    differences: Mapping[tuple[str, str], Extremes]  # the same of the differences of signals that were asked for
 
     @property
     def remark(self) -> str:

@@ -67,29 +67,15 @@ class Quantity:
 
 @dataclass(frozen=True)
 class Columns:
-    """Columns that were asked for.
+    """Columns that were asked for."""
 
-    Attributes
-    ----------
-    source : str
-        Where they come from.
-    values : mapping of str to ndarray
-        Each of shape (rows,), by the name that was asked for; every value is finite.
-    units : mapping of str to str
-        Unit by the same names, empty where the source does not say.
-    assumptions : str
-        What was assumed about the layout of a file, such as `tab-separated, decimal comma`; empty for a run.
-    time : str or None
-        Name of the column of times that was looked for and found.
-    elsewhere : mapping of str to (Path, str)
-        File and column of those that were asked for as `FILE:COLUMN`.
-    """
-
-    source: str
-    values: Mapping[str, Floats]
-    units: Mapping[str, str]
+    source: str  # where they come from
+    values: Mapping[str, Floats]  # each of shape (rows,), by the name that was asked for; every value is finite
+    units: Mapping[str, str]  # unit by the same names, empty where the source does not say
+    # What was assumed about the layout of a file, such as `tab-separated, decimal comma`; empty for a run.
     assumptions: str = ""
-    time: str | None = None
+    time: str | None = None  # name of the column of times that was looked for and found
+    # File and column of those that were asked for as `FILE:COLUMN`.
     elsewhere: Mapping[str, tuple[Path, str]] = field(default_factory=dict)
 
     def quantity(self, name: str) -> Quantity:
@@ -245,22 +231,10 @@ def write_blocks(
 ) -> None:
     """Write blocks of columns, one below the other, as CSV.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    header : sequence of str
-        Heads of the columns.
-    blocks : iterable
-        Columns of equal length.
-    escape_formulas : bool
-        Whether an apostrophe is put before a text that a spreadsheet would take for a formula, which may start
-        programs (https://owasp.org/www-community/attacks/CSV_Injection). Numbers stay as they are, also as texts.
+    With `escape_formulas` an apostrophe is put before a text that a spreadsheet would take for a formula, which may
+    start programs (https://owasp.org/www-community/attacks/CSV_Injection). Numbers stay as they are, also as texts.
 
-    Raises
-    ------
-    DataError
-        If the file cannot be written.
+    Raises DataError if the file cannot be written.
     """
     shown = _as_text if escape_formulas else lambda cell: cell
     with result_file(path) as part, part.open("w", newline="", encoding="utf-8") as file:

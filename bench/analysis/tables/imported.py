@@ -26,21 +26,11 @@ PROTOCOL = "imported"
 
 @dataclass(frozen=True)
 class ImportedRun:
-    """What was imported.
+    """What was imported."""
 
-    Attributes
-    ----------
-    folder : Path
-        The folder of the run.
-    rows : int
-        Number of readings.
-    assumptions : str
-        What was assumed about the layout of the file and about times.
-    """
-
-    folder: Path
-    rows: int
-    assumptions: str
+    folder: Path  # the folder of the run
+    rows: int  # number of readings
+    assumptions: str  # what was assumed about the layout of the file and about times
 
 
 def import_file(

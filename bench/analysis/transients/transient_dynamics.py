@@ -57,24 +57,13 @@ def read_transients(path: Path, drive: str, response: str) -> TransientRecording
 
 @dataclass(frozen=True, eq=False)
 class Transients:
-    """What runs show of a drive and its response independently of the model of the specimen.
-
-    Attributes
-    ----------
-    recordings : tuple of TransientRecording
-        The runs.
-    actuator : IdentifiedActuator
-        The dynamics of the drive.
-    noise : (float, float)
-        Standard deviation of one reading of the drive, input units, and of the response, output units.
-    first_look : float
-        Median time from a change of the set-point to the next reading, s.
-    """
+    """What runs show of a drive and its response independently of the model of the specimen."""
 
     recordings: tuple[TransientRecording, ...]
-    actuator: IdentifiedActuator
+    actuator: IdentifiedActuator  # the dynamics of the drive
+    # Standard deviation of one reading of the drive, input units, and of the response, output units.
     noise: tuple[float, float]
-    first_look: float
+    first_look: float  # median time from a change of the set-point to the next reading, s
 
 
 def identify_transients(recordings: Sequence[TransientRecording]) -> Transients:

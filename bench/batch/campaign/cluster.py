@@ -53,23 +53,12 @@ def check_address(address: str) -> None:
 
 @dataclass(frozen=True)
 class Parcel:
-    """A task with all that it reads.
-
-    Attributes
-    ----------
-    task : CampaignTask
-        The task.
-    code : str
-        Hash of the programs with which it is meant to be carried out.
-    folders : dict of str to bytes
-        The folders of the tasks that it needs, packed, by name.
-    files : dict of str to dict of str to bytes
-        By the path of a file that it reads, content by name, of those beside it as well.
-    """
+    """A task with all that it reads."""
 
     task: CampaignTask
-    code: str
-    folders: dict[str, bytes]
+    code: str  # hash of the programs with which it is meant to be carried out
+    folders: dict[str, bytes]  # the folders of the tasks that it needs, packed, by name
+    # By the path of a file that it reads, content by name, of those beside it as well.
     files: dict[str, dict[str, bytes]]
 
 

@@ -83,29 +83,18 @@ def holder(campaign: Path) -> Holder:
 
 @dataclass(frozen=True)
 class Before:
-    """What earlier starts have left.
+    """What earlier starts have left."""
 
-    Attributes
-    ----------
-    done : dict of str to Done
-        By name of the task.
-    places : dict of str to str
-        By name of a task the one that it had then: what differs among the runs was something else.
-    lost : dict of str to tuple of str
-        By name of a task that has to be done again the files that have gone from its folder.
-    """
-
-    done: dict[str, Done]
+    done: dict[str, Done]  # by name of the task
+    # By name of a task the one that it had then: what differs among the runs was something else.
     places: dict[str, str]
+    # By name of a task that has to be done again the files that have gone from its folder.
     lost: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
     def put_in_place(self, campaign: Path) -> list[str]:
         """Rename the folders of tasks that have another name now, and of those that are not whole.
 
-        Returns
-        -------
-        list of str
-            A line for each task that is done again as its folder is not whole.
+        Returns a line for each task that is done again as its folder is not whole.
         """
         lines = []
         for name, files in self.lost.items():

@@ -49,20 +49,11 @@ Axis = Mapping[str, Any]
 
 @dataclass(frozen=True)
 class Estimate:
-    """What a campaign will take, by the plans of its runs.
+    """What a campaign will take, by the plans of its runs."""
 
-    Attributes
-    ----------
-    laboratory_seconds : float
-        Of the runs whose plan is known, s.
-    wall_seconds : float
-        The same on one core of this machine, s.
-    unknown : int
-        Number of tasks that are in neither: studies, identifications, and runs that need a model of the campaign.
-    """
-
-    laboratory_seconds: float = 0.0
-    wall_seconds: float = 0.0
+    laboratory_seconds: float = 0.0  # of the runs whose plan is known, s
+    wall_seconds: float = 0.0  # the same on one core of this machine, s
+    # Number of tasks that are in neither: studies, identifications, and runs that need a model of the campaign.
     unknown: int = 0
 
 

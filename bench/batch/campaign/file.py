@@ -207,20 +207,11 @@ class _Content(CheckedTable):
 
 @dataclass(frozen=True)
 class CampaignFile:
-    """A campaign file that was read; names in it were not looked up yet.
+    """A campaign file that was read; names in it were not looked up yet."""
 
-    Attributes
-    ----------
-    path : Path
-        Where it was read from.
-    most_runs : int
-        Most runs that it may ask for.
-    runs, models, comparisons, studies : tuple
-        Its tables, in their order.
-    """
-
-    path: Path
-    most_runs: int
+    path: Path  # where it was read from
+    most_runs: int  # most runs that it may ask for
+    # Its tables, in their order.
     runs: tuple[RunsTable, ...]
     models: tuple[ModelsTable, ...]
     comparisons: tuple[ComparisonsTable, ...]

@@ -16,24 +16,12 @@ _TICKS = 20
 
 @dataclass(frozen=True)
 class KnownRig:
-    """An emulated rig with its overrides.
+    """An emulated rig with its overrides."""
 
-    Attributes
-    ----------
-    file : RigFile
-        What it was read from.
-    description : RigDescription
-        Its devices and signals.
-    pace : float
-        Wall-clock seconds that a second of laboratory time takes here.
-    digest : str
-        Hash of the rig file with all overrides, and of the programs beside it.
-    """
-
-    file: RigFile
-    description: RigDescription
-    pace: float
-    digest: str
+    file: RigFile  # what it was read from
+    description: RigDescription  # its devices and signals
+    pace: float  # wall-clock seconds that a second of laboratory time takes here
+    digest: str  # hash of the rig file with all overrides, and of the programs beside it
 
     @classmethod
     def look_at(cls, name: str, overrides: Mapping[str, str]) -> KnownRig:

@@ -22,15 +22,9 @@ MARKDOWN_NAME = "studies.md"
 
 @dataclass(frozen=True)
 class OverSeeds:
-    """One number of a study with several seeds.
+    """One number of a study with several seeds."""
 
-    Attributes
-    ----------
-    values : tuple of float
-        One a seed, at least one.
-    """
-
-    values: tuple[float, ...]
+    values: tuple[float, ...]  # one a seed, at least one
 
     def __format__(self, specification: str) -> str:
         """Return `median (least–greatest)`, each as a number would be; one number if they are alike."""

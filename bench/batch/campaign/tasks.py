@@ -184,45 +184,25 @@ class CampaignTask(ABC):
 
 @dataclass(frozen=True)
 class RunTask(CampaignTask):
-    """A run on an emulated rig, on the virtual clock.
-
-    Attributes
-    ----------
-    table : str
-        Name of the table that asks for it.
-    protocol, rig : str
-        As `bench run` takes them.
-    seed : int
-        As the file has it; the laboratory's is `seed_offset` more.
-    parameters : mapping
-        Parameters that were set, without models of the campaign.
-    models : mapping of str to str
-        Name of the task by the parameter that takes its model file.
-    overrides : mapping of str to str
-        Values of the rig file by dotted key.
-    faults : str
-        File of faults; empty for none.
-    interlock_rate : float, optional
-        As for `bench run`.
-    inputs : tuple of str
-        Files that its parameters name.
-    model_labels : mapping of str to str
-        What tells the models apart, by the parameter, for people.
-    """
+    """A run on an emulated rig, on the virtual clock."""
 
     kind = "run"
 
-    table: str
+    table: str  # name of the table that asks for it
+    # As `bench run` takes them.
     protocol: str
     rig: str
-    seed: int
+    seed: int  # as the file has it; the laboratory's is `seed_offset` more
     seed_offset: int = 0
+    # Parameters that were set, without models of the campaign.
     parameters: Mapping[str, Any] = field(default_factory=dict)
+    # Name of the task by the parameter that takes its model file.
     models: Mapping[str, str] = field(default_factory=dict)
-    overrides: Mapping[str, str] = field(default_factory=dict)
-    faults: str = ""
-    interlock_rate: float | None = None
-    inputs: tuple[str, ...] = ()
+    overrides: Mapping[str, str] = field(default_factory=dict)  # values of the rig file by dotted key
+    faults: str = ""  # file of faults; empty for none
+    interlock_rate: float | None = None  # as for `bench run`
+    inputs: tuple[str, ...] = ()  # files that its parameters name
+    # What tells the models apart, by the parameter, for people.
     model_labels: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -296,34 +276,20 @@ class RunTask(CampaignTask):
 
 @dataclass(frozen=True)
 class ModelTask(CampaignTask):
-    """The identification of a model from a run, or from several together.
-
-    Attributes
-    ----------
-    table : str
-        Name of the table that asks for it.
-    sources : tuple of str
-        Names of the tasks of the runs; several for a model that needs them.
-    model : str
-        Name of a registered model.
-    input, output : str
-        Columns; empty for the signals of the slots `drive` and `response`.
-    options : mapping
-        Options of the identification, as `bench.analysis.FitOptions.of` takes them.
-    label : str
-        What tells it from the others of its rig and seed.
-    """
+    """The identification of a model from a run, or from several together."""
 
     kind = "model"
     _not_described = ("input", "output", "label")
 
-    table: str
-    sources: tuple[str, ...]
-    model: str
+    table: str  # name of the table that asks for it
+    sources: tuple[str, ...]  # names of the tasks of the runs; several for a model that needs them
+    model: str  # name of a registered model
+    # Columns; empty for the signals of the slots `drive` and `response`.
     input: str = ""
     output: str = ""
+    # Options of the identification, as `bench.analysis.FitOptions.of` takes them.
     options: Mapping[str, Any] = field(default_factory=dict)
-    label: str = ""
+    label: str = ""  # what tells it from the others of its rig and seed
 
     @property
     def needs(self) -> tuple[str, ...]:
@@ -356,33 +322,18 @@ class ModelTask(CampaignTask):
 
 @dataclass(frozen=True)
 class ComparisonTask(CampaignTask):
-    """The errors of models on a run.
-
-    Attributes
-    ----------
-    table : str
-        Name of the table that asks for it.
-    source : str
-        Name of the run's task.
-    models : mapping of str to str
-        Name of each identification's task by that of its table.
-    input, output : str
-        Columns; empty for the signals of the slots `drive` and `response`.
-    recalibrate : str
-        What is estimated of the session first, with commas; empty for nothing.
-    recalibrate_rows : int, optional
-        First rows for that; they do not count in the errors.
-    """
+    """The errors of models on a run."""
 
     kind = "comparison"
 
-    table: str
-    source: str
-    models: Mapping[str, str]
+    table: str  # name of the table that asks for it
+    source: str  # name of the run's task
+    models: Mapping[str, str]  # name of each identification's task by that of its table
+    # Columns; empty for the signals of the slots `drive` and `response`.
     input: str = ""
     output: str = ""
-    recalibrate: str = ""
-    recalibrate_rows: int | None = None
+    recalibrate: str = ""  # what is estimated of the session first, with commas; empty for nothing
+    recalibrate_rows: int | None = None  # first rows for that; they do not count in the errors
 
     @property
     def needs(self) -> tuple[str, ...]:
@@ -408,23 +359,13 @@ class ComparisonTask(CampaignTask):
 
 @dataclass(frozen=True)
 class StudyTask(CampaignTask):
-    """A study with one seed.
-
-    Attributes
-    ----------
-    study : str
-        Name of a registered study.
-    rig : str
-        Another rig than the study's own; empty for that.
-    seed : int
-        From which the seeds of its runs come.
-    """
+    """A study with one seed."""
 
     kind = "study"
 
-    study: str
-    rig: str
-    seed: int
+    study: str  # name of a registered study
+    rig: str  # another rig than the study's own; empty for that
+    seed: int  # from which the seeds of its runs come
 
     @property
     def leaves(self) -> tuple[str, ...]:

@@ -22,31 +22,16 @@ from bench.rig import load_rig
 
 @dataclass(frozen=True)
 class Tuned:
-    """Numbers that were found for a controller.
+    """Numbers that were found for a controller."""
 
-    Attributes
-    ----------
-    task : TuningTask
-        What they are for.
-    twin : str
-        The emulated rig on which they were found.
-    first, best : TuningTrial
-        The numbers before and after, in sessions that the search has not seen. The same if nothing better was found.
-    trials : int
-        Number of trials of the search.
-    others : dict
-        Tables of the rig file for the other controllers of the protocol.
-    provenance : dict
-        What the tuning file says of where they come from.
-    """
-
-    task: TuningTask
-    twin: str
+    task: TuningTask  # what they are for
+    twin: str  # the emulated rig on which they were found
+    # The numbers before and after, in sessions that the search has not seen. The same if nothing better was found.
     first: TuningTrial
     best: TuningTrial
-    trials: int
-    others: dict[str, Any]
-    provenance: dict[str, str | float]
+    trials: int  # number of trials of the search
+    others: dict[str, Any]  # tables of the rig file for the other controllers of the protocol
+    provenance: dict[str, str | float]  # what the tuning file says of where they come from
 
     def text(self) -> str:
         """Return the tuning file."""

@@ -59,18 +59,10 @@ def task_of(file: ModelFile, controller: str, protocol: str | None) -> TuningTas
 
 
 class Scale(NamedTuple):
-    """RMS error (output units) and seconds at a target by which costs are counted.
+    """RMS error (output units) and seconds at a target by which costs are counted."""
 
-    Attributes
-    ----------
-    identified : tuple of float
-        With the model as it is.
-    others : tuple of float
-        The greatest with the models from which the specimen differs.
-    """
-
-    identified: tuple[float, float]
-    others: tuple[float, float]
+    identified: tuple[float, float]  # with the model as it is
+    others: tuple[float, float]  # the greatest with the models from which the specimen differs
 
     @classmethod
     def of(cls, identified: tuple[float, float], others: Sequence[tuple[float, float]]) -> Scale:
@@ -81,41 +73,18 @@ class Scale(NamedTuple):
 
 @dataclass
 class TuningRuns:
-    """Carries out trials of a controller's numbers.
+    """Carries out trials of a controller's numbers."""
 
-    Parameters
-    ----------
-    task : TuningTask
-        What is tuned.
-    rig : str
-        The emulated rig, or a twin.
-    file : ModelFile
-        The identified model.
-    folder : Path
-        Where the runs go.
-    workers : Workers
-        Who carries them out.
-    settings : mapping of str to str
-        Further parameters of the protocol.
-    seeds : int
-        Sessions of each run.
-    first_seed : int
-        Seed of the first session; the others follow.
-    scale : Scale, optional
-        By what the cost is counted; by the first trial if not given.
-    time_weight : float
-        Part of the RMS error of the first numbers that costs as much as their time, at least 0.
-    """
-
-    task: TuningTask
-    rig: str
-    file: ModelFile
-    folder: Path
-    workers: Workers
-    settings: Mapping[str, str]
-    seeds: int = 1
-    first_seed: int = 0
-    scale: Scale | None = None
+    task: TuningTask  # what is tuned
+    rig: str  # the emulated rig, or a twin
+    file: ModelFile  # the identified model
+    folder: Path  # where the runs go
+    workers: Workers  # who carries them out
+    settings: Mapping[str, str]  # further parameters of the protocol
+    seeds: int = 1  # sessions of each run
+    first_seed: int = 0  # seed of the first session; the others follow
+    scale: Scale | None = None  # by what the cost is counted; by the first trial if not given
+    # Part of the RMS error of the first numbers that costs as much as their time, at least 0.
     time_weight: float = TIME_WEIGHT
     failures: list[str] = field(default_factory=list)
     _count: int = 0

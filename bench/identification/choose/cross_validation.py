@@ -153,10 +153,7 @@ def compare_smoothing(
     smoothing : sequence of float
         Weights to try.
 
-    Raises
-    ------
-    ValueError
-        If there is nothing to try, a weight is wrong, or there are fewer samples than folds.
+    Raises ValueError if there is nothing to try, a weight is wrong, or there are fewer samples than folds.
     """
     if not len(smoothing):
         raise ValueError("smoothing: expected at least one weight, got none")

@@ -37,18 +37,10 @@ _LEAST_FITTED = 0.3
 
 @dataclass(frozen=True, eq=False)
 class Fold:
-    """One division of the rows; rows in neither part are between the two, or were never to be fitted.
+    """One division of the rows; rows in neither part are between the two, or were never to be fitted."""
 
-    Attributes
-    ----------
-    tested : ndarray of bool, shape (N,)
-        Rows left out of the fit and predicted.
-    trained : ndarray of bool, shape (N,)
-        Rows of the fit.
-    """
-
-    tested: Flags
-    trained: Flags
+    tested: Flags  # shape (N,); rows left out of the fit and predicted
+    trained: Flags  # shape (N,); rows of the fit
 
 
 def near(chosen: Flags, distance: int) -> Flags:

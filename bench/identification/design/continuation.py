@@ -41,13 +41,9 @@ class Tail:
     From `center - reach` to `center + reach`, then to and fro, one step less at each reversal on one side and the
     other, down to the centre, and back to the first maximum. Whatever has return-point memory gives the output of
     the first visit there again.
-
-    Parameters
-    ----------
-    center, reach, step : float
-        Input units; the reach a multiple of the step.
     """
 
+    # Input units; the reach a multiple of the step.
     center: float
     reach: float
     step: float

@@ -33,18 +33,10 @@ _SEED = 0
 
 @dataclass(frozen=True, eq=False)
 class Scaling:
-    """Units in which the prior of the coefficients and of the bias is the identity, and the noise is 1.
+    """Units in which the prior of the coefficients and of the bias is the identity, and the noise is 1."""
 
-    Attributes
-    ----------
-    factors : ndarray, shape (K + q,)
-        By which columns of the regressor are multiplied.
-    bias : float
-        The column of the bias.
-    """
-
-    factors: Floats
-    bias: float
+    factors: Floats  # shape (K + q,); by which columns of the regressor are multiplied
+    bias: float  # the column of the bias
 
     @classmethod
     def of(cls, operator: Operator[Any], noise: float = NOISE) -> Scaling:

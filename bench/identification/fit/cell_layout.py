@@ -20,22 +20,13 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True, eq=False)
 class CellLayout:
-    """The cell of each sparse column of a regressor.
+    """The cell of each sparse column of a regressor."""
 
-    Parameters
-    ----------
-    order : int
-        Number of intervals M of the plane, 0 if the columns have no place.
-    cells : ndarray of int64, shape (columns,)
-        Cell of each sparse column. A cell may have a second column, that of its relays which were on before the
-        first sample; its density then is the sum of the two coefficients.
-    layers : ndarray of int64, shape (columns,)
-        0 for the first column of a cell, 1 for the second.
-    """
-
-    order: int
+    order: int  # number of intervals M of the plane, 0 if the columns have no place
+    # Shape (columns,); cell of each sparse column. A cell may have a second column, that of its relays which were on
+    # before the first sample; its density then is the sum of the two coefficients.
     cells: Indices
-    layers: Indices
+    layers: Indices  # shape (columns,); 0 for the first column of a cell, 1 for the second
 
     @classmethod
     @lru_cache(maxsize=8)
@@ -101,14 +92,9 @@ class CellLayout:
 
 @dataclass(frozen=True, eq=False)
 class PlanesBeside(CellLayout):
-    """The cells of several planes, whose columns stand one plane after the other.
+    """The cells of several planes, whose columns stand one plane after the other."""
 
-    Parameters
-    ----------
-    planes : tuple of CellLayout
-        Layout of each plane. The order of the whole is the least, and 0 if the columns of one have no place.
-    """
-
+    # Layout of each plane. The order of the whole is the least, and 0 if the columns of one have no place.
     planes: tuple[CellLayout, ...]
 
     @classmethod

@@ -27,22 +27,13 @@ _LEFT = 1e-28
 
 @dataclass(frozen=True, eq=False)
 class Collapsed:
-    """A least-squares problem with the normal equations of a longer one.
+    """A least-squares problem with the normal equations of a longer one."""
 
-    Attributes
-    ----------
-    regressor : Regressor
-        Shape (n, K + q).
-    outputs, weights : ndarray, shape (n,)
-        Outputs and weights of its rows.
-    left : float
-        Weighted sum of squares of the outputs that no coefficient can reach: what its residual sum lacks.
-    """
-
-    regressor: Regressor
+    regressor: Regressor  # shape (n, K + q)
+    # Shape (n,); outputs and weights of its rows.
     outputs: Floats
     weights: Floats
-    left: float
+    left: float  # weighted sum of squares of the outputs that no coefficient can reach: what its residual sum lacks
 
 
 def collapse(regressor: Regressor, outputs: Floats, weights: Floats) -> Collapsed | None:

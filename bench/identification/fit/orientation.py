@@ -59,10 +59,7 @@ def possible_signs(
     inputs, outputs, weights : ndarray, shape (N,)
         The measured sequence; weight 0 where a sample does not count.
 
-    Raises
-    ------
-    ValueError
-        If the model has no orientation to choose, or it cannot fall.
+    Raises ValueError if the model has no orientation to choose, or it cannot fall.
     """
     if not has_orientation(spec, template):
         if wanted != "auto":

@@ -24,34 +24,17 @@ else:
 
 @dataclass(frozen=True, eq=False)
 class ScaledColumns:
-    """Columns A about their weighted means and scaled, and a penalty L on the sparse ones of them.
+    """Columns A about their weighted means and scaled, and a penalty L on the sparse ones of them."""
 
-    Attributes
-    ----------
-    changes : (starts, rows, values)
-        The sparse columns, K, as differences; see `_kernels`.
-    base, means : ndarray, shape (K,)
-        First values and weighted means of the sparse columns.
-    norms : ndarray, shape (K + q,)
-        By which all columns are divided.
-    extra : ndarray, shape (N, q)
-        The dense columns, about their means and scaled already.
-    weights : ndarray, shape (N,)
-        Weight of each sample, W on the diagonal.
-    total : float
-        Sum of the weights.
-    penalty : csr_array, shape (K, K), or None
-        L, in scaled coefficients.
-    """
-
-    changes: Columns
+    changes: Columns  # the sparse columns, K, as differences; see `_kernels`
+    # Shape (K,); first values and weighted means of the sparse columns.
     base: Floats
     means: Floats
-    norms: Floats
-    extra: Floats
-    weights: Floats
-    total: float
-    penalty: csr_array | None
+    norms: Floats  # shape (K + q,); by which all columns are divided
+    extra: Floats  # shape (N, q); the dense columns, about their means and scaled already
+    weights: Floats  # shape (N,); weight of each sample, W on the diagonal
+    total: float  # sum of the weights
+    penalty: csr_array | None  # shape (K, K); L, in scaled coefficients
 
     def model(self, x: Floats) -> Floats:
         """Return A x, shape (N,)."""

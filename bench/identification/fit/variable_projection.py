@@ -95,27 +95,13 @@ class Evidence:
 
 @dataclass(frozen=True, eq=False)
 class End:
-    """Where a search ended.
+    """Where a search ended."""
 
-    Attributes
-    ----------
-    values : ndarray, shape (P,)
-        The parameters.
-    residuals : ndarray, shape (N,)
-        Weighted.
-    jacobian : ndarray, shape (N, P)
-        Their derivative by the parameters.
-    evaluations : int
-        Evaluations of the residuals.
-    converged : bool
-        Whether the tolerance was reached.
-    """
-
-    values: Floats
-    residuals: Floats
-    jacobian: Floats
-    evaluations: int = 1
-    converged: bool = True
+    values: Floats  # shape (P,); the parameters
+    residuals: Floats  # shape (N,); weighted
+    jacobian: Floats  # shape (N, P); their derivative by the parameters
+    evaluations: int = 1  # evaluations of the residuals
+    converged: bool = True  # whether the tolerance was reached
 
     @property
     def cost(self) -> float:

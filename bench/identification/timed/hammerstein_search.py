@@ -48,21 +48,11 @@ class _Parameter:
 
 
 class Following(NamedTuple):
-    """What follows an operator and stands beside it, but for the strengths of what stands beside it.
+    """What follows an operator and stands beside it, but for the strengths of what stands beside it."""
 
-    Attributes
-    ----------
-    part : LinearPart
-        Delay, lag or resonance, and creep.
-    drift_time : float
-        Time constant of a drift that fades, s; 0 for another.
-    friction_speed : float
-        Of a friction, input units/s; 0 if there is none.
-    """
-
-    part: LinearPart
-    drift_time: float
-    friction_speed: float
+    part: LinearPart  # delay, lag or resonance, and creep
+    drift_time: float  # time constant of a drift that fades, s; 0 for another
+    friction_speed: float  # of a friction, input units/s; 0 if there is none
 
 
 def beside(elements: Sequence[str]) -> list[str]:
@@ -72,45 +62,19 @@ def beside(elements: Sequence[str]) -> list[str]:
 
 @dataclass(frozen=True, eq=False)
 class Search:
-    """Everything but the elements: the measured sequence, and the operator's columns.
+    """Everything but the elements: the measured sequence, and the operator's columns."""
 
-    Attributes
-    ----------
-    times : ndarray, shape (N,)
-        s.
-    static : FitProblem
-        The problem of the operator alone.
-    columns : ndarray, shape (N, K)
-        Its regressor.
-    roots : ndarray, shape (N,)
-        Square roots of the weights, 0 for rows left out.
-    signs : tuple
-        Signs of the operator's coefficients that are tried.
-    smoothing : float
-        Weight of the roughness penalty on the density of the operator, see `fit`.
-    ridge : float
-        Weight of the penalty on the coefficients of an operator without a density, see `fit_ridge`.
-    elapsed : ndarray, shape (N,)
-        Since the first row, s.
-    speeds : ndarray, shape (N,)
-        Velocity of the input, input units/s.
-    principal : ndarray, shape (N, r)
-        Principal columns of the regressor.
-    step : float
-        Median step of time, s.
-    """
-
-    times: Floats
-    static: FitProblem
-    columns: Floats
-    roots: Floats
-    signs: tuple[Literal[1, -1], ...]
-    smoothing: float = 0.0
-    ridge: float = 0.0
-    elapsed: Floats = field(init=False)
-    speeds: Floats = field(init=False)
-    principal: Floats = field(init=False)
-    step: float = field(init=False)
+    times: Floats  # shape (N,); s
+    static: FitProblem  # the problem of the operator alone
+    columns: Floats  # shape (N, K); its regressor
+    roots: Floats  # shape (N,); square roots of the weights, 0 for rows left out
+    signs: tuple[Literal[1, -1], ...]  # signs of the operator's coefficients that are tried
+    smoothing: float = 0.0  # weight of the roughness penalty on the density of the operator, see `fit`
+    ridge: float = 0.0  # weight of the penalty on the coefficients of an operator without a density, see `fit_ridge`
+    elapsed: Floats = field(init=False)  # shape (N,); since the first row, s
+    speeds: Floats = field(init=False)  # shape (N,); velocity of the input, input units/s
+    principal: Floats = field(init=False)  # shape (N, r); principal columns of the regressor
+    step: float = field(init=False)  # median step of time, s
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "elapsed", self.times - self.times[0])

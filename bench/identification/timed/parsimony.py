@@ -36,13 +36,6 @@ def moving(columns: Floats, weights: Floats, skip: int) -> Floats:
 def schwarz(cost: float, parameters: int, used: int) -> float:
     """Return the criterion of Schwarz (Annals of Statistics 6, 461, 1978): the model of the least is taken.
 
-    Parameters
-    ----------
-    cost : float
-        Sum of squares over the samples, >= 0.
-    parameters : int
-        How many the model has, less those that all models have.
-    used : int
-        Number of samples that count.
+    `cost` is the sum of squares over the samples, `parameters` the number of those that not all models have.
     """
     return used * math.log(max(cost, 1e-300)) + parameters * math.log(used)

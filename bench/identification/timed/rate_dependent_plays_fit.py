@@ -48,40 +48,21 @@ _UNKNOWN = 1.0
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """Time constants with the fit.
+    """Time constants with the fit."""
 
-    Attributes
-    ----------
-    lags : ndarray, shape (J,)
-        s.
-    fit : Fit
-        Weights of the plays without time constant, then of those of each; of the sign of the problem's orientation.
-    cost : float
-        Weighted sum of squares.
-    deviations : ndarray, shape (J,)
-        Standard deviations of the logarithms of the time constants.
-    """
-
-    lags: Floats
+    lags: Floats  # shape (J,); s
+    # Weights of the plays without time constant, then of those of each; of the sign of the problem's orientation.
     fit: Fit
-    cost: float
-    deviations: Floats
+    cost: float  # weighted sum of squares
+    deviations: Floats  # shape (J,); standard deviations of the logarithms of the time constants
 
 
 @dataclass(frozen=True, eq=False)
 class PlaysSearch:
-    """The measured sequence, and the problem of plays that do not depend on the rate.
+    """The measured sequence, and the problem of plays that do not depend on the rate."""
 
-    Attributes
-    ----------
-    times : ndarray, shape (N,)
-        s.
-    static : FitProblem
-        That of a Prandtl-Ishlinskii operator of the same thresholds.
-    """
-
-    times: Floats
-    static: FitProblem
+    times: Floats  # shape (N,); s
+    static: FitProblem  # that of a Prandtl-Ishlinskii operator of the same thresholds
 
     @classmethod
     def of(

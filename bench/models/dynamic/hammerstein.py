@@ -26,21 +26,11 @@ from bench.models.operator import Operator, operator_from_json
 
 
 class Knots(NamedTuple):
-    """What the delay has not yet let through.
+    """What the delay has not yet let through."""
 
-    Attributes
-    ----------
-    times : tuple of float
-        Since the start of the record, s.
-    values : tuple of float
-        Output of the operator less its bias, output units.
-    filters : FilterState
-        State at the first of these times.
-    """
-
-    times: tuple[float, ...]
-    values: tuple[float, ...]
-    filters: FilterState
+    times: tuple[float, ...]  # since the start of the record, s
+    values: tuple[float, ...]  # output of the operator less its bias, output units
+    filters: FilterState  # state at the first of these times
 
 
 class HammersteinState(NamedTuple):

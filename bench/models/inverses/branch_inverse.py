@@ -19,18 +19,11 @@ Source: rounding of float64: a sum of 1000 elements errs by no more than 1000 ti
 
 
 class Branch(NamedTuple):
-    """The output along a monotone move to an end of the operating range: linear between its corners.
+    """The output along a monotone move to an end of the operating range: linear between its corners."""
 
-    Attributes
-    ----------
-    drives : ndarray, shape (n,)
-        The drive at the corners, in the order of the move; the first is that of the present input.
-    outputs : ndarray, shape (n,)
-        The output there, output units, all rising or all falling.
-    """
-
+    # Shape (n,); the drive at the corners, in the order of the move; the first is that of the present input.
     drives: Floats
-    outputs: Floats
+    outputs: Floats  # shape (n,); the output there, output units, all rising or all falling
 
 
 class Branched(Protocol):

@@ -81,30 +81,14 @@ class Inversion(Generic[S]):
 
 @dataclass(frozen=True, eq=False)
 class Following(Generic[S]):
-    """The set-points that bring the output to one target after another.
+    """The set-points that bring the output to one target after another."""
 
-    Parameters
-    ----------
-    setpoints : ndarray, shape (N,)
-        The input that meets each target (the last one where there are two).
-    saturating : ndarray, shape (N,)
-        The set-point to pass before it, NaN where none is needed.
-    outputs : ndarray, shape (N,)
-        The operator's outputs at `setpoints`.
-    met : ndarray of bool, shape (N,)
-        Whether the target could be met; if not, the output is the closest one.
-    iterations : ndarray of int64, shape (N,)
-        Segments walked for each target.
-    state : object
-        Memory after the last set-point.
-    """
-
-    setpoints: Floats
-    saturating: Floats
-    outputs: Floats
-    met: NDArray[np.bool_]
-    iterations: NDArray[np.int64]
-    state: S
+    setpoints: Floats  # shape (N,); the input that meets each target (the last one where there are two)
+    saturating: Floats  # shape (N,); the set-point to pass before it, NaN where none is needed
+    outputs: Floats  # shape (N,); the operator's outputs at `setpoints`
+    met: NDArray[np.bool_]  # shape (N,); whether the target could be met; if not, the output is the closest one
+    iterations: NDArray[np.int64]  # shape (N,); segments walked for each target
+    state: S  # memory after the last set-point
 
 
 @dataclass(frozen=True, eq=False)

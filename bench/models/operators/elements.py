@@ -27,21 +27,11 @@ _BLOCK = 2**20
 
 
 class CompiledStep(NamedTuple):
-    """What a stream of elements steps with.
+    """What a stream of elements steps with."""
 
-    Attributes
-    ----------
-    name : str
-        The step, of `_element_stream_kernels`.
-    numbers : tuple of float
-        The operator's numbers, in the order in which the step takes them.
-    arrays : tuple of ndarray
-        Its arrays, likewise; at most two.
-    """
-
-    name: str
-    numbers: tuple[float, ...]
-    arrays: tuple[Floats, ...] = ()
+    name: str  # the step, of `_element_stream_kernels`
+    numbers: tuple[float, ...]  # the operator's numbers, in the order in which the step takes them
+    arrays: tuple[Floats, ...] = ()  # its arrays, likewise; at most two
 
 
 class ElementOperator(Operator[ElementState]):
@@ -55,14 +45,8 @@ class ElementOperator(Operator[ElementState]):
     def respond(self, inputs: Floats, present: float, elements: Floats) -> Floats:
         """Return the columns of a sequence, shape (N, K), from a present input.
 
-        Parameters
-        ----------
-        inputs : ndarray, shape (N,)
-            Input units.
-        present : float
-            The input before the sequence.
-        elements : ndarray, shape (E,)
-            What the elements remember; changed to that after the sequence.
+        `inputs` has the shape (N,), in input units; `elements`, shape (E,), is changed to what the elements remember
+        after the sequence.
         """
 
     @abstractmethod
@@ -152,15 +136,7 @@ class ElementOperator(Operator[ElementState]):
 
 
 class ElementStream(AddressedStream[ElementState]):
-    """An operator of elements, changed in place; equal to `ElementOperator.step` but for the rounding of a sum.
-
-    Parameters
-    ----------
-    operator : ElementOperator
-        The operator, which has a compiled step.
-    state : tuple of float
-        State to begin with.
-    """
+    """An operator of elements, changed in place; equal to `ElementOperator.step` but for the rounding of a sum."""
 
     operator: ElementOperator
 

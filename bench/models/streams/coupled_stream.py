@@ -14,15 +14,7 @@ S = TypeVar("S")
 
 
 class CoupledStream(Generic[S]):
-    """A model from voltage and force to length, and its present state, which `step` changes.
-
-    Parameters
-    ----------
-    model : Coupled
-        The model.
-    state : object
-        State to begin with.
-    """
+    """A model from voltage and force to length, and its present state, which `step` changes."""
 
     def __init__(self, model: Coupled[S], state: S) -> None:
         self.model = model

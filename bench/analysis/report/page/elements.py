@@ -18,48 +18,25 @@ class PageText:
 
 @dataclass(frozen=True)
 class PageTable:
-    """A table: heads, rows of cells, and a note below.
+    """A table: heads, rows of cells, and a note below."""
 
-    Attributes
-    ----------
-    heads : sequence of str
-        Empty texts only if it has none.
-    rows : sequence of sequence of str
-        As many cells each as there are heads.
-    title, note : str
-        Above and below; empty for none.
-    folded : bool
-        Whether it is shown only when it is opened.
-    numbers_from : int
-        First column of numbers, which are aligned right.
-    """
-
-    heads: Sequence[str]
-    rows: Sequence[Sequence[str]]
+    heads: Sequence[str]  # empty texts only if it has none
+    rows: Sequence[Sequence[str]]  # as many cells each as there are heads
+    # Above and below; empty for none.
     title: str = ""
     note: str = ""
-    folded: bool = False
-    numbers_from: int = 99
+    folded: bool = False  # whether it is shown only when it is opened
+    numbers_from: int = 99  # first column of numbers, which are aligned right
     kind = "table"
 
 
 @dataclass(frozen=True)
 class PageFigure:
-    """A figure.
+    """A figure."""
 
-    Attributes
-    ----------
-    svg : str
-        An `svg` element, as `bench.analysis.report.page.svg.inlined` returns it.
-    caption : str
-        What it shows.
-    is_map : bool
-        Whether its colours are values, which a dark page leaves as they are.
-    """
-
-    svg: str
-    caption: str
-    is_map: bool = False
+    svg: str  # an `svg` element, as `bench.analysis.report.page.svg.inlined` returns it
+    caption: str  # what it shows
+    is_map: bool = False  # whether its colours are values, which a dark page leaves as they are
     kind = "figure"
 
 
@@ -81,23 +58,13 @@ class PageSection:
 
 @dataclass(frozen=True)
 class Page:
-    """A whole page.
+    """A whole page."""
 
-    Attributes
-    ----------
-    title, subtitle : str
-        Its heads.
-    badge, badge_style : str
-        State in a word, and its style: `good`, `open`, `bad` or empty.
-    lead : sequence of str
-        What it says in words, one paragraph each.
-    sections : sequence of PageSection
-        The rest.
-    """
-
+    # Its heads.
     title: str
     subtitle: str
+    # State in a word, and its style: `good`, `open`, `bad` or empty.
     badge: str
     badge_style: str
-    lead: Sequence[str]
+    lead: Sequence[str]  # what it says in words, one paragraph each
     sections: Sequence[PageSection] = field(default_factory=tuple)

@@ -25,14 +25,7 @@ _FEW_COEFFICIENTS = 30
 def models_section(models: Sequence[ModelOnRun], times: Floats, scratch: Path) -> PageSection:
     """Return loops and residuals of models, their errors, bands and coefficients.
 
-    Parameters
-    ----------
-    models : sequence of ModelOnRun
-        At least one.
-    times : ndarray, shape (N,)
-        Laboratory time of each reading, s.
-    scratch : Path
-        Folder for files that are not kept.
+    There is one model at least. `times`, shape (N,), has the laboratory time of each reading, s.
     """
     parts: list[PagePart] = [*errors_parts(models)]
     for i, group in enumerate(_by_signals(models)):

@@ -52,20 +52,8 @@ def run_page(
 ) -> Page:
     """Return the page of a run; of one that has not ended what there is, marked as unfinished.
 
-    Parameters
-    ----------
-    record : Record
-        The run.
-    steps : Table
-        Its readings.
-    summary : TelemetrySummary
-        Its telemetry.
-    models : sequence of ModelOnRun
-        Models to show beside the readings.
-    result : mapping
-        What `report_run` returns, as far as it is known.
-    published : sequence of Published
-        Numbers of papers; those that concern the run are shown.
+    `result` is what `report_run` returns, as far as it is known. Of the numbers of papers those are shown that
+    concern the run.
     """
     meta, events = record.meta, record.events()
     extremes = result["extremes"]

@@ -26,17 +26,9 @@ def inlined(path: Path, description: str) -> str:
     Coordinates keep a hundredth of a point, and the dots of a curve become one path. The identifiers that stay are
     those of clips and marks, which differ from figure to figure.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    description : str
-        What it shows, for those who do not see it; plain text.
+    `description` is a plain text for readers who do not see the figure.
 
-    Raises
-    ------
-    DataError
-        If it cannot be read or is no such file.
+    Raises DataError if it cannot be read or is no such file.
     """
     from markupsafe import escape
 

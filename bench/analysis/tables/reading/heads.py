@@ -51,17 +51,10 @@ class NoColumnError(DataError):
 
 @dataclass(frozen=True)
 class Head:
-    """Head of a column.
+    """Head of a column."""
 
-    Attributes
-    ----------
-    text : str
-        As it stands in the file.
-    name, unit : str
-        Its parts; the unit is empty where there is none.
-    """
-
-    text: str
+    text: str  # as it stands in the file
+    # Its parts; the unit is empty where there is none.
     name: str
     unit: str
 
@@ -145,23 +138,9 @@ def bare_unit(text: str) -> str:
 def find_place(path: Path, heads: Sequence[Head], columns: int, name: str) -> int:
     """Return the index of the column that a name or a number from 1 means.
 
-    Parameters
-    ----------
-    path : Path
-        The file, for messages.
-    heads : sequence of Head
-        Heads, none where the table has no header.
-    columns : int
-        Number of columns.
-    name : str
-        Head, head without its unit, or number.
+    `heads` is empty where the table has no header. The name is a head, a head without its unit, or a number.
 
-    Raises
-    ------
-    NoColumnError
-        If there is no such column.
-    DataError
-        If there are several.
+    Raises NoColumnError if there is no such column; DataError if there are several.
     """
     wanted = _folded(name.strip())
     texts = [_folded(head.text) for head in heads]

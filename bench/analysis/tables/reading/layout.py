@@ -69,37 +69,18 @@ Mask: TypeAlias = tuple[bool | None, ...]
 
 @dataclass(frozen=True)
 class Layout:
-    """Layout of a table.
+    """Layout of a table."""
 
-    Attributes
-    ----------
-    delimiter : str
-        Between cells; a blank stands for runs of blanks and tabs.
-    decimal : str
-        Point or comma.
-    start : int
-        Number of lines above the first row of data, in the file.
-    heads : tuple of Head
-        Heads by column; none where there is no header, or one that does not fit the data.
-    columns : int
-        Number of columns of the data.
-    notes : tuple of str
-        What was assumed.
-    numbers, figures : tuple of int
-        Indices of the columns that hold numbers as a rule; of those that hold numbers, dates or times of day.
-    comments : int
-        Number of lines of comment above the data.
-    """
-
-    delimiter: str
-    decimal: str
-    start: int
-    heads: tuple[Head, ...]
-    columns: int
-    notes: tuple[str, ...]
+    delimiter: str  # between cells; a blank stands for runs of blanks and tabs
+    decimal: str  # point or comma
+    start: int  # number of lines above the first row of data, in the file
+    heads: tuple[Head, ...]  # heads by column; none where there is no header, or one that does not fit the data
+    columns: int  # number of columns of the data
+    notes: tuple[str, ...]  # what was assumed
+    # Indices of the columns that hold numbers as a rule; of those that hold numbers, dates or times of day.
     numbers: tuple[int, ...] = ()
     figures: tuple[int, ...] = ()
-    comments: int = 0
+    comments: int = 0  # number of lines of comment above the data
 
     @property
     def marks(self) -> tuple[str, ...]:
@@ -190,22 +171,10 @@ def is_number(cell: str, decimal: str) -> bool:
 def find_layout(path: Path, lines: Sequence[str], options: ReadingOptions, first: int = 0) -> Layout | None:
     """Find the layout of a table from its first lines; None if no row of them has a number.
 
-    Parameters
-    ----------
-    path : Path
-        The file, for messages.
-    lines : sequence of str
-        First lines of the table.
-    options : ReadingOptions
-        What is known. With a table the first one is found, otherwise names and values above a much longer table
-        are no table.
-    first : int
-        Number of lines above these.
+    If the options name a table, the first one is found. Otherwise names and values above a much longer table are no
+    table.
 
-    Raises
-    ------
-    DataError
-        If the lines can be read in several ways: names the option that decides.
+    Raises DataError if the lines can be read in several ways: names the option that decides.
     """
     found: list[tuple[tuple[bool, int, int, float], Layout]] = []
     for delimiter in [options.delimiter] if options.delimiter else list(DELIMITERS):

@@ -49,13 +49,8 @@ _LEFT_OUT = "tables and strings of MATLAB left out"
 def load_contents(path: Path, kind: str) -> tuple[Any, tuple[str, ...]]:
     """Return the contents of a file, and what was assumed.
 
-    Parameters
-    ----------
-    path : Path
-        The file.
-    kind : str
-        `MATLAB`, `HDF5`, `TDMS` or `Parquet`: arrays by name, in mappings where they are grouped, with the unit at
-        the end of a name. `spreadsheet`: lines of cells with tabs between them, by sheet.
+    The contents of `MATLAB`, `HDF5`, `TDMS` and `Parquet` are arrays by name, in mappings where they are grouped,
+    with the unit at the end of a name. Those of a `spreadsheet` are lines of cells with tabs between them, by sheet.
 
     Raises DataError if the file cannot be read, ends the process that reads it, or takes too long; MissingExtraError
     if a library is not installed.

@@ -28,12 +28,8 @@ def read_arrays(
     the parts of each structure, table or group `S` as `S.part`; `options.table` chooses one, whose columns then have
     short names. Without it that is the only one, if nothing stands beside it.
 
-    Raises
-    ------
-    DataError
-        If the file cannot be read, a column is missing, columns differ in length, or a value is not finite.
-    ConfigurationError
-        If an option does not apply, or a library is not installed.
+    Raises DataError if the file cannot be read, a column is missing, columns differ in length, or a value is not
+    finite; ConfigurationError if an option does not apply, or a library is not installed.
     """
     options.check_only(path, f"a {kind} file", "table", *OF_TIMES)
     contents, remarks = load_contents(path, kind)

@@ -24,12 +24,8 @@ def read_spreadsheet(
 
     A table of a sheet of several is chosen by `SHEET:NUMBER`.
 
-    Raises
-    ------
-    DataError
-        If the file cannot be read, a column is missing, or a cell is not a finite number: names sheet and line.
-    ConfigurationError
-        If an option does not apply, or the library for spreadsheets is not installed.
+    Raises DataError if the file cannot be read, a column is missing, or a cell is not a finite number: names sheet
+    and line; ConfigurationError if an option does not apply, or the library for spreadsheets is not installed.
     """
     options.check_only(path, "a spreadsheet", "table", "skip_lines", *OF_TIMES)
     sheets, _ = load_contents(path, "spreadsheet")

@@ -30,19 +30,8 @@ class TextRows:
 
     Those at its end are a summary; the others stay.
 
-    Parameters
-    ----------
-    figures : collection of int
-        Indices of the columns of numbers, dates and times.
-    decimal : str
-        Decimal sign.
-    asked : collection of int
-        Indices of the columns that are asked for. A label in one of them is a wrong cell, unless it begins the row.
-
-    Attributes
-    ----------
-    within : list of int
-        Lines that have a label and stay.
+    `figures` are the indices of the columns of numbers, dates and times; `asked` those of the columns that are asked
+    for. A label in one of the latter is a wrong cell, unless it begins the row.
     """
 
     def __init__(self, figures: Collection[int], decimal: str, asked: Collection[int] = ()) -> None:

@@ -20,24 +20,12 @@ OTHER_COLUMN = "; most rows have no number in this column: choose another"
 
 @dataclass(frozen=True)
 class ReadColumns:
-    """Columns that were read.
+    """Columns that were read."""
 
-    Attributes
-    ----------
-    names : list of str
-        Those that were asked for, and that of a column of times where one was looked for and found.
-    values : list of ndarray
-        In the same order, shape (rows,) each, finite.
-    units : list of str
-        Likewise; empty where the file does not say.
-    notes : tuple of str
-        What was assumed about the file.
-    """
-
-    names: list[str]
-    values: list[Floats]
-    units: list[str]
-    notes: tuple[str, ...]
+    names: list[str]  # those that were asked for, and that of a column of times where one was looked for and found
+    values: list[Floats]  # in the same order, shape (rows,) each, finite
+    units: list[str]  # likewise; empty where the file does not say
+    notes: tuple[str, ...]  # what was assumed about the file
 
 
 def finite_number(where: str, cell: str, decimal: str = ".", remedy: str = "") -> float:

@@ -31,24 +31,12 @@ _MOST_LINES_BELOW = 20
 
 @dataclass(frozen=True)
 class Ending:
-    """End of a table.
+    """End of a table."""
 
-    Attributes
-    ----------
-    end : int or None
-        Number of lines up to it; None if nothing follows.
-    rest : int
-        Number of lines up to what follows the rows of a summary.
-    within : tuple of int
-        Lines of the table that have a text in a column of numbers.
-    rows : int
-        Number of rows.
-    """
-
-    end: int | None
-    rest: int
-    within: tuple[int, ...]
-    rows: int
+    end: int | None  # number of lines up to it; None if nothing follows
+    rest: int  # number of lines up to what follows the rows of a summary
+    within: tuple[int, ...]  # lines of the table that have a text in a column of numbers
+    rows: int  # number of rows
 
 
 @dataclass(frozen=True)

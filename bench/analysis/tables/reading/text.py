@@ -35,24 +35,12 @@ _GZIP = b"\x1f\x8b"
 
 @dataclass(frozen=True)
 class TextFile:
-    """A text file.
+    """A text file."""
 
-    Attributes
-    ----------
-    path : Path
-        The file, which may be compressed by gzip.
-    encoding : str
-        As Python names it.
-    compressed : bool
-        Whether it is.
-    choice : str
-        What stands before the number of a table in `--format table=N`.
-    """
-
-    path: Path
-    encoding: str
-    compressed: bool
-    choice: str = ""
+    path: Path  # the file, which may be compressed by gzip
+    encoding: str  # as Python names it
+    compressed: bool  # whether it is
+    choice: str = ""  # what stands before the number of a table in `--format table=N`
 
     def lines(self, start: int = 0, end: int | None = None) -> Iterator[str]:
         """Yield lines from number `start` to before `end`, from 0; each ends in a line feed, the last perhaps not.

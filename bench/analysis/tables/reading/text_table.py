@@ -62,12 +62,8 @@ class _SeveralError(Exception):
 def read_text(path: Path, names: Sequence[str], options: ReadingOptions, times: Sequence[str] = ()) -> ReadColumns:
     """Read columns of a text file, perhaps compressed by gzip, and the first of `times` that is there.
 
-    Raises
-    ------
-    DataError
-        If the file cannot be read, is ambiguous, or a cell is not a finite number: names line and option.
-    ConfigurationError
-        If `options.table` is not a number.
+    Raises DataError if the file cannot be read, is ambiguous, or a cell is not a finite number: names line and
+    option; ConfigurationError if `options.table` is not a number.
     """
     if options.table is not None and not options.table.isdecimal():
         raise ConfigurationError(f"--format table={options.table}: the tables of a text file have numbers, from 1")
