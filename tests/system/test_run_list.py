@@ -13,7 +13,6 @@ from heater_protocols import stairs
 from rich.console import Console
 
 from bench.analysis import compare_runs
-from bench.cli.run_list import Status
 from bench.execution import Run, carry_out
 from bench.protocol import Messages, Note, NumberList, ProtocolParameters, parameter, protocol
 from bench.record import FILE_NAME, Difference, Record, run_name
@@ -224,7 +223,7 @@ class TestWhatIsAskedFor:
         assert said in " ".join(err.replace("│", " ").split())
 
     def test_a_status_that_there_is_finds_none(self, bench, runs):
-        code, out, _ = bench("runs", runs["plain"].parent, "--status", Status.ABORTED)
+        code, out, _ = bench("runs", runs["plain"].parent, "--status", "aborted")
         assert code == 0
         assert out.endswith("0 runs\n")
 
