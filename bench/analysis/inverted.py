@@ -218,7 +218,4 @@ def _are_equal(outputs: Floats, targets: Floats) -> npt.NDArray[np.bool_]:
 
 
 def _flags(met: npt.NDArray[np.bool_], targets: Floats, outputs: Floats) -> list[str]:
-    return [
-        (Reach.MET if at else Reach.TOO_HIGH if target > output else Reach.TOO_LOW).value
-        for at, target, output in zip(met.tolist(), targets.tolist(), outputs.tolist(), strict=True)
-    ]
+    return [Reach.of(at, short).value for at, short in zip(met.tolist(), (targets - outputs).tolist(), strict=True)]

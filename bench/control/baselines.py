@@ -122,6 +122,4 @@ class IntegralControl(Scripted):
 
 def saturation(wished: float, low: float, high: float, error: float) -> Reach:
     """Return what a wish beyond the limits says of the target."""
-    if low <= wished <= high:
-        return Reach.MET
-    return Reach.TOO_HIGH if error > 0.0 else Reach.TOO_LOW
+    return Reach.of(low <= wished <= high, error)

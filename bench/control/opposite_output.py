@@ -6,7 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 from bench.control.tracking import Command, TargetController, Trace
-from bench.models import OPPOSITE, Reach
+from bench.models import Reach
 
 
 class OppositeOutput:
@@ -50,4 +50,4 @@ class OppositeOutput:
     @property
     def reach(self) -> Reach:
         """Whether the present target can be met."""
-        return OPPOSITE[self._controller.reach]
+        return self._controller.reach.opposite

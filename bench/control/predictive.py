@@ -285,7 +285,7 @@ class PredictiveFollower(ControllerBase):
         wanted = np.interp(times, ends, references)
         weights = np.tile(np.append(np.full(_PARTS - 1, self._parameters.between), 1.0), self.horizon)
         followed = self._inverse.follow(references[1:], state)
-        self._reach = _reach(bool(followed.met[0]), references[1], float(followed.outputs[0]))
+        self._reach = Reach.of(followed.met[0], references[1] - float(followed.outputs[0]))
         inverses = [np.interp(ends[:-1] + ahead, ends[1:], followed.setpoints) for ahead in self._ahead]
         plans = np.clip([*inverses, np.append(self._plan[1:], self._plan[-1])], self._low, self._high)
 
@@ -316,9 +316,3 @@ class PredictiveFollower(ControllerBase):
                 break
             plan, error = tries[best], left[best]
         return np.asarray(plan)
-
-
-def _reach(met: bool, target: float, output: float) -> Reach:
-    if met:
-        return Reach.MET
-    return Reach.TOO_HIGH if target > output else Reach.TOO_LOW

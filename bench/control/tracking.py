@@ -25,7 +25,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass, fields
 from typing import Any, NamedTuple, Protocol
 
@@ -34,7 +34,7 @@ from bench.control.estimators import DisturbanceEstimator
 from bench.control.model_filters import ModelFilter
 from bench.control.overshoot import Overshoot, Passing
 from bench.control.tuning import Spans
-from bench.models import Inverse, InverseStream, Inversion, Operator, Reach, ResponseDynamics, SeenInput, Stream
+from bench.models import Inverse, InverseStream, Operator, Reach, ResponseDynamics, SeenInput, Stream
 
 TO_REST = 10.0
 """Time constants in which a specimen comes to rest to the sensor's noise.
@@ -346,8 +346,15 @@ class ControllerBase:
         stream = inverse.operator.stream(state)
         self._memory, self._move = stream, stream.step
 
-    def _answer(self, found: Inversion[Any], target: float) -> tuple[float, ...]:
-        """Return the set-points of an inversion within the limits, and note whether they meet the target."""
+    def _way(self, target: float) -> Iterator[float]:
+        """Yield the set-points that lead to a target, the last from the memory as it is when it is asked for."""
+        first, *rest = self._answer(target)
+        yield first
+        if rest:
+            yield self._answer(target)[-1]
+
+    def _answer(self, target: float) -> tuple[float, ...]:
+        found = self._inverse.invert(self.state, target)
         return self._within(found.setpoints, found.reach, target)
 
     def _within(self, found: tuple[float, ...], reach: Reach, target: float) -> tuple[float, ...]:
@@ -357,7 +364,7 @@ class ControllerBase:
         if setpoints != found and self._model is not None:
             short = target - float(self._model.evaluate(setpoints, self.state)[-1])
             if abs(short) > self._close:
-                self._reach = Reach.TOO_HIGH if short > 0.0 else Reach.TOO_LOW
+                self._reach = Reach.of(False, short)
         return setpoints
 
 
@@ -528,11 +535,8 @@ class OpenLoopInverse(Scripted):
         self._wait = wait
 
     def _run(self, target: float, reading: Sample) -> Script:  # noqa: ARG002
-        first, *rest = self._answer(self._inverse.invert(self.state, target), target)
-        yield from self._settle(first)
-        if rest:
-            (second,) = self._answer(self._inverse.invert(self.state, target), target)[-1:]
-            yield from self._settle(second)
+        for setpoint in self._way(target):
+            yield from self._settle(setpoint)
         yield from self._hold(self._poll)
 
     def _settle(self, setpoint: float) -> Generator[Command, Sample, None]:
@@ -598,11 +602,8 @@ class Correcting(Scripted):
     def _towards(self, target: float) -> Move:
         """Go where the model's output is `target`, through saturation if necessary."""
         arrival, at_rest = self._correction.arrival, _AT_REST * self._correction.close_enough
-        first, *rest = self._answer(self._inverse.invert(self.state, target), target)
-        reading = yield from self._arrive(first, arrival, at_rest)
-        if rest:
-            (second,) = self._answer(self._inverse.invert(self.state, target), target)[-1:]
-            reading = yield from self._arrive(second, arrival, at_rest)
+        for setpoint in self._way(target):
+            reading = yield from self._arrive(setpoint, arrival, at_rest)
         return reading
 
     def _correct(self, target: float) -> Move:

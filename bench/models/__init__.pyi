@@ -57,7 +57,6 @@ from .inverses.branch_inverse import (
     BranchInverse as BranchInverse,
 )
 from .inverses.falling_inverse import (
-    OPPOSITE as OPPOSITE,
     FallingInverse as FallingInverse,
 )
 from .inverses.inverse import (

@@ -71,5 +71,4 @@ class BranchInverse(NumericalInverse[ElementState]):
         after, output = operator.step(state, setpoint)
         scale = max(tolerance, 1e-12 * max(abs(least), abs(greatest), abs(here)))
         short = wanted - output
-        reach = Reach.MET if abs(short) <= scale else Reach.TOO_HIGH if short > 0.0 else Reach.TOO_LOW
-        return Inversion((setpoint,), (output,), reach, pieces, after)
+        return Inversion((setpoint,), (output,), Reach.of(abs(short) <= scale, short), pieces, after)

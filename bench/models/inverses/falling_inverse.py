@@ -9,10 +9,6 @@ from numpy.typing import ArrayLike
 
 from bench.base import checks as _checks
 from bench.models.inverses.inverse import Following, Inverse, Inversion, S
-from bench.models.reach import Reach
-
-OPPOSITE = {Reach.MET: Reach.MET, Reach.TOO_HIGH: Reach.TOO_LOW, Reach.TOO_LOW: Reach.TOO_HIGH}
-"""What is said of the target of the opposite output."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +28,7 @@ class FallingInverse(Inverse[S]):
     def invert(self, state: S, target: float) -> Inversion[S]:
         """Return the set-points that bring the output from `state` to `target`; see `Inverse.invert`."""
         found = self.opposite.invert(state, -target)
-        return replace(found, outputs=tuple([-output for output in found.outputs]), reach=OPPOSITE[found.reach])
+        return replace(found, outputs=tuple([-output for output in found.outputs]), reach=found.reach.opposite)
 
     def follow(self, targets: ArrayLike, state: S | None = None) -> Following[S]:
         """Return the set-points that bring the output to one target after another; see `Inverse.follow`."""

@@ -197,8 +197,7 @@ class NumericalInverse(Inverse[S]):
             answers.sort(key=lambda setpoints: abs(setpoints[-1] - present))
         outputs = {setpoints: operator.evaluate(setpoints, state) for setpoints, _ in ways}
         best = answers[0] if answers else min(outputs, key=lambda way: abs(outputs[way][-1] - wanted))
-        short = wanted - float(outputs[best][-1])
-        reach = Reach.MET if answers else Reach.TOO_HIGH if short > 0.0 else Reach.TOO_LOW
+        reach = Reach.of(bool(answers), wanted - float(outputs[best][-1]))
         last = operator.advance(state, best)
         return Inversion(best, tuple(outputs[best].tolist()), reach, _PIECES * len(ways), last)
 
@@ -278,11 +277,7 @@ class TableInverse(NumericalInverse[None]):
 
     def look_up(self, target: float) -> tuple[float, Reach]:
         """Return the input of a target in output units, within the table, and whether the table holds it."""
-        reach = Reach.MET
-        if target > self._outputs[-1]:
-            reach = Reach.TOO_HIGH
-        elif target < self._outputs[0]:
-            reach = Reach.TOO_LOW
+        reach = Reach.of(self._outputs[0] <= target <= self._outputs[-1], target - self._outputs[0])
         after = int(np.searchsorted(self._outputs, target))
         if 0 < after < self._rows.size and self._rows[after] > self._rows[after - 1] + 1:
             # Between the ends of a level stretch there is nothing to interpolate.
@@ -307,7 +302,7 @@ class PlayInverse(NumericalInverse["PlayState"]):
     def invert(self, state: PlayState, target: float) -> Inversion[PlayState]:
         """Return the set-point that brings the output to `target`; see `Inverse.invert`."""
         found = self.follow([target], state)
-        reach = Reach.MET if found.met[0] else Reach.TOO_HIGH if target > found.outputs[0] else Reach.TOO_LOW
+        reach = Reach.of(found.met[0], target - found.outputs[0])
         return Inversion((float(found.setpoints[0]),), (float(found.outputs[0]),), reach, 1, found.state)
 
     def stream(self, state: PlayState | None = None) -> PlayInverseStream:
@@ -405,9 +400,7 @@ class PreisachInverse(Inverse[MemoryCurve]):
         count, first, last, error, iterations = _kernels.invert_state(
             *self._constants, start, state.input, float(target)
         )
-        reach = Reach.MET
-        if abs(error) > 2.0 * tolerance:
-            reach = Reach.TOO_HIGH if error < 0.0 else Reach.TOO_LOW
+        reach = Reach.of(abs(error) <= 2.0 * tolerance, -error)
         if count == 1:
             return Inversion((last,), (target + error,), reach, iterations, state.step(last))
         turned = plus if first > last else minus

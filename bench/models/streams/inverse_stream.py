@@ -136,9 +136,7 @@ class PreisachInverseStream(InverseStream[MemoryCurve]):
     def reach(self) -> Reach:
         """Whether the last target can be met."""
         error = self._numbers.item(self._places.ERROR)
-        if abs(error) <= 2.0 * self._numbers.item(self._places.TOLERANCE):
-            return Reach.MET
-        return Reach.TOO_HIGH if error < 0.0 else Reach.TOO_LOW
+        return Reach.of(abs(error) <= 2.0 * self._numbers.item(self._places.TOLERANCE), -error)
 
 
 class PlayInverseStream(InverseStream["PlayState"]):
@@ -160,11 +158,10 @@ class PlayInverseStream(InverseStream["PlayState"]):
         _checks.number("target", target)
         if self._moved:
             self._backward, self._moved = self.inverse._backward(self._forward.state), False
-        low, high = self._low, self._high
-        within = low if target < low else high if target > high else target
+        within = min(max(target, self._low), self._high)
         setpoint = self._backward.step(within)
         self._output, self._saturating = self._forward.step(setpoint), math.nan
-        self._reach = Reach.TOO_LOW if within > target else Reach.TOO_HIGH if within < target else Reach.MET
+        self._reach = Reach.of(within == target, target - within)
         return setpoint
 
     def move(self, value: float) -> float:
