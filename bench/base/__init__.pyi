@@ -84,6 +84,7 @@ from .parsing import (
     json_text as json_text,
     parse_json as parse_json,
     parse_toml as parse_toml,
+    toml_value as toml_value,
     write_json_file as write_json_file,
 )
 from .patience import (

@@ -18,6 +18,7 @@ from bench.base.whole_files import write_result
 
 _TOO_DEEP = "it is nested too deeply"
 _WITH_COMMA = re.compile(r"[+-]?\d*,\d+([eE][+-]?\d+)?")
+_BARE = re.compile(r"[A-Za-z0-9_-]+")
 _MOST_DIGITS = 308
 """Digits of a whole number that a double can hold (IEEE 754: up to 1.8e308)."""
 
@@ -53,6 +54,21 @@ def parse_toml(text: str) -> dict[str, Any]:
         elif isinstance(value, int) and abs(value) >= 10**_MOST_DIGITS:
             raise ValueError(f"a whole number has more than {_MOST_DIGITS} digits")
     return content
+
+
+def toml_value(value: object) -> str:
+    """Return a text, number, list or table as TOML has it in one line."""
+    if isinstance(value, Mapping):
+        pairs = [
+            f"{key if _BARE.fullmatch(key) else toml_value(key)} = {toml_value(of)}" for key, of in value.items()
+        ]
+        return f"{{ {', '.join(pairs)} }}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(toml_value, value))}]"
+    if isinstance(value, float) and not math.isfinite(value):
+        return str(float(value))
+    # The scalars of TOML are otherwise those of JSON.
+    return json.dumps(value, ensure_ascii=False)
 
 
 def end_of_json(text: str) -> int:

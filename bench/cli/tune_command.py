@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 
 from bench.base import print_plain, write_result
-from bench.cli.command_support import JsonOption, check_outputs, write_json
+from bench.cli.command_support import JsonOption, check_outputs, parse_assignments, write_json
 from bench.cli.printing import console, print_rows, show_compilation
 
 
@@ -59,8 +59,9 @@ def tune_(
 
     check_outputs(out=out, json_file=json_file, read=[model])
     found = tune(
-        model, rig, twin=twin, controller=controller, protocol=protocol, settings=settings or [], seeds=seeds,
-        checks=checks, rounds=rounds, time_weight=time_weight, workers=workers, folder=runs, console=console,
+        model, rig, twin=twin, controller=controller, protocol=protocol,
+        settings=parse_assignments("--set", settings or []), seeds=seeds, checks=checks, rounds=rounds,
+        time_weight=time_weight, workers=workers, folder=runs, console=console,
     )  # fmt: skip
     write_result(out, found.text())
     print_rows(f"{controller} on {found.twin}", found.rows())

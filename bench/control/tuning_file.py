@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 from pydantic import BeforeValidator
 
-from bench.base import ConfigurationError, parse_json, parse_toml
+from bench.base import ConfigurationError, parse_json, parse_toml, toml_value
 
 
 def load_tuning(path: Path) -> dict[str, dict[str, Any]]:
@@ -59,15 +59,6 @@ def tuning_text(tuning: Mapping[str, Mapping[str, Any]], provenance: Mapping[str
     """Return the text of a tuning file."""
     lines = ["# Numbers of controllers, found by bench model tune; used by --set tuning=FILE.", ""]
     for controller, numbers in tuning.items():
-        lines += [f"[tuning.{controller}]", *(f"{name} = {_value(value)}" for name, value in numbers.items()), ""]
-    lines += ["[provenance]", *(f"{name} = {_value(value)}" for name, value in provenance.items())]
+        lines += [f"[tuning.{controller}]", *(f"{name} = {toml_value(value)}" for name, value in numbers.items()), ""]
+    lines += ["[provenance]", *(f"{name} = {toml_value(value)}" for name, value in provenance.items())]
     return "\n".join(lines) + "\n"
-
-
-def _value(value: Any) -> str:  # noqa: ANN401 - a number, a text or a table of them
-    if isinstance(value, Mapping):
-        return "{ " + ", ".join(f"{name} = {_value(inner)}" for name, inner in value.items()) + " }"
-    if isinstance(value, str):
-        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
-        return f'"{escaped}"'
-    return repr(float(value)) if isinstance(value, float) else str(value)

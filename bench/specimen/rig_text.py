@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from bench.base import CheckedTable
+from bench.base import CheckedTable, toml_value
 from bench.rig import RigFile
 from bench.specimen.identify import measured_signals
 from bench.specimen.specimen import Unevenness, Wander
@@ -34,11 +34,11 @@ def rig_text(twin: IdentifiedTwin, file: RigFile, rig: str, out: Path) -> str:
         "# set-points, and the response follows the drive as was identified. Other signals stand at the level that",
         "# was measured, with the noise that was measured, or follow the set-point of their device at once.",
         "",
-        f"extends = {_value(_base(rig, out))}",
-        f"without = {_value(_left_out(file))}",
+        f"extends = {toml_value(_base(rig, out))}",
+        f"without = {toml_value(_left_out(file))}",
         "",
         "[rig]",
-        f"title = {_value(f'{file.rig.title}: twin')}",
+        f"title = {toml_value(f'{file.rig.title}: twin')}",
         "",
         *_devices(twin, file),
         *_emulation(twin, file),
@@ -150,19 +150,7 @@ def _table(
     yield f"[{name}]"
     fields = {} if described is None else described.model_fields
     for key, value in keys.items():
-        text = f"{key} = {_value(value)}"
+        text = f"{key} = {toml_value(value)}"
         yield f"{text:<36}# {fields[key].description}" if key in fields else text
     yield from tail
     yield ""
-
-
-def _value(value: Any) -> str:  # noqa: ANN401 - any of TOML
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False)
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, list | tuple):
-        return f"[{', '.join(map(_value, value))}]"
-    if isinstance(value, dict):
-        return "{ " + ", ".join(f"{json.dumps(key)} = {_value(each)}" for key, each in value.items()) + " }"
-    return repr(value)

@@ -13,14 +13,13 @@ from typing import Any, TypeGuard
 import numpy as np
 
 from bench.analysis import WholeIdentification, check_template, option_names, whole_identification, whole_models
-from bench.base import BenchError, ConfigurationError, closest, registry
+from bench.base import BenchError, ConfigurationError, closest, registry, toml_value
 from bench.batch.campaign.file import (
     REFERENCE,
     CampaignFile,
     ComparisonsTable,
     ModelsTable,
     RunsTable,
-    as_override,
     axes,
     dotted,
 )
@@ -206,7 +205,7 @@ class _Expander:
         self._varying[table.label] = tuple(key for key, varies in varying.items() if varies)
         for protocol, rig in itertools.product(table.protocol, table.rigs):
             for replaced in _grid(overrides):
-                known = self._rig(where, rig, {key: as_override(value) for key, value in replaced.items()})
+                known = self._rig(where, rig, {key: toml_value(value) for key, value in replaced.items()})
                 for faults in filter(None, table.faults):
                     self._check_faults(where, known, faults)
                 for chosen in _grid(parameters):
@@ -281,7 +280,7 @@ class _Expander:
                     seed_offset=table.seed_offset,
                     parameters=given,
                     models=used,
-                    overrides={key: as_override(value) for key, value in replaced.items()},
+                    overrides={key: toml_value(value) for key, value in replaced.items()},
                     faults=path,
                     interlock_rate=table.interlock_rate,
                     inputs=tuple(inputs.values()),

@@ -37,7 +37,6 @@ Paths are relative to the file. Unknown keys are errors.
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -276,10 +275,3 @@ def dotted(table: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
     for key, value in table.items():
         found |= dotted(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
     return found
-
-
-def as_override(value: object) -> str:
-    """Return a value of an override as the text of `--override`: TOML, whose scalars and arrays are as in JSON."""
-    if isinstance(value, dict):
-        return f"{{{', '.join(f'{json.dumps(key)} = {as_override(inner)}' for key, inner in value.items())}}}"
-    return json.dumps(value, ensure_ascii=False)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib.metadata
-from collections.abc import Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from hashlib import sha256
 from pathlib import Path
@@ -58,7 +58,7 @@ def tune(
     twin: str | None = None,
     controller: str = "closed-loop-inverse",
     protocol: str | None = None,
-    settings: Sequence[str] = (),
+    settings: Mapping[str, str] | None = None,
     seeds: int = 2,
     checks: int = 8,
     rounds: int = 2,
@@ -96,12 +96,7 @@ def tune(
     spec = controller_spec(task.kind, controller)
     if spec.numbers is None:
         raise ConfigurationError(f"controller {controller} has no numbers that could be tuned")
-    given: dict[str, str] = {}
-    for setting in settings:
-        key, equals, value = setting.partition("=")
-        if not equals:
-            raise ConfigurationError(f"--set {setting}: expected KEY=VALUE")
-        given[key] = value
+    given = settings or {}
     low, high = file.model.first.input_range if file.model.kind == TwoStage.kind else file.operator.input_range
     drive = load_rig(rig).roles.get("drive")
     setup = ControllerSetup(
@@ -123,11 +118,7 @@ def tune(
             shown.print(begun, highlight=False, markup=False)
 
     # What each of many runs says of itself would hide what the search says.
-    kernels = (
-        "bench.models",
-        "bench.control",
-        *getattr(tuned_on.laboratory, "kernels", ()),
-    )
+    kernels = ("bench.models", "bench.control", *getattr(tuned_on.laboratory, "kernels", ()))
     with Workers(workers, title=f"tune {controller}", kernels=kernels) as pool:
         runs = TuningRuns(task, on, file, folder, pool, given, seeds, time_weight=time_weight)
         best = search(begin, spec.tunable, runs, tell, rounds)
@@ -154,7 +145,7 @@ def tune(
         "rig": rig,
         "twin": on,
         "protocol": task.protocol,
-        "settings": ", ".join(settings),
+        "settings": ", ".join(f"{key}={value}" for key, value in given.items()),
         "cost": f"0.5 (as identified + worst margin) of RMS + {time_weight:g} time a target, as multiples of those "
         f"before; margins: gain and time constant by {MARGIN:g} to either side",
         "better": f"cost less by more than {ERRORS:g} standard errors in the same sessions, "
