@@ -36,6 +36,7 @@ from bench.identification import (
     Resolution,
     Validity,
     advise_on_record,
+    begin,
     check_congruency,
     check_options,
     check_return_points,
@@ -287,11 +288,10 @@ def check_template(model: str, inputs: Floats, options: Mapping[str, Any]) -> No
     Raises ValueError if the model does not take them.
     """
     spec = find_model(model)
-    assert spec.template is not None
     known = [option.name for option in model_options(spec)]
     own = {name: value for name, value in options.items() if name in known}
     check_options(model, own)
-    spec.template(inputs, **own)
+    begin(spec, inputs, own)
 
 
 def _implausible_times(model: TimedModel[Any], times: Floats) -> Iterator[Advice]:
@@ -522,10 +522,7 @@ def _is_undetermined(model: str, data: Dataset, options: FitOptions, own: Mappin
     if options.smoothing is not None or options.ridge is not None or options.cross_validated or options.levels_to_try:
         return False
     spec = find_model(model)
-    assert spec.template is not None
-    template: Operator[Any] = spec.template(
-        data.inputs, **{name: value for name, value in own.items() if name not in _OF_ALL}
-    )
+    template = begin(spec, data.inputs, {name: value for name, value in own.items() if name not in _OF_ALL})
     count = template.coefficients.size
     return spec.constrained and bool(template.densities()) and samples < count <= _MOST_CROSS_VALIDATED
 

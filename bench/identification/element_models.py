@@ -8,7 +8,7 @@ import numpy as np
 
 from bench.base import Floats
 from bench.identification.options import OptionHelp
-from bench.identification.plane_models import InputRange, input_span
+from bench.identification.plane_models import InputRange, at_least_one, operating_range
 from bench.models import BoucWen, Duhem, GeneralizedPrandtlIshlinskii, KrasnoselskiiPokrovskii, MaxwellSlip, ModelSpec
 
 _Origin: TypeAlias = Annotated[
@@ -20,20 +20,10 @@ _Plane: TypeAlias = Annotated[
 ]
 
 
-def _ranges(inputs: Floats, input_range: tuple[float, float] | None) -> tuple[float, float]:
-    return input_span(inputs, "input_range") if input_range is None else input_range
-
-
-def _placed(span: tuple[float, float], origin: float | None, input_unit: str, output_unit: str) -> dict[str, Any]:
+def _placed(span: tuple[float, float], origin: float | None) -> dict[str, Any]:
     """Return what every operator of elements with an origin takes."""
     rest = min(max(0.0, span[0]), span[1]) if origin is None else origin
-    return {"origin": rest, "input_range": span, "input_unit": input_unit, "output_unit": output_unit}
-
-
-def _count(name: str, value: int) -> int:
-    if value < 1:
-        raise ValueError(f"{name}: expected at least 1, got {value}")
-    return value
+    return {"origin": rest, "input_range": span}
 
 
 def _bouc_wen(
@@ -41,14 +31,9 @@ def _bouc_wen(
     *,
     origin: _Origin = None,
     input_range: InputRange = None,
-    input_unit: str = "",
-    output_unit: str = "",
 ) -> BoucWen:
-    span = _ranges(inputs, input_range)
-    return BoucWen(
-        scale=0.5 * (span[1] - span[0]),
-        **_placed(span, origin, input_unit, output_unit),
-    )
+    span = operating_range(inputs, input_range)
+    return BoucWen(scale=0.5 * (span[1] - span[0]), **_placed(span, origin))
 
 
 def _duhem(
@@ -57,16 +42,10 @@ def _duhem(
     degree: Annotated[int, OptionHelp("of the curve that the output relaxes to")] = 3,
     origin: _Origin = None,
     input_range: InputRange = None,
-    input_unit: str = "",
-    output_unit: str = "",
 ) -> Duhem:
-    span = _ranges(inputs, input_range)
-    zeros = np.zeros(_count("degree", degree))
-    return Duhem(
-        zeros,
-        zeros,
-        **_placed(span, origin, input_unit, output_unit),
-    )
+    span = operating_range(inputs, input_range)
+    zeros = np.zeros(at_least_one("degree", degree))
+    return Duhem(zeros, zeros, **_placed(span, origin))
 
 
 def _generalized_prandtl_ishlinskii(
@@ -75,14 +54,10 @@ def _generalized_prandtl_ishlinskii(
     plays: Annotated[int, OptionHelp("number of plays; their thresholds are i / plays, i from 0")] = 15,
     origin: _Origin = None,
     input_range: InputRange = None,
-    input_unit: str = "",
-    output_unit: str = "",
 ) -> GeneralizedPrandtlIshlinskii:
-    span = _ranges(inputs, input_range)
+    span = operating_range(inputs, input_range)
     return GeneralizedPrandtlIshlinskii(
-        np.arange(_count("plays", plays)) / plays,
-        np.zeros(plays),
-        **_placed(span, origin, input_unit, output_unit),
+        np.arange(at_least_one("plays", plays)) / plays, np.zeros(plays), **_placed(span, origin)
     )
 
 
@@ -92,21 +67,17 @@ def _krasnoselskii_pokrovskii(
     levels: Annotated[int, OptionHelp("number of intervals of the plane; a ramp is one interval wide")] = 15,
     plane: _Plane = None,
     input_range: InputRange = None,
-    input_unit: str = "",
-    output_unit: str = "",
 ) -> KrasnoselskiiPokrovskii:
-    span = _ranges(inputs, input_range)
+    span = operating_range(inputs, input_range)
     low, high = span if plane is None else plane
     if not low < high:
         raise ValueError(f"plane: expected two increasing inputs, got {low} and {high}")
-    width = (high - low) / _count("levels", levels)
+    width = (high - low) / at_least_one("levels", levels)
     return KrasnoselskiiPokrovskii(
         low + width * np.arange(levels, dtype=np.float64),
         np.zeros(levels * (levels + 1) // 2),
         width,
         input_range=(min(span[0], low), max(span[1], high)),
-        input_unit=input_unit,
-        output_unit=output_unit,
     )
 
 
@@ -120,18 +91,13 @@ def _maxwell_slip(
     ] = None,
     origin: _Origin = None,
     input_range: InputRange = None,
-    input_unit: str = "",
-    output_unit: str = "",
 ) -> MaxwellSlip:
-    span = _ranges(inputs, input_range)
+    span = operating_range(inputs, input_range)
     reach = 0.5 * (span[1] - span[0]) if maximum is None else maximum
     if reach <= 0.0:
         raise ValueError(f"maximum: expected a positive number, got {maximum}")
-    return MaxwellSlip(
-        reach * np.arange(1, _count("elements", elements) + 1) / elements,
-        np.zeros(elements),
-        **_placed(span, origin, input_unit, output_unit),
-    )
+    slips = reach * np.arange(1, at_least_one("elements", elements) + 1) / elements
+    return MaxwellSlip(slips, np.zeros(elements), **_placed(span, origin))
 
 
 BOUC_WEN = ModelSpec("Bouc-Wen operator, rate-independent, with a spring", BoucWen, _bouc_wen)

@@ -6,15 +6,20 @@ import difflib
 import inspect
 import types
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
 
-from bench.models import ModelSpec, find_model
+from bench.base import Floats
+from bench.models import ModelSpec, Operator, find_model
 
 _OF_ALL = ("weights", "skip", "initial", "orientation")
 """Keywords of a fit in time that are no options of one model."""
+
+
+UNITS = ("input_unit", "output_unit")
+"""Options that every model takes."""
 
 
 @dataclass(frozen=True)
@@ -44,12 +49,22 @@ def model_options(spec: ModelSpec) -> tuple[ModelOption, ...]:
     return tuple(option for option in given if not option.name.endswith("_unit") and option.name not in _OF_ALL)
 
 
+def begin(spec: ModelSpec, inputs: Floats, options: Mapping[str, Any]) -> Operator[Any]:
+    """Return the operator before the fit, by options that may hold its units."""
+    assert spec.template is not None
+    own = {name: value for name, value in options.items() if name not in UNITS}
+    template: Any = spec.template(inputs, **own)
+    begun: Operator[Any] = replace(template, **{name: options[name] for name in UNITS if name in options})
+    return begun
+
+
 def check_options(model_name: str, options: Mapping[str, Any]) -> None:
     """Check that a model takes options of these names, and values of these kinds.
 
     Raises ValueError if it does not: names the options that there are, with their defaults.
     """
-    known = {option.name: option for option in _all_options(find_model(model_name).template)}
+    units = {name: ModelOption(name, "", "", (str,)) for name in UNITS}
+    known = units | {option.name: option for option in _all_options(find_model(model_name).template)}
     for name, value in options.items():
         if name not in known:
             raise ValueError(f"options of {model_name}: {_unknown(name, tuple(known.values()))}")

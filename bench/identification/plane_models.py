@@ -77,6 +77,18 @@ def input_span(inputs: Floats, name: str) -> tuple[float, float]:
     return low, high
 
 
+def operating_range(inputs: Floats, given: tuple[float, float] | None) -> tuple[float, float]:
+    """Return the operating range: what was given, else what the inputs span."""
+    return input_span(inputs, "input_range") if given is None else given
+
+
+def at_least_one(name: str, value: int) -> int:
+    """Return a number of parts; raise ValueError if there is none."""
+    if value < 1:
+        raise ValueError(f"{name}: expected at least 1, got {value}")
+    return value
+
+
 def _preisach(
     inputs: Floats,
     *,
@@ -86,8 +98,6 @@ def _preisach(
     reversible: Annotated[ReversibleKind, OptionHelp("part without memory, beside the density")] = "none",
     degree: Annotated[int | None, OptionHelp("of the reversible part 'polynomial'", "5")] = None,
     input_range: InputRange = None,
-    input_unit: str = "",
-    output_unit: str = "",
 ) -> Preisach:
     if plane is None and isinstance(levels, int | np.integer):
         plane = input_span(inputs, "plane")
@@ -96,24 +106,16 @@ def _preisach(
     span = _operating(inputs, (float(lattice[0]), float(lattice[-1])), input_range)
     if degree is not None and reversible != "polynomial":
         raise ValueError(f"degree: belongs to the reversible part 'polynomial', not to {reversible!r}")
-    if degree is not None and degree < 1:
-        raise ValueError(f"degree: expected at least 1, got {degree}")
     terms: dict[str, Reversible | None] = {
         "none": None,
         "linear": QuadraticTerm(origin=middle),
         "quadratic": QuadraticTerm(quadratic=0.0, origin=middle),
-        "polynomial": PolynomialTerm((0.0,) * (5 if degree is None else degree), *span),
+        "polynomial": PolynomialTerm((0.0,) * at_least_one("degree", 5 if degree is None else degree), *span),
     }
     if reversible not in terms:
         raise ValueError(f"reversible: expected one of {', '.join(terms)}, got {reversible!r}")
-    return Preisach(
-        lattice,
-        np.zeros(lattice.size * (lattice.size - 1) // 2),
-        reversible=terms[reversible],
-        input_range=span,
-        input_unit=input_unit,
-        output_unit=output_unit,
-    )
+    cells = lattice.size * (lattice.size - 1) // 2
+    return Preisach(lattice, np.zeros(cells), reversible=terms[reversible], input_range=span)
 
 
 def _nonmonotonic(
@@ -126,18 +128,8 @@ def _nonmonotonic(
         float | None, OptionHelp("input at which the thermal term is zero", "the low end of the operating range")
     ] = None,
     input_range: InputRange = None,
-    input_unit: str = "",
-    output_unit: str = "",
 ) -> Preisach:
-    plain = _preisach(
-        inputs,
-        levels=levels,
-        spacing=spacing,
-        plane=plane,
-        input_range=input_range,
-        input_unit=input_unit,
-        output_unit=output_unit,
-    )
+    plain = _preisach(inputs, levels=levels, spacing=spacing, plane=plane, input_range=input_range)
     zero = plain.input_range[0] if reference is None else reference
     return replace(plain, reversible=ThermalExpansion(0.0, 0.0, *plain.plane, zero))
 
@@ -147,13 +139,8 @@ def _polynomial(
     *,
     degree: Annotated[int, OptionHelp("of the polynomial")] = 12,
     input_range: InputRange = None,
-    input_unit: str = "",
-    output_unit: str = "",
 ) -> Polynomial:
-    if degree < 1:
-        raise ValueError(f"degree: expected at least 1, got {degree}")
-    span = input_span(inputs, "input_range") if input_range is None else input_range
-    return Polynomial(np.zeros(degree), span, input_unit=input_unit, output_unit=output_unit)
+    return Polynomial(np.zeros(at_least_one("degree", degree)), operating_range(inputs, input_range))
 
 
 def _polynomial_plays(
@@ -166,21 +153,14 @@ def _polynomial_plays(
         float | None, OptionHelp("input of the relaxed state, input units", "the first input of the data")
     ] = None,
     input_range: InputRange = None,
-    input_unit: str = "",
-    output_unit: str = "",
 ) -> PolynomialPlays:
-    for name, value in (("degree", degree), ("plays", plays), ("powers", powers)):
-        if value < 1:
-            raise ValueError(f"{name}: expected at least 1, got {value}")
-    low, high = input_span(inputs, "input_range") if input_range is None else input_range
-    thresholds = 0.5 * (high - low) * np.arange(1, plays + 1) / (plays + 1)
+    low, high = operating_range(inputs, input_range)
+    thresholds = 0.5 * (high - low) * np.arange(1, at_least_one("plays", plays) + 1) / (plays + 1)
     return PolynomialPlays(
-        np.zeros(degree),
+        np.zeros(at_least_one("degree", degree)),
         thresholds,
-        np.zeros(plays * powers),
+        np.zeros(plays * at_least_one("powers", powers)),
         (low, high),
-        input_unit=input_unit,
-        output_unit=output_unit,
         powers=powers,
         origin=float(inputs[0]) if origin is None else origin,
     )
@@ -196,25 +176,19 @@ def _prandtl_ishlinskii(
     origin: Annotated[float, OptionHelp("input of the relaxed state, input units")] = 0.0,
     dead_zones: Annotated[int, OptionHelp("thresholds of a rising map after the plays (Kuhnen 2003)")] = 0,
     input_range: InputRange = None,
-    input_unit: str = "",
-    output_unit: str = "",
 ) -> PrandtlIshlinskii:
-    if plays < 1:
-        raise ValueError(f"plays: expected at least 1, got {plays}")
     if dead_zones < 0:
         raise ValueError(f"dead_zones: expected an integer >= 0, got {dead_zones!r}")
     low, high = input_span(inputs, "maximum") if maximum is None else (0.0, 2.0 * maximum)
     if high <= low:
         raise ValueError(f"maximum: expected a positive number, got {maximum}")
     return PrandtlIshlinskii(
-        0.5 * (high - low) * np.arange(plays) / plays,
+        0.5 * (high - low) * np.arange(at_least_one("plays", plays)) / plays,
         np.zeros(plays),
         origin=origin,
         # Where they lie is for the outputs to say.
         after=DeadZones(np.arange(float(dead_zones)), np.ones(dead_zones + 1)) if dead_zones else None,
         input_range=_operating(inputs, (np.inf, -np.inf), input_range),
-        input_unit=input_unit,
-        output_unit=output_unit,
     )
 
 

@@ -21,8 +21,8 @@ class ModelSpec:
     model : type
         Its class: an `Operator`, or a whole model with a `kind`, `to_json` and `from_json`.
     template : callable or None
-        Takes the inputs and the keyword options of `identify`; returns the operator before the fit. None for a
-        model that `identify` cannot make of one input and one output.
+        Takes the inputs and the keyword options of `identify` but the units; returns the operator before the fit.
+        None for a model that `identify` cannot make of one input and one output.
     constrained : bool
         Whether the signs of `Operator.nonnegative` are imposed; otherwise the coefficients are free, with penalties
         on the cells of a density (`identify` says which).

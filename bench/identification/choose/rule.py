@@ -27,6 +27,7 @@ from bench.identification.choose.cross_validation import EQUAL
 from bench.identification.choose.score import SCORING, Candidate, Measurements, Score, evaluate
 from bench.identification.choose.splits import has_one_kind
 from bench.identification.fit.orientation import Orientation, has_orientation
+from bench.identification.options import UNITS, begin
 from bench.identification.timed.hammerstein_fit import with_element
 from bench.models import ModelSpec, Operator, find_model, identifiable_models
 
@@ -369,7 +370,7 @@ class _Search:
     def _structures(self, model: str, spec: ModelSpec) -> list[dict[str, Any]]:
         """Return the options of each structure of a model; those of more coefficients than rows only if alone."""
         assert spec.template is not None
-        taken = inspect.signature(spec.template).parameters
+        taken = {*inspect.signature(spec.template).parameters, *UNITS}
         fixed = {name: value for name, value in self.given.options.items() if name in taken}
         varied = {name: values for name, values in spec.variants.items() if name not in fixed}
         made, counts = [], []
@@ -384,9 +385,7 @@ class _Search:
         return [options for options, count in zip(made, counts, strict=True) if count <= most]
 
     def _template(self, spec: ModelSpec, options: Mapping[str, Any]) -> Operator[Any]:
-        assert spec.template is not None
-        template: Operator[Any] = spec.template(self.measured.inputs[self.measured.fitted], **options)
-        return template
+        return begin(spec, self.measured.inputs[self.measured.fitted], options)
 
     def _penalties(
         self, spec: ModelSpec, template: Operator[Any]
