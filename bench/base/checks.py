@@ -29,6 +29,14 @@ def samples(name: str, values: ArrayLike) -> Floats:
     return array
 
 
+def counted(name: str, values: ArrayLike, count: int, what: str = "values") -> Floats:
+    """Return `values` as `samples` does, `count` of them; `what` says in the error what was expected."""
+    array = samples(name, values)
+    if array.size != count:
+        raise ValueError(f"{name}: expected {count} {what}, got {array.size}")
+    return array
+
+
 def increasing(name: str, values: ArrayLike, least: int = 2) -> Floats:
     """Return `values` as `samples` does, strictly increasing and at least `least` long."""
     array = samples(name, values)
@@ -48,10 +56,7 @@ def plays(thresholds: ArrayLike, weights: ArrayLike) -> tuple[Floats, Floats]:
     increase = increasing("thresholds", thresholds, least=1)
     if increase[0] != 0.0:
         raise ValueError(f"thresholds: expected the first to be 0, got {increase[0]}")
-    one_each = samples("weights", weights)
-    if one_each.size != increase.size:
-        raise ValueError(f"weights: expected {increase.size} values, one for each play, got {one_each.size}")
-    return increase, one_each
+    return increase, counted("weights", weights, increase.size, "values, one for each play")
 
 
 def number(name: str, value: Any) -> float:  # noqa: ANN401 - an unchecked argument

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from contextlib import suppress
-from types import TracebackType
 from typing import Any, ClassVar, Self
 
 from numba.core import event
@@ -78,9 +77,7 @@ class CompilationDisplay(event.Listener):
         event.register(_KIND, self)  # type: ignore[no-untyped-call]  # numba ships no types
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         event.unregister(_KIND, self)  # type: ignore[no-untyped-call]
         CompilationDisplay._innermost = self._outer
         self._progress.stop()

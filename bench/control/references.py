@@ -305,9 +305,7 @@ def fastest_slope(inverse: Inverse[S], times: ArrayLike, reference: ArrayLike, s
         of the model.
     """
     moments = _checks.increasing("times", times, least=3)
-    wanted = _checks.samples("reference", reference)
-    if wanted.size != moments.size:
-        raise ValueError(f"reference: expected {moments.size} values, one for each time, got {wanted.size}")
+    wanted = _checks.counted("reference", reference, moments.size, "values, one for each time")
     followed = inverse.follow(wanted, state)
     if not followed.met.all():
         at = int(np.argmin(followed.met))

@@ -6,7 +6,6 @@ import tempfile
 from collections.abc import Callable
 from io import BytesIO
 from pathlib import Path
-from types import TracebackType
 from typing import Self, TypeVar
 
 from PIL import Image
@@ -65,9 +64,7 @@ class Camera:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:

@@ -41,9 +41,7 @@ def check_data(inputs: ArrayLike, outputs: ArrayLike | None = None) -> list[Advi
         If the lengths differ, or a sequence is empty or not finite.
     """
     u = _checks.samples("inputs", inputs)
-    y = None if outputs is None else _checks.samples("outputs", outputs)
-    if y is not None and y.size != u.size:
-        raise ValueError(f"outputs: expected {u.size} values, one for each input, got {y.size}")
+    y = None if outputs is None else _checks.counted("outputs", outputs, u.size, "values, one for each input")
     span = float(np.ptp(u))
     if span == 0.0:
         return [Advice("constant-input", f"the input is {u[0]:g} throughout, so nothing can be identified")]

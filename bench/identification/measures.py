@@ -70,9 +70,7 @@ def measure_errors(measured: ArrayLike, predicted: ArrayLike) -> Errors:
     Raises ValueError if the lengths differ, or a sequence is empty or not finite.
     """
     truth = _checks.samples("measured", measured)
-    model = _checks.samples("predicted", predicted)
-    if truth.size != model.size:
-        raise ValueError(f"predicted: expected {truth.size} values, as many as measured, got {model.size}")
+    model = _checks.counted("predicted", predicted, truth.size, "values, as many as measured")
     error = np.abs(truth - model)
     return Errors(
         maximum=float(error.max()),
@@ -138,9 +136,7 @@ def compare(
         nothing is left after `skip`.
     """
     sequence = _checks.samples("inputs", inputs)
-    measured = _checks.samples("outputs", outputs)
-    if measured.size != sequence.size:
-        raise ValueError(f"outputs: expected {sequence.size} values, one for each input, got {measured.size}")
+    measured = _checks.counted("outputs", outputs, sequence.size, "values, one for each input")
     if not models:
         raise ValueError("models: expected at least one, got none")
     if not 0 <= skip < sequence.size:

@@ -160,10 +160,8 @@ def _untested(name: str, reason: str) -> MemoryTest:
 
 
 def _pair(inputs: ArrayLike, outputs: ArrayLike) -> tuple[Floats, Floats]:
-    u, y = _checks.samples("inputs", inputs), _checks.samples("outputs", outputs)
-    if y.size != u.size:
-        raise ValueError(f"outputs: expected {u.size} values, one for each input, got {y.size}")
-    return u, y
+    u = _checks.samples("inputs", inputs)
+    return u, _checks.counted("outputs", outputs, u.size, "values, one for each input")
 
 
 def _ratchet(visited: list[_Extremum]) -> float | None:

@@ -159,9 +159,8 @@ def recalibrate(
             raise ValueError(f"expected some of {', '.join(KINDS)}, got {kind!r}")
         if wanted.count(kind) > 1:
             raise ValueError(f"{kind} is given twice")
-    u, y = _checks.samples("inputs", inputs), _checks.samples("outputs", outputs)
-    if u.size != y.size:
-        raise ValueError(f"outputs: expected {u.size} values, one for each input, got {y.size}")
+    u = _checks.samples("inputs", inputs)
+    y = _checks.counted("outputs", outputs, u.size, "values, one for each input")
     count = u.size if rows is None else rows
     if not 0 <= skip < count <= u.size or count - skip < 2 * len(wanted) + 3:
         raise ValueError(

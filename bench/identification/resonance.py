@@ -255,9 +255,8 @@ def identify_dynamics(inputs: ArrayLike, outputs: ArrayLike, dt: float) -> Dynam
         If a sequence is wrong, there is not exactly one step, too few samples follow it, no resonance stands out,
         or a pole's relative standard uncertainty exceeds 25 %.
     """
-    u, y = _checks.samples("inputs", inputs), _checks.samples("outputs", outputs)
-    if y.size != u.size:
-        raise ValueError(f"outputs: expected {u.size} values, one for each input, got {y.size}")
+    u = _checks.samples("inputs", inputs)
+    y = _checks.counted("outputs", outputs, u.size, "values, one for each input")
     _checks.positive("dt", dt)
     changes = np.flatnonzero(np.diff(u)) + 1
     if changes.size != 1:

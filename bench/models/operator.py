@@ -81,10 +81,7 @@ class Operator(Model, ABC, Generic[S]):
 
     def _coefficients(self, values: ArrayLike) -> Floats:
         """Return coefficients as `_checks.samples` does; ValueError if they are not as many as the present ones."""
-        numbers = _checks.samples("coefficients", values)
-        if numbers.size != self.coefficients.size:
-            raise ValueError(f"coefficients: expected {self.coefficients.size} values, got {numbers.size}")
-        return numbers
+        return _checks.counted("coefficients", values, self.coefficients.size)
 
     def _settle(self, *numbers: str, span: tuple[float, float] | None = None, **checked: Floats | float) -> None:
         """Set `checked` fields, arrays read-only, and finite `numbers`, the bias and the range (default `span`)."""

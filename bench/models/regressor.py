@@ -88,7 +88,7 @@ class Regressor:
         """
         from bench.models.kernels import memory_kernels as _kernels
 
-        weights = self._vector("coefficients", coefficients, self.shape[1])
+        weights = _checks.counted("coefficients", coefficients, self.shape[1])
         count = self.base.size
         result = self.extra @ weights[count:]
         if count:
@@ -105,10 +105,3 @@ class Regressor:
         _kernels.dense_rows(self.starts, self.cells, self.changes, self.base, result)
         result[:, self.base.size :] = self.extra
         return result
-
-    @staticmethod
-    def _vector(name: str, values: ArrayLike, size: int) -> Floats:
-        vector = _checks.samples(name, values)
-        if vector.size != size:
-            raise ValueError(f"{name}: expected {size} values, got {vector.size}")
-        return vector

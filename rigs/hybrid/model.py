@@ -128,9 +128,8 @@ class HybridModel(Model):
             If a sequence is wrong, or the model would be used more than 5 % beyond the range of temperatures or
             voltages that it was fitted on.
         """
-        i, u = _checks.samples("currents", currents), _checks.samples("voltages", voltages)
-        if u.size != i.size:
-            raise ValueError(f"voltages: expected {i.size} values, one for each current, got {u.size}")
+        i = _checks.samples("currents", currents)
+        u = _checks.counted("voltages", voltages, i.size, "values, one for each current")
         _check_range("voltages", u, self.hysteresis.input_range, "V", "hysteresis")
         temperatures = self.network.simulate(i, dt, ambient)
         rises = temperatures[:, NODES.index("tip")] - self.reference

@@ -343,10 +343,7 @@ def _runs(currents: Floats, ambient: Floats) -> Iterator[tuple[int, int]]:
 
 
 def _nodes(name: str, values: ArrayLike) -> Floats:
-    array = _checks.samples(name, values)
-    if array.size != len(NODES):
-        raise ValueError(f"{name}: expected {len(NODES)} values ({', '.join(NODES)}), got {array.size}")
-    return array
+    return _checks.counted(name, values, len(NODES), f"values ({', '.join(NODES)})")
 
 
 def _ambients(ambient: ArrayLike, count: int) -> Floats:

@@ -113,11 +113,8 @@ def identify_network(
         from its start.
     """
     i = _checks.samples("currents", currents)
-    measured = []
-    for name, values in (("base", base), ("tip", tip)):
-        measured.append(_checks.samples(name, values))
-        if measured[-1].size != i.size:
-            raise ValueError(f"{name}: expected {i.size} values, one for each current, got {measured[-1].size}")
+    each = "values, one for each current"
+    measured = [_checks.counted(name, values, i.size, each) for name, values in (("base", base), ("tip", tip))]
     step = _checks.positive("dt", dt)
     known = {each.name for each in fields(ThermalNetwork)}
     if not free or not set(free) <= known or len(set(free)) != len(free):

@@ -74,12 +74,9 @@ class Series:
     def __post_init__(self) -> None:
         if self.kind not in _KINDS:
             raise ValueError(f"kind: expected {' or '.join(map(repr, _KINDS))}, got {self.kind!r}")
-        count = None
         for name in ("voltages", "forces", "lengths"):
-            values = _checks.samples(name, getattr(self, name))
-            count = values.size if count is None else count
-            if values.size != count:
-                raise ValueError(f"{name}: expected {count} values, one for each voltage, got {values.size}")
+            count = np.size(self.voltages)
+            values = _checks.counted(name, getattr(self, name), count, "values, one for each voltage")
             object.__setattr__(self, name, _checks.frozen(values))
         steps = []
         for step in self.preparation:
@@ -389,9 +386,8 @@ def _all(series: Iterable[Series]) -> tuple[Series, ...]:
 
 def _resting(voltages: ArrayLike, forces: ArrayLike, lowest: float) -> tuple[Floats, Floats]:
     """Return the checked series at resting length."""
-    v, f = _checks.samples("voltages", voltages), _checks.samples("forces", forces)
-    if v.size != f.size:
-        raise ValueError(f"forces: expected {v.size} values, one for each voltage, got {f.size}")
+    v = _checks.samples("voltages", voltages)
+    f = _checks.counted("forces", forces, v.size, "values, one for each voltage")
     # Otherwise nothing in the data tells the force of the cold wire, on which every u rests.
     if not math.isclose(v.min(), lowest, abs_tol=1e-9):
         raise ValueError(f"voltages: expected a sample at the lowest voltage {lowest}, got {v.min()} at least")

@@ -185,8 +185,6 @@ def check_times(times: ArrayLike) -> Floats:
 
 def check_sequence(times: ArrayLike, **columns: ArrayLike) -> tuple[Floats, ...]:
     """Return times and columns of the same length as arrays, or raise ValueError."""
-    found = check_times(times), *(_checks.samples(name, values) for name, values in columns.items())
-    for name, values in zip(columns, found[1:], strict=True):
-        if values.size != found[0].size:
-            raise ValueError(f"{name}: expected {found[0].size} values, one for each time, got {values.size}")
-    return found
+    clock = check_times(times)
+    each = "values, one for each time"
+    return clock, *(_checks.counted(name, values, clock.size, each) for name, values in columns.items())

@@ -86,9 +86,8 @@ class RateDependentPlays(TimedModel[PlaysState]):
 
     def __post_init__(self) -> None:
         for name in ("thresholds", "time_constants", "weights"):
-            values = _checks.samples(name, getattr(self, name))
-            if values.size != np.size(self.weights):
-                raise ValueError(f"{name}: expected {np.size(self.weights)} values, one for each weight")
+            count = np.size(self.weights)
+            values = _checks.counted(name, getattr(self, name), count, "values, one for each weight")
             if name != "weights" and (values < 0.0).any():
                 raise ValueError(f"{name}: expected values >= 0, got {values.min()}")
             object.__setattr__(self, name, _checks.frozen(values))
@@ -180,9 +179,7 @@ class RateDependentPlays(TimedModel[PlaysState]):
         Raises ValueError if it is no state of this model.
         """
         plays, last = (_checks.json_field(document, key, "memory") for key in ("plays", "last"))
-        numbers = _checks.samples("memory", plays)
-        if numbers.size != self.thresholds.size:
-            raise ValueError(f"memory: expected {self.thresholds.size} plays, got {numbers.size}")
+        numbers = _checks.counted("memory", plays, self.thresholds.size, "plays")
         if last is None:
             return PlaysState(tuple(numbers.tolist()))
         sample = _checks.samples("memory", last).tolist()

@@ -55,9 +55,7 @@ class Duhem(ElementOperator):
 
     def __post_init__(self) -> None:
         anhysteretic = _checks.samples("anhysteretic", self.anhysteretic)
-        slope = _checks.samples("slope", self.slope)
-        if slope.size != anhysteretic.size:
-            raise ValueError(f"slope: expected {anhysteretic.size} values, as of anhysteretic, got {slope.size}")
+        slope = _checks.counted("slope", self.slope, anhysteretic.size, "values, as of anhysteretic")
         rate = _checks.positive("rate", self.rate)
         self._settle("origin", anhysteretic=anhysteretic, slope=slope, rate=rate)
 

@@ -66,9 +66,7 @@ class ElementOperator(Operator[ElementState]):
         """Return the present input and a copy of the elements of a state."""
         present, elements = self.at_rest()
         if state is not None:
-            numbers = _checks.samples("state", state)
-            if numbers.size != elements.size + 1:
-                raise ValueError(f"state: expected {elements.size + 1} numbers, got {numbers.size}")
+            numbers = _checks.counted("state", state, elements.size + 1, "numbers")
             present, elements = float(numbers[0]), numbers[1:]
         return present, elements.copy()
 

@@ -54,12 +54,8 @@ class KrasnoselskiiPokrovskii(ElementOperator):
 
     def __post_init__(self) -> None:
         nodes = _checks.increasing("nodes", self.nodes, least=1)
-        weights = _checks.samples("weights", self.weights)
-        if weights.size != nodes.size * (nodes.size + 1) // 2:
-            raise ValueError(
-                f"weights: expected {nodes.size * (nodes.size + 1) // 2} values for {nodes.size} nodes, got "
-                f"{weights.size}"
-            )
+        kernels = nodes.size * (nodes.size + 1) // 2
+        weights = _checks.counted("weights", self.weights, kernels, f"values for {nodes.size} nodes")
         width = _checks.positive("width", self.width)
         self._settle(span=(nodes[0], nodes[-1] + width), nodes=nodes, weights=weights, width=width)
 

@@ -62,9 +62,7 @@ class MaxwellSlip(ElementOperator):
         slips = _checks.increasing("slips", self.slips, least=1)
         if slips[0] <= 0.0:
             raise ValueError(f"slips: expected values > 0, got {slips[0]}")
-        stiffnesses = _checks.samples("stiffnesses", self.stiffnesses)
-        if stiffnesses.size != slips.size:
-            raise ValueError(f"stiffnesses: expected {slips.size} values, one for each slip, got {stiffnesses.size}")
+        stiffnesses = _checks.counted("stiffnesses", self.stiffnesses, slips.size, "values, one for each slip")
         origin = _checks.number("origin", self.origin)
         span = origin - slips[-1], origin + slips[-1]
         self._settle("spring", "origin", span=span, slips=slips, stiffnesses=stiffnesses)

@@ -68,14 +68,10 @@ class PolynomialPlays(Operator[State]):
         thresholds = _checks.increasing("thresholds", self.thresholds, least=1)
         if thresholds[0] <= 0.0:
             raise ValueError(f"thresholds: expected positive values, got {thresholds[0]}")
-        weights = _checks.samples("weights", self.weights)
         if self.powers < 1:
             raise ValueError(f"powers: expected at least 1, got {self.powers}")
-        if weights.size != self.powers * thresholds.size:
-            raise ValueError(
-                f"weights: expected {self.powers * thresholds.size} values, {self.powers} for each play, got "
-                f"{weights.size}"
-            )
+        count = self.powers * thresholds.size
+        weights = _checks.counted("weights", self.weights, count, f"values, {self.powers} for each play")
         series = _checks.samples("series", self.series)
         origin = () if self.origin is None else ("origin",)
         self._settle(*origin, series=series, thresholds=thresholds, weights=weights)

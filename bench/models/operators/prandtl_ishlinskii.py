@@ -50,11 +50,8 @@ class DeadZones:
 
     def __post_init__(self) -> None:
         thresholds = _checks.increasing("thresholds", self.thresholds, least=1)
-        slopes = _checks.samples("slopes", self.slopes)
-        if slopes.size != thresholds.size + 1:
-            raise ValueError(
-                f"slopes: expected {thresholds.size + 1} values for {thresholds.size} thresholds, got {slopes.size}"
-            )
+        count = thresholds.size
+        slopes = _checks.counted("slopes", self.slopes, count + 1, f"values for {count} thresholds")
         if (slopes < 0.0).any() and (slopes > 0.0).any():
             raise ValueError(f"slopes: expected values >= 0, or all <= 0, got {slopes.min()} and {slopes.max()}")
         object.__setattr__(self, "thresholds", _checks.frozen(thresholds))
@@ -234,10 +231,7 @@ class PrandtlIshlinskii(Operator[PlayState]):
     def _checked(self, state: PlayState | None) -> Floats:
         if state is None:
             return np.zeros(self.thresholds.size)
-        plays = _checks.samples("state", state)
-        if plays.size != self.thresholds.size:
-            raise ValueError(f"state: expected {self.thresholds.size} play states, got {plays.size}")
-        return plays
+        return _checks.counted("state", state, self.thresholds.size, "play states")
 
     def _drive(self, inputs: ArrayLike) -> Floats:
         x = _checks.samples("inputs", inputs) - self.origin

@@ -110,12 +110,9 @@ class Preisach(Operator[MemoryCurve]):
 
     def __post_init__(self) -> None:
         levels = _checks.increasing("levels", self.levels)
-        density = _checks.samples("density", self.density)
         order = levels.size - 1
-        if density.size != order * (order + 1) // 2:
-            raise ValueError(
-                f"density: expected {order * (order + 1) // 2} values for {order} intervals, got {density.size}"
-            )
+        cells = order * (order + 1) // 2
+        density = _checks.counted("density", self.density, cells, f"values for {order} intervals")
         self._settle(span=(levels[0], levels[-1]), levels=levels, density=density)
         low, high = self.input_range
         if low > levels[0] or high < levels[-1]:

@@ -38,10 +38,7 @@ class Reversible(Document, ABC):
 
         Raises ValueError if their number is wrong or one is not finite.
         """
-        values = _checks.samples("coefficients", coefficients)
-        if values.size != self.coefficients.size:
-            raise ValueError(f"coefficients: expected {self.coefficients.size} values, got {values.size}")
-        return self._with(values.tolist())
+        return self._with(_checks.counted("coefficients", coefficients, self.coefficients.size).tolist())
 
     @abstractmethod
     def _with(self, values: list[float]) -> Self: ...

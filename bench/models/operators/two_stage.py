@@ -422,10 +422,8 @@ def _agree(name: str, unit: str, other: str) -> None:
 
 
 def _pair(voltages: ArrayLike, forces: ArrayLike) -> tuple[Floats, Floats]:
-    v, f = _checks.samples("voltages", voltages), _checks.samples("forces", forces)
-    if v.size != f.size:
-        raise ValueError(f"forces: expected {v.size} values, one for each voltage, got {f.size}")
-    return v, f
+    v = _checks.samples("voltages", voltages)
+    return v, _checks.counted("forces", forces, v.size, "values, one for each voltage")
 
 
 def _interleaved(blocked: Floats, forces: Floats, together: bool) -> Floats:
