@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeGuard
+from typing import Any, TypeGuard, TypeVar
 
 import numpy as np
 
@@ -44,6 +44,7 @@ _LONGEST_NAME = 120
 _UNSAFE = re.compile(r"[^A-Za-z0-9_.=+,-]+")
 
 Axis = Mapping[str, Any]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -297,12 +298,12 @@ class _Expander:
         self, where: str, referred: Mapping[str, str], rig: str, seed: int
     ) -> Iterator[Mapping[str, ModelTask]]:
         """Yield the models that a run takes, one set a run: those of its rig and seed."""
-        found = {
-            key: self._models_of(f"{where}: parameters.{key} = '{REFERENCE}{name}'", name, rig, seed)
-            for key, name in referred.items()
-        }
-        for chosen in itertools.product(*found.values()):
-            yield dict(zip(found, chosen, strict=True))
+        return _grid(
+            {
+                key: self._models_of(f"{where}: parameters.{key} = '{REFERENCE}{name}'", name, rig, seed)
+                for key, name in referred.items()
+            }
+        )
 
     def _models_of(self, where: str, name: str, rig: str, seed: int) -> list[ModelTask]:
         """Return the models of a table for a rig and a seed; raise ConfigurationError if there are none."""
@@ -346,7 +347,7 @@ class _Expander:
             {"runs": [run.identity for run in runs], **table.model_dump(exclude={"name", "runs", "seed"})}
         )
         task = ModelTask(
-            name=f"{table.name}/{base}{'-' * bool(base)}{identity[:SHOWN_DIGITS]}",
+            name=_folder(table.name, base, identity),
             identity=identity,
             table=table.name,
             sources=tuple(run.name for run in runs),
@@ -419,7 +420,7 @@ class _Expander:
             base = run.name.rpartition("/")[2].rpartition("-")[0]
             self._add(
                 ComparisonTask(
-                    name=f"{table.name}/{base}{'-' * bool(base)}{identity[:SHOWN_DIGITS]}",
+                    name=_folder(table.name, base, identity),
                     identity=identity,
                     table=table.name,
                     source=run.name,
@@ -539,7 +540,7 @@ def _is_path(value: object) -> TypeGuard[str]:
     return isinstance(value, str) and not value.startswith(REFERENCE)
 
 
-def _grid(values: Mapping[str, Sequence[Any]]) -> Iterator[dict[str, Any]]:
+def _grid(values: Mapping[str, Sequence[T]]) -> Iterator[dict[str, T]]:
     for chosen in itertools.product(*values.values()):
         yield dict(zip(values, chosen, strict=True))
 
@@ -562,5 +563,8 @@ def _setting(run: RunTask, key: str) -> str:
 def _name(table: str, values: Mapping[str, Any], varying: Sequence[str], identity: str) -> str:
     """Return the folder of a task: what differs within its table, and the first digits of its identity."""
     parts = [str(values[key]) if key in ("protocol", "rig") else f"{key}={values[key]}" for key in varying]
-    text = _UNSAFE.sub("_", "-".join(parts))[:_LONGEST_NAME]
+    return _folder(table, _UNSAFE.sub("_", "-".join(parts))[:_LONGEST_NAME], identity)
+
+
+def _folder(table: str, text: str, identity: str) -> str:
     return f"{table}/{text}{'-' * bool(text)}{identity[:SHOWN_DIGITS]}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -137,14 +137,10 @@ def over_seeds(table: ResultsTable, varying: Sequence[str]) -> ResultsTable:
         for key in list(table.columns)[names.index("reason") + 1 :]
         if key[0] not in (*_NOT_GROUPED, "folder") and _is_numeric(table.columns[key])
     ]
-    groups: dict[tuple[Cell, ...], list[int]] = {}
-    for i in range(len(table)):
-        groups.setdefault(tuple(table.columns[key][i] for key in keys), []).append(i)
     rows: list[Row] = []
-    for group, members in groups.items():
+    for group, members in _groups(table, [("table", ""), *keys]):
         completed = sum(table.columns[("status", "")][i] == "completed" for i in members)
-        row = _without_units(table=table.columns[("table", "")][members[0]])
-        row |= dict(zip(keys, group, strict=True)) | _without_units(runs=len(members), completed=completed)
+        row = group | _without_units(runs=len(members), completed=completed)
         for name, unit in results:
             row |= _statistics(name, unit, (table.columns[(name, unit)][i] for i in members))
         rows.append(row)
@@ -168,13 +164,9 @@ def comparisons_table(expansion: Expansion, done: Mapping[str, Done]) -> Results
 
 def over_runs(comparisons: ResultsTable) -> ResultsTable:
     """Return median, worst and spread of the errors of each model over the runs of a `comparisons_table`."""
-    groups: dict[tuple[Cell, Cell], list[int]] = {}
-    heads = zip(comparisons.columns[("comparison", "")], comparisons.columns[("model", "")], strict=True)
-    for i, key in enumerate(heads):
-        groups.setdefault(key, []).append(i)
     rows: list[Row] = []
-    for (comparison, model), members in groups.items():
-        row = _without_units(comparison=comparison, model=model, runs=len(members))
+    for group, members in _groups(comparisons, [("comparison", ""), ("model", "")]):
+        row = group | _without_units(runs=len(members))
         for name, unit in comparisons.columns:
             if name in ERRORS:
                 row |= _statistics(name, unit, (comparisons.columns[(name, unit)][i] for i in members))
@@ -276,6 +268,15 @@ def together(tables: Iterable[ResultsTable]) -> ResultsTable:
     """Return the rows of several tables in one; what varies in one of them is empty in the others."""
     rows = [{key: cells[i] for key, cells in table.columns.items()} for table in tables for i in range(len(table))]
     return ResultsTable.of(rows)
+
+
+def _groups(table: ResultsTable, keys: Sequence[tuple[str, str]]) -> Iterator[tuple[Row, list[int]]]:
+    """Yield the different cells of some columns, with the rows that have them."""
+    groups: dict[tuple[Cell, ...], list[int]] = {}
+    for i, cells in enumerate(zip(*(table.columns[key] for key in keys), strict=True)):
+        groups.setdefault(cells, []).append(i)
+    for cells, members in groups.items():
+        yield dict(zip(keys, cells, strict=True)), members
 
 
 def _without_units(**cells: Cell) -> Row:
