@@ -11,7 +11,7 @@ import numpy as np
 
 from bench.analysis.model_service import FitOptions, IdentifiedFile
 from bench.analysis.tables.data import check_variation, write_csv
-from bench.analysis.tables.dataset import Dataset, check_rows, overwritten_from, parse_rows
+from bench.analysis.tables.dataset import Dataset, check_rows, parse_rows
 from bench.analysis.tables.reading.table import FEWEST_ROWS
 from bench.analysis.tables.starting_state import bind_times, left_out
 from bench.base import ConfigurationError, DataError, closest
@@ -30,7 +30,7 @@ from bench.identification import (
     once,
     select,
 )
-from bench.models import Operator, TimedModel, find_model, identifiable_models, timed_models
+from bench.models import Operator, TimedModel, find_model, identifiable_models, overwritten_from, timed_models
 
 ALL = "all"
 """Name that stands for the models that are compared if none is named."""

@@ -36,7 +36,6 @@ from bench.identification import (
     Resolution,
     Validity,
     advise_on_record,
-    begin,
     check_congruency,
     check_options,
     check_return_points,
@@ -47,6 +46,7 @@ from bench.identification import (
     model_options,
     once,
     resolve,
+    template_of,
 )
 from bench.models import (
     Coverage,
@@ -291,7 +291,7 @@ def check_template(model: str, inputs: Floats, options: Mapping[str, Any]) -> No
     known = [option.name for option in model_options(spec)]
     own = {name: value for name, value in options.items() if name in known}
     check_options(model, own)
-    begin(spec, inputs, own)
+    template_of(spec, inputs, own)
 
 
 def _implausible_times(model: TimedModel[Any], times: Floats) -> Iterator[Advice]:
@@ -522,7 +522,7 @@ def _is_undetermined(model: str, data: Dataset, options: FitOptions, own: Mappin
     if options.smoothing is not None or options.ridge is not None or options.cross_validated or options.levels_to_try:
         return False
     spec = find_model(model)
-    template = begin(spec, data.inputs, {name: value for name, value in own.items() if name not in _OF_ALL})
+    template = template_of(spec, data.inputs, {name: value for name, value in own.items() if name not in _OF_ALL})
     count = template.coefficients.size
     return spec.constrained and bool(template.densities()) and samples < count <= _MOST_CROSS_VALIDATED
 

@@ -116,9 +116,9 @@ from .model_file import (
     parse_model as parse_model,
 )
 from .options import (
-    begin as begin,
     check_options as check_options,
     model_options as model_options,
+    template_of as template_of,
 )
 from .recalibration import (
     Kind as Kind,

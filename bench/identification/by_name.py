@@ -24,7 +24,7 @@ from bench.identification.fit.regularization import Regularization, choose_regul
 from bench.identification.fit.shape import fit_operator, fit_shape, undetermined_shape
 from bench.identification.inspection import check_data
 from bench.identification.measures import Errors, measure_errors
-from bench.identification.options import begin, check_options
+from bench.identification.options import check_options, template_of
 from bench.identification.trust import check_interpolation, check_record, check_skipped, judge_fit
 from bench.models import ModelSpec, Operator, Regressor, TimedModel, find_model
 
@@ -262,7 +262,7 @@ def set_up_problem(
         raise ValueError(f"initial: 'estimate' needs a nonnegative Preisach density, not {model_name}")
     check_options(model_name, options)
     # Its range is that of the rows that are fitted: nothing is known of the output beyond it.
-    template = begin(spec, sequence[w > 0.0], options)
+    template = template_of(spec, sequence[w > 0.0], options)
     if initial == "skip":
         skip = max(skip, template.unknown_until(sequence))
         check_skipped(sequence.size, skip, template.coefficients.size, spec.estimate_state is not None)

@@ -49,7 +49,7 @@ def model_options(spec: ModelSpec) -> tuple[ModelOption, ...]:
     return tuple(option for option in given if not option.name.endswith("_unit") and option.name not in _OF_ALL)
 
 
-def begin(spec: ModelSpec, inputs: Floats, options: Mapping[str, Any]) -> Operator[Any]:
+def template_of(spec: ModelSpec, inputs: Floats, options: Mapping[str, Any]) -> Operator[Any]:
     """Return the operator before the fit, by options that may hold its units."""
     assert spec.template is not None
     own = {name: value for name, value in options.items() if name not in UNITS}

@@ -77,6 +77,7 @@ from .kernels.memory_kernels import (
 )
 from .memory import (
     MemoryCurve as MemoryCurve,
+    overwritten_from as overwritten_from,
 )
 from .operator import (
     Operator as Operator,

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from bench.base import Floats, checks as _checks
 from bench.models.coverage import Coverage
 from bench.models.documents import Model
+from bench.models.memory import overwritten_from
 from bench.models.regressor import Regressor
 from bench.models.streams.stream import Stream
 
@@ -23,9 +24,6 @@ S = TypeVar("S")
 # Samples of the operating range by which the defaults look for extrema and for falling parts.
 # Derivation: a smooth extremum between two of 1000 parts is met to 1 / (8 · 1000²), 1e-7 of the curvature's scale.
 _SAMPLES = 1001
-# Part of the range of inputs at its ends whose memory is as good as known.
-# Derivation: of a plane of evenly many hysterons a corner of 1 % holds 1e-4, less than a reading shows.
-_OUTERMOST = 0.01
 
 
 class Shape(NamedTuple):
@@ -235,21 +233,8 @@ class Operator(Model, ABC, Generic[S]):
         return None
 
     def unknown_until(self, inputs: ArrayLike) -> int:
-        """Return the first sample from which the inputs, shape (N,), have overwritten all memory they ever do.
-
-        What only the outermost hundredth of their range overwrites does not count: sampled turning points that are
-        meant to be equal are not.
-        """
-        if self.memoryless:
-            return 0
-        sequence = _checks.samples("inputs", inputs)
-        top, bottom = np.maximum.accumulate(sequence), np.minimum.accumulate(sequence)
-        low, high = self.plane or (-np.inf, np.inf)
-        margin = _OUTERMOST * (top[-1] - bottom[-1])
-        # A relay is known once α <= top or β >= bottom: none that will be switched may be left.
-        rising = (top >= min(top[-1] - margin, high)) | (bottom <= low)
-        falling = (bottom <= max(bottom[-1] + margin, low)) | (top >= high)
-        return int(np.argmax(rising & falling))
+        """Return the first sample from which the inputs, shape (N,), have overwritten all memory they ever do."""
+        return 0 if self.memoryless else overwritten_from(inputs, self.plane)
 
     def coverage(self, inputs: ArrayLike, state: S | None = None) -> Coverage | None:  # noqa: ARG002
         """Return which cells of the plane a sequence sweeps; None for an operator without a plane."""

@@ -19,7 +19,7 @@ from bench.analysis.tables.reading.table import FEWEST_ROWS
 from bench.analysis.tables.times import rows_in_time, seconds_of
 from bench.base import ConfigurationError, DataError, Floats
 from bench.identification import Advice, ModelFile
-from bench.models import PolynomialPlays, TimedModel
+from bench.models import TimedModel, overwritten_from
 
 Flags = npt.NDArray[np.bool_]
 
@@ -316,14 +316,6 @@ def check_rows(option: str, rows: slice | None, count: int) -> None:
     if rows is not None and max(rows.stop or 0, rows.start or 0) > count:
         text = f"{'' if rows.start is None else rows.start}:{'' if rows.stop is None else rows.stop}"
         raise ConfigurationError(f"{option} {text} goes beyond the last row: there are {count}")
-
-
-def overwritten_from(inputs: Floats) -> int:
-    """Return the first row from which inputs, shape (N,), have overwritten all memory that they ever do."""
-    low, high = float(inputs.min()), float(inputs.max())
-    if low == high:
-        return 0
-    return PolynomialPlays(np.zeros(1), np.ones(1), np.zeros(1), (low, high)).unknown_until(inputs)
 
 
 def digest(inputs: Floats) -> str:

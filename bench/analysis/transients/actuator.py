@@ -202,12 +202,16 @@ def _candidates(slow: float, recordings: Sequence[TransientRecording]) -> list[d
 
 
 def _weights(recording: TransientRecording) -> Floats:
-    """Return the weight of each row: less while the drive moves, as the instants of readings are uncertain."""
-    moves = np.abs(np.diff(recording.driven))
-    rates = moves / np.maximum(np.diff(recording.times), 1e-3)
+    moves, span = np.abs(np.diff(recording.driven)), float(np.ptp(recording.driven))
+    noise = max(float(np.median(moves)) / MEDIAN_OF_DIFFERENCES, 1e-6 * span)
+    return row_weights(recording.times, recording.driven, noise)
+
+
+def row_weights(times: Floats, values: Floats, error: float) -> Floats:
+    """Return the weight of each row: less while values move, as the instants of readings are uncertain."""
+    rates = np.abs(np.diff(values)) / np.maximum(np.diff(times), 1e-3)
     fastest = np.maximum(np.append(rates, 0.0), np.append(0.0, rates))
-    noise = max(float(np.median(moves)) / MEDIAN_OF_DIFFERENCES, 1e-6 * float(np.ptp(recording.driven)))
-    return np.asarray(1.0 / np.sqrt(noise**2 + (_INSTANT * fastest) ** 2))
+    return np.asarray(1.0 / np.sqrt(error**2 + (_INSTANT * fastest) ** 2))
 
 
 def _time_scale(recordings: Sequence[TransientRecording]) -> float:

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from bench.analysis.transients.actuator import LONGEST_PART, at_rows, grid_step, latency, start_position
+from bench.analysis.transients.actuator import LONGEST_PART, at_rows, grid_step, latency, row_weights, start_position
 from bench.analysis.transients.recorded_transients import TransientRecording
 from bench.base import DeferredModule, Floats
 from bench.models import ActuatorDynamics, ResponseDynamics
@@ -23,8 +23,6 @@ if TYPE_CHECKING:
 else:
     _kernels = DeferredModule("bench.models.kernels.actuator_kernels")
 
-_INSTANT = 0.03
-"""Standard uncertainty of the instant of a reading, s."""
 POWERS = (1.0, 2.0)
 """Powers of the drive that may lag: of a pressure or position, and of heat."""
 _LATE = (1.0, 3.0, 10.0, 30.0, 100.0, 300.0)
@@ -228,9 +226,4 @@ def _uncertainty(squares_of: Callable[[float, float], float], lagged: ResponseDy
 
 
 def _weights(recording: TransientRecording) -> Floats:
-    """Return the weight of each row: less while the response moves, as the instants of readings are uncertain."""
-    moves = np.abs(np.diff(recording.responded))
-    rates = moves / np.maximum(np.diff(recording.times), 1e-3)
-    fastest = np.maximum(np.append(rates, 0.0), np.append(0.0, rates))
-    error = 5e-3 * float(np.ptp(recording.responded))
-    return np.asarray(1.0 / np.sqrt(error**2 + (_INSTANT * fastest) ** 2))
+    return row_weights(recording.times, recording.responded, 5e-3 * float(np.ptp(recording.responded)))

@@ -27,7 +27,7 @@ from bench.identification.choose.cross_validation import EQUAL
 from bench.identification.choose.score import SCORING, Candidate, Measurements, Score, evaluate
 from bench.identification.choose.splits import has_one_kind
 from bench.identification.fit.orientation import Orientation, has_orientation
-from bench.identification.options import UNITS, begin
+from bench.identification.options import UNITS, template_of
 from bench.identification.timed.hammerstein_fit import with_element
 from bench.models import ModelSpec, Operator, find_model, identifiable_models
 
@@ -385,7 +385,7 @@ class _Search:
         return [options for options, count in zip(made, counts, strict=True) if count <= most]
 
     def _template(self, spec: ModelSpec, options: Mapping[str, Any]) -> Operator[Any]:
-        return begin(spec, self.measured.inputs[self.measured.fitted], options)
+        return template_of(spec, self.measured.inputs[self.measured.fitted], options)
 
     def _penalties(
         self, spec: ModelSpec, template: Operator[Any]

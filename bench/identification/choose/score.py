@@ -19,7 +19,7 @@ from bench.identification.fit.least_squares import Fit, one_thread
 from bench.identification.fit.orientation import NAMES, Orientation, has_orientation
 from bench.identification.timed.hammerstein_fit import reshape, set_up_search
 from bench.identification.timed.hammerstein_search import Search, find_best
-from bench.models import PolynomialPlays
+from bench.models import overwritten_from
 
 # Turns smaller than this part of the range need not be kept when rows are left out.
 # Source: half of the noise of 1 % that turning points are told from, see `splits`.
@@ -115,10 +115,7 @@ class Measurements:
         If that leaves less than a quarter of those that may be fitted, all are tested.
         """
         rows = np.ones(inputs.size, dtype=bool) if fitted is None else fitted
-        span = float(inputs.min()), float(inputs.max())
-        until = 0
-        if span[0] < span[1]:
-            until = PolynomialPlays(np.zeros(1), np.ones(1), np.zeros(1), span).unknown_until(inputs)
+        until = overwritten_from(inputs)
         left = int(rows[until:].sum())
         return cls(inputs, outputs, rows, times, runs, until if left >= _KNOWN * int(rows.sum()) else 0)
 

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike
 from bench.base import Floats, checks as _checks
 from bench.models.dynamic.model_with_time import TimedModel, check_sequence
 from bench.models.inverses.inverse import Policy
-from bench.models.operators.prandtl_ishlinskii import PrandtlIshlinskii
+from bench.models.memory import overwritten_from
 
 
 class PlaysState(NamedTuple):
@@ -154,7 +154,7 @@ class RateDependentPlays(TimedModel[PlaysState]):
 
     def unknown_until(self, inputs: ArrayLike) -> int:
         """Return what plays without a rate do."""
-        return PrandtlIshlinskii(np.zeros(1), np.ones(1)).unknown_until(inputs)
+        return overwritten_from(inputs)
 
     def parameters(self) -> Mapping[str, tuple[float, str]]:
         """Return the time constants, and the part of the weights that each has."""
