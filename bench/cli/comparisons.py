@@ -13,7 +13,7 @@ from rich.text import Text
 from bench.base import percent, print_plain, show_patience, show_table
 from bench.cli.band_options import BandsOption, Recalibrating, print_examined
 from bench.cli.command_support import JsonOption, check_outputs, write_json
-from bench.cli.data_options import ReadingGroup, offer_groups, print_assumptions
+from bench.cli.data_options import FiguresOption, ReadingGroup, SkipOption, offer_groups, print_assumptions
 from bench.cli.model_commands import InitialOption
 from bench.cli.printing import console, show_compilation, warn
 from bench.cli.run_names import BEFORE, NEWEST, RunArgument, find_run
@@ -45,15 +45,7 @@ def models_on_data(
     time_column: Annotated[
         str | None, typer.Option("--time", metavar="COLUMN", help="Column of times, for models with time.")
     ] = None,
-    skip: Annotated[
-        int | None,
-        typer.Option(
-            min=0,
-            metavar="ROWS",
-            help="First rows, which drive the memory but are left out of the errors; on the models' own data those "
-            "that their identifications left out.",
-        ),
-    ] = None,
+    skip: SkipOption = None,
     initial: InitialOption = None,
     bands: BandsOption = False,
     *,
@@ -62,7 +54,7 @@ def models_on_data(
         Path | None,
         typer.Option(metavar="FILE.csv", help="File for input, measured output, and by model the rest."),
     ] = None,
-    figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for figures.")] = None,
+    figures: FiguresOption = None,
     json_file: JsonOption = None,
     reading: ReadingGroup,
 ) -> None:

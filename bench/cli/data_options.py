@@ -6,6 +6,7 @@ import functools
 import inspect
 from collections.abc import Callable
 from dataclasses import is_dataclass
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -33,6 +34,18 @@ def _layout(
 
 ReadingGroup = Annotated[ReadingOptions, _layout]
 """The options of the layout of a file."""
+
+
+SkipOption = Annotated[
+    int | None,
+    typer.Option(
+        min=0,
+        metavar="ROWS",
+        help="First rows, which drive the memory but are left out of the errors; on a model's own data those that "
+        "its identification left out.",
+    ),
+]
+FiguresOption = Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for figures.")]
 
 
 def offer_groups(command: Callable[..., None]) -> Callable[..., None]:

@@ -21,7 +21,7 @@ from bench.cli.choice_options import (
 )
 from bench.cli.command_line import command_line
 from bench.cli.command_support import JsonOption, check_given, check_outputs, write_json
-from bench.cli.data_options import ReadingGroup, offer_groups, print_assumptions
+from bench.cli.data_options import FiguresOption, ReadingGroup, SkipOption, offer_groups, print_assumptions
 from bench.cli.model_options import ModelOptions
 from bench.cli.printing import console, print_rows, show_compilation, warn
 from bench.cli.run_names import NEWEST, complete_run, find_run
@@ -175,7 +175,7 @@ class FitOutputs:
         Path | None,
         typer.Option(metavar="FILE.md", help="Model card to write."),
     ] = None
-    figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for figures.")] = None
+    figures: FiguresOption = None
     json_file: JsonOption = None
 
 
@@ -326,20 +326,12 @@ def predict_(
         str | None, typer.Option("--output", metavar="COLUMN", help="Measured output, to compare with.")
     ] = None,
     time_column: TimeColumn = None,
-    skip: Annotated[
-        int | None,
-        typer.Option(
-            min=0,
-            metavar="ROWS",
-            help="First rows, which drive the memory but are left out of the errors; on the model's own data those "
-            "that its identification left out.",
-        ),
-    ] = None,
+    skip: SkipOption = None,
     initial: InitialOption = None,
     continue_memory: ContinueMemory = False,
     *,
     recalibrating: Recalibrating,
-    figures: Annotated[Path | None, typer.Option(metavar="DIR", help="Folder for figures.")] = None,
+    figures: FiguresOption = None,
     json_file: JsonOption = None,
     reading: ReadingGroup,
 ) -> None:
