@@ -96,6 +96,7 @@ from .printing import (
     PlainConsole as PlainConsole,
     html_table as html_table,
     print_plain as print_plain,
+    show_rows as show_rows,
     show_table as show_table,
 )
 from .redaction import (

@@ -74,6 +74,16 @@ def show_table(console: Console, table: Table) -> None:
         _print_block(console, [head.plain for head in heads], row, table.columns)
 
 
+def show_rows(console: Console, title: str, rows: Iterable[tuple[str, str | Text]]) -> None:
+    """Print (name, text) pairs under a title; a `str` may have markup."""
+    table = Table(title=title, title_justify="left", show_header=False, box=None, padding=(0, 2))
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column()
+    for name, text in rows:
+        table.add_row(name, text)
+    show_table(console, table)
+
+
 def html_table(heads: Sequence[str], rows: Iterable[Sequence[str]], title: str = "") -> str:
     """Return a table of texts as HTML, for notebooks."""
 

@@ -6,9 +6,8 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 
 from rich.markup import escape
-from rich.table import Table
 
-from bench.base import BenchError, PlainConsole, show_table
+from bench.base import BenchError, PlainConsole, show_rows
 
 console = PlainConsole()
 error_console = PlainConsole(stderr=True)
@@ -37,9 +36,4 @@ def show_compilation() -> Iterator[None]:
 
 def print_rows(title: str, rows: Iterable[tuple[str, str]]) -> None:
     """Print (name, text) pairs under a title."""
-    table = Table(title=title, title_justify="left", show_header=False, box=None, padding=(0, 2))
-    table.add_column(style="bold", no_wrap=True)
-    table.add_column()
-    for name, text in rows:
-        table.add_row(name, text)
-    show_table(console, table)
+    show_rows(console, title, rows)

@@ -2,6 +2,7 @@ from . import (
     rows as rows,
 )
 from .card import (
+    card_rows as card_rows,
     expected_steps as expected_steps,
     run_card as run_card,
 )

@@ -3,46 +3,56 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from datetime import datetime
 from typing import Any
 
 from bench.base import format_duration, prefixed
 
 
 def run_card(meta: Mapping[str, Any]) -> str:
-    """Return a run's metadata as a Markdown page, for the dashboard and the report.
-
-    `missing_rows` in the metadata, a text, says what its record lacks.
-    """
-    units = meta.get("units", {})
+    """Return a run's metadata as a Markdown page, for the dashboard; see `card_rows`."""
     lines = [
         f"# {meta['rig_title']}",
         "",
         f"**{meta['protocol']}** on **{meta['rig']}**: {meta['protocol_summary']}",
         "",
+        "| | |",
+        "|---|---|",
     ]
-    lines += ["| | |", "|---|---|"]
-    rows = {
+    return "\n".join([*lines, *(f"| {name} | {text} |" for name, text in card_rows(meta).items())])
+
+
+def card_rows(meta: Mapping[str, Any]) -> dict[str, str]:
+    """Return what a run was, from its metadata: a text by its name.
+
+    `missing_rows` in the metadata, a text, says what its record lacks. Parameters without a value are left out.
+    """
+    units = meta.get("units", {})
+    started = datetime.fromisoformat(meta["epoch"]).isoformat(sep=" ", timespec="seconds")
+    return {
         **({"incomplete": meta["missing_rows"]} if "missing_rows" in meta else {}),
         "run": meta["run"],
         "operator": meta["operator"],
-        "started": f"{meta['epoch']} ({meta['clock']} clock)",
+        "started": f"{started} ({meta['clock']} clock)",
         **_expected(meta),
-        "seed": meta["seed"],
+        "seed": str(meta["seed"]),
         **{f"device {name}": identity for name, identity in meta["devices"].items()},
         **{
             f"parameter {name}": _shown(value, units.get(name, ""))
             for name, value in meta["parameters"].items()
-            if name not in meta.get("without_slot", ())
+            if value not in (None, "") and name not in meta.get("without_slot", ())
         },
-        "git": meta["git"],
+        "git": str(meta["git"]),
     }
-    lines += [f"| {key} | {value} |" for key, value in rows.items()]
-    return "\n".join(lines)
 
 
 def _shown(value: Any, unit: str) -> str:  # noqa: ANN401 - anything that JSON can hold
+    if isinstance(value, Mapping):
+        texts = {name: _shown(part, "") for name, part in value.items()}
+        nested = {name for name, part in value.items() if isinstance(part, Mapping)}
+        return ", ".join(f"{name} ({text})" if name in nested else f"{name} {text}" for name, text in texts.items())
     text = f"{value:g}" if isinstance(value, float) else str(value)
-    return text if value is None or unit in ("", "1") else f"{text} {unit}"
+    return text if unit in ("", "1") else f"{text} {unit}"
 
 
 def _expected(meta: Mapping[str, Any]) -> dict[str, str]:

@@ -31,10 +31,10 @@ from bench.analysis.report.telemetry_summary import TelemetrySummary, summarize,
 from bench.analysis.report.uncertainty_tables import uncertainty_parts
 from bench.analysis.tracking_errors import results_json
 from bench.analysis.uncertain_results import RunUncertainty
-from bench.base import format_duration, print_plain, show_table, with_unit
+from bench.base import format_duration, print_plain, show_rows, show_table, with_unit
 from bench.identification import ModelFile, models_among
 from bench.models import MemoryCurve
-from bench.record import Record, Table, expected_steps, lateness_lines, run_card
+from bench.record import Record, Table, card_rows, expected_steps, lateness_lines
 
 PAGE_NAME = "report.html"
 """Usual file name of the page of a run."""
@@ -76,13 +76,10 @@ def report_run(
     MissingExtraError
         If matplotlib or jinja2 is not installed.
     """
-    # A Markdown parser is dear to import, and each study imports this module.
-    from rich.markdown import Markdown
-
     check_matplotlib()
     with Record(run) as record:
         folder = make_folder(out or record.path.parent / "report")
-        console.print(Markdown(run_card(record.meta)))
+        _print_card(record.meta, console)
         steps = record.steps()
         without_priors(record, steps)
         if remark := record.remark():
@@ -177,6 +174,14 @@ def draw_identification(found: IdentifiedFile, out: Path) -> list[Path]:
             resolution = found.resolution.diagonal[: swept.size] if found.resolution else None
             plot_coverage(paths[-1], density, swept, found.file.memory, resolution)
     return paths
+
+
+def _print_card(meta: Mapping[str, Any], console: Console) -> None:
+    rows = card_rows(meta)
+    # A name of any length, on a line of its own.
+    print_plain(console, f"{rows.pop('run')}: {meta['rig_title']}")
+    title = f"{meta['protocol']} on {meta['rig']}: {meta['protocol_summary']}"
+    show_rows(console, title, ((name, Text(text)) for name, text in rows.items()))
 
 
 def _print_status(record: Record, steps: int, console: Console) -> None:
