@@ -40,7 +40,7 @@ from numpy.typing import NDArray
 
 from bench.devices import Identity
 from sim_devices.instruments.emulated import LineFaults
-from sim_devices.instruments.registers import Register, RegisterInstrument
+from sim_devices.instruments.registers import FrameParts, Register, RegisterInstrument
 from sim_devices.noise import normals
 from sim_devices.wire.modbus import DEVICE_FAILURE, ILLEGAL_ADDRESS, Packet, RegisterError
 from sim_devices.world import World
@@ -482,34 +482,31 @@ class EmulatedT7(LineFaults, RegisterInstrument):
             held[channel] = volts
         return volts
 
-    def _frame_reader(self, frames: Sequence[Sequence[Callable[[], float]]], pack: Callable[..., bytes]) -> Packet:
-        """Return what reads several frames; those that begin with a scan have it in one call."""
+    def _carrying_out(
+        self,
+        parts: Sequence[FrameParts],
+        unpack: Callable[[bytes], tuple[float, ...]],
+        pack: Callable[..., bytes],
+    ) -> Packet:
+        """Return what carries frames out; those that only read, and begin with a scan, have it in one call."""
         scan, first, left = self._scan, 0, [] if self._scan is None else self._conversions(self._scan.count)
-        while left and first < len(frames) and left[: len(frames[first])] == list(frames[first]):
-            left = left[len(frames[first]) :]
+        while left and first < len(parts) and left[: len(parts[first][0])] == list(parts[first][0]):
+            left = left[len(parts[first][0]) :]
             first += 1
-        if scan is None or left:
-            return super()._frame_reader(frames, pack)
-        one_by_one = self._conversions(scan.count)
-        begin, end, lead, rest = self._begin, self._end, self._lead, frames[first:]
+        if scan is None or left or any(registers for _, registers in parts):
+            return super()._carrying_out(parts, unpack, pack)
+        one_by_one, lead = self._conversions(scan.count), self._lead
         draw, scales = self._draw, self._scales
 
         def read_scan(packet: bytes) -> bytes:  # noqa: ARG001
-            begin()
-            try:
-                volts = scan(scales, draw) if self._held is None and self._are_single_ended else None
-                values = [read() for read in one_by_one] if volts is None else [*volts]
-                for readers in rest:
-                    for read in readers:
-                        values.append(read())
-                    if self._touched:
-                        lead()
-                answer = pack(*values)
-            except BaseException as error:
-                end(error)
-                raise
-            end(None)
-            return answer
+            volts = scan(scales, draw) if self._held is None and self._are_single_ended else None
+            values = [read() for read in one_by_one] if volts is None else [*volts]
+            for readers, _ in parts[first:]:
+                for read in readers:
+                    values.append(read())
+                if self._touched:
+                    lead()
+            return pack(*values)
 
         return read_scan
 

@@ -18,6 +18,9 @@ Kind = Literal["F32", "I32", "U32", "U16"]
 
 _FORMATS = {"F32": ">f", "I32": ">i", "U32": ">I", "U16": ">H"}
 
+Reader = Callable[[], float]
+"""Returns the value of a register."""
+
 
 @dataclass(frozen=True)
 class Register:
@@ -67,10 +70,14 @@ class Register:
         )
 
 
+FrameParts = tuple[Sequence[Reader], Sequence[Register]]
+"""What one frame of a packet reads, and the registers that it writes."""
+
+
 class _Reads(NamedTuple):
     """What a read of neighbouring words takes."""
 
-    read: tuple[Callable[[], float], ...]
+    read: tuple[Reader, ...]
     values: struct.Struct
     words: struct.Struct
     skipped: int
@@ -86,7 +93,7 @@ class _Writes(NamedTuple):
     refusal: RegisterError | None
 
 
-def _integer(read: Callable[[], float]) -> int:
+def _integer(read: Reader) -> int:
     return int(read())
 
 
@@ -166,7 +173,7 @@ class RegisterInstrument(ABC):
     def prepare(self, frames: Sequence[Frame], heads: Sequence[int]) -> Packet | None:
         """Return what carries such a packet out, as one request; see `wire.modbus.PacketBank`."""
         sent, answered = ">", ">"
-        parts: list[tuple[tuple[Callable[[], float], ...], tuple[Register, ...]]] = []
+        parts: list[FrameParts] = []
         for frame, head in zip(frames, heads, strict=True):
             try:
                 if frame.writes:
@@ -184,121 +191,56 @@ class RegisterInstrument(ABC):
                     parts.append((reads.read, ()))
             except RegisterError:
                 return None
-        unpack, pack = struct.Struct(sent).unpack, struct.Struct(answered).pack
-        writing = any(frame.writes for frame in frames)
-        if len(parts) == 1:
-            ((readers, registers),) = parts
-            if not writing:
-                return self._reader(readers, pack)
-            if len(registers) == 1:
-                return self._writer(registers[0], unpack)
-        if not writing:
-            return self._frame_reader([readers for readers, _ in parts], pack)
-        begin, end, lead, isfinite = self._begin, self._end, self._lead, math.isfinite
+        return self._as_request(self._carrying_out(parts, struct.Struct(sent).unpack, struct.Struct(answered).pack))
 
-        def carry_out(packet: bytes) -> bytes:
-            given = iter(unpack(packet))
-            values: list[float] = []
-            begin()
-            try:
-                for readers, registers in parts:
-                    for read in readers:
-                        values.append(read())
-                    for register in registers:
-                        value = next(given)
-                        if register.write is None or not isfinite(value):
-                            self._take(register, value)
-                        else:
-                            register.write(value)
-                    if self._touched:
-                        lead()
-                answer = pack(*values)
-            except BaseException as error:
-                end(error)
-                raise
-            end(None)
-            return answer
-
-        return carry_out
-
-    # What a fast loop sends, with as few calls as possible.
-
-    def _reader(self, readers: Sequence[Callable[[], float]], pack: Callable[..., bytes]) -> Packet:
-        """Return what only reads."""
+    def _as_request(self, act: Packet) -> Packet:
+        """Return what serves a packet as one request; as `_request` does, but with fewer calls."""
         begin, end = self._begin, self._end
 
-        def read_one(packet: bytes) -> bytes:  # noqa: ARG001
+        def serve(packet: bytes) -> bytes:
             begin()
             try:
-                answer = pack(read())
+                answer = act(packet)
             except BaseException as error:
                 end(error)
                 raise
             end(None)
             return answer
 
-        def read_all(packet: bytes) -> bytes:  # noqa: ARG001
-            begin()
-            try:
-                answer = pack(*[read() for read in readers])
-            except BaseException as error:
-                end(error)
-                raise
-            end(None)
-            return answer
+        return serve
 
-        read = readers[0]
-        return read_one if len(readers) == 1 else read_all
+    def _carrying_out(
+        self,
+        parts: Sequence[FrameParts],
+        unpack: Callable[[bytes], tuple[float, ...]],
+        pack: Callable[..., bytes],
+    ) -> Packet:
+        """Return what carries frames out: what each reads, and the registers that it writes."""
+        if len(parts) == 1 and not parts[0][1]:
+            # What a fast loop sends most.
+            return lambda _: pack(*[read() for read in parts[0][0]])
+        lead, writes = self._lead, any(registers for _, registers in parts)
 
-    def _frame_reader(self, frames: Sequence[Sequence[Callable[[], float]]], pack: Callable[..., bytes]) -> Packet:
-        """Return what reads several frames, between which outputs may be followed."""
-        begin, end, lead = self._begin, self._end, self._lead
-
-        def read_frames(packet: bytes) -> bytes:  # noqa: ARG001
+        def carry_out(packet: bytes) -> bytes:
+            given = iter(unpack(packet) if writes else ())
             values: list[float] = []
-            begin()
-            try:
-                for readers in frames:
-                    for read in readers:
-                        values.append(read())
-                    if self._touched:
-                        lead()
-                answer = pack(*values)
-            except BaseException as error:
-                end(error)
-                raise
-            end(None)
-            return answer
+            for readers, registers in parts:
+                for read in readers:
+                    values.append(read())
+                for register in registers:
+                    self._take(register, next(given))
+                if self._touched:
+                    lead()
+            return pack(*values)
 
-        return read_frames
-
-    def _writer(self, register: Register, unpack: Callable[[bytes], tuple[float, ...]]) -> Packet:
-        """Return what writes one register."""
-        begin, end, isfinite, write = self._begin, self._end, math.isfinite, register.write
-        assert write is not None
-
-        def write_one(packet: bytes) -> bytes:
-            (value,) = unpack(packet)
-            begin()
-            try:
-                if isfinite(value):
-                    write(value)
-                else:
-                    self._take(register, value)
-            except BaseException as error:
-                end(error)
-                raise
-            end(None)
-            return b""
-
-        return write_one
+        return carry_out
 
     @staticmethod
     def _take(register: Register, value: float) -> None:
         if not math.isfinite(value):
             raise RegisterError(ILLEGAL_VALUE, f"{register.name}: allowed are finite numbers, got {value}")
-        if register.write is not None:
-            register.write(value)
+        assert register.write is not None
+        register.write(value)
 
     def _lead(self) -> None:
         """Let what depends on the outputs follow; most have none."""
