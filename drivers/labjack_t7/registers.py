@@ -71,7 +71,8 @@ class Register(NamedTuple):
 class Span(NamedTuple):
     """Neighbouring registers of one type, to be read at once again and again."""
 
-    address: int
+    name: str
+    """What reading them is called in messages."""
     request: bytes
     """Asks for them."""
     size: int
@@ -94,7 +95,7 @@ class Span(NamedTuple):
         values = struct.Struct(f">{count}{register.form}")
         words = values.size // 2
         return cls(
-            address=register.address,
+            name=f"reading register {register.address}",
             request=read_request(register.address, words),
             size=2 + values.size,
             reply=struct.Struct(f">xx{count}{register.form}"),
@@ -117,7 +118,7 @@ class Packet(NamedTuple):
     """Spans to be read in one packet of function 76 again and again, in their order, and the owner number."""
 
     name: str
-    """Names their registers."""
+    """What reading them is called in messages."""
     request: bytes
     """Asks for them."""
     size: int
@@ -131,17 +132,22 @@ class Packet(NamedTuple):
         read = (*spans, _OWNER_SPAN)
         reply = struct.Struct(">x" + "".join(span.values.format[1:] for span in read))
         return cls(
-            name=", ".join(f"reading register {span.address}" for span in spans),
+            name=", ".join(span.name for span in spans),
             request=bytes((FEEDBACK,)) + b"".join(span.frame for span in read),
             size=reply.size,
             reply=reply,
         )
 
+    def ask(self, client: ModbusClient) -> tuple[float, ...]:
+        """Return the values of all spans and the owner number; raises what the request does."""
+        return self.reply.unpack(client.request(self.request, self.size))
+
 
 class Target(NamedTuple):
     """A register to be set again and again."""
 
-    address: int
+    name: str
+    """What setting it is called in messages."""
     head: bytes
     """What stands before its value in the request."""
     echo: bytes
@@ -159,7 +165,13 @@ class Target(NamedTuple):
             raise ValueError(f"{register.name} can only be read")
         value = struct.Struct(f">{register.form}")
         head = write_request(register.address, bytes(value.size))[: -value.size]
-        return cls(register.address, head, head[:-1], value.pack)
+        return cls(f"writing register {register.address}", head, head[:-1], value.pack)
+
+    def send(self, value: float, client: ModbusClient) -> None:
+        """Set the register; raises what the request does, and `OSError` if the answer is none to it."""
+        reply = client.request(self.head + self.encode(value), len(self.echo))
+        if reply != self.echo:
+            raise OSError(f"the answer {reply.hex(' ')} is none to the request {self.head.hex(' ')} …")
 
 
 AIN = Register("AIN#", 0, "F32", "R")
@@ -228,11 +240,6 @@ _DETAILS = {
     2375: "AIN resolution index not allowed",
     2376: "AIN rate not possible at this resolution index",
 }
-
-
-def _ask_echo(target: Target, request: bytes, client: ModbusClient) -> None:
-    if client.request(request, len(target.echo)) != target.echo:
-        raise OSError("the answer is none to the request")
 
 
 class LabJackT7:
@@ -452,51 +459,29 @@ class LabJackT7:
 
     def read_span(self, span: Span) -> tuple[float, ...]:
         """Get the values of neighbouring registers of one type."""
-        if self._connection.ended or not self._connected:
-            self.reopen()
-        try:
-            with self._lock:
-                reply = self._client.request(span.request, span.size)
-            if reply[1] != span.size - 2:
-                raise OSError(f"the answer announces {reply[1]} bytes where {span.size - 2} were asked for")
-        except (RefusedError, OSError) as error:
-            return self._again(error, f"reading register {span.address}", span.ask)
-        return span.reply.unpack(reply)
+        return self._carry_out(span.name, span.ask)
 
     def read_packet(self, packet: Packet) -> tuple[float, ...]:
         """Get the values of several spans in one request, one behind the other; raises what `read_spans` does."""
-        if self._connection.ended or not self._connected:
-            self.reopen()
-        try:
-            with self._lock:
-                reply = self._client.request(packet.request, packet.size)
-        except (RefusedError, OSError) as error:
-            reply = self._again(error, packet.name, lambda client: client.request(packet.request, packet.size))
-        values = packet.reply.unpack(reply)
-        owner = values[-1]
+        *values, owner = self._carry_out(packet.name, packet.ask)
         if owner != self._owner and self.checks_owner:
-            self._check_owner(owner, self._client)
-        return values[:-1]
+            self._check_owner(int(owner), self._client)
+        return tuple(values)
 
     def read_spans(self, spans: Sequence[Span], *writes: tuple[int, bytes]) -> list[list[float]]:
         """Get the values of several spans in one request; what is to be written at addresses goes first in it.
 
         Raises `DeviceRestartedError` or `DeviceError` also if the owner number is not that of `claim` any more.
         """
-        if self._connection.ended or not self._connected:
-            self.reopen()
+        doing = ", ".join((*(f"writing register {address}" for address, _ in writes), *(span.name for span in spans)))
+        # Before anything is asked whether it is to be checked, as the connection may have to be opened again.
+        self._ensure_open()
         checks = self.checks_owner
         if checks:
             spans = (*spans, _OWNER_SPAN)
         frames = b"".join((*(write_frame(*write) for write in writes), *(span.frame for span in spans)))
         size = sum(span.values.size for span in spans)
-        try:
-            with self._lock:
-                reply = self._client.feedback(frames, size)
-        except (RefusedError, OSError) as error:
-            doing = [f"writing register {address}" for address, _ in writes]
-            doing += [f"reading register {span.address}" for span in spans if span is not _OWNER_SPAN]
-            reply = self._again(error, ", ".join(doing), lambda client: client.feedback(frames, size))
+        reply = self._carry_out(doing, lambda client: client.feedback(frames, size))
         values, position = [], 0
         for span in spans:
             values.append(list(span.values.unpack_from(reply, position)))
@@ -529,8 +514,7 @@ class LabJackT7:
         numpy.ndarray
             What was read, one row for each value.
         """
-        if self._connection.ended or not self._connected:
-            self.reopen()
+        self._ensure_open()
         reads = b"".join(span.frame for span in spans)
         size = len(reads)
         pause = write_frame(WAIT_US_BLOCKING.address, self.encode(WAIT_US_BLOCKING, wait))
@@ -576,26 +560,11 @@ class LabJackT7:
 
     def write_span(self, address: int, data: bytes) -> None:
         """Set neighbouring registers from an address on."""
-        if self._connection.ended or not self._connected:
-            self.reopen()
-        try:
-            with self._lock:
-                self._client.write(address, data)
-        except (RefusedError, OSError) as error:
-            self._again(error, f"writing register {address}", lambda client: client.write(address, data))
+        self._carry_out(f"writing register {address}", lambda client: client.write(address, data))
 
     def send(self, target: Target, value: float) -> None:
         """Set a register."""
-        if self._connection.ended or not self._connected:
-            self.reopen()
-        request = target.head + target.encode(value)
-        try:
-            with self._lock:
-                reply = self._client.request(request, len(target.echo))
-            if reply != target.echo:
-                raise OSError(f"the answer {reply.hex(' ')} is none to the request {target.head.hex(' ')} …")
-        except (RefusedError, OSError) as error:
-            self._again(error, f"writing register {target.address}", partial(_ask_echo, target, request))
+        self._carry_out(target.name, partial(target.send, value))
 
     def set(self, values: Mapping[Register, float]) -> None:
         """Set neighbouring registers of one type and read them back, in one request.
@@ -640,6 +609,19 @@ class LabJackT7:
             raise self._wrong(f"is {known}, not a T7: PRODUCT_ID is {product:g}, not 7")
         (firmware,) = self.read(FIRMWARE_VERSION)
         return Identity("LabJack", "T7", str(self.read_integer(SERIAL_NUMBER)), f"{firmware:.4f}")
+
+    def _ensure_open(self) -> None:
+        if self._connection.ended or not self._connected:
+            self.reopen()
+
+    def _carry_out(self, doing: str, ask: Callable[[ModbusClient], Answer]) -> Answer:
+        """Return what a request brings, which is repeated over another connection if nothing answers."""
+        self._ensure_open()
+        try:
+            with self._lock:
+                return ask(self._client)
+        except (RefusedError, OSError) as error:
+            return self._again(error, doing, ask)
 
     def _again(self, error: RefusedError | OSError, doing: str, ask: Callable[[ModbusClient], Answer]) -> Answer:
         """Return what a request that failed brings over another connection; raise what a refusal means."""
