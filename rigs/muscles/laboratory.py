@@ -10,7 +10,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from functools import partial
-from typing import ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -29,7 +29,7 @@ from sim_devices.laboratory import EmulatedLaboratory, TrueValue
 from sim_devices.plants.coiled_polymer import CoiledPolymerMuscle, CoiledPolymerParameters
 from sim_devices.plants.grid import GRID_TOLERANCE, Floats, changed
 from sim_devices.plants.mckibben import McKibbenMuscle, McKibbenParameters
-from sim_devices.plants.muscle import MuscleParameters
+from sim_devices.plants.muscle import Muscle
 from sim_devices.plants.sma import SMAParameters, SMAWire
 from sim_devices.transducers.data_sheets import GAUGE_BLOCKS, LOAD_CELL, POSITION, WEIGHTS
 from sim_devices.transducers.imperfect import ImperfectSensor, SensorErrors, imperfect, shown
@@ -70,48 +70,6 @@ FaultName = Literal[
 _SENSOR_KERNELS = ("sim_devices.instruments._flintec_kernels", "sim_devices.transducers._imperfect_kernels")
 
 
-class MusclePlant(Protocol):
-    """What frame and instruments need of a muscle."""
-
-    def advance(self, dt: float) -> None:
-        """Integrate over `dt` seconds."""
-
-    def apply(self, voltage: float) -> None:
-        """Apply a voltage, V."""
-
-    def blow(self, on: bool) -> None:
-        """Switch the fan."""
-
-    def hang(self, load_newton: float) -> None:
-        """Hang a dead load on the end."""
-
-    def clamp(self, length_metre: float) -> None:
-        """Hold the end at a position, m from rest."""
-
-    def since_point(self) -> float:
-        """Return the time for which it has stood at the last point of its time grid, s."""
-
-    @property
-    def parameters(self) -> MuscleParameters:
-        """Its numbers."""
-
-    @property
-    def forces(self) -> Floats:
-        """The force (N) at the last points of its time grid, in a ring; see `Muscle`."""
-
-    @property
-    def current(self) -> float:
-        """Current, A."""
-
-    @property
-    def force(self) -> float:
-        """Tension, N."""
-
-    @property
-    def position(self) -> float:
-        """Position of the end, m from rest."""
-
-
 class MuscleLaboratorySettings(SensorSettings, ABC):
     """Keys of the table `[emulation]` that all these laboratories have."""
 
@@ -148,7 +106,7 @@ class MuscleLaboratorySettings(SensorSettings, ABC):
     fault_time: float = Field(default=0.0, ge=0, description="time of the fault, s of laboratory time")
 
     @abstractmethod
-    def make_muscle(self, rng: np.random.Generator) -> MusclePlant:
+    def make_muscle(self, rng: np.random.Generator) -> Muscle[Any]:
         """Return the muscle of this laboratory."""
 
 
@@ -160,7 +118,7 @@ class Frame:
 
     Parameters
     ----------
-    muscle : MusclePlant
+    muscle : Muscle
         The specimen; it begins without a load.
 
     Attributes
@@ -173,7 +131,7 @@ class Frame:
         A fault: the muscle is torn, so that no current flows, nothing pulls, and its end lies at the bottom.
     """
 
-    def __init__(self, muscle: MusclePlant) -> None:
+    def __init__(self, muscle: Muscle[Any]) -> None:
         self.muscle = muscle
         self.drum: EmulatedDrum | None = None
         self.gauge: float | None = None
@@ -240,7 +198,7 @@ class ForceCourse:
     ----------
     frame : Frame
         The muscle's frame.
-    muscle : MusclePlant
+    muscle : Muscle
         The muscle, which keeps its force.
     sensor : FaultySensor
         What the load cell sees of the force.
@@ -250,7 +208,7 @@ class ForceCourse:
 
     tolerance = GRID_TOLERANCE
 
-    def __init__(self, frame: Frame, muscle: MusclePlant, sensor: FaultySensor, cell: Callable[[], float]) -> None:
+    def __init__(self, frame: Frame, muscle: Muscle[Any], sensor: FaultySensor, cell: Callable[[], float]) -> None:
         self._frame = frame
         self._muscle = muscle
         self._sensor = sensor
@@ -484,7 +442,7 @@ class SMALaboratorySettings(_ThermalSettings):
 
     specimen_seed: int = Field(default=SMAParameters.specimen_seed, ge=0, description="seed of the specimen")
 
-    def make_muscle(self, rng: np.random.Generator) -> MusclePlant:
+    def make_muscle(self, rng: np.random.Generator) -> Muscle[Any]:
         """Return the wire."""
         return SMAWire(
             changed(SMAParameters(specimen_seed=self.specimen_seed, ambient_sd=self.ambient_deviation), self.plant),
@@ -506,7 +464,7 @@ class McKibbenLaboratorySettings(MuscleLaboratorySettings):
         default=500.0, ge=0, le=1e5, description="standard deviation of the regulated pressure, Pa"
     )
 
-    def make_muscle(self, rng: np.random.Generator) -> MusclePlant:
+    def make_muscle(self, rng: np.random.Generator) -> Muscle[Any]:
         """Return the muscle."""
         return McKibbenMuscle(changed(McKibbenParameters(supply_sd=self.pressure_deviation), self.plant), rng)
 
@@ -524,7 +482,7 @@ class McKibbenLaboratory(MuscleLaboratory):
 class CoiledPolymerLaboratorySettings(_ThermalSettings):
     """Keys of the laboratory with the super-coiled polymer muscle."""
 
-    def make_muscle(self, rng: np.random.Generator) -> MusclePlant:
+    def make_muscle(self, rng: np.random.Generator) -> Muscle[Any]:
         """Return the muscle."""
         return CoiledPolymerMuscle(
             changed(CoiledPolymerParameters(ambient_sd=self.ambient_deviation), self.plant), rng

@@ -197,6 +197,11 @@ class Muscle(GridPlant[M]):
     def force(self) -> float:
         """Tension, N."""
 
+    @property
+    @abstractmethod
+    def position(self) -> float:
+        """Position of the moving end, m from rest: the elongation of muscle, frame and load cell."""
+
     def _keep_first_force(self) -> None:
         """Keep the force with which time begins."""
         self.forces[0] = self.force
