@@ -18,6 +18,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
+from sim_devices.instruments.emulated import LineFaults
 from sim_devices.wire import TcpServer
 from sim_devices.wire.modbus import FEEDBACK, Feedback, Packet, RegisterBank, answer, prepare, refusal
 
@@ -41,22 +42,6 @@ class Restartable(Protocol):
 
     def on_restart(self, follow: Callable[[], None]) -> None:
         """Call `follow()` at each restart."""
-
-
-@runtime_checkable
-class OnLine(Protocol):
-    """An instrument whose line can be disturbed."""
-
-    @property
-    def answering(self) -> bool:
-        """Whether requests arrive."""
-
-    @property
-    def undisturbed(self) -> bool:
-        """Whether requests arrive, and answers as they are."""
-
-    def transmit(self, answer: bytes) -> bytes:
-        """Return what the host receives of an answer."""
 
 
 class ModbusTcpInstrument(TcpServer):
@@ -120,7 +105,7 @@ class ModbusTcpStream:
 
     def __init__(self, bank: RegisterBank, closed: Callable[[ModbusTcpStream], None] = lambda _: None) -> None:
         self._bank = bank
-        self._line = bank if isinstance(bank, OnLine) else None
+        self._line = bank if isinstance(bank, LineFaults) else None
         self._closed = closed
         self._own = {FEEDBACK: Feedback()}
         self._known: dict[bytes, _Known | None] = {}
