@@ -15,6 +15,13 @@ from bench.devices import Actuator, Device
 _LONGEST_RECONNECTION = 1.0  # s, as `Device.reconnect` says
 _LONGEST_SAFE = 3.0  # s, on a line that stays dead
 
+Act = Callable[[], object]
+"""What a test does to the line or the instrument, such as to cut it."""
+Output = Callable[[], float]
+"""Tells the true output of the instrument."""
+Pair = tuple[float, float]
+"""Two set-points, or the lowest and the highest."""
+
 
 class SilentInstrumentContract:
     """The contract of an actuator whose instrument stops answering.
@@ -23,9 +30,7 @@ class SilentInstrumentContract:
     that cuts the line.
     """
 
-    def test_silence_is_an_error_of_every_call(
-        self, device: Actuator, set_points: tuple[float, float], unplug: Callable[[], object]
-    ) -> None:
+    def test_silence_is_an_error_of_every_call(self, device: Actuator, set_points: Pair, unplug: Act) -> None:
         """Reading and setting raise a `DeviceConnectionError` that names the device."""
         device.set(set_points[0])
         unplug()
@@ -33,9 +38,7 @@ class SilentInstrumentContract:
             with pytest.raises(DeviceConnectionError, match=f"^{device.name}: "):
                 call()
 
-    def test_safe_without_an_answer_raises(
-        self, device: Actuator, set_points: tuple[float, float], unplug: Callable[[], object]
-    ) -> None:
+    def test_safe_without_an_answer_raises(self, device: Actuator, set_points: Pair, unplug: Act) -> None:
         """A safe state that could not be confirmed is not a safe state."""
         device.set(set_points[0])
         unplug()
@@ -52,11 +55,7 @@ class SpoiltAnswerContract:
     """
 
     def test_a_spoilt_answer_is_asked_for_again(
-        self,
-        device: Actuator,
-        set_points: tuple[float, float],
-        spoil: Callable[[], object],
-        requests: list[bytes],
+        self, device: Actuator, set_points: Pair, spoil: Act, requests: list[bytes]
     ) -> None:
         """The same request is repeated once, and no other."""
         device.set(set_points[0]).wait()
@@ -82,18 +81,14 @@ class RestartedInstrumentContract:
         return device
 
     @pytest.mark.parametrize("take", ["glance", "measure", "read"])
-    def test_the_next_reading_finds_the_restart(
-        self, in_use: Device, restart: Callable[[], object], take: str
-    ) -> None:
+    def test_the_next_reading_finds_the_restart(self, in_use: Device, restart: Act, take: str) -> None:
         """The next reading raises, and so does each one after it."""
         restart()
         for _ in range(3):
             with pytest.raises(DeviceRestartedError, match=f"^{in_use.name}: "):
                 getattr(in_use, take)()
 
-    def test_an_instrument_that_restarted_is_not_taken_back(
-        self, in_use: Device, restart: Callable[[], object]
-    ) -> None:
+    def test_an_instrument_that_restarted_is_not_taken_back(self, in_use: Device, restart: Act) -> None:
         """`reconnect` does not take it for the instrument that was left."""
         restart()
         with pytest.raises(DeviceRestartedError, match=f"^{in_use.name}: "):
@@ -109,12 +104,12 @@ class RestartedActuatorContract(RestartedInstrumentContract):
     """
 
     @pytest.fixture
-    def output_limits(self, device: Actuator) -> tuple[float, float]:
+    def output_limits(self, device: Actuator) -> Pair:
         """Return the lowest and highest output that the settings allow, here the limits of the set-point."""
         return device.limits.low, device.limits.high
 
     @pytest.fixture
-    def in_use(self, device: Actuator, set_points: tuple[float, float]) -> Actuator:
+    def in_use(self, device: Actuator, set_points: Pair) -> Actuator:
         """Return the device with its output on."""
         device.set(set_points[0]).wait()
         return device
@@ -123,10 +118,10 @@ class RestartedActuatorContract(RestartedInstrumentContract):
     def test_nothing_is_set_after_a_restart(
         self,
         in_use: Actuator,
-        set_points: tuple[float, float],
-        restart: Callable[[], object],
-        output: Callable[[], float],
-        output_limits: tuple[float, float],
+        set_points: Pair,
+        restart: Act,
+        output: Output,
+        output_limits: Pair,
         *,
         read_first: bool,
     ) -> None:
@@ -148,11 +143,7 @@ class RestartedActuatorContract(RestartedInstrumentContract):
             in_use.set(set_points[1])
 
     def test_a_restart_at_rest_is_found_before_the_output_goes_on(
-        self,
-        in_use: Actuator,
-        set_points: tuple[float, float],
-        restart: Callable[[], object],
-        output: Callable[[], float],
+        self, in_use: Actuator, set_points: Pair, restart: Act, output: Output
     ) -> None:
         """An instrument that restarted with its output off is not switched on without its settings."""
         in_use.safe()
@@ -181,8 +172,8 @@ class LineLostContract:
         self,
         in_use: Device,
         clock: Clock,
-        cut: Callable[[], object],
-        mend: Callable[[], object],
+        cut: Act,
+        mend: Act,
         truth: Callable[[], dict[str, float]],
         tolerance: float,
     ) -> None:
@@ -212,13 +203,7 @@ class LineLostContract:
         for name, value in truth().items():
             assert values[name] == pytest.approx(value, abs=tolerance)
 
-    def test_another_instrument_is_refused(
-        self,
-        in_use: Device,
-        cut: Callable[[], object],
-        mend: Callable[[], object],
-        exchange: Callable[[], object],
-    ) -> None:
+    def test_another_instrument_is_refused(self, in_use: Device, cut: Act, mend: Act, exchange: Act) -> None:
         """Another instrument at the same address is not taken for the one that was lost, and there is no retry."""
         cut()
         exchange()
@@ -227,13 +212,7 @@ class LineLostContract:
             in_use.reconnect()
         assert not isinstance(raised.value, DeviceConnectionError)
 
-    def test_a_restart_behind_a_lost_line_is_found(
-        self,
-        in_use: Device,
-        cut: Callable[[], object],
-        mend: Callable[[], object],
-        restart: Callable[[], object],
-    ) -> None:
+    def test_a_restart_behind_a_lost_line_is_found(self, in_use: Device, cut: Act, mend: Act, restart: Act) -> None:
         """An instrument that lost its supply with its line is not taken back, however often that is tried."""
         cut()
         restart()
@@ -251,18 +230,13 @@ class ActuatorLineLostContract(LineLostContract):
     """
 
     @pytest.fixture
-    def in_use(self, device: Actuator, set_points: tuple[float, float]) -> Actuator:
+    def in_use(self, device: Actuator, set_points: Pair) -> Actuator:
         """Return the device with its output on."""
         device.set(set_points[0]).wait()
         return device
 
     def test_reconnection_leaves_the_output_as_it_is(
-        self,
-        in_use: Actuator,
-        set_points: tuple[float, float],
-        cut: Callable[[], object],
-        mend: Callable[[], object],
-        output: Callable[[], float],
+        self, in_use: Actuator, set_points: Pair, cut: Act, mend: Act, output: Output
     ) -> None:
         """Nothing moves by it, and the next set-point is taken."""
         before = output()
@@ -282,12 +256,7 @@ class SafeOverAFreshLineContract:
     """
 
     def test_safe_opens_a_line_of_its_own(
-        self,
-        device: Actuator,
-        set_points: tuple[float, float],
-        cut: Callable[[], object],
-        mend: Callable[[], object],
-        output: Callable[[], float],
+        self, device: Actuator, set_points: Pair, cut: Act, mend: Act, output: Output
     ) -> None:
         """A line that broke and can be opened again brings the output to its safe state, at the first call."""
         device.set(set_points[1]).wait()
@@ -298,12 +267,7 @@ class SafeOverAFreshLineContract:
         assert output() == 0.0
 
     def test_safe_after_an_error_opens_a_line_of_its_own(
-        self,
-        device: Actuator,
-        set_points: tuple[float, float],
-        cut: Callable[[], object],
-        mend: Callable[[], object],
-        output: Callable[[], float],
+        self, device: Actuator, set_points: Pair, cut: Act, mend: Act, output: Output
     ) -> None:
         """So it does after a reading and an earlier `safe` have failed."""
         device.set(set_points[1]).wait()
@@ -317,13 +281,7 @@ class SafeOverAFreshLineContract:
 
     @pytest.mark.parametrize("found_before", [False, True], ids=["at once", "after an error"])
     def test_a_line_that_stays_dead_is_said_soon(
-        self,
-        device: Actuator,
-        clock: Clock,
-        set_points: tuple[float, float],
-        cut: Callable[[], object],
-        *,
-        found_before: bool,
+        self, device: Actuator, clock: Clock, set_points: Pair, cut: Act, *, found_before: bool
     ) -> None:
         """`safe` raises within 3 s, so that it does not hold up the safe state of others on the line."""
         device.set(set_points[1]).wait()
@@ -345,7 +303,7 @@ class WatchdogContract:
     """
 
     def test_silence_switches_the_output_off_at_the_declared_time(
-        self, device: Actuator, clock: Clock, set_points: tuple[float, float], output: Callable[[], float]
+        self, device: Actuator, clock: Clock, set_points: Pair, output: Output
     ) -> None:
         """The output is on until then and off after it, without a word of the host."""
         assert device.watchdog is not None
