@@ -9,6 +9,7 @@ Assumption: a T7 takes several writes of an LJTick-DAC in one packet.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from contextlib import suppress
 from functools import partial
 from typing import ClassVar, Self
@@ -247,20 +248,20 @@ class T7HighVoltageSupply(T7InputDevice[T7HighVoltageSettings], T7LineDevice[T7H
 
     def _look(self) -> tuple[float, float, bool]:
         """Get voltage in V, current in A, and whether the amplifier reports that it is on, by one conversion."""
-        return self._monitored(*self._convert())
+        return self._monitored(*self._check(self._read()))
 
     def _monitored(self, voltage: float, current: float, status: float) -> tuple[float, float, bool]:
         self._looked = self._clock.now()
         settings = self._settings
         return settings.volts_per_volt * voltage, settings.amperes_per_volt * current, status >= _STATUS_ON
 
-    def _values(self, *volts: float) -> dict[str, float]:
-        voltage, current, on = self._monitored(*volts)
+    def _put(self, values: dict[str, float], voltages: Sequence[float], begin: int) -> None:
+        voltage, current, on = self._monitored(*voltages[begin : begin + 3])
         if on and not self._enabled:
             raise self._still_on()
         if self._enabled and not on:
             raise self._went_off()
-        return {f"{self.name}_voltage": voltage, f"{self.name}_current": current}
+        values[f"{self.name}_voltage"], values[f"{self.name}_current"] = voltage, current
 
     def _still_on(self) -> DeviceError:
         return DeviceError(

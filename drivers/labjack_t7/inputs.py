@@ -149,11 +149,7 @@ class T7InputDevice(T7Device[InputSettingsT]):
 
     def _taken(self, voltages: Sequence[float]) -> dict[str, float]:
         """Return the signals of one conversion of each input."""
-        limit = self._limit
-        for volts in voltages:
-            if not -limit < volts < limit:
-                raise self._invalid(voltages)
-        return self._values(*voltages)
+        return self._values(*self._check(voltages))
 
     def joins(self, other: Device) -> bool:
         """Return whether another device can be read in one request with this one: on the same connection."""
@@ -212,18 +208,20 @@ class T7InputDevice(T7Device[InputSettingsT]):
     def _converted(self, voltages: Floats) -> Floats:
         return np.array([list(self._values(*row).values()) for row in voltages.tolist()])
 
-    @abstractmethod
     def _values(self, *volts: float) -> dict[str, float]:
         """Return the signals of a voltage of each input."""
+        values: dict[str, float] = {}
+        self._put(values, volts, 0)
+        return values
 
+    @abstractmethod
     def _put(self, values: dict[str, float], voltages: Sequence[float], begin: int) -> None:
         """Put the signals among the values; the voltages of this device begin there."""
-        values.update(self._values(*voltages[begin : begin + len(self._settings.channels)]))
 
     def _average(self) -> Sequence[float]:
         """Get the mean of `samples` conversions of each input in V; the inputs are averaged one after the other."""
         if self._settings.samples == 1:
-            return self._convert()
+            return self._check(self._read())
         # The averages come first: reading one starts the burst and waits for its end.
         values = self._line.read_packet(self._averages)
         count = len(self._settings.channels)
@@ -231,10 +229,6 @@ class T7InputDevice(T7Device[InputSettingsT]):
         self._check(maxima)
         self._check(minima)
         return self._check(means)
-
-    def _convert(self) -> Sequence[float]:
-        """Get one conversion of each input in V."""
-        return self._check(self._read())
 
     def _read(self) -> tuple[float, ...]:
         if len(self._conversions) == 1:

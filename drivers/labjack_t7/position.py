@@ -121,11 +121,6 @@ class T7PositionSensor(T7InputDevice[T7PositionSettings], PositionSensor):
     def safe(self) -> None:
         """Do nothing: a sensor is safe in any state."""
 
-    def _values(self, *volts: float) -> dict[str, float]:
-        values: dict[str, float] = {}
-        self._put(values, volts, 0)
-        return values
-
     def _put(self, values: dict[str, float], voltages: Sequence[float], begin: int) -> None:
         if self._readout == "voltage":
             position = (voltages[begin] - self._zero_volts) / self._volts_per_metre

@@ -99,11 +99,6 @@ class T7Thermistor(T7InputDevice[T7ThermistorSettings], TemperatureSensor):
     def safe(self) -> None:
         """Do nothing: a sensor is safe in any state."""
 
-    def _values(self, *volts: float) -> dict[str, float]:
-        values: dict[str, float] = {}
-        self._put(values, volts, 0)
-        return values
-
     def _put(self, values: dict[str, float], voltages: Sequence[float], begin: int) -> None:
         excitation = voltages[begin + 1]
         low, high = self._excitation
