@@ -1,4 +1,4 @@
-"""A Dynamixel MX-28 with a drum on its shaft: a linear stage that winds a wire."""
+"""The devices that a Dynamixel MX-28 is: a servo that holds an angle, and a linear stage with a drum on its shaft."""
 
 from __future__ import annotations
 
@@ -6,8 +6,35 @@ from typing import ClassVar
 
 from pydantic import Field
 
-from bench.devices import LinearStage
+from bench.devices import LinearStage, Servo
 from drivers.dynamixel.mx28 import MX28, MX28Settings
+
+
+class AngleSettings(MX28Settings):
+    """Rig-file settings of a Dynamixel MX-28 that holds an angle."""
+
+    position_limits: tuple[float, float] = Field(
+        description="lowest and highest angle set-point, rad; both within ±1048575 counts of the servo"
+    )
+
+    _LIMITS = ("position_limits", "rad")
+
+    @property
+    def per_radian(self) -> float:
+        """1: the set-point is the angle."""
+        return 1.0
+
+
+class DynamixelMX28(MX28[AngleSettings], Servo):
+    """A Dynamixel MX-28 as a servo."""
+
+    Settings: ClassVar[type[AngleSettings]] = AngleSettings
+    _DIGITS = 4
+
+    @property
+    def torque_enabled(self) -> bool:
+        """Whether the servo holds its position, as it reports now."""
+        return self._holds()
 
 
 class DrumSettings(MX28Settings):
