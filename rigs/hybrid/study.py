@@ -419,43 +419,53 @@ def _table_3(
     return {name: dict(zip(keys, row, strict=True)) for name, row in rows.items()}
 
 
-class _Fit(NamedTuple):
-    """One figure: its name, what is drawn over what, in which units, and the outputs of models by their titles."""
-
-    name: str
-    horizontal_label: str
-    quantity: str
-    unit: str
-    horizontal: Floats
-    measured: Floats
-    modelled: Mapping[str, Floats]
-
-
 _NAMES = {"linear, from geometry": "linear", "Prandtl-Ishlinskii": "prandtl-ishlinskii", "polynomial": "polynomial"}
 """Names of models by their titles, which decide the colours."""
 _PERIODS = 12
 """Periods of the resonance that the figure of the step shows."""
 
 
-def _fits(found: HybridIdentification, runs: _Runs) -> Iterator[_Fit]:
-    """Yield the paper's figures."""
+def _draw_models(campaign: RunSeries, found: HybridIdentification, runs: _Runs) -> Iterator[Path]:
+    """Have the paper's figures drawn; yield their files."""
 
-    def compared(name: str, samples: Samples, label: str, horizontal: Floats, shown: slice = slice(None)) -> _Fit:
-        """Return measured and simulated temperature of the base, with the air as identified."""
+    def draw(
+        name: str,
+        label: str,
+        quantity: str,
+        unit: str,
+        horizontal: Floats,
+        measured: Floats,
+        modelled: Mapping[str, Floats],
+    ) -> Path:
+        return campaign.draw(
+            name,
+            plot_fit,
+            horizontal,
+            measured,
+            modelled,
+            horizontal_label=label,
+            output_label=f"{quantity} / {unit}",
+            error_label=f"residual / {unit}",
+            titles={title: errors_text(measure_errors(measured, each), unit) for title, each in modelled.items()},
+            names=_NAMES,
+        )
+
+    def draw_base(name: str, samples: Samples, label: str, horizontal: Floats, shown: slice = slice(None)) -> Path:
+        """Draw measured and simulated temperature of the base, with the air as identified."""
         network = found.network.network
         base = network.simulate(samples[CURRENT], samples.period, found.network.ambient)[:, 2]
         modelled = {"thermal network": base[shown]}
-        return _Fit(name, label, "temperature of the base", "°C", horizontal[shown], samples[BASE][shown], modelled)
+        return draw(name, label, "temperature of the base", "°C", horizontal[shown], samples[BASE][shown], modelled)
 
     around, stepped = read_loop(runs.sine.folder), read_loop(runs.steps.folder)
     second = slice(len(around.table) // 2, None)
-    yield compared("figure-12-static-temperature", around, "current / A", around[CURRENT], second)
-    yield compared("figure-13-temperature-steps", stepped, "time / s", stepped.times)
+    yield draw_base("figure-12-static-temperature", around, "current / A", around[CURRENT], second)
+    yield draw_base("figure-13-temperature-steps", stepped, "time / s", stepped.times)
     with Record(runs.static.folder) as record:
         curve, names = record.steps(), signal_names(record)
     rises, deflections = curve[names[TIP]] - REFERENCE, curve[names[DEFLECTION]]
     by_heat, by_voltage = SENSITIVITIES
-    yield _Fit(
+    yield draw(
         "figure-14-thermomechanical",
         "temperature of the tip less 22 °C / K",
         "deflection",
@@ -468,7 +478,7 @@ def _fits(found: HybridIdentification, runs: _Runs) -> Iterator[_Fit]:
         },
     )
     piezo = found.piezo
-    yield _Fit(
+    yield draw(
         "figure-15-hysteresis",
         "voltage / V",
         "deflection",
@@ -486,7 +496,7 @@ def _fits(found: HybridIdentification, runs: _Runs) -> Iterator[_Fit]:
     end = begun + _PERIODS * 2.0 * np.pi / found.dynamics.model.frequency
     shown = (fast.times >= begun - 1e-3) & (fast.times <= end)
     deflection = fast[DEFLECTION] * 1e6
-    yield _Fit(
+    yield draw(
         "figure-16-step",
         "time after the step / ms",
         "deflection",
@@ -495,26 +505,6 @@ def _fits(found: HybridIdentification, runs: _Runs) -> Iterator[_Fit]:
         deflection[shown],
         {"D(s)": (deflection - found.dynamics.residuals * 1e6)[shown]},
     )
-
-
-def _draw_models(campaign: RunSeries, found: HybridIdentification, runs: _Runs) -> Iterator[Path]:
-    """Have the paper's figures drawn; yield their files."""
-    for fit in _fits(found, runs):
-        yield campaign.draw(
-            fit.name,
-            plot_fit,
-            fit.horizontal,
-            fit.measured,
-            fit.modelled,
-            horizontal_label=fit.horizontal_label,
-            output_label=f"{fit.quantity} / {fit.unit}",
-            error_label=f"residual / {fit.unit}",
-            titles={
-                title: errors_text(measure_errors(fit.measured, values), fit.unit)
-                for title, values in fit.modelled.items()
-            },
-            names=_NAMES,
-        )
 
 
 def _draw_control(campaign: RunSeries, moves: Mapping[str, Tracked]) -> Iterator[Path]:
