@@ -254,11 +254,9 @@ class LineActuator(LineDevice[SettingsT, LineT], Actuator):
         """Try everything that makes the device safe; raise `DeviceError` if that is not confirmed."""
 
     def _unconfirmed(self, part: str, failures: list[DeviceError]) -> DeviceError:
-        """Return the error for a part that may still be on, after everything was tried.
-
-        It is a `DeviceConnectionError` if the first failure was one: then a fresh line may help.
-        """
+        """Return the error for a part that may still be on, after everything was tried."""
         reason = f" ({failures[0]})" if failures else ""
+        # If the connection failed, a fresh line may help.
         lost = bool(failures) and isinstance(failures[0], DeviceConnectionError)
         kind = DeviceConnectionError if lost else DeviceError
         return kind(self.name, f"does not confirm that its {part} is off{reason}; disconnect its power supply")

@@ -290,10 +290,8 @@ class FlintecDAD141(LineDevice[DAD141Settings, _Line], LoadCell):
         return Identity("Flintec", "DAD 141.1", str(serial_number), f"{major}.{minor:02d}")
 
     def _check_order(self) -> None:
-        """Raise unless the peak weight as floating-point number and as integer has the same digits.
-
-        Both are read in one request; as the weight may pass its peak in between, several times if they differ.
-        """
+        """Raise unless the peak weight as floating-point number and as integer has the same digits."""
+        # Several times, as the weight may pass its peak between the two.
         for _ in range(_ORDER_LOOKS):
             weight, digits = unpack("fi", self._line.read(_PEAK, 4))
             if _agree(weight, digits):

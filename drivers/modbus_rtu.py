@@ -277,10 +277,7 @@ class RtuLine:
         self._silent_since = self._answered_at = now
 
     def _catch_up(self) -> None:
-        """Let late replies pass: what comes before the reply to a request like no other is old.
-
-        Raises `NoReplyError` if that has no reply, and `OSError` if the line is lost or does not fall silent.
-        """
+        """Let late replies pass: what comes before the reply to a request like no other is old."""
         settings = self._settings
         self._client.settle(_QUIET * settings.timeout)
         late_until = self._late_until

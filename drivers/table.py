@@ -410,13 +410,10 @@ class TableActuator(TableSensor[SwitchedLine], GeneralActuator):
             check_read_back(self.name, line.target, written, found, "; ".join(line.errors()) if wrong else "")
 
     def _check_output(self) -> None:
-        """Raise `DeviceError` if an output that was switched on is off without the bench.
-
-        One that has lost its set-point as well has restarted: `DeviceRestartedError`, now and at each later call. Of
-        an output that cannot be asked for, only the set-point is looked at.
-        """
+        """Raise `DeviceError` if an output that was switched on is off without the bench."""
         if not self._on:
             return
+        # One that has lost its set-point as well has restarted; if it cannot be asked for, that alone is looked at.
         is_on = self._line.reads_on()
         if is_on is None:
             self._check_left()

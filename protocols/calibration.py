@@ -126,10 +126,7 @@ def _compare(
     expected: float = 1.0,
     scale: float = 1.0,
 ) -> Messages:
-    """Prompt for one value after another, and read each; the label of a reading is its value, times a scale.
-
-    A reading is `expected` times the value, within the tolerance.
-    """
+    """Prompt for values, and read each, labelled by `scale` times the value; expect `expected` times the value."""
     unit = unit or slot.unit
     for value in values:
         yield Phase(f"{value:g} {unit}")

@@ -89,11 +89,9 @@ class RegisteredPart:
 
 
 def _packages() -> list[tuple[str, metadata.Distribution]]:
-    """Return the packages that register a part, each with its name.
-
-    Of hundreds of packages few do: the entry points of the others are not parsed.
-    """
+    """Return the packages that register a part, each with its name."""
     found = []
+    # Of hundreds of packages few do: the entry points of the others are not parsed.
     for package in metadata.distributions():
         text = package.read_text("entry_points.txt")
         if text is None or "[bench." not in text:

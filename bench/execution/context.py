@@ -536,10 +536,7 @@ def _leave(reason: str, station: Station | None = None, journal: Path | None = N
 
 
 def _dashboard_class(run: Run, console: Console) -> type[Dashboard] | None:
-    """Import the dashboard if the run needs it, and say so if it is not installed.
-
-    Raises MissingExtraError only for a live view: without a recording the journal has everything.
-    """
+    """Import the dashboard if the run needs it; say so if it is not installed, or raise if a live view needs it."""
     if not (run.live or run.recording):
         return None
     try:

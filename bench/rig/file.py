@@ -385,10 +385,7 @@ def _identity(name: str) -> str:
 
 
 def _merged(path: str, text: str, extending: tuple[str, ...], bases: list[str]) -> dict[str, Any]:
-    """Return the content of a file over those that it extends, which join `bases`.
-
-    `extending` are the rigs on the way to it.
-    """
+    """Return the content of a file over those that it extends, which join `bases`; `extending` led to it."""
     try:
         content = _without_dates(parse_toml(text))
     except ValueError as error:
@@ -591,10 +588,7 @@ def _load_part(
     found: list[str],
     devices: Mapping[str, DriverSettings] | None = None,
 ) -> tuple[Any, Any] | None:
-    """Return the class that `key` of a table names, and its settings from the other keys; problems go to `found`.
-
-    Settings with a field `devices` are given `devices` in it.
-    """
+    """Return the class that `key` of a table names, and its settings from the other keys; problems go to `found`."""
     options = dict(table)
     reference = options.pop(key, None)
     where = f"{prefix}{key} = {reference!r}"

@@ -327,11 +327,7 @@ class MX28(RecoverableDevice[MX28SettingsT, ServoLine], Actuator):
         self._setpoint = self._position(position)
 
     def _make_safe(self) -> None:
-        """Switch the torque off and see that it is off; an expired watchdog is cleared.
-
-        If the servo refuses or still reports its torque on, its output is set to zero and it is rebooted,
-        which loses the number of turns.
-        """
+        """Switch the torque off and see that it is off, or reboot the servo, which loses the number of turns."""
         line = self._line
         line.urgent = True
         try:

@@ -210,11 +210,9 @@ class ServoLine:
         return "only packets of others", b""
 
     def _read_packet(self, expected: int, ended: bool) -> bytes | None:
-        """Return the next packet, None after silence, nothing for a damaged one.
-
-        All the bytes that are expected are waited for at once, which is faster than to begin with the head. A
-        refusal of a read is shorter, so it is noticed after the timeout only.
-        """
+        """Return the next packet, None after silence, nothing for a damaged one."""
+        # All the bytes that are expected are waited for at once, which is faster than to begin with the head; a
+        # refusal of a read is shorter, so it is noticed after the timeout only.
         received = self._received
         read = 0
         while read < _MOST_NOISE:

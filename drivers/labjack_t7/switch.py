@@ -66,9 +66,6 @@ class T7Switch(T7LineDevice[T7LineSettings], Switch):
         return {f"{self.name}_state": float(on)}
 
     def _make_safe(self) -> None:
-        """Switch off and see that the line is off.
-
-        Raises `DeviceError` if that could not be confirmed; a line that cannot be reached is left to the watchdog.
-        """
+        """Switch off and see that the line is off; one that cannot be reached is left to the watchdog."""
         self._setpoint = 0.0
         self._output.switch(False)

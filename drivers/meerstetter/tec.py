@@ -298,11 +298,7 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         self._setpoint = present
 
     def _make_safe(self) -> None:
-        """Switch the output stage off in every possible way, and see that it is off.
-
-        Live enable and output stage enable are both switched off; if either fails, or the device still
-        reports a running output, the emergency stop (`ES`, error 11 on the device) follows.
-        """
+        """Switch the output stage off in every possible way, the emergency stop last, and see that it is off."""
         with self._line.in_haste():
             failures = attempt(partial(self._write, _LIVE_ENABLED, _OFF), partial(self._write, _ENABLE, _OFF))
             if failures or not self._is_off():

@@ -458,10 +458,8 @@ class RoboteqSupply(RecoverableDevice[SupplySettings, NodeLine], VoltageSupply):
                 raise self._refused(_COMMAND, 0, channel, error) from None
 
     def _resumable(self) -> tuple[int, ...]:
-        """Return the channels that the next command may resume, that of this driver first.
-
-        All of them after a silence, unless the last command was 0: so were those to the other channels.
-        """
+        """Return the channels that the next command may resume, that of this driver first."""
+        # All after a silence, unless the last command was 0: so were those to the other channels.
         resumable = self._was_silent() and (self._commanded_at == -math.inf or self._command != 0)
         return self._channels if resumable else self._channels[:1]
 

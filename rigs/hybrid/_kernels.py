@@ -272,10 +272,8 @@ def _parts(numbers: Floats) -> Filter:
 
 @inner
 def _factorise(matrix: Floats, factor: Floats, scale: float) -> None:
-    """Find the Cholesky factor of a multiple of a positive definite matrix, in the lower triangle.
-
-    In plain loops, so that the filter gives the same on every machine, as it would not with the BLAS of numpy.
-    """
+    """Find the Cholesky factor of a multiple of a positive definite matrix, in the lower triangle."""
+    # In plain loops, so that the filter gives the same on every machine, as it would not with the BLAS of numpy.
     for j in range(matrix.shape[0]):
         for i in range(j, matrix.shape[0]):
             total = scale * matrix[i, j]

@@ -406,10 +406,7 @@ class MuscleProportionalIntegral(MuscleController):
 
 
 def _timing(setup: ControllerSetup) -> InverseControlParameters:
-    """Return the parameters of a setup: from the dynamics in the model file, with the rig's numbers in their place.
-
-    Raises ConfigurationError if nothing says how fast the muscle is, or a target's time is too short for it.
-    """
+    """Return the parameters of a setup: those of the rig, or from the dynamics in the model file."""
     options = dict(setup.options)
     duration = float(options.pop("duration"))
     dynamics = setup.model.dynamics

@@ -197,12 +197,9 @@ def look_ahead(plant: Floats) -> None:
 
 @inner
 def _look_ahead(thermal: Thermal) -> None:
-    """Find the change of the temperatures over the step that begins here.
-
-    The implicit midpoint rule takes everything that is linear at a given current; it keeps the energy
-    balance to rounding. The nonlinear part of convection changes over seconds and is taken at the middle of
-    the step, extrapolated from the step before.
-    """
+    """Find the change of the temperatures over the step that begins here."""
+    # The implicit midpoint rule takes what is linear at a given current, and keeps the energy balance to rounding.
+    # The rest of convection changes over seconds: it is extrapolated from the step before to the middle of this one.
     rise, increment, state, command, c, nodes, factors = thermal
     saturated = _take_commands(thermal)
     if command[CLOSED] != 0.0:

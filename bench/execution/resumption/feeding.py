@@ -304,10 +304,8 @@ def _feed(
 
 
 def _approach(start: Place, own: Place, end: Place, switches: Collection[str]) -> list[dict[str, float]]:
-    """Return where to stop on the way to a place, for the actuators that go further than the run itself did.
-
-    First with a tenth of the way left if that is still more than the run's own step, then where the run came from.
-    """
+    """Return where to stop on the way to a place, for the actuators that go further than the run itself did."""
+    # First with a tenth of the way left if that is still more than the run's own step, then where the run came from.
     far, near = {}, {}
     for name, value in end.setpoints.items():
         jump = value - start.setpoints.get(name, value)

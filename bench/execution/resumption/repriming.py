@@ -191,18 +191,15 @@ def _slope(fed: Fed, drive: str, name: str) -> float:
 
 
 def _noise(fed: Fed, name: str) -> float:
-    """Return the noise of a signal at rest: the larger of that of ticks and that of readings.
-
-    That of the last ticks is free of drift: a median of differences within the second halves of steps, as in the
-    first ones the specimen goes to its place. It is zero for a signal that stands on one digit and jumps now and
-    then: readings that differ from the tick before them show such jumps.
-    """
+    """Return the noise of a signal at rest: of ticks or of readings, whichever is larger."""
+    # Free of drift: a median of differences within the second halves of steps, as the specimen moves in the first.
     ticks = fed.past.ticks
     values, steps = ticks[name][-_TICKS:], ticks["step"][-_TICKS:]
     of_steps = [np.abs(np.diff(values[steps == step])) for step in np.unique(steps)]
     differences = np.concatenate([np.empty(0), *(each[each.size // 2 :] for each in of_steps)])
     differences = differences[np.isfinite(differences)]
     of_ticks = float(np.median(differences)) / _NORMAL if differences.size else 0.0
+    # Zero for a signal that stands on one digit and jumps now and then, which readings show.
     return max(of_ticks, _jumps(fed, name))
 
 
