@@ -1,5 +1,4 @@
-"""What a step costs beside its devices: the engine on the virtual clock, and bluesky's RunEngine; a request of a
-guardian.
+"""What a step costs beside its devices: the engine on the virtual clock, and bluesky's RunEngine.
 
 Prints, asserts no time.
 """
@@ -17,12 +16,10 @@ from pydantic import Field
 from bench.base import Interrupts, VirtualClock, registry
 from bench.devices import DriverSettings, Identity, Limits, Status, TemperatureSensor, VoltageSupply
 from bench.execution.engine import Engine
-from bench.execution.guardian.remote import GuardedRig, RemoteStation
 from bench.execution.station.local import LocalStation
 from bench.protocol import Arrived, ProtocolParameters, Step, protocol
 from bench.record import FILE_NAME, Journal
-from bench.rig import LaboratorySettings, Look, Rig, attach, load_rig
-from sim_devices.serving.process import serve
+from bench.rig import LaboratorySettings, Rig, load_rig
 
 pytestmark = pytest.mark.benchmark
 
@@ -30,7 +27,6 @@ pytestmark = pytest.mark.benchmark
 registry.import_beside(Path(__file__))
 
 STEPS = 5000
-REQUESTS = 5000
 
 RIG = """
 [rig]
@@ -139,13 +135,6 @@ def rig_file(tmp_path, monkeypatch):
     return load_rig(str(path))
 
 
-def table(rows, times, unit):
-    print(f"\n{rows:32} {'median':>9} {'99 %':>9} {'99.9 %':>9}  {unit}")
-    for name, each in times.items():
-        figures = np.percentile(each, [50.0, 99.0, 99.9])
-        print(f"{name:32} " + " ".join(f"{figure:9.3g}" for figure in figures))
-
-
 def of_engine(rig_file, folder):
     """Return the wall-clock time of each step, µs."""
     stamps = []
@@ -207,29 +196,7 @@ def test_a_step(rig_file, tmp_path):
         "bench, journal and interlocks": of_engine(rig_file, tmp_path / "bench"),
         "bluesky, JSON writer": of_bluesky(rig_file, tmp_path / "bluesky"),
     }
-    table(f"{STEPS} steps", times, "µs a step")
-
-
-def test_a_request(tmp_path):
-    with ExitStack() as stack:
-        served = stack.enter_context(serve("vo2", clock="x1"))
-        attachment = attach(served.endpoints_file, "vo2")
-        stack.callback(attachment.close)
-        guarded = GuardedRig(load_rig("vo2"), "vo2", {}, served.endpoints_file, 0, "a benchmark")
-        station = RemoteStation(guarded, attachment.clock)
-        stack.callback(station.close)
-        stack.callback(station.end)
-        requests = {
-            "promise": lambda: station._ask("promise", seconds=60.0, why="a benchmark"),
-            "check of a set-point": lambda: station.check({"tec": [40.0]}),
-            "look at the T7, served": lambda: station.look(Look.PART, ["psd_position"]),
-        }
-        times = {}
-        for name, request in requests.items():
-            taken = []
-            for _ in range(REQUESTS if "served" not in name else 500):
-                begin = time.perf_counter()
-                request()
-                taken.append(1e3 * (time.perf_counter() - begin))
-            times[name] = np.array(taken)
-    table("requests of a guardian", times, "ms")
+    print(f"\n{f'{STEPS} steps':32} {'median':>9} {'99 %':>9} {'99.9 %':>9}  µs a step")
+    for name, each in times.items():
+        figures = np.percentile(each, [50.0, 99.0, 99.9])
+        print(f"{name:32} " + " ".join(f"{figure:9.3g}" for figure in figures))
