@@ -16,6 +16,7 @@ from collections.abc import Callable, Sequence
 from functools import lru_cache
 from typing import Any
 
+from bench.base import crc16_modbus
 from drivers.serial_line import settle_line
 
 # The drivers raise everything that pymodbus logs as an error, with the name of the device.
@@ -211,25 +212,8 @@ class TcpClient(_PortClient):
         return self._receive(reply, size)[_HEADER_SIZE:size]
 
 
-def _crc_table() -> tuple[int, ...]:
-    table = []
-    for value in range(256):
-        for _ in range(8):
-            value = value >> 1 ^ (0xA001 if value & 1 else 0)
-        table.append(value)
-    return tuple(table)
-
-
-_CRC = _crc_table()
-
-
-@lru_cache(_KNOWN_REPLIES)
-def crc16(data: bytes) -> bytes:
-    """Return the CRC of a Modbus RTU frame as it follows on the line, low byte first."""
-    crc = 0xFFFF
-    for byte in data:
-        crc = crc >> 8 ^ _CRC[(crc ^ byte) & 0xFF]
-    return crc.to_bytes(2, "little")
+crc16 = lru_cache(_KNOWN_REPLIES)(crc16_modbus)
+"""The CRC of a frame as it follows on the line."""
 
 
 class NoReplyError(OSError):

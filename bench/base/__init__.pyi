@@ -40,6 +40,10 @@ from .configuration_errors import (
     explain as explain,
     problems as problems,
 )
+from .crc import (
+    crc16_dynamixel as crc16_dynamixel,
+    crc16_modbus as crc16_modbus,
+)
 from .deferred import (
     DeferredModule as DeferredModule,
 )

@@ -8,13 +8,13 @@ from __future__ import annotations
 import math
 import struct
 from collections.abc import Callable, Mapping
-from functools import lru_cache, partial
+from functools import partial
 from typing import ClassVar
 
 import serial
 from pydantic import Field
 
-from bench.base import Clock
+from bench.base import Clock, crc16_dynamixel as crc
 from drivers.device import other_answer
 from drivers.serial_line import RESENDS, SerialSettings, forget_received, lost_line, no_answer, open_port, patience_of
 
@@ -239,33 +239,6 @@ class ServoLine:
             read += len(chunk)
             ended = len(chunk) < missing
         return b""
-
-
-def _crc_of_byte(index: int) -> int:
-    value = index << 8
-    for _ in range(8):
-        value = (value << 1) ^ (0x8005 if value & 0x8000 else 0)
-    return value & 0xFFFF
-
-
-_CRC_OF_BYTE = tuple(_crc_of_byte(index) for index in range(256))
-_BEGINNING = 28  # bytes that a servo at rest often repeats: head, error, and all of a reading but its tick
-
-
-def crc(data: bytes) -> int:
-    """Return the CRC-16 of a packet: polynomial 0x8005, initial value 0, highest bit first."""
-    return _crc_from(_crc_of_beginning(data[:_BEGINNING]), data[_BEGINNING:])
-
-
-@lru_cache(maxsize=256)
-def _crc_of_beginning(data: bytes) -> int:
-    return _crc_from(0, data)
-
-
-def _crc_from(value: int, data: bytes) -> int:
-    for byte in data:
-        value = (value << 8 & 0xFF00) ^ _CRC_OF_BYTE[value >> 8 ^ byte]
-    return value
 
 
 def frame(servo_id: int, instruction: int, parameters: bytes) -> bytes:

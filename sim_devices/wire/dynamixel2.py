@@ -22,6 +22,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from enum import IntEnum
 from functools import lru_cache
 
+from bench.base import crc16_dynamixel as crc16
 from sim_devices.instruments.dynamixel import LOWEST_FIRMWARE_THAT_CLEARS, EmulatedMX28
 from sim_devices.instruments.dynamixel_table import ErrorNumber
 from sim_devices.instruments.emulated import RequestRefusedError
@@ -72,34 +73,6 @@ _FOR_ALL = frozenset(
         Instruction.FAST_BULK_READ,
     )
 )
-
-
-def _crc_of_byte(index: int) -> int:
-    crc = index << 8
-    for _ in range(8):
-        crc = (crc << 1) ^ (0x8005 if crc & 0x8000 else 0)
-    return crc & 0xFFFF
-
-
-_CRC_OF_BYTE = [_crc_of_byte(index) for index in range(256)]
-
-_BEGINNING = 28  # bytes of a packet that a host or a servo at rest often repeats
-
-
-def crc16(data: bytes) -> int:
-    """Return the CRC of a packet: polynomial 0x8005, initial value 0, highest bit first."""
-    return _crc_from(_crc_of_beginning(data[:_BEGINNING]), data[_BEGINNING:])
-
-
-@lru_cache(maxsize=256)
-def _crc_of_beginning(data: bytes) -> int:
-    return _crc_from(0, data)
-
-
-def _crc_from(crc: int, data: bytes) -> int:
-    for byte in data:
-        crc = (crc << 8 & 0xFF00) ^ _CRC_OF_BYTE[crc >> 8 ^ byte]
-    return crc
 
 
 def frame(servo_id: int, instruction: int, parameters: bytes = b"") -> bytes:

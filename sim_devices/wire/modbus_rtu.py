@@ -19,6 +19,7 @@ from collections.abc import Mapping
 from functools import lru_cache
 from typing import NamedTuple
 
+from bench.base import crc16_modbus as crc16
 from sim_devices.instruments.emulated import LineFaults
 from sim_devices.wire import WireServer
 from sim_devices.wire.modbus import READS, Packet, RegisterBank, answer, prepare, refusal
@@ -40,26 +41,6 @@ _FIXED: Mapping[int, int] = {
 
 _COUNTED: Mapping[int, tuple[int, int]] = {15: (9, 6), 16: (9, 6), 20: (5, 2), 21: (5, 2), 23: (13, 10)}
 """Bytes of a request without its data, and where the number of bytes of its data stands."""
-
-
-def _crc_table() -> tuple[int, ...]:
-    table = []
-    for value in range(256):
-        for _ in range(8):
-            value = value >> 1 ^ (0xA001 if value & 1 else 0)
-        table.append(value)
-    return tuple(table)
-
-
-_TABLE = _crc_table()
-
-
-def crc16(data: bytes | bytearray | memoryview) -> bytes:
-    """Return the CRC of a frame as it follows on the wire, least significant byte first."""
-    crc = 0xFFFF
-    for byte in data:
-        crc = crc >> 8 ^ _TABLE[(crc ^ byte) & 0xFF]
-    return crc.to_bytes(2, "little")
 
 
 _crc_of_reply = lru_cache(maxsize=1024)(crc16)
