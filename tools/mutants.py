@@ -38,7 +38,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 MODULES = ("bench/control", "bench/execution/engine.py", "bench/record", "drivers")
 TESTS = ("tests/unit", "tests/contract", "tests/wire/drivers", "tests/system/test_cli.py")
-TABLES = ("tests/contracts/test_settings.py", "tests/contracts/test_values.py")
+TABLES = ("tests/contract/test_settings.py", "tests/contract/test_values.py")
 MOST_TESTS, MOST_SECONDS = 600, 40.0
 _TIMEOUT = 60.0  # s of one test
 _NOT_LOADED = 99
