@@ -92,20 +92,6 @@ class MeCom(Dialect):
         operand = {b"VS": row + word_32(rng).hex().upper().encode(), b"CS": b"0000E100", b"?IF": b"", b"ES": b""}
         return self._sealed(rng, command + operand.get(command, b"" if command == b"RS" else row))
 
-    @staticmethod
-    def _bulk(rng, row):
-        """Return a read of several parameters, or a read or write of many elements of one."""
-        rows = [b"%04X01" % rng.choice(tuple(PARAMETERS)) for _ in range(rng.choice((1, 3, 10)))]
-        first, count = rng.choice((0, 0, 1, 0xFFFFFFFF)), rng.choice((0, 1, 1, 2, 0xFFFF))
-        return rng.choice(
-            (
-                b"?VX%02X" % len(rows) + b"".join(rows),
-                b"?VB" + row + b"%08X%04X" % (first, count),
-                b"VB" + row + b"%08X%04X01" % (first, count) + word_32(rng).hex().upper().encode() * min(count, 3),
-                b"SP",
-            )
-        )
-
     def wild(self, rng):
         command = rng.choice((b"", b"?VR", b"VS", b"?VM", b"?VX", b"VX", b"VB", b"?VB", b"SP", b"CS", b"?", b"?IF"))
         alphabet = rng.choice((b"0123456789ABCDEF", b"0123456789abcdefxyz+-#!", bytes(range(256))))
