@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import signal
 import sqlite3
+import statistics
 import subprocess
 import sys
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -35,7 +38,44 @@ _LONGEST_START = 120.0
 """Longest wait for what a run does at its start, s."""
 
 
-def hear_signals() -> None:
+HEADS = f"{'safe':>7} {'median s':>9} {'longest s':>9} {'allowed s':>9}"
+"""Heads of what `report` prints behind a title."""
+
+
+@dataclass(frozen=True)
+class Found:
+    """What came of a trial: the time until its outputs were off and what was allowed, s; what was wrong."""
+
+    seconds: float
+    within: float
+    problem: str = ""
+
+
+def report(title: str, found: Sequence[Found]) -> int:
+    """Print a row of the table, and what was wrong; return how often something was."""
+    times = [each.seconds for each in found]
+    problems = [each.problem for each in found if each.problem]
+    print(
+        f"{title} {len(found) - len(problems):3}/{len(found):3} {statistics.median(times):9.3f} "
+        f"{max(times):9.3f} {found[0].within:9.1f}",
+        *(f"         {each}" for each in problems),
+        sep="\n",
+        flush=True,
+    )
+    return len(problems)
+
+
+def trials_parser(description: str, times: int) -> argparse.ArgumentParser:
+    """Return the options of trials on served rigs; the runs hear signals from now on."""
+    _hear_signals()
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--rig", action="append", choices=list(SETPOINTS))
+    parser.add_argument("--times", type=int, default=times, help="trials of each kind")
+    parser.add_argument("--busy", type=int, default=0, help="busy processes beside")
+    return parser
+
+
+def _hear_signals() -> None:
     """Let the runs hear signals that a shell has its background jobs ignore."""
     signal.signal(signal.SIGINT, signal.default_int_handler)
     for name in ("SIGHUP", "SIGQUIT"):

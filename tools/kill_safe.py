@@ -12,19 +12,17 @@ its own, which its watchdog switches off, and for those that no watchdog does, o
 
 from __future__ import annotations
 
-import argparse
 import json
 import os
 import random
 import signal
-import statistics
 import sys
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import ExitStack
 from dataclasses import dataclass
 
-from guarded_run import SETPOINTS, GuardedRun, hear_signals, outputs_on, start_busy
+from guarded_run import HEADS, SETPOINTS, Found, GuardedRun, outputs_on, report, start_busy, trials_parser
 
 from bench.execution.guardian.rescuer import SILENCE
 from bench.record import ending_of
@@ -88,20 +86,11 @@ GUARDIAN = {"guardian SIGKILL": signal.SIGKILL, "guardian SIGSTOP": signal.SIGST
 """What the guardian is sent once everything is on."""
 
 
-@dataclass(frozen=True)
-class Found:
-    """What came of a part of a trial: the time until its outputs were off and what was allowed, s; what was wrong."""
-
-    seconds: float
-    within: float
-    problem: str = ""
-
-    @classmethod
-    def judged(cls, seconds: float, within: float, left: Collection[str] = ()) -> Found:
-        """Return what is found if some outputs are left on, or were on for so long."""
-        if left:
-            return cls(seconds, within, f"still on after {seconds:.2f} s: {', '.join(left)}")
-        return cls(seconds, within, f"after {seconds:.2f} s" if seconds > within else "")
+def judged(seconds: float, within: float, left: Collection[str] = ()) -> Found:
+    """Return what is found if some outputs are left on, or were on for so long."""
+    if left:
+        return Found(seconds, within, f"still on after {seconds:.2f} s: {', '.join(left)}")
+    return Found(seconds, within, f"after {seconds:.2f} s" if seconds > within else "")
 
 
 def started(rig: EmulatedRig, protocol: str, *, stalled: bool = False) -> GuardedRun:
@@ -135,7 +124,7 @@ def harm_bench(rig: EmulatedRig, trial: Trial, wait: float) -> dict[str, Found]:
                 return {"": Found(0.0, trial.within, "the outputs were off before the trial")}
             run.process.send_signal(trial.sent)
         seconds, left = watch(rig, LINES[rig.name], trial.within + 10.0)
-        found = Found.judged(max(seconds.values()), trial.within, left)
+        found = judged(max(seconds.values()), trial.within, left)
         problem = found.problem
         if trial.sent is signal.SIGSTOP:
             run.process.send_signal(signal.SIGCONT)
@@ -160,7 +149,7 @@ def harm_guardian(rig: EmulatedRig, sent: signal.Signals, wait: float) -> dict[s
         time.sleep(wait)
         os.kill(run.guardian, sent)
         seconds, left = watch(rig, LINES[rig.name], within + 10.0)
-        found = Found.judged(max(seconds.values()), within, left)
+        found = judged(max(seconds.values()), within, left)
         problem = found.problem
         if (code := run.exit_code()) != 7:
             problem = problem or f"exit code {code}: {run.said[-300:]}"
@@ -196,7 +185,7 @@ def cut_line(rig: EmulatedRig, instrument: str, lose: Callable[[str], None], wai
         waited = {name for names, _ in parts.values() for name in names}
         seconds, left = watch(rig, waited, max([20.0, *(within + 10.0 for _, within in parts.values())]))
         for title, (names, within) in parts.items():
-            found[title] = Found.judged(max(seconds[name] for name in names), within, names & left)
+            found[title] = judged(max(seconds[name] for name in names), within, names & left)
         code = run.exit_code()
         said = run.said
         problem = ""
@@ -204,7 +193,7 @@ def cut_line(rig: EmulatedRig, instrument: str, lose: Callable[[str], None], wai
             problem = f"exit code {code}, and no device of {instrument} is named: {said[-300:]}"
         rig.control.plug_in(instrument)
         seconds, left = watch(rig, own, 13.0)
-        mended = Found.judged(max(seconds.values(), default=0.0), 3.0, left)
+        mended = judged(max(seconds.values(), default=0.0), 3.0, left)
         if not run.has_freed_lines():
             problem = problem or "the guardian is still there"
         found["mended"] = Found(mended.seconds, mended.within, mended.problem or problem)
@@ -233,19 +222,15 @@ def trials(rig: EmulatedRig) -> Iterator[tuple[str, Callable[[float], Mapping[st
 
 def main() -> int:
     """Print the table; return 0 if every output was safe in time in every trial."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--rig", action="append", choices=list(SETPOINTS))
+    parser = trials_parser(__doc__, times=10)
     parser.add_argument("--trial", action="append", help="only trials of this name, or whose name begins with it")
-    parser.add_argument("--times", type=int, default=10, help="trials of each kind")
-    parser.add_argument("--busy", type=int, default=0, help="busy processes beside")
     parser.add_argument("--seed", type=int, default=0, help="of the instants")
     given = parser.parse_args()
     instants = random.Random(given.seed)
-    hear_signals()
     bad = 0
     with ExitStack() as stack:
         start_busy(given.busy, stack)
-        print(f"{'rig':8} {'trial':28} {'safe':>7} {'median s':>9} {'longest s':>9} {'allowed s':>9}")
+        print(f"{'rig':8} {'trial':28} {HEADS}")
         for name in given.rig or SETPOINTS:
             rig = stack.enter_context(serve(name, clock="x1"))
             for title, carry_out in trials(rig):
@@ -256,20 +241,6 @@ def main() -> int:
                     parts = [each[part] for each in found if part in each]
                     bad += report(f"{name:8} {f'{title}: {part}' if part else title:28}", parts)
     return 1 if bad else 0
-
-
-def report(title: str, found: list[Found]) -> int:
-    """Print a row of the table; return how often something was wrong."""
-    times = [each.seconds for each in found]
-    problems = [each.problem for each in found if each.problem]
-    print(
-        f"{title} {len(found) - len(problems):3}/{len(found):3} {statistics.median(times):9.3f} "
-        f"{max(times):9.3f} {found[0].within:9.1f}",
-        *(f"         {each}" for each in problems),
-        sep="\n",
-        flush=True,
-    )
-    return len(problems)
 
 
 if __name__ == "__main__":
