@@ -87,20 +87,27 @@ def cells_of(content: bytes, delimiter: str) -> list[Cells]:
     return [[cell.strip().strip('"\ufeff').strip() for cell in line] for line in split]
 
 
-def check(folder: Path, file: Path, rows: Sequence[Cells], decimal: str = ".") -> str:
-    """Import a file; return what is wrong with what was taken, empty if nothing is."""
+def imported(folder: Path, file: Path) -> tuple[dict[str, Any], np.ndarray] | None:
+    """Import a file; return what is said of it and the rows that were read, None if it is refused."""
     result, out = folder / "result.json", folder / "runs"
     ended = call(
         "runs", "import", file, "--input", "u", "--output", "y", "--time", "t", "--out", out, "--json", result
     )
     if ended.code:
-        return ""
+        return None
     (run,) = out.iterdir()
     with Record(run) as record:
         steps = record.steps()
         read = np.column_stack([steps["u"], steps["y"]])
-    said = json.loads(result.read_text(encoding="utf-8"))
     shutil.rmtree(out)
+    return json.loads(result.read_text(encoding="utf-8")), read
+
+
+def check(folder: Path, file: Path, rows: Sequence[Cells], decimal: str = ".") -> str:
+    """Import a file; return what is wrong with what was taken, empty if nothing is."""
+    if (found := imported(folder, file)) is None:
+        return ""
+    said, read = found
     if said["rows"] != len(read):
         return f"{said['rows']} rows are said, {len(read)} are in the journal"
     text = json.dumps(said)
@@ -279,15 +286,8 @@ def _flat(values: Any) -> list[Any]:
 
 def count_only(folder: Path, file: Path, rows: int) -> str:
     """Import a file whose numbers may be damaged; return what is wrong with the number of rows."""
-    result, out = folder / "result.json", folder / "runs"
-    ended = call(
-        "runs", "import", file, "--input", "u", "--output", "y", "--time", "t", "--out", out, "--json", result
-    )
-    if ended.code:
-        return ""
-    shutil.rmtree(out)
-    read = json.loads(result.read_text(encoding="utf-8"))["rows"]
-    return "" if read == rows else f"{read} rows of {rows} are read"
+    found = imported(folder, file)
+    return "" if found is None or found[0]["rows"] == rows else f"{found[0]['rows']} rows of {rows} are read"
 
 
 def try_parquet(folder: Path, rng: random.Random) -> str:

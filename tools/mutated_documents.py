@@ -27,9 +27,11 @@ MODELS = {
     "hammerstein": ("--time", "t", "-o", "static=polynomial", "-o", "dynamics=lag"),
 }  # fmt: skip
 CALIBRATION = {
-    "format": "bench-calibration", "version": 1, "signal": "psd_position", "unit": "m", "reference": "a gauge",
-    "calibrated": "2026-01-05", "low": -4e-5, "high": 9e-5, "coefficients": [1e-7, 2e-7, -1e-8], "lateness": 0.01,
-    "uncertainty": 1e-8, "repeatability": 2e-8, "readings": 40, "run": "somewhere",
+    "format": "bench-calibration", "version": 2, "signal": "psd_position", "unit": "m", "serial_number": "",
+    "date": "2026-01-05", "interval_days": 365, "reference": "a gauge", "reference_unit": "m",
+    "reference_uncertainty": 1e-8, "low": -4e-5, "high": 9e-5, "coefficients": [1e-7, 2e-7],
+    "covariance": [[1e-18, 0.0], [0.0, 1e-18]], "degrees_of_freedom": 30, "lateness": 0.01, "repeatability": 2e-8,
+    "readings": 40, "run": "somewhere",
 }  # fmt: skip
 CALIBRATED = 'extends = "vo2"\n[derived.tip]\nkind = "calibrated"\nsource = "psd_position"\ncalibration = "c.json"\n'
 TUNING = {
@@ -37,9 +39,6 @@ TUNING = {
     "provenance": {"source": "a twin", "error": 1.5},
 }  # fmt: skip
 FAULTS = {"fault": [{"fault": "tec.delay", "at": 3.0, "duration": 2.0, "values": {"seconds": 0.1}}]}
-ENDPOINTS = {
-    "rigs": {"vo2": {"instruments": {"tec": {"port": "socket://127.0.0.1:5000"}}}}, "control": "tcp://127.0.0.1:5001",
-}  # fmt: skip
 
 
 def toml_of(document: dict[str, Any]) -> str:
