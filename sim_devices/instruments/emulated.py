@@ -1,4 +1,4 @@
-"""The common base of the emulated instruments: a role without a wire, and the faults of a line."""
+"""The common base of the emulated instruments: a role without a wire, and what holds for all of them."""
 
 from __future__ import annotations
 
@@ -66,24 +66,17 @@ class EmulatedDevice(Device):
         return 0.0 if self._normals is None else deviation * next(self._normals)
 
 
-class LineFaults:
-    """The line of an emulated instrument, which can be unplugged and disturbed."""
+class Pluggable:
+    """An emulated instrument that can be unplugged from its line."""
 
     world: World
 
     plugged_in = True
-    _corrupt_next = False
-    _drop_next = False
 
     @property
     def answering(self) -> bool:
         """Whether the instrument answers requests at the clock's present time."""
         return self.plugged_in
-
-    @property
-    def undisturbed(self) -> bool:
-        """Whether a request arrives, and its answer as it is."""
-        return self.plugged_in and not self._corrupt_next and not self._drop_next
 
     def attend(self) -> None:
         """Bring the instrument to the clock's present time: a request has arrived."""
@@ -98,29 +91,6 @@ class LineFaults:
         """Undo `unplug`."""
         with self.world.at_present():
             self.plugged_in = True
-
-    def corrupt_next_answer(self) -> None:
-        """Damage the next answer on the line; the instrument has acted all the same."""
-        self._corrupt_next = True
-
-    def drop_next_answer(self) -> None:
-        """Lose the next answer on the line; the instrument has acted all the same."""
-        self._drop_next = True
-
-    def transmit(self, answer: bytes) -> bytes:
-        """Return what the host receives of an answer, after the faults of the line."""
-        if answer and self._drop_next:
-            self._drop_next = False
-            return b""
-        if answer and self._corrupt_next:
-            self._corrupt_next = False
-            return self._corrupted(answer)
-        return answer
-
-    def _corrupted(self, answer: bytes) -> bytes:
-        """Flip one bit."""
-        middle = len(answer) // 2
-        return answer[:middle] + bytes((answer[middle] ^ 1,)) + answer[middle + 1 :]
 
 
 class FreezingReadings:
@@ -158,7 +128,7 @@ class FreezingReadings:
         """Forget what was kept of the readings; an instrument that keeps some overrides it."""
 
 
-class EmulatedInstrument(LineFaults, EmulatedDevice):
+class EmulatedInstrument(Pluggable, EmulatedDevice):
     """An emulated instrument with a line of its own."""
 
     @contextmanager

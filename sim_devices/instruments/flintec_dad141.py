@@ -45,7 +45,7 @@ import numpy as np
 
 from bench.base import DeferredModule, DeviceError
 from bench.devices import Identity, LoadCell
-from sim_devices.instruments.emulated import EmulatedDevice, LineFaults
+from sim_devices.instruments.emulated import EmulatedDevice, Pluggable
 from sim_devices.instruments.registers import Register, RegisterInstrument
 from sim_devices.wire.modbus import DEVICE_FAILURE, ILLEGAL_VALUE, Frame, Packet, RegisterError
 from sim_devices.world import World
@@ -133,7 +133,7 @@ class _SetUp:
     motion_time: int = 1000  # ms
 
 
-class EmulatedDAD141(LineFaults, EmulatedDevice, RegisterInstrument, LoadCell):
+class EmulatedDAD141(Pluggable, EmulatedDevice, RegisterInstrument, LoadCell):
     """A DAD 141.1 with its load cell: the role, called directly, and a bank of Modbus registers for the wire.
 
     Every access brings the world up to date first and holds its lock. The filter sees the force as often as

@@ -39,7 +39,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from bench.devices import Identity
-from sim_devices.instruments.emulated import LineFaults
+from sim_devices.instruments.emulated import Pluggable
 from sim_devices.instruments.registers import FrameParts, Register, RegisterInstrument
 from sim_devices.noise import normals
 from sim_devices.wire.modbus import DEVICE_FAILURE, ILLEGAL_ADDRESS, Packet, RegisterError
@@ -202,7 +202,7 @@ class _Input:
         self.scale = _SCALES[volts, resolution or _DEFAULT_INDEX]
 
 
-class EmulatedT7(LineFaults, RegisterInstrument):
+class EmulatedT7(Pluggable, RegisterInstrument):
     """A LabJack T7 as a bank of Modbus registers; a `Timed` instrument because of its watchdog.
 
     Every access first brings the world up to date and holds its lock. A burst lets the clock pass, as the
@@ -304,10 +304,6 @@ class EmulatedT7(LineFaults, RegisterInstrument):
     def identity(self) -> Identity:
         """Identity of the instrument."""
         return Identity("LabJack", "T7", str(self.serial_number), f"{self.firmware:.4f}")
-
-    def _corrupted(self, answer: bytes) -> bytes:
-        """Flip a bit of the transaction's number: Modbus TCP has no check of its own."""
-        return answer[:1] + bytes((answer[1] ^ 1,)) + answer[2:]
 
     # The outputs as the laboratory sees them.
 

@@ -420,10 +420,6 @@ class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
             self.plugged_in = True
             self.quiet_until = -math.inf
 
-    def _corrupted(self, answer: bytes) -> bytes:
-        """Cut the adapter's line in its middle."""
-        return answer[: len(answer) // 2] + b"\r"
-
     # Timed events.
 
     def deadline(self) -> float:

@@ -132,6 +132,5 @@ class TwinServer(WireServer):
             instrument.attend()
             self._received = rest if len(rest) <= _LONGEST else b""
             return b"".join(
-                instrument.transmit(instrument.obey(each.decode("ascii", "replace").strip()).encode() + END)
-                for each in requests
+                instrument.obey(each.decode("ascii", "replace").strip()).encode() + END for each in requests
             )

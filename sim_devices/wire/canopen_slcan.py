@@ -172,7 +172,7 @@ class CanopenSlcanServer(WireServer):
             if len(data) == 8 and device.state is not NodeState.STOPPED:
                 answer = self._node.answer(data)
                 if answer:
-                    return device.transmit(b"%s%s\r" % (self._answer_head, hexlify(answer).upper()))
+                    return b"%s%s\r" % (self._answer_head, hexlify(answer).upper())
         elif identifier == _SYNC:
             return _lines(*device.process_data(synchronous=True))
         elif identifier != _NMT:

@@ -331,10 +331,10 @@ def _fast_answer(present: Mapping[int, EmulatedMX28], reads: list[tuple[int, int
             error = refusal.reason
         # This form of answer has no stuffing.
         answer += bytes((error | _ALERT * servo.alert, number)) + content
-        answer = servo.transmit(answer + struct.pack("<H", crc16(answer)))
+        answer += struct.pack("<H", crc16(answer))
     return answer
 
 
 def _status(servo: EmulatedMX28, bus_id: int, error: int, content: bytes) -> bytes:
     flags = error | (_ALERT if servo.alert else 0)
-    return servo.transmit(frame(bus_id, Instruction.STATUS, bytes((flags,)) + content))
+    return frame(bus_id, Instruction.STATUS, bytes((flags,)) + content)

@@ -148,7 +148,7 @@ class MeComServer(WireServer):
             return b""
         answer = head + content
         # An acknowledge carries the CRC of its request.
-        return device.transmit(answer + (b"%04X\r" % crc_hqx(answer, 0) if content else crc + b"\r"))
+        return answer + (b"%04X\r" % crc_hqx(answer, 0) if content else crc + b"\r")
 
     def _act(self, request: bytes) -> bytes:
         """Carry a request out; return the payload of the answer, empty for an acknowledge."""

@@ -20,7 +20,7 @@ from functools import lru_cache
 from typing import NamedTuple
 
 from bench.base import crc16_modbus as crc16
-from sim_devices.instruments.emulated import LineFaults
+from sim_devices.instruments.emulated import Pluggable
 from sim_devices.wire import WireServer
 from sim_devices.wire.modbus import READS, Packet, RegisterBank, answer, prepare, refusal
 
@@ -80,7 +80,7 @@ class ModbusRtuServer(WireServer):
             raise ValueError(f"address: allowed are 1 to 247, got {address}")
         self._bank = bank
         self._address = address
-        self._line = bank if isinstance(bank, LineFaults) else None
+        self._line = bank if isinstance(bank, Pluggable) else None
         self._received = bytearray()
         # A host asks the same few again and again.
         self._known: dict[bytes, _Known] = {}
@@ -170,8 +170,7 @@ class ModbusRtuServer(WireServer):
         return b"" if address == BROADCAST else self._sealed(reply)
 
     def _sealed(self, reply: bytes) -> bytes:
-        sealed = reply + _crc_of_reply(reply)
-        return sealed if self._line is None else self._line.transmit(sealed)
+        return reply + _crc_of_reply(reply)
 
 
 def _length(received: bytes | memoryview) -> int | None:

@@ -77,4 +77,4 @@ class TextServer(WireServer):
         answer = self._instrument.obey(message.decode(self._encoding, "replace"))
         if answer is None:
             return b""
-        return self._instrument.transmit(answer.encode(self._encoding, "replace") + self._end_of_answer)
+        return answer.encode(self._encoding, "replace") + self._end_of_answer

@@ -60,7 +60,8 @@ def connected(kind, stack):
         instrument.write_parameter(2030, 3.0)
         instrument.write_parameter(2060, WATCHDOG)
         return Bench(clock=clock, device=instrument, instrument=instrument, plant=plant)
-    port, requests = serial_port(stack, MeComServer(instrument), clock)
+    server = MeComServer(instrument)
+    port, requests = serial_port(stack, server, clock)
     settings = MeerstetterTEC.Settings(
         port=port, temperature_limits=(10.0, 95.0), current_limit=3.0, voltage_limit=15.0, watchdog=WATCHDOG
     )
@@ -70,7 +71,10 @@ def connected(kind, stack):
 
     device = connect()
     stack.callback(device.close)
-    return Bench(clock=clock, device=device, instrument=instrument, plant=plant, connect=connect, requests=requests)
+    return Bench(
+        clock=clock, device=device, instrument=instrument, plant=plant,
+        connect=connect, requests=requests, server=server,
+    )  # fmt: skip
 
 
 class OnAPlate(OnABench):

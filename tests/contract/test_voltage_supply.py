@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from cases import cases
 from emulated_bench import Bench, OnABench, OnALine, serial_port, tcp_port
+from faulty_line import halved, lost, spoil_next_answer
 from hypothesis import given, strategies as st
 
 from bench.base import DeviceError, VirtualClock
@@ -509,14 +510,14 @@ def test_rescue_of_a_voltage_that_a_dead_host_left(bench):
 
 
 @over_the_wire
-@pytest.mark.parametrize("fault", ["corrupt_next_answer", "drop_next_answer"])
+@pytest.mark.parametrize("fault", [halved, lost])
 def test_spoilt_answer_is_asked_for_again(bench, output, fault):
     def set_and_wait():
         bench.device.set(5.0).wait()
 
     bench.device.set(6.0)
     for call in (bench.device.measure, set_and_wait, bench.device.safe):
-        getattr(bench.instrument, fault)()
+        spoil_next_answer(bench.server.server, fault)
         call()
     assert bench.plant.voltage == 0.0
 
@@ -534,7 +535,7 @@ def test_command_that_was_lost_until_the_watchdog_expired_does_not_resume(bench,
 SUPPLY_CALLS = st.one_of(
     st.tuples(st.just("set"), st.sampled_from([0.0, 3.0, 6.0, 12.0])),
     st.tuples(st.just("sleep"), st.sampled_from([0.05, 0.5, 0.9, 0.995, 0.999, 1.0, 1.5, 100.0])),
-    st.tuples(st.sampled_from(["drop_next_answer", "corrupt_next_answer"]), st.none()),
+    st.tuples(st.sampled_from([lost, halved]), st.none()),
     st.tuples(st.sampled_from(["measure", "glance", "safe", "release", "emergency_stop"]), st.none()),
     st.tuples(st.sampled_from(["connect", "recover"]), st.none()),
 )
@@ -560,8 +561,8 @@ def test_power_that_was_dropped_never_comes_back(calls):
                     stack.callback(supply.close)
                 elif call == "set":
                     supply.set(value)
-                elif call in ("drop_next_answer", "corrupt_next_answer"):
-                    getattr(bench.instrument, call)()
+                elif call in (lost, halved):
+                    spoil_next_answer(bench.server.server, call)
                 else:
                     getattr(supply, call)()
             bench.instrument.world.advance()

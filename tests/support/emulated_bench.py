@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import pytest
+from faulty_line import damaged, lost, spoil_next_answer
 
 from bench.base import VirtualClock
 from bench.devices import Device
@@ -155,9 +156,9 @@ class OnATorque:
 class Spoilt(OnABench):
     """The fixture that spoils the next answer by a `fault`, over the wire."""
 
-    @pytest.fixture(params=["corrupt_next_answer", "drop_next_answer"])
+    @pytest.fixture(params=[damaged, lost])
     def spoil(self, bench, request):
-        return getattr(bench.instrument, request.param)
+        return lambda: spoil_next_answer(bench.server, request.param)
 
 
 def check_reproducible(record):

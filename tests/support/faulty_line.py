@@ -87,6 +87,34 @@ class FaultyLine(WireServer):
         return min([self.server.next_unsolicited(), *(instant for instant, _ in self._due[:1])])
 
 
+def lost(answer):
+    return b""
+
+
+def damaged(answer):
+    """Return an answer with a wrong bit in its middle."""
+    middle = len(answer) // 2
+    return answer[:middle] + bytes((answer[middle] ^ 1,)) + answer[middle + 1 :]
+
+
+def halved(answer):
+    """Return the first half of a line."""
+    return answer[: len(answer) // 2] + b"\r"
+
+
+def spoil_next_answer(server, spoilt):
+    """Have the next answer of a server, and none after it, be what `spoilt` makes of it."""
+    waiting = vars(server).setdefault("spoilt", [])
+    waiting.append(spoilt)
+
+    def receive(data):
+        sent = type(server).receive(server, data)
+        begin = server.answer_begins(sent)
+        return sent[:begin] + waiting.pop(0)(sent[begin:]) if waiting and sent[begin:] else sent
+
+    server.receive = receive
+
+
 class InPieces(WireServer):
     """Passes requests on; each answer comes in two pieces with a pause between them.
 

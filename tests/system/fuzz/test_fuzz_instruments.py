@@ -4,6 +4,7 @@ import random
 
 import pytest
 from dialects import MalformedError
+from faulty_line import damaged
 from fuzz_instruments import SMA, TARGETS, FailedError, fuzz, make, make_bench_supply, mutated
 
 from bench.base import VirtualClock
@@ -12,6 +13,7 @@ from rigs.vo2.laboratory import VO2Laboratory
 from sim_devices.instruments.flintec_dad141 import EmulatedDAD141
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC
 from sim_devices.wire.canopen_slcan import CanopenSlcanServer
+from sim_devices.wire.mecom import MeComServer
 
 
 @pytest.mark.parametrize("name", TARGETS)
@@ -71,7 +73,8 @@ def test_a_failure_that_a_server_hides_is_noticed(monkeypatch):
 
 
 def test_a_damaged_answer_is_noticed(monkeypatch):
-    monkeypatch.setattr(EmulatedTEC, "transmit", EmulatedTEC._corrupted)
+    receive = MeComServer.receive
+    monkeypatch.setattr(MeComServer, "receive", lambda *given: (sent := receive(*given)) and damaged(sent))
     with pytest.raises(MalformedError):
         fuzz("vo2/tec", 200, seed=0)
 

@@ -164,8 +164,8 @@ class TestReconnection:
         assert station.clock.now() == since
 
     def test_requests_that_were_repeated_are_counted_at_the_end(self, vo2):
-        station, tec, rig = vo2()
-        tec.drop_next_answer()
+        station, _, rig = vo2()
+        rig.laboratory.inject("tec.drop")
         station.look(Look.GLANCE)
         assert rig.devices["tec"].repeats == 1
         assert station.news() == []

@@ -631,7 +631,7 @@ def test_a_wait_is_no_communication():
     assert t7.watchdog_expired
 
 
-def test_disturbed_lines():
+def test_unplugged_lines():
     t7 = make()
     stream = ModbusTcpStream(t7)
     request = frame("0101 0000 0006 01 03 d73c 0002")
@@ -639,9 +639,4 @@ def test_disturbed_lines():
     t7.unplug()
     assert stream.receive(request) == b""
     t7.plug_in()
-    assert stream.receive(request) == reply
-    t7.drop_next_answer()
-    assert stream.receive(request) == b""
-    t7.corrupt_next_answer()
-    assert stream.receive(request) == b"\x01\x00" + reply[2:]
     assert stream.receive(request) == reply
