@@ -8,6 +8,7 @@ import pytest
 from cases import cases
 from emulated_bench import Bench, Given, OnABench, check_reproducible, tcp_port
 from modbus_tcp import ModbusTcpServer
+from two_current_psd import TwoCurrentPSD
 
 from bench.base import DeviceError, VirtualClock
 from bench.contracts import PositionSensorContract
@@ -15,7 +16,7 @@ from drivers.labjack_t7 import T7PositionSensor
 from sim_devices.instruments.labjack_t7 import EmulatedT7
 from sim_devices.transducers.displacement import DisplacementSensor
 from sim_devices.transducers.magnet import RatiometricSensor
-from sim_devices.transducers.photodetector import NormalisedPSD, TwoCurrentPSD
+from sim_devices.transducers.photodetector import NormalisedPSD
 from sim_devices.world import World
 
 
@@ -95,7 +96,7 @@ def connected(kind, readout, stack, seed=1):
         def spoil():
             transducer.supply_volts = 0.3
     else:
-        transducer = TwoCurrentPSD(lambda: stage.value, rng=streams[0])
+        transducer = TwoCurrentPSD(lambda: stage.value, streams[0])
         inputs = {2: transducer.first, 3: transducer.second}
 
         def spoil():

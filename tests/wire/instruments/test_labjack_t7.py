@@ -17,7 +17,6 @@ from sim_devices.instruments.labjack_t7 import DAC_STEP, RAIL, EmulatedT7
 from sim_devices.plants import _voltage_course_kernels as course_kernels
 from sim_devices.transducers.displacement import DisplacementSensor
 from sim_devices.transducers.magnet import RatiometricSensor
-from sim_devices.transducers.photodetector import TwoCurrentPSD
 from sim_devices.transducers.piezo_amplifier import PiezoAmplifier
 from sim_devices.wire.modbus import RegisterError, answer
 from sim_devices.wire.modbus_tcp import FramingError, ModbusTcpInstrument, ModbusTcpStream
@@ -319,21 +318,6 @@ def test_watchdog_is_set_up_while_disabled_only(t7):
 
 
 # The transducers
-
-
-def test_two_current_psd():
-    deflection = 0.0
-    psd = TwoCurrentPSD(lambda: deflection, noise_volts=0.0, rng=np.random.default_rng(2))
-    for deflection in (-50e-6, 0.0, 70e-6):
-        first, second = psd.first(), psd.second()
-        assert first + second == pytest.approx(8.0)
-        spot = 0.037 / 2 * (second - first) / (first + second)
-        assert spot / 185.0 == pytest.approx(deflection, abs=1e-12)
-    deflection = 101e-6
-    assert psd.first() == psd.second() == 0.0
-    deflection = 0.0
-    psd.light = 0.25
-    assert psd.first() + psd.second() == pytest.approx(2.0)
 
 
 @cases(
