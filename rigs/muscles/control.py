@@ -316,7 +316,7 @@ class MuscleClosedLoop(_Modelled):
         elif error * self._error < 0.0 and abs(error) > max(_OVERSHOOT * abs(self._error), noise):
             self._part = max(_LEAST_PART, 0.5 * self._part)
         self._error = error
-        return lag.lead(self._clip(present + self._part * move), self._parameters.horizon, self.limits)[0]
+        return lag.lead(self._clip(present + self._part * move), self._parameters.horizon, self.limits)
 
 
 @dataclass(frozen=True)

@@ -60,36 +60,30 @@ class Lag:
             return self
         return Lag(self.time_constant, final + (self.level - final) * self._remains(duration), self.power)
 
-    def lead(self, target: float, horizon: float, limits: tuple[float, float]) -> tuple[float, bool]:
-        """Return the constant voltage that leads to a target within a time, and whether it had to be clipped.
+    def lead(self, target: float, horizon: float, limits: tuple[float, float]) -> float:
+        """Return the constant voltage that leads to a target within a time, as far as the limits allow.
 
         Parameters
         ----------
         target : float
             Wanted `voltage` at the end, V, at least 0.
         horizon : float
-            Time until then, s; the voltage exceeds its steady value the more, the shorter it is.
+            Time until then, s, > 0; the voltage exceeds its steady value the more, the shorter it is.
         limits : tuple of float
             Least and greatest voltage, V, at least 0.
 
         Raises
         ------
         ValueError
-            If the target is negative, the horizon not positive, the limits are not in order or negative, or a
-            number is not finite.
+            If the target is negative or not finite.
         """
         if not 0.0 <= target < math.inf:
             raise ValueError(f"target: expected a finite number of V, at least 0, got {target}")
-        if not 0.0 < horizon < math.inf:
-            raise ValueError(f"horizon: expected a positive number of s, got {horizon}")
         low, high = limits
-        if not 0.0 <= low <= high < math.inf:
-            raise ValueError(f"limits: expected two finite numbers of V, at least 0 and in order, got {limits}")
         wanted = self.level + (target**self.power - self.level) / (1.0 - self._remains(horizon))
-        clipped = min(max(wanted, low**self.power), high**self.power)
-        if clipped != wanted:
-            return (low if wanted < clipped else high), True
-        return float(wanted ** (1.0 / self.power)), False
+        if wanted < low**self.power:
+            return low
+        return high if wanted > high**self.power else float(wanted ** (1.0 / self.power))
 
     def _remains(self, duration: float) -> float:
         return math.exp(-duration / self.time_constant) if self.time_constant else 0.0

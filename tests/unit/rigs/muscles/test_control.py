@@ -211,10 +211,9 @@ def test_lag_does_not_depend_on_how_time_is_split(level, time_constant, voltage,
 @given(st.floats(0.0, 9.0), st.floats(0.5, 20.0), st.floats(0.0, 3.0), st.floats(0.2, 20.0))
 def test_lead_meets_its_target_unless_clipped(level, time_constant, target, horizon):
     lag = Lag(time_constant, level)
-    voltage, clipped = lag.lead(target, horizon, LIMITS)
+    voltage = lag.lead(target, horizon, LIMITS)
     arrived = lag.advance(horizon, voltage).voltage
-    if clipped:
-        assert voltage in LIMITS
+    if voltage in LIMITS:
         # It falls short of the target, on the side where it comes from.
         assert (arrived - target) * (lag.voltage - target) >= -1e-12
     else:
@@ -457,9 +456,6 @@ def test_lasts_its_time_and_then_holds(inverse, name):
         (lambda: Lag(5.0).advance(-1.0, 1.0), "duration: expected a finite number"),
         (lambda: Lag(5.0).advance(1.0, math.nan), "voltage: expected a finite"),
         (lambda: Lag(5.0).lead(-1.0, 2.0, LIMITS), "target: expected a finite number of V"),
-        (lambda: Lag(5.0).lead(1.0, 0.0, LIMITS), "horizon: expected a positive"),
-        (lambda: Lag(5.0).lead(1.0, 2.0, (3.0, 0.0)), "limits: expected two finite"),
-        (lambda: Lag(5.0).lead(1.0, 2.0, (-1.0, 3.0)), "limits: expected two finite"),
         (lambda: InverseControlParameters(5.0, 1.0, 0.0), "horizon: expected a positive"),
         (lambda: InverseControlParameters(5.0, 1.0, 2.0, duration=math.inf), "duration: expected a positive"),
         (lambda: InverseControlParameters(5.0, 1.0, 2.0, 3.0), "power: expected 1 or 2"),
