@@ -23,6 +23,8 @@ class OpenedJournal:
     ----------
     path : Path
         The file.
+    first_page : bytes, optional
+        What is read in the place of its first page, which is lost.
 
     Attributes
     ----------
@@ -39,12 +41,14 @@ class OpenedJournal:
         If it cannot be opened.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, first_page: bytes = b"") -> None:
         self.path = path
         self.remark = ""
         self._copy: tempfile.TemporaryDirectory[str] | None = None
         try:
-            if os.access(path.parent, os.W_OK):
+            if first_page:
+                self.db = self._copied("has lost its first page", first_page)
+            elif os.access(path.parent, os.W_OK):
                 try:
                     # Reading a WAL file may need its companions; mode=ro keeps us from changing the record itself.
                     self.db = _connected(path, "mode=ro")
@@ -87,11 +91,13 @@ class OpenedJournal:
             f"`bench runs repair {self.path}` writes a copy with all rows, and bench resume takes them in"
         )
 
-    def _copied(self, why: str) -> sqlite3.Connection:
+    def _copied(self, why: str, first_page: bytes = b"") -> sqlite3.Connection:
         self._copy = tempfile.TemporaryDirectory(prefix="bench-journal-")
         copy = Path(self._copy.name) / self.path.name
         for each in (self.path, *_companions(self.path)):
             shutil.copyfile(each, copy.with_name(each.name))
+        with copy.open("r+b") as file:
+            file.write(first_page)
         self.remark = f"{self.path} {why}: it is read from a copy, {copy}"
         return _connected(copy, "mode=rw")
 

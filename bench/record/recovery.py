@@ -29,7 +29,7 @@ from bench.record.rows import (
     table_definitions,
 )
 from bench.record.second_file import NAME as SECOND_NAME, read_second_file, second_files
-from bench.record.store import copied_heading, copy_heading, insert
+from bench.record.store import copied_heading, copy_heading, first_page, insert
 from bench.record.write_ahead_log import log_damage
 
 _KEYS = {"meta": "key", "signals": "position", "files": "rowid", **NUMBERS}
@@ -261,17 +261,30 @@ def _opened(journal: Path) -> tuple[OpenedJournal | None, str]:
     """Open a journal; return also what is wrong with it by SQLite's own check and its write-ahead log, or nothing."""
     if not journal.is_file():
         return None, "it is not there"
+    lost = ""
     try:
         opened = OpenedJournal(journal)
     except DataError as error:
-        return None, str(error.__cause__ or error)
+        lost = str(error.__cause__ or error)
+        try:
+            opened = _opened_without_first_page(journal)
+        except (DataError, sqlite3.DatabaseError):
+            return None, lost
     # A text that is damaged is one whose checksum does not fit.
     opened.db.text_factory = lambda content: content.decode("utf-8", "replace")
     try:
         found = str(opened.db.execute("PRAGMA quick_check(1)").fetchone()[0]).replace("\n", " ")
     except sqlite3.DatabaseError as error:
         found = str(error)
-    return opened, ("" if found == "ok" else found) or log_damage(journal.with_name(f"{journal.name}-wal"))
+    found = "" if found == "ok" else found
+    return opened, lost or found or log_damage(journal.with_name(f"{journal.name}-wal"))
+
+
+def _opened_without_first_page(journal: Path) -> OpenedJournal:
+    size = journal.stat().st_size
+    with closing(OpenedJournal(journal, first_page([], size))) as opened:
+        names = opened.db.execute("SELECT name FROM signals ORDER BY position").fetchall()
+    return OpenedJournal(journal, first_page([name for (name,) in names], size))
 
 
 def _identity(heading: Mapping[tuple[str, Any], Row], seconds: Sequence[Path]) -> str:

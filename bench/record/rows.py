@@ -36,6 +36,7 @@ _TABLES = (
     "events (event INTEGER PRIMARY KEY, t REAL NOT NULL, level TEXT NOT NULL, kind TEXT NOT NULL, "
     "text TEXT NOT NULL, checksum INTEGER NOT NULL)",
     "files (name TEXT PRIMARY KEY, sha256 TEXT NOT NULL, content BLOB NOT NULL)",
+    "heading (line BLOB NOT NULL)",
 )
 
 TABLES = ("meta", "signals", "steps", "telemetry", "events", "files")

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import sqlite3
+import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager, suppress
 from itertools import groupby
 from pathlib import Path
 
-from bench.record.rows import HEADING, TABLES, Row, is_good, sealed, table_definitions
+from bench.record.rows import FILE_NAME, HEADING, TABLES, Row, is_good, sealed, table_definitions
 from bench.record.second_file import decoded, encoded
 
 OTHERS = 5.0
@@ -132,7 +133,6 @@ class Store:
         """Close the file, as one that can be read where nothing can be written."""
         # Out of WAL mode, as a reader of a WAL file leaves companions beside it; while one reads, it cannot be.
         with suppress(sqlite3.Error):
-            self._db.execute("PRAGMA busy_timeout=0")
             self._db.execute("PRAGMA journal_mode=DELETE")
         self._db.close()
 
@@ -150,10 +150,24 @@ def copy_heading(db: sqlite3.Connection) -> None:
     rows = [(table, row) for table in HEADING for row in db.execute(f"SELECT * FROM {table}")]  # noqa: S608 - own names
     # The copy that is there is better than one of a damaged row.
     if all(is_good(table, row) for table, row in rows):
-        db.execute("CREATE TABLE IF NOT EXISTS heading (line BLOB NOT NULL)")
         db.execute("DELETE FROM heading")
         lines = [(encoded(Row(table, row[:-1])),) for table, row in rows]
         db.executemany("INSERT INTO heading VALUES (?)", lines)
+
+
+def first_page(signals: Sequence[str], size: int) -> bytes:
+    """Return the first page of a journal of so many bytes: what is where follows from the number of its signals.
+
+    The tables are made in one order, before any row, and SQLite never moves where one begins
+    (https://sqlite.org/fileformat2.html, section 1).
+    """
+    with tempfile.TemporaryDirectory(prefix="bench-journal-") as folder:
+        path = Path(folder) / FILE_NAME
+        with closing(Store(path)) as store:
+            store.create(signals, [])
+        content = path.read_bytes()
+    page = int.from_bytes(content[16:18], "big")
+    return content[:28] + (size // page).to_bytes(4, "big") + content[32:page]
 
 
 def copied_heading(db: sqlite3.Connection) -> list[Row]:

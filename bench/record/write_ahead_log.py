@@ -30,37 +30,26 @@ def log_damage(log: Path) -> str:
             rest_is_empty = not any(any(block) for block in iter(lambda: file.read(1 << 16), b""))
             if rest_is_empty:
                 return ""
-            if len(header) < _HEADER or not _is_header(header):
+            magic, page = struct.unpack(">I4xI", header[:12])
+            order = ">" if magic & 1 else "<"
+            if magic & ~1 != _MAGIC or _chained((0, 0), header[:_SUMMED], order) != _sums(header[_SUMMED:]):
                 return "the header of its write-ahead log is damaged"
-            page = int.from_bytes(header[8:12], "big")
             file.seek(_HEADER)
-            return _damaged_frame(header, iter(lambda: file.read(_FRAME + page), b""), page, _order_of(header))
+            return _damaged_frame(header, iter(lambda: file.read(_FRAME + page), b""), page, order)
     except FileNotFoundError:
         return ""
-
-
-def _is_header(header: bytes) -> bool:
-    magic = int.from_bytes(header[:4], "big")
-    page = int.from_bytes(header[8:12], "big")
-    if magic & ~1 != _MAGIC or not 512 <= page <= 65536 or page & (page - 1):
-        return False
-    return _chained((0, 0), header[:_SUMMED], _order_of(header)) == struct.unpack(">II", header[_SUMMED:])
-
-
-def _order_of(header: bytes) -> str:
-    return ">" if header[3] & 1 else "<"
 
 
 def _damaged_frame(header: bytes, frames: Iterator[bytes], page: int, order: str) -> str:
     """Return which frame does not fit although it belongs to the log."""
     salts = header[16:24]
-    before: tuple[int, int] = struct.unpack(">II", header[24:32])
+    before = _sums(header[_SUMMED:])
     number, damaged = 0, 0
     for frame in frames:
         number += 1
         if not damaged and len(frame) == _FRAME + page and frame[8:16] == salts:
             found = _chained(_chained(before, frame[:8], order), frame[_FRAME:], order)
-            if found == struct.unpack(">II", frame[16:24]):
+            if found == _sums(frame[16:_FRAME]):
                 before = found
                 continue
         damaged = damaged or number
@@ -73,6 +62,11 @@ def _damaged_frame(header: bytes, frames: Iterator[bytes], page: int, order: str
 def _is_commit(head: bytes, salts: bytes) -> bool:
     """Return whether a frame ends a commit of this round of the log; each round has new salts."""
     return any(head[4:8]) and (head[8:12] == salts[:4] or head[12:16] == salts[4:])
+
+
+def _sums(content: bytes) -> tuple[int, int]:
+    first, second = struct.unpack(">II", content)
+    return first, second
 
 
 def _chained(before: tuple[int, int], content: bytes, order: str) -> tuple[int, int]:

@@ -83,8 +83,8 @@ class TestAnOverwrittenPage:
         assert code == 2
         assert "exists already" in err
 
-    @pytest.mark.parametrize("table", ["meta", "signals", "heading"])
-    def test_that_has_the_heading_takes_nothing_as_there_is_a_copy_of_it(self, bench, completed, folder, table):
+    @pytest.mark.parametrize("table", ["meta", "signals", "heading", "the first page"])
+    def test_that_has_the_heading_or_is_the_first_takes_nothing(self, bench, completed, folder, table):
         overwrite(folder, table)
         code, out, err = bench("runs", "repair", folder)
         assert (code, err) == (0, "")
@@ -108,10 +108,10 @@ class TestAnOverwrittenPage:
         assert not (folder / RECOVERED_NAME).exists()
 
     def test_takes_the_rows_on_it_alone_wherever_it_is(self, completed, folder):
-        """Whichever page but the first two are overwritten: all rows of other tables are read again."""
+        """Whichever two pages are overwritten: all rows of other tables are read again."""
         whole = (folder / FILE_NAME).read_bytes()
         tables = ("steps", "telemetry", "events", "files")
-        for first in range(1, len(whole) // 4096 - 1):
+        for first in range(len(whole) // 4096 - 1):
             damaged = bytearray(whole)
             damaged[4096 * first : 4096 * (first + 2)] = b"\xa5" * 8192
             (folder / FILE_NAME).write_bytes(damaged)
@@ -123,8 +123,9 @@ class TestAnOverwrittenPage:
                     assert mine == theirs, (first, table)
             assert len([table for table in found.tables.values() if table.missing]) <= 2
 
-    def test_that_is_the_first_leaves_nothing_and_says_so(self, bench, folder):
-        overwrite(folder, None)
+    def test_that_is_the_first_with_that_of_the_signals_leaves_nothing_and_says_so(self, bench, folder):
+        for table in ("signals", "the first page"):
+            overwrite(folder, table)
         code, _, err = bench("runs", "repair", folder)
         assert code == 3
         assert "nothing of it is readable by SQLite: file is not a database" in err

@@ -401,6 +401,13 @@ class TestSlowDisk:
         with Record(tmp_path) as run:
             np.testing.assert_array_equal(run.telemetry()["force"], np.arange(1000))
 
+    def test_a_single_tick_waits_for_no_other_row(self, tmp_path, monkeypatch):
+        written, write = threading.Event(), Store.write
+        monkeypatch.setattr(Store, "write", lambda store, rows: (write(store, rows), written.set()))
+        with closing(new_journal(tmp_path, 60.0)) as journal:
+            journal.telemetry(0.0, 0, (1.0, 2.0))
+            assert written.wait(60.0)
+
     def test_a_disk_that_does_not_answer_ends_the_run(self, gate, tmp_path, monkeypatch):
         monkeypatch.setattr(keeping, "_LAST_WAIT", 0.05)
         before = {*threading.enumerate()}

@@ -193,11 +193,7 @@ def test_a_journal_with_bytes_that_are_no_text_is_a_message(tmp_path, change):
         path.write_bytes(path.read_bytes().replace(b"CREATE TABLE telemetry", b"CREATE TABLE \xdf\xdf\xdfemetry"))
     with pytest.raises(DataError, match=r"not a readable journal|damaged"), Record(tmp_path) as record:
         record.telemetry()
-    if change.startswith("UPDATE"):
-        assert recover(tmp_path).is_complete
-        return
-    with pytest.raises(DataError, match="nothing of it is readable"):
-        recover(tmp_path)
+    assert recover(tmp_path).is_complete
 
 
 @pytest.mark.parametrize("table", ["steps", "telemetry", "events"])

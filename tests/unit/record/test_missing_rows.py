@@ -9,6 +9,7 @@ import warnings
 from contextlib import closing, suppress
 
 import pytest
+from cases import cases
 from written_run import META, SIGNALS, write_run
 
 from bench.base import DataError, IncompleteRecordWarning
@@ -91,6 +92,13 @@ def test_one_bit_of_the_log_at_any_place_is_noticed(killed, tmp_path):
         # Of the first frames are the tables themselves.
         with suppress(DataError):
             assert missing(copy), number
+
+
+@cases("byte", [8, 12])
+def test_a_damaged_salt_of_the_last_commit_is_noticed(killed, tmp_path, byte):
+    copy = shutil.copytree(killed, tmp_path / "run")
+    flip(copy / LOG_NAME, 8 * (32 + (used(killed / LOG_NAME) // FRAME - 1) * FRAME + byte))
+    assert "write-ahead log is damaged" in missing(copy).damage
 
 
 def test_what_is_missing_is_named(folder):
