@@ -56,10 +56,10 @@ def safe(
     confirmed its safe state when the command was ended, or at the limit.
     """
     from bench.base import Interrupts
-    from bench.rig import UNANSWERED, opened, rescue
+    from bench.rig import UNANSWERED, load_rig, opened, rescue
 
-    replaced = parse_assignments("--override", overrides or [])
-    with opened(rig, replaced, attach, "bench safe", warn if force else None) as place, Interrupts() as interrupts:
+    file = load_rig(rig, parse_assignments("--override", overrides or []))
+    with opened(file, attach, "bench safe", warn if force else None) as place, Interrupts() as interrupts:
 
         def is_ended() -> bool:
             return interrupts.pause_requested or interrupts.abort_requested()
@@ -104,9 +104,10 @@ def clear(
     Exit codes: 0 every device is ready; 2 the rig file is wrong or does not fit an instrument, or the rig is in use;
     4 a device is still in error, or cannot be reached; 130 not confirmed.
     """
-    from bench.rig import Condition, look, opened, recover
+    from bench.rig import Condition, load_rig, look, opened, recover
 
-    with opened(rig, parse_assignments("--override", overrides or []), attach, "bench rig clear") as place:
+    file = load_rig(rig, parse_assignments("--override", overrides or []))
+    with opened(file, attach, "bench rig clear") as place:
         entries = place.only(device)
         found: dict[str, Condition] = {entry.name: look(place, entry) for entry in entries}
         _print_conditions(list(found.values()))
@@ -164,14 +165,14 @@ def check(
     end. The highest counts.
     """
     from bench.base import Interrupts
-    from bench.rig import check_up, opened
+    from bench.rig import check_up, load_rig, opened
 
     def keep_on() -> None:
         if interrupts.pause_requested or interrupts.abort_requested():
             raise AbortError("the check-up was ended; every device was brought into its safe state")
 
-    replaced = parse_assignments("--override", overrides or [])
-    with Interrupts() as interrupts, opened(rig, replaced, attach, "bench rig check") as place:
+    file = load_rig(rig, parse_assignments("--override", overrides or []))
+    with Interrupts() as interrupts, opened(file, attach, "bench rig check") as place:
         place.clock.interrupted = lambda: interrupts.pause_requested or interrupts.abort_requested()
         checks = check_up(place, exercise, keep_on)
         name = place.file.name

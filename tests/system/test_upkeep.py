@@ -20,9 +20,10 @@ pytestmark = pytest.mark.usefixtures("warm_popen")
 CLIENT = """
 import sys
 from pathlib import Path
-from bench.rig import opened
+from bench.rig import load_rig, opened
 rig, file, *settings = sys.argv[1:]
-with opened(rig, {"devices.tec.watchdog": "300"} if rig in ("vo2", "hybrid") else {}, Path(file), "a run") as place:
+overrides = {"devices.tec.watchdog": "300"} if rig in ("vo2", "hybrid") else {}
+with opened(load_rig(rig, overrides), Path(file), "a run") as place:
     values = dict(setting.split("=") for setting in settings)
     devices = []
     for entry in place.entries:

@@ -10,7 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from bench.base import Clock, Stopwatch, WallClock
+from bench.base import Clock, ConfigurationError, Stopwatch, WallClock
 from bench.execution.guardian.channel import Channel, ChannelError, Message, to_message
 from bench.execution.guardian.process import Guardian
 from bench.execution.guardian.rescuer import Rescuer
@@ -34,6 +34,8 @@ def _open(hello: Message, stack: ExitStack) -> tuple[Rig, Rescuer]:
         If a device cannot be connected.
     """
     file = load_rig(hello["rig"], hello["overrides"])
+    if repr(file.content) != hello["content"]:
+        raise ConfigurationError(f"{file.path} was changed while the run was prepared; start the run again")
     clock: Clock
     locks = stack.enter_context(Locks(Holder.of_this_process(file.name, hello["doing"], hello["process"])))
     if hello["attach"] is not None:

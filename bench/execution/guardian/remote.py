@@ -124,6 +124,7 @@ class RemoteStation(Station):
                 _OPENING,
                 rig=guarded.rig,
                 overrides=dict(guarded.overrides),
+                content=repr(guarded.file.content),
                 attach=None if guarded.attach is None else str(guarded.attach),
                 seed=guarded.seed,
                 doing=guarded.doing,

@@ -149,8 +149,8 @@ def main() -> int:
     content = parse_json(pipe.readline())
     guardian = ParentProcess(content["guardian"])
     report = Report(Path(content["report"]))
-    # The drivers as well: nothing has to be loaded any more when it counts.
-    names = [entry.name for entry in load_rig(content["rig"], content["overrides"]).devices]
+    # The drivers as well: nothing has to be loaded any more when it counts, and the file may be edited meanwhile.
+    file = load_rig(content["rig"], content["overrides"])
     signs: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     threading.Thread(target=_read, args=(pipe, signs), daemon=True).start()
     report.write({})
@@ -163,14 +163,12 @@ def main() -> int:
     guardian.await_end(_DIES)
     attach = None if content["attach"] is None else Path(content["attach"])
     try:
-        with opened(
-            content["rig"], content["overrides"], attach, "making safe without its guardian", _go_on
-        ) as place:
+        with opened(file, attach, "making safe without its guardian", _go_on) as place:
             for seconds, found in rescue(place, limit=TRY_FOR):
                 if seconds >= _REPORT_AFTER or all(each.is_safe for each in found):
                     report.write({each.device: _state(each) for each in found})
     except BenchError as error:
-        report.write(dict.fromkeys(names, str(error)))
+        report.write(dict.fromkeys((entry.name for entry in file.devices), str(error)))
     return 0
 
 

@@ -103,7 +103,7 @@ def resume(asked: Resume, console: Console, interrupts: Interrupts | None = None
         scratch = tempfile.TemporaryDirectory(prefix="bench-resume-", ignore_cleanup_errors=True)
         run = _run_of(asked, meta, files, Path(stack.enter_context(scratch)).resolve())
         if asked.attach is not None or run.original is None or run.original.rig is None:
-            with opened(run.rig, run.overrides, asked.attach, "bench resume") as place:
+            with opened(load_rig(run.rig, run.overrides), asked.attach, "bench resume") as place:
                 for name, meaning in clear_expired_watchdogs(place).items():
                     print_plain(console, f"{name}: cleared: {meaning}")
         result = carry_out(run, console, interrupts, again)

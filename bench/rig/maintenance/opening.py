@@ -10,7 +10,7 @@ from pathlib import Path
 from bench.base import Clock, ConfigurationError, make_clock
 from bench.devices import Device
 from bench.rig.attachment import attach
-from bench.rig.file import DeviceEntry, RigFile, load_rig
+from bench.rig.file import DeviceEntry, RigFile
 from bench.rig.maintenance.locks import EMULATED, Holder, Locks, line_names, port_of
 
 _IN_PROCESS = "in this process"
@@ -64,20 +64,17 @@ class Workplace:
 
 @contextmanager
 def opened(
-    rig: str,
-    overrides: Mapping[str, str],
+    file: RigFile,
     endpoints: Path | None,
     doing: str,
     report_use: Callable[[str], None] | None = None,
 ) -> Iterator[Workplace]:
-    """Read a rig file, and hold the lines of its devices until the block is left.
+    """Hold the lines of the devices of a rig until the block is left.
 
     Parameters
     ----------
-    rig : str
-        Name of a packaged rig, or path of a rig file.
-    overrides : mapping of str to str
-        Values of the rig file to replace, by dotted key.
+    file : RigFile
+        The rig.
     endpoints : Path, optional
         Endpoints file of `bench rig emulate`, for the instruments that are served there.
     doing : str
@@ -88,9 +85,8 @@ def opened(
     Raises
     ------
     ConfigurationError
-        If the rig file is wrong, or another process holds one of the lines.
+        If another process holds one of the lines, or the rig cannot be served.
     """
-    file = load_rig(rig, overrides)
     with ExitStack() as stack:
         ports: Mapping[str, str] = {}
         clock: Clock

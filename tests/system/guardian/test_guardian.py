@@ -22,12 +22,12 @@ from bench.base import (
     LimitError,
     VirtualClock,
 )
+from bench.execution.guardian.remote import GuardedRig, RemoteStation
 from bench.rig import Look, Rig, load_rig
 
 pytestmark = [
     pytest.mark.usefixtures("warm_popen"),
     pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="signals of POSIX"),
-    pytest.mark.timeout(240),
 ]
 
 SAFE = {"tec": "safe", "psd": "safe"}
@@ -122,6 +122,14 @@ class TestRequests:
         wrong = {"devices__tec__port": "emulated://nothing"}
         with pytest.raises(ConfigurationError, match=r"devices\.tec\.port"), connected(vo2, **wrong):
             pass
+
+    def test_a_rig_file_that_was_edited_since_the_bench_read_it_is_refused(self, vo2, tmp_path):
+        path = tmp_path / "vo2.toml"
+        path.write_text('extends = "vo2"\n')
+        guarded = GuardedRig(load_rig(str(path)), str(path), {}, vo2.endpoints_file, 0, "a test")
+        path.write_text('extends = "vo2"\n[safety]\nrate = 4.0\n')
+        with pytest.raises(ConfigurationError, match="was changed while the run was prepared"):
+            RemoteStation(guarded, VirtualClock())
 
 
 class TestBenchGone:
@@ -332,6 +340,16 @@ class TestGuardianGone:
         (news,) = [news for news in it.news() if news.kind == "guardian"]
         assert news.level == "ERROR"
         assert "was lost" in news.text
+
+    def test_killed_while_somebody_edits_the_rig_file(self, station, vo2, tmp_path):
+        path = tmp_path / "vo2.toml"
+        path.write_text('extends = "vo2"\n')
+        it = station(str(path))
+        seconds_until(it._report.is_ready)
+        path.write_text("[rig")
+        guardian_of(it).kill()
+        assert it.end() == SAFE
+        assert not is_on(vo2)
 
     def test_stopped_while_the_bench_asks_for_nothing(self, station, vo2):
         """It is killed before the rescue, as it would keep the lines."""

@@ -15,12 +15,11 @@ from kill_safe import DEATH, PATIENCE, PROMISE
 from bench.analysis import list_runs
 from bench.base import ConfigurationError
 from bench.record import BLACK_BOX_NAME, Record, ending_of
-from bench.rig import is_in_use, opened
+from bench.rig import is_in_use, load_rig, opened
 from sim_devices.serving.process import serve
 
 pytestmark = [
     pytest.mark.usefixtures("warm_popen"),
-    pytest.mark.timeout(600),
     pytest.mark.skipif(not sys.platform.startswith("linux"), reason="it looks for processes as on Linux"),
 ]
 
@@ -165,7 +164,7 @@ def test_the_rig_is_free_before_a_slow_message_is_sent(vo2, started, tmp_path):
 
     def is_free():
         # Its lines are locked and nothing is sent, as a message is waited for no longer than a busy machine starts.
-        with contextlib.suppress(ConfigurationError), opened("vo2", {}, vo2.endpoints_file, "a test"):
+        with contextlib.suppress(ConfigurationError), opened(load_rig("vo2"), vo2.endpoints_file, "a test"):
             return True
         return False
 
