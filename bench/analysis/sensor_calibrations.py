@@ -76,7 +76,9 @@ def calibrate_run(run: Path, sensor: str, reference: Reference) -> Calibration:
                 f"{run}: {reference.signal} is in {units[reference.signal]}, not in {unit}; if it does not measure "
                 f"what {sensor} measures, name its unit"
             )
-        day = datetime.fromisoformat(record.meta["epoch"]).date()
+        # The virtual clock begins in the year 2000, and a calibration ages by the calendar.
+        started = record.meta["host"]["started"] if record.meta["clock"] == "virtual" else record.meta["epoch"]
+        day = datetime.fromisoformat(started).astimezone().date()
         if reference.signal is not None:
             _check_certificate(record.meta, reference.signal, day)
         about: dict[str, Any] = {

@@ -8,7 +8,6 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field, replace
-from datetime import date
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -27,6 +26,7 @@ from bench.base import (
     needed_for,
     print_plain,
     say_at_once,
+    wall_time,
 )
 from bench.devices import Signal
 from bench.execution.accuracy import check_accuracy
@@ -68,10 +68,10 @@ from bench.rig import (
     RigFile,
     Slots,
     attach,
+    calibration_warnings,
     check_start,
     clock_for,
     load_rig,
-    overdue_calibrations,
     read_schedule,
     schedule_faults,
     twin_of,
@@ -258,7 +258,6 @@ class RunContext(ExitStack):
             expected,
             guarded=self.guardian is not None,
             attended=self._is_attended,
-            today=self.clock.date().astimezone().date(),
         )
         if self.run.accuracy:
             self._accuracy = check_accuracy(
@@ -403,7 +402,7 @@ def _open_view(dashboard: Dashboard, console: Console) -> None:
 
 
 def _checked(
-    run: Run, description: RigDescription, expected: Plan, *, guarded: bool, attended: bool, today: date
+    run: Run, description: RigDescription, expected: Plan, *, guarded: bool, attended: bool
 ) -> tuple[str, ...]:
     """Check what is known before anything moves; return warnings."""
     check_before_moving(description, run.protocol, expected)
@@ -413,7 +412,8 @@ def _checked(
             f"protocol {run.protocol.name} asks the operator {expected.prompts} times to do something by hand; "
             "run it in a terminal, where an operator can answer"
         )
-    warnings = overdue_calibrations(file, today)
+    # By the calendar: laboratory time may begin in any year.
+    warnings = calibration_warnings(file, wall_time().astimezone().date())
     if not guarded:
         return warnings
     return (*check_start(description, interval=1.0 / file.safety.rate, interval_key="safety.rate"), *warnings)

@@ -102,10 +102,10 @@ from .slots import (
     rate_unit as rate_unit,
 )
 from .start_checks import (
+    calibration_warnings as calibration_warnings,
     check_start as check_start,
     lines_of as lines_of,
     longest_away as longest_away,
-    overdue_calibrations as overdue_calibrations,
 )
 from .uncertainty import (
     LEVEL as LEVEL,

@@ -88,22 +88,30 @@ def check_start(
     return tuple(f"{file.path}: {warning}" for warning in (*_shortened(rig), *accepted))
 
 
-def overdue_calibrations(file: RigFile, today: date) -> tuple[str, ...]:
-    """Return a warning for each device and calibrated signal whose calibration is due on a day or before it."""
-    return (
-        *(
-            f"{file.path}: devices.{entry.name}: its calibration was due on {due}; calibrate it, then set calibrated "
-            "and calibration_due"
-            for entry in file.devices
-            if (due := entry.settings.calibration_due) is not None and due <= today
-        ),
-        *(
-            f"{file.path}: derived.{name}: the calibration of {of.source} by {of.calibration.reference} of "
-            f"{of.calibration.date} holds for {of.calibration.interval_days} days and was due on {due}; calibrate it"
-            for name, of in file.derived.items()
-            if isinstance(of, Calibrated) and (due := of.calibration.due) <= today
-        ),
-    )
+def calibration_warnings(file: RigFile, today: date) -> tuple[str, ...]:
+    """Return a warning for each calibration of a device or signal that is due by a day, or dated after it."""
+    stated = [
+        (
+            f"devices.{entry.name}: its calibration",
+            entry.settings.calibrated,
+            entry.settings.calibration_due,
+            "calibrate it, then set calibrated and calibration_due",
+        )
+        for entry in file.devices
+    ]
+    for name, of in file.derived.items():
+        if isinstance(of, Calibrated):
+            known = of.calibration
+            what = f"derived.{name}: the calibration of {of.source} by {known.reference}"
+            stated.append((what, known.date, known.due, f"it holds for {known.interval_days} days: calibrate it"))
+    warnings = []
+    for what, calibrated, due, advice in stated:
+        if calibrated is not None and calibrated > today:
+            advice = "correct the date, or that of this computer"
+            warnings.append(f"{file.path}: {what} is dated {calibrated}, after today, {today}; {advice}")
+        elif due is not None and due <= today:
+            warnings.append(f"{file.path}: {what} was due on {due}; {advice}")
+    return tuple(warnings)
 
 
 def _wrong_intervals(

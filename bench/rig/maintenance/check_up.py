@@ -151,6 +151,9 @@ def _calibration(day: date | None, due: date | None, today: date, afterwards: st
     parts = [*([f"of {day}"] if day else []), *([f"due on {due}"] if due else [])]
     if not parts:
         return []
+    if day is not None and day > today:
+        text = f"of {day}, after today, {today}"
+        return [CheckFinding("calibration", text, "correct the date, or that of this computer")]
     if due is not None and due <= today:
         parts.append(f"{(today - due).days} days ago")
         return [CheckFinding("calibration", ", ".join(parts), f"calibrate it, then {afterwards}")]

@@ -13,9 +13,9 @@ from bench.rig import (
     Rig,
     RigDescription,
     SafetyTable,
+    calibration_warnings,
     check_start,
     load_rig,
-    overdue_calibrations,
     packaged_rigs,
 )
 
@@ -269,9 +269,11 @@ class TestCalibrations:
     @cases("day", ["2027-03-01", '"2027-03-01"'])
     def test_is_due_from_its_day_on(self, tmp_path, day):
         file = self.rig(tmp_path, f"calibrated = 2026-03-01\ncalibration_due = {day}")
-        assert overdue_calibrations(file, date(2027, 2, 28)) == ()
-        (warning,) = overdue_calibrations(file, date(2027, 3, 1))
+        assert calibration_warnings(file, date(2027, 2, 28)) == ()
+        (warning,) = calibration_warnings(file, date(2027, 3, 1))
         assert "devices.psd: its calibration was due on 2027-03-01" in warning
+        (warning,) = calibration_warnings(file, date(2026, 2, 28))
+        assert "devices.psd: its calibration is dated 2026-03-01, after today" in warning
         # As the record of a run has it.
         assert json.loads(json.dumps(file.content))["devices"]["psd"]["calibration_due"] == "2027-03-01"
 
@@ -290,12 +292,11 @@ class TestCalibrations:
         file = load_rig(str(path))
         # It comes before what comes from it.
         assert list(file.derived) == ["tip_angle", "curvature"]
-        assert overdue_calibrations(file, date(2026, 5, 29)) == ()
-        (warning,) = overdue_calibrations(file, date(2026, 5, 30))
-        assert (
-            "derived.tip_angle: the calibration of psd_position by goniometer 12 of 2026-03-01 holds for 90"
-            in warning
-        )
+        assert calibration_warnings(file, date(2026, 5, 29)) == ()
+        (warning,) = calibration_warnings(file, date(2026, 5, 30))
+        assert "derived.tip_angle: the calibration of psd_position by goniometer 12 was due on 2026-05-30" in warning
+        (warning,) = calibration_warnings(file, date(2026, 2, 28))
+        assert "is dated 2026-03-01, after today" in warning
 
     @cases(
         ("lines", "message"),
