@@ -2,21 +2,37 @@
 
 from __future__ import annotations
 
+import signal
 import sqlite3
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 import bench
-from bench.record import FILE_NAME, Record
+from bench.record import FILE_NAME
 
-LONG = 120.0
-"""Wall-clock time that a busy machine may take, s."""
+_DYING = """
+import os, signal, threading
+from bench.cli import main
+from bench.record import Journal
+
+def die(journal):
+    {before}
+    os.kill(os.getpid(), signal.SIGKILL)
+
+def step(journal, record, write=Journal.step):
+    write(journal, record)
+    if journal.steps >= {steps}:
+        threading.Timer({delay}, die, [journal]).start() if {delay} else die(journal)
+
+Journal.step = step
+main({command})
+"""
+"""A command that dies once a step is durable: a process that watched it would come too late on a busy machine."""
 
 
 class EndedFirstError(Exception):
@@ -37,27 +53,21 @@ def finished_steps(folder: Path) -> int:
     return 0
 
 
-def kill_after(
-    steps: int,
-    folder: Path,
-    *command: str,
-    delay: float = 0.0,
-    kill: Callable[[subprocess.Popen[bytes]], None] = subprocess.Popen.kill,
-) -> Path:
-    """Start a `bench` command that writes one run below a folder, and kill it by SIGKILL.
+def kill_after(steps: int, folder: Path, *command: str, delay: float = 0.0, before: str = "") -> Path:
+    """Carry out a `bench` command that writes one run below a folder, and that kills itself by SIGKILL on the way.
 
     Parameters
     ----------
     steps : int
-        Finished steps after which it is killed.
+        Finished steps after which it does.
     folder : Path
         Where the run is.
     *command : str
         Of `bench`.
     delay : float
         Wall-clock time after that step, s, so that it is killed within another one.
-    kill : callable
-        Kills the process, and others with it.
+    before : str
+        What the process does before it kills itself, in Python.
 
     Returns
     -------
@@ -67,30 +77,20 @@ def kill_after(
     Raises
     ------
     EndedFirstError
-        If the run was completed before it was killed, as may be on a busy machine.
+        If the run was completed before.
     """
-    code = f"from bench.cli import main; main({list(command)!r})"
+    code = _DYING.format(steps=steps, delay=delay, before=before, command=list(command))
     process = subprocess.Popen(
         [sys.executable, "-P", "-c", code],
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         stdin=subprocess.DEVNULL,
     )
-    start = time.monotonic()
-    while finished_steps(folder) < steps:
-        ended = process.poll()
-        if ended == 0:
-            raise EndedFirstError("it was completed before it was killed")
-        assert ended is None, f"it failed before it was killed: {process.stderr.read().decode()}"
-        assert time.monotonic() - start < LONG, f"{steps} steps not within {LONG:g} s"
-        time.sleep(0.002)
-    time.sleep(delay)
-    kill(process)
-    process.communicate()
+    said = process.communicate()[1].decode()
+    if process.returncode == 0:
+        raise EndedFirstError("it was completed before it was killed")
+    assert process.returncode == -signal.SIGKILL, f"it failed before it was killed: {said}"
     (journal,) = folder.glob(f"**/{FILE_NAME}")
-    with Record(journal.parent) as record:
-        if record.status == "completed":
-            raise EndedFirstError("it was completed before it was killed")
     return journal.parent
 
 

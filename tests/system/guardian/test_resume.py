@@ -1,16 +1,11 @@
-import os
-import signal
-from functools import partial
-
 import pytest
-from benches import is_on, rescuer_of, seconds_until
-from guarded_run import find_guardian
+from benches import TOOLS, is_on, seconds_until
 from killing import kill_after
 
 from bench.base import DeviceError
 from bench.cli import main
 from bench.record import BLACK_BOX_NAME, Record
-from bench.rig import clear_expired_watchdogs, opened
+from bench.rig import clear_expired_watchdogs, load_rig, opened
 from sim_devices.serving.process import serve
 
 pytestmark = pytest.mark.usefixtures("warm_popen")
@@ -26,14 +21,15 @@ def served():
         yield rig
 
 
-def kill_both(folder, bench):
-    (journal,) = folder.glob("*/journal.sqlite")
-    guardian = find_guardian(journal.parent)
-    # Held first: a bench that lives on for a moment makes safe what its guardian left, and has the locks meanwhile.
-    os.kill(bench.pid, signal.SIGSTOP)
+KILL_ITS_GUARDIAN = f"""
+    import sys
+    sys.path.append({str(TOOLS)!r})
+    from benches import rescuer_of
+    from guarded_run import find_guardian
+    guardian = find_guardian(journal.path.parent)
     os.kill(rescuer_of(guardian), signal.SIGKILL)
     os.kill(guardian, signal.SIGKILL)
-    bench.kill()
+"""
 
 
 def test_clears_what_the_watchdogs_left_and_goes_on(served, tmp_path, capsys):
@@ -41,7 +37,7 @@ def test_clears_what_the_watchdogs_left_and_goes_on(served, tmp_path, capsys):
     command = ["run", "damped-oscillation", "--rig", "vo2", "--attach", str(served.endpoints_file)]
     command += ["--no-rehearse", "--out", str(tmp_path), *(f"--set={setting}" for setting in settings)]
     command += [f"--override={key}={value}" for key, value in PATIENT.items()]
-    folder = kill_after(1, tmp_path, *command, kill=partial(kill_both, tmp_path))
+    folder = kill_after(1, tmp_path, *command, before=KILL_ITS_GUARDIAN)
     with Record(folder) as record:
         total = record.meta["plan"]["steps"]
         before = len(record.steps())
@@ -91,7 +87,7 @@ def status_of(folder):
 def test_clears_no_other_error(served):
     served.control.fault("tec-over-current")
     with (
-        opened("vo2", {}, served.endpoints_file, "a test") as place,
+        opened(load_rig("vo2"), served.endpoints_file, "a test") as place,
         pytest.raises(DeviceError, match=r"tec: error 1\d\d \((?!communication watchdog)"),
     ):
         clear_expired_watchdogs(place)
