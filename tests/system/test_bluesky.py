@@ -35,7 +35,6 @@ def run(engine, plan):
     return documents
 
 
-@pytest.mark.timeout(120)
 class TestScan:
     @pytest.fixture
     def documents(self, engine, rig):
@@ -80,7 +79,6 @@ class TestScan:
         assert rig.clock.now() < 200.0
 
 
-@pytest.mark.timeout(120)
 class TestFailures:
     def test_a_setpoint_outside_of_the_limits_ends_the_plan(self, engine, rig):
         with pytest.raises(LimitError, match=r"tec: set-point 99 °C is outside of 15 to 95 °C"):

@@ -224,7 +224,6 @@ def start(tmp_path, rig_file):
         process.close()
 
 
-@pytest.mark.timeout(200)
 class TestProcesses:
     def assert_aborted(self, process, reason, code=130):
         assert process.end() == code, process.output

@@ -16,7 +16,6 @@ pytestmark = pytest.mark.usefixtures("warm_popen")
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs pseudo-terminals")
-@pytest.mark.timeout(240)
 def test_lateness_is_in_record_report_and_dashboard(tmp_path, capsys):
     rig = tmp_path / "supplies.toml"
     rig.write_text(rig_of(1), encoding="utf-8")

@@ -332,7 +332,6 @@ class TestTwin:
 class TestEnd:
     """The end that the display shows, from 5 % of a run on."""
 
-    @pytest.mark.timeout(200)
     @pytest.mark.parametrize(
         ("name", "rig", "settings", "clock"),
         [

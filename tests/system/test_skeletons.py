@@ -15,7 +15,6 @@ def new(*arguments):
     return ended.value.code
 
 
-@pytest.mark.timeout(600)
 @pytest.mark.parametrize(
     "parts", [pytest.param(["model"], id="a model"), pytest.param(list(PARTS), id="all", marks=pytest.mark.seeds)]
 )

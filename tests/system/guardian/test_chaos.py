@@ -24,7 +24,6 @@ PART = ["Guardian._turn", "Guardian._is_safe", "StationCore.reply", "LineThreads
 """What `make test` lets fail, one for each way out of a failure; `make test-all` all methods."""
 
 
-@pytest.mark.timeout(600)
 @pytest.mark.parametrize(
     "methods", [pytest.param(PART, id="part"), pytest.param(list(METHODS), id="all", marks=pytest.mark.seeds)]
 )

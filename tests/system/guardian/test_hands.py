@@ -16,7 +16,6 @@ pytest.importorskip("textual")
 
 pytestmark = [
     pytest.mark.skipif(not hasattr(signal, "SIGHUP"), reason="terminals of POSIX"),
-    pytest.mark.timeout(240),
 ]
 
 

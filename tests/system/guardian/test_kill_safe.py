@@ -12,7 +12,6 @@ from sim_devices.serving.process import serve
 pytestmark = [
     pytest.mark.usefixtures("warm_popen"),
     pytest.mark.slow,
-    pytest.mark.timeout(600),
     pytest.mark.skipif(not sys.platform.startswith("linux"), reason="it looks for processes as on Linux"),
 ]
 

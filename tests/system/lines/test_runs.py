@@ -131,7 +131,6 @@ def served():
 
 @pytest.mark.usefixtures("warm_popen")
 @pytest.mark.skipif(sys.platform == "win32", reason="pseudo-terminals")
-@pytest.mark.timeout(240)
 class TestServed:
     @pytest.fixture
     def station(self, served, buses):

@@ -919,7 +919,6 @@ class TestInterrupted:
         assert (outcome.status, outcome.reason) == ("aborted", "ended by Ctrl-C, twice")
         b.assert_safe()
 
-    @pytest.mark.timeout(60)
     def test_a_protocol_that_only_talks_can_be_aborted(self, bench):
         def chatter(parameters):
             for i in range(100_000):

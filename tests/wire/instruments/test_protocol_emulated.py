@@ -142,7 +142,6 @@ class TestTime:
         assert port.read(3) == b"ba\n"
         assert clock.now() == before
 
-    @pytest.mark.timeout(60)
     def test_waiting_for_ever_for_what_never_comes_is_an_error(self, port):
         # A real port would never return, which no test or rehearsal can use.
         port.timeout = None

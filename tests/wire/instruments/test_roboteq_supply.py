@@ -471,7 +471,6 @@ class TestProcessData:
         assert caught.value.reason == code
 
 
-@pytest.mark.timeout(60)
 def test_driver_over_a_pseudo_terminal(pseudo_terminal):
     clock = WallClock()
     device, load = make_device(clock, watchdog=0.0)
