@@ -21,13 +21,14 @@ import threading
 import urllib.parse
 import urllib.request
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from email.message import EmailMessage
 from functools import partial
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from bench.base import OPTION, ConfigurationError, json_text, redacted, wall_time
+from bench.base import OPTION, ConfigurationError, Stopwatch, json_text, redacted, wall_time
 from bench.record import Event, StepRecord
 
 _OCCASIONS = {"pause": "pause", "prompt": "prompt", "warning": "warning", "interlock": "trip", "end": "end"}
@@ -61,7 +62,7 @@ def sender(target: str) -> Send:
 
     Raises ConfigurationError if the target is none: no such program, no mail server.
     """
-    if target.lower().startswith(("http://", "https://")):
+    if target.lower().startswith(("http://", "https://")) and urllib.parse.urlsplit(target).hostname:
         return partial(_post, target)
     if target.lower().startswith("mailto:"):
         address = target[len("mailto:") :]
@@ -70,9 +71,14 @@ def sender(target: str) -> Send:
         if not os.environ.get("BENCH_SMTP_HOST"):
             known = "; ".join(f"{name}: {text}" for name, text in _SMTP.items())
             raise ConfigurationError(f"{OPTION} {target}: BENCH_SMTP_HOST is not set ({known})")
+        if not (port := os.environ.get("BENCH_SMTP_PORT") or "587").isdecimal():
+            raise ConfigurationError(f"{OPTION} {target}: BENCH_SMTP_PORT is {port!r}; expected a number")
         return partial(_mail, address)
-    # On Windows a backslash is part of a path.
-    words = [word.strip('"') for word in shlex.split(target, posix=False)] if os.name == "nt" else shlex.split(target)
+    words: list[str] = []
+    # A quotation that does not end is no command.
+    with suppress(ValueError):
+        # On Windows a backslash is part of a path.
+        words = [word.strip('"') if os.name == "nt" else word for word in shlex.split(target, posix=os.name != "nt")]
     program = shutil.which(words[0]) if words else None
     if program is None:
         raise ConfigurationError(
@@ -136,6 +142,8 @@ def _mail(address: str, facts: Facts) -> None:
 class Notifier:
     """Sends messages about a run; an `Observer` of the engine, whose thread waits for none of them.
 
+    Each target has a thread of its own: a server that does not answer keeps no other target from being told.
+
     Use it as a context manager. What fails is returned by `take_notices`, for the record.
 
     Parameters
@@ -152,22 +160,21 @@ class Notifier:
     """
 
     def __init__(self, targets: Sequence[str], signals: Sequence[str] = ()) -> None:
-        self._senders = {target: sender(target) for target in targets}
+        self._notices: list[str] = []
+        self._lines = [_Line(target, self._notices) for target in targets]
         self.signals = tuple(signals)
         self.facts: dict[str, Any] = {}
         """What is said of the run in each message: run, rig, protocol, …"""
         self.is_told: Callable[[], bool] = lambda: False
         """Whether another process has told already that the run has failed; nobody is told twice."""
         self._values: Sequence[float] = ()
-        self._waiting: queue.Queue[Facts | None] = queue.Queue(_MOST)
-        self._notices: list[str] = []
         self._reason = ""
         self._is_finished = False
-        self._thread = threading.Thread(target=self._work, name="notifier", daemon=True)
 
     def start(self) -> None:
         """Begin to send; what has happened before is sent as well."""
-        self._thread.start()
+        for line in self._lines:
+            line.thread.start()
 
     def __enter__(self) -> Self:
         self.start()
@@ -208,14 +215,14 @@ class Notifier:
             **self.facts,
             "values": {name: value for name, value in values.items() if value == value},
         }
-        try:
-            self._waiting.put_nowait(facts)
-        except queue.Full:
-            self._notices.append(f"{occasion} was not sent: {_MOST} messages wait already")
+        for line in self._lines:
+            line.put(facts)
 
     def take_notices(self) -> list[str]:
         """Return what has failed since the last call."""
-        taken, self._notices = self._notices, []
+        # Threads append to it.
+        taken = self._notices[:]
+        del self._notices[: len(taken)]
         return taken
 
     def finish(self, longest: float = _AT_THE_END) -> None:
@@ -223,29 +230,45 @@ class Notifier:
         if self._is_finished:
             return
         self._is_finished = True
+        waited = Stopwatch()
+        for line in self._lines:
+            with suppress(queue.Full):
+                line.waiting.put(None, timeout=max(0.0, longest - waited.seconds()))
+        for line in self._lines:
+            line.thread.join(max(0.0, longest - waited.seconds()))
+            if line.thread.is_alive():
+                self._notices.append(f"{line.shown}: messages were not sent within {longest:g} s after the end")
+
+
+class _Line:
+    """Sends messages to one target in a thread of its own; what fails joins the notices."""
+
+    def __init__(self, target: str, notices: list[str]) -> None:
+        self._target, self._send, self._notices = target, sender(target), notices
+        self.shown = redacted(target)
+        self.waiting: queue.Queue[Facts | None] = queue.Queue(_MOST)
+        self.thread = threading.Thread(target=self._work, name="notifier", daemon=True)
+
+    def put(self, facts: Facts) -> None:
+        """Have a message sent."""
         try:
-            self._waiting.put(None, timeout=longest)
-            self._thread.join(longest)
+            self.waiting.put_nowait(facts)
         except queue.Full:
-            pass
-        if self._thread.is_alive():
-            self._notices.append(f"messages were not sent within {longest:g} s after the end")
+            self._fail(facts, f"{_MOST} messages wait already")
 
     def _work(self) -> None:
-        while (facts := self._waiting.get()) is not None:
-            for target, send in self._senders.items():
-                try:
-                    send(facts)
-                except subprocess.TimeoutExpired:
-                    # What this error says names all arguments.
-                    self._fail(target, facts, f"it took longer than {WITHIN:g} s")
-                # Whatever a library raises: the run goes on.
-                except Exception as error:
-                    self._fail(target, facts, str(error))
+        while (facts := self.waiting.get()) is not None:
+            try:
+                self._send(facts)
+            except subprocess.TimeoutExpired:
+                # What this error says names all arguments.
+                self._fail(facts, f"it took longer than {WITHIN:g} s")
+            # Whatever a library raises: the run goes on.
+            except Exception as error:
+                self._fail(facts, str(error).replace(self._target, self.shown))
 
-    def _fail(self, target: str, facts: Facts, why: str) -> None:
-        shown = redacted(target)
-        self._notices.append(f"{shown} was not told of the {facts['event']}: {why.replace(target, shown)}")
+    def _fail(self, facts: Facts, why: str) -> None:
+        self._notices.append(f"{self.shown} was not told of the {facts['event']}: {why}")
 
 
 def facts_of(meta: Mapping[str, Any], folder: Path) -> dict[str, Any]:

@@ -21,14 +21,14 @@ import datetime
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.polynomial import chebyshev
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field, ValidationError, model_validator
+from pydantic import AfterValidator, Field, ValidationError, model_validator
 
-from bench.base import CheckedTable, DataError, DeviceError, parse_json, problems, reason, write_json_file
+from bench.base import CheckedTable, DataError, DeviceError, check_unit, parse_json, problems, reason, write_json_file
 from bench.devices import Signal
 from bench.rig.derived import Derived, DerivedSignal
 
@@ -65,7 +65,9 @@ class Calibration(CheckedTable):
     date: datetime.date = Field(description="day of the calibration")
     interval_days: int = Field(ge=1, description="days after which a new calibration is due")
     reference: str = Field(min_length=1, description="what it was compared with, and its certificate")
-    reference_unit: str = Field(description="unit of the reference, in which the calibrated value is")
+    reference_unit: Annotated[str, AfterValidator(check_unit)] = Field(
+        description="unit of the reference, in which the calibrated value is"
+    )
     reference_uncertainty: float = Field(
         gt=0.0, description="standard uncertainty of the reference, common to all its values, in its unit"
     )

@@ -129,8 +129,7 @@ class Guardian:
         self._writes_stacks = False
         self._keeps_record = False
         self._zero = rig.clock.now()
-        # One each: a server that does not answer keeps no other from being told.
-        self._notifiers: list[Notifier] = []
+        self._notifier = Notifier(())
         self._values: dict[str, float] = {}
         self._told: float | None = None
         self._is_asked_to_end = False
@@ -188,11 +187,10 @@ class Guardian:
 
     def finish(self) -> None:
         """Wait until all have been told that the bench hung or is gone, and close the record."""
-        for notifier in self._notifiers:
-            if self._told is not None:
-                notifier.finish(WITHIN)
-            for text in notifier.take_notices():
-                self._box.note("notify", text=text)
+        if self._told is not None:
+            self._notifier.finish(WITHIN)
+        for text in self._notifier.take_notices():
+            self._box.note("notify", text=text)
         self._box.close()
 
     # What has to be done now
@@ -329,9 +327,8 @@ class Guardian:
         self._writes_stacks = bool(message["stacks"])
         passed = (self._rig.clock.date() - datetime.fromisoformat(message["epoch"])).total_seconds()
         self._zero = self._rig.clock.now() - passed
-        self._notifiers = [Notifier([target]) for target in message["targets"]]
-        for notifier in self._notifiers:
-            notifier.facts = message["facts"]
+        self._notifier = Notifier(message["targets"])
+        self._notifier.facts = message["facts"]
         self._keeps_record = True
         self._reply(message)
 
@@ -575,12 +572,12 @@ class Guardian:
         t = self._rig.clock.now() - self._zero
         self._told = now
         self._box.note(FAILED, reason=reason, safe=self._safe)
-        for notifier in self._notifiers:
-            notifier.signals = tuple(self._values)
-            notifier.telemetry(t, 0, tuple(self._values.values()))
-            notifier.event(Event(t, "ERROR", "error", f"{reason}; {states}"))
-            notifier.event(Event(t, "WARN", "end", "failed"))
-            notifier.start()
+        notifier = self._notifier
+        notifier.signals = tuple(self._values)
+        notifier.telemetry(t, 0, tuple(self._values.values()))
+        notifier.event(Event(t, "ERROR", "error", f"{reason}; {states}"))
+        notifier.event(Event(t, "WARN", "end", "failed"))
+        notifier.start()
 
     def _end_bench(self, now: float) -> None:
         """End the process of a bench that hung and has not come back: ask it first, then kill it."""

@@ -46,6 +46,8 @@ class TestTargets:
         [
             ("no-such-program-here", "there is no such program"),
             ("", "there is no such program"),
+            ('say "hello', "there is no such program"),
+            ("https://", "there is no such program"),
             ("mailto:nobody", "expected mailto:NAME@DOMAIN"),
             ("mailto:me@lab.example", "BENCH_SMTP_HOST is not set"),
         ],
@@ -54,6 +56,12 @@ class TestTargets:
         monkeypatch.delenv("BENCH_SMTP_HOST", raising=False)
         with pytest.raises(ConfigurationError, match=message):
             Notifier([target])
+
+    def test_refuses_a_mail_server_without_a_number_as_its_port(self, monkeypatch):
+        monkeypatch.setenv("BENCH_SMTP_HOST", "mail.lab.example")
+        monkeypatch.setenv("BENCH_SMTP_PORT", "smtp")
+        with pytest.raises(ConfigurationError, match="BENCH_SMTP_PORT is 'smtp'; expected a number"):
+            Notifier(["mailto:me@lab.example"])
 
     def test_a_command_gets_the_facts_twice(self, listener):
         command, told = listener
@@ -193,6 +201,16 @@ class TestNotifier:
         # 20 wait, and one is under way at most.
         assert 19 <= len(notices) <= 20
         assert "20 messages wait already" in notices[0]
+
+    def test_one_that_hangs_keeps_no_other_from_being_told(self, monkeypatch):
+        free, told = threading.Event(), threading.Event()
+        senders = {"slow": lambda _: free.wait(), "quick": lambda _: told.set()}
+        monkeypatch.setattr("bench.execution.notify.sender", senders.__getitem__)
+        with Notifier(["slow", "quick"]) as notifier:
+            notifier.event(Event(0.0, "WARN", "pause", "paused"))
+            was_told = told.wait(30)
+            free.set()
+        assert was_told
 
     def test_a_run_tells_its_end_and_records_what_failed(self, listener, tmp_path, rig_file):
         command, told = listener

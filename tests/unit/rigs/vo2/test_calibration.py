@@ -99,6 +99,7 @@ def test_a_calibrated_rig_and_the_one_message_for_each_calibration_that_does_not
         ({"reference_uncertainty": -0.01}, "reference_uncertainty = -0.01"),
         ({"reference_uncertainty": None}, "reference_uncertainty"),
         ({"unit": "V"}, "is in m; the calibration is in V"),
+        ({"reference_unit": "banana"}, "reference_unit = 'banana': is no unit"),
         ({"reference_unit": "rad"}, "expected a deflection in m or an angle in °"),
         ({"serial_number": "470000001"}, "serial number 470000001, but psd has 470012345"),
     ):
