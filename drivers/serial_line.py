@@ -12,7 +12,7 @@ from typing import Any, ClassVar
 import serial
 from pydantic import Field
 
-from bench.base import DeviceConnectionError, slowness
+from bench.base import BUSY, DeviceConnectionError, slowness
 from bench.devices import DriverSettings
 from bench.rig import EMULATED, LONGEST_TURN
 
@@ -25,9 +25,6 @@ computer; as long as its line may be lost (`bench.execution.station.reconnection
 
 _LONGEST_WITHOUT_WATCHDOG = 1.0
 """Longest wait for an answer on a busy computer, s, of an instrument that has no watchdog."""
-
-_BUSY = 1.5
-"""Slowness from which on a computer counts as busy: a pause of its own is no reason to wait."""
 
 
 class SerialSettings(DriverSettings):
@@ -117,7 +114,7 @@ class PatientPort:
         """Return what comes within the time by which a busy computer makes the wait longer."""
         nominal = self._port.timeout
         self.patience = nominal
-        if not nominal or nominal >= self._longest or (factor := self._measure()) < _BUSY:
+        if not nominal or nominal >= self._longest or (factor := self._measure()) < BUSY:
             return b""
         self.patience = min(factor * nominal, self._longest)
         self._port.timeout = self.patience - nominal

@@ -30,8 +30,13 @@ from bench.rig import load_rig
 from sim_devices.serving.process import EmulatedRig, serve
 
 DEATH, PROMISE, PATIENCE = 0.2, 5.0, 4.0
-"""Time within which every output has to be off, s: the bench died; it broke the promise of a hold (its period of 1 to
-2 s and 2 s), or of a computation (set to 3 s here, and 1 s for the last step)."""
+"""Time within which every output has to be off on an idle computer, s: the bench died; it broke the promise of a hold
+(its period of 1 to 2 s and 2 s), or of a computation (set to 3 s here, and 1 s for the last step).
+
+The first is no promise of the bench but a bound of what was measured: the system says at once that a process has
+died, each line ends the exchange at work, and one exchange switches an output off. What makes it longer is only how
+long guardian and emulator wait for a processor, as with `--busy`.
+"""
 
 RESCUE = 2.0
 """Time within which the rescuer makes every device safe, s: it opens the lines."""

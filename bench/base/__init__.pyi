@@ -10,6 +10,7 @@ from .checks import (
     Floats as Floats,
 )
 from .clock import (
+    BUSY as BUSY,
     Clock as Clock,
     Pace as Pace,
     PacedClock as PacedClock,

@@ -47,6 +47,10 @@ _PROBE = 0.01
 (`sched(7)`, EEVDF), so that others come in between."""
 
 
+BUSY = 1.5
+"""Slowness from which on a computer counts as busy: a pause of its own is no reason to wait."""
+
+
 class Clock(ABC):
     """Laboratory time in seconds since the clock was made.
 

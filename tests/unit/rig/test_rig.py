@@ -1,11 +1,12 @@
 import tomllib
+from contextlib import ExitStack
 
 import pytest
 from cases import cases
 from heater_laboratory import CLOSED, RIG, HeaterLaboratory, HeaterTEC
 from hypothesis import given, settings, strategies as st
 
-from bench.base import ConfigurationError, DeviceConnectionError, DeviceError, VirtualClock
+from bench.base import ConfigurationError, DeviceConnectionError, DeviceError, VirtualClock, WallClock
 from bench.rig import DashboardLayout, Rig, load_rig
 
 SPOT = """
@@ -420,6 +421,24 @@ class TestConnecting:
         with pytest.raises(DeviceConnectionError, match="probe: no answer"):
             Rig(load_rig(path), VirtualClock(), 1)
         assert CLOSED == ["tec"]
+
+    @cases(("slow", "tries"), [(1.0, 1), (2.0, 2)])
+    def test_one_that_does_not_answer_is_asked_once_more_on_a_busy_computer(self, rig_file, monkeypatch, slow, tries):
+        calls, connect = [], HeaterTEC.connect
+
+        def fail_once(*given):
+            calls.append(given)
+            if len(calls) == 1:
+                raise DeviceConnectionError("tec", "no answer")
+            return connect(*given)
+
+        monkeypatch.setattr(HeaterTEC, "connect", fail_once)
+        monkeypatch.setattr("bench.rig.connected.slowness", lambda: slow)
+        with ExitStack() as stack:
+            if tries == 1:
+                stack.enter_context(pytest.raises(DeviceConnectionError, match="no answer"))
+            Rig(load_rig(rig_file()), WallClock(), 1).close()
+        assert len(calls) == tries
 
     def test_one_that_fails_to_close_keeps_none_from_being_closed(self, rig_file):
         with Rig(load_rig(rig_file()), VirtualClock(), 1) as rig:
