@@ -91,27 +91,23 @@ def check_start(
 def calibration_warnings(file: RigFile, today: date) -> tuple[str, ...]:
     """Return a warning for each calibration of a device or signal that is due by a day, or dated after it."""
     stated = [
-        (
-            f"devices.{entry.name}: its calibration",
-            entry.settings.calibrated,
-            entry.settings.calibration_due,
-            "calibrate it, then set calibrated and calibration_due",
-        )
-        for entry in file.devices
+        (f"devices.{each.name}: its calibration", each.settings.calibrated, each.settings.calibration_due)
+        for each in file.devices
     ]
-    for name, of in file.derived.items():
-        if isinstance(of, Calibrated):
-            known = of.calibration
-            what = f"derived.{name}: the calibration of {of.source} by {known.reference}"
-            stated.append((what, known.date, known.due, f"it holds for {known.interval_days} days: calibrate it"))
+    stated += [
+        (f"derived.{name}: the calibration of {of.source} by {known.reference}", known.date, known.due)
+        for name, of in file.derived.items()
+        if isinstance(of, Calibrated) and (known := of.calibration)
+    ]
     warnings = []
-    for what, calibrated, due, advice in stated:
-        if calibrated is not None and calibrated > today:
-            advice = "correct the date, or that of this computer"
-            warnings.append(f"{file.path}: {what} is dated {calibrated}, after today, {today}; {advice}")
+    for what, day, due in stated:
+        if day is not None and day > today:
+            warnings.append(
+                f"{what} is dated {day}, after today, {today}; correct that, or the clock of the computer"
+            )
         elif due is not None and due <= today:
-            warnings.append(f"{file.path}: {what} was due on {due}; {advice}")
-    return tuple(warnings)
+            warnings.append(f"{what} was due on {due}; calibrate it, and state the new dates")
+    return tuple(f"{file.path}: {warning}" for warning in warnings)
 
 
 def _wrong_intervals(
