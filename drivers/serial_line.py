@@ -6,6 +6,7 @@ import errno
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -98,19 +99,19 @@ class PatientPort:
 
     def read(self, size: int = 1) -> bytes:
         """Return so many bytes; fewer only after the wait."""
-        received: bytes = self._port.read(size)
-        if len(received) < size:
-            received += self._waited(lambda: self._port.read(size - len(received)))
-        return received
+        return self._whole(self._port.read, size)
 
     def read_until(self, expected: bytes, size: int) -> bytes:
         """Return what comes up to an end, or so many bytes; another only after the wait."""
-        received: bytes = self._port.read_until(expected, size)
-        if len(received) < size and not received.endswith(expected):
-            received += self._waited(lambda: self._port.read_until(expected, size - len(received)))
+        return self._whole(partial(self._port.read_until, expected), size, expected)
+
+    def _whole(self, read: Callable[[int], bytes], size: int, end: bytes | None = None) -> bytes:
+        received = read(size)
+        if len(received) < size and not (end and received.endswith(end)):
+            received += self._waited(read, size - len(received))
         return received
 
-    def _waited(self, read: Callable[[], bytes]) -> bytes:
+    def _waited(self, read: Callable[[int], bytes], size: int) -> bytes:
         """Return what comes within the time by which a busy computer makes the wait longer."""
         nominal = self._port.timeout
         self.patience = nominal
@@ -119,7 +120,7 @@ class PatientPort:
         self.patience = min(factor * nominal, self._longest)
         self._port.timeout = self.patience - nominal
         try:
-            return read()
+            return read(size)
         finally:
             self._port.timeout = nominal
 
@@ -250,11 +251,11 @@ class Share:
             if self._shared.user is not self:
                 self._take_turn()
             yield
-        except OSError:
+        except Exception as error:
             self._shared.give_up()
-            raise
-        except Exception as error:  # pyserial passes on that of termios, which is no OSError
-            self._shared.give_up()
+            if isinstance(error, OSError):
+                raise
+            # pyserial passes on that of termios.
             raise OSError(str(error)) from error
 
     def _note(self, received: object) -> None:

@@ -292,8 +292,8 @@ class _Course:
 
     def _is_off(self, values: Mapping[str, float], setpoints: Mapping[str, float] | None) -> bool:
         """Return whether a set-point that is compared is none, as the output is off."""
-        names = [name for name in (self.interlock.signal, self.interlock.minus) if name.endswith(SETPOINT)]
-        return any(math.isnan(_reading(name, values, setpoints) or 0.0) for name in names)
+        names = (name for name in (self.interlock.signal, self.interlock.minus) if name.endswith(SETPOINT))
+        return any(found != found for found in (_reading(name, values, setpoints) for name in names))
 
     def _act(self, t: float, value: float, criterion: _Criterion, i: int, found: list[InterlockFinding]) -> None:
         interlock, finding, since = self.interlock, self.active[i], criterion.since

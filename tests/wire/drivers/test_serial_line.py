@@ -11,9 +11,12 @@ from bench.base import DeviceConnectionError, VirtualClock, slowness
 from drivers.serial_line import (
     MOST_STRAY,
     RESENDS,
+    LinePort,
+    OpenPort,
     PatientPort,
     SerialSettings,
     forget_received,
+    holder_of,
     open_port,
     patient,
     settle_line,
@@ -28,6 +31,15 @@ port = open_port("first", SerialSettings(port=sys.argv[1], baudrate=9600))
 print("open", flush=True)
 sys.stdin.read()
 """
+
+
+def test_the_holder_of_a_port_is_not_that_of_any_lock(node, tmp_path):
+    fcntl = pytest.importorskip("fcntl")
+    port = opened(node)
+    with (tmp_path / "lock").open("w") as other:
+        fcntl.flock(other, fcntl.LOCK_EX)
+        port.close()
+        assert holder_of(node) is None
 
 
 @pytest.fixture
@@ -167,8 +179,24 @@ class LatePort:
         return self.read(size)
 
 
+class TornPort(LatePort):
+    """A port whose answer comes in pieces."""
+
+    def read(self, size=1):
+        return super().read(min(size, 3))
+
+
+READS = pytest.mark.parametrize("read", [lambda port: port.read(4), lambda port: port.read_until(b"\n", 4)])
+
+
 class TestPatience:
-    @pytest.mark.parametrize("read", [lambda port: port.read(4), lambda port: port.read_until(b"\n", 4)])
+    @READS
+    def test_an_answer_ends_where_it_ends(self, read):
+        assert read(PatientPort(TornPort(b"yes\nyes\n", 0.0), 1.0, lambda: 8.0)) == b"yes\n"
+        # What is there already says nothing of the machine.
+        assert read(PatientPort(LatePort(b"yes\n", 0.0), 1.0, pytest.fail)) == b"yes\n"
+
+    @READS
     @pytest.mark.parametrize(
         ("late", "slowness", "comes"),
         [
@@ -206,6 +234,24 @@ class TestPatience:
         settings = SerialSettings(port="emulated://tec", baudrate=9600)
         port = LatePort(b"", 0.0)
         assert patient(port, settings) is port
+
+
+def test_a_late_answer_is_not_taken_for_an_echo():
+    class EchoingPort(LatePort):
+        def write(self, data):
+            self.answer += data + b"yes\n"
+            return len(data)
+
+        def reset_input_buffer(self):
+            self.answer = b""
+
+    settings = SerialSettings(port="/dev/ttyX", baudrate=9600, echo=True)
+    shared = OpenPort(EchoingPort(b"", 0.0), lambda: None)
+    line = LinePort(shared, "tec", settings)
+    line.write(b"first\n")
+    # Its answer was given up, and comes now.
+    line.write(b"second\n")
+    assert line.read_until(b"\n", 4) == b"yes\n"
 
 
 def test_slowness_is_that_of_this_process():
