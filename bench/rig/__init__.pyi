@@ -80,7 +80,6 @@ from .maintenance.rescue import (
     UNANSWERED as UNANSWERED,
     Rescued as Rescued,
     rescue as rescue,
-    rescue_by_another_process as rescue_by_another_process,
 )
 from .maintenance.safe_state import (
     SAFE as SAFE,

@@ -45,6 +45,12 @@ class WarmPopen(subprocess.Popen):
         finally:
             self._close_pipe_fds(*pipes)
 
+    def __del__(self, *settings):
+        # One that is left alive is not waited for.
+        if getattr(self, "_connection", None) is not None:
+            self._connection.close()
+        super().__del__(*settings)
+
     def _internal_poll(self, *settings, **named):
         if self._connection is None:
             return super()._internal_poll(*settings, **named)

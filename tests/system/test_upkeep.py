@@ -12,7 +12,6 @@ import pytest
 from cases import cases
 
 from bench.base import Stopwatch
-from bench.rig import rescue_by_another_process
 from sim_devices.serving.process import serve
 
 pytestmark = pytest.mark.usefixtures("warm_popen")
@@ -185,18 +184,6 @@ class TestSafe:
             out, _ = process.communicate()
         assert process.returncode == 7
         assert "NOT CONFIRMED" in out
-
-    @pytest.mark.slow
-    def test_by_a_process_of_its_own_for_one_that_opens_no_line(self, served):
-        rig = served("hybrid")
-        with client(rig, "tec=0.1", "piezo=20"):
-            assert rig.control.state()["amplifier_enable"] == 1.0
-        names = ["tec", "displacement", "base", "tip", "piezo"]
-        assert rescue_by_another_process(rig.name, {}, rig.endpoints_file, names) == dict.fromkeys(names, "safe")
-        assert rig.control.state()["amplifier_enable"] == 0.0
-        failed = rescue_by_another_process("nowhere", {}, None, ["tec"])
-        assert list(failed) == ["tec"]
-        assert "there is no rig 'nowhere'" in failed["tec"]
 
 
 class TestOneBench:

@@ -19,16 +19,19 @@ import numpy as np
 from bench.base import STACKS, AbortError, BenchError, Clock, GuardianError, Stopwatch, WallClock
 from bench.devices import DeviceDescription, Floats, Identity, Limits, Signal
 from bench.execution.guardian.channel import LONGEST_ANSWER, ChannelError, Message, to_error
-from bench.execution.guardian.rescuer import SILENCE, Report
+from bench.execution.guardian.rescuer import SILENCE, Report, Rescuer
 from bench.execution.guardian.start import start_guardian
 from bench.execution.station.interface import Arrivals, News, Station
-from bench.rig import Look, RigDescription, RigFile, rescue_by_another_process
+from bench.rig import Look, RigDescription, RigFile
 
 _OPENING = 120.0
 """Longest wait until all devices are connected, s."""
 
 _RESCUE = 20.0
 """Longest wait for what a rescuer reports, s; it reports within 3 s unless the machine is busy."""
+
+_LONGEST_RESCUE = 60.0
+"""Longest wait for one that is started only then, on a busy machine, s."""
 
 _LOOK_AGAIN = 0.05
 """Time between two looks for that, s."""
@@ -77,7 +80,7 @@ class RemoteStation(Station):
     """A station in another process.
 
     One request is outstanding at a time, and each has a number. If the guardian is lost, its rescuer makes the
-    devices safe, or `bench safe` in a process of its own if there is none; this one never opens a line.
+    devices safe, or another one if there is none; this process never opens a line.
 
     Parameters
     ----------
@@ -98,7 +101,6 @@ class RemoteStation(Station):
 
     def __init__(self, guarded: GuardedRig, clock: Clock) -> None:
         self.clock = clock
-        self._guarded = guarded
         self._answer_within = LONGEST_ANSWER + guarded.file.safety.reconnect
         self._number = 0
         self._news: list[News] = []
@@ -116,19 +118,22 @@ class RemoteStation(Station):
         # On Windows what is still open cannot be deleted.
         self._scratch = tempfile.TemporaryDirectory(prefix="bench-rescuer-", ignore_cleanup_errors=True)
         self._report = Report(Path(self._scratch.name) / "report.json")
+        self._what = {
+            "rig": guarded.rig,
+            "overrides": dict(guarded.overrides),
+            "attach": None if guarded.attach is None else str(guarded.attach),
+            "report": str(self._report.path),
+        }
         self._log = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `close`
         self._process, self._channel = start_guardian(self._log)
         try:
             found = self._ask(
                 "hello",
                 _OPENING,
-                rig=guarded.rig,
-                overrides=dict(guarded.overrides),
+                **self._what,
                 content=repr(guarded.file.content),
-                attach=None if guarded.attach is None else str(guarded.attach),
                 seed=guarded.seed,
                 doing=guarded.doing,
-                report=str(self._report.path),
                 process=os.getpid(),
             )
         except BaseException as error:
@@ -331,16 +336,24 @@ class RemoteStation(Station):
         self._process.kill()
         self._has_ended()
         self._news.append(News("ERROR", "guardian", f"{error}; the devices are made safe without it"))
+        states = self._reported(_RESCUE)
+        if not states:
+            self._report.write({})
+            try:
+                Rescuer({**self._what, "guardian": 0}).leave()
+            except GuardianError as failure:
+                return dict.fromkeys(self.description.devices, str(failure))
+            states = self._reported(_LONGEST_RESCUE)
+        return states or dict.fromkeys(self.description.devices, "no rescuer has said whether it is safe")
+
+    def _reported(self, longest: float) -> Mapping[str, str]:
+        """Return what a rescuer reports; nothing if there is none, or it says nothing for so long."""
         waited = Stopwatch()
-        while self._report.is_ready() and waited.seconds() < _RESCUE:
+        while self._report.is_ready() and waited.seconds() < longest:
             if states := self._report.states():
                 return states
             WallClock().sleep(_LOOK_AGAIN)
-        guarded = self._guarded
-        try:
-            return rescue_by_another_process(guarded.rig, guarded.overrides, guarded.attach, self.description.devices)
-        except Exception as failure:
-            return dict.fromkeys(self.description.devices, f"{type(failure).__name__}: {failure}")
+        return {}
 
     def _ask(self, do: str, within: float | None = None, **content: Any) -> Any:  # noqa: ANN401 - what JSON holds
         """Send a request and return what is replied.

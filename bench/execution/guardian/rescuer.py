@@ -51,8 +51,8 @@ class Rescuer:
     Parameters
     ----------
     content : mapping
-        `rig`, `overrides` and `attach` as for `opened`, and `report`, the path of the file in
-        which it says that it is ready, and later what has become of each device.
+        `rig`, `overrides` and `attach` as for `GuardedRig`, and `report`, the path of the file in which it says that
+        it is ready, and later what has become of each device; `guardian` if that is not this process, 0 for none.
     """
 
     def __init__(self, content: dict[str, Any]) -> None:
@@ -60,7 +60,7 @@ class Rescuer:
         assert self._process.stdin is not None
         self._pipe = self._process.stdin.fileno()
         self._last = float("-inf")
-        self._write(json.dumps({**content, "guardian": os.getpid()}).encode() + b"\n")
+        self._write(json.dumps({"guardian": os.getpid(), **content}).encode() + b"\n")
         if sys.platform != "win32":
             os.set_blocking(self._pipe, False)
 
@@ -73,6 +73,10 @@ class Rescuer:
     def release(self) -> None:
         """Let it end without an action, as nothing is left to be made safe."""
         self._write(_RELEASED)
+        self.leave()
+
+    def leave(self) -> None:
+        """Give no sign of life any more: it makes the devices safe unless it was released."""
         assert self._process.stdin is not None
         with suppress(OSError):
             self._process.stdin.close()

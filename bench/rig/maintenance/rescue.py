@@ -3,16 +3,11 @@
 from __future__ import annotations
 
 import math
-import os
-import subprocess
-import sys
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from pathlib import Path
-from tempfile import TemporaryDirectory
 
-from bench.base import Clock, DeviceError, Stopwatch, parse_json
+from bench.base import Clock, DeviceError, Stopwatch
 from bench.devices import Actuator
 from bench.rig.file import DeviceEntry
 from bench.rig.maintenance.locks import port_of
@@ -27,12 +22,6 @@ _SLICE = 0.1
 
 _SENSORS = 3.0
 """Wall-clock time (s) for which a device without an output is waited for."""
-
-_LIMIT = 20.0
-"""Wall-clock time (s) for which a process of its own tries."""
-
-_LONGEST_RESCUE = 60.0
-"""Wall-clock time (s) for that process, its start on a busy machine included."""
 
 UNANSWERED = "has not answered yet"
 """State of a device before its first try has ended."""
@@ -104,51 +93,6 @@ def rescue(
             last, reported = found, seconds
     tries.end()
     yield seconds, found
-
-
-def rescue_by_another_process(
-    rig: str, overrides: Mapping[str, str], endpoints: Path | None, devices: Iterable[str]
-) -> dict[str, str]:
-    """Make the devices of a rig safe by `bench safe --force`, for a process that opens no line itself.
-
-    Parameters
-    ----------
-    rig, overrides, endpoints
-        As for `bench.rig.maintenance.opening.opened`.
-    devices : iterable of str
-        Names of the devices of the rig.
-
-    Returns
-    -------
-    dict of str to str
-        By device name: `safe`, or what went wrong; the same of all if the process itself failed.
-    """
-    with TemporaryDirectory(prefix="bench-safe-") as folder:
-        result = Path(folder) / "result.json"
-        command = [sys.executable, "-P", "-m", "bench", "safe", rig, "--force", "--json", str(result)]
-        command += ["--limit", f"{_LIMIT:g}"]
-        command += [f"--override={key}={value}" for key, value in overrides.items()]
-        command += [] if endpoints is None else ["--attach", str(endpoints)]
-        # The modules of the rig have to be found as here.
-        path = os.pathsep.join(entry for entry in sys.path if entry)
-        try:
-            ended = subprocess.run(  # noqa: S603 - this interpreter
-                command,
-                stdin=subprocess.DEVNULL,
-                capture_output=True,
-                text=True,
-                env={**os.environ, "PYTHONPATH": path},
-                start_new_session=True,
-                timeout=_LONGEST_RESCUE,
-                check=False,
-            )
-            if not result.exists():
-                reason = f"`bench safe` ended with exit code {ended.returncode}: {ended.stderr.strip()}"
-                return dict.fromkeys(devices, reason)
-            content = parse_json(result.read_text(encoding="utf-8"))
-        except (OSError, ValueError, subprocess.SubprocessError) as error:
-            return dict.fromkeys(devices, f"`bench safe` failed: {error}")
-    return {name: SAFE if each["is_safe"] else each["state"] for name, each in content.items()}
 
 
 class _Tries:
