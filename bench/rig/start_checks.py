@@ -94,11 +94,11 @@ def calibration_warnings(file: RigFile, today: date) -> tuple[str, ...]:
         (f"devices.{each.name}: its calibration", each.settings.calibrated, each.settings.calibration_due)
         for each in file.devices
     ]
-    stated += [
-        (f"derived.{name}: the calibration of {of.source} by {known.reference}", known.date, known.due)
-        for name, of in file.derived.items()
-        if isinstance(of, Calibrated) and (known := of.calibration)
-    ]
+    for name, of in file.derived.items():
+        if isinstance(of, Calibrated):
+            known = of.calibration
+            what = f"derived.{name}: the calibration of {of.source} by {known.reference}"
+            stated.append((what, known.date, known.due))
     warnings = []
     for what, day, due in stated:
         if day is not None and day > today:
