@@ -160,11 +160,12 @@ def carry_out(rig: EmulatedRig, case: Case, protocol: str) -> Found:
         parameters["until"] = __file__
     with ExitStack() as stack:
         stack.callback(rig.control.advance, REST)
-        if case.fault:
-            stack.callback(rig.control.end_fault, case.fault)
         if case.fault_first:
             rig.control.fault(case.fault, **case.values)
         run = stack.enter_context(GuardedRun(rig, protocol, overrides, parameters))
+        if case.fault:
+            # Before the run is left: a guardian goes on until what is frozen shows that it is safe.
+            stack.callback(rig.control.end_fault, case.fault)
         crossed = None
         if case.crossing is None:
             run.await_on(0)
