@@ -3,13 +3,10 @@
 from contextlib import closing
 
 import pytest
-from heater_protocols import stairs
 
 from bench.api import open_rig
 from bench.base import DeviceError, LimitError, VirtualClock
 from bench.base.clock import VIRTUAL_EPOCH
-from bench.execution import check_before_moving
-from bench.protocol import plan
 from bench.rig import Rig, load_rig
 
 bluesky = pytest.importorskip("bluesky")
@@ -35,48 +32,31 @@ def run(engine, plan):
     return documents
 
 
-class TestScan:
-    @pytest.fixture
-    def documents(self, engine, rig):
-        return run(engine, plans.scan([rig.devices["psd"]], rig.devices["tec"], 40.0, 60.0, 5))
-
-    def test_documents_come_in_full(self, documents):
-        assert {name: len(entries) for name, entries in documents.items()} == {
-            "start": 1,
-            "descriptor": 1,
-            "event": 5,
-            "stop": 1,
-        }
-        assert documents["stop"][0]["exit_status"] == "success"
-        assert documents["start"][0]["motors"] == ("tec",)
-
-    def test_units(self, documents):
-        keys = documents["descriptor"][0]["data_keys"]
-        assert {name: key["units"] for name, key in keys.items()} == {
-            "psd_position": "m",
-            "tec_temperature": "°C",
-            "tec_sink_temperature": "°C",
-            "tec_current": "A",
-            "tec_voltage": "V",
-        }
-        assert all(key["dtype"] == "number" and key["shape"] == [] for key in keys.values())
-
-    def test_values(self, documents):
-        data = [event["data"] for event in documents["event"]]
-        temperatures = [entry["tec_temperature"] for entry in data]
-        assert temperatures == pytest.approx([40.0, 45.0, 50.0, 55.0, 60.0], abs=0.1)
-        # Below the transition the film expands, above 55 °C it begins to bend the other way.
-        positions = [entry["psd_position"] for entry in data]
-        assert positions[:4] == sorted(positions[:4], reverse=True)
-        assert positions[4] > positions[3]
-        assert all(-6e-6 < position < 100e-6 for position in positions)
-        assert data[-1]["tec_current"] > data[0]["tec_current"] > 0
-
-    def test_times_are_those_of_the_laboratory(self, documents, rig):
-        stamps = [event["timestamps"]["tec_temperature"] for event in documents["event"]]
-        assert stamps == sorted(stamps)
-        assert VIRTUAL_EPOCH.timestamp() < stamps[0] < stamps[-1] <= VIRTUAL_EPOCH.timestamp() + rig.clock.now()
-        assert rig.clock.now() < 200.0
+def test_a_scan_gives_documents_with_units_values_and_times_of_the_laboratory(engine, rig):
+    documents = run(engine, plans.scan([rig.devices["psd"]], rig.devices["tec"], 40.0, 60.0, 5))
+    counts = {name: len(entries) for name, entries in documents.items()}
+    assert counts == {"start": 1, "descriptor": 1, "event": 5, "stop": 1}
+    assert documents["stop"][0]["exit_status"] == "success"
+    assert documents["start"][0]["motors"] == ("tec",)
+    keys = documents["descriptor"][0]["data_keys"]
+    units = {"temperature": "°C", "sink_temperature": "°C", "current": "A", "voltage": "V"}
+    assert {name: key["units"] for name, key in keys.items()} == {
+        "psd_position": "m", **{f"tec_{name}": unit for name, unit in units.items()}
+    }  # fmt: skip
+    assert all(key["dtype"] == "number" and key["shape"] == [] for key in keys.values())
+    data = [event["data"] for event in documents["event"]]
+    temperatures = [entry["tec_temperature"] for entry in data]
+    assert temperatures == pytest.approx([40.0, 45.0, 50.0, 55.0, 60.0], abs=0.1)
+    # Below the transition the film expands, above 55 °C it begins to bend the other way.
+    positions = [entry["psd_position"] for entry in data]
+    assert positions[:4] == sorted(positions[:4], reverse=True)
+    assert positions[4] > positions[3]
+    assert all(-6e-6 < position < 100e-6 for position in positions)
+    assert data[-1]["tec_current"] > data[0]["tec_current"] > 0
+    stamps = [event["timestamps"]["tec_temperature"] for event in documents["event"]]
+    assert stamps == sorted(stamps)
+    assert VIRTUAL_EPOCH.timestamp() < stamps[0] < stamps[-1] <= VIRTUAL_EPOCH.timestamp() + rig.clock.now()
+    assert rig.clock.now() < 200.0
 
 
 class TestFailures:
@@ -89,11 +69,6 @@ class TestFailures:
         rig.laboratory.tec.unplug()
         with pytest.raises(DeviceError, match="tec"):
             engine(plan_stubs.mv(rig.devices["tec"], 50.0))
-
-
-def test_the_rig_of_a_scan_runs_protocols_too(rig):
-    with pytest.raises(Exception, match="probe_temperature"):
-        check_before_moving(rig.description, stairs, plan(stairs, stairs.parameters()))
 
 
 class TestReadables:

@@ -39,20 +39,7 @@ class TestFlags:
             assert interrupts.pause_requested
             assert not interrupts.abort_requested()
 
-    @cases(
-        "name",
-        [
-            "SIGTERM",
-            "SIGHUP",
-            "SIGQUIT",
-            "SIGUSR1",
-            "SIGUSR2",
-            "SIGALRM",
-            "SIGVTALRM",
-            "SIGPROF",
-            "SIGXCPU",
-        ],
-    )
+    @cases("name", ["SIGTERM", "SIGHUP", "SIGUSR1"])
     def test_the_system_ends_at_once(self, name):
         with Interrupts() as interrupts:
             signal.raise_signal(getattr(signal, name))
@@ -73,12 +60,8 @@ class TestFlags:
         # Those that stop a process are not sent, as nobody would continue it.
         stopping = {signal.SIGTSTP, signal.SIGTTIN, signal.SIGTTOU, signal.SIGTRAP}
         sent = signal.valid_signals() - broken - not_caught - stopping
-        done = subprocess.run(
-            [sys.executable, "-c", code, *(str(int(number)) for number in sent)],
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+        command = [sys.executable, "-c", code, *(str(int(number)) for number in sent)]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
         assert (done.returncode, done.stdout) == (0, "lives True\n"), done.stderr
 
     def test_former_handlers_come_back(self):
@@ -129,14 +112,8 @@ class Process:
     def __init__(self, tmp_path, rig, protocol, *settings, clock="wall", terminal=False, **keys):
         self.folder = tmp_path / "runs"
         self.witness = tmp_path / "witness.txt"
-        command = [
-            sys.executable,
-            str(SUPPORT / "run_heater.py"),
-            str(self.folder),
-            rig,
-            clock,
-            f"{PROTOCOLS}:{protocol}",
-        ]
+        script = str(SUPPORT / "run_heater.py")
+        command = [sys.executable, script, str(self.folder), rig, clock, f"{PROTOCOLS}:{protocol}"]
         environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(SUPPORT), str(SUPPORT.parents[1])])}
         self.terminal = None
         if terminal:
@@ -249,15 +226,11 @@ class TestProcesses:
         process.send(signal.SIGINT)
         assert self.assert_aborted(process, "Ctrl-C") == 0
 
-    @pytest.mark.parametrize(
-        ("name", "protocol"), [("SIGTERM", "stairs"), ("SIGTERM", "settle"), ("SIGHUP", "stairs")]
-    )
-    def test_the_system_ends_it_at_once(self, start, name, protocol):
-        more = ("dwell=3000",) if protocol == "stairs" else ("minimum=3000", "timeout=3600")
-        process = start(protocol, *more, clock="x2")
+    def test_the_system_ends_it_at_once(self, start):
+        process = start("settle", "minimum=3000", "timeout=3600", clock="x2")
         process.until_it_holds()
-        process.send(getattr(signal, name))
-        assert self.assert_aborted(process, name) == 0
+        process.send(signal.SIGTERM)
+        assert self.assert_aborted(process, "SIGTERM") == 0
 
     def test_killed_it_leaves_what_was_finished(self, start):
         process = start("stairs", "dwell=0.02", "count=2000", "increment=0.02")

@@ -35,7 +35,6 @@ DRIVE = Signal("drive", "V", "drive", 3)
 LENGTH = Signal("length", "m", "position", 9)
 CURVATURE = Signal("response", "1/m", "curvature", 2)
 STRAIN = Signal("strain", "1", "strain", 6)
-TEMPERATURE = Signal("temperature", "°C", "temperature", 3)
 
 
 @pytest.fixture
@@ -78,11 +77,9 @@ def report(tmp_path):
             (0.375e-3, 0.105e-3),
             "error max 0.375 mm, error rms 0.275 mm, error median 0.240 mm, 8.0 s a target",
         ),
-        (LENGTH, (1.5e-6, 0.5e-6), "error max 1.500 µm, error rms 1.118 µm, error median 1.000 µm, 8.0 s a target"),
         (LENGTH, (23e-9, 21e-9), "error max 23 nm, error rms 22 nm, error median 22 nm, 8.0 s a target"),
         (CURVATURE, (8.125, 4.125), "error max 8.12 1/m, error rms 6.44 1/m, error median 6.12 1/m, 8.0 s a target"),
         (STRAIN, (375e-6, 105e-6), "error max 0.000375, error rms 0.000275, error median 0.000240, 8.0 s a target"),
-        (TEMPERATURE, (0.02, 0.01), "error max 0.020 °C, error rms 0.016 °C, error median 0.015 °C, 8.0 s a target"),
     ],
 )
 def test_targets(report, output, errors, said):
@@ -95,7 +92,6 @@ def test_targets(report, output, errors, said):
     ("output", "errors", "said"),
     [
         (LENGTH, (30e-6, -10e-6), "error max 30.000 µm, error rms 22.361 µm"),
-        (CURVATURE, (1.25, -0.75), "error max 1.25 1/m, error rms 1.03 1/m"),
         (STRAIN, (2e-6, -1e-6), "error max 0.0000020, error rms 0.0000016"),
     ],
 )
@@ -123,7 +119,6 @@ def test_a_plain_number_has_no_unit(report):
     ("output", "unit", "row"),
     [
         (LENGTH, "m", ["line", "polynomial", "0.25", "0.25", "0.25", "mm", "6.67"]),
-        (CURVATURE, "1/m", ["line", "polynomial", "0.00025", "0.00025", "0.00025", "1/m", "6.67"]),
         (STRAIN, "1", ["line", "polynomial", "0.00025", "0.00025", "0.00025", "", "6.67"]),
     ],
 )

@@ -286,7 +286,7 @@ class TestResume:
 def whole(request, tmp_path_factory):
     """A run along a random sequence, to be cut anywhere."""
     out = tmp_path_factory.mktemp(request.param)
-    return bench.run("random-validation", request.param, out=out, count=150).folder
+    return bench.run("random-validation", request.param, out=out, count=125).folder
 
 
 @pytest.mark.slow
@@ -305,7 +305,7 @@ class TestAgreement:
         with Record(copy) as record:
             return outcome.error, [event.text for event in record.events()[before:] if event.kind == "resumed"]
 
-    @pytest.mark.parametrize("steps", [31, 78, 122, 149])
+    @pytest.mark.parametrize("steps", [31, 122])
     def test_the_specimen_of_the_run_is_accepted(self, whole, tmp_path, monkeypatch, steps):
         error, texts = self.compared(whole, tmp_path / "run", steps, monkeypatch)
         assert not isinstance(error, AgreementError), error
@@ -315,9 +315,8 @@ class TestAgreement:
     def test_one_that_is_elsewhere_is_refused(self, whole, tmp_path, monkeypatch, share):
         read = Past.of
         monkeypatch.setattr(Past, "of", lambda record: _shifted(read(record), share))
-        for steps in (61, 122):
-            error, _ = self.compared(whole, tmp_path / str(steps), steps, monkeypatch)
-            assert isinstance(error, AgreementError)
+        error, _ = self.compared(whole, tmp_path / "run", 61, monkeypatch)
+        assert isinstance(error, AgreementError)
 
 
 def _leave(*_):

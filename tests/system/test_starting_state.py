@@ -90,10 +90,7 @@ def printed_errors(out):
 @pytest.mark.parametrize(
     ("name", "options"),
     [
-        ("preisach", ["--initial", "positive"]),
-        ("preisach", ["--initial", "skip", "-o", "orientation=falling"]),
         ("preisach", ["--initial", "estimate", "--levels", 5, "--skip", 12]),
-        ("preisach-signed", ["--initial", "positive", "-o", "reversible=linear"]),
         ("prandtl-ishlinskii", ["--initial", "skip"]),
     ],
 )
@@ -147,27 +144,6 @@ def test_the_start_is_kept_and_can_be_chosen(bench, tmp_path, data):
     ):
         code, _, err = bench(*command)
         assert (code, err.count("error:")) == (2, 1), err
-
-
-def test_figures_say_the_errors_of_the_text(monkeypatch, tmp_path, data):
-    from matplotlib.figure import Figure
-
-    from bench.analysis import draw_identification, errors_text
-
-    titles = []
-    save = Figure.savefig
-
-    def noted(figure, *arguments, **options):
-        legends = [axes.get_legend() for axes in figure.axes if axes.get_legend()]
-        titles.extend(text.get_text() for legend in legends for text in legend.get_texts())
-        save(figure, *arguments, **options)
-
-    monkeypatch.setattr(Figure, "savefig", noted)
-    found = identify(data[1], "preisach", **NAMES, initial="skip", levels=6)
-    assert found.identification.skip > 0
-    draw_identification(found, tmp_path)
-    errors, unit = found.identification.errors, found.file.operator.output_unit
-    assert f"preisach: {errors_text(errors, unit)}" in titles
 
 
 class TestStartingState:

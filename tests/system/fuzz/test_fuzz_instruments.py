@@ -18,16 +18,11 @@ from sim_devices.wire.mecom import MeComServer
 
 @pytest.mark.parametrize("name", TARGETS)
 def test_no_input_does_harm(name):
-    outcome = fuzz(name, 1000, seed=0)
-    assert outcome.frames == 1000
+    outcome, again, other = (fuzz(name, 400, seed) for seed in (0, 0, 1))
+    assert outcome.frames == 400
     # Most requests reach the instrument, or the inputs would test the framing alone.
-    assert outcome.answers > 250
-
-
-@pytest.mark.parametrize("name", TARGETS)
-def test_the_same_seed_gives_the_same_bytes(name):
-    first, second, other = (fuzz(name, 200, seed) for seed in (1, 1, 2))
-    assert first.digest.digest() == second.digest.digest() != other.digest.digest()
+    assert outcome.answers > 100
+    assert outcome.digest.digest() == again.digest.digest() != other.digest.digest()
 
 
 @pytest.mark.parametrize(
@@ -47,10 +42,10 @@ def test_every_port_of_a_laboratory_is_fuzzed(rig, laboratory):
 @pytest.mark.parametrize("name", ["vo2/tec", "sma/load_cell", "sma/stage", "sma/supply", "vo2/psd"])
 def test_inputs_are_of_every_kind(name):
     rng, dialect = random.Random(0), TARGETS[name].dialect
-    inputs = [mutated(dialect, rng) for _ in range(1000)]
+    inputs = [mutated(dialect, rng) for _ in range(500)]
     assert min(map(len, inputs)) <= 1
     assert max(map(len, inputs)) > 300
-    assert len(set(inputs)) > 500
+    assert len(set(inputs)) > 250
 
 
 def test_an_exception_is_noticed(monkeypatch):
