@@ -6,7 +6,6 @@ import pytest
 from cases import cases
 
 import bench
-from bench.dashboard import rebuild
 from bench.record import Record, recover
 from rigs.muscles.identification import identify_muscle, read_resting, read_series
 
@@ -72,10 +71,3 @@ def test_the_same_muscle_is_found():
     rms = {kind: errors.rms_percent for kind, errors in found.errors.items()}
     expected = {"force-voltage": 0.7396707647, "length-voltage": 5.5134796876, "length-force": 3.2158518630}
     assert rms == pytest.approx(expected, rel=1e-6)
-
-
-def test_a_run_can_be_shown_again(tmp_path):
-    recording = tmp_path / "run.rrd"
-    with Record(FOLDER / "hybrid-damped-oscillation") as record:
-        rebuild(record, recording)
-    assert recording.stat().st_size > 50_000

@@ -16,21 +16,22 @@ ERRORS = {"rms", "max", "median", "average", "settling", "seconds"}
 BAND = 1.5
 RECORDED_SEED = 0
 SHORT = {
-    "vo2": ("tracking.count=12", "following.duration=400"),
+    "vo2": ("tracking.count=12", "following.duration=200"),
     "sma": (
-        "length-voltage.points=19",
-        "length-verification.points=9",
-        "length-force.points=8",
+        "length-voltage.points=13",
+        "length-verification.points=7",
+        "length-force.points=5",
+        "length-force.voltages=0,1,2,3",
         "length-control.count=10",
         "force-control.count=10",
     ),
     "muscles": (
-        "length-voltage.points=19",
-        "length-verification.points=9",
-        "length-force.points=8",
-        "length-voltage.dwell=30",
-        "length-verification.dwell=30",
-        "length-force.dwell=30",
+        "length-voltage.points=13",
+        "length-verification.points=7",
+        "length-force.points=5",
+        "length-voltage.dwell=20",
+        "length-verification.dwell=20",
+        "length-force.dwell=20",
         "force-voltage.dwell=30",
     ),
     "hybrid": (
@@ -38,6 +39,7 @@ SHORT = {
         "hybrid-control.steps=2",
         "hybrid-control.rate=100",
         "hybrid-control.record_rate=25",
+        "hybrid-control.speed=3e-6",
         "calibration-displacement.rate=4",
         "fine-step.duration=0.08",
     ),
