@@ -36,20 +36,8 @@ def measured(tmp_path_factory):
 
 def test_a_sequence_is_written_and_carried_out(bench, tmp_path):
     path = tmp_path / "sequence.csv"
-    code, out, err = bench(
-        "model",
-        "design",
-        "--rig",
-        "vo2",
-        "--levels",
-        2,
-        "--dwell",
-        0.5,
-        "--sequence",
-        "first-order-reversals",
-        "--out",
-        path,
-    )
+    options = ["--levels", 2, "--dwell", 0.5, "--sequence", "first-order-reversals"]
+    code, out, err = bench("model", "design", "--rig", "vo2", *options, "--out", path)
     assert code == 0, err
     assert f"setpoints={path}" in out.replace("\n", "")
     columns = read_columns(path, ["time", "input", "dwell"])

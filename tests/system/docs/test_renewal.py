@@ -28,15 +28,6 @@ def renewal(of_docs):
     return of_docs("renew_controllers")
 
 
-def row(status="completed", reason="", rms="2e-6", **more):
-    return {"status": status, "reason": reason, "tracking_rms [m]": rms} | more
-
-
-@pytest.fixture
-def shown(renewal):
-    return renewal.Shown("tracking_rms", "µm", 1e-6, "emulation.plant", "as identified")
-
-
 def test_the_tables_of_the_page_are_those_of_the_campaign(renewal, of_docs):
     assert {name.partition(" ")[0] for name in renewal.ROBUSTNESS} == set(CONTROLLED)
     page = (ROOT / "docs" / "reference" / "robustness.md").read_text(encoding="utf-8")
@@ -57,49 +48,6 @@ def test_each_change_has_a_title_of_its_own(renewal, name):
 
 def _inline(change):
     return change if isinstance(change, str) else "{" + ", ".join(f"{k} = {v}" for k, v in change.items()) + "}"
-
-
-@pytest.mark.parametrize(
-    ("runs", "cell"),
-    [
-        ([row(rms="3e-6"), row(), row(rms="1e-6")], "2 / 3"),
-        ([row(), row(status="failed", reason="no", rms="9")], "2 / 2, 1 stopped"),
-        ([row(reason="errs"), row(reason="errs")], "2 / 2, warned"),
-        ([row(status="failed", reason="no")], "stopped"),
-    ],
-)
-def test_a_cell_has_median_and_worst_and_how_runs_ended(renewal, shown, runs, cell):
-    runs = [{**run, "emulation.plant": "{}", "controller": "latched"} for run in runs]
-    assert renewal.table(shown, runs) == f"| µm | latched |\n| --- | --- |\n| as identified | {cell} |"
-
-
-def test_a_change_beyond_twice_the_nominal_error_is_named_unless_each_run_says_so_itself(renewal, shown):
-    def runs(*changed):
-        nominal = {**row(), "controller": "latched", "emulation.plant": "{}"}
-        return [
-            nominal,
-            *({**each, "controller": "latched", "emulation.plant": '{"friction" = 0.7}'} for each in changed),
-        ]
-
-    stopped = row(status="failed", reason="no", rms="9")
-    assert renewal.silent(shown, runs(row(rms="5e-6"), row(rms="5e-6", reason="errs"))) == ["latched, friction × 2"]
-    for within in ([row(rms="3.9e-6")], [row(rms="5e-6", reason="errs")], [stopped], [row(), row(), row(rms="9e-6")]):
-        assert renewal.silent(shown, runs(*within)) == []
-
-
-def test_followers_have_a_row_for_each_rig_and_reference(renewal):
-    runs = [
-        {
-            "controller": controller, "rig": rig, "period [s]": period, "status": "completed", "reason": "",
-            "following_rms [m]": "1.5e-8",
-        }
-        for controller in ("closed-loop-inverse", "predictive")
-        for rig, period in (("hybrid", "6.0"), ("sma", ""))
-    ]  # fmt: skip
-    assert renewal.following(runs).splitlines()[2:] == [
-        "| `hybrid`, nm | sine, 6 s | 15 / 15 | 15 / 15 |",
-        "| `sma`, µm | file | 0.015 / 0.015 | 0.015 / 0.015 |",
-    ]
 
 
 def test_the_table_of_the_choice_has_a_row_for_each_record_and_a_column_for_each_plant(of_docs):
