@@ -13,7 +13,6 @@ from written_run import META, SIGNALS, write_run
 from bench.analysis import PAGE_NAME, report_run
 from bench.api import identify
 from bench.devices import Settled, Signal
-from bench.identification import damped_oscillation
 from bench.protocol import TRACES
 from bench.record import FILE_NAME, Event, Journal, StepRecord, add_model
 
@@ -92,13 +91,3 @@ def test_of_models_on_a_run(tmp_path, drawn):
     report_run(folder, (), None, Console(file=io.StringIO()), page=folder / PAGE_NAME)
     assert len(drawn) > 4
     assert {name: problems for name, problems in drawn.items() if problems} == {}
-
-
-def test_a_plot_of_a_fit(tmp_path, drawn):
-    inputs = damped_oscillation(0.0, 10.0, 5.0, 8, step=0.5)
-    outputs = inputs + np.sign(np.gradient(inputs))
-    table = "\n".join(f"{u},{y}" for u, y in zip(inputs, outputs, strict=True))
-    (tmp_path / "loop.csv").write_text(f"voltage [V],position [µm]\n{table}\n", encoding="utf-8")
-    model = identify(tmp_path / "loop.csv", "prandtl-ishlinskii", input="voltage", output="position")
-    assert model.plot().png.startswith(b"\x89PNG")
-    assert [problems for problems in drawn.values() if problems] == []

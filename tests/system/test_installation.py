@@ -1,8 +1,6 @@
 """The bench installed from its distributions in a clean environment, without the checkout and without a network."""
 
 import os
-import re
-import shlex
 import shutil
 import subprocess
 import sys
@@ -10,10 +8,8 @@ import sysconfig
 import tarfile
 import tomllib
 import zipfile
-from itertools import pairwise
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 ROOT = Path(__file__).parents[2]
@@ -100,25 +96,3 @@ def test_it_runs_without_the_checkout(environment, tmp_path):
     assert "[devices.tec]" in done([bench, "show", "vo2"], tmp_path, variables)
     done([bench, "new", "device", "micro-balance"], tmp_path, variables)
     assert (tmp_path / "micro-balance" / "pyproject.toml").is_file()
-
-
-@pytest.mark.seeds
-# A new environment compiles the kernels again.
-@pytest.mark.timeout(1200)
-def test_the_words_of_the_readme_lead_to_reports(environment, tmp_path):
-    bench, variables = environment
-    text = (ROOT / "README.md").read_text(encoding="utf-8")
-    lines = "\n".join(re.findall(r"```sh\n(.*?)```", text, re.DOTALL)).splitlines()
-    commands = [shlex.split(line, comments=True) for line in lines if line.startswith("bench ")]
-    (own,) = (words for words in commands if words[1] == "identify" and "." in words[2])
-    column = dict(pairwise(own))
-    inputs = 5 * np.sin(np.linspace(0, 6 * np.pi, 200)) * np.linspace(1, 0.2, 200)
-    rows = "".join(f"{u:.4f},{np.tanh(u) + 0.1 * u:.4f}\n" for u in inputs)
-    (tmp_path / own[2]).write_text(f"{column['--input']} [V],{column['--output']} [um]\n{rows}")
-    for words in commands:
-        done([bench, *words[1:]], tmp_path, variables)
-    (page,) = tmp_path.glob("recordings/*/report.html")
-    assert "preisach-nonmonotonic" in page.read_text(encoding="utf-8")
-    (card,) = tmp_path.glob("*.md")
-    assert own[2] in card.read_text(encoding="utf-8")
-    assert [*tmp_path.glob("figures/*.png")]

@@ -14,12 +14,9 @@ from matplotlib.figure import Figure
 from bench import identify
 from bench.analysis import (
     ColumnNames,
-    Predictions,
-    Quantity,
     compare_models,
     draw_comparison,
     draw_identification,
-    draw_predicted,
     errors_text,
     load_models,
     read_columns,
@@ -108,20 +105,6 @@ class TestRows:
         assert list(drawn) == ["preisach-loops.png"]
         assert_labelled(drawn["preisach-loops.png"])
 
-    def test_time_goes_first_and_models_are_told_apart(self):
-        found = Predictions(
-            Quantity("u [V]", "V", np.arange(3.0)),
-            "N",
-            {"a": np.zeros(3), "b": np.ones(3)},
-            Quantity("force", "N", np.full(3, 2.0)),
-            Quantity("t", "s", np.arange(3.0)),
-            skip=1,
-        )
-        heads = [head for head, _ in found.table()]
-        assert heads[:3] == ["t [s]", "u [V]", "measured [N]"]
-        assert heads[3:] == ["a predicted [N]", "a residual [N]", "b predicted [N]", "b residual [N]"]
-        assert {name: errors.rms for name, errors in found.errors().items()} == {"a": 2.0, "b": 1.0}
-
     def test_compared_rows_give_the_compared_errors(self, bench, tmp_path, loop, models):
         out, result = tmp_path / "out.csv", tmp_path / "out.json"
         code, _, err = bench(
@@ -170,15 +153,6 @@ class TestFigures:
         title = drawn["preisach-density.png"][0].get_title(loc="left")
         assert title == f"light grey: zero; hatched: never swept ({share:.0%})"
         assert share > 0.1
-
-    def test_a_prediction_is_drawn_over_time_where_it_is_known(self, tmp_path, drawn):
-        u = np.linspace(0.0, 1.0, 5)
-        found = Predictions(
-            Quantity("u", "V", u), "N", {"m": u}, Quantity("f", "N", u + 1.0), Quantity("t", "s", 2.0 * u)
-        )
-        draw_predicted(found, tmp_path)
-        assert drawn["m-errors.png"][1].get_xlabel() == "time / s"
-        assert drawn["m-errors.png"][1].lines[0].get_xdata()[-1] == 2.0
 
     def test_compared_models_share_their_figures(self, tmp_path, loop, models, drawn):
         compared = compare_models(
@@ -229,13 +203,6 @@ class TestPlaces:
             assert word in err.replace("\n", " ")
         assert data.read_text() == "voltage,displacement\n1,1\n"
 
-    def test_the_folder_of_figures_is_made(self, bench, tmp_path, loop):
-        code, _, err = bench(
-            "identify", loop, *COLUMNS, "--model", "polynomial", "--figures", tmp_path / "new" / "figures"
-        )
-        assert code == 0, err
-        assert len(list((tmp_path / "new" / "figures").iterdir())) == 2
-
 
 def read_card(path):
     """A card's sections by title: the rows of the table by their first cells, or the text."""
@@ -278,7 +245,7 @@ class TestCard:
     def test_a_card_has_the_band_and_the_models_that_were_compared(self, bench, tmp_path, loop):
         result = tmp_path / "fit.json"
         code, _, err = bench(
-            "identify", loop, *COLUMNS, "--model", "polynomial,prandtl-ishlinskii", "--band",
+            "identify", loop, *COLUMNS, "--model", "polynomial,prandtl-ishlinskii", "-o", "plays=5", "--band",
             "--card", tmp_path / "card.md", "--json", result,
         )  # fmt: skip
         assert code == 0, err

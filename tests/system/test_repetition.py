@@ -18,7 +18,7 @@ from rich.console import Console
 from bench.analysis import compare_runs
 from bench.base import Interrupts
 from bench.cli import main
-from bench.execution import Resume, Run, carry_out as carry_out_run, repeat, resume
+from bench.execution import Run, carry_out as carry_out_run, repeat
 from bench.identification import ModelFile
 from bench.models import Preisach, uniform_levels
 from bench.protocol import find_protocol
@@ -243,13 +243,3 @@ class TestParametersChangedAtAPause:
             equal = compare_runs(before, now).equal
         assert equal["steps"]
         assert equal["telemetry"]
-
-    def test_a_resumed_run_has_them(self, paused):
-        # As if it had died after its second step.
-        with closing(sqlite3.connect(paused / FILE_NAME)) as db, db:
-            db.execute("DELETE FROM steps WHERE step > 1")
-            db.execute("DELETE FROM telemetry WHERE step > 1")
-            db.execute("DELETE FROM events WHERE t > 2.5")
-            db.execute("DELETE FROM meta WHERE key IN ('status', 'reason', 'finished', 'safe_state', 'counts')")
-        resume(Resume(folder=paused), Console(quiet=True))
-        assert self.durations(paused) == [2.0, 0.5, 0.5, 0.5]

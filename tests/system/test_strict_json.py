@@ -13,7 +13,6 @@ from bench.batch import StudyResult
 from bench.batch.campaign.study_tables import over_seeds, write_study
 from bench.devices import Settled
 from bench.execution.guardian.black_box import BlackBox
-from bench.identification import load_model
 from bench.record import BLACK_BOX_NAME, FILE_NAME, Journal, StepRecord, add_model
 from bench.record.model_files import models_beside
 
@@ -80,25 +79,6 @@ def test_every_command_that_reads_a_run(run, tmp_path, bench):
     assert assert_strict(tmp_path) >= 8
     metadata = strict(out / "metadata.json")[0]
     assert metadata["limits"] == {"plate": [None, None]}
-
-
-@pytest.mark.slow
-def test_every_command_about_models(tmp_path, bench):
-    inputs = np.tile([0.0, 1.0, 2.0, 3.0, 2.0, 1.0], 5)
-    # An output that does not vary has no errors in percent of its range.
-    write_csv(tmp_path / "flat.csv", ["u", "y"], [inputs, np.full(inputs.size, 2.0)])
-    write_csv(tmp_path / "loop.csv", ["u", "y"], [inputs, inputs**2])
-    words = ("--input", "u", "--output", "y")
-    model = tmp_path / "model.json"
-    fit = bench("identify", tmp_path / "loop.csv", "--model", "polynomial", *words, "--out", model)
-    assert fit[0] == 0, fit
-    code, _, err = bench(
-        "predict", model, tmp_path / "flat.csv", *words, "--out", tmp_path / "p.csv", "--json", tmp_path / "p.json"
-    )
-    assert code == 0, err
-    assert assert_strict(tmp_path) == 2
-    assert strict(tmp_path / "p.json")[0]["rms_percent"] is None
-    assert load_model(model).name == "polynomial"
 
 
 def test_what_the_guardian_has_seen(tmp_path):

@@ -13,10 +13,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from urllib.request import urlopen
 
-import numpy as np
 import pytest
 import rerun_cli
-from playwright.sync_api import Browser
 from rerun.chunk import RrdReader
 
 from bench.base import WallClock
@@ -189,35 +187,3 @@ def test_the_viewer_for_browsers_is_not_reachable_from_outside(ended: Path) -> N
         # A server of every address of the machine answers at this one, too.
         with pytest.raises(OSError, match=r"refused|assign|unreachable"):
             socket.create_connection(("127.0.0.2", int(host.rpartition(":")[2])), timeout=PATIENCE)
-
-
-@pytest.mark.slow
-@pytest.mark.seeds
-def test_a_browser_shows_a_replay(ended: Path, tmp_path: Path, browser: Browser) -> None:
-    with JournalView(ended, 0) as view, web_viewer(view.uri) as address:
-        view.follow()
-        page = browser.new_page(viewport={"width": 900, "height": 600})
-        requests: list[str] = []
-        page.on("request", lambda request: requests.append(request.url))
-        page.route(lambda url: "127.0.0.1" not in url, lambda route: route.abort())
-        page.goto(f"{address}&renderer=webgl")
-        png = tmp_path / "page.png"
-
-        def is_drawn() -> bool:
-            page.wait_for_timeout(1000)
-            page.screenshot(path=str(png))
-            pixels = _pixels(png)
-            # The colours of the drive and of the response, which nothing of an empty viewer has.
-            return all(
-                (abs(pixels - colour).sum(axis=2) < 60).sum() > 50 for colour in ((236, 100, 46), (58, 132, 232))
-            )
-
-        wait_until(is_drawn)
-        assert any(url.endswith("/ReadMessages") for url in requests)
-        page.close()
-
-
-def _pixels(png: Path) -> np.ndarray:
-    from PIL import Image
-
-    return np.asarray(Image.open(png).convert("RGB")).astype(int)

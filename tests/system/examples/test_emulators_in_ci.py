@@ -49,14 +49,3 @@ def test_the_plugin_imports_nothing_heavy(tmp_path, finished_process):
     )
     done = finished_process([sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider"], tmp_path, None)
     assert done.returncode == 0, done.stdout
-
-
-def test_the_server_imports_nothing_heavy(tmp_path, finished_process):
-    script = (
-        "import sys, threading\n"
-        "from bench.cli import main\n"
-        "import sim_devices.serving.commands, rigs.vo2.laboratory\n"
-        f"assert not {{*sys.modules}} & {{*{HEAVY!r}}}, sys.modules.keys() & {{*{HEAVY!r}}}\n"
-    )
-    done = finished_process([sys.executable, "-c", script], tmp_path, None)
-    assert done.returncode == 0, done.stderr

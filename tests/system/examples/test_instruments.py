@@ -5,7 +5,6 @@ from pathlib import Path
 import pytest
 from cases import cases
 
-import bench as face
 from bench.base import DeviceConnectionError, DeviceError, VirtualClock
 from bench.rig import Rig, load_rig
 from sim_devices import protocol_emulated
@@ -130,10 +129,3 @@ def test_its_emulated_rig_measures_within_its_limits_and_is_safe(name):
                 rig.clock.sleep(60.0)
                 assert rig.measure()[f"{device.name}_setpoint"] == pytest.approx(0.5 * (low + high))
                 device.safe()
-
-
-@pytest.mark.parametrize("name", ["thorlabs-ted4015.toml", "keysight-e3632a.toml"])
-def test_a_general_protocol_runs_on_it(name, tmp_path):
-    range_ = {"hot": 60.0, "cool": 30.0} if "ted" in name else {"hot": 8.0, "cool": 4.0}
-    run = face.run("creep", str(FOLDER / name), clock="virtual", seed=1, out=tmp_path / "run", **range_)
-    assert run.status == "completed"
