@@ -34,7 +34,10 @@ def completed(tmp_path_factory):
     """The journal of a completed run on the heater."""
     folder = tmp_path_factory.mktemp("completed")
     (folder / "heater.toml").write_text(RIG, encoding="utf-8")
-    return face.run(stairs, folder / "heater.toml", out=folder / "runs", count=6).folder
+    with pytest.MonkeyPatch.context() as patch:
+        # The command is in the heading: with a long one it takes pages beside those of its copy.
+        patch.setattr("sys.argv", ["bench"])
+        return face.run(stairs, folder / "heater.toml", out=folder / "runs", count=6).folder
 
 
 @pytest.fixture
@@ -150,21 +153,6 @@ class TestDamage:
         with Record(folder) as record:
             assert "bench runs repair" in record.damage()
 
-    def test_is_a_row_that_is_missing(self, folder):
-        with closing(sqlite3.connect(folder / FILE_NAME)) as db, db:
-            db.execute("DELETE FROM telemetry WHERE tick = 3")
-        with Record(folder) as record:
-            assert record.missing.ranges == {"telemetry": ((3, 3),)}
-            assert "bench runs repair" in record.damage()
-
-    def test_that_is_a_flipped_bit_is_one_row(self, folder):
-        with closing(sqlite3.connect(folder / FILE_NAME)) as db, db:
-            db.execute("UPDATE telemetry SET t = t + 1 WHERE tick = 3")
-        found = recover(folder)
-        assert found.status == "failed"
-        assert found.tables["telemetry"].first_bad == "3"
-        assert [state.missing for state in found.tables.values()].count(0) == 5
-
     def test_is_none_in_a_whole_one_which_is_left_alone(self, bench, folder):
         before = sorted(folder.iterdir())
         code, out, _ = bench("runs", "repair", folder / FILE_NAME)
@@ -208,12 +196,6 @@ class TestALostJournal:
         assert find_journals(lost.parent) == [lost / FILE_NAME]
         with pytest.raises(DataError, match=f"{lost / RECOVERED_NAME} is a recovered copy of it"):
             Record(lost)
-
-    def test_is_told_from_no_run(self, tmp_path):
-        (tmp_path / "nothing").mkdir()
-        assert find_journals(tmp_path) == []
-        with pytest.raises(DataError, match=f"nothing is not a run: there is no {FILE_NAME}"):
-            Record(tmp_path / "nothing")
 
     def test_that_cannot_be_read_names_the_way_back(self, tmp_path):
         (tmp_path / FILE_NAME).write_bytes(b"nothing" * 99)
