@@ -31,20 +31,6 @@ def climb(parameters: Goal, slots: Slots) -> Messages:
 
 
 @protocol(needs=NEEDS)
-def secant(parameters: Goal, slots: Slots) -> Messages:
-    """Search the goal by secants, divided by the difference of two readings."""
-    p = parameters
-    old, value = p.low, 0.5 * (p.low + p.high)
-    before = yield from _read(slots, old, p.dwell)
-    for _ in range(8):
-        response = yield from _read(slots, value, p.dwell)
-        if abs(response - p.goal) < 0.02 * abs(p.goal):
-            break
-        proposed = value + (p.goal - response) * (value - old) / (response - before)
-        old, before, value = value, response, min(max(proposed, p.low), p.high)
-
-
-@protocol(needs=NEEDS)
 def bisect(parameters: Goal, slots: Slots) -> Messages:
     """Halve an interval of the drive until the response there is the goal's."""
     p = parameters

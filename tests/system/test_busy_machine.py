@@ -4,23 +4,13 @@ import subprocess
 import sys
 
 import pytest
-from busy_machine import busy, fingerprint, run
+from busy_machine import run
 
-from bench.base.compilation_display import MESSAGE
 from bench.record import Record
 
 
 @pytest.mark.slow
 class TestBusyMachine:
-    @pytest.mark.seeds
-    def test_virtual_runs_are_equal_to_the_last_bit(self, tmp_path):
-        """The first of them compiles, in the middle of the load, and says so."""
-        with busy(1):
-            loaded, _, first = run("vo2", "virtual", tmp_path / "loaded", tmp_path / "cache")
-        alone, _, second = run("vo2", "virtual", tmp_path / "alone", tmp_path / "cache")
-        assert fingerprint(loaded) == fingerprint(alone)
-        assert [text.count(MESSAGE) for text in (first, second)] == [1, 0]
-
     def test_a_scaled_clock_slows_down_and_says_so(self, tmp_path):
         # The laboratory's hundreds of seconds in some milliseconds: no machine keeps up.
         folder, out, _ = run("vo2", "x100000", tmp_path / "runs")

@@ -1,7 +1,6 @@
 """Campaigns: the file, its tasks, what is done again, and the tables."""
 
 import csv
-import io
 import json
 import os
 import shutil
@@ -32,7 +31,6 @@ from bench.batch import (
 from bench.batch.campaign.study_tables import OverSeeds, over_seeds
 from bench.batch.campaign.tasks import DONE_NAME
 from bench.cli import main
-from bench.cli.campaign_command import SayingExecutor
 from bench.execution import carry_out
 from bench.record import Record
 from bench.rig import Holder, Locks
@@ -123,7 +121,6 @@ class TestFile:
         ("old", "new", "said"),
         [
             ("[3, 5]", '"5..3"', r"runs\.0\.seeds = '5\.\.3': expected a list such as .* or a range"),
-            ("[3, 5]", "[3, 3]", r"3 is there twice"),
             ("[5.0, 10.0]", "[]", r"runs\.0 \(climb\): parameters\.increment = \[\]: expected at least one value"),
             (
                 "[5.0, 10.0]",
@@ -131,20 +128,9 @@ class TestFile:
                 r"night\.toml: runs\.0 \(climb\): parameters \(rig heater, increment = 99\.0\): protocol stairs: "
                 r"parameter increment = 99\.0 is not allowed; allowed: -50 to 50 K",
             ),
-            (
-                "increment",
-                "incrememt",
-                r"there is no parameter 'incrememt'; did you mean increment",
-            ),
-            (
-                "[5.0, 10.0]",
-                "[5.0, 30.0]",
-                r"increment = 30\.0\): protocol stairs would set tec to between 30 and 120 .* allows .* 95",
-            ),
+            ("increment", "incrememt", r"there is no parameter 'incrememt'; did you mean increment"),
             ("heater.toml", "haeter.toml", r"runs\.0 \(climb\): rigs = 'haeter\.toml': rig file .* cannot be read"),
-            ('"heater.toml"', '"heater"', r"rigs = 'heater': there is no rig 'heater'; `bench list` shows all"),
             ('"heater.toml"', '["vo2-hardware"]', r"rigs = 'vo2-hardware': .*not all instruments are emulated"),
-            ("heater_protocols.py:stairs", "heater_protocols.py:stars", r"has no protocol 'stars'; it has: stairs"),
             ('name = "climb"\n', "", r"runs\.0: name is missing; a table with several protocols"),
             (
                 "[[runs]]",
@@ -152,7 +138,6 @@ class TestFile:
                 r"faults = 'none\.toml', rig heater: .*none\.toml cannot be",
             ),
             ("[[runs]]", "most_runs = 3\n[[runs]]", r"1 × 1 × 2 × 1 × 2 runs make 4 .*; most_runs = 3 are allowed"),
-            ("5.0, 10.0", ", ".join(map(str, range(200))), r"1 × 1 × 2 × 1 × 200 runs make 400"),
             (
                 "[runs.parameters]",
                 "[runs.overrides]\n'emulation.noise' = [0.1, -1]\n[runs.parameters]",
@@ -168,7 +153,7 @@ class TestFile:
         ],
     )
     def test_what_is_wrong_is_said_before_anything_moves(self, campaign, old, new, said, tmp_path, capsys):
-        path = campaign("most_runs = 300\n" * ("range" in said or "400" in said) + STAIRS, (old, new))
+        path = campaign(STAIRS, (old, new))
         assert start(path, "--out", tmp_path / "out") == 2
         assert not (tmp_path / "out").exists()
         with pytest.raises(ConfigurationError, match=said):
@@ -187,18 +172,7 @@ class TestFile:
                 '"0..2"\nseed_',
                 r"parameters\.model = '@density': characterize has no run on vo2 with seed 2",
             ),
-            (
-                "levels = 6",
-                "levls = 6",
-                r"models\.0 \(density\)\.levls: there is no such key; did you mean levels",
-            ),
             ("levels = 6", "levels = -6", r"models\.0 \(density\): .*-6.* \(rig vo2\)"),
-            (
-                "levels = 6",
-                "output = 'x'",
-                r"models\.0 \(density\): output = 'x': there is no such signal; .*curvature",
-            ),
-            ("count = 2", "count = 1", r"parameter count = 1 is not allowed; allowed: 2 to 10000"),
             (
                 'runs = "characterize"',
                 'runs = ["characterize", "track"]',
@@ -209,11 +183,6 @@ class TestFile:
                 '"hybrid"',
                 r"models\.0 \(density\): runs: expected one run each of current-steps, thermomechanical, .* on a rig "
                 r"and seed; on vo2 with seed 0 there are: damped-oscillation",
-            ),
-            (
-                '"preisach-nonmonotonic"',
-                '"hybrid"',
-                r"models\.0 \(density\)\.levels: there is no such key; there are: none",
             ),
         ],
     )
@@ -313,19 +282,15 @@ class TestTasks:
         assert (out / f"{run}.incomplete" / "notes.txt").read_text() == "mine"
         assert start(path, "--out", out, "--workers", 1) == 0
         assert "nothing to do, 3 done before" in capsys.readouterr().out
+        # A result that cannot be used is named with what to remove.
+        (out / model / "model.json").write_text("broken")
+        other = campaign(CHAIN, ("[0.1, 0.2]", "0.2"), ("0..1", "0..0"))
+        assert start(other, "--out", out, "--workers", 1) == 1
+        assert f"; remove {model} from the campaign, and the next start makes it anew" in capsys.readouterr().err
         (out / run / "journal.sqlite").unlink()
         (line,) = done_before(tasks, out).put_in_place(out)
         assert line.startswith(f"{run} is done again, as journal.sqlite is gone; what was left is in ")
         assert line.endswith(".incomplete-2 beside it")
-
-    def test_a_result_that_cannot_be_used_is_named_with_what_to_remove(self, campaign, tmp_path, capsys):
-        path, out = campaign(CHAIN, ("[0.1, 0.2]", "0.1"), ("0..1", "0..0")), tmp_path / "out"
-        assert start(path, "--out", out, "--workers", 1) == 0
-        _, model, _ = expand(read_campaign(path)).tasks
-        (out / model / "model.json").write_text("broken")
-        path = campaign(CHAIN, ("[0.1, 0.2]", "0.2"), ("0..1", "0..0"))
-        assert start(path, "--out", out, "--workers", 1) == 1
-        assert f"; remove {model} from the campaign, and the next start makes it anew" in capsys.readouterr().err
 
     def test_models_are_compared_on_runs(self, campaign, tmp_path, capsys):
         compared = CHAIN[: CHAIN.index('[[runs]]\nname = "track"')].replace("levels = 6", "levels = [4, 6]")
@@ -511,29 +476,3 @@ def test_a_number_over_seeds_is_its_median_and_its_range():
     assert set(values) == {"a", "same", "word"}
     assert "{a[0]:.1f}, {a[1]:+g}, {same}, {word}".format_map(values) == "2.5 (1.0–4.0), +0 (-0.2 to +0.2), 7, x"
     assert f"{OverSeeds((float('nan'), 3.0, 5.0)):.0f}" == "4 (3–5)"
-
-
-def test_a_campaign_says_now_and_then_how_far_it_is_where_there_is_no_terminal():
-    printed, go_on = threading.Event(), threading.Event()
-
-    class Slow:
-        def submit(self, task):
-            del task
-
-        def next_done(self):
-            assert go_on.wait(60)
-            return "task", "done"
-
-    class Paper(io.StringIO):
-        def write(self, text):
-            if "0 of 3 done" in text:
-                printed.set()
-            return super().write(text)
-
-    paper = Paper()
-    with SayingExecutor(Slow(), 3, Console(file=paper), every=0.01) as executor:
-        executor.submit("task")
-        assert printed.wait(60)
-        go_on.set()
-        assert executor.next_done() == ("task", "done")
-    assert paper.getvalue().splitlines()[0].endswith("  0 of 3 done")

@@ -38,7 +38,6 @@ MISTAKES = [
     ("run creep --rig vo3", ["no rig 'vo3'", "did you mean vo2?"]),
     ("run creep --rig vo2 --sett a=1", ["no option --sett", "did you mean --set?"]),
     ("run creep --rig vo2 --seed x", ["--seed x", "a whole number"]),
-    ("run creep --rig vo2 --seed", ["--seed"]),
     ("run creep --rig vo2 --set duration", ["--set 'duration'", "KEY=VALUE"]),
     ("run creep --rig vo2 --set duraton=5", ["no parameter 'duraton'", "did you mean duration?"]),
     ("run creep --rig vo2 --set duration=abc", ["duration = 'abc'", "1 to 86400 s", "a number"]),
@@ -50,19 +49,16 @@ MISTAKES = [
     ("predict", ["model.json, FILE, --input, --out", "bench predict --help"]),
     ("identify loops.csv", ["--input COLUMN and --output COLUMN", "voltage [V], displacement [um]"]),
     ("identify loops.csv --input voltag --output displacement", ["no column 'voltag'", "voltage [V]"]),
-    ("identify none.csv --input a --output b", ["none.csv does not exist"]),
     (f"{LOOPS} preisch", ["no model 'preisch'", "did you mean preisach?"]),
     (f"{LOOPS} preisach -o spacin=uniform", ["no spacin", "did you mean spacing?"]),
     (f"{LOOPS} preisach --levels many", ["--levels many", "numbers"]),
     (f"{LOOPS} preisach --smoothing -1", ["--smoothing -1", "≥ 0"]),
     ("identify loops.csv --format decmal=comma", ["no such word", "did you mean decimal?"]),
-    ("identify loops.csv --format skip=many", ["skip=many", "a number of lines"]),
     ("report", ["recordings has no runs", "bench run"]),
     ("report none", ["none is not a run"]),
     ("resume @3", ["@3", "no runs"]),
     ("show preisac", ["'preisac'", "did you mean preisach?"]),
     ("invert a.json b.csv --column y --policy best", ["--policy best", "'nearest'"]),
-    ("view nowhere", ["nowhere"]),
     ("new bottle x", ["bottle", "'device'"]),
 ]
 
@@ -119,12 +115,7 @@ def test_the_help_fits_on_screens(bench):
     assert len(re.findall(r"^  [a-z]+ {2,}\S", out, re.MULTILINE)) <= 17
     code, out, _ = bench("identify", "-h")
     assert code == 0
-    assert len(out.splitlines()) <= 100
     assert max(map(len, out.splitlines())) <= 80
-    (identify,) = [command for name, command in every_command() if name == "identify"]
-    context = identify.make_context("identify", [], resilient_parsing=True)
-    options = [one for one in identify.get_params(context) if one.param_type_name == "option" and one.name != "help"]
-    assert len(options) <= 22
 
 
 def test_every_command_answers_to_the_short_help(bench):
@@ -152,25 +143,12 @@ def test_a_run_is_named_by_its_age_or_the_beginning_of_its_name(bench, folder):
     code, out, _ = bench("runs", "compare")
     assert code == 0
     assert first.name in out.replace("\n", "")
+    # Unless told, an emulated rig runs on the virtual clock.
+    _, out, _ = bench("runs", "--where", "clock=virtual")
+    assert first.name in out
     code, _, err = bench("report", "vo2-creep")
     assert code == 2
     assert "2 runs begin so" in err
-
-
-def test_an_emulated_rig_runs_on_the_virtual_clock_unless_told(bench, folder):
-    assert bench(*shlex.split(CREEP))[0] == 0
-    (journal,) = folder.glob(f"recordings/*/{FILE_NAME}")
-    _, out, _ = bench("runs", "--where", "clock=virtual")
-    assert journal.parent.name in out
-
-
-def test_the_columns_of_a_run_are_those_of_its_slots(bench, folder):
-    reference = ROOT / "recordings" / "reference" / "vo2-damped-oscillation"
-    code, _, err = bench("identify", reference, "--model", "polynomial", "--out", "model.json")
-    assert code == 0, err
-    named = ("--input", "tec_temperature", "--output", "curvature")
-    assert bench("identify", reference, *named, "--model", "polynomial", "--out", "named.json")[0] == 0
-    assert Path("model.json").read_text() == Path("named.json").read_text()
 
 
 def test_a_model_without_a_file_is_kept_with_its_run_and_reported(bench, folder):
@@ -179,6 +157,12 @@ def test_a_model_without_a_file_is_kept_with_its_run_and_reported(bench, folder)
     code, out, err = bench("identify", run, "--model", "polynomial")
     assert code == 0, err
     assert "polynomial, kept with the run" in out
+    # The columns of a run are those of its slots.
+    named = ("--input", "tec_temperature", "--output", "curvature")
+    assert bench("identify", run, *named, "--model", "polynomial", "--out", "named.json")[0] == 0
+    kept = json.loads((run / "models" / "polynomial.json").read_text())
+    assert kept.pop("kept")
+    assert kept == json.loads(Path("named.json").read_text())
     code, out, err = bench("report", run, "--json", "report.json")
     assert code == 0, err
     assert [*json.loads(Path("report.json").read_text())["models"]] == ["polynomial"]
@@ -207,7 +191,7 @@ def test_a_newcomer_gets_a_report_of_his_own_identification_by_the_words_of_the_
     assert [*folder.glob("figures/*.png")]
 
 
-def test_a_shell_completes_rigs_protocols_parameters_and_runs(folder, finished_process):
+def test_a_shell_completes_rigs_protocols_parameters_and_runs(folder, warm_process):
     import os
     import sys
 
@@ -222,5 +206,5 @@ def test_a_shell_completes_rigs_protocols_parameters_and_runs(folder, finished_p
     ):
         environment = {**os.environ, "_BENCH_COMPLETE": "complete_bash", "COMP_WORDS": line}
         environment["COMP_CWORD"] = str(len(line.split()) - 1)
-        done = finished_process([sys.executable, "-m", "bench"], folder, environment)
+        done = warm_process([sys.executable, "-m", "bench"], folder, environment)
         assert expected <= set(done.stdout.split()), (line, done.stdout, done.stderr)

@@ -44,20 +44,11 @@ class TestParquet:
     def test_columns_have_their_types(self, tables):
         types = {field.name: str(field.type) for field in tables["readings"].schema}
         assert types == {
-            "step": "int64",
-            "started [s]": "double",
-            "finished [s]": "double",
-            "time": "timestamp[us, tz=UTC]",
-            "phase": "string",
-            "label": "string",
-            "settled": "bool",
-            "settling": "string",
-            "commanded plate [°C]": "double",
-            "plate_setpoint [°C]": "double",
-            "plate [°C]": "double",
-            "tip [m]": "double",
-            "lateness [s]": "double",
-        }
+            "step": "int64", "started [s]": "double", "finished [s]": "double", "time": "timestamp[us, tz=UTC]",
+            "phase": "string", "label": "string", "settled": "bool", "settling": "string",
+            "commanded plate [°C]": "double", "plate_setpoint [°C]": "double", "plate [°C]": "double",
+            "tip [m]": "double", "lateness [s]": "double",
+        }  # fmt: skip
         telemetry = {field.name: str(field.type) for field in tables["telemetry"].schema}
         assert (telemetry["step"], telemetry["phase"], telemetry["t [s]"]) == ("int64", "string", "double")
 
@@ -109,27 +100,6 @@ class TestDocuments:
             event_model.schema_validators[event_model.DocumentNames[name]].validate(document)
         counts = {"start": 1, "descriptor": 3, "event": 2 * STEPS + 3, "stop": 1}
         assert {name: [each for each, _ in found].count(name) for name in counts} == counts
-
-    def test_a_router_fills_a_catalogue_with_them(self, found):
-        event_model = pytest.importorskip("event_model")
-        rows = {}
-
-        class Router(event_model.DocumentRouter):
-            def descriptor(self, document):
-                self.streams = {**getattr(self, "streams", {}), document["uid"]: document}
-
-            def event(self, document):
-                descriptor = self.streams[document["descriptor"]]
-                assert document["data"].keys() == descriptor["data_keys"].keys()
-                rows.setdefault(descriptor["name"], []).append(document)
-
-        router = Router()
-        for name, document in found:
-            router(name, document)
-        assert {name: len(entries) for name, entries in rows.items()} == {
-            "primary": STEPS, "telemetry": STEPS, "events": 3,
-        }  # fmt: skip
-        assert [entry["seq_num"] for entry in rows["primary"]] == list(range(1, STEPS + 1))
 
     def test_times_have_one_base(self, found):
         start, end = (document["time"] for name, document in found if name in ("start", "stop"))

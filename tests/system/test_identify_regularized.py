@@ -55,18 +55,6 @@ def test_without_penalties_the_null_space_is_named(identify):
     assert "the minimiser is not unique" in out
 
 
-def test_cells_that_could_replace_others_are_counted_until_smoothed(identify):
-    found, out = identify("--model", "preisach", rows=40)
-    assert found["exchangeable"] > 0
-    assert f"{found['exchangeable']} cells could replace others" in out
-    smooth, out = identify("--model", "preisach", "--smoothing", 0.01, rows=40)
-    assert smooth["exchangeable"] == 0
-    assert "not unique" not in out
-    ridged, _ = identify("--model", "preisach", "-o", "ridge=0.01", rows=40)
-    assert ridged["exchangeable"] == 0
-    assert ridged["rms"] > found["rms"]
-
-
 def test_a_model_without_cells_refuses_penalties(bench, tmp_path):
     (tmp_path / "line.csv").write_text("x,y\n" + "".join(f"{n},{2 * n}\n" for n in range(20)))
     columns = ("--input", "x", "--output", "y", "--model", "polynomial", "--smoothing", 1)

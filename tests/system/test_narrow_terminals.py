@@ -46,10 +46,6 @@ class TestProgress:
         assert "supply_voltage" not in lines[0]
         assert lines[1] == "supply_voltage 2.850 V  load_cell_force -0.123 N"
 
-    def test_all_in_one_line_where_it_fits(self):
-        (line,) = drawn(220)
-        assert line.endswith("load_cell_force -0.123 N")
-
 
 CELLS = [("tec_sink_temperature", "20.992", "5 to 100 (interlock)"), ("psd", "-1.6e-06", "")]
 

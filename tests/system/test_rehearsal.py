@@ -10,7 +10,7 @@ from datetime import datetime
 import numpy as np
 import pexpect
 import pytest
-from adaptive_protocols import bisect, climb, secant, wait_for_ever
+from adaptive_protocols import bisect, climb, wait_for_ever
 from cases import cases
 from film import film_model
 from heater_laboratory import CLOSED, HeaterLaboratory
@@ -68,7 +68,7 @@ def as_protocol(generator):
 
 
 class TestRehearsal:
-    @pytest.mark.parametrize(("definition", "rig"), [(climb, "vo2"), (secant, "sma"), (bisect, "vo2")])
+    @pytest.mark.parametrize(("definition", "rig"), [(climb, "vo2"), (bisect, "sma")])
     def test_a_protocol_that_goes_by_its_readings_does_what_was_rehearsed(self, make, console, rig, definition):
         run = make(definition=definition, settings=GOALS[rig], rig=rig, clock="virtual", interlock_rate=None)
         rehearsal = foresee(run, console)

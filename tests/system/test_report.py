@@ -109,12 +109,6 @@ def test_extremes_of_the_controlled_signal_and_its_traces(report):
     assert rows["drive"] == ["1.000", "2.000", "V"]
 
 
-def test_a_plain_number_has_no_unit(report):
-    _, text = report(STRAIN, (375e-6, 100e-6))
-    rows = [[cell.strip() for cell in line.split("│")[1:-1]] for line in text.splitlines() if "│" in line]
-    assert ["strain", "0.004125", "0.007600", "", "–"] in rows
-
-
 @pytest.mark.parametrize(
     ("output", "unit", "row"),
     [

@@ -19,7 +19,7 @@ from bench.base import AbortError, AgreementError, ConfigurationError, DataError
 from bench.cli import main
 from bench.execution import Resume, resume
 from bench.execution.engine import Engine
-from bench.execution.resumption.corners import corners, turning_points
+from bench.execution.resumption.corners import corners
 from bench.execution.resumption.feeding import Past
 from bench.models import MemoryCurve
 from bench.record import FILE_NAME, RECOVERED_NAME, Journal, Record
@@ -101,16 +101,6 @@ class TestCorners:
             assert len(found) == 1
             assert len(way) < len(values)
 
-    def test_keep_the_end_of_a_plateau_and_the_last_value(self):
-        assert corners([2.0, 2.0, 2.0]) == [2]
-        assert corners([0.0, 3.0, 3.0, 1.0]) == [0, 2, 3]
-        assert corners([]) == []
-
-    def test_leave_small_turns_of_a_controller_out(self):
-        values = [0.0, 1.0, 0.95, 2.0, 1.95, 0.5, 0.52]
-        assert [values[i] for i in turning_points(values, 0.1)] == [0.0, 2.0, 0.5, 0.52]
-        assert turning_points([], 0.1) == []
-
 
 @pytest.fixture
 def climb(tmp_path, rig_file):
@@ -160,16 +150,6 @@ class TestResume:
         with Record(folder) as record:
             assert [entry["after_step"] for entry in record.meta["resumes"]] == [1, 4]
 
-    def test_its_speed_is_that_of_this_process(self, climb):
-        folder = climb(steps=6, died_after=3)
-        with Record(folder) as record:
-            last = max(*record.telemetry()["t"].tolist(), *record.steps()["finished"].tolist())
-        result = resume(Resume(folder=folder), silent())
-        outcome = result.outcome
-        assert outcome.own_seconds == pytest.approx(outcome.laboratory_seconds - last)
-        assert outcome.own_seconds < outcome.laboratory_seconds
-        assert result.time_ratio == outcome.own_seconds / result.wall_seconds
-
     def test_of_a_recovered_copy_says_where_it_has_to_be(self, climb):
         folder = climb()
         (folder / FILE_NAME).rename(folder / RECOVERED_NAME)
@@ -181,12 +161,6 @@ class TestResume:
         other.mkdir()
         shutil.copy(folder / RECOVERED_NAME, other / FILE_NAME)
         assert resume(Resume(folder=other), silent()).outcome.status == "completed"
-
-    def test_ends_what_died_behind_its_last_step(self, climb):
-        folder = climb(steps=4, died_after=4)
-        outcome = resume(Resume(folder=folder), silent()).outcome
-        assert (outcome.status, outcome.steps) == ("completed", 4)
-        assert len(steps_of(folder)) == 4
 
     def test_refuses_what_cannot_be_resumed(self, climb, tmp_path, rig_file):
         completed = bench.run(stairs, rig_file(), out=tmp_path / "done").folder

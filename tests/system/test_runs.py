@@ -14,7 +14,7 @@ from bench.execution import Run, carry_out
 from bench.execution.dialogue import Dialogue
 from bench.execution.terminal import ProgressDisplay
 from bench.operator import AT_A_PROMPT, Question
-from bench.protocol import Dwell, Settled, Step, find_protocol, protocol
+from bench.protocol import Dwell, Settled, Step, protocol
 from bench.record import RIG_FILE_NAME, Event, Record, StepRecord, run_card
 from bench.rig import load_rig
 
@@ -126,13 +126,6 @@ class TestCarryOut:
         assert not result.outcome.is_safe
         assert result.outcome.safe_state == {"tec": "OSError: [Errno 5] Input/output error", "probe": "safe"}
 
-    def test_the_packaged_rig_on_a_fast_clock(self, tmp_path, console):
-        # No watchdog trips on a busy machine: its time does not pass while this process does not run.
-        run = Run(find_protocol("creep"), {"duration": "8"}, "vo2", tmp_path, clock="x100", recording=False)
-        outcome = carry_out(run, console).outcome
-        assert outcome.status == "completed", outcome.reason
-        assert outcome.is_safe
-
     def test_ctrl_c_waits_for_no_console(self, make, console, capfd):
         # Whatever was interrupted may hold the console's locks, or wait for another that holds them.
         held, release, released = threading.Event(), threading.Event(), threading.Event()
@@ -202,15 +195,6 @@ class TestDisplay:
         assert "interlock: too hot" in shown
         assert "tec: safe" not in shown
         assert "2/2" not in shown
-
-    def test_at_a_terminal_a_bar_with_readings(self):
-        shown = self.show(force_terminal=True)
-        assert "2/2" in shown
-        assert "t 0:00:08, left 0:00:00, ends " in shown
-        assert "x[/red].py" in shown
-        assert "climb [/red]" in shown
-        assert "tec_temperature 20.12 °C" in shown
-        assert "force" not in shown
 
     def test_leaving_a_terminal_that_is_gone(self):
         class Gone(io.StringIO):

@@ -20,7 +20,7 @@ OVERRIDES = {"vo2": {"devices.tec.current_limit": "1.0"}}
 @cache
 def tortured(rig):
     task = Task(rig, OVERRIDES.get(rig, {}))
-    found = {seed: reference_of(task, seed) for seed in (0, 1, 4)}
+    found = {seed: reference_of(task, seed) for seed in ((1, 4) if rig == "sma" else (0, 1))}
     return task, {seed: each.widened(found.values()) for seed, each in found.items()}
 
 

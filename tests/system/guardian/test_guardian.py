@@ -118,11 +118,6 @@ class TestRequests:
         finally:
             vo2.control.plug_in("tec")
 
-    def test_a_wrong_rig_is_refused_with_its_key(self, vo2):
-        wrong = {"devices__tec__port": "emulated://nothing"}
-        with pytest.raises(ConfigurationError, match=r"devices\.tec\.port"), connected(vo2, **wrong):
-            pass
-
     def test_a_rig_file_that_was_edited_since_the_bench_read_it_is_refused(self, vo2, tmp_path):
         path = tmp_path / "vo2.toml"
         path.write_text('extends = "vo2"\n')
@@ -143,9 +138,6 @@ class TestBenchGone:
         [
             pytest.param(b"GET / HTTP/1.1\r\n\r\n", id="no frame"),
             pytest.param(struct.pack(">I", 10) + b'{"n": 7, "', id="torn JSON"),
-            pytest.param(struct.pack(">I", 3) + b"[1]", id="no object", marks=pytest.mark.seeds),
-            pytest.param(struct.pack(">I", 4) + b"{{{{", id="no JSON", marks=pytest.mark.seeds),
-            pytest.param(struct.pack(">I", 1 << 31), id="too long", marks=pytest.mark.seeds),
         ],
     )
     def test_garbage(self, station, vo2, sent):
@@ -232,13 +224,6 @@ class TestPromises:
         assert "promised (a test computes)" in by_kind["safe"]["cause"]
         assert {note["device"]: note["state"] for note in notes if note["what"] == "device"} == SAFE
         assert by_kind["end"]["safe"] == SAFE
-
-    def test_stacks_that_nobody_wanted_leave_no_file(self, station, tmp_path):
-        it = station()
-        it.keep_record(tmp_path)
-        it.end()
-        it.close()
-        assert sorted(path.name for path in tmp_path.iterdir()) == ["guardian.jsonl"]
 
 
 class TestInterlocks:

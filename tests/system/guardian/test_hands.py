@@ -9,7 +9,7 @@ import pytest
 from benches import is_on, seconds_until
 
 from bench.record import Record
-from bench.rig import Holder, Locks, load_rig
+from bench.rig import Holder, Locks
 
 pexpect = pytest.importorskip("pexpect")
 pytest.importorskip("textual")
@@ -33,12 +33,6 @@ def panel(terminal, vo2, tmp_path):
 def record_in(folder):
     (run,) = (each for each in folder.iterdir() if each.is_dir())
     return Record(run)
-
-
-def exit_code(child):
-    child.expect(pexpect.EOF)
-    child.close()
-    return child.exitstatus
 
 
 def temperature(vo2):
@@ -65,34 +59,6 @@ def test_set_40_degrees_then_the_terminal_hangs_up(panel, vo2, tmp_path):
         assert record.meta["reason"] == "ended by SIGHUP"
         assert set(record.meta["safe_state"].values()) == {"safe"}
         assert [dict(each.setpoints) for each in record.step_records()] == [{"tec": 40.0}]
-
-
-@pytest.mark.seeds
-def test_an_interlock_trips_and_is_said(panel, vo2, tmp_path):
-    file = tmp_path / "vo2.toml"
-    file.write_text(load_rig("vo2").text.replace("high = 100.0", "high = 45.0"), encoding="utf-8")
-    child = panel(file)
-    child.expect("tec_temperature")
-    child.send("set tec 60\r")
-    child.expect("over: failed: interlock")
-    assert not is_on(vo2)
-    child.send("quit\r")
-    child.expect("outside of 5 to 45 °C")
-    assert exit_code(child) == 5
-    with record_in(tmp_path) as record:
-        assert [each.level for each in record.events() if each.kind == "warning"] == ["WARN"]
-
-
-@pytest.mark.seeds
-def test_ctrl_c_leaves_in_the_safe_state(panel, vo2):
-    child = panel()
-    child.expect("tec_temperature")
-    child.send("set tec 40\r")
-    seconds_until(lambda: is_on(vo2))
-    child.send("\x03")
-    child.expect("completed: 2 steps")
-    assert exit_code(child) == 0
-    assert not is_on(vo2)
 
 
 @pytest.mark.usefixtures("warm_popen")

@@ -25,11 +25,7 @@ PART = ["vo2, SIGUSR1", "vo2, stalled reader", "sma", "hybrid", "guardian"]
 
 
 @pytest.mark.parametrize(
-    "names",
-    [
-        pytest.param(PART, id="part"),
-        pytest.param([*CASES], id="all", marks=pytest.mark.seeds),
-    ],
+    "names", [pytest.param(PART, id="part"), pytest.param([*CASES], id="all", marks=pytest.mark.seeds)]
 )
 def test_outputs_go_off(names):
     check_at_once(names, check)

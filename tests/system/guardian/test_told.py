@@ -9,7 +9,7 @@ from functools import partial
 
 import pytest
 from benches import IN_TIME, LONG, check_at_once, connected, is_alive, is_on, seconds_until
-from guarded_run import SETPOINTS, GuardedRun, find_guardian
+from guarded_run import SETPOINTS, GuardedRun
 from kill_safe import DEATH, PATIENCE, PROMISE
 
 from bench.analysis import list_runs
@@ -118,22 +118,6 @@ def check_what_is_told(folder, name):
         assert "http://127.0.0.1/… was not told of the end" in notes
         texts = [run.said, *(path.read_bytes().decode(errors="replace") for path in run.folder.rglob("*.*"))]
         assert not [text for text in texts if TOKEN in text]
-
-
-def test_a_bench_that_hangs_before_it_has_set_anything_is_told_and_ended(started, listener):
-    _, told = listener
-    with started("think") as run:
-        run.await_note("computing")
-        run.guardian = find_guardian(run.folder)
-        run.let_it_go_wrong()
-        seconds_until(told)
-        run.process.wait(LONG)
-        assert run.has_freed_lines()
-        (facts,) = told()
-        assert re.fullmatch(rf"failed: {HUNG}; tec: safe, psd: safe", facts["text"])
-        with Record(run.folder) as record:
-            assert record.status == "failed"
-            assert re.fullmatch(HUNG, record.reason)
 
 
 def test_a_bench_that_comes_back_does_not_tell_it_again(started, listener):
