@@ -48,17 +48,6 @@ def spin(parameters: Parameters) -> Messages:
 
 
 @protocol(needs=())
-def think(parameters: Parameters) -> Messages:
-    """Compute for ever before anything is set."""
-    yield Note("computing")
-    reading = yield Step({}, Dwell(0.2))
-    while reading.values and not Path(parameters.until).exists():
-        reading = yield Step({}, Dwell(0.2))
-    while reading.values:
-        pass
-
-
-@protocol(needs=())
 def keep_interpreter(parameters: Parameters) -> Messages:
     """Run code that never gives up Python's lock."""
     if (yield from _hold_until(parameters)):
@@ -82,20 +71,3 @@ def leave(parameters: Parameters) -> Messages:
     """End the process as if all were well."""
     if (yield from _hold_until(parameters)):
         os._exit(0)
-
-
-class CycleParameters(ProtocolParameters):
-    until: str = parameter("", unit="", help="file at which it ends, once it has cycled twice")
-
-
-@protocol(needs=())
-def cycle(parameters: CycleParameters) -> Messages:
-    """Heat and cool the plate of the VO2 rig, and read it at rest."""
-    cycles = 0
-    while cycles < 2 or not Path(parameters.until).exists():
-        yield Step({"tec": 30.0}, Dwell(4.0))
-        reading = yield Step({"tec": 34.0}, Dwell(4.0))
-        cycles += 1
-        # The dry run waits for no file.
-        if not reading.values:
-            return

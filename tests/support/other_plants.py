@@ -48,11 +48,6 @@ def damped(rng, center=0.0):
     return damped_oscillation(-1.0, 1.0, center, int(rng.integers(30, 44)), STEP)
 
 
-def first_order(rng):
-    starts = np.sort(rng.uniform(-0.9, 0.9, 20))[::-1]
-    return ramps([-1.0, 1.0, *(value for start in starts.tolist() for value in (start, 1.0))], STEP)
-
-
 def cycles(rng):
     return ramps([-1.0, 1.0, *(12 * [-0.8, 0.8])], STEP)
 

@@ -79,9 +79,3 @@ def run(folder):
         find_protocol("damped-oscillation"), {}, "vo2", Path(folder), clock="x1", recording=False, rehearse=False
     )
     return carry_out(run, task_console())
-
-
-def virtual_run(folder):
-    """Carry out a run of a second."""
-    run = Run(find_protocol("random-validation"), {}, "vo2", Path(folder), clock="virtual", recording=False)
-    return carry_out(run, task_console()).outcome.steps

@@ -245,7 +245,7 @@ class TestCard:
     def test_a_card_has_the_band_and_the_models_that_were_compared(self, bench, tmp_path, loop):
         result = tmp_path / "fit.json"
         code, _, err = bench(
-            "identify", loop, *COLUMNS, "--model", "polynomial,prandtl-ishlinskii", "-o", "plays=5", "--band",
+            "identify", loop, *COLUMNS, "--model", "polynomial,prandtl-ishlinskii", "--time", "none", "--band",
             "--card", tmp_path / "card.md", "--json", result,
         )  # fmt: skip
         assert code == 0, err
@@ -262,7 +262,7 @@ class TestCard:
 
     def test_a_card_has_what_the_held_out_errors_say_against_the_choice(self, bench, tmp_path, loop):
         code, _, err = bench(
-            "identify", loop, *COLUMNS, "--model", "polynomial,polynomial-plays", "--train", "0:40",
+            "identify", loop, *COLUMNS, "--model", "polynomial,polynomial-plays", "--train", "0:40", "--time", "none",
             "--card", tmp_path / "card.md", "--json", tmp_path / "fit.json",
         )  # fmt: skip
         assert code == 0, err

@@ -7,7 +7,6 @@ from bench.base import VirtualClock
 from bench.rig import Rig, load_rig
 
 BUSES = str(Path(__file__).parent / "buses.toml")
-LINES = "cells", "heaters", "tecs", "servos", "can"
 
 
 @contextmanager
