@@ -12,6 +12,7 @@ import pytest
 from cases import cases
 from hypothesis import HealthCheck, given, settings, strategies as st
 from refusals import blamed
+from still_plant import Still, sealed
 
 from bench.base import DeviceConnectionError, DeviceError, DeviceRestartedError, VirtualClock, WallClock
 from drivers.flintec_dad141 import FlintecDAD141
@@ -25,16 +26,6 @@ from sim_devices.world import World
 
 Settings = FlintecDAD141.Settings
 WIDE = (-100.0, 100.0)
-
-
-def sealed(text: str) -> bytes:
-    frame = bytes.fromhex(text)
-    return frame + crc16(frame)
-
-
-class Still:
-    def advance(self, dt: float) -> None:
-        pass
 
 
 class Tap(WireServer):

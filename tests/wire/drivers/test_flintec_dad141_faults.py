@@ -5,6 +5,7 @@ import struct
 import numpy as np
 import pytest
 from faulty_line import KINDS, FaultyLine
+from still_plant import Still
 
 from bench.base import DeviceConnectionError, VirtualClock
 from drivers.flintec_dad141 import FlintecDAD141
@@ -14,11 +15,6 @@ from sim_devices.wire.modbus_rtu import ModbusRtuServer
 from sim_devices.world import World
 
 TIMEOUT = 0.2
-
-
-class Still:
-    def advance(self, dt):
-        pass
 
 
 class Counting:

@@ -4,6 +4,7 @@ import pytest
 import serial
 from cases import cases
 from faulty_line import InPieces
+from still_plant import sealed
 
 from drivers.modbus import (
     NoReplyError,
@@ -29,11 +30,6 @@ from sim_devices.protocol_emulated import register, unregister
 from sim_devices.wire import WireServer
 
 BLOCK = read_request(0x3500, 5)
-
-
-def sealed(text):
-    frame = bytes.fromhex(text)
-    return frame + crc16(frame)
 
 
 class Answers(WireServer):

@@ -7,6 +7,7 @@ from importlib.util import find_spec
 import numpy as np
 import pytest
 from cases import cases
+from still_plant import Still
 
 from bench.base import (
     ConfigurationError,
@@ -156,11 +157,6 @@ SUPPLY = ActuatorTable(
 )
 
 
-class Nothing:
-    def advance(self, dt):
-        pass
-
-
 @pytest.fixture
 def clock():
     return VirtualClock()
@@ -169,7 +165,7 @@ def clock():
 @pytest.fixture
 def instrument(clock):
     meters = {"voltage": Meter(lambda: emulated.output), "current": Meter(lambda: 0.1 * emulated.output)}
-    emulated = EmulatedTextInstrument("supply", World(Nothing(), clock), SUPPLY, meters, np.random.default_rng(0))
+    emulated = EmulatedTextInstrument("supply", World(Still(), clock), SUPPLY, meters, np.random.default_rng(0))
     return emulated
 
 
@@ -205,7 +201,7 @@ class TestContractOverTCP(ActuatorContract):
         return "EXAMPLE 2260B, serial number emulated, firmware unknown"
 
 
-class TestRestart(RestartedActuatorContract):
+class OnASupply:
     @pytest.fixture
     def device(self, supply):
         return supply
@@ -222,6 +218,8 @@ class TestRestart(RestartedActuatorContract):
     def output(self, instrument):
         return lambda: instrument.output
 
+
+class TestRestart(OnASupply, RestartedActuatorContract):
     def test_a_restart_at_rest_is_found_before_the_output_goes_on(self, in_use, restart, instrument, monkeypatch):
         """The safe state has set 0 V as a restart does, so none is seen; but the limits are written first."""
         in_use.safe()
@@ -232,23 +230,7 @@ class TestRestart(RestartedActuatorContract):
         assert sent.index(":SOUR:CURR 1.5") < sent.index(":SOUR:VOLT 6") < sent.index("OUTPut 1")
 
 
-class TestLineLost(ActuatorLineLostContract):
-    @pytest.fixture
-    def device(self, supply):
-        return supply
-
-    @pytest.fixture
-    def set_points(self):
-        return 7.5, 22.5
-
-    @pytest.fixture
-    def restart(self, instrument):
-        return instrument.power_cycle
-
-    @pytest.fixture
-    def output(self, instrument):
-        return lambda: instrument.output
-
+class TestLineLost(OnASupply, ActuatorLineLostContract):
     @pytest.fixture
     def cut(self, supply, monkeypatch):
         def cut():
@@ -279,13 +261,6 @@ class TestLineLost(ActuatorLineLostContract):
     @pytest.fixture
     def tolerance(self):
         return 1e-6
-
-
-def test_an_output_that_goes_off_is_found(supply, instrument):
-    supply.set(5.0)
-    instrument.switch(False)
-    with pytest.raises(DeviceError, match="its output is off although it was switched on"):
-        supply.measure()
 
 
 def test_an_instrument_of_another_kind_is_refused(connect, instrument, monkeypatch):

@@ -9,8 +9,8 @@ from hypothesis import given, strategies as st
 from refusals import blamed
 
 from bench.base import ConfigurationError, DeviceConnectionError, DeviceError, DeviceRestartedError, VirtualClock
-from drivers.roboteq import ABORT_CODES, CHANNEL_FLAGS, FAULT_FLAGS, RoboteqSupply, supply as driver
-from drivers.roboteq.canopen import Entry, NodeLine
+from drivers.roboteq import ABORT_CODES, RoboteqSupply, supply as driver
+from drivers.roboteq.canopen import NodeLine
 from drivers.roboteq.process_data import ProcessData
 from drivers.roboteq.supply import _POWER, _VOLTS
 from sim_devices.protocol_emulated import register, unregister
@@ -770,45 +770,7 @@ def test_against_a_node_of_the_package_canopen(local_node, connect):
     supply.release()
 
 
-# What stands in the manuals.
-
-
-# Roboteq CANBus Networking Manual V2.0 and CiA 301: index, bytes of a download (0 if it is read only), signed, title.
-OBJECTS_OF_THE_MAKER = """
-1000 0 unsigned: device type
-1008 0 unsigned: device name
-1009 0 unsigned: hardware version
-100A 0 unsigned: software version
-1017 2 unsigned: producer heartbeat time
-1018 0 unsigned: identity
-2000 4 signed: motor command
-200C 1 unsigned: emergency stop
-200D 1 unsigned: release of the emergency stop
-200E 1 unsigned: stop
-2100 0 signed: motor current
-2102 0 signed: applied power
-210D 0 unsigned: battery voltage
-2112 0 unsigned: fault flags
-2122 0 unsigned: channel flags
-"""
-
-
-def test_objects_are_those_of_the_maker():
-    found = {
-        f"{each.index:04X} {each.size} {'signed' if each.signed else 'unsigned'}: {each.title}"
-        for each in vars(driver).values()
-        if isinstance(each, Entry)
-    }
-    assert found == set(OBJECTS_OF_THE_MAKER.strip().splitlines())
-    assert driver.DEVICE_TYPE == 0x000F0191
-
-
-def test_flags_and_abort_codes_are_those_of_the_standard():
-    faults = "overheat", "over-voltage", "under-voltage", "short circuit", "emergency stop", "setup fault"
-    faults += "MOSFET failure", "default configuration loaded"
-    assert {bit: text for bit, (text, _) in FAULT_FLAGS.items()} == {1 << n: text for n, text in enumerate(faults)}
-    flags = "amps limit", "stall", "loop error", "safety stop", "forward limit", "reverse limit", "amps trigger"
-    assert {bit: text for bit, (text, _) in CHANNEL_FLAGS.items()} == {1 << n: text for n, text in enumerate(flags)}
+def test_abort_codes_are_those_of_the_standard():
     standard = pytest.importorskip("canopen").sdo.exceptions.SdoAbortedError.CODES
     # What belongs to block transfers, or is no reason of its own, is left out.
     assert set(standard) - set(ABORT_CODES) == {0x05040002, 0x05040003, 0x05040004, 0x060A0023, 0x08000024}
@@ -1095,15 +1057,6 @@ def test_reading_is_one_synchronization(controller, synchronous):
     assert len(controller.marks) == 1
     assert [data[:4].hex() for _, data in controller.received] == ["23002001"]
     assert synchronous.repeats == 0
-
-
-def test_flags_come_with_the_process_data(controller, synchronous):
-    controller.objects |= {(0x2112, 0): (0x8001, 2)}
-    with pytest.raises(DeviceError, match=r"overheat.*0x8000"):
-        synchronous.measure()
-    controller.objects |= {(0x2112, 0): (0, 2), (0x2122, 1): (0x04, 4)}
-    with pytest.raises(DeviceError, match="loop error"):
-        synchronous.measure()
 
 
 def test_marks_count_and_begin_again():

@@ -10,6 +10,7 @@ import pytest
 import serial
 from cases import cases
 from hypothesis import example, given, strategies as st
+from still_plant import Still
 
 from bench.base import DeviceConnectionError, VirtualClock
 from sim_devices.instruments.dynamixel import (
@@ -34,11 +35,6 @@ from sim_devices.world import World
 TOP_SPEED = 12.0 * NO_LOAD_SPEED_PER_VOLT
 
 
-class Nothing:
-    def advance(self, dt):
-        pass
-
-
 class Spring:
     """Pulls the shaft back to `rest` by `rate` N·m/rad."""
 
@@ -54,13 +50,13 @@ class Spring:
 
 
 def make_servos(*changes, clock=None):
-    world = World(Nothing(), clock or VirtualClock())
+    world = World(Still(), clock or VirtualClock())
     return [EmulatedMX28(f"servo-{number}", world, **keys) for number, keys in enumerate(changes)]
 
 
 def make_servo(load=None, **changes):
     """Return a servo in extended position mode."""
-    servo = EmulatedMX28("servo", World(Nothing(), VirtualClock()), load, **changes)
+    servo = EmulatedMX28("servo", World(Still(), VirtualClock()), load, **changes)
     servo.write_item(11, 4)
     return servo
 
@@ -487,14 +483,6 @@ def test_sdk_reboot_clear_and_factory_reset(bus):
 # Control table.
 
 
-def test_defaults_of_the_maker():
-    (servo,) = make_servos({})
-    expected = {0: 30, 6: 45, 7: 1, 8: 1, 9: 250, 11: 3, 13: 2, 20: 0, 24: 10, 31: 80, 32: 160, 34: 95, 36: 885}
-    expected |= {40: 32767, 44: 380, 48: 4095, 52: 0, 63: 52, 64: 0, 68: 2, 70: 0, 84: 850, 98: 0, 100: 885}
-    assert {address: servo.read_item(address) for address in expected} == expected
-    assert servo.read_item(132) == servo.read_item(116) == 2048
-
-
 def test_example_of_the_maker_for_indirect_data():
     """E-Manual, Indirect Address, Indirect Data: the LED, then a goal position in four bytes."""
     servo = make_servo()
@@ -604,20 +592,6 @@ def test_reboot_forgets_ram_and_turns():
     assert servo.position == where
     assert servo.read_item(132) == servo.read_item(116) == -5000 % 4096
     assert [servo.read_item(address) for address in (64, 68, 98, 112)] == [0, 2, 0, 0]
-
-
-@cases(("option", "kept"), [(255, (1, 1)), (1, (9, 1)), (2, (9, 3))])
-def test_factory_reset(option, kept):
-    servo = make_servo()
-    servo.write_item(7, 9)
-    servo.write_item(8, 3)
-    servo.factory_reset(option)
-    wait(servo, REBOOT_TIME)
-    assert (servo.read_item(7), servo.read_item(8)) == kept
-    assert servo.read_item(11) == 3
-    assert servo.read_item(6) == 45
-    with pytest.raises(RequestRefusedError):
-        servo.factory_reset(3)
 
 
 def test_homing_offset_and_reverse_mode():
