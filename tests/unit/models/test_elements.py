@@ -1,7 +1,6 @@
 """Operators of elements against independent oracles: differential equations, definitions written out, brute force."""
 
 import copy
-import json
 import math
 import pickle
 from itertools import pairwise
@@ -20,7 +19,6 @@ from bench.models import (
     MaxwellSlip,
     PrandtlIshlinskii,
     Reach,
-    operator_from_json,
 )
 from bench.models.inverses.branch_inverse import BranchInverse
 from bench.models.inverses.inverse import NumericalInverse
@@ -107,33 +105,6 @@ class TestEachOperator:
             with pytest.raises(ValueError, match="value: expected a finite number"):
                 stream.step(value)
         assert stream.state == state
-
-    @given(some, values, st.integers(2, 30))
-    def test_does_not_depend_on_the_rate(self, operator, inputs, pieces):
-        start = operator.present_input(operator.initial_state())
-        fine = np.concatenate(
-            [np.linspace(a, b, pieces + 1)[1:] for a, b in zip([start, *inputs], inputs, strict=False)]
-        )
-        np.testing.assert_allclose(
-            operator.evaluate(fine)[pieces - 1 :: pieces], operator.evaluate(inputs), atol=1e-7
-        )
-
-    @given(some, values, values)
-    def test_is_linear_in_its_coefficients(self, operator, history, inputs):
-        state = operator.advance(operator.initial_state(), history)
-        regressor = operator.regressor(inputs, state)
-        expected = operator.evaluate(inputs, state)
-        np.testing.assert_allclose(operator.bias + regressor.product(operator.coefficients), expected, atol=1e-12)
-        other = operator.with_coefficients(-2.0 * operator.coefficients, 1.0)
-        np.testing.assert_allclose(other.evaluate(inputs, state), 1.0 - 2.0 * (expected - operator.bias), atol=1e-11)
-
-    @given(some, values)
-    def test_json_round_trip(self, operator, inputs):
-        again = operator_from_json(json.loads(json.dumps(operator.to_json())))
-        assert type(again) is type(operator)
-        np.testing.assert_array_equal(again.evaluate(inputs), operator.evaluate(inputs))
-        state = operator.advance(operator.initial_state(), inputs)
-        assert again.state_from_json(json.loads(json.dumps(operator.state_to_json(state)))) == state
 
     @settings(max_examples=60)
     @given(some, values, st.floats(*RANGE))

@@ -1,6 +1,5 @@
 """The memory curve against the history it stands for."""
 
-import json
 import math
 
 import numpy as np
@@ -49,12 +48,6 @@ def test_staircase_tells_every_relay(history, saturation):
 def test_sequence_equals_steps(history, saturation):
     start = MemoryCurve((), -1000.0 if saturation < 0 else 1000.0, saturation)
     assert start.advance(history) == driven(history, saturation)
-
-
-@given(inputs, st.sampled_from([-1, 1]))
-def test_json_round_trip(history, saturation):
-    memory = driven(history, saturation)
-    assert MemoryCurve.from_json(json.loads(json.dumps(memory.to_json()))) == memory
 
 
 @given(inputs, st.sampled_from([-1, 1]))

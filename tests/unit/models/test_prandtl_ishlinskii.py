@@ -1,6 +1,5 @@
 """The Prandtl-Ishlinskii operator against its definition, and its inverse against it."""
 
-import json
 import math
 
 import numpy as np
@@ -8,7 +7,7 @@ import pytest
 from cases import cases
 from hypothesis import given, strategies as st
 
-from bench.models import DeadZones, PrandtlIshlinskii, operator_from_json
+from bench.models import DeadZones, PrandtlIshlinskii
 
 volts = st.lists(st.floats(-40.0, 40.0), min_size=1, max_size=40)
 seeds = st.integers(0, 10_000)
@@ -127,16 +126,6 @@ def test_saturated_states_are_what_a_long_way_leaves():
     for direction in (-1, 1):
         state = operator.advance(operator.initial_state(), [-direction * 1000.0, direction * 40.0])
         np.testing.assert_allclose(operator.saturated_state(direction), state)
-
-
-@given(seeds, st.booleans())
-def test_json_round_trip(seed, after):
-    operator = actuator(seed, after, origin=1.5)
-    copy = operator_from_json(json.loads(json.dumps(operator.to_json())))
-    assert isinstance(copy, PrandtlIshlinskii)
-    inputs = np.linspace(-40, 40, 30)
-    np.testing.assert_array_equal(copy.evaluate(inputs), operator.evaluate(inputs))
-    assert copy.to_json() == operator.to_json()
 
 
 def test_dead_zones():

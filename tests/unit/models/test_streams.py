@@ -193,17 +193,10 @@ def test_a_two_stage_stream_moves_as_its_model_between_fixed_ends():
     assert stream.state == state
 
 
-@cases("kind", ["polynomial", "summed", "linear"])
+@cases("kind", ["summed", "linear"])
 def test_every_other_model_has_a_stream(kind):
     rng = np.random.default_rng(3)
     inputs, forces = walk(rng, 50), walk(rng, 50)
-    if kind == "polynomial":
-        operator = Polynomial(np.array([0.3, -0.2, 0.1]), (0.0, 1.0), 0.2)
-        stream = operator.stream()
-        np.testing.assert_array_equal([stream.step(value) for value in inputs], operator.evaluate(inputs))
-        assert stream.state is None
-        assert stream.value == operator.evaluate(inputs[-1:])[0]
-        return
     model = Summed(plays(rng), plays(rng)) if kind == "summed" else Linear(0.4, 0.1, plays(rng), (0.0, 1.0))
     stream = model.stream()
     outputs = [stream.step(*pair) for pair in zip(inputs, forces, strict=True)]
@@ -253,14 +246,6 @@ def test_a_stream_keeps_what_it_reads():
         inverse.move(value)
     np.testing.assert_array_equal(outputs, expected)
     assert inverse.value == expected[-1]
-
-
-def test_streams_of_one_operator_are_independent():
-    operator = preisach(np.random.default_rng(9), 5)
-    one, other = operator.stream(), operator.stream()
-    one.step(0.9)
-    assert other.state == operator.initial_state()
-    assert other.step(0.4) == operator.evaluate([0.4])[0]
 
 
 @settings(max_examples=150)
