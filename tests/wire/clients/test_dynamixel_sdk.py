@@ -93,12 +93,3 @@ def test_a_slow_profile_takes_the_wall_clock_of_the_server(connect):
     assert len({round(position / 10) for position in positions}) > 4
     servo.write(PROFILE_VELOCITY, 0)
     servo.write(TORQUE_ENABLE, 0, 1)
-
-
-def test_a_line_is_opened_again_after_half_a_frame(connect):
-    first = connect()
-    before = first.read(0, 2)
-    first.port.ser.write(bytes.fromhex("ff ff fd 00 01 07 00 02 84"))
-    first.port.closePort()
-    second = connect()
-    assert second.read(0, 2) == before == 30

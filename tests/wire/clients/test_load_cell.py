@@ -62,13 +62,6 @@ def test_minimalmodbus_sets_the_filter(minimal):
         assert cell.read_long(FILTER) == setting
 
 
-def test_minimalmodbus_opens_the_line_again_after_half_a_frame(minimal):
-    first = minimal()
-    first.serial.write(bytes.fromhex("01 03 20"))
-    first.serial.close()
-    assert minimal().read_long(IDENTITY) == 1410
-
-
 def test_mbpoll_weighs(port, hang, mbpoll):
     hang(4.0)
     polled = mbpoll(*SERIAL, "-r", GROSS, "-t", "4:float", port)

@@ -107,13 +107,6 @@ def test_any_device_answers_to_address_0(connect):
     assert connect(address=0).integer(100) == 1091
 
 
-def test_a_cut_line_is_opened_again_after_half_a_frame(connect):
-    first = connect()
-    first.line.write(first.frame("?IF")[:9])
-    first.close()
-    assert connect().integer(100) == 1091
-
-
 def test_a_lost_answer_is_asked_for_again(tec, vo2):
     tec.line.timeout = 2.0
     vo2.control.drop("tec")

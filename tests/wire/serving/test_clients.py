@@ -42,20 +42,6 @@ def identity(line):
     return line.read_until(b"\r")
 
 
-def test_bytes_may_come_one_by_one(vo2, connect):
-    connection = connect(vo2.port("psd"))
-    for byte in request(9):
-        connection.sendall(bytes((byte,)))
-    assert receive(connection, 13)[:2] == b"\x00\x09"
-
-
-def test_requests_may_be_sent_before_their_answers_are_read(vo2, connect):
-    connection = connect(vo2.port("psd"))
-    connection.sendall(b"".join(map(request, range(300))))
-    replies = receive(connection, 300 * 13)
-    assert [struct.unpack_from(">H", replies, 13 * index)[0] for index in range(300)] == list(range(300))
-
-
 def test_two_connections_are_served_in_turn_and_a_third_is_turned_away(vo2, connect):
     first, second = connect(vo2.port("psd")), connect(vo2.port("psd"))
     assert product(first) == product(second) == product(first, 2) == 7.0
@@ -75,13 +61,6 @@ def test_a_client_that_leaves_makes_room_at_once(vo2, connect):
     assert product(keeper) == 7.0
 
 
-def test_a_frame_that_was_left_unfinished_disturbs_nobody(vo2, connect):
-    connection = connect(vo2.port("psd"))
-    connection.sendall(request(1)[:9])
-    connection.close()
-    assert product(connect(vo2.port("psd"))) == 7.0
-
-
 def test_garbage_on_tcp_ends_only_its_connection(vo2, connect):
     keeper, rude = connect(vo2.port("psd")), connect(vo2.port("psd"))
     with suppress(ConnectionError):
@@ -89,16 +68,6 @@ def test_garbage_on_tcp_ends_only_its_connection(vo2, connect):
         while rude.recv(4096):
             pass
     assert product(keeper) == 7.0
-
-
-def test_a_client_that_floods_and_reads_nothing_is_not_read_any_further(vo2, connect):
-    keeper, flooding = connect(vo2.port("psd")), connect(vo2.port("psd"))
-    flooding.settimeout(2.0)
-    # More than any buffers of the system hold.
-    with pytest.raises(TimeoutError):
-        flooding.sendall(3_000_000 * request(3))
-    assert product(keeper) == 7.0
-    assert vo2.control.time() > 0.0
 
 
 def test_raw_bytes_on_tcp_have_one_client_at_a_time(emulate, opened, connect):

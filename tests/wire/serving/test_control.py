@@ -75,14 +75,6 @@ def test_time_is_advanced_on_a_scaled_clock_and_passes_by_itself(vo2):
     assert vo2.control.wait(until) >= until
 
 
-def test_an_unplugged_line_is_silent_until_it_is_plugged_in(vo2, tec):
-    assert answered(tec)
-    vo2.control.unplug("tec")
-    assert tec(SILENCE) == b""
-    vo2.control.plug_in("tec")
-    assert answered(tec)
-
-
 def test_a_cut_resets_connections_and_turns_new_ones_away(vo2, connect):
     connection = connect(vo2.port("psd"))
     vo2.control.cut("psd")
