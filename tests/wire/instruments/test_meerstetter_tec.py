@@ -5,7 +5,6 @@ import math
 import numpy as np
 import pytest
 
-from bench.devices import TECMode
 from sim_devices.instruments.emulated import RequestRefusedError
 from sim_devices.instruments.meerstetter_table import PARAMETERS, DeviceStatus, ServerError
 from sim_devices.instruments.meerstetter_tec import EmulatedTEC
@@ -101,13 +100,6 @@ def test_every_writable_parameter_takes_its_bounds_and_nothing_beyond(tec):
         if number not in (50000, 50001, 2010, 4010, 4011, 5010, 5011):
             tec.write_parameter(number, row.high)
             tec.write_parameter(number, row.low)
-
-
-def test_identity_is_what_the_parameters_say(tec):
-    assert [tec.read_parameter(number) for number in (100, 102, 103)] == [1091, 10910042, 410]
-    assert tec.identity.model == "TEC-1091"
-    assert tec.identity.firmware == "4.10"
-    assert len(tec.identification) == 20
 
 
 @pytest.mark.parametrize(("enable", "live", "on"), [(0, 1, False), (1, 0, True), (2, 0, False), (3, 1, False)])
@@ -287,13 +279,3 @@ def test_noise_is_small_seeded_and_on_the_object_alone(clock, plate):
     assert np.std(readings(1, 1000)) == pytest.approx(0.002, rel=0.15)
     assert np.mean(readings(1, 1000)) == pytest.approx(AMBIENT, abs=5e-4)
     assert len(set(readings(1, 1001))) == 1
-
-
-def test_current_heats_and_cools_the_plate(tec, clock):
-    tec.select_mode(TECMode.CURRENT)
-    tec.set(0.5)
-    clock.sleep(60.0)
-    warm = tec.measure()["tec_temperature"]
-    tec.set(-0.5)
-    clock.sleep(60.0)
-    assert tec.measure()["tec_temperature"] < AMBIENT < warm

@@ -267,13 +267,6 @@ class TestAdapter:
         assert server.receive(b"t601807F4010000000000\r") == b"z\rt58188000200101000405\r"
         assert load.applied == []
 
-    def test_device_name_in_segments(self, server):
-        assert server.receive(b"t60184008100000000000\r") == b"z\rt5818410810000F000000\r"
-        assert server.receive(b"t60186000000000000000\r") == b"z\rt581800526F626F746571\r"
-        assert server.receive(b"t60187000000000000000\r") == b"z\rt58181020534443323136\r"
-        assert server.receive(b"t60186000000000000000\r") == b"z\rt58180D30000000000000\r"
-        assert server.receive(b"t60187000000000000000\r").startswith(b"z\rt581880")
-
     def test_wrong_toggle_bit_ends_the_transfer(self, server):
         server.receive(b"t60184008100000000000\r")
         assert server.receive(b"t60187000000000000000\r") == b"z\rt58188008100000000305\r"
@@ -328,29 +321,6 @@ class TestAdapter:
         assert server.unsolicited() == b"t701100\r"
         assert server.next_unsolicited() == pytest.approx(0.45)
 
-    def test_network_management(self, server, device, clock):
-        query = b"t6018400D210200000000\r"
-        assert server.receive(b"t00020201\r") == b"z\r"
-        assert device.state is NodeState.STOPPED
-        assert server.receive(query) == b"z\r"
-        clock.sleep(0.1)
-        assert server.receive(b"\r") == b"t701104\r\r"
-        assert server.receive(b"t00028000\r") == b"z\r"
-        assert server.receive(query).startswith(b"z\rt5818")
-        clock.sleep(0.1)
-        assert server.receive(b"\r") == b"t70117F\r\r"
-        assert server.receive(b"t00020105\rt000101\r") == b"z\rz\r"
-        assert device.state is NodeState.PRE_OPERATIONAL
-        assert server.receive(b"t00020101\r") == b"z\r"
-        assert device.state is NodeState.OPERATIONAL
-        assert server.receive(b"t00028101\r") == b"z\rt701100\r"
-
-    def test_an_unplugged_line(self, server, device):
-        query = b"t6018400D210200000000\r"
-        assert server.receive(query) == b"z\rt58184B0D2102F0000000\r"
-        device.unplug()
-        assert server.receive(query) == b"z\r"
-
     @given(st.lists(st.one_of(st.binary(max_size=80), st.sampled_from([b"\r", b"O\r", b"C\r", b"S4\r", b"t"]))))
     @example([b"O\r", b"t601\r" * 100])
     @example([b"t\xb2\xb3\xb9\r"])
@@ -365,19 +335,6 @@ class TestAdapter:
 
 
 class TestProcessData:
-    def test_configuration_as_delivered(self, device):
-        for number in range(4):
-            assert device.read_object(0x1800 + number, 1) == 0x40000181 + 0x100 * number
-            assert device.read_object(0x1400 + number, 1) == 0x201 + 0x100 * number
-            for mapping, index, first in ((0x1A00, 0x2106, 1), (0x1600, 0x2005, 9)):
-                assert device.read_object(mapping + number, 0) == 2
-                for place in (1, 2):
-                    expected = index << 16 | (first + 2 * number + place - 1) << 8 | 32
-                    assert device.read_object(mapping + number, place) == expected
-            for parameters in (0x1800, 0x1400):
-                assert device.read_object(parameters + number, 0) == 2
-                assert device.read_object(parameters + number, 2) == 255
-
     def test_mapping_of_the_example_is_sent_after_each_sync(self, server, device):
         for sent in MAPPING_EXAMPLE:
             assert server.receive(sent).endswith(b"t581860%s00000000\r" % sent[7:13])
