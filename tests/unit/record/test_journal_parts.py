@@ -6,7 +6,6 @@ import os
 import shutil
 import sqlite3
 import sys
-import tempfile
 import warnings
 from contextlib import closing
 
@@ -38,13 +37,7 @@ from bench.record.store import Store
 
 SIGNALS = (Signal("force", "N", "force"),)
 STATUS = {"status": "completed", "reason": "", "finished": 9.0, "safe_state": {}}
-
-
-@pytest.fixture(autouse=True)
-def other_disk(tmp_path_factory, monkeypatch):
-    folder = tmp_path_factory.mktemp("temporary")
-    monkeypatch.setattr(tempfile, "tempdir", str(folder))
-    return folder
+pytestmark = pytest.mark.usefixtures("other_disk")
 
 
 def step(number, started=None):
@@ -112,15 +105,6 @@ class TestSecondFile:
         file.close()
         for row, read in zip(rows, [*read_second_file(file.path, "one")][1:], strict=True):
             np.testing.assert_equal(read, row)
-
-    def test_one_of_another_journal_is_left_out(self, tmp_path):
-        path = self.write(tmp_path / SECOND_NAME, 1, 2)
-        assert self.events(path, "other") == self.events(path, "") == []
-        with pytest.raises(FileExistsError):
-            SecondFile(path, "other")
-        data = path.read_bytes()
-        path.write_bytes(data[data.index(b"\n") + 1 :])
-        assert self.events(path) == self.events(path, None) == []
 
     @pytest.mark.skipif(sys.platform == "win32", reason="needs links and users of POSIX")
     @pytest.mark.parametrize("forged", ["link", "second name", "of another user"])
@@ -474,14 +458,6 @@ def test_events_and_steps_are_numbered_by_the_journal(tmp_path):
     with Record(tmp_path) as record:
         assert record.meta["counts"] == {"steps": 1, "telemetry": 1, "events": 1}
         assert [each.text for each in record.events()] == ["one"]
-
-
-def test_a_model_is_kept_beside_the_journal(tmp_path):
-    journal = Journal(tmp_path / FILE_NAME, SIGNALS, {})
-    journal.keep_model("film", 3.0, {"order": 21})
-    journal.close()
-    with Record(tmp_path) as record:
-        assert record.models() == {"film": {"order": 21}}
 
 
 @pytest.mark.parametrize("problem", ["disk I/O error", "database disk image is malformed"])
