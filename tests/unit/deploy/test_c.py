@@ -47,8 +47,8 @@ def _compare(family, seed, real, folder, compiler):
     operator = file.operator
     least, greatest = operator.output_range()
     beyond = 0.05 * (greatest - least)
-    inputs = random_sequence(*operator.input_range, 3000, seed, real)
-    targets = random_sequence(least - beyond, greatest + beyond, 40, seed + 1, real)
+    inputs = random_sequence(*operator.input_range, 1000, seed, real)
+    targets = random_sequence(least - beyond, greatest + beyond, 20, seed + 1, real)
     compiled = Compiled(file, folder, real, compiler)
     assert compiled.size_of_state == compiled.deployment.state
     found = differences(operator, file.memory, compiled, inputs, targets, real)
@@ -189,13 +189,14 @@ def _bytes_of(objects):
     return int(text) + int(data)
 
 
-@pytest.mark.parametrize("family", ["preisach", "preisach, signed", *FAMILIES[6:]])
+@pytest.mark.parametrize("family", ["preisach", *FAMILIES[6:]])
 def test_a_cortex_compiler_takes_it_and_the_readme_bounds_its_code(family, arm_gcc, tmp_path):
     model = plane(41, family.partition(", ")[2]) if family.startswith("preisach") else _file(family, 5).operator
     for real in ("float", "double"):
         found = deploy(ModelFile(family, model), real=real)
         found.write(tmp_path)
-        for optimized in ("-O2", "-Os"):
+        # What is the smaller for a plane of 40 levels; for the others once is enough.
+        for optimized in ("-O2", "-Os") if family == "preisach" else ("-O2",):
             run([arm_gcc, "-mcpu=cortex-m4", "-mthumb", optimized, *STRICT, "-c", "model.c"], tmp_path)
             size = _bytes_of(run([arm_gcc.replace("gcc", "size"), "model.o"], tmp_path))
             assert size <= found.constants + found.code
