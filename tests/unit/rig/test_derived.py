@@ -212,21 +212,13 @@ class TestOnARig:
     @cases(
         ("old", "new", "key"),
         [
-            (
-                "tec_temperature",
-                "tec_temprature",
-                "half.expression: 'tec_temprature': there is no such signal",
-            ),
+            ("tec_temperature", "tec_temprature", "half.expression: 'tec_temprature': there is no such signal"),
             ("tec_temperature", "half", "derived.half.expression: 'half': there is no such signal"),
             ("tec_temperature", "total", "or it comes from this one; there are: tec_setpoint"),
             ('unit = "K"', 'unit = "V"', "derived.half.expression = '0.5 * tec_temperature' is in K, not in unit"),
             ('unit = "K"', 'unit = "V"\nunits = 3', "derived.half.units: there is no such key; did you mean unit?"),
             ('unit = "K"', "", "derived.half.unit: is missing (unit of the result; 1 for a plain number)"),
-            (
-                "0.5 * tec",
-                "tec.value + tec",
-                "derived.half.expression = 'tec.value + tec_temperature': 'tec",
-            ),
+            ("0.5 * tec", "tec.value + tec", "derived.half.expression = 'tec.value + tec_temperature': 'tec"),
             ('unit = "K"', 'unit = "K"\nconstants = { k = "5 K2" }', "derived.half.constants.k = '5 K2'"),
             ('unit = "K"', 'unit = "K"\nkind = "no_such:Class"', "derived.half.kind = 'no_such:Class'"),
             ('unit = "K"', 'unit = "K"\nkind = "math:sqrt"', "kind = 'math:sqrt': is not a DerivedSignal"),
