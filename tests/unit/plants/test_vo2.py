@@ -95,24 +95,6 @@ class TestHysteresis:
         assert curvature.min() == pytest.approx(-96.0, abs=1.5)
         assert curvature.max() == pytest.approx(1838.0, abs=2.5)
 
-    def test_loop_is_not_monotone(self, major_loop):
-        # Expansion bends against the transition at both ends of either branch.
-        for branch in major_loop:
-            slopes = np.diff(branch[:, 1]) / np.diff(branch[:, 0])
-            assert slopes[0] < 0.0
-            assert slopes[-1] < 0.0
-            assert slopes.max() > 200.0
-
-    @cases("turn", [60.0, 63.0, 66.0])
-    def test_curve_is_locked_after_a_reversal(self, turn):
-        plant = make()
-        quasi_static(plant, staircase(22.0, turn, 0.1), dwell=2.0)
-        back = quasi_static(plant, staircase(turn, turn - 4.0, 0.1))
-        locked = (back[10, 1] - back[0, 1]) / (back[10, 0] - back[0, 0])
-        assert -4.3 < locked < -2.0
-        # By 4 K the transition runs back and the curvature falls below where it turned.
-        assert back[-1, 1] < back[:, 1].max() - 5.0
-
     def test_coupling_breaks_congruency(self):
         """Minor loops between the same temperatures differ in height: no Preisach operator does that."""
         difference = {}
@@ -197,21 +179,6 @@ class TestHysteresis:
 
 
 class TestRegulatedPlate:
-    @cases("size", [0.5, 5.0, 30.0])
-    def test_step_response(self, size):
-        plant = make()
-        quasi_static(plant, [50.0], dwell=60.0)
-        plant.regulate(50.0 + size)
-        plate = []
-        for _ in range(200):
-            plant.advance(0.05)
-            plate.append((plant.plate_temperature - 50.0) / size)
-        assert max(plate) - 1.0 < 0.002
-        inside = np.abs(np.array(plate) - 1.0) <= 0.01
-        settled = 0.05 * (1 + np.flatnonzero(~inside).max() + 1)
-        # The slew limit of 15 K/s adds to large steps.
-        assert 2.0 < settled < 3.2 + size / 15.0
-
     def test_matches_the_continuous_loop(self):
         plant = make()
         quasi_static(plant, [50.0], dwell=60.0)
@@ -258,20 +225,6 @@ class TestRegulatedPlate:
 
 
 class TestPeltier:
-    @cases("target", [84.0, 15.0])
-    def test_holding_current_has_the_sign_of_the_work(self, target):
-        plant = make()
-        plant.regulate(target)
-        plant.advance(1800.0)
-        assert plant.plate_temperature == pytest.approx(target)
-        assert math.copysign(1.0, plant.current) == math.copysign(1.0, target - 22.0)
-        assert abs(plant.current) < 1.5
-        assert plant.voltage * plant.current > 0.0
-        # Driving the same current holds the same temperature.
-        plant.drive(plant.current)
-        plant.advance(600.0)
-        assert plant.plate_temperature == pytest.approx(target, abs=0.01)
-
     @cases("mode", ["drive", "regulate"])
     def test_energy_is_conserved(self, mode):
         """Electrical work equals the heat stored in plate and sink plus what went into the room."""
@@ -440,34 +393,21 @@ class TestTime:
                 split.advance(part * 1e-6)
             assert snapshot(split) == snapshot(whole)
 
-    def test_one_seed_one_trajectory(self):
-        runs = [quasi_static(make(VO2Parameters(), seed=s), [60.0, 66.0, 62.0]) for s in (1, 1, 2)]
-        assert np.array_equal(runs[0], runs[1])
-        assert not np.array_equal(runs[0], runs[2])
 
-
-class TestRefusals:
-    @cases("dt", [-1e-9, math.nan, math.inf])
-    def test_advance(self, dt):
-        with pytest.raises(ValueError, match="dt must"):
-            make(SMALL).advance(dt)
-
-    @cases("target", [-300.0, math.nan, math.inf])
-    def test_targets(self, target):
-        with pytest.raises(ValueError, match="target_celsius"):
-            make(SMALL).regulate(target)
-        with pytest.raises(ValueError, match="initial_temperature"):
-            make(SMALL, initial_temperature=target)
-
-    @cases("limit", [-1.0, math.nan])
-    def test_current_limit(self, limit):
+@cases(
+    ("command", "value", "words"),
+    [
+        *(("advance", dt, "dt must") for dt in (-1e-9, math.nan, math.inf)),
+        *(("regulate", target, "target_celsius") for target in (-300.0, math.nan, math.inf)),
+        *(("drive", current, "current must lie") for current in (5.1, -6.0, math.nan)),
+    ],
+)
+def test_wrong_commands_are_refused_and_change_nothing(command, value, words):
+    plant = make(SMALL)
+    with pytest.raises(ValueError, match=words):
+        getattr(plant, command)(value)
+    for limit in (-1.0, math.nan):
         with pytest.raises(ValueError, match="current_limit"):
-            make(SMALL).regulate(50.0, current_limit=limit)
-
-    @cases("current", [5.1, -6.0, math.nan])
-    def test_current(self, current):
-        plant = make(SMALL)
-        with pytest.raises(ValueError, match="current must lie"):
-            plant.drive(current)
-        plant.advance(1.0)
-        assert plant.current == 0.0
+            plant.regulate(50.0, current_limit=limit)
+    plant.advance(1.0)
+    assert plant.current == 0.0
