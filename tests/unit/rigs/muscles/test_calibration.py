@@ -70,7 +70,7 @@ def test_intervals_of_a_calibrated_length_contain_the_true_one():
         "reference_uncertainty": BLOCKS.uncertainty,
     }  # fmt: skip
     inside = []
-    for seed in range(40):
+    for seed in range(20):
         wire = Wire(seed)
         blocks = Characteristic(GAUGE_BLOCKS.specimen(seed, "gauge_blocks"), -REST, REST)
         readings = [wire.read(blocks.value(place)) for place in places for _ in range(10)]

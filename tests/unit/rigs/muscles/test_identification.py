@@ -131,10 +131,7 @@ class TestReading:
         ("statement", "words"),
         [
             (f"UPDATE steps SET label = 'other' WHERE label = '{SAMPLE}'", "has no readings with the label 'sample'"),
-            (
-                f"UPDATE signals SET name = 'other' WHERE name = '{LENGTH}'",
-                f"table signals has no row of {LENGTH}",
-            ),
+            (f"UPDATE signals SET name = 'other' WHERE name = '{LENGTH}'", f"table signals has no row of {LENGTH}"),
             ("UPDATE meta SET value = '\"aborted\"' WHERE key = 'status'", "the run is aborted"),
             ("DELETE FROM meta WHERE key = 'status'", "the run is unfinished"),
         ],

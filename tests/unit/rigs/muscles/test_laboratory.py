@@ -11,7 +11,6 @@ from short_runs import assert_refused
 from bench.base import ConfigurationError, DeviceError, VirtualClock
 from bench.rig import Rig, load_rig
 from rigs.muscles.laboratory import (
-    FAN_LINE,
     LOAD,
     STAGE,
     Frame,
@@ -139,21 +138,6 @@ class TestFrame:
             assert force == pytest.approx(standing[0][0], abs=0.01)
             assert position == pytest.approx(standing[0][1], abs=1e-9)
 
-    def test_a_line_of_the_t7_switches_the_fan(self):
-        with rig() as bench:
-            wire = bench.laboratory.muscle
-            assert bench.file.devices[-1].settings.line == FAN_LINE
-            bench.laboratory.operate(LOAD, 0.3)
-            temperatures = {}
-            for on in (0.0, 1.0, 0.0):
-                bench.devices["fan"].set(on)
-                bench.devices["supply"].set(2.0)
-                look(bench, 40.0)
-                temperatures.setdefault(on, []).append(wire.temperature)
-        still, blown = temperatures[0.0], temperatures[1.0][0]
-        assert blown < still[0] - 5.0
-        assert still[1] == pytest.approx(still[0], abs=2.0)
-
 
 class TestOperator:
     @cases("name", RIGS)
@@ -259,11 +243,6 @@ class TestNoise:
             position = bench.devices["wire_end"].measure()["wire_end_position"]
             bench.clock.sleep_until(12.0)
             return position, bench.devices["supply"].measure(), bench.devices["load_cell"].measure()
-
-    def test_the_same_seed_gives_the_same_readings(self):
-        assert self.readings(3) == self.readings(3)
-        assert self.readings(3)[0] != self.readings(4)[0]
-        assert self.readings(3)[2] != self.readings(4)[2]
 
     def test_how_often_one_instrument_is_asked_does_not_change_what_another_says(self):
         seldom, often = self.readings(3), self.readings(3, asked_of_the_cell=5)

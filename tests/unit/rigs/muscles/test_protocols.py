@@ -248,31 +248,26 @@ class TestRefused:
             ("none", "cannot be read"),
         ],
     )
-    def test_models_that_do_not_fit(self, bench, tmp_path, files, protocol, name, words):
-        code, _, err = bench("run", protocol, *SMA, "--set", f"model={files[name]}", "--out", tmp_path)
-        assert code == 3
-        assert err.count("error:") == 1
-        assert words in re.sub(r"\s+", " ", err)
-        assert f"{name}.json" in err
-        assert not list(tmp_path.iterdir())
-        with pytest.raises(DataError):
+    def test_models_that_do_not_fit(self, files, protocol, name, words):
+        with pytest.raises(DataError, match=words) as caught:
             planned(protocol, model=files[name])
+        assert f"{name}.json" in str(caught.value)
 
     @cases("protocol", CONTROL)
-    def test_a_model_that_does_not_say_how_fast_the_muscle_is(self, bench, tmp_path, files, protocol):
-        model = files["without-dynamics"]
-        code, _, err = bench("run", protocol, *SMA, "--set", f"model={model}", "--out", tmp_path)
-        assert code == 2
-        assert "does not say how fast the muscle follows" in re.sub(r"\s+", " ", err)
-        assert not list(tmp_path.iterdir())
+    def test_a_model_that_does_not_say_how_fast_the_muscle_is(self, files, protocol):
+        with pytest.raises(ConfigurationError, match="does not say how fast the muscle follows"):
+            planned(protocol, model=files["without-dynamics"])
 
-    @cases("protocol", [*CHARACTERIZATION, *CONTROL])
-    def test_a_rig_without_a_muscle(self, bench, tmp_path, files, protocol):
-        settings = ["--set", f"model={files['two-stage']}"] if protocol in CONTROL else []
-        code, _, err = bench("run", protocol, "--rig", "vo2", "--clock", "virtual", *settings, "--out", tmp_path)
+    @cases(
+        ("protocol", "missing"),
+        [
+            ("length-voltage", "[roles.force], [roles.load], [roles.cooling]"),
+            ("force-voltage", "[roles.force], [roles.stage]"),
+        ],
+    )
+    def test_a_rig_without_a_muscle(self, bench, tmp_path, protocol, missing):
+        code, _, err = bench("run", protocol, "--rig", "vo2", "--clock", "virtual", "--out", tmp_path)
         assert code == 2
-        on_weights = protocol in ("length-voltage", "length-verification", "length-control")
-        missing = "[roles.force], [roles.load], [roles.cooling]" if on_weights else "[roles.force], [roles.stage]"
         text = re.sub(r"\s+", " ", err)
         assert f"vo2.toml: protocol {protocol} needs {missing}; the file binds: drive, response" in text
         assert not list(tmp_path.iterdir())
@@ -280,29 +275,13 @@ class TestRefused:
     @cases(
         ("protocol", "settings", "words"),
         [
-            (
-                "length-force",
-                {"smallest_force": 6, "largest_force": 5},
-                "smallest_force = 6 N is not allowed with largest_force = 5 N; allowed: smallest_force < larg",
-            ),
-            (
-                "length-force",
-                {"stiffnesses": "900, 30"},
-                "stiffnesses = 900, 30 N/m is not allowed; allowed: two positive",
-            ),
-            (
-                "force-voltage",
-                {"stiffnesses": "0, 0"},
-                "stiffnesses = 0, 0 N/m is not allowed; allowed: two positive",
-            ),
+            ("length-force", {"smallest_force": 6, "largest_force": 5}, "smallest_force = 6 N is not allowed with"),
+            ("length-force", {"stiffnesses": "900, 30"}, "stiffnesses = 900, 30 N/m is not allowed"),
+            ("force-voltage", {"stiffnesses": "0, 0"}, "stiffnesses = 0, 0 N/m is not allowed"),
             ("force-voltage", {"highest": "0"}, "highest = '0' is not allowed; allowed: > 0 V"),
             ("length-verification", {"highest": "-1"}, "highest = '-1' is not allowed; allowed: > 0 V"),
             ("length-voltage", {"loads": "0, 1"}, "loads = 0, 1 N is not allowed; allowed: positive numbers"),
-            (
-                "calibration-load",
-                {"weights": "1, -1", "tolerance": "0.2"},
-                "weights = 1, -1 N is not allowed; allowed: numbers ≥ 0",
-            ),
+            ("calibration-load", {"weights": "1, -1", "tolerance": "0.2"}, "weights = 1, -1 N is not allowed"),
         ],
     )
     def test_a_parameter_is_named_with_its_value_and_what_is_allowed(self, protocol, settings, words):
@@ -334,30 +313,18 @@ def identified(tmp_path_factory):
 
 
 class TestControl:
-    def session(self, bench, tmp_path, protocol, **settings):
+    def test_length_under_a_weight_that_changes(self, bench, identified, tmp_path):
+        settings = {"model": identified, "count": 7, "change": 1.96, "duration": 15, "readings": 3, "dwell": 10}
         code, _, err = bench(
-            "run", protocol, *SMA, *assignments("--set", settings), "--out", tmp_path, "--json", tmp_path / "run.json"
+            *("run", "length-control", *SMA, *assignments("--set", settings)),
+            *("--out", tmp_path, "--json", tmp_path / "run.json"),
         )
         assert code == 0, err
         result = json.loads((tmp_path / "run.json").read_text())
         assert set(result["safe_state"].values()) == {"safe"}
         with Record(Path(result["folder"])) as record:
-            signal = LENGTH if protocol == "length-control" else FORCE
-            assert record.meta["controls"] == signal
-            return target_results(record, signal), record.telemetry(), record.events()
-
-    def test_length_under_a_weight_that_changes(self, bench, identified, tmp_path):
-        results, ticks, events = self.session(
-            bench,
-            tmp_path,
-            "length-control",
-            model=identified,
-            count=7,
-            change=1.96,
-            duration=15,
-            readings=3,
-            dwell=10,
-        )
+            assert record.meta["controls"] == LENGTH
+            results, ticks, events = target_results(record, LENGTH), record.telemetry(), record.events()
         assert results.targets.size == 7
         assert np.sqrt(np.mean((results.outputs - results.targets) ** 2)) < 0.02e-3
         assert np.all(results.seconds >= 15.0 - 1e-6)
@@ -370,30 +337,6 @@ class TestControl:
         rms = 1e3 * np.sqrt(np.mean((results.outputs - results.targets) ** 2))
         assert note.startswith("closed-loop-inverse: 7 targets")
         assert f"RMS {rms:.3f} mm" in note
-
-    def test_force_between_fixed_ends(self, bench, identified, tmp_path):
-        results, ticks, events = self.session(
-            bench, tmp_path, "force-control",
-            model=identified, count=5, duration=15, readings=3, dwell=10, conditioning=1,
-        )  # fmt: skip
-        assert results.targets.size == 5
-        assert np.sqrt(np.mean((results.outputs - results.targets) ** 2)) < 0.1
-        at_work = np.isfinite(ticks["reference"]) & (ticks["t"] > events[-4].t - 60.0)
-        assert np.ptp(ticks["stage_position"][at_work]) < 1e-5
-        assert ticks["supply_setpoint"][at_work].max() <= 3.0
-
-    @pytest.mark.parametrize("controller", ["open-loop-inverse", "proportional-integral"])
-    def test_the_loop_is_better_than_no_loop(self, bench, identified, tmp_path, controller):
-        results, _, _ = self.session(
-            bench, tmp_path, "length-control",
-            model=identified, controller=controller, count=5, duration=15, readings=3, dwell=10,
-        )  # fmt: skip
-        rms = np.sqrt(np.mean((results.outputs - results.targets) ** 2))
-        low, high = {
-            "open-loop-inverse": (0.05e-3, 1.5e-3),
-            "proportional-integral": (0.0, 0.15e-3),
-        }[controller]
-        assert low < rms < high
 
 
 LENGTH_RUN = ("length-voltage", {"loads": "4.9", "points": "11", "dwell": "5"})
