@@ -217,7 +217,7 @@ def test_a_run_under_control_records_it(bench, tmp_path):
         "preisach-nonmonotonic",
         input="tec_temperature",
         output="curvature",
-        levels=10,
+        levels=6,
         plane=(30.0, 70.0),
         band=True,
     )

@@ -78,7 +78,7 @@ def run(bench, tmp_path):
 # The other rigs in part by the next test.
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "rig", [each if each in ("vo2", "mckibben") else pytest.param(each, marks=pytest.mark.seeds) for each in CASES]
+    "rig", [each if each == "vo2" else pytest.param(each, marks=pytest.mark.seeds) for each in CASES]
 )
 def test_from_characterization_to_report(run, bench, tmp_path, rig):
     case = CASES[rig]
@@ -117,7 +117,7 @@ def test_from_characterization_to_report(run, bench, tmp_path, rig):
     assert re.search(rf"error rms [\d.]+ {units}", re.sub(r"\s+", " ", text))
 
 
-@pytest.mark.parametrize("rig", ["sma", "coiled-polymer", "hybrid"])
+@pytest.mark.parametrize("rig", ["sma", "mckibben", "coiled-polymer", "hybrid"])
 def test_from_characterization_to_tracking_in_few_steps(run, bench, tmp_path, rig):
     case, model = CASES[rig], tmp_path / "model.json"
     low, high = load_rig(rig).roles["response"].range
@@ -141,38 +141,14 @@ REFUSED = [
     ("damped-oscillation", {"increment": "-1"}, "increment = '-1' is not allowed; allowed: > 0 K"),
     ("random-validation", {"increment": "0"}, "increment = '0' is not allowed; allowed: > 0 K"),
     ("damped-oscillation", {"increment": "nan"}, "increment = 'nan' is not allowed; allowed: > 0 K"),
-    (
-        "damped-oscillation",
-        {"center": "90"},
-        "center = 90 °C is not allowed with high = 84 °C; allowed: low < center < high",
-    ),
-    (
-        "damped-oscillation",
-        {"low": "84", "high": "21"},
-        "low = 84 °C is not allowed with center = 54 °C; allowed: low < ",
-    ),
+    ("damped-oscillation", {"center": "90"}, "center = 90 °C is not allowed with high = 84 °C"),
+    ("damped-oscillation", {"low": "84", "high": "21"}, "low = 84 °C is not allowed with center = 54 °C"),
     # Refused before an array of so many numbers is made.
     ("damped-oscillation", {"low": "-1e12"}, "increment = 0.35 °C is not allowed from low = -1e+12 to high = 84 °C"),
-    (
-        "damped-oscillation",
-        {"increment": "1e-9"},
-        "increment = 1e-09 °C is not allowed from low = 21 to high = 84 °C",
-    ),
-    (
-        "random-validation",
-        {"inner_low": "-1e12"},
-        "increment = 1.2 °C is not allowed from inner_low = -1e+12 to high = 84 °C",
-    ),
-    (
-        "random-validation",
-        {"low": "84", "high": "21"},
-        "low = 84 °C is not allowed with high = 21 °C; allowed: low < high",
-    ),
-    (
-        "random-validation",
-        {"inner_low": "72", "inner_high": "40"},
-        "inner_low = 72 °C is not allowed with inner_high = 40 °C; allowed: inner_low < inner_high",
-    ),
+    ("damped-oscillation", {"increment": "1e-9"}, "increment = 1e-09 °C is not allowed from low = 21 to high = 84"),
+    ("random-validation", {"inner_low": "-1e12"}, "increment = 1.2 °C is not allowed from inner_low = -1e+12 to"),
+    ("random-validation", {"low": "84", "high": "21"}, "low = 84 °C is not allowed with high = 21 °C"),
+    ("random-validation", {"inner_low": "72", "inner_high": "40"}, "inner_low = 72 °C is not allowed with"),
     ("sequence", {"low": "84", "high": "21"}, "low = 84 °C is not allowed with high = 21 °C; allowed: low < high"),
     *(
         (protocol, settings, words)
@@ -191,22 +167,10 @@ REFUSED = [
     ),
     ("creep", {"load": "-1"}, "load = '-1' is not allowed; allowed: ≥ 0"),
     ("tracking", {"reset": "90"}, "reset = 90 °C is not allowed with hottest = 84 °C; allowed: reset < hottest"),
-    (
-        "tracking",
-        {"low": "900", "high": "100"},
-        "low = 900 1/m is not allowed with high = 100 1/m; allowed: low < high",
-    ),
-    (
-        "following",
-        {"low": "900", "high": "100"},
-        "low = 900 1/m is not allowed with high = 100 1/m; allowed: low < high",
-    ),
+    ("tracking", {"low": "900", "high": "100"}, "low = 900 1/m is not allowed with high = 100 1/m"),
+    ("following", {"low": "900", "high": "100"}, "low = 900 1/m is not allowed with high = 100 1/m"),
     ("following", {"fastest": "0"}, "fastest = '0' is not allowed; allowed: > 0 K/s"),
-    (
-        "following",
-        {"duration": "1e7", "rate": "50"},
-        "duration = 1e+07 s is not allowed at rate = 50 1/s; allowed: ≤ 2",
-    ),
+    ("following", {"duration": "1e7", "rate": "50"}, "duration = 1e+07 s is not allowed at rate = 50 1/s"),
 ]
 
 

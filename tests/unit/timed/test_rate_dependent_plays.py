@@ -192,11 +192,11 @@ def test_targets_are_followed_on_from_a_state_and_those_out_of_reach_are_clamped
     assert set(found.flags[150:]) == {"met"}
 
 
-def cycles(frequencies, amplitudes, rate=2000.0):
-    """Return times and sines, one a frequency (Hz) and amplitude, at a rate or 400 samples each."""
+def cycles(frequencies, amplitudes, rate=2000.0, most=400):
+    """Return times and sines, one a frequency (Hz) and amplitude, at a rate or of so many samples at most."""
     times, inputs, now = [], [], 0.0
     for frequency, amplitude in zip(frequencies, amplitudes, strict=True):
-        count = min(round(rate / frequency), 400)
+        count = min(round(rate / frequency), most)
         shares = np.arange(count) / count
         times.append(now + shares / frequency)
         inputs.append(amplitude * np.sin(2.0 * np.pi * shares))
@@ -227,11 +227,13 @@ def activated(times, inputs, substeps=10):
 def test_loops_that_widen_with_the_rate_are_predicted_at_other_rates():
     rng = np.random.default_rng(0)
     t, u = cycles(
-        [1, 1, 1, 5, 5, 5, *[20] * 4, *[50] * 5], [1, 0.6, 0.3, 1, 0.6, 0.3, 1, 0.7, 0.5, 0.2, 1, 0.8, 0.6, 0.4, 0.2]
+        [1, 1, 1, 5, 5, 5, *[20] * 4, *[50] * 5],
+        [1, 0.6, 0.3, 1, 0.6, 0.3, 1, 0.7, 0.5, 0.2, 1, 0.8, 0.6, 0.4, 0.2],
+        most=120,
     )
     y = activated(t, u)
     y += 0.002 * np.ptp(y) * rng.standard_normal(y.size)
-    later, fresh = cycles([1, 2, 10, 10, 30, 30, 30, 30, 3], [0.9, 0.5, 0.9, 0.5, 0.8, 1, 0.4, 0.6, 0.7])
+    later, fresh = cycles([1, 2, 10, 10, 30, 30, 30, 30, 3], [0.9, 0.5, 0.9, 0.5, 0.8, 1, 0.4, 0.6, 0.7], most=120)
     truth = activated(later, fresh)
 
     def held_out(predicted):

@@ -52,7 +52,6 @@ def oscillator(folder):
             hammerstein,
             ("--model", "hammerstein", "-o", "static=polynomial", "-o", "degree=3", "-o", "dynamics=lag,drift"),
         ),
-        (hammerstein, ("--model", "hammerstein", "--levels", 8, "-o", "dynamics=lag", "--smoothing", 0.01)),
         (plays, ("--model", "rate-dependent-plays", "-o", "plays=10", "-o", "time_constants=1")),
         (plays, ("--model", "rate-dependent-plays", "--initial", "skip", "-o", "maximum=4")),
         pytest.param(oscillator, ("--model", "bouc-wen-oscillator"), marks=pytest.mark.seeds),
@@ -131,15 +130,6 @@ def test_smoothing_is_chosen_by_cross_validation_and_refused_where_there_is_none
     ):
         code, _, text = bench("identify", data, *COLUMNS, "--model", model, option)
         assert (code, words in " ".join(text.split())) == (2, True), text
-
-
-def test_times_are_read_in_their_unit(bench, tmp_path):
-    code, _, _ = bench(
-        "identify", hammerstein(tmp_path), *COLUMNS, "--model", "hammerstein", "--levels", 5, "-o", "dynamics=lag",
-        "--json", tmp_path / "fit.json",
-    )  # fmt: skip
-    assert code == 0
-    assert json.loads((tmp_path / "fit.json").read_text())["shape"]["time constant"] == pytest.approx(4e-3, rel=0.05)
 
 
 def test_what_does_not_fit_together_is_refused_with_the_option(bench, tmp_path):
