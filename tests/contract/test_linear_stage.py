@@ -18,14 +18,13 @@ from bench.contracts import (
 from drivers.dynamixel import DynamixelDrum
 from sim_devices.instruments.dynamixel import EmulatedMX28
 from sim_devices.instruments.dynamixel_drum import EmulatedDrum
-from sim_devices.instruments.dynamixel_table import COUNT, VELOCITY_UNIT, HardwareError
+from sim_devices.instruments.dynamixel_table import COUNT, HardwareError
 from sim_devices.wire.dynamixel2 import Dynamixel2Server
 from sim_devices.world import World
 
 WATCHDOG = 2.5
 RADIUS = 0.012
 RESOLUTION = COUNT * RADIUS
-VELOCITY = 42 * VELOCITY_UNIT * RADIUS
 ZERO = 2048
 TURN = 2.0 * math.pi * RADIUS
 
@@ -108,28 +107,6 @@ class TestSilence(OnADrum, SilentInstrumentContract):
         bench.instrument.unplug()
         with pytest.raises(DeviceConnectionError, match="stage: "):
             status.wait()
-
-
-@cases("goal", [0.01, -0.02, 2.5 * TURN, -1.5 * TURN])
-def test_arrives_and_holds(kind, stack, goal):
-    bench = connected(kind, stack)
-    status = bench.device.set(goal)
-    assert not status.update()
-    assert bench.device.force_enabled
-    assert bench.device.setpoint == goal
-    bench.clock.sleep(0.6)
-    assert bench.device.measure()["stage_velocity"] == pytest.approx(
-        math.copysign(VELOCITY, goal), abs=VELOCITY_UNIT * RADIUS
-    )
-    status.wait()
-    assert status.success
-    for _ in range(3):
-        bench.clock.sleep(2.0)
-        values = bench.device.glance()
-        assert values["stage_position"] == pytest.approx(goal, abs=0.51 * RESOLUTION)
-        assert values["stage_velocity"] == 0.0
-    assert bench.where() == pytest.approx(goal, abs=0.51 * RESOLUTION)
-    assert bench.drum.position == pytest.approx(bench.where(), abs=1e-12)
 
 
 def never_moved(bench):

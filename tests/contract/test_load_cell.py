@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from cases import cases
-from emulated_bench import Bench, Given, OnABench, check_reproducible, over_the_wire, serial_port
+from emulated_bench import Bench, Given, OnABench, over_the_wire, serial_port
 
 from bench.base import DeviceError, VirtualClock
 from bench.contracts import LineLostContract, LoadCellContract, RestartedInstrumentContract
@@ -214,15 +214,3 @@ def test_a_measurement_is_the_mean_over_its_time(bench):
     bench.clock.sleep(2.0)
     # Readings over 0.5 s, 0.25 s on the mean; both lags hold them back by 25.6 ms each.
     assert force(bench.device.measure()) == pytest.approx(2.0 + 0.25 - 2 * 0.0256, abs=8e-3)
-
-
-def test_one_seed_gives_one_record(kind, stack):
-    def record(seed):
-        bench = connected(kind, stack, seed)
-        values = []
-        for step in range(5):
-            bench.put(2.0 * step)
-            values += [force(bench.device.measure()), force(bench.device.glance())]
-        return values
-
-    check_reproducible(record)

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 from cases import cases
-from emulated_bench import Bench, Given, OnABench, check_reproducible, tcp_port
+from emulated_bench import Bench, Given, OnABench, tcp_port
 from modbus_tcp import ModbusTcpServer
 from two_current_psd import TwoCurrentPSD
 
@@ -177,17 +177,6 @@ def test_a_measurement_is_the_mean_over_its_time(kind, stack):
     bench.plant.rate = 2e-3
     # Conversions at 1, 2 ... 10 ms: their mean is at 5.5 ms.
     assert bench.device.measure()["tip_position"] == pytest.approx(11e-6, abs=0.15e-6)
-
-
-def test_one_seed_gives_one_record(kind, readout, stack):
-    def record(seed):
-        bench = connected(kind, readout, stack, seed)
-        values = []
-        for bench.plant.value in CASES[readout].positions:
-            values += [*bench.device.measure().values(), *bench.device.glance().values()]
-        return values
-
-    check_reproducible(record)
 
 
 def test_a_socket_changes_nothing(readout, stack):

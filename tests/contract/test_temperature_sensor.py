@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from cases import cases
-from emulated_bench import Bench, Given, OnABench, check_reproducible, tcp_port
+from emulated_bench import Bench, Given, OnABench, tcp_port
 
 from bench.base import DeviceError, VirtualClock
 from bench.contracts import TemperatureSensorContract
@@ -103,14 +103,3 @@ def test_a_measurement_takes_the_time_of_its_conversions(bench):
     begin = bench.clock.now()
     bench.device.glance()
     assert bench.clock.now() == begin
-
-
-def test_one_seed_gives_one_record(stack):
-    def record(seed):
-        bench = connected(stack, seed)
-        values = []
-        for bench.plant.value in TEMPERATURES:
-            values += [*bench.device.measure().values(), *bench.device.glance().values()]
-        return values
-
-    check_reproducible(record)

@@ -269,26 +269,3 @@ class TestGeneralRoles:
             coil.safe()
         assert coil.sent == (2.0, "off")
         assert math.isnan(coil.setpoint)
-
-
-class TestBlueskyByStructure:
-    def test_every_device_conforms(self, rig):
-        for device in rig.devices.values():
-            for protocol in ("Readable", "Stoppable", "HasName", "HasParent"):
-                assert isinstance(device, getattr(bluesky_protocols, protocol)), protocol
-            assert device.parent is None
-        assert isinstance(rig.devices["tec"], bluesky_protocols.Movable)
-        assert not isinstance(rig.devices["probe"], bluesky_protocols.Movable)
-
-    def test_read_and_describe_agree(self, rig):
-        rig.clock.sleep(3.0)
-        for device in rig.devices.values():
-            reading, description = device.read(), device.describe()
-            assert list(reading) == list(description) == [signal.name for signal in device.signals]
-            for signal in device.signals:
-                key = description[signal.name]
-                assert key["units"] == signal.unit
-                assert key["dtype"] == "number"
-                assert key["shape"] == []
-                assert device.identity.serial_number in key["source"]
-                assert reading[signal.name]["timestamp"] == rig.clock.epoch.timestamp() + 3.0

@@ -272,12 +272,6 @@ class TestSetpoints:
         assert b.sent == []
         assert len(b.samples()["t"]) == 10
 
-    def test_whole_numbers_and_those_of_numpy(self, bench):
-        b = bench()
-        assert b.run(loop(Playback(lambda t: np.float32(30) if t < 0.5 else np.int64(31)))).status == "completed"
-        assert b.sent == [30.0, 31.0]
-        assert set(b.samples()["tec_setpoint"]) == {30.0, 31.0}
-
     @pytest.mark.parametrize("value", [95.5, 9.0, math.nan, math.inf])
     def test_beyond_the_limits_it_is_refused_and_the_run_ends_safe(self, bench, value):
         b = bench()
@@ -403,15 +397,6 @@ class TestRecord:
             assert np.all(np.isnan(steps[name]))
             assert np.all(np.isnan(ticks[name][ticks["t"] > 1.0]))
         assert np.isnan(ticks["lateness"]).sum() == len(ticks) - 10
-
-    def test_observers_see_what_the_journal_has(self, bench):
-        b = bench()
-        b.run(loop(Controller(), 20.0, 1.0))
-        with b.record() as run:
-            assert run.events() == b.watcher.events
-            # As texts, as nan is not equal to itself.
-            assert repr(list(run.step_records())) == repr(b.watcher.steps)
-        assert b.telemetry()["t"].tolist() == [t for t, _, _ in b.watcher.ticks]
 
 
 class TestLate:

@@ -16,7 +16,6 @@ from bench.protocol import (
     Note,
     Phase,
     ProtocolParameters,
-    Reading,
     Settled,
     Step,
     UntilSteady,
@@ -514,27 +513,6 @@ class TestPackaged:
         assert 21.0 <= low < 40.0
         assert 72.0 < high <= 84.0
 
-    def test_random_validation_is_the_same_each_time(self, vo2):
-        definition = find_protocol("random-validation")
-        parameters = vo2.parse(definition, {"count": "50"})
-
-        def setpoints():
-            messages, got = definition.start(parameters, vo2.slots(definition)), []
-            try:
-                message = next(messages)
-                while True:
-                    got.append(message)
-                    message = (
-                        messages.send(Reading(0, 0.0, Settled.DWELL, {}))
-                        if isinstance(message, Step)
-                        else next(messages)
-                    )
-            except StopIteration:
-                return got
-
-        assert setpoints() == setpoints()
-        assert vo2.plan(definition, {"sequence_seed": "2"}).extremes != vo2.plan(definition).extremes
-
     def test_creep(self, vo2):
         definition = find_protocol("creep")
         expected = vo2.plan(definition)
@@ -650,14 +628,3 @@ class TestFixedRate:
 
         with pytest.raises(ConfigurationError, match="protocol go: FixedRate: expected rate, duration > 0"):
             plan(define(go), Nothing())
-
-
-class TestPlayback:
-    def test_setpoints_are_functions_of_time(self):
-        playback = Playback(lambda t: 2.0 * t, lambda t: -t)
-        assert [playback.update(t, (5.0, 6.0)) for t in (0.0, 1.5)] == [(0.0, 0.0), (3.0, -1.5)]
-
-    def test_it_thinks_nothing(self):
-        playback = Playback()
-        assert playback.update(0.0, ()) == ()
-        assert math.isnan(playback.trace.reference)
