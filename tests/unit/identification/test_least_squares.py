@@ -12,7 +12,7 @@ from scipy.optimize import lsq_linear, nnls
 from bench.identification import fit, fit_minimum_norm, ramps
 from bench.identification.fit import least_squares
 from bench.identification.fit.cholesky_factor import CholeskyFactor
-from bench.models import Preisach, QuadraticTerm, Regressor, ThermalExpansion, uniform_levels
+from bench.models import Preisach, QuadraticTerm, Regressor, uniform_levels
 
 
 def oscillation(count=25, step=0.05):
@@ -113,27 +113,6 @@ def test_kkt_on_random_dense_problems(seed, rows, columns, duplicates):
     assert kkt(matrix, outputs, found, signs) < 1e-9
 
 
-@settings(max_examples=25)
-@given(st.integers(0, 10_000), st.integers(1, 12))
-def test_kkt_on_random_excitations(seed, order):
-    rng = np.random.default_rng(seed)
-    cells = order * (order + 1) // 2
-    operator = Preisach(uniform_levels(0.0, 1.0, order), np.zeros(cells))
-    inputs = rng.uniform(-0.1, 1.1, 80)
-    outputs = rng.normal(size=80)
-    regressor = operator.regressor(inputs)
-    found = fit(regressor, outputs)
-    assert kkt(regressor.dense(), outputs, found, np.ones(cells, dtype=bool)) < 1e-9
-    assert found.certificate.kkt_residual < 1e-10
-
-
-def test_recovers_a_known_model_without_noise():
-    operator, inputs, outputs = problem(order=6, term=ThermalExpansion(2.0, 3.0, -1.0, 1.0, -2.0), noise=0.0)
-    found = fit(operator.regressor(inputs), outputs)
-    np.testing.assert_allclose(found.coefficients, operator.coefficients, atol=1e-8)
-    assert found.bias == pytest.approx(0.7, abs=1e-8)
-
-
 def test_constant_input_identifies_nothing_but_the_bias():
     operator, _, _ = problem()
     outputs = np.array([1.0, 2.0, 3.0])
@@ -193,24 +172,6 @@ def test_smoothing_fills_gaps_and_lowers_roughness():
     carried = fit(half, half.product(np.ones(55)), smoothing=1e-6)
     assert carried.coefficients[-1] > 0.5
     assert carried.certificate.coverage < 0.5
-
-
-def test_smoothed_solution_satisfies_its_own_conditions():
-    operator, inputs, outputs = problem(order=5, noise=0.3)
-    regressor = operator.regressor(inputs)
-    found = fit(regressor, outputs, smoothing=0.05)
-    a, b = centred(regressor.dense(), outputs)
-    mean_square = (np.linalg.norm(a, axis=0) ** 2).mean()
-    cell = {(i, j): i * (i + 1) // 2 + j for i in range(5) for j in range(i + 1)}
-    laplacian = np.zeros((15, 15))
-    for (i, j), here in cell.items():
-        for other in ((i + 1, j), (i - 1, j), (i, j + 1), (i, j - 1)):
-            if other in cell:
-                laplacian[here, here] += 1
-                laplacian[here, cell[other]] -= 1
-    stacked = np.vstack([a, math.sqrt(0.05 * mean_square) * laplacian])
-    expected, _ = nnls(stacked, np.concatenate([b, np.zeros(15)]))
-    np.testing.assert_allclose(found.coefficients, expected, atol=1e-9)
 
 
 def test_smoothed_uncertainties_are_those_of_the_penalised_normal_equations():

@@ -132,33 +132,6 @@ class TestUnusable:
         with pytest.raises(DataError, match=rf"m\.json is damaged: key '{key}' is missing"):
             parse_model(document, "m.json")
 
-    @cases(
-        ("path", "value"),
-        [
-            (("model",), None),
-            (("model", "type"), ["preisach"]),
-            (("model", "levels"), [30.0, 20.0]),
-            (("model", "density"), [math.nan] * 10),
-            (("model", "bias"), "much"),
-            (("model", "input_range"), [1.0]),
-            (("model", "input_unit"), 5),
-            (("model", "output_unit"), ["1/m"]),
-            (("model", "reversible"), {"type": "magic"}),
-            (("model", "reversible", "k0"), "2.8"),
-            (("model", "reversible", "low"), 80.0),
-            (("model", "reversible", "extra"), 1.0),
-            (("memory",), False),
-            (("memory", "extrema"), [1.0, 2.0, 3.0]),
-            (("memory", "extrema"), [math.nan]),
-            (("memory", "input"), "x"),
-            (("memory", "saturation"), 0),
-            (("provenance",), 5),
-        ],
-    )
-    def test_wrong_values(self, path, value):
-        with pytest.raises(DataError, match=r"m\.json"):
-            parse_model(changed(content(), path, value), "m.json")
-
 
 def _paths(node, prefix=()):
     for key, value in node.items() if isinstance(node, dict) else enumerate(node):
@@ -281,26 +254,6 @@ HYBRID = HybridModel(
 )
 
 
-@pytest.fixture
-def hybrid_file(tmp_path):
-    """Write the content of the file of a hybrid model, with values at some paths replaced or taken away."""
-
-    def write(changes=(), missing=()):
-        document = json.loads(json.dumps(ModelFile("hybrid", HYBRID, provenance={"sources": ["a", "b"]}).to_json()))
-        for path, value in changes:
-            document = changed(document, path, value)
-        for *parents, key in missing:
-            node = document
-            for part in parents:
-                node = node[part]
-            del node[key]
-        path = tmp_path / "m.json"
-        path.write_text(json.dumps(document), encoding="utf-8")
-        return path
-
-    return write
-
-
 class TestHybrid:
     def test_round_trip(self, tmp_path):
         path = tmp_path / "model.json"
@@ -336,42 +289,6 @@ class TestHybrid:
             path.write_text(json.dumps(document))
             with pytest.raises(DataError, match=rf"m\.json is not a model file: its `format` is not '{FORMAT}'"):
                 load_model(path, "hybrid")
-
-    @cases(
-        "path",
-        [
-            ("model",),
-            ("provenance",),
-            *(("model", part) for part in ("network", "polynomial", "hysteresis", "dynamics", "reference")),
-            ("model", "network", "seebeck"),
-            ("model", "polynomial", "series"),
-            ("model", "hysteresis", "weights"),
-            ("model", "dynamics", "damping"),
-        ],
-    )
-    def test_a_missing_key_is_named(self, hybrid_file, path):
-        with pytest.raises(DataError, match=rf"m\.json is damaged: .*{path[-1]}"):
-            load_model(hybrid_file(missing=[path]))
-
-    @cases(
-        ("path", "value"),
-        [
-            (("model",), None),
-            (("model", "network", "seebeck"), -1.0),
-            (("model", "polynomial", "input_range"), [5.0, 10.0]),
-            (("model", "hysteresis", "weights"), [1.0]),
-            (("model", "hysteresis", "weights"), [-1.0] * 4),
-            (("model", "hysteresis", "thresholds"), [3.0, 2.0, 1.0, 0.0]),
-            (("model", "dynamics", "gain"), 0.0),
-            (("model", "dynamics", "damping"), 1.5),
-            (("model", "dynamics", "frequency"), -4e3),
-            (("model", "dynamics", "numerator"), [1.0]),
-            (("model", "reference"), math.inf),
-        ],
-    )
-    def test_wrong_values(self, hybrid_file, path, value):
-        with pytest.raises(DataError, match=r"m\.json is damaged: "):
-            load_model(hybrid_file([(path, value)]))
 
 
 @settings(max_examples=100, deadline=None)

@@ -121,11 +121,7 @@ def test_a_file_keeps_it(tmp_path):
         ({"low": 1.0}, "expected low < high"),
         ({"version": 1}, "version"),
         ({"coefficients": []}, "coefficients"),
-        ({"covariance": [[0.0]]}, "covariance: expected a symmetric matrix of 2 by 2"),
         ({"covariance": [[-1.0, 0.0], [0.0, 1.0]]}, "no variance below 0"),
-        ({"reference_uncertainty": -1e-9}, "reference_uncertainty = -1e-09"),
-        ({"reference_uncertainty": 0.0}, "reference_uncertainty = 0"),
-        ({"interval_days": 0}, "interval_days"),
         ({"extra": 1}, "extra"),
     ],
 )

@@ -149,15 +149,6 @@ class TestOneHolder:
             locks("other").take_instrument(tec)
         locks("other").take_instrument(Identity("Meerstetter Engineering", "TEC-1091", "13", "4.10"))
 
-    def test_lines_that_were_freed_are_taken_again(self, locks, tmp_path):
-        one, node = locks("one"), port(tmp_path / "a")
-        for _ in range(2):
-            one.take_lines([node])
-            with pytest.raises(ConfigurationError, match="in use"):
-                locks("other").take_lines([node])
-            one.close()
-        locks("other").take_lines([node])
-
     @pytest.mark.parametrize("number", ["12", " 12 ", "A0", "1"])
     def test_a_serial_number_tells_an_instrument_from_others(self, locks, number):
         tec = Identity("Meerstetter Engineering", "TEC-1091", number, "4.10")

@@ -151,15 +151,8 @@ class TestUnknownKeys:
             ),
             ("[rig]", "[tele-metry]\n[rig]", "tele-metry", "telemetry"),
             ("[rig]", "[rig]\ntitel = 'x'", "rig.titel", "title"),
-            (
-                "temperature_limits",
-                "temperature-limits = 3\ntemperature_limits",
-                "devices.tec.temperature-limits",
-                "temperature_limits",
-            ),
             ('port = "emulated://heater"', 'prot = "x"\nport = "emulated://heater"', "devices.tec.prot", "port"),
             ("high = 90.0", "high = 90.0\nhihg = 3.0", "interlocks.0.hihg", "high"),
-            ("period = 0.5", "period = 0.5\nperoid = 1", "telemetry.peroid", "period"),
             ("noise = 0.002", "noise = 0.002\nnoize = 1", "emulation.noize", "noise"),
         ],
     )
@@ -192,16 +185,13 @@ class TestWrongValues:
         [
             ('"a heated plate"', "5", ("rig.title = 5", "a text")),
             ("period = 0.5", "period = 0.0", ("telemetry.period = 0.0", "0.01")),
-            ("period = 0.5", "period = 'often'", ("telemetry.period = 'often'", "number")),
             ("high = 90.0", "high = 90.0\nlow = 95.0", ("interlocks.0", "low must be below high", "95", "90")),
             ("[10.0, 95.0]", "[10.0]", ("devices.tec.temperature_limits",)),
-            ("[10.0, 95.0]", "[10.0, nan]", ("devices.tec.temperature_limits", "nan")),
             ("[10.0, 95.0]", "'warm'", ("devices.tec.temperature_limits = 'warm'", "allowed set-points, °C")),
             ("noise = 0.002", "noise = 2", ("emulation.noise = 2", "≤ 1", "noise of one reading")),
             ("temperature_limits = [10.0, 95.0]", "", ("devices.tec.temperature_limits: is missing",)),
             (f"driver = {DRIVER}", "", ("devices.tec.driver", "expected module:class")),
             (DRIVER, "5", ("devices.tec.driver = 5", "expected module:class")),
-            (DRIVER, '"HeaterTEC"', ("devices.tec.driver = 'HeaterTEC'", "expected module:class")),
             (DRIVER, '"no_such:X"', ("devices.tec.driver = 'no_such:X'", "cannot be loaded")),
             (DRIVER, '"a..b:X"', ("devices.tec.driver = 'a..b:X'",)),
             (DRIVER, '"heater_laboratory:Gone"', ("has no Gone",)),
@@ -247,11 +237,8 @@ class TestWrongValues:
         ("key", "value"),
         [
             ("input_range", "[1.0, 1.0]"),
-            ("input_range", "[2.0, 1.0]"),
             ("output_range", "[nan, 1.0]"),
             ("plane", "[0.0, inf]"),
-            ("plane", "[70.0, 30.0]"),
-            ("levels", "1"),
         ],
     )
     def test_dashboard_ranges(self, rig_file, key, value):
@@ -291,15 +278,6 @@ class TestDerived:
             ),
             (DERIVED, ("derived.curvature.source = 'spot_position'", "probe_temperature")),
             (DERIVED.replace("spot_position", "curvature"), ("derived.curvature.source = 'curvature'",)),
-            (
-                DERIVED.replace("spot_position", "later")
-                + DERIVED.replace(".curvature", ".later").replace("spot_position", "probe_temperature"),
-                ("derived.later.source = 'probe_temperature'",),
-            ),
-            (
-                DERIVED.replace("spot_position", "probe_temperature"),
-                ("derived.curvature.source = 'probe_temperature'", "°C"),
-            ),
             (DERIVED.replace("cantilever-curvature", "magic"), ("derived.curvature.kind = 'magic'",)),
             (DERIVED + "residual_curvature = 9000\n", ("derived.curvature", "7770.4 1/m")),
         ],
@@ -354,13 +332,11 @@ class TestOverrides:
         [
             ("devices.laser.port", "there is no table 'devices.laser' in which 'port' could be set"),
             ("dashboard.levels", "there is no table 'dashboard'"),
-            ("rig.title.x", "there is no table 'rig.title'"),
             ("interlocks.0.high", "there is no table 'interlocks.0'"),
             ("devices.tec.prot", "devices.tec.prot: there is no such key"),
             ("telemetry.period", "telemetry.period = 'soon'"),
             ("telemetry", "telemetry = 'soon'"),
             ("", "there is no such key"),
-            (".", "there is no table"),
         ],
     )
     def test_of_what_is_not_there(self, rig_file, key, expected):

@@ -496,12 +496,6 @@ def test_one_sample_needs_no_burst(bench):
     assert bench.clock.now() == 0.0
 
 
-def test_calibration_of_a_voltage(bench):
-    sensor = bench.sensor(zero_volts=2.5, volts_per_metre=-2e4, position_limits=(-1e-3, 1e-3))
-    bench.volts[0] = 4.5
-    assert sensor.measure()["psd_position"] == pytest.approx(-100e-6, abs=1e-8)
-
-
 def test_a_setting_that_is_not_taken_is_noticed(bench):
     def alter(address: int, words: list[int]) -> list[int]:
         return [5] if address == 41500 else words
