@@ -1110,6 +1110,11 @@ def test_registers_are_used_in_their_direction_alone():
             use.of(register_)
 
 
+def test_details_of_refusals_are_those_of_the_maker():
+    """The errors of an input in labjack/ljm_constants, ljm_constants.json."""
+    assert set(registers._DETAILS) == set(range(2370, 2377))
+
+
 def without_a_line(kind, **settings):
     """Return a device that converts voltages, and has nothing to read them with."""
     return kind("psd", kind.Settings(port="host", **settings), VirtualClock(), None)
