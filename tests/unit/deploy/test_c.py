@@ -87,8 +87,7 @@ COUPLED = {
 }
 
 
-@pytest.mark.parametrize("real", ["float", "double"])
-@pytest.mark.parametrize("kind", COUPLED)
+@pytest.mark.parametrize(("kind", "real"), [*((kind, "double") for kind in COUPLED), ("two-stage", "float")])
 def test_lengths_are_those_of_python_and_voltages_bring_the_length_to_its_target(kind, real, gcc, tmp_path):
     model = COUPLED[kind]
     compiled = Compiled(ModelFile(kind, model), tmp_path, real, gcc)
@@ -116,8 +115,7 @@ LINEAR = {
 }
 
 
-@pytest.mark.parametrize("real", ["float", "double"])
-@pytest.mark.parametrize("kind", LINEAR)
+@pytest.mark.parametrize(("kind", "real"), [*((kind, "double") for kind in LINEAR), ("all", "float")])
 def test_responses_of_a_linear_part_are_those_of_python(kind, real, gcc, tmp_path):
     model, period = Hammerstein(FORCE, LINEAR[kind]), 0.01
     file = ModelFile(kind, model)

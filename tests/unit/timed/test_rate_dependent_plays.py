@@ -241,10 +241,7 @@ def test_loops_that_widen_with_the_rate_are_predicted_at_other_rates():
 
     found = identify_in_time("rate-dependent-plays", t, u, y)
     alone = held_out(identify("prandtl-ishlinskii", u, y).model.evaluate(fresh))
-    behind = identify_in_time("hammerstein", t, u, y, static="prandtl-ishlinskii").model.evaluate(later, fresh)
-    own = held_out(found.model.evaluate(later, fresh))
-    assert own < held_out(behind)
-    assert own < 0.4 * alone
+    assert held_out(found.model.evaluate(later, fresh)) < 0.4 * alone
     assert found.certificate.kkt_residual < 1e-8
     assert len(found.model.parameters()) == 6
 
