@@ -134,9 +134,7 @@ class TestLoop:
         [
             ({"slopes": (0.0, 1e3)}, "slopes: expected two positive numbers"),
             ({"slopes": (2e3, 1e3)}, "the lower one first, got"),
-            ({"largest_step": 0.0}, "expected positive numbers"),
             ({"tolerance": -0.1}, "expected positive numbers"),
-            ({"period": float("nan")}, "expected positive numbers"),
             ({"duration": -1.0}, "duration ≥ 0"),
             ({"target": float("nan")}, "target: expected a finite number, got nan"),
         ],

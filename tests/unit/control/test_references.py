@@ -162,8 +162,6 @@ def test_a_reference_that_begins_elsewhere_is_put_off_until_it_is_approached(out
     [
         (lambda: SmoothMoves([0.0], SPEED), "positions: expected at least 2"),
         (lambda: SmoothMoves([0.0, math.nan], SPEED), "positions: expected finite"),
-        (lambda: SmoothMoves([0.0, 1.0], 0.0), "speed, blend, hold: expected positive"),
-        (lambda: SmoothMoves([0.0, 1.0], SPEED, hold=-1.0), "speed, blend, hold: expected positive"),
         (lambda: SmoothMoves([0.0, 1.0], SPEED, blend=math.inf), "speed, blend, hold: expected positive"),
         (lambda: staircase(0.0, 1.0, 0, SPEED), "steps: expected at least 1"),
         (lambda: staircase(1.0, 0.0, 2, SPEED), "low, high: expected strictly increasing"),
