@@ -3,6 +3,7 @@ import math
 import numpy as np
 import pytest
 from cases import cases
+from hypothesis import given, settings, strategies as st
 
 from bench.control import DriftEstimator, agility_for
 
@@ -56,6 +57,25 @@ class TestAgainstExactSolutions:
         drift, deviation = batch(times, values, 0.02, 0.05)
         assert estimator.uncertainty == pytest.approx(deviation, rel=1e-5)
         assert estimator.drift == pytest.approx(drift, abs=1e-4 * deviation)
+
+    def test_two_readings(self):
+        estimator = DriftEstimator(noise=0.5, agility=1e-6)
+        estimator.update(10.0, 1.0)
+        estimator.update(12.0, 5.0)
+        assert estimator.drift == pytest.approx(2.0, rel=1e-6)
+        assert estimator.uncertainty == pytest.approx(0.5 * math.sqrt(2) / 2.0, rel=1e-6)
+
+    @settings(max_examples=40)
+    @given(st.floats(1e-9, 1e3), st.floats(0.05, 10.0))
+    def test_scales_with_its_unit(self, scale, period):
+        plain = DriftEstimator(noise=0.01, agility=0.02)
+        scaled = DriftEstimator(noise=0.01 * scale, agility=0.02 * scale)
+        for k in range(6):
+            value = math.sin(k) * 0.05
+            plain.update(k * period, value)
+            scaled.update(k * period, value * scale)
+        assert scaled.drift == pytest.approx(plain.drift * scale, rel=1e-3, abs=1e-4 * scale)
+        assert scaled.uncertainty == pytest.approx(plain.uncertainty * scale, rel=1e-3)
 
 
 class TestSteadiness:

@@ -10,8 +10,20 @@ from hypothesis import given, strategies as st
 
 from bench.control import DisturbanceEstimator
 
+variances = st.floats(1e-6, 1e6)
+
 
 class TestAgainstClosedForm:
+    @given(variances, st.floats(1e-3, 1e3))
+    def test_the_gain_settles_where_the_riccati_equation_says(self, q, ratio):
+        r = q * ratio
+        estimator = DisturbanceEstimator(walk_variance=q, reading_variance=r)
+        for _ in range(400):
+            estimator.update(0.0)
+        predicted = 0.5 * (q + math.sqrt(q * q + 4.0 * q * r))
+        assert estimator.gain == pytest.approx(predicted / (predicted + r), rel=1e-9)
+        assert estimator.uncertainty == pytest.approx(math.sqrt(predicted * r / (predicted + r)), rel=1e-9)
+
     @given(st.lists(st.floats(-1e3, 1e3) | st.none(), min_size=1, max_size=30), st.floats(0.01, 100.0))
     def test_each_update_is_that_of_filterpy(self, values, q):
         reference = KalmanFilter(dim_x=1, dim_z=1)
@@ -33,6 +45,14 @@ class TestAgainstClosedForm:
         estimator.reset()
         assert estimator.value == 0.0
         assert estimator.update(-7.0) == pytest.approx(-7.0, rel=1e-8)
+
+    def test_the_uncertainty_is_that_of_a_random_walk_seen_through_noise(self):
+        rng = np.random.default_rng(5)
+        estimator = DisturbanceEstimator(walk_variance=0.5, reading_variance=2.0)
+        walk = np.cumsum(math.sqrt(0.5) * rng.standard_normal(20_000))
+        readings = walk + math.sqrt(2.0) * rng.standard_normal(walk.size)
+        errors = np.array([estimator.update(z) for z in readings]) - walk
+        assert errors[100:].std() == pytest.approx(estimator.uncertainty, rel=0.03)
 
 
 class TestMissingReadings:
