@@ -69,18 +69,20 @@ def identify_hysteresis(recording: TransientRecording, file: RigFile) -> tuple[s
         "output_unit": units[recording.response],
         "plane": layout.plane if layout is not None and layout.input == recording.drive else None,
     }
+    # Finer than there are readings, a plane takes its time and says no more.
+    levels = min(_FINE, inputs.size)
     trials = []
     for name, own in _MODELS.items():
         options = {**common, **own}
         try:
-            found = cross_validate(name, inputs, outputs, smoothing=_SMOOTHING, levels=(_FINE,), **options)
+            found = cross_validate(name, inputs, outputs, smoothing=_SMOOTHING, levels=(levels,), **options)
         except ValueError as error:
             raise DataError(
                 f"{recording.path}: no model can be identified from its readings ({error}); give one by --model FILE"
             ) from None
         trials.append((found.smoothest, name, options))
     best, name, options = min(trials, key=lambda each: each[0].rms)
-    return name, identify(name, inputs, outputs, levels=_FINE, smoothing=best.smoothing, **options).model
+    return name, identify(name, inputs, outputs, levels=levels, smoothing=best.smoothing, **options).model
 
 
 def _drive_at_readings(recording: TransientRecording) -> Floats:

@@ -71,9 +71,7 @@ def test_the_model_is_from_the_run_that_sweeps_the_drive(tmp_path):
     assert twin.warnings == ()
 
 
-def test_a_short_run_makes_a_twin_and_warnings(tmp_path, monkeypatch):
-    # A fine plane takes so few readings a quarter of a minute.
-    monkeypatch.setattr("bench.specimen.hysteresis._FINE", 20)
+def test_a_short_run_makes_a_twin_and_warnings(tmp_path):
     run = bench.run("damped-oscillation", "vo2", out=tmp_path, seed=1, increment=8.0, half_cycles=3, dwell=2.0)
     twin = write_twin([run.folder], "vo2", tmp_path / "twin.toml")
     few, *_, history, still = twin.warnings
