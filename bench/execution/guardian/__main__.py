@@ -46,7 +46,7 @@ def _open(hello: Message, stack: ExitStack) -> tuple[Rig, Rescuer]:
     else:
         locks.take_lines(port_of(entry.settings) for entry in file.devices)
         clock = WallClock()
-    rescuer = Rescuer({key: hello[key] for key in ("rig", "overrides", "attach", "report")})
+    rescuer = Rescuer({key: hello[key] for key in ("rig", "overrides", "attach", "report", "process")})
     try:
         rig = Rig(file, clock, hello["seed"])
         stack.callback(rig.close)

@@ -32,7 +32,7 @@ from bench.execution.guardian.black_box import BlackBox
 from bench.execution.guardian.channel import LONGEST_ANSWER, STILL_AT_IT, Channel, ChannelError, Message, to_message
 from bench.execution.guardian.lines import BENCH, LOOK, SAFE, LineThreads, NotAskedError, Result
 from bench.execution.guardian.parent import SIGKILL, ParentProcess
-from bench.execution.guardian.rescuer import TRY_FOR, Rescuer
+from bench.execution.guardian.rescuer import TRY_FOR, Rescuer, in_words
 from bench.execution.notify import WITHIN, Notifier
 from bench.execution.station.core import StationCore
 from bench.execution.station.interface import News, counted, news_of
@@ -329,6 +329,7 @@ class Guardian:
         self._zero = self._rig.clock.now() - passed
         self._notifier = Notifier(message["targets"])
         self._notifier.facts = message["facts"]
+        self._rescuer.will_tell({"targets": message["targets"], "facts": message["facts"], "t": passed})
         self._keeps_record = True
         self._reply(message)
 
@@ -565,17 +566,13 @@ class Guardian:
         assert self._safe is not None
         cause = self._core.cause
         reason = fate if cause in (None, self._loss) or str(cause) == fate else f"{cause}; then {fate}"
-        states = ", ".join(
-            f"{name}: {state if state == IS_SAFE else f'NOT CONFIRMED SAFE, {state}'}"
-            for name, state in self._safe.items()
-        )
         t = self._rig.clock.now() - self._zero
         self._told = now
         self._box.note(FAILED, reason=reason, safe=self._safe)
         notifier = self._notifier
         notifier.signals = tuple(self._values)
         notifier.telemetry(t, 0, tuple(self._values.values()))
-        notifier.event(Event(t, "ERROR", "error", f"{reason}; {states}"))
+        notifier.event(Event(t, "ERROR", "error", f"{reason}; {in_words(self._safe)}"))
         notifier.event(Event(t, "WARN", "end", "failed"))
         notifier.start()
 

@@ -123,6 +123,7 @@ class RemoteStation(Station):
             "overrides": dict(guarded.overrides),
             "attach": None if guarded.attach is None else str(guarded.attach),
             "report": str(self._report.path),
+            "process": os.getpid(),
         }
         self._log = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `close`
         self._process, self._channel = start_guardian(self._log)
@@ -134,7 +135,6 @@ class RemoteStation(Station):
                 content=repr(guarded.file.content),
                 seed=guarded.seed,
                 doing=guarded.doing,
-                process=os.getpid(),
             )
         except BaseException as error:
             self.close()
@@ -350,7 +350,7 @@ class RemoteStation(Station):
         """Return what a rescuer reports; nothing if there is none, or it says nothing for so long."""
         waited = Stopwatch()
         while self._report.is_ready() and waited.seconds() < longest:
-            if states := self._report.states():
+            if states := self._report.take():
                 return states
             WallClock().sleep(_LOOK_AGAIN)
         return {}

@@ -1,7 +1,8 @@
 """Makes a rig safe when its guardian has died or hangs: `python -m bench.execution.guardian.rescuer`.
 
 A guardian starts it before it opens a line, so that it has loaded what it needs by the time that it is needed. It
-opens no line as long as the guardian's signs of life come through a pipe, its standard input.
+opens no line as long as the guardian's signs of life come through a pipe, its standard input. If the bench dies as
+well, it tells those whom the run had to tell.
 """
 
 from __future__ import annotations
@@ -10,18 +11,22 @@ import io
 import json
 import os
 import queue
+import select
 import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from bench.base import ENDING, BenchError, parse_json, write_whole
+from bench.base import ENDING, BenchError, Stopwatch, WallClock, parse_json, write_whole
 from bench.execution.guardian.parent import SIGKILL, ParentProcess
 from bench.execution.guardian.start import start_module
+from bench.execution.notify import Notifier
+from bench.record import Event
 from bench.rig import SAFE, Rescued, load_rig, opened, rescue
 
 SILENCE = 3.0
@@ -42,7 +47,15 @@ _REPORT_AFTER = 3.0
 _DIES = 1.0
 """Time within which a process that was killed has ended, s."""
 
-_ALIVE, _RELEASED = b".", b"!"
+_TAKEN = 10.0
+"""Time within which a bench that lives has taken the last report, s, also on a busy machine."""
+
+_NOBODY: Mapping[str, Any] = {"targets": (), "facts": {}, "t": 0.0}
+
+_GONE = "the bench and its guardian are gone: they were killed or crashed"
+
+_ALIVE, _RELEASED = b".\n", b"!\n"
+"""What a guardian writes, besides a line of JSON that says who is to be told."""
 
 
 class Rescuer:
@@ -52,7 +65,8 @@ class Rescuer:
     ----------
     content : mapping
         `rig`, `overrides` and `attach` as for `GuardedRig`, and `report`, the path of the file in which it says that
-        it is ready, and later what has become of each device; `guardian` if that is not this process, 0 for none.
+        it is ready, and later what has become of each device; `process`, the number of the bench; `guardian` if that
+        is not this process, 0 for none.
     """
 
     def __init__(self, content: dict[str, Any]) -> None:
@@ -69,6 +83,10 @@ class Rescuer:
         if now - self._last >= _INTERVAL:
             self._last = now
             self._write(_ALIVE)
+
+    def will_tell(self, whom: Mapping[str, Any]) -> None:
+        """Say who is to be told if the bench dies, too: `targets` and `facts` as for `Notifier`, and `t`, s."""
+        self._write(json.dumps(whom).encode() + b"\n")
 
     def release(self) -> None:
         """Let it end without an action, as nothing is left to be made safe."""
@@ -112,10 +130,23 @@ class Report:
             return {str(name): str(state) for name, state in content["devices"].items()}
         return {}
 
+    def take(self) -> dict[str, str]:
+        """Return the states and remove the file, once they are known."""
+        if states := self.states():
+            self.path.unlink(missing_ok=True)
+        return states
+
     def write(self, states: dict[str, str]) -> None:
         """Write the states of devices down, empty while they are not known; a bench that has left reads no more."""
         with suppress(OSError):
             write_whole(self.path, json.dumps({"process": os.getpid(), "devices": states}))
+
+
+def in_words(states: Mapping[str, str]) -> str:
+    """Return the states of devices as a text: `safe`, or what went wrong."""
+    return ", ".join(
+        f"{name}: {state if state == SAFE else f'NOT CONFIRMED SAFE, {state}'}" for name, state in states.items()
+    )
 
 
 def is_needed(signs: queue.SimpleQueue[bytes]) -> bool:
@@ -137,7 +168,7 @@ def is_needed(signs: queue.SimpleQueue[bytes]) -> bool:
             # Before its first sign it opens lines, which may take long.
             silent += _SLICE if has_begun else 0.0
             continue
-        if not sign or _RELEASED in sign:
+        if sign in (b"", _RELEASED):
             return not sign
         silent, has_begun = 0.0, True
     return True
@@ -155,8 +186,10 @@ def main() -> int:
     report = Report(Path(content["report"]))
     # The drivers as well: nothing has to be loaded any more when it counts, and the file may be edited meanwhile.
     file = load_rig(content["rig"], content["overrides"])
+    bench = _descriptor_of(content["process"])
     signs: queue.SimpleQueue[bytes] = queue.SimpleQueue()
-    threading.Thread(target=_read, args=(pipe, signs), daemon=True).start()
+    told = _Told()
+    threading.Thread(target=_read, args=(pipe, signs, told), daemon=True).start()
     report.write({})
     if not is_needed(signs):
         # A bench that has lost its guardian since then must not wait for this one.
@@ -166,18 +199,66 @@ def main() -> int:
     guardian.send(SIGKILL)
     guardian.await_end(_DIES)
     attach = None if content["attach"] is None else Path(content["attach"])
+    states: dict[str, str] = {}
     try:
         with opened(file, attach, "making safe without its guardian", _go_on) as place:
             for seconds, found in rescue(place, limit=TRY_FOR):
+                states = {each.device: _state(each) for each in found}
                 if seconds >= _REPORT_AFTER or all(each.is_safe for each in found):
-                    report.write({each.device: _state(each) for each in found})
+                    report.write(states)
+                    if _has_died(bench):
+                        told.tell(states)
     except BenchError as error:
-        report.write(dict.fromkeys((entry.name for entry in file.devices), str(error)))
+        states = dict.fromkeys((entry.name for entry in file.devices), str(error))
+        report.write(states)
+    if _is_left(report, bench):
+        told.tell(states)
     return 0
 
 
-def _read(pipe: io.FileIO, signs: queue.SimpleQueue[bytes]) -> None:
-    while sign := pipe.read(4096):
+class _Told:
+    """Those who are told once that bench and guardian are gone; nobody if the guardian has named none."""
+
+    def __init__(self) -> None:
+        self._whom = _NOBODY
+        self._since = Stopwatch()
+
+    def take(self, line: bytes) -> None:
+        self._whom, self._since = parse_json(line), Stopwatch()
+
+    def tell(self, states: Mapping[str, str]) -> None:
+        whom, self._whom = self._whom, _NOBODY
+        with Notifier(whom["targets"]) as notifier:
+            notifier.facts = whom["facts"]
+            t = whom["t"] + self._since.seconds()
+            notifier.event(Event(t, "ERROR", "error", f"{_GONE}; {in_words(states)}"))
+            notifier.event(Event(t, "WARN", "end", "failed"))
+
+
+def _is_left(report: Report, bench: int | None) -> bool:
+    """Return whether the bench has died or hangs: one that lives takes the report at once."""
+    waited = Stopwatch()
+    while report.is_ready() and waited.seconds() < _TAKEN and not _has_died(bench):
+        WallClock().sleep(_SLICE)
+    return report.is_ready()
+
+
+def _has_died(process: int | None) -> bool:
+    """Return whether a process is known to be dead."""
+    return process is not None and bool(select.select([process], [], [], 0.0)[0])
+
+
+def _descriptor_of(process: int) -> int | None:
+    """Return what becomes readable when a process dies; None where the system has no such thing, or it is dead."""
+    with suppress(AttributeError, OSError):
+        return os.pidfd_open(process)
+    return None
+
+
+def _read(pipe: io.FileIO, signs: queue.SimpleQueue[bytes], told: _Told) -> None:
+    while sign := pipe.readline():
+        if sign not in (_ALIVE, _RELEASED):
+            told.take(sign)
         signs.put(sign)
     signs.put(b"")
 

@@ -32,13 +32,13 @@ SILENT = [None] * 1000
 @pytest.mark.parametrize(
     ("signs", "needed"),
     [
-        ([b".", b""], True),
+        ([b".\n", b""], True),
         ([b""], True),
-        ([b".", b".!"], False),
+        ([b".\n", b"!\n"], False),
         # It is released while it still opens its lines.
-        ([None] * 100 + [b"!"], False),
+        ([None] * 100 + [b"!\n"], False),
         ([None] * 100 + [b""], True),
-        ([b".", *SILENT], True),
+        ([b".\n", *SILENT], True),
     ],
 )
 def test_a_guardian_that_is_gone_or_silent_and_no_other(signs, needed):
@@ -46,7 +46,7 @@ def test_a_guardian_that_is_gone_or_silent_and_no_other(signs, needed):
 
 
 def test_silence_is_told_from_signs_that_come_late():
-    signs = Signs(b".", *[None, None, b"."] * 50, *SILENT)
+    signs = Signs(b".\n", *[None, None, b".\n"] * 50, *SILENT)
     assert is_needed(signs)
     assert SILENCE <= signs.waited < SILENCE + 0.5
     assert len(signs._signs) < 1000
@@ -55,9 +55,9 @@ def test_silence_is_told_from_signs_that_come_late():
 def test_one_that_is_released_before_it_is_ready_does_nothing(tmp_path):
     """As by a guardian that is refused the rig: what it writes comes at once."""
     report = tmp_path / "report.json"
-    content = {"rig": "vo2", "overrides": {}, "attach": None, "report": str(report), "guardian": 1}
+    content = {"rig": "vo2", "overrides": {}, "attach": None, "report": str(report), "process": 1, "guardian": 1}
     command = [sys.executable, "-P", "-m", "bench.execution.guardian.rescuer"]
-    done = subprocess.run(command, input=json.dumps(content).encode() + b"\n.!", check=False)
+    done = subprocess.run(command, input=json.dumps(content).encode() + b"\n.\n!\n", check=False)
     assert done.returncode == 0
     # Nobody waits for what it reports.
     assert not report.exists()

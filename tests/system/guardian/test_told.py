@@ -2,6 +2,7 @@
 
 import contextlib
 import json
+import os
 import re
 import signal
 import sys
@@ -118,6 +119,20 @@ def check_what_is_told(folder, name):
         assert "http://127.0.0.1/… was not told of the end" in notes
         texts = [run.said, *(path.read_bytes().decode(errors="replace") for path in run.folder.rglob("*.*"))]
         assert not [text for text in texts if TOKEN in text]
+
+
+def test_its_rescuer_tells_it_if_the_guardian_is_killed_as_well(vo2, started, listener):
+    _, told = listener
+    with started("hold") as run:
+        run.await_on(1)
+        run.process.send_signal(signal.SIGSTOP)
+        os.kill(run.guardian, signal.SIGKILL)
+        run.process.kill()
+        seconds_until(lambda: not is_on(vo2))
+        seconds_until(told)
+        (facts,) = told()
+        assert (facts["event"], facts["run"], facts["rig"]) == ("end", str(run.folder), "vo2")
+        assert facts["text"].endswith("; tec: safe, psd: safe")
 
 
 def test_a_bench_that_comes_back_does_not_tell_it_again(started, listener):
