@@ -50,12 +50,10 @@ _DIES = 1.0
 _TAKEN = 10.0
 """Time within which a bench that lives has taken the last report, s, also on a busy machine."""
 
-_NOBODY: Mapping[str, Any] = {"targets": (), "facts": {}, "t": 0.0}
-
-_GONE = "the bench and its guardian are gone: they were killed or crashed"
+_GONE = "the bench and its guardian are gone: they were killed, crashed or hang"
 
 _ALIVE, _RELEASED = b".\n", b"!\n"
-"""What a guardian writes, besides a line of JSON that says who is to be told."""
+"""Signs of a guardian: it lives; it needs no rescuer. Its only other line is JSON and names those who are told."""
 
 
 class Rescuer:
@@ -220,19 +218,22 @@ class _Told:
     """Those who are told once that bench and guardian are gone; nobody if the guardian has named none."""
 
     def __init__(self) -> None:
-        self._whom = _NOBODY
+        self._line = b""
         self._since = Stopwatch()
 
     def take(self, line: bytes) -> None:
-        self._whom, self._since = parse_json(line), Stopwatch()
+        self._line, self._since = line, Stopwatch()
 
     def tell(self, states: Mapping[str, str]) -> None:
-        whom, self._whom = self._whom, _NOBODY
-        with Notifier(whom["targets"]) as notifier:
-            notifier.facts = whom["facts"]
-            t = whom["t"] + self._since.seconds()
-            notifier.event(Event(t, "ERROR", "error", f"{_GONE}; {in_words(states)}"))
-            notifier.event(Event(t, "WARN", "end", "failed"))
+        line, self._line = self._line, b""
+        # A target that has become wrong since the run began must not keep the devices from being made safe.
+        with suppress(BenchError, LookupError, TypeError, ValueError):
+            whom = parse_json(line)
+            with Notifier(whom["targets"]) as notifier:
+                notifier.facts = whom["facts"]
+                t = whom["t"] + self._since.seconds()
+                notifier.event(Event(t, "ERROR", "error", f"{_GONE}; {in_words(states)}"))
+                notifier.event(Event(t, "WARN", "end", "failed"))
 
 
 def _is_left(report: Report, bench: int | None) -> bool:
