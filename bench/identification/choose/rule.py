@@ -12,7 +12,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
@@ -298,7 +298,7 @@ class _Search:
     def _other_structures(self, best: Candidate) -> list[Candidate]:
         most = _MOST_IN_TIME if best.dynamics else None
         made = [replace(best, options=options, shape=()) for options in self.made[best.model]]
-        return [one for one in made if one.options != best.options and self._has_at_most(one, most)]
+        return self._untried(one for one in made if self._has_at_most(one, most))
 
     def _other_memories(self, best: Candidate) -> list[Candidate]:
         """Return a candidate from the initial memories with which it was not tried yet."""
@@ -308,7 +308,9 @@ class _Search:
         memories: list[Initial | None] = [None, "negative", "positive"]
         memories += ["skip"] if self.measured.may_skip else []
         memories += ["estimate"] if spec.estimate_state is not None else []
-        made = [replace(best, initial=memory) for memory in memories]
+        return self._untried(replace(best, initial=memory) for memory in memories)
+
+    def _untried(self, made: Iterable[Candidate]) -> list[Candidate]:
         done = {repr(replace(score.candidate, shape=())) for score in self.scores}
         return [one for one in made if repr(replace(one, shape=())) not in done]
 

@@ -76,13 +76,16 @@ def test_the_least_score_wins_and_of_ties_the_fewest_degrees_of_freedom(scores, 
 
 
 @cases("plant", ["duhem", "jiles-atherton"])
-def test_the_choice_errs_less_than_a_cubic_with_plays_on_other_inputs(plant):
+def test_the_choice_tries_nothing_twice_and_errs_less_than_a_cubic_with_plays_on_other_inputs(plant):
     rng = np.random.default_rng(5)
     respond = PLANTS[plant]
     inputs, others = random_reversals(rng, 200, 25), random_reversals(rng, 200, 25)
     outputs, truth = settled(respond, inputs), settled(respond, others)
     noisy = outputs + 0.01 * np.ptp(outputs) * rng.standard_normal(outputs.size)
-    found = select(Measurements.of(inputs, noisy), FAST).chosen.candidate
+    selection = select(Measurements.of(inputs, noisy), FAST)
+    found = selection.chosen.candidate
+    tried = [repr(score.candidate) for score in selection.scores]
+    assert len(set(tried)) == len(tried)
 
     def error(candidate):
         name, options = candidate.fitted
