@@ -192,7 +192,7 @@ def identify(
         As in `bench.analysis.FitOptions`: `smoothing`, `skip`, `cross_validated`, `initial`, `orientation`, and the
         options of the model; `time_column` for a model with time and `weights_column`; and those of `ReadingOptions`
         where the layout of a file is not found from it: `delimiter`, `decimal`, `encoding`, `skip_lines`, `table`,
-        `interval`, `time_unit`.
+        `interval`, `time_unit`, `missing`.
 
     Raises
     ------

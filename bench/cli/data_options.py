@@ -24,7 +24,7 @@ def _layout(
             metavar="WORD=VALUE,...",
             help="What is not to be found from the file: decimal=comma, delimiter=semicolon, encoding=cp1252, skip=3 "
             "(first lines), table=2 (number, sheet or variable; telemetry of a run), interval=0.1s (between rows), "
-            "time-unit=ms.",
+            "time-unit=ms, missing=nan (rows with it are left out).",
         ),
     ] = None,
 ) -> ReadingOptions:

@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import numpy.typing as npt
 
 from bench.analysis.tables.reading.heads import SECONDS, NoColumnError
 from bench.analysis.tables.reading.library_files import HDF5
@@ -75,6 +76,7 @@ class Columns:
     # What was assumed about the layout of a file, such as `tab-separated, decimal comma`; empty for a run.
     assumptions: str = ""
     time: str | None = None  # name of the column of times that was looked for and found
+    kept: npt.NDArray[np.int64] | None = None  # numbers of the rows, from 0, where rows without a value are left out
     # File and column of those that were asked for as `FILE:COLUMN`.
     elsewhere: Mapping[str, tuple[Path, str]] = field(default_factory=dict)
 
@@ -142,7 +144,7 @@ def read_columns(
         if beyond.size:
             raise DataError(
                 f"{path}: row {beyond[0] + 1}, column {name}: {values[beyond[0]]:g} is what instruments write for an "
-                "overload or a missing value; delete the row from the file, or put a number there"
+                f"overload or a missing value{options.missing_remedy(f'{values[beyond[0]]:g}')}"
             )
     return columns
 
@@ -295,8 +297,14 @@ def _from_files(path: Path, names: Sequence[str], options: ReadingOptions, times
             sizes = {len(column): name for name, column in values.items()}
             counts = ", ".join(f"{name} {size}" for size, name in sizes.items())
             raise DataError(f"{path}: columns differ in length: {counts}")
+    kept = None
+    if options.missing is not None:
+        rows = len(next(iter(values.values())))
+        kept = np.flatnonzero(~np.any([options.are_missing(column) for column in values.values()], axis=0))
+        values = {name: column[kept] for name, column in values.items()}
+        notes.append(f"{rows - kept.size} of {rows} rows left out, as a value is missing")
     text = ", ".join(filter(None, notes)).replace(": , ", ": ")
-    return Columns(str(path), values, units, text, time, elsewhere)
+    return Columns(str(path), values, units, text, time, kept, elsewhere)
 
 
 def find_elsewhere(path: Path, name: str) -> tuple[Path, str] | None:

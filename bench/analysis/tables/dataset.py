@@ -215,7 +215,8 @@ def read_dataset(
     }
     time, remarks = columns.get(names.time or first.time or ""), list[str]()
     if interval is not None:
-        time = Quantity("time", "s", interval * np.arange(columns[names.input].values.size, dtype=np.float64))
+        rows = np.arange(columns[names.input].values.size) if first.kept is None else first.kept
+        time = Quantity("time", "s", interval * rows.astype(np.float64))
         remarks.append(f"rows {interval:g} s apart")
     elif time is not None and not is_run(paths[0]):
         try:

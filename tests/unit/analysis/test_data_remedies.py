@@ -7,7 +7,7 @@ import pytest
 from cases import cases
 from lab_tables import ROWS, U, Y, body, check, matlab, parquet, table, write
 
-from bench.analysis import ReadingOptions, read_columns
+from bench.analysis import ColumnNames, ReadingOptions, read_columns, read_dataset
 from bench.base import DataError
 
 LINES = body().splitlines(keepends=True)
@@ -161,18 +161,37 @@ class TestWhatWouldHelp:
         ],
     )
     def test_a_wrong_cell_among_numbers(self, tmp_path, cell, said):
-        message = refused(tmp_path, TABLE.replace(f",{Y[20]:.3f}\n", f",{cell}\n", 1))
+        content = TABLE.replace(f",{Y[20]:.3f}\n", f",{cell}\n", 1)
         row = 1 + int(list(Y).index(Y[20]))
-        assert message == (
-            f"data.txt: line {row + 1}, row {row}, column y: {said}; no option leaves out a row: delete line "
-            f"{row + 1} from the file, or put a number there"
-        )
+        remedy = f"to leave out the rows that have it, say --format missing={cell or 'empty'}"
+        assert refused(tmp_path, content) == f"data.txt: line {row + 1}, row {row}, column y: {said}; {remedy}"
+        found = read(tmp_path, content, missing=f"-1e9|{cell or 'empty'}")
+        np.testing.assert_array_equal([*found.values.values()], np.delete([U, Y], row - 1, axis=1))
+        assert found.assumptions.endswith(f"1 of {ROWS} rows left out, as a value is missing")
+
+    def test_rows_without_a_value_leave_the_others_at_their_times(self, tmp_path):
+        lines = TABLE.splitlines(keepends=True)
+        lines[4], lines[9] = f"0.15,-9999,{Y[3]}\n", "late,1.0,2.0\n"
+        path = write(tmp_path, "".join(lines))
+        with pytest.raises(DataError, match=r"--format missing=-9999\|late"):
+            read_dataset([path], ColumnNames("U", "y", time="time"), ReadingOptions(missing="-9999"))
+        for options, columns in (({"interval": "50ms"}, {}), ({}, {"time": "time"})):
+            missing = ReadingOptions(missing="-9999.0|late", **options)
+            data = read_dataset([path], ColumnNames("U", "y", **columns), missing)
+            gone = [3, 8] if columns else [3]
+            np.testing.assert_allclose(data.times, np.delete(0.05 * np.arange(ROWS), gone), atol=1e-9)
+            np.testing.assert_array_equal(data.inputs[:3], U[:3])
+
+    def test_a_clock_without_a_time_in_a_row_goes_on_past_midnight(self, tmp_path):
+        clock = ["23:59:58", "--", "00:00:02", *(f"00:00:{second:02}" for second in range(4, 34, 2))]
+        path = write(tmp_path, "time,U,y\n" + "".join(f"{at},{n},{n % 3}\n" for n, at in enumerate(clock)))
+        data = read_dataset([path], ColumnNames("U", "y", time="time"), ReadingOptions(missing="--"))
+        np.testing.assert_array_equal(data.times, 2.0 * np.array([0, *range(2, len(clock))]))
 
     def test_a_text_in_the_first_row(self, tmp_path):
         message = refused(tmp_path, "time,U,y\nSequence,Volt,5\n" + BODY)
         assert "line 2, row 1, column U: 'Volt' is not a number; if line 2 is above the data" in message
-        assert "leave it out with --format skip=N; otherwise" in message
-        assert "delete it from the file, or put a number there" in message
+        assert "leave it out with --format skip=N; to leave out the rows that have it, say" in message
 
     def test_a_column_of_texts(self, tmp_path):
         content = "day,U,y\n" + "".join(f"Tuesday,{u},{y}\n" for u, y in zip(U, Y, strict=True))
@@ -262,5 +281,7 @@ class TestOtherFormats:
     @cases(("name", "save"), [("d.mat", matlab), ("d.parquet", parquet)])
     def test_matlab_and_parquet(self, tmp_path, name, save):
         path = write(tmp_path, save(U=U, y=np.where(np.arange(ROWS) == 4, np.nan, Y)), name)
-        with pytest.raises(DataError, match=r"row 5, column y: .*; no option leaves out a row: save the file"):
+        with pytest.raises(DataError, match=r"row 5, column y: nan is not .*say --format missing=nan"):
             read_columns(path, ("U", "y"))
+        found = read_columns(path, ("U", "y"), options=ReadingOptions(missing="nan"))
+        np.testing.assert_array_equal([*found.values.values()], np.delete([U, Y], 4, axis=1))

@@ -55,8 +55,13 @@ def _otherwise(cell: str) -> float | None:
 
 def _past_midnight(times: Floats) -> Floats:
     """Return times of day, s, which go on where they fall back by more than half a day."""
-    falls = np.diff(times, prepend=times[:1]) < -_DAY / 2.0
-    return times + _DAY * np.cumsum(falls) if falls.any() and times.max() < _DAY else times
+    known = np.isfinite(times)
+    falls = np.diff(times[known], prepend=times[known][:1]) < -_DAY / 2.0
+    if not falls.any() or times[known].max() >= _DAY:
+        return times
+    onward = times.copy()
+    onward[known] += _DAY * np.cumsum(falls)
+    return onward
 
 
 def moment_in(where: str, cell: str) -> float:
@@ -88,7 +93,7 @@ def since_first(
     for place, name in enumerate(names):
         if are_moments[place]:
             times = _past_midnight(values[place]) if may_be_clocks else values[place]
-            columns[place] = times - times[:1]
+            columns[place] = times - times[np.isfinite(times)][:1]
             midnight = ", past midnight" if times is not values[place] else ""
             notes.append(f"{name}: dates and times, in s since the first row{midnight}")
     return columns, ["s" if is_moment else unit for unit, is_moment in zip(units, are_moments, strict=True)], notes

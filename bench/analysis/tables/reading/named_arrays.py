@@ -12,8 +12,8 @@ import numpy.typing as npt
 from bench.analysis.tables.reading.heads import NoColumnError, find_place, make_heads, with_times
 from bench.analysis.tables.reading.library_files import load_contents
 from bench.analysis.tables.reading.moments import since_first
-from bench.analysis.tables.reading.options import OF_TIMES, ReadingOptions
-from bench.analysis.tables.reading.table import FEWEST_ROWS, NO_ROW_LEFT_OUT, ReadColumns
+from bench.analysis.tables.reading.options import OF_ALL, ReadingOptions
+from bench.analysis.tables.reading.table import FEWEST_ROWS, ReadColumns
 from bench.base import DataError
 
 Array = npt.NDArray[Any]
@@ -31,7 +31,7 @@ def read_arrays(
     Raises DataError if the file cannot be read, a column is missing, columns differ in length, or a value is not
     finite; ConfigurationError if an option does not apply, or a library is not installed.
     """
-    options.check_only(path, f"a {kind} file", "table", *OF_TIMES)
+    options.check_only(path, f"a {kind} file", "table", *OF_ALL)
     contents, remarks = load_contents(path, kind)
     turned: list[str] = []
     found = _choose(path, contents or {}, options.table, turned)
@@ -51,12 +51,11 @@ def read_arrays(
             + ", ".join(f"{name} {len(column)}" for name, column in zip(names, chosen, strict=True))
         )
     for name, column in zip(names, chosen, strict=True):
-        bad = np.flatnonzero(~np.isfinite(column))
-        if bad.size:
-            raise DataError(
-                f"{path}: row {bad[0] + 1}, column {name}: {column[bad[0]]} is not a finite number; "
-                f"{NO_ROW_LEFT_OUT}: save the file without it, or with a number there"
-            )
+        for row in np.flatnonzero(~np.isfinite(column)):
+            text = f"{column[row]}"
+            if column.dtype.kind == "M" or not options.is_missing(text):
+                remedy = "" if column.dtype.kind == "M" else options.missing_remedy(text)
+                raise DataError(f"{path}: row {row + 1}, column {name}: {text} is not a finite number{remedy}")
     are_moments = [column.dtype.kind == "M" for column in chosen]
     # Differences first: the ns since 1970 have more digits than a float.
     values = [

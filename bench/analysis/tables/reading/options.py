@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import codecs
 import re
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import numpy.typing as npt
+
 from bench.analysis.tables.reading.heads import SECONDS, spelled
-from bench.base import ConfigurationError, closest
+from bench.base import ConfigurationError, Floats, closest
 
 _DELIMITERS = {"comma": ",", "semicolon": ";", "tab": "\t", "\\t": "\t", "blank": " ", "blanks": " ", "space": " "}
 _DECIMALS = {"point": ".", "comma": ","}
 
-OF_TIMES = ("interval", "time_unit")
+OF_ALL = ("interval", "time_unit", "missing")
 """Options that apply to every kind of file."""
 
 
@@ -23,7 +27,7 @@ _INTERVAL = re.compile(r"(\d+\.?\d*(?:e[+-]?\d+)?)\s*([a-zµ]+)")
 
 _WORDS = {
     "delimiter": "delimiter", "decimal": "decimal", "encoding": "encoding", "skip_lines": "skip", "table": "table",
-    "interval": "interval", "time_unit": "time-unit",
+    "interval": "interval", "time_unit": "time-unit", "missing": "missing",
 }  # fmt: skip
 """The words of `--format`, by option."""
 
@@ -51,6 +55,9 @@ class ReadingOptions:
         Time between rows that are evenly sampled and have no column of times, such as `0.1s` or `50 ms`.
     time_unit : str, optional
         Unit of the column of times where its head has none: `d`, `h`, `min`, `s`, `ms`, `us` or `ns`.
+    missing : str, optional
+        What stands for a missing value, such as `nan`, `--`, `-9999` or `empty`; several with `|` between them. A row
+        that has it in a column that is read is left out.
 
     Raises
     ------
@@ -65,6 +72,7 @@ class ReadingOptions:
     table: str | None = None
     interval: str | None = None
     time_unit: str | None = None
+    missing: str | None = None
 
     def __post_init__(self) -> None:
         delimiter, decimal = self.delimiter, self.decimal
@@ -126,6 +134,28 @@ class ReadingOptions:
                 f"--format interval={self.interval}: expected a time > 0 with its unit, such as 0.1s"
             )
         return float(match[1]) * SECONDS[unit]
+
+    @property
+    def _missing(self) -> list[str]:
+        return [] if self.missing is None else [text.strip().casefold() for text in self.missing.split("|")]
+
+    def is_missing(self, cell: str) -> bool:
+        """Return whether a cell without blanks around it is one of the texts for a missing value."""
+        return (cell.casefold() or "empty") in self._missing
+
+    def missing_remedy(self, cell: str) -> str:
+        """Return the remedy for a cell that may stand for a missing value, such as `nan`."""
+        texts = "|".join([*filter(None, [self.missing]), cell.strip() or "empty"])
+        return f"; to leave out the rows that have it, say --format missing={texts}"
+
+    def are_missing(self, values: Floats) -> npt.NDArray[np.bool_]:
+        """Return which values are missing, shape (N,): nan, and the numbers that stand for a missing value."""
+        gone = np.isnan(values)
+        for text in self._missing:
+            with suppress(ValueError):
+                # A file may hold it in single precision.
+                gone |= np.isclose(values, float(text), 1e-6, 0.0)
+        return gone
 
     def check_only(self, path: Path, kind: str, *allowed: str) -> None:
         """Check that no option is given beside those that a kind of file allows.

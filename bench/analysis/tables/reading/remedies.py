@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from bench.analysis.tables.reading.heads import NoColumnError, is_unit
 from bench.analysis.tables.reading.layout import SAMPLE_LINES, Layout, is_comment, is_number
 from bench.analysis.tables.reading.options import ReadingOptions
-from bench.analysis.tables.reading.table import NO_ROW_LEFT_OUT, OTHER_COLUMN
+from bench.analysis.tables.reading.table import OTHER_COLUMN
 from bench.analysis.tables.reading.tables import list_tables, walk_tables
 from bench.analysis.tables.reading.text import FALLBACK, TextFile
 
@@ -28,12 +28,12 @@ _SPELLED = " \t,;|.+-'\"_()[]{}<>"
 """What delimits by itself, or stands within a number or a name."""
 
 
-def cell_remedy(cell: str, layout: Layout, place: int, line: int, *, first: bool) -> str:
+def cell_remedy(cell: str, layout: Layout, options: ReadingOptions, place: int, line: int, *, first: bool) -> str:
     """Return what may help with a cell that is not a finite number; `first` if no number stands above it."""
     if place not in layout.numbers and (not cell or is_number(cell, layout.decimal)):
         return OTHER_COLUMN
     if not cell or is_number(cell, layout.decimal):
-        return f"; {NO_ROW_LEFT_OUT}: delete line {line} from the file, or put a number there"
+        return options.missing_remedy(cell)
     other = "," if layout.decimal == "." else "."
     if is_number(cell, other):
         sign = "comma" if other == "," else "point"
@@ -55,11 +55,8 @@ def cell_remedy(cell: str, layout: Layout, place: int, line: int, *, first: bool
     if place not in layout.numbers:
         return OTHER_COLUMN + ", or leave out lines above the data with --format skip=N" * first
     if first:
-        return (
-            f"; if line {line} is above the data, leave it out with --format skip=N; otherwise delete it from the "
-            "file, or put a number there"
-        )
-    return f"; {NO_ROW_LEFT_OUT}: delete line {line} from the file, or put a number there"
+        return f"; if line {line} is above the data, leave it out with --format skip=N{options.missing_remedy(cell)}"
+    return options.missing_remedy(cell)
 
 
 def missing_column(

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from bench.analysis.tables.reading.layout import MUCH_LONGER, delimited
 from bench.analysis.tables.reading.library_files import load_contents
-from bench.analysis.tables.reading.options import OF_TIMES, ReadingOptions
+from bench.analysis.tables.reading.options import OF_ALL, ReadingOptions
 from bench.analysis.tables.reading.table import ReadColumns
 from bench.analysis.tables.reading.text import TextLines
 from bench.analysis.tables.reading.text_table import read_tables
@@ -27,7 +27,7 @@ def read_spreadsheet(
     Raises DataError if the file cannot be read, a column is missing, or a cell is not a finite number: names sheet
     and line; ConfigurationError if an option does not apply, or the library for spreadsheets is not installed.
     """
-    options.check_only(path, "a spreadsheet", "table", "skip_lines", *OF_TIMES)
+    options.check_only(path, "a spreadsheet", "table", "skip_lines", *OF_ALL)
     sheets, _ = load_contents(path, "spreadsheet")
     title, table, chosen = _choose(path, sheets, options.table)
     sheet = TextLines(

@@ -11,9 +11,6 @@ from bench.base import DataError, Floats
 FEWEST_ROWS = 10
 """Fewer samples than this identify nothing."""
 
-NO_ROW_LEFT_OUT = "no option leaves out a row"
-"""Begins the remedy for a cell that is not a finite number."""
-
 OTHER_COLUMN = "; most rows have no number in this column: choose another"
 """Remedy for a cell of a column that is not one of numbers."""
 
@@ -23,7 +20,7 @@ class ReadColumns:
     """Columns that were read."""
 
     names: list[str]  # those that were asked for, and that of a column of times where one was looked for and found
-    values: list[Floats]  # in the same order, shape (rows,) each, finite
+    values: list[Floats]  # in the same order, shape (rows,) each, finite but for nan where a value is missing
     units: list[str]  # likewise; empty where the file does not say
     notes: tuple[str, ...]  # what was assumed about the file
 

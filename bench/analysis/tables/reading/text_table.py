@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import itertools
+import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -136,7 +137,7 @@ def _read_table(
     """Read columns of a table; _SeveralError if its end is unknown and other tables follow."""
     names = with_times(names, times, layout.heads, lambda name: _place(file, layout, name))
     layout, places = _find_places(file, names, options, layout, lines)
-    body = _Body(file, layout, names, places)
+    body = _Body(file, layout, names, places, options)
     body.ending = ending
     after: tuple[str, ...] | None = ()
     try:
@@ -194,8 +195,11 @@ def _find_places(
 class _Body:
     """The data of a table: its end if known, its lines of comment, and which columns hold dates and times."""
 
-    def __init__(self, file: TextFile, layout: Layout, names: Sequence[str], places: Sequence[int]) -> None:
+    def __init__(
+        self, file: TextFile, layout: Layout, names: Sequence[str], places: Sequence[int], options: ReadingOptions
+    ) -> None:
         self._file, self._layout, self._names, self._places = file, layout, names, places
+        self._options = options
         self._width = max(layout.columns, len(layout.heads))
         self.ending: Ending | None = None
         self.comments = 0
@@ -246,12 +250,16 @@ class _Body:
         return [np.array(column, dtype=np.float64) for column in values]
 
     def _number(self, where: str, cell: str, place: int, line: int, *, first: bool) -> float:
+        if self._options.is_missing(cell):
+            return math.nan
         if place in self.moments:
             return moment_in(where, cell)
         try:
             return finite_number(where, cell, self._layout.decimal)
         except DataError as error:
-            raise DataError(f"{error}{cell_remedy(cell, self._layout, place, line, first=first)}") from None
+            raise DataError(
+                f"{error}{cell_remedy(cell, self._layout, self._options, place, line, first=first)}"
+            ) from None
 
     def _end(self) -> int | None:
         return None if self.ending is None else self.ending.end
