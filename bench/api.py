@@ -182,7 +182,7 @@ def identify(
     Parameters
     ----------
     source : RunFolder, str or Path
-        A run, or a table of measurements: text, .gz, .mat, .h5, .tdms, .parquet or a spreadsheet.
+        A run, or a table of measurements: text, .gz, .mat, .h5, .tdms, .npz, .npy, .parquet or a spreadsheet.
     model : str
         Name of a registered model.
     input, output : str, optional

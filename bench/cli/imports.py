@@ -17,7 +17,7 @@ from bench.cli.printing import console
 def import_(
     file: Annotated[
         Path,
-        typer.Argument(metavar="FILE", help="Table of measurements (text, .mat, .xlsx, .h5, .tdms, .parquet)."),
+        typer.Argument(metavar="FILE", help="Table of measurements (text, .mat, .xlsx, .h5, .tdms, .npz, .parquet)."),
     ],
     input_column: Annotated[
         str, typer.Option("--input", metavar="COLUMN", help="Column of the input, or FILE:COLUMN.")

@@ -36,7 +36,7 @@ DataArgument = Annotated[
     Path,
     typer.Argument(
         metavar="FILE",
-        help="Table of measurements (text, .mat, .xlsx, .h5, .tdms, .parquet), or a run.",
+        help="Table of measurements (text, .mat, .xlsx, .h5, .tdms, .npz, .parquet), or a run.",
         parser=find_run,
         autocompletion=complete_run,
     ),
@@ -187,8 +187,8 @@ def identify_(
         list[Path] | None,
         typer.Argument(
             metavar="FILE",
-            help="Tables of measurements (text, .mat, .xlsx, .h5, .tdms, .parquet), or runs; one model of all. The "
-            "newest run if not given.",
+            help="Tables of measurements (text, .mat, .xlsx, .h5, .tdms, .npz, .parquet), or runs; one model of all. "
+            "The newest run if not given.",
             parser=find_run,
             autocompletion=complete_run,
             show_default=False,
@@ -394,7 +394,9 @@ def invert(
     model_path: ModelArgument,
     file: Annotated[
         Path,
-        typer.Argument(metavar="TARGETS.csv", help="Table of targets (text, .mat, .xlsx, .h5, .tdms, .parquet)."),
+        typer.Argument(
+            metavar="TARGETS.csv", help="Table of targets (text, .mat, .xlsx, .h5, .tdms, .npz, .parquet)."
+        ),
     ],
     column: Annotated[str, typer.Option("--column", metavar="NAME", help="Column with the targets.")],
     out: Annotated[Path, typer.Option(metavar="FILE.csv", help="File for the set-points.")] = Path("setpoints.csv"),

@@ -117,6 +117,14 @@ def tdms(path):
             file.write_segment([ChannelObject("run", name, values, properties)])
 
 
+def numpy_file(*array, **arrays):
+    def save(path):
+        with path.open("wb") as file:
+            np.savez(file, **arrays) if arrays else np.save(file, *array)
+
+    return save
+
+
 def parquet(**columns):
     def save(path):
         import pyarrow as pa

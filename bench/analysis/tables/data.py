@@ -269,9 +269,11 @@ def _reader(path: Path) -> Callable[[Path, Sequence[str], ReadingOptions, Sequen
     # Text may have the ending of a spreadsheet, or of MATLAB, whose version 4 has numbers of four bytes first.
     if start.startswith(b"MATLAB") or (path.suffix.lower() == ".mat" and b"\0" in start):
         return partial(read_arrays, kind="MATLAB")
+    if path.suffix.lower() == ".npz":
+        return partial(read_arrays, kind="NumPy")
     if start.startswith(_SPREADSHEETS):
         return read_spreadsheet
-    kinds = {HDF5: "HDF5", b"TDSm": "TDMS", b"PAR1": "Parquet"}
+    kinds = {HDF5: "HDF5", b"TDSm": "TDMS", b"PAR1": "Parquet", b"\x93NUM": "NumPy"}
     kind = kinds.get(start[:4])
     return read_text if kind is None else partial(read_arrays, kind=kind)
 

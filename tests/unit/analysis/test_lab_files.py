@@ -17,6 +17,7 @@ from lab_tables import (
     later_matlab,
     matlab,
     number,
+    numpy_file,
     parquet,
     rows,
     sheets,
@@ -296,6 +297,12 @@ LAYOUTS = {
     "HDF5": (hdf5, "HDF5", {"file": "d.h5", **TIMED, **UNITS}),
     "TDMS": (tdms, "TDMS", {"file": "d.tdms", **TIMED, **UNITS}),
     "Parquet": (parquet(time=MOMENTS), "dates and times", {"file": "d.parquet", **TIMED, **UNITS}),
+    "arrays of NumPy": (numpy_file(U=U, y=Y, note="x"), "NumPy", {"file": "d.npz"}),
+    "a matrix of NumPy": (
+        numpy_file(np.vstack([TIME, U, Y])), "d: 3 × 40, its rows read as columns",
+        {"file": "d.npy", "names": ("2", "d(3,:)")},
+    ),
+    "objects of NumPy": (numpy_file(np.array([None, {}])), "allow_pickle", {"file": "d.npy", **NOT}),
     "texts in Parquet": (parquet(), "no column 'note'", {"file": "d.parquet", "names": ("U", "note"), **NOT}),
     **{
         f"a damaged {name}": (start + bytes(600), words, {"file": name, **NOT})
@@ -305,6 +312,8 @@ LAYOUTS = {
             ("d.mat", b"nothing" * 20, "cannot be read as a MATLAB file"),
             ("d.h5", b"\x89HDF\r\n\x1a\n", "cannot be read"),
             ("d.parquet", b"PAR1", "cannot be read as a parquet file"),
+            ("d.npy", b"\x93NUMPY\x01\0", "cannot be read as a NumPy file"),
+            ("d.npz", b"PK\x03\x04", "cannot be read as a NumPy file"),
             ("d.png", b"\x89PNG\r\n\x1a\n\0\0\0\rIHDR\x80\x90", "is no table of text"),
             ("d.gz", b"\x1f\x8b", "cannot be read"),
         )

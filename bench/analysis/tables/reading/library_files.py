@@ -39,6 +39,7 @@ _KINDS: dict[str, tuple[str, str, Extra]] = {
     "HDF5": ("an HDF5 file", "h5py", "files"),
     "TDMS": ("a TDMS file", "nptdms", "files"),
     "Parquet": ("a parquet file", "pyarrow", "report"),
+    "NumPy": ("a NumPy file", "numpy", "files"),
     "spreadsheet": ("a spreadsheet", "python_calamine", "files"),
 }
 """By kind its words, the library that reads it, and the extra of that."""
@@ -49,7 +50,7 @@ _LEFT_OUT = "tables and strings of MATLAB left out"
 def load_contents(path: Path, kind: str) -> tuple[Any, tuple[str, ...]]:
     """Return the contents of a file, and what was assumed.
 
-    The contents of `MATLAB`, `HDF5`, `TDMS` and `Parquet` are arrays by name, in mappings where they are grouped,
+    The contents of all but a `spreadsheet` are arrays by name, in mappings where they are grouped,
     with the unit at the end of a name. Those of a `spreadsheet` are lines of cells with tabs between them, by sheet.
 
     Raises DataError if the file cannot be read, ends the process that reads it, or takes too long; MissingExtraError
@@ -193,6 +194,11 @@ def _parquet(path: Path) -> Any:  # noqa: ANN401
     return found
 
 
+def _numpy(path: Path) -> dict[str, Any]:
+    found = np.load(path, allow_pickle=False)
+    return {path.stem: found} if isinstance(found, np.ndarray) else dict(found)
+
+
 def _sheets(path: Path) -> dict[str, tuple[str, ...]]:
     from python_calamine import CalamineWorkbook
 
@@ -217,7 +223,9 @@ def _with_unit(name: str, unit: object) -> str:
     return f"{name} [{text}]" if isinstance(text, str) and text.strip() else name
 
 
-_LOADERS = {"MATLAB": _matlab, "HDF5": _hdf5, "TDMS": _tdms, "Parquet": _parquet, "spreadsheet": _sheets}
+_LOADERS = {
+    "MATLAB": _matlab, "HDF5": _hdf5, "TDMS": _tdms, "Parquet": _parquet, "NumPy": _numpy, "spreadsheet": _sheets,
+}  # fmt: skip
 
 
 if __name__ == "__main__":

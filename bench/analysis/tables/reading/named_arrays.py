@@ -1,4 +1,4 @@
-"""Columns of files of named arrays: MATLAB, HDF5, TDMS and Parquet."""
+"""Columns of files of named arrays: MATLAB, HDF5, TDMS, Parquet and NumPy."""
 
 from __future__ import annotations
 
