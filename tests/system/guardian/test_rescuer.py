@@ -6,8 +6,10 @@ import subprocess
 import sys
 
 import pytest
+from benches import seconds_until
 
-from bench.execution.guardian.rescuer import SILENCE, is_needed
+from bench.execution.guardian.rescuer import SILENCE, Report, is_needed
+from bench.rig import SAFE
 
 
 class Signs:
@@ -61,3 +63,21 @@ def test_one_that_is_released_before_it_is_ready_does_nothing(tmp_path):
     assert done.returncode == 0
     # Nobody waits for what it reports.
     assert not report.exists()
+
+
+@pytest.mark.parametrize(
+    "line", [b"{\n", b"[]\n", b'{"targets": ["ftp://x"], "facts": {}, "t": 0}\n', b'{"targets": []}\n']
+)
+def test_whom_it_cannot_tell_does_not_keep_it_from_making_the_devices_safe(vo2, tmp_path, line):
+    report = Report(tmp_path / "report.json")
+    with subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE) as bench:
+        content = {"rig": "vo2", "overrides": {}, "attach": str(vo2.endpoints_file), "report": str(report.path)}
+        content |= {"process": bench.pid, "guardian": 0}
+        command = [sys.executable, "-P", "-m", "bench.execution.guardian.rescuer"]
+        with subprocess.Popen(command, stdin=subprocess.PIPE) as rescuer:
+            rescuer.stdin.write(json.dumps(content).encode() + b"\n" + line)
+            rescuer.stdin.flush()
+            seconds_until(report.is_ready)
+            bench.kill()
+    assert rescuer.returncode == 0
+    assert report.states() == {"tec": SAFE, "psd": SAFE}
