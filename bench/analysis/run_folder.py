@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from bench.analysis.picture import Picture
-from bench.base import DataError, html_table
+from bench.base import DataError, counted, html_table
 from bench.record import Event, Record, Table
 
 
@@ -119,4 +119,5 @@ class RunFolder:
     def __repr__(self) -> str:
         """Return what was run, how it ended and where it is."""
         meta = self.meta
-        return f"<{meta['protocol']} on {meta['rig']}: {self.status}, {len(self.readings)} readings, {self.folder}>"
+        size = counted(len(self.readings), "reading")
+        return f"<{meta['protocol']} on {meta['rig']}: {self.status}, {size}, {self.folder}>"

@@ -81,6 +81,7 @@ from .interrupts import (
 )
 from .names import (
     closest as closest,
+    counted as counted,
     reason as reason,
 )
 from .parsing import (

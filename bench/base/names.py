@@ -1,4 +1,4 @@
-"""What messages say: of names that there are not, and of files that cannot be read."""
+"""What messages say: counts, names that there are not, and files that cannot be read."""
 
 from __future__ import annotations
 
@@ -29,6 +29,11 @@ def closest(name: str, known: Iterable[str], where: str = "") -> str:
     if len(names) > _FEW and where:
         return f"{where} shows all {len(names)}"
     return f"there are: {', '.join(names) or 'none'}"
+
+
+def counted(count: int, noun: str) -> str:
+    """Return a count with its noun, such as `1 run` and `2 runs`."""
+    return f"{count} {noun}{'s' * (count != 1)}"
 
 
 def reason(error: Exception) -> str:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from bench.base import print_plain
+from bench.base import counted, print_plain
 from bench.cli.command_support import JsonOption, check_outputs, write_json
 from bench.cli.printing import console, print_rows
 from bench.cli.run_names import NEWEST, RunArgument
@@ -67,7 +67,7 @@ def calibrate(
         ("reference", f"{found.reference}, {found.reference_uncertainty:.3g} {unit} (standard uncertainty)"),
         ("holds", f"from {found.date} to {found.due}"),
         ("instrument", found.serial_number or "tells no serial number"),
-        ("range", f"{found.low:.6g} to {found.high:.6g} {found.unit}, {found.readings} readings"),
+        ("range", f"{found.low:.6g} to {found.high:.6g} {found.unit}, {counted(found.readings, 'reading')}"),
         ("values at its ends and middle", ", ".join(f"{each:.6g}" for each in values) + f" {unit}"),
         ("coefficients", str(len(found.coefficients))),
         ("accuracy (standard uncertainty)", f"{found.uncertainty:.3g} {unit}"),

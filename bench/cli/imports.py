@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from bench.base import print_plain
+from bench.base import counted, print_plain
 from bench.cli.command_support import JsonOption, check_outputs, write_json
 from bench.cli.data_options import ReadingGroup, offer_groups, print_assumptions
 from bench.cli.printing import console
@@ -59,6 +59,6 @@ def import_(
         reading=reading,
     )
     print_assumptions(file.name, found.assumptions)
-    console.print(f"{found.rows} readings", highlight=False)
+    console.print(counted(found.rows, "reading"), highlight=False)
     print_plain(console, f"run: {found.folder}")
     write_json(json_file, {"folder": str(found.folder), "rows": found.rows, "assumptions": found.assumptions})

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
-from bench.base import ConfigurationError, DataError, print_plain, show_patience
+from bench.base import ConfigurationError, DataError, counted, print_plain, show_patience
 from bench.cli.band_options import BandOption, Recalibrating, print_band, print_examined
 from bench.cli.choice_options import (
     Comparing,
@@ -305,7 +305,7 @@ def _identify_whole(
     """Identify a model from several runs together, such as one of several inputs."""
     check_given(context, ("files", "model", "test", "options", "out", "json_file"), "this model is of whole runs")
     test = None if comparing.test is None else Path(comparing.test)
-    with show_patience(f"reading and fitting {len(runs)} runs", console):
+    with show_patience(f"reading and fitting {counted(len(runs), 'run')}", console):
         found = whole.of_runs(runs, test, options.values)
     if outputs.out is not None:
         found.file.save(outputs.out)
@@ -474,7 +474,7 @@ def invert(
     counts = {flag: found.flags.count(flag) for flag in kinds}
     two = sum(value != "" for value in passing)
     console.print(
-        f"{len(found.flags)} targets: {', '.join(f'{count} {flag}' for flag, count in counts.items())}; "
+        f"{counted(len(found.flags), 'target')}: {', '.join(f'{count} {flag}' for flag, count in counts.items())}; "
         f"{two} by way of saturation: {out}",
         highlight=False,
         soft_wrap=True,

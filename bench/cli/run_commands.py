@@ -12,7 +12,7 @@ import typer
 from rich.markup import escape
 from rich.table import Table
 
-from bench.base import BenchError, ConfigurationError, format_duration, print_plain, show_table
+from bench.base import BenchError, ConfigurationError, counted, format_duration, print_plain, show_table
 from bench.cli.command_support import (
     UNSAFE_EXIT_CODE,
     AttachOption,
@@ -231,8 +231,9 @@ def print_result(
         else f", the last {format_duration(outcome.own_seconds)} of it"
     )
     console.print(
-        f"{outcome.status}: {outcome.steps} steps, {format_duration(outcome.laboratory_seconds)} of laboratory time"
-        f"{end} in {format_duration(result.wall_seconds)}" + (f" ({ratio:.0f} times as fast)" if ratio >= 2 else ""),
+        f"{outcome.status}: {counted(outcome.steps, 'step')}, {format_duration(outcome.laboratory_seconds)} of "
+        f"laboratory time{end} in {format_duration(result.wall_seconds)}"
+        + (f" ({ratio:.0f} times as fast)" if ratio >= 2 else ""),
         highlight=False,
     )
     if outcome.pace is not None and not outcome.pace.is_reached:

@@ -10,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from bench.base import ConfigurationError
+from bench.base import ConfigurationError, counted
 from bench.cli.printing import error_console
 
 RECORDINGS = Path("recordings")
@@ -42,7 +42,7 @@ def find_run(given: str | Path) -> Path:
     if match := re.fullmatch(r"@(\d+)", text):
         runs, number = newest_runs(RECORDINGS), int(match[1])
         if not 1 <= number <= len(runs):
-            there = f"has {len(runs)} run{'s' * (len(runs) != 1)}" if runs else "has no runs; bench run makes one"
+            there = f"has {counted(len(runs), 'run')}" if runs else "has no runs; bench run makes one"
             raise ConfigurationError(f"{text}: {RECORDINGS} {there}" if text != "@1" else f"{RECORDINGS} {there}")
         error_console.print(f"[dim]run: {runs[number - 1]}[/]", highlight=False, soft_wrap=True)
         return runs[number - 1]

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from bench.base import print_plain
+from bench.base import counted, print_plain
 from bench.cli.printing import console
 
 if TYPE_CHECKING:
@@ -28,4 +28,4 @@ def write_rows(path: Path, found: Predictions) -> None:
 
     table = found.table()
     write_csv(path, [head for head, _ in table], [values for _, values in table])
-    print_plain(console, f"{found.input.values.size} rows: {path}")
+    print_plain(console, f"{counted(found.input.values.size, 'row')}: {path}")

@@ -25,7 +25,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal, NamedTuple, TypeAlias,
 
 import numpy as np
 
-from bench.base import DeferredModule, Floats
+from bench.base import DeferredModule, Floats, counted
 from bench.control.tuning import Spans
 from bench.models import Operator, Preisach, transported, widened, widening
 
@@ -202,8 +202,8 @@ class ModelFilter(ABC):
         """Return what was estimated, and from how many readings, in a line."""
         texts = ", ".join(f"{name} {estimate}" for name, estimate in self.estimates().items())
         more = f", {self.refused} refused" if self.refused else ""
-        again = f", begun anew {self.restarts} times" if self.restarts else ""
-        return f"{texts}, from {self.taken} readings{more}{again}"
+        again = f", begun again {counted(self.restarts, 'time')}" if self.restarts else ""
+        return f"{texts}, from {counted(self.taken, 'reading')}{more}{again}"
 
     def to_json(self) -> dict[str, Any]:
         """Return what was estimated and from how many readings, for the provenance of the corrected model."""

@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from bench.base import Floats, checks as _checks
+from bench.base import Floats, checks as _checks, counted
 
 _MINUS_INFINITY = -math.inf
 # Part of the range of inputs at its ends whose memory is as good as known.
@@ -181,13 +181,12 @@ class MemoryCurve:
         if not self.extrema:
             lines.append("no reversal remembered: on a major branch")
             return "\n".join(lines)
-        count = len(self.extrema)
-        lines.append(f"{count} reversal{'s' if count > 1 else ''} remembered, outermost first:")
+        lines.append(f"{counted(len(self.extrema), 'reversal')} remembered, outermost first:")
         maximum = self.saturation < 0
         for value in self.extrema:
             lines.append(f"  {'maximum' if maximum else 'minimum'} {value:g}{suffix}")
             maximum = not maximum
-        if count > 1:
+        if len(self.extrema) > 1:
             last, before = self.extrema[-1], self.extrema[-2]
             lines.append(f"the innermost loop closes at {before:g}{suffix}, {abs(before - last):g}{suffix} wide")
         return "\n".join(lines)

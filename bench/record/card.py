@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from datetime import datetime
 from typing import Any
 
-from bench.base import format_duration, prefixed
+from bench.base import counted, format_duration, prefixed
 
 
 def run_card(meta: Mapping[str, Any]) -> str:
@@ -59,11 +59,12 @@ def _expected(meta: Mapping[str, Any]) -> dict[str, str]:
     """Return the rows about what was expected of the run: its rehearsal if there was one, else its plan."""
     rehearsal, planned = meta.get("rehearsal"), meta["plan"]
     if rehearsal is None:
+        steps = counted(planned["steps"], "step")
         if planned.get("complete", True):
-            return {"planned": f"{planned['steps']} steps, {_between(planned['seconds'], planned.get('at_most'))}"}
-        known = f"{planned['steps']} steps, {format_duration(planned['seconds'])}"
+            return {"planned": f"{steps}, {_between(planned['seconds'], planned.get('at_most'))}"}
+        known = f"{steps}, {format_duration(planned['seconds'])}"
         return {"planned": f"unknown, as readings decide; {known} up to the first that does"}
-    length = f"{rehearsal['steps']} steps, {format_duration(rehearsal['seconds'])}"
+    length = f"{counted(rehearsal['steps'], 'step')}, {format_duration(rehearsal['seconds'])}"
     if (most := rehearsal["at_most"]) is not None:
         length += f", at most {format_duration(most)}"
     margins = [

@@ -7,6 +7,8 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from bench.base import counted
+
 EDGES = (1e-4, 2e-4, 5e-4, 1e-3, 2e-3, 5e-3, 1e-2, 2e-2, 5e-2, 0.1, 0.2, 0.5, 1.0)
 """Upper ends of all bins but the last, which has none, s; each belongs to its bin."""
 
@@ -74,7 +76,7 @@ def headline_of(label: str, recorded: Mapping[str, Any]) -> str:
     """Return a histogram in one line, see `Lateness.to_json`, behind the label of its loop."""
     rate = f" at {recorded['rate']:g} Hz" if recorded["rate"] is not None else ""
     return (
-        f"{label or 'the loop'}: {recorded['samples']} samples{rate}, {recorded['left_out']} left out; "
+        f"{label or 'the loop'}: {counted(recorded['samples'], 'sample')}{rate}, {recorded['left_out']} left out; "
         f"mean {1e3 * recorded['mean']:.3g} ms, worst {1e3 * recorded['worst']:.3g} ms"
     )
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bench.base import ConfigurationError, header_with_unit, html_table
+from bench.base import ConfigurationError, counted, header_with_unit, html_table
 from bench.record.rows import StepRecord
 
 _ROWS_SHOWN = 5
@@ -68,7 +68,7 @@ class Table:
         return heads, rows
 
     def _repr_html_(self) -> str:
-        return html_table(*self._shown(), f"{len(self)} rows")
+        return html_table(*self._shown(), counted(len(self), "row"))
 
     def __repr__(self) -> str:
         """Return size, column heads with units, and the first and last rows."""
@@ -77,4 +77,4 @@ class Table:
         lines = [
             "  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in [heads, *rows]
         ]
-        return "\n".join([*lines, f"{len(self)} rows"])
+        return "\n".join([*lines, counted(len(self), "row")])

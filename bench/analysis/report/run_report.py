@@ -31,7 +31,7 @@ from bench.analysis.report.telemetry_summary import TelemetrySummary, summarize,
 from bench.analysis.report.uncertainty_tables import uncertainty_parts
 from bench.analysis.tracking_errors import results_json
 from bench.analysis.uncertain_results import RunUncertainty
-from bench.base import format_duration, print_plain, show_rows, show_table, with_unit
+from bench.base import counted, format_duration, print_plain, show_rows, show_table, with_unit
 from bench.identification import ModelFile, models_among
 from bench.models import MemoryCurve
 from bench.record import Record, Table, card_rows, expected_steps, lateness_lines
@@ -187,8 +187,8 @@ def _print_card(meta: Mapping[str, Any], console: Console) -> None:
 def _print_status(record: Record, steps: int, console: Console) -> None:
     style = {"completed": "green", "unfinished": "yellow"}.get(record.status, "red")
     expected = expected_steps(record.meta)
-    of = f" of {expected}" if expected is not None else ""
-    console.print(f"[{style}]{record.status}[/] after {steps}{of} steps", highlight=False)
+    carried_out = f"{steps} of {counted(expected, 'step')}" if expected is not None else counted(steps, "step")
+    console.print(f"[{style}]{record.status}[/] after {carried_out}", highlight=False)
     if record.reason:
         console.print(f"  {record.reason}", highlight=False, markup=False)
     for device, state in record.safe_state.items():

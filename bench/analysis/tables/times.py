@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from bench.analysis.tables.data import Quantity
 from bench.analysis.tables.reading.heads import SECONDS, spelled
-from bench.base import ConfigurationError, DataError, Floats
+from bench.base import ConfigurationError, DataError, Floats, counted
 
 Flags = npt.NDArray[np.bool_]
 
@@ -54,8 +54,7 @@ def rows_in_time(
     if count and values.size - count > 1 and all(map(np.all, same)):
         kept = ~repeated
         seconds, notes = seconds_of(source, replace(column, values=values[kept]), unit)
-        rows = f"{count} row{'s' * (count != 1)}"
-        return kept, seconds, (*notes, f"{rows} equal to the row before in time and values left out")
+        return kept, seconds, (*notes, f"{counted(count, 'row')} equal to the row before in time and values left out")
     return np.ones(values.size, dtype=bool), *seconds_of(source, column, unit)
 
 
@@ -106,8 +105,9 @@ def seconds_of(source: str, column: Quantity, unit: str | None = None) -> tuple[
         notes.append("times since the first row")
     times, repeated = _spread(source, name, values * scale)
     if repeated:
-        rows = f"{repeated} row{'s' * (repeated != 1)}"
-        notes.append(f"{rows} with the stamp of the row before spread evenly up to the next stamp")
+        notes.append(
+            f"{counted(repeated, 'row')} with the stamp of the row before spread evenly up to the next stamp"
+        )
     return times, tuple(notes)
 
 

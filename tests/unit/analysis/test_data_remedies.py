@@ -263,7 +263,7 @@ class TestOtherFormats:
     def test_what_is_no_table(self, tmp_path, content, kind, names):
         message = refused(tmp_path, content, names, "file.txt")
         assert message.startswith(
-            f"file.txt: is {kind}, not a table; text, .gz of text, .mat, .h5, .tdms, .parquet and spreadsheets"
+            f"file.txt: is {kind}, not a table; text, .gz of text, .mat, .h5, .tdms, .npz, .parquet and spreadsheets"
         )
 
     def test_an_array_in_a_file_of_json(self, tmp_path):

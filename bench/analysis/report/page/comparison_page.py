@@ -12,7 +12,7 @@ from bench.analysis.figures.panels import Curve, plot_panels, plot_signals
 from bench.analysis.report.page.elements import Page, PageFigure, PageSection, PageTable
 from bench.analysis.report.page.svg import inlined
 from bench.analysis.run_comparison import SIGNAL_HEADS, RunComparison
-from bench.base import fitting_prefix, with_unit
+from bench.base import counted, fitting_prefix, with_unit
 from bench.record import Record, Table
 
 
@@ -44,9 +44,9 @@ def _lead(found: RunComparison) -> list[str]:
     count = len(found.differences)
     equal = [name for name, same in found.equal.items() if same]
     lead = [
-        f"First: {first.run}, {first.status} after {first.steps} steps. Second: {second.run}, {second.status} after "
-        f"{second.steps} steps.",
-        f"{count} thing{'s' if count != 1 else ''} that they were given differ{'' if count != 1 else 's'}."
+        f"First: {first.run}, {first.status} after {counted(first.steps, 'step')}. "
+        f"Second: {second.run}, {second.status} after {counted(second.steps, 'step')}.",
+        f"{counted(count, 'thing')} that they were given differ{'' if count != 1 else 's'}."
         if count
         else "Nothing differs in what they were given.",
         f"Equal to the last bit: {', '.join(equal) or 'nothing'}.",

@@ -32,7 +32,7 @@ from bench.analysis.report.run_figures import Phase, draw_loops, draw_signals, p
 from bench.analysis.report.telemetry_summary import TelemetrySummary
 from bench.analysis.report.uncertainty_tables import uncertainty_parts
 from bench.analysis.tracking_errors import FollowingResult, following_result, target_results, ticks_with
-from bench.base import Display, Floats, format_duration, percent, with_unit
+from bench.base import Display, Floats, counted, format_duration, percent, with_unit
 from bench.devices import Signal
 from bench.identification import models_among
 from bench.record import Event, Record, Table, expected_steps
@@ -113,17 +113,17 @@ def _lead(
         f"{meta['operator']} on {started} UTC{clock}."
     )
     expected = expected_steps(meta)
-    of = f" of {expected}" if expected is not None else ""
+    carried_out = f"{steps} of {counted(expected, 'step')}" if expected is not None else counted(steps, "step")
     lasted = f" and {format_duration(found[-1].end)} of laboratory time" if found else ""
     if record.status == "unfinished":
         second = (
             "UNFINISHED: the run goes on, or its process died; this page has what was recorded until now, "
-            f"{steps}{of} steps{lasted}."
+            f"{carried_out}{lasted}."
         )
     else:
         reason = f": {record.reason}" if record.reason else ""
         states = safe_state_text(record.safe_state)
-        second = f"It ended as {record.status} after {steps}{of} steps{lasted}{reason}. {states}"
+        second = f"It ended as {record.status} after {carried_out}{lasted}{reason}. {states}"
     lead = [first, second]
     if remark := record.remark():
         lead.append(f"{remark[0].upper()}{remark[1:]}.")
@@ -131,7 +131,7 @@ def _lead(
     warned = sum(event.level in ("WARN", "ERROR") for event in events)
     lead.append(
         f"{f'Interlocks acted {len(acted)} times' if acted else 'No interlock acted'}; "
-        f"{warned or 'no'} warning{'' if warned == 1 else 's'} and errors among {len(events)} events."
+        f"{warned or 'no'} warning{'' if warned == 1 else 's'} and errors among {counted(len(events), 'event')}."
     )
     for key, words in (("tracking", "brought to its targets"), ("following", "made to follow its reference")):
         if key in result:

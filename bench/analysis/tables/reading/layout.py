@@ -13,7 +13,7 @@ from typing import TypeAlias
 
 from bench.analysis.tables.reading.heads import Head, bare_unit, is_unit, make_heads
 from bench.analysis.tables.reading.options import ReadingOptions
-from bench.base import DataError
+from bench.base import DataError, counted
 
 COMMENT_MARKS = ("#", "%", "//", ";")
 """What begins a line of comment; a semicolon does unless it delimits."""
@@ -446,7 +446,7 @@ def _notes(above: Sequence[str], comments: int, header: Header, delimiter: str, 
 
 def count_lines(number: int, what: str) -> str:
     """Return a count of lines for people."""
-    return f"{number} line{'s' * (number != 1)} {what}"
+    return f"{counted(number, 'line')} {what}"
 
 
 def _quoted(rows: Sequence[Row], lines: Sequence[str], options: ReadingOptions) -> bool:

@@ -20,7 +20,7 @@ from bench.analysis.tables.reading.layout import (
 from bench.analysis.tables.reading.options import ReadingOptions
 from bench.analysis.tables.reading.summary_rows import TextRows
 from bench.analysis.tables.reading.text import TextFile
-from bench.base import DataError
+from bench.base import DataError, counted
 
 _NAME_AND_VALUE = re.compile(r"\s*[^\W\d][^:=\t,;]*[:=]\s*\S.*")
 """A line such as `PMax: 19.8`."""
@@ -194,4 +194,4 @@ def list_tables(tables: Sequence[Table]) -> str:
         f"{number} from line {table.layout.start + 1} ({table.ending.rows} × {table.layout.columns})"
         for number, table in enumerate(tables, start=1)
     ]
-    return f"{len(tables)} table{'s' * (len(tables) != 1)}, of rows × columns: {', '.join(sizes)}"
+    return f"{counted(len(tables), 'table')}, of rows × columns: {', '.join(sizes)}"
