@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from bench.analysis.tables.reading.heads import SECONDS, NoColumnError
+from bench.analysis.tables.reading.heads import SECONDS, NoColumnError, split_unit
 from bench.analysis.tables.reading.library_files import HDF5
 from bench.analysis.tables.reading.named_arrays import read_arrays
 from bench.analysis.tables.reading.options import ReadingOptions
@@ -44,7 +44,7 @@ class Quantity:
     Attributes
     ----------
     name : str
-        As it was asked for; a unit at the end, as in `force [N]`, is that of the quantity.
+        As it was asked for; a unit at the end, as in `force [N]` or `force (N)`, is that of the quantity.
     unit : str
         Empty if unknown.
     values : ndarray, shape (N,)
@@ -63,7 +63,8 @@ class Quantity:
     @property
     def title(self) -> str:
         """The name without the unit."""
-        return self.name.removesuffix(f"[{self.unit}]").rstrip() if self.unit else self.name
+        name, unit = split_unit(self.name)
+        return name if unit == self.unit else self.name
 
 
 @dataclass(frozen=True)

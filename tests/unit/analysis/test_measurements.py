@@ -216,3 +216,19 @@ def test_a_damaged_page_of_a_parquet_file_is_refused(tmp_path):
     path.write_bytes(content)
     with pytest.raises(DataError, match="cannot be read"):
         read_columns(path, ["u"])
+
+
+@cases(
+    ("name", "unit", "header"),
+    [
+        ("force", "N", "force [N]"),
+        ("force [N]", "N", "force [N]"),
+        ("force (N)", "N", "force [N]"),
+        ("T / degC", "°C", "T [°C]"),
+        ("force (upper)", "N", "force (upper) [N]"),
+        ("force [N]", "kg", "force [N] [kg]"),
+        ("force (N)", "", "force (N)"),
+    ],
+)
+def test_a_unit_stands_in_a_head_once(name, unit, header):
+    assert Quantity(name, unit, np.zeros(2)).header == header
