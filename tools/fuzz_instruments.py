@@ -233,7 +233,7 @@ def kept(server):
 
 @contextmanager
 def bounded():
-    """End an input that takes more than its CPU time, where the system can; yields what begins its time anew."""
+    """End an input that takes more than its CPU time, where the system can; yields what begins its time again."""
     if not hasattr(signal, "setitimer"):
         yield lambda: None
         return

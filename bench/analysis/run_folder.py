@@ -15,7 +15,7 @@ from bench.record import Event, Record, Table
 class RunFolder:
     """A run that was recorded.
 
-    Every property reads the journal anew, so that a run that goes on can be watched.
+    Every property reads the journal again, so that a run that goes on can be watched.
 
     Parameters
     ----------

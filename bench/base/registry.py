@@ -116,7 +116,7 @@ def _all_entries() -> tuple[RegisteredPart, ...]:
 
 
 def forget() -> None:
-    """Look anew for what is registered, as the import path has changed."""
+    """Look again for what is registered, as the import path has changed."""
     _all_entries.cache_clear()
     entries.cache_clear()
 

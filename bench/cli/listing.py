@@ -1,6 +1,6 @@
 """What `bench list` shows, remembered until a file of a package that registers a part changes.
 
-To say it anew, every rig, protocol, model and driver is imported: half a second of CPU.
+To say it again, every rig, protocol, model and driver is imported: half a second of CPU.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def listing() -> dict[str, Any]:
 
     found = Catalogue.of_installed().to_json()
     if not found["problems"]:
-        # Where nothing can be remembered, it is said anew each time.
+        # Where nothing can be remembered, it is said again each time.
         with suppress(OSError):
             file.parent.mkdir(parents=True, exist_ok=True)
             write_whole(file, json_text({"state": state, "catalogue": found}))

@@ -72,7 +72,7 @@ class OpenLoopFollower(_Follower):
     ----------
     inverse : Inverse
         Inverse of the identified model. Of an answer with two elements the first is set; the next
-        period is asked anew, so that the second follows when the actuator has come there.
+        period is asked again, so that the second follows when the actuator has come there.
     state, limits
         As in `OpenLoopInverse`.
     parameters : FollowingParameters

@@ -12,7 +12,7 @@ Both have in common:
 * A reading far from what the model can explain is refused, as that of a sensor that jumped is. While readings are
   refused nothing is forgotten, so that a sensor that stays wrong is not believed after a while.
 * All estimates are bounded. If the model as it was identified explains refused readings much better than the adapted
-  one does, the adaptation begins anew from it.
+  one does, the adaptation begins again from it.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ WORST = GATE**2
 Derivation: then even a reading at the gate is no surprise.
 """
 _LATELY, _LOST = 20, 6
-"""Number of last readings, and of those refused among them that begin the adaptation anew.
+"""Number of last readings, and of those refused among them that begin the adaptation again.
 
 Derivation: a sensor that jumps in one reading of twenty has six of twenty refused with a probability of 3e-4.
 """
@@ -107,7 +107,7 @@ class ModelFilter(ABC):
     identified, model : Operator
         The model to begin with, and the corrected one. States of one are states of the other.
     taken, refused, restarts : int
-        Readings that were learnt from, readings that were refused, and how often the adaptation began anew.
+        Readings that were learnt from, readings that were refused, and how often the adaptation began again.
     uncertainty : float
         Standard deviation of the corrected model's output at the last reading, output units; nan before.
     """

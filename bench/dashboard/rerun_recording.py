@@ -115,7 +115,7 @@ class RerunRecording:
             self._stream.log(path, *what, static=True)
 
     def arrange(self, blueprint: rrb.Blueprint) -> None:
-        """Arrange the views anew."""
+        """Arrange the views again."""
         if self._is_written:
             self._stream.send_blueprint(blueprint)
 

@@ -141,7 +141,7 @@ class Writer:
         self._timeline.write(self.recording, parts)
 
     def arrange(self) -> None:
-        """Arrange the views anew if what they have to show has changed."""
+        """Arrange the views again if what they have to show has changed."""
         wanted = (
             frozenset(self._filled),
             None if self._errors is None else self._errors.range(),

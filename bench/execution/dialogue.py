@@ -167,7 +167,7 @@ class Dialogue:
         return f"{question.title} for {format_duration(seconds)}  {self._display.latest}"[: self._console.width - 1]
 
     def _redraw(self, status: str) -> None:
-        """Write the line above that of the cursor anew; what is typed stays."""
+        """Write the line above that of the cursor again; what is typed stays."""
         if not self._console.is_terminal or self._console.legacy_windows:
             return
         with self._display.lock:

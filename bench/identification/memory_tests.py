@@ -25,7 +25,7 @@ _SAME = 0.01
 # Derivation: twice that noise; and the difference of two readings has √2 times the noise of one.
 _LIMIT = 0.02
 _NOISE = 2.0
-# Part by which the range may grow without the other end being counted anew: reversal curves grow it step by step.
+# Part by which the range may grow without the other end being counted again: reversal curves grow it step by step.
 # Source: a choice; reversal curves in four steps or more grow a range by no more at a time.
 _GROWTH = 0.25
 # Points along a branch at which branches are compared, and the shortest common part of the input range. Source: a
@@ -206,7 +206,7 @@ def _crossing(u: Floats, y: Floats, first: int, last: int, value: float) -> floa
 def _visits(u: Floats, y: Floats) -> list[_Extremum]:
     """Return all extrema with the outputs at each visit before the memory lost them.
 
-    The greatest and the least input so far are known to the memory for good; they begin anew when the range grows by
+    The greatest and the least input so far are known to the memory for good; they begin again when the range grows by
     much, as does the first sample, which need not be an extremum.
     """
     near = _SAME * float(np.ptp(u))

@@ -223,7 +223,7 @@ def _best_shift(operator: Operator[Any] | TimedSequence, solve: Any) -> float:  
     if best in (0, _TRIALS - 1):
         raise ValueError(
             f"input-offset: at {trials[best]:.3g} {operator.input_unit}, 10 % of the operating range, the rows still "
-            "fit better; identify the model anew, or use more rows"
+            "fit better; identify the model again, or use more rows"
         )
     around = (float(trials[best - 1]), float(trials[best + 1]))
     return float(minimize_scalar(cost, bounds=around, method="bounded", options={"xatol": 1e-7 * most}).x)

@@ -171,7 +171,7 @@ class Keeper:
 
     def _commit(self, rows: Sequence[Row]) -> tuple[str, str]:
         """Write rows into the journal; return why that was not possible, and how the journal was lost; or nothing."""
-        # SQLite goes on with a file that is removed, and would make a new one where it is opened anew.
+        # SQLite goes on with a file that is removed, and would make a new one where it is opened again.
         loss = self._loss or self.store.loss()
         try:
             if rows and not loss:
@@ -258,7 +258,7 @@ class Keeper:
         assert second is not None
         raise RecordError(
             f"{path} was {self._loss} while the run went on; everything so far is in {second.path}{problem}, "
-            f"from which `bench runs repair {path.parent}` writes it anew, and the run ends here"
+            f"from which `bench runs repair {path.parent}` writes it again, and the run ends here"
         )
 
     def _look_around(self) -> None:

@@ -93,7 +93,7 @@ class Store:
         self._db.execute(f"PRAGMA busy_timeout={round(1e3 * seconds)}")
 
     def reconnect(self) -> None:
-        """Open the file anew, as after a failure of the disk."""
+        """Open the file again, as after a failure of the disk."""
         with suppress(sqlite3.Error):
             self._db.close()
         self._connect()

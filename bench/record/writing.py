@@ -311,7 +311,7 @@ def take_in(path: Path) -> tuple[Path, tuple[Signal, ...], dict[str, int], dict[
         if lost[table]:
             raise DataError(
                 f"{file} lacks {lost[table]} of its {table}, which are lost, and a run is resumed by all of them; "
-                "start the run anew"
+                "start the run again"
             )
     return file, signals, counts, {table: count for table, count in lost.items() if count}
 

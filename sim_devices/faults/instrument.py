@@ -43,7 +43,7 @@ def instrument_faults(name: str, instrument: object, line: FaultyLine) -> dict[s
             f"{name} is switched off and on again; connections on TCP are lost", partial(_restart, instrument, line)
         )
         found[f"{name}.power-loss"] = Fault(
-            f"{name} has no power: its output is off and its line dead; at the end it starts anew",
+            f"{name} has no power: its output is off and its line dead; at the end it starts again",
             partial(_lose_power, instrument, line),
             undo=partial(_regain_power, instrument, line),
         )

@@ -17,7 +17,7 @@ Assumptions, where these say nothing:
 - A burst longer than the 0.18 s that the datasheet allows is refused with exception 4.
 - DAC outputs clip at 0 and 5 V, LJTick-DAC outputs at ±10 V; their steps are even, without error of gain or
   offset. The register of a DAC reads back what was written.
-- After a timeout the watchdog timer begins anew, so that the actions are repeated; doing them again changes
+- After a timeout the watchdog timer begins again, so that the actions are repeated; doing them again changes
   nothing while there is no communication, so they are done once.
 - WAIT_US_BLOCKING, which the versions of the map at hand do not have, is a UINT32 at 61590 that takes 0 to
   100 000 µs; a longer wait is refused with exception 4. The frames of a packet of function 76 are carried out one

@@ -17,7 +17,7 @@ Assumptions, where the manuals are silent or were not at hand:
   counts only when it is sent again, which is the worst reading of the manual. A command of 0 resumes nothing on its
   own channel, an emergency stop on none.
 - The power follows the command at once (a real device has a ramp), and is 0 as long as a fault stands.
-- The amps limit acts when the power is applied, by scaling it down, and holds until it is applied anew.
+- The amps limit acts when the power is applied, by scaling it down, and holds until it is applied again.
 - A command beyond ±1000 ‰ is refused rather than clipped.
 - The device starts its node by itself (autostart); a reset by NMT clears command and emergency stop.
 - A reset by NMT brings the PDOs back to their configuration as delivered.
@@ -409,7 +409,7 @@ class EmulatedRoboteq(FreezingReadings, EmulatedInstrument, VoltageSupply):
             self._apply()
 
     def power_cycle(self) -> None:
-        """Interrupt the supply of the device: it starts anew, and says so by its boot-up message."""
+        """Interrupt the supply of the device: it starts again, and says so by its boot-up message."""
         with self.world.at_present():
             self._restart(power=True)
 

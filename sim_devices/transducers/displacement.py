@@ -28,7 +28,7 @@ class DisplacementSensor:
     reach: float = 200e-6
     """Displacement of either sign in m beyond which the output stays where it is."""
     noise: float = 10e-9
-    """White noise in m rms, drawn anew for every conversion; zero or positive."""
+    """White noise in m rms, drawn for every conversion; zero or positive."""
     resolution: float = 10e-9
     """Steps in which the sensor gives the displacement, in m."""
     _: KW_ONLY

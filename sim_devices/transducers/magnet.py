@@ -23,7 +23,7 @@ class RatiometricSensor:
     stroke: float = 0.035
     """Stroke in m."""
     noise: float = 0.01e-3
-    """White noise in m rms, drawn anew for every conversion; zero or positive."""
+    """White noise in m rms, drawn for every conversion; zero or positive."""
     resolution: float = 0.04e-3
     """Steps in which the sensor gives the position, in m."""
     supply_error: float = 20e-3

@@ -25,7 +25,7 @@ class NormalisedPSD:
     volts_per_metre: float = 1e5
     """Sensitivity in V/m."""
     noise_volts: float = 5e-3
-    """White noise of the amplifier in V rms, drawn anew for every conversion; zero or positive."""
+    """White noise of the amplifier in V rms, drawn for every conversion; zero or positive."""
     _: KW_ONLY
     rng: np.random.Generator
     """Source of the noise; nothing else may draw from it."""

@@ -45,7 +45,7 @@ class PiezoAmplifier:
     scale_error : float
         Relative deviation of gain and voltage monitor of one instance, rms; drawn once.
     noise_volts : float
-        White noise of either monitor in V rms, drawn anew for every conversion; zero or positive.
+        White noise of either monitor in V rms, drawn for every conversion; zero or positive.
     rng : numpy.random.Generator
         Source of the noise and of the errors of scale.
     """

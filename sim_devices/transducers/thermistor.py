@@ -38,7 +38,7 @@ class Thermistor:
     excitation_error: float = 10e-3
     """Deviation of the excitation of one instance, V rms; drawn once."""
     noise: float = 0.02
-    """White noise in K rms, drawn anew for every conversion; zero or positive."""
+    """White noise in K rms, drawn for every conversion; zero or positive."""
     _: KW_ONLY
     rng: np.random.Generator
     """Source of the noise and of the error of the excitation."""

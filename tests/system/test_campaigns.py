@@ -286,7 +286,7 @@ class TestTasks:
         (out / model / "model.json").write_text("broken")
         other = campaign(CHAIN, ("[0.1, 0.2]", "0.2"), ("0..1", "0..0"))
         assert start(other, "--out", out, "--workers", 1) == 1
-        assert f"; remove {model} from the campaign, and the next start makes it anew" in capsys.readouterr().err
+        assert f"; remove {model} from the campaign, and the next start makes it again" in capsys.readouterr().err
         (out / run / "journal.sqlite").unlink()
         (line,) = done_before(tasks, out).put_in_place(out)
         assert line.startswith(f"{run} is done again, as journal.sqlite is gone; what was left is in ")

@@ -187,7 +187,7 @@ class TestResume:
         db.execute("DELETE FROM events WHERE text LIKE 'step 0 at%'")
         db.commit()
         db.close()
-        with pytest.raises(ConfigurationError, match=r"has no finished step to go on from; start the run anew"):
+        with pytest.raises(ConfigurationError, match=r"has no finished step to go on from; start the run again"):
             resume(Resume(folder=folder), silent())
 
     def test_refuses_another_version_unless_it_is_accepted(self, climb):

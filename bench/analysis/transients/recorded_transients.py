@@ -88,7 +88,7 @@ class TransientRecording:
         return np.asarray(np.where(before < 0, np.inf, self.times - self.changes[np.maximum(before, 0)]))
 
     def within(self, start: float, end: float) -> TransientRecording:
-        """Return the part between two instants on the clock of the run, s, both included; times begin anew."""
+        """Return the part between two instants on the clock of the run, s, both included; times begin again."""
         rows = (self.times >= start - self.zero - 1e-9) & (self.times <= end - self.zero + 1e-9)
         first = float(self.times[rows][0])
         # A set-point at the very beginning of the part belongs to it, and not what came before.

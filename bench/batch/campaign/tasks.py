@@ -158,7 +158,7 @@ class CampaignTask(ABC):
     def _way_on(self, campaign: Path, reason: str) -> str:
         """Return how to go on if the reason why it was refused is what another task has left."""
         wrong = next((name for name in self.needs if str(campaign / name) in reason), None)
-        return f"; remove {wrong} from the campaign, and the next start makes it anew" if wrong else ""
+        return f"; remove {wrong} from the campaign, and the next start makes it again" if wrong else ""
 
     def _said_in(self, folder: Path) -> Done | None:
         try:

@@ -210,7 +210,7 @@ class Fed:
         if isinstance(message, FixedRate) and any(message.controller is used for used in self.spent):
             raise ConfigurationError(
                 f"the fast loop {message.label!r} goes on with a controller of a loop before it, whose state is not "
-                "in the record; the run cannot be resumed from here, carry it out anew"
+                "in the record; the run cannot be resumed from here, carry it out again"
             )
 
     def settle_at(self, place: Place, period: float) -> Settle:
@@ -407,7 +407,7 @@ class _Feeding:
         if not seen:
             raise ConfigurationError(
                 f"step {self._record.step} was under control, and the record does not say which readings its "
-                "controller saw (it is of an older version); the run cannot be resumed, carry it out anew"
+                "controller saw (it is of an older version); the run cannot be resumed, carry it out again"
             )
         times = ticks["t"]
         rows = np.searchsorted(times, seen, side="right") - 1

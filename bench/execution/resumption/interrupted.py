@@ -94,7 +94,7 @@ class Interrupted:
             )
         fed = feed(definition, parameters, slots, self.past)
         if fed.step is None:
-            raise ConfigurationError(f"{self.folder} has no finished step to go on from; start the run anew")
+            raise ConfigurationError(f"{self.folder} has no finished step to go on from; start the run again")
         if fed.message is not None:
             fed.check_fresh(fed.message)
         measured = [slot.signal for slot in slots.values()]

@@ -135,7 +135,7 @@ def _check_can_be_resumed(record: Record, given: Path) -> None:
     if "rig_given" not in meta:
         raise ConfigurationError(
             f"{given} is a recovered copy of a record whose metadata were lost; it takes them to resume a run, so "
-            "start it anew"
+            "start it again"
         )
 
 

@@ -422,7 +422,7 @@ class PreisachInverse(Inverse[MemoryCurve]):
         start = self.operator._pieces(before)
         count = len(before.extrema)
         room = 2 * wanted.size + max(start[0].size, count) + 2
-        # One block, as the allocator gives back to the system several as large, whose pages then come anew each time.
+        # One block, as the allocator gives back to the system several as large, whose pages it then maps each time.
         block = np.empty((6, room))
         extrema = block[5]
         extrema[:count] = before.extrema

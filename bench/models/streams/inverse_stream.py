@@ -142,7 +142,7 @@ class PreisachInverseStream(InverseStream[MemoryCurve]):
 class PlayInverseStream(InverseStream["PlayState"]):
     """The exact inverse of a Prandtl-Ishlinskii operator on arrays; equal to `PlayInverse.follow` to the last bit.
 
-    It follows targets beside the operator itself. After a `move` it starts anew from the operator's state.
+    It follows targets beside the operator itself. After a `move` it starts again from the operator's state.
     """
 
     inverse: PlayInverse
