@@ -91,7 +91,7 @@ def advise_on_record(
     if runs == 1:
         yield Advice(
             ONE_RUN,
-            "the rows are of one run, and another run may differ by more than the error on blocks",
+            "the rows are of one run, and on another run the errors may be greater",
             "give several runs, each in a file of its own, and whole runs are left out",
         )
 

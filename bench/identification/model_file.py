@@ -217,7 +217,10 @@ def load_model(path: Path, kind: str | None = None) -> ModelFile:
     try:
         content = parse_json(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise DataError(f"model file {path} cannot be read: {error.strerror}") from None
+        # Those that are kept with a run.
+        kept = ", ".join(map(str, sorted(path.glob("models/*.json"))))
+        remedy = f"; in it there is {kept}" if kept else ""
+        raise DataError(f"model file {path} cannot be read: {error.strerror}{remedy}") from None
     # Not only a JSONDecodeError: a number of thousands of digits, too.
     except ValueError as error:
         raise DataError(f"model file {path} is damaged: not JSON: {error}") from None

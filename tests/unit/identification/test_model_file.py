@@ -93,6 +93,14 @@ class TestRoundTrip:
 
 
 class TestUnusable:
+    def test_a_run_is_refused_with_the_model_that_is_kept_with_it(self, tmp_path):
+        kept = tmp_path / "models" / "m.json"
+        kept.parent.mkdir()
+        ModelFile("m", MODELS["preisach"], None).save(kept)
+        with pytest.raises(DataError) as caught:
+            load_model(tmp_path)
+        assert str(kept) in str(caught.value)
+
     def test_no_file(self, tmp_path):
         with pytest.raises(DataError, match=r"absent\.json cannot be read: No such file"):
             load_model(tmp_path / "absent.json")
