@@ -43,7 +43,8 @@ class Line(Protocol):
     """A connection to an instrument.
 
     One that knows them has attributes more: `lost`, whether it failed and has to be opened again; `repeats`, the
-    number of requests that were repeated; and `port`, which counts the `requests` if it is shared.
+    number of requests that were repeated; `resends`, how often a request is sent again at most, which is 0 after one
+    without an answer, until the next answer; and `port`, which counts the `requests` if it is shared.
     """
 
     def close(self) -> None:
@@ -189,7 +190,10 @@ class LineDevice(Device, Generic[SettingsT, LineT]):
         """Close the line, and open another to the same address."""
         repeats, requests = self.repeats, self.requests
         self._line.close()
-        self._line = self._open_line(self.name, self._settings, self._clock)
+        line: Any = self._open_line(self.name, self._settings, self._clock)
+        # Until something answers, each request is sent once, as others wait for the line.
+        line.resends = 0
+        self._line = line
         self._earlier_repeats, self._earlier_requests, self._closed = repeats, requests, False
 
     def _begin(self) -> None:

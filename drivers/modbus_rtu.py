@@ -6,8 +6,8 @@ Source: MODBUS over Serial Line, Specification and Implementation Guide V1.02, 2
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable
+from contextlib import suppress
 from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Self, TypeVar, overload
 
 from pydantic import Field
@@ -110,6 +110,8 @@ class RtuLine:
         Longest time between two replies since the attribute was last set to zero, s.
     repeats : int
         Number of requests that were repeated.
+    resends : int
+        How often a request is sent again at most; 0 after one without an answer, until the next answer.
     reading : tuple of int
         Functions that read, taken in turn.
     first_of_echo : int
@@ -140,7 +142,7 @@ class RtuLine:
         self._in_step = True
         self._echoes = 0
         self._is_open = True
-        self._resends = RESENDS
+        self.resends = RESENDS
         self.lost = False
         self.longest_silence = 0.0
         self.repeats = 0
@@ -155,15 +157,6 @@ class RtuLine:
         """Release the line."""
         self._is_open = False
         self._client.close()
-
-    @contextmanager
-    def at_most(self, resends: int) -> Iterator[None]:
-        """Send a request again so often at most."""
-        self._resends = resends
-        try:
-            yield
-        finally:
-            self._resends = RESENDS
 
     def read(self, address: int, count: int) -> list[int]:
         """Get `count` registers from `address` on, each 0 to 65535."""
@@ -218,8 +211,9 @@ class RtuLine:
         if self.lost:
             raise DeviceConnectionError(self._name, f"the line {self._settings.port} was lost; open it again")
         problem: NoReplyError | None = None
+        resends, self.resends = self.resends, RESENDS
         try:
-            for attempt in range(1 + self._resends):
+            for attempt in range(1 + resends):
                 self.repeats += attempt > 0
                 try:
                     if not self._in_step:
@@ -233,6 +227,7 @@ class RtuLine:
         except OSError as error:
             self.lost = True
             raise lost_line(self._name, self._settings, error, ", then connect again") from error
+        self.resends = 0
         if isinstance(problem, UnexpectedReplyError):
             raise DeviceConnectionError(
                 self._name, f"{problem}; check that no other master is on the line"
@@ -245,7 +240,7 @@ class RtuLine:
             "address",
             settings.address,
             other_answer(problem.heard) if problem else "",
-            resends=self._resends,
+            resends=resends,
             speed=f"{settings.baudrate} Bd, parity {settings.parity}, mode RTU{self.set_at}",
         ) from problem
 

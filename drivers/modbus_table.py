@@ -138,24 +138,21 @@ class _MeasuringLine(RtuLine, TableLine):
         self.swaps_words = settings.low_word_first
         self.first_of_echo = min(table.at for table in settings.signals.values())
 
-    def identify(self, resends: int) -> Identity:
+    def identify(self) -> Identity:
         keys = self._keys
-        with self.at_most(resends):
-            model = "Modbus instrument"
-            if keys.identity is not None:
-                wanted = keys.identity
-                found = self._identifying(wanted.at, wanted.kind)
-                if found != wanted.value:
-                    raise self._other(f"has {found:g} in register 0x{wanted.at:04X}, expected {wanted.value}")
-                model = f"{model} {wanted.value}"
-            number = (
-                "unknown"
-                if keys.serial_number_at is None
-                else f"{self._identifying(keys.serial_number_at, 'U32'):.0f}"
-            )
-            if keys.identity is None and keys.serial_number_at is None:
-                # So that something has answered at least.
-                self.quantities(list(keys.signals)[:1])
+        model = "Modbus instrument"
+        if keys.identity is not None:
+            wanted = keys.identity
+            found = self._identifying(wanted.at, wanted.kind)
+            if found != wanted.value:
+                raise self._other(f"has {found:g} in register 0x{wanted.at:04X}, expected {wanted.value}")
+            model = f"{model} {wanted.value}"
+        number = (
+            "unknown" if keys.serial_number_at is None else f"{self._identifying(keys.serial_number_at, 'U32'):.0f}"
+        )
+        if keys.identity is None and keys.serial_number_at is None:
+            # So that something has answered at least.
+            self.quantities(list(keys.signals)[:1])
         return Identity("unknown", model, number, "unknown")
 
     def start(self) -> None:

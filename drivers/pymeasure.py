@@ -237,7 +237,7 @@ class _MeasuringLine(TableLine):
                 device, f"cannot open {settings.port}: {type(error).__name__}: {error}"
             ) from None
 
-    def identify(self, resends: int) -> Identity:  # noqa: ARG002 - the library does not repeat
+    def identify(self) -> Identity:
         settings = self._settings
         if not hasattr(type(self.instrument), "id"):
             return Identity("unknown", settings.instrument.partition(":")[2], "unknown", "unknown")

@@ -163,8 +163,8 @@ class OpenPort:
         Whose request was the last.
     is_lost : bool
         Whether it failed, so that each device has to open it again.
-    answers : bool or None
-        Whether anything has come since a device last opened it; None if nothing was waited for.
+    silent : set of str
+        The devices that have waited in vain since anything has come.
     """
 
     def __init__(self, port: Any, close: Callable[[], object], address: str = "") -> None:  # noqa: ANN401
@@ -172,7 +172,7 @@ class OpenPort:
         self.devices: set[str] = set()
         self.user: Share | None = None
         self.is_lost = False
-        self.answers: bool | None = None
+        self.silent: set[str] = set()
         self._close = close
         self._address = address
 
@@ -192,19 +192,18 @@ _shared: dict[str, OpenPort] = {}
 def shared_port(address: str, device: str, open_it: Callable[[], tuple[Any, Callable[[], object]]]) -> OpenPort:
     """Return the port at an address that devices share; `open_it` opens it, and returns it and what closes it.
 
-    It is opened again if it failed, or if nothing has answered there since a device last opened it.
+    It is opened again if it failed, or if several devices have waited in vain and nothing has come since.
 
     Raises `DeviceConnectionError` if the device has it open already, as of another rig.
     """
     shared = _shared.get(address)
     if shared is not None and device in shared.devices:
         raise DeviceConnectionError(device, f"cannot open {address}: this program has opened it already")
-    if shared is not None and shared.answers is False:
+    if shared is not None and len(shared.silent) > 1:
         # Perhaps it is the adapter that is silent.
         shared.give_up()
     if shared is None or shared.is_lost:
         shared = _shared[address] = OpenPort(*open_it(), address)
-    shared.answers = None
     return shared
 
 
@@ -260,7 +259,10 @@ class Share:
 
     def _note(self, received: object) -> None:
         """Note whether what was waited for has come."""
-        self._shared.answers = self._shared.answers or bool(received)
+        if received:
+            self._shared.silent.clear()
+        else:
+            self._shared.silent.add(self._device)
 
 
 class LinePort(Share):

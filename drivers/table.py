@@ -31,7 +31,6 @@ from bench.devices import (
 )
 from drivers.device import LineDevice, attempt, refuse_hiding
 from drivers.quantities import arrival_of, check_ranges, check_read_back, output_lost, signals_of
-from drivers.serial_line import RESENDS
 
 _UNKNOWN = Identity("unknown", "unknown", "unknown", "unknown")
 
@@ -61,8 +60,8 @@ class TableLine(ABC):
         self.tables = tables
 
     @abstractmethod
-    def identify(self, resends: int) -> Identity:
-        """Return which instrument answers; a request is repeated so often at most.
+    def identify(self) -> Identity:
+        """Return which instrument answers.
 
         Raises `DeviceConnectionError` if it is none of the kind that the table describes.
         """
@@ -246,8 +245,7 @@ class TableSensor(LineDevice[Any, LineT], GeneralSensor):
         return line
 
     def _identify(self) -> Identity:
-        # An attempt to reconnect is one question, as others wait for it.
-        return self._line.identify(RESENDS if self._identity is _UNKNOWN else 0)
+        return self._line.identify()
 
     def _start(self) -> None:
         self._line.start()

@@ -25,6 +25,7 @@ class TwinLine:
         self._device = device
         self._settings = SerialSettings(port=settings.port, baudrate=settings.baudrate, timeout=settings.timeout)
         self._port = open_port(device, self._settings)
+        self.resends = RESENDS
 
     def close(self) -> None:
         """Release the line."""
@@ -35,7 +36,8 @@ class TwinLine:
 
         Raises `DeviceConnectionError` if none comes.
         """
-        for _ in range(1 + RESENDS):
+        resends, self.resends = self.resends, RESENDS
+        for _ in range(1 + resends):
             try:
                 forget_received(self._port)
                 self._port.write(request.encode() + END)
@@ -44,6 +46,7 @@ class TwinLine:
                 raise lost_line(self._device, self._settings, error) from None
             if answer.endswith(END):
                 return answer[: -len(END)].decode("ascii", "replace")
+        self.resends = 0
         raise DeviceConnectionError(self._device, f"no answer to {request!r} at {self._settings.port}")
 
 

@@ -102,6 +102,8 @@ def _print(rehearsal: Rehearsal) -> None:
             markup=False,
             soft_wrap=True,
         )
+    for text in rehearsal.shortened:
+        console.print(text, highlight=False, markup=False, soft_wrap=True)
     if rehearsal.status == "completed":
         console.print("nothing would trip" if not rehearsal.findings else "it would complete", highlight=False)
 

@@ -74,6 +74,7 @@ from bench.rig import (
     load_rig,
     read_schedule,
     schedule_faults,
+    shortened_absences,
     twin_of,
 )
 
@@ -414,6 +415,10 @@ def _checked(
         )
     # By the calendar: laboratory time may begin in any year.
     warnings = calibration_warnings(file, wall_time().astimezone().date())
+    # Of the default nobody expects that it counts for every device.
+    if "reconnect" in file.safety.model_fields_set:
+        shortened = shortened_absences(description, guarded=guarded)
+        warnings = (*(f"{file.path}: {each}" for each in shortened), *warnings)
     if not guarded:
         return warnings
     return (*check_start(description, interval=1.0 / file.safety.rate, interval_key="safety.rate"), *warnings)
@@ -470,6 +475,7 @@ def _rehearsed(
             rig=file.name,
             seed=run.seed,
             interlock_rate=_interlock_rate(run, file),
+            guarded=run.attach is not None or not file.in_process,
             interrupts=interrupts,
             observers=[display],
         )

@@ -29,7 +29,7 @@ from bench.execution.station.local import LocalStation
 from bench.operator import ABORT, RESUME, Question
 from bench.protocol import LATENESS, LONGEST, TRACES, Plan, ProtocolDefinition, ProtocolParameters, plan
 from bench.record import Event, StepRecord
-from bench.rig import SETPOINT, Interlock, Rig, RigDescription, RigFile
+from bench.rig import SETPOINT, Interlock, Rig, RigDescription, RigFile, shortened_absences
 
 LONGEST_DAYS = 30.0
 """Longest rehearsal, days of laboratory time: a protocol that waits for a reading which never comes ends there."""
@@ -137,6 +137,8 @@ class Rehearsal:
         What happened.
     marks : tuple of (int, float)
         Number of finished steps and laboratory time from the start in s, in order.
+    shortened : tuple of str
+        Which lines may be lost for less than `[safety] reconnect`, and why.
     """
 
     rig: str
@@ -152,6 +154,7 @@ class Rehearsal:
     extremes: Mapping[str, Extremes]
     findings: tuple[RehearsalFinding, ...] = ()
     marks: tuple[tuple[int, float], ...] = ()
+    shortened: tuple[str, ...] = ()
 
     @classmethod
     def of_plan(cls, description: RigDescription, definition: ProtocolDefinition, expected: Plan) -> Self:
@@ -173,6 +176,7 @@ class Rehearsal:
             prompted=expected.prompted,
             extremes=extremes,
             marks=_marks(expected.finished),
+            shortened=shortened_absences(description, guarded=not description.file.in_process),
         )
 
     @property
@@ -239,6 +243,7 @@ class Rehearsal:
             },
             "findings": [vars(finding) for finding in self.findings],
             "marks": [[steps, round(seconds, 3)] for steps, seconds in self.marks],
+            "shortened": list(self.shortened),
         }
 
     @classmethod
@@ -262,6 +267,7 @@ class Rehearsal:
             },
             findings=tuple(RehearsalFinding(**finding) for finding in content["findings"]),
             marks=tuple((steps, seconds) for steps, seconds in content["marks"]),
+            shortened=tuple(content.get("shortened", ())),
         )
 
 
@@ -276,6 +282,7 @@ def rehearse(
     rig: str,
     seed: int = 0,
     interlock_rate: float | None = None,
+    guarded: bool = False,
     interrupts: Interrupts | None = None,
     observers: Iterable[Observer] = (),
 ) -> Rehearsal:
@@ -293,6 +300,8 @@ def rehearse(
         Seed of everything random in the emulated laboratory.
     interlock_rate : float, optional
         Looks at the interlocks in a laboratory second, Hz, beside those with each reading and each tick.
+    guarded : bool
+        Whether a guardian will look at the interlocks of the run.
     interrupts : Interrupts, optional
         What the operator and the system ask for; any request ends the rehearsal.
     observers : iterable of Observer
@@ -337,6 +346,7 @@ def rehearse(
         extremes=kept.extremes(description),
         findings=tuple(kept.findings),
         marks=_marks(kept.finished),
+        shortened=shortened_absences(description, guarded=guarded),
     )
 
 

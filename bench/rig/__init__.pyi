@@ -101,10 +101,12 @@ from .slots import (
     rate_unit as rate_unit,
 )
 from .start_checks import (
+    LongestAbsence as LongestAbsence,
     calibration_warnings as calibration_warnings,
     check_start as check_start,
     lines_of as lines_of,
     longest_away as longest_away,
+    shortened_absences as shortened_absences,
 )
 from .uncertainty import (
     LEVEL as LEVEL,

@@ -242,6 +242,12 @@ class Rig:
                 read[name] = device.measure if best else device.glance
         return read
 
+    def watching(self, signals: Collection[str]) -> dict[str, Callable[[], dict[str, float]]]:
+        """Return what a look at the interlocks asks of each device, by name: for signals, and to feed watchdogs."""
+        readers = {name: actuator.glance for name, actuator in self.actuators.items()}
+        readers.update(self.readers(Look.PART, signals))
+        return {name: readers[name] for name in self.devices if name in readers}
+
     def quick_reader(self, wanted: Collection[str]) -> Callable[[], dict[str, float]]:
         """Return a function that takes a quick reading of the devices that some signals come from, and of no other.
 

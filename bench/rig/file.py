@@ -500,7 +500,8 @@ def _validate(path: str, text: str, content: Mapping[str, Any]) -> RigFile:
         if loaded is not None:
             entries.append(DeviceEntry(device, *loaded))
     # What is missing would be said twice.
-    found += [] if found else wrong_lines(entries, tables.lines)
+    if not found:
+        found += wrong_lines(entries, tables.lines, 1.0 / tables.safety.rate if tables.interlocks else 0.0)
     for i, device in enumerate(order := tables.safety.order):
         if device not in tables.devices or device in order[:i]:
             found.append(f"safety.order: {device!r}: expected devices, each once; {closest(device, tables.devices)}")

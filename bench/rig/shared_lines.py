@@ -40,11 +40,14 @@ def with_line(
     return {**lines[name], **table}
 
 
-def wrong_lines(entries: Sequence[DeviceEntry], lines: Mapping[str, Mapping[str, Any]]) -> list[str]:
+def wrong_lines(
+    entries: Sequence[DeviceEntry], lines: Mapping[str, Mapping[str, Any]], interval: float = 0.0
+) -> list[str]:
     """Return what is wrong with the lines that devices share: one message a problem.
 
     Each device needs an address that no other on its line has, what is of the line has one value for all, and a
-    device that is silent may not keep the others waiting for longer than `LONGEST_TURN`.
+    device that falls silent may not keep the others waiting for longer than `LONGEST_TURN`, nor for longer than
+    `BLIND` together with the `interval` between two looks at the interlocks, s.
     """
     found = []
     for name, keys in lines.items():
@@ -65,13 +68,19 @@ def wrong_lines(entries: Sequence[DeviceEntry], lines: Mapping[str, Mapping[str,
                 )
             else:
                 taken[address] = entry.name
-            turn = settings.longest_turn
-            if turn > LONGEST_TURN:
+            turn, allowed = settings.longest_turn, min(LONGEST_TURN, BLIND - interval)
+            if turn > allowed:
                 timeout = getattr(settings, "timeout", turn)
+                rate = f" with safety.rate = {1.0 / interval:g}" if allowed < LONGEST_TURN else ""
+                advice = (
+                    f"a timeout of {timeout * allowed / turn:.3g} s at most"
+                    if allowed > 0.0
+                    else f"a safety.rate of {1.0 / (BLIND - LONGEST_TURN):g} Hz at least"
+                )
+                key = f"{f'lines.{name}' if 'timeout' in keys else where}.timeout"
                 found.append(
-                    f"{f'lines.{name}' if 'timeout' in keys else where}.timeout = {timeout:g}: while {entry.name} is "
-                    f"silent, the others on line {name} are not asked for {turn:.3g} s; allowed are "
-                    f"{LONGEST_TURN:g} s, so a timeout of {timeout * LONGEST_TURN / turn:.3g} s at most"
+                    f"{key} = {timeout:g}: when {entry.name} falls silent, the others on line {name} are not "
+                    f"asked for {turn:.3g} s; allowed are {max(allowed, 0.0):.3g} s{rate}, so {advice}"
                 )
         for key in sorted(set().union(*(entry.settings.keys_of_line for entry in sharing))):
             given = {e.name: getattr(e.settings, key) for e in sharing if key in type(e.settings).model_fields}

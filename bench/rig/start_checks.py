@@ -6,7 +6,8 @@ Nothing here touches a device.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
+from dataclasses import dataclass
 from datetime import date
 
 from bench.base import ConfigurationError, closest
@@ -16,6 +17,7 @@ from bench.rig.description import RigDescription
 from bench.rig.file import RigFile
 from bench.rig.interlocks.config import SETPOINT, Interlock, Level
 from bench.rig.maintenance.locks import line_names, port_of
+from bench.rig.shared_lines import BLIND
 
 SHARE_OF_WATCHDOG = 0.4
 """Longest silence of the host on purpose, as a share of the shortest watchdog: one late answer may double it."""
@@ -32,18 +34,71 @@ def lines_of(file: RigFile) -> dict[str, str]:
     return {name: next(iter(line_names(port)), port or name) for name, port in ports.items()}
 
 
-def longest_away(file: RigFile, devices: Mapping[str, Device | DeviceDescription]) -> dict[str, float]:
-    """Return for how long the line of each device may be away, s; taken while all lines are there.
+@dataclass(frozen=True)
+class LongestAbsence:
+    """For how long the line of a device may be lost.
+
+    Attributes
+    ----------
+    seconds : float
+        That time, s.
+    reason : str
+        Why it is not `[safety] reconnect`; empty if it is.
+    """
+
+    seconds: float
+    reason: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.seconds:g} s{self.reason and f' at most, {self.reason}'}"
+
+
+def longest_away(
+    file: RigFile, devices: Mapping[str, Device | DeviceDescription], looked_at: Collection[str] = ()
+) -> dict[str, LongestAbsence]:
+    """Return for how long the line of each device may be lost; taken while all lines are there.
 
     It is `[safety] reconnect` of the rig file, or 0.6 of the shortest watchdog on the line: an actuator that shares
-    it is out of reach as well, and the rest of the rig is not left on after its watchdog has expired.
+    it is out of reach as well, and the rest of the rig is not left on after its watchdog has expired. Where a
+    guardian looks at interlocks, it is `BLIND` at most for the devices `looked_at`, which the interlocks need.
     """
     lines = lines_of(file)
-    longest = dict.fromkeys(lines.values(), file.safety.reconnect)
+    longest = dict.fromkeys(lines.values(), LongestAbsence(file.safety.reconnect))
     for name, line in lines.items():
-        if watchdog := devices[name].watchdog:
-            longest[line] = min(longest[line], SHARE_AWAY * watchdog)
-    return {name: longest[line] for name, line in lines.items()}
+        watchdog = devices[name].watchdog
+        if watchdog and SHARE_AWAY * watchdog < longest[line].seconds:
+            reason = f"{SHARE_AWAY:g} of the watchdog of {name}, {watchdog:g} s"
+            longest[line] = LongestAbsence(SHARE_AWAY * watchdog, reason)
+    blind = LongestAbsence(BLIND, "as an interlock needs its readings")
+    return {
+        name: blind if name in looked_at and longest[line].seconds > BLIND else longest[line]
+        for name, line in lines.items()
+    }
+
+
+def shortened_absences(rig: RigDescription, *, guarded: bool) -> tuple[str, ...]:
+    """Say for which devices `[safety] reconnect` is cut short, and by what.
+
+    Parameters
+    ----------
+    rig : RigDescription
+        What was found when it was connected.
+    guarded : bool
+        Whether a guardian looks at the interlocks.
+    """
+    looked_at: set[str] = set()
+    if guarded:
+        needed = _origins(rig, [name for each in rig.file.interlocks for name in (each.signal, each.minus)])
+        looked_at = {name for name, each in rig.devices.items() if needed & {signal.name for signal in each.signals}}
+    names: dict[str, list[str]] = {}
+    for name, longest in longest_away(rig.file, rig.devices, looked_at).items():
+        if longest.reason:
+            names.setdefault(str(longest), []).append(name)
+    reconnect = rig.file.safety.reconnect
+    return tuple(
+        f"safety.reconnect = {reconnect:g}: the line of {', '.join(each)} may be lost for {longest}"
+        for longest, each in names.items()
+    )
 
 
 def check_start(
@@ -66,8 +121,7 @@ def check_start(
     Returns
     -------
     tuple of str
-        Warnings: a key that has not its full effect, and what is accepted only since an operator is present
-        (`safety.unattended = false`).
+        Warnings: what is accepted only since an operator is present (`safety.unattended = false`).
 
     Raises
     ------
@@ -85,7 +139,7 @@ def check_start(
     if wrong:
         raise ConfigurationError("\n".join(f"{file.path}: {problem}" for problem in wrong))
     accepted = (f"{problem}; accepted, as safety.unattended = false" for problem in unguarded)
-    return tuple(f"{file.path}: {warning}" for warning in (*_shortened(rig), *accepted))
+    return tuple(f"{file.path}: {warning}" for warning in accepted)
 
 
 def calibration_warnings(file: RigFile, today: date) -> tuple[str, ...]:
@@ -128,20 +182,6 @@ def _wrong_intervals(
     for device, longest in measurements.items():
         if longest > allowed * (1.0 + 1e-9):
             yield f"devices.{device}: a measurement takes {longest:.3g} s, but {why}"
-
-
-def _shortened(rig: RigDescription) -> Iterable[str]:
-    """Say for which lines `safety.reconnect` is longer than a watchdog allows, if the file gives it."""
-    safety = rig.file.safety
-    if "reconnect" not in safety.model_fields_set:
-        return
-    for name, longest in longest_away(rig.file, rig.devices).items():
-        watchdog = rig.devices[name].watchdog
-        if watchdog and longest < safety.reconnect and longest == SHARE_AWAY * watchdog:
-            yield (
-                f"safety.reconnect = {safety.reconnect:g}: the line of {name} may be lost for {longest:g} s at most, "
-                f"{SHARE_AWAY:g} of its watchdog of {watchdog:g} s"
-            )
 
 
 def _wrong_interlock(interlock: Interlock, rig: RigDescription) -> Iterable[str]:

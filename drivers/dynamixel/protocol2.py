@@ -84,6 +84,8 @@ class ServoLine:
         Whether the servo has answered since the line was opened.
     repeats : int
         How many requests were sent again.
+    resends : int
+        How often a request is sent again at most; 0 after one without an answer, until the next answer.
     urgent : bool
         Whether requests are sent without waiting for what may still come.
     """
@@ -99,6 +101,7 @@ class ServoLine:
         self._silence = f"no answer within {settings.timeout:g} s"
         self.alert = self.answered = self.urgent = False
         self.repeats = 0
+        self.resends = RESENDS
         self.port = open_port(device, settings)
 
     def close(self) -> None:
@@ -135,10 +138,11 @@ class ServoLine:
 
     def _exchange(self, request: bytes, length: int) -> bytes:
         problem = self._silence
+        resends, self.resends = self.resends, RESENDS
         try:
             if self._clock.now() < self._quiet_at and not self.urgent:
                 self._clock.sleep_until(self._quiet_at)
-            for number in range(1 + RESENDS):
+            for number in range(1 + resends):
                 if number:
                     # The answer to the first one may come as well, after the one that is taken.
                     self.repeats += 1
@@ -158,8 +162,9 @@ class ServoLine:
             self._expect_late()
         except (serial.SerialException, OSError) as error:
             raise lost_line(self._device, self._settings, error) from None
+        self.resends = 0
         found = "" if _HEADER in self._heard else other_answer(self._heard)
-        raise no_answer(self._device, self._settings, problem, "id", self._settings.id, found)
+        raise no_answer(self._device, self._settings, problem, "id", self._settings.id, found, resends=resends)
 
     def _expect_late(self) -> None:
         """Take note that an answer to what is sent now may come late."""

@@ -81,6 +81,8 @@ class TECLine:
     ----------
     repeats : int
         Number of requests that were sent again.
+    resends : int
+        How often a request is sent again at most; 0 after one without an answer, until the next answer.
     """
 
     def __init__(self, device: str, settings: TECLineSettings) -> None:
@@ -90,6 +92,7 @@ class TECLine:
         self._sequence = 0
         self._most_resends = RESENDS
         self.repeats = 0
+        self.resends = RESENDS
         self._received = bytearray()
         self._strange = b""
         self._silence = f"no answer within {settings.timeout:g} s"
@@ -144,8 +147,7 @@ class TECLine:
         end = b"%04X\r" % crc_hqx(body, 0)
         frame, head = body + end, b"!" + body[1:7]
         self._strange = b""
-        if resends > self._most_resends:
-            resends = self._most_resends
+        resends, self.resends = min(resends, self._most_resends, self.resends), RESENDS
         try:
             for attempt in range(1 + resends):
                 if attempt:
@@ -170,6 +172,7 @@ class TECLine:
                     forget_received(self.port)
         except (serial.SerialException, OSError) as error:
             raise lost_line(self._device, self._settings, error) from None
+        self.resends = 0
         found, address = other_answer(self._strange), self._settings.address
         raise no_answer(self._device, self._settings, problem, "address", address, found, resends=resends)
 

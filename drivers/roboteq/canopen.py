@@ -141,6 +141,8 @@ class NodeLine:
         How long the last request that was answered took, s.
     repeats : int
         How many requests were sent again.
+    resends : int
+        How often a request is sent again at most; 0 after one without an answer, until the next answer.
     answered : bool
         Whether the node has answered since the line was opened.
     port : SlcanAdapter or NodePort
@@ -164,6 +166,7 @@ class NodeLine:
         self._quiet_at = -math.inf
         self.round_trip = 0.0
         self.repeats = 0
+        self.resends = RESENDS
         self.answered = self.restarted = self.urgent = False
         try:
             self.port = self._adapter = slcan.open_adapter(device, settings, settings.bitrate, settings.node)
@@ -276,7 +279,7 @@ class NodeLine:
             # As a rule they come at once, and nothing else does.
             matched = adapter.matched(_set_of(heads))
             if matched:
-                self.answered = True
+                self.answered, self.resends = True, RESENDS
                 return matched
             sent_at = clock.now()
             for _ in range(_MOST_FRAMES):
@@ -291,7 +294,7 @@ class NodeLine:
                     if head == heads[len(found)] and len(line) == 5 + 2 * int(head[4:]):
                         found.append(line[5:])
                         if len(found) == len(heads):
-                            self.answered = True
+                            self.answered, self.resends = True, RESENDS
                             return found
                 else:
                     self._notice(line)
@@ -338,12 +341,13 @@ class NodeLine:
         """Send the line of a request; return the eight bytes of its answer."""
         adapter, clock = self._adapter, self._clock
         refusals = adapter.refusals
+        resends, self.resends = self.resends, RESENDS
         try:
             if clock.now() < self._quiet_at and not self.urgent:
                 clock.sleep_until(self._quiet_at)
             self._hear()
             # Twice the same segment would be a wrong toggle bit.
-            for number in range(1 + RESENDS if multiplexer else 1):
+            for number in range(1 + resends if multiplexer else 1):
                 sent_at = clock.now()
                 if sent_at + self.round_trip >= before:
                     raise MissedError
@@ -362,7 +366,8 @@ class NodeLine:
             self._quiet_at = sent_at + _LATEST * self._adapter.patience
         except (can.CanError, serial.SerialException, OSError) as error:
             raise self._lost(error) from None
-        raise self._silence(adapter.refusals - refusals, adapter.strange)
+        self.resends = 0
+        raise self._silence(adapter.refusals - refusals, adapter.strange, resends)
 
     def _hear(self) -> None:
         """Take note of what has come, which answers nothing."""
@@ -411,14 +416,14 @@ class NodeLine:
     def _lost(self, error: BaseException) -> DeviceConnectionError:
         return lost_line(self._device, self._settings, _cause(error))
 
-    def _silence(self, refusals: int, strange: bytes) -> DeviceConnectionError:
+    def _silence(self, refusals: int, strange: bytes, resends: int) -> DeviceConnectionError:
         settings = self._settings
         found = f"; heard of node {', '.join(map(str, sorted(self._heard)))} instead" if self._heard else ""
         if refusals:
             found += f"; the adapter reports an error ({refusals} BEL)"
         found += other_answer(strange)
         problem, speed = f"no answer within {settings.timeout:g} s", f"{settings.bitrate} bit/s"
-        return no_answer(self._device, settings, problem, "node", settings.node, found, speed)
+        return no_answer(self._device, settings, problem, "node", settings.node, found, speed, resends)
 
 
 @lru_cache(maxsize=16)

@@ -25,7 +25,8 @@ from drivers.roboteq.canopen import AbortedError, Entry, NodeLine
 _VARIABLE = 16
 _MARK = Entry(0x2106, "user variable")
 _HIGHEST_MARK = 0x7FFF_FFFF
-_MOST_READINGS = 4
+MOST_READINGS = 4
+"""How often the process data are asked for until a whole set has come."""
 
 _DESTROYED, _NO_REMOTE = 1 << 31, 1 << 30
 _TPDO, _TPDO_MAPPING, _FIRST_TPDO = 0x1800, 0x1A00, 0x180
@@ -138,13 +139,15 @@ class ProcessData:
         seen: list[bytes] = []
         odd = False
         before = b""
-        for number in range(_MOST_READINGS):
+        for number in range(MOST_READINGS):
             if line.restarted:
                 break
             if number:
                 line.repeats += 1
             found = line.synchronize(self._heads, before)
             before = b""
+            if not (found or line.resends):
+                break
             if found and found[1][8:] == self._mark_digits:
                 first, second = found[0] + found[1][:8], found[2] + found[3][:8]
                 obeyed = _decoded(_COMMAND, found[3][8:])
@@ -161,6 +164,7 @@ class ProcessData:
                 before = self.next_mark()
         if seen:
             raise DeviceError(self._device, "its process data do not agree with each other; check the adapter's line")
+        line.resends = 0
         raise DeviceConnectionError(
             self._device, "no process data follow a SYNC within the timeout; check power, cable and state of the node"
         )

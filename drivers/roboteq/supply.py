@@ -35,7 +35,7 @@ from bench.base import Clock, ConfigurationError, DeviceConnectionError, DeviceE
 from bench.devices import CheckFinding, Identity, Limits, Status, VoltageSupply
 from drivers.device import RecoverableDevice, attempt
 from drivers.roboteq.canopen import ABSENT, AbortedError, Entry, MissedError, NodeLine, NodeSettings, described
-from drivers.roboteq.process_data import ProcessData, Report
+from drivers.roboteq.process_data import MOST_READINGS, ProcessData, Report
 
 DEVICE_TYPE = 0x000F0191
 """Object 0x1000 of a controller: device profile 401 (electronic data sheet)."""
@@ -117,6 +117,15 @@ class SupplySettings(NodeSettings):
     heartbeat: float = Field(
         default=0.5, ge=0.03, le=60.0, description="age of the last heartbeat after which the controller is lost, s"
     )
+
+    @property
+    def longest_turn(self) -> float:
+        """Longest time that a request and its repetitions keep the line while nothing answers, s.
+
+        Process data are waited for up to two time-outs, as the neighbours answer a SYNC as well; then the mark is
+        asked for.
+        """
+        return (2 * MOST_READINGS + 1) * self.timeout
 
     @model_validator(mode="after")
     def _check_limits(self) -> Self:

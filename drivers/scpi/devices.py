@@ -55,11 +55,11 @@ class _MeasuringLine(TextLine, TableLine):
         TableLine.__init__(self, name, settings.signals)
         TextLine.__init__(self, name, settings, clock)
 
-    def identify(self, resends: int) -> Identity:
+    def identify(self) -> Identity:
         settings = self._settings
         if not settings.identity_query:
             return Identity("unknown", "text instrument", "unknown", "unknown")
-        answer, _ = self.ask(settings.identity_query, template(ANY_TEXT), resends)
+        answer, _ = self.ask(settings.identity_query, template(ANY_TEXT))
         if template(settings.identity).match(answer) is None:
             raise DeviceConnectionError(
                 self._device,

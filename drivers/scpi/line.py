@@ -41,6 +41,8 @@ class TextLine:
         Whether the line itself failed, so that it has to be opened again.
     repeats : int
         Number of questions that were repeated.
+    resends : int
+        How often a question is sent again at most; 0 after one without an answer, until the next answer.
     port : Any
         The port, None of VISA.
 
@@ -58,6 +60,7 @@ class TextLine:
         self._in_step = True
         self.lost = False
         self.repeats = 0
+        self.resends = RESENDS
         self._end, self._encoding, self._delay = settings.write_terminator, settings.encoding, settings.delay
         self._transport = open_transport(device, settings, settings.read_terminator.encode(settings.encoding))
         self.port = getattr(self._transport, "port", None)
@@ -94,11 +97,13 @@ class TextLine:
         """
         units = units or {}
         answer: str | None = None
+        resends = min(resends, self.resends)
         for attempt in range(1 + resends):
             self.repeats += attempt > 0
             if not self._in_step and not self._catch_up():
                 continue
             answer = self._exchange(question)
+            self.resends = 0 if answer is None else RESENDS
             numbers = None if answer is None else form.match(answer, units)
             if answer is not None and numbers is not None:
                 return answer, numbers

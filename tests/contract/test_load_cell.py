@@ -10,7 +10,7 @@ from emulated_bench import Bench, Given, OnABench, over_the_wire, serial_port
 from bench.base import DeviceError, VirtualClock
 from bench.contracts import LineLostContract, LoadCellContract, RestartedInstrumentContract
 from drivers.flintec_dad141 import FlintecDAD141
-from sim_devices.instruments.flintec_dad141 import EmulatedDAD141, reading_interval
+from sim_devices.instruments.flintec_dad141 import START_TIME, EmulatedDAD141, reading_interval
 from sim_devices.protocol_emulated import register, unregister
 from sim_devices.wire.modbus_rtu import ModbusRtuServer
 from sim_devices.world import World
@@ -73,7 +73,7 @@ class TestAfterARestart(OnABench, RestartedInstrumentContract):
             self.bench.device.tare()
         return self.bench.device
 
-    @pytest.fixture(params=[0.0, 0.5])
+    @pytest.fixture(params=[START_TIME, 1.0])
     def restart(self, request):
         def power_cycle():
             self.bench.instrument.power_cycle()
@@ -107,7 +107,11 @@ class TestLineLost(OnABench, LineLostContract):
 
     @pytest.fixture
     def restart(self, bench):
-        return bench.instrument.power_cycle
+        def power_cycle():
+            bench.instrument.power_cycle()
+            bench.clock.sleep(START_TIME)
+
+        return power_cycle
 
     @pytest.fixture
     def exchange(self, bench):

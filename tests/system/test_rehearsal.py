@@ -104,6 +104,29 @@ class TestRehearsal:
         others = [rehearsed(seed) for seed in range(3)]
         assert np.median(others) == pytest.approx(outcome.laboratory_seconds, rel=0.12)
 
+    @pytest.mark.parametrize(
+        ("rig", "overrides", "shortened"),
+        [
+            ("vo2", {}, ["tec may be lost for 3 s at most, 0.6 of the watchdog of tec, 5 s"]),
+            ("vo2", {"safety.reconnect": "3.0"}, []),
+            # A guardian would look at the interlocks.
+            ("vo2-hardware", {}, ["tec, psd may be lost for 2 s at most, as an interlock needs its readings"]),
+        ],
+    )
+    def test_what_cuts_the_key_reconnect_short_is_said(self, make, console, rig, overrides, shortened):
+        creep = find_protocol("creep")
+        found = foresee(make(definition=creep, rig=rig, overrides=overrides), console)
+        assert [*found.shortened] == [f"safety.reconnect = 10: the line of {each}" for each in shortened]
+        assert Rehearsal.from_json(found.to_json()).shortened == found.shortened
+
+    def test_the_key_reconnect_that_is_cut_short_is_warned_of_in_the_record(self, make, console):
+        run = make(
+            rig="vo2", definition=find_protocol("creep"), clock="virtual", overrides={"safety.reconnect": "10"}
+        )
+        with Record(carry_out(run, console).folder) as record:
+            warnings = [event.text for event in record.events() if event.level == "WARN"]
+        assert any("safety.reconnect = 10: the line of tec may be lost for 3 s at most" in each for each in warnings)
+
     def test_margins_are_those_to_devices_and_interlocks(self, make, console):
         rehearsal = foresee(make(settings={"start": 40.0}), console)
         setpoint, probe = rehearsal.extremes["tec_setpoint"], rehearsal.extremes["probe_temperature"]

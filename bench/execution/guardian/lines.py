@@ -17,6 +17,7 @@ from typing import Any
 from bench.base import Clock, DeviceConnectionError
 from bench.devices import Device
 from bench.execution.station.reconnection import Absence
+from bench.rig import LongestAbsence
 
 SAFE, BENCH, LOOK = range(3)
 """Priorities of calls that wait for their line: the safe state, requests of the bench, looks at the interlocks."""
@@ -70,7 +71,7 @@ class LineThreads:
     clock : Clock
         The clock of the run.
     longest : callable
-        Returns for how long the line of a device may be away, s.
+        Returns for how long the line of a device may be away.
     notify : callable
         Called in the thread of a line with the name of a device whose line was away, for how long (s), and why.
 
@@ -85,7 +86,7 @@ class LineThreads:
         devices: Mapping[str, Device],
         lines: Mapping[str, str],
         clock: Clock,
-        longest: Callable[[str], float],
+        longest: Callable[[str], LongestAbsence],
         notify: Callable[[str, float, str], None],
     ) -> None:
         self._devices = devices
@@ -116,9 +117,11 @@ class LineThreads:
         away: list[str] = []
         while True:
             call = self._next(calls, away)
+            before = len(away)
             if call is not None:
                 self._serve(call, away)
-            if away:
+            # A device that has just been missed has had its turn.
+            if away and len(away) == before:
                 # One attempt at most between two calls, each device in its turn.
                 device = min(away, key=self._due)
                 if self._due(device) <= self._clock.now() or self._ending.is_set():

@@ -105,7 +105,7 @@ class Guardian:
         watch = InterlockWatch(rig.file.interlocks, {each.name: each.display for each in rig.signals})
         self._core = StationCore(watch, 1.0 / (safety.rate * min(factor, 10.0)))
         self._watched = watch.signals
-        self._looked_at = self._look_readers()
+        self._looked_at = rig.watching(watch.signals)
         self._statuses: list[Status] = []
         self._news: list[News] = []
         self._box = BlackBox()
@@ -113,9 +113,6 @@ class Guardian:
         self._wake, self._woken = socket.socketpair()
         for each in (self._wake, self._woken):
             each.setblocking(False)
-        # Once: a host is looked up by its name, which takes long when its line is lost.
-        self._line_may_be_away = longest_away(rig.file, rig.devices)
-        self._lines = LineThreads(rig.devices, lines_of(rig.file), rig.clock, self._longest_away, self._line_was_away)
         self._looking: set[str] = set()
         self._latest: dict[str, dict[str, float]] = {}
         self._concerned = {name: self._signals_of(name) for name in self._looked_at}
@@ -123,6 +120,11 @@ class Guardian:
         self._said_at = 0.0
         self._requested = 0.0
         self._seen_at = {name: self._wall.now() for name, known in self._concerned.items() if known & self._watched}
+        # Once: a host is looked up by its name, which takes long when its line is lost.
+        self._longest_away = longest_away(rig.file, rig.devices, self._seen_at)
+        self._lines = LineThreads(
+            rig.devices, lines_of(rig.file), rig.clock, self._longest_away.__getitem__, self._line_was_away
+        )
         self._bench_is_there = True
         self._loss: GuardianError | None = None
         self._lost_at = 0.0
@@ -212,7 +214,7 @@ class Guardian:
             if (taken := now - self._requested) > LONGEST_ANSWER + self._rig.file.safety.reconnect:
                 self._core.trip(GuardianError(f"a request was not carried out within {taken:.0f} s"))
         for name, seen in self._seen_at.items():
-            if now - seen > BLIND + self._longest_away(name):
+            if now - seen > BLIND + self._longest_away[name].seconds:
                 self._core.trip(DeviceError(name, f"could not be looked at for {now - seen:.1f} s; see its line"))
         if self._core.over:
             self._keep_safe(now)
@@ -424,13 +426,6 @@ class Guardian:
 
     # Interlocks
 
-    def _look_readers(self) -> dict[str, Callable[[], dict[str, float]]]:
-        """Return what is asked at each look: what interlocks need, and what feeds the watchdogs of instruments."""
-        readers = self._rig.readers(Look.PART, self._watched)
-        for name, device in self._rig.actuators.items():
-            readers.setdefault(name, device.glance)
-        return {name: readers[name] for name in self._rig.devices if name in readers}
-
     def _signals_of(self, name: str) -> frozenset[str]:
         """Return the signals of a device, and the derived ones that come from them."""
         own = {signal_.name for signal_ in self._rig.devices[name].signals}
@@ -464,10 +459,6 @@ class Guardian:
                 self._seen_at[name] = now
         findings = self._core.judge(t, values, self._rig.setpoints, now=now, factor=self._factor)
         self._news += news_of(findings)
-
-    def _longest_away(self, name: str) -> float:
-        longest = self._line_may_be_away[name]
-        return min(longest, BLIND) if name in self._seen_at else longest
 
     def _line_was_away(self, name: str, seconds: float, why: str) -> None:
         text = f"{name}: line lost for {seconds:.1f} s: {why}"

@@ -42,11 +42,13 @@ class LocalStation(Station):
         watch = InterlockWatch(rig.file.interlocks, {each.name: each.display for each in rig.signals})
         self._core = StationCore(watch, 1.0 / interlock_rate if interlock_rate else math.inf)
         self._watched = watch.signals
+        self._watching = rig.watching(watch.signals)
         self._core.begin(self.clock.now())
         self._statuses: list[Status] = []
         self._news: list[News] = []
         self._safe: Mapping[str, str] | None = None
         self._lost: set[str] = set()
+        self._away: set[str] = set()
         self._slow: dict[str, tuple[float, float]] = {}
         """When a device that took long had answered or failed, and how long it took, s."""
         self._longest_away = longest_away(rig.file, rig.devices)
@@ -209,8 +211,9 @@ class LocalStation(Station):
 
     def _made_safe(self) -> dict[str, str]:
         order = self._rig.file.safety.order
-        # A stable sort: those that have no order come after the others, as they stand.
-        ranked = sorted(self._rig.devices, key=lambda name: order.index(name) if name in order else len(order))
+        ranks = {name: order.index(name) if name in order else len(order) for name in self._rig.devices}
+        # Those that have no order come after the others, as they stand, and what is silent after what answers.
+        ranked = sorted(ranks, key=lambda name: (ranks[name], name in self._away))
         return make_safe(self._rig.devices[name] for name in ranked)
 
     def _ask(self, name: str, call: Callable[[], _T]) -> _T:
@@ -237,21 +240,28 @@ class LocalStation(Station):
         raise type(error)(error.device, f"{error.text} ({causes} just before)") from error
 
     def _reconnect(self, name: str, error: DeviceConnectionError) -> None:
+        self._away.add(name)
         absence = Absence(self._rig.devices[name], error, self.clock, self._longest_away[name])
+        # Those that share its line have waited for it.
+        self._look_at_others()
         while (seconds := absence.try_again()) is None:
-            self._feed_others(name)
+            self._look_at_others()
             self.clock.sleep_until(absence.due)
+        self._away.discard(name)
         self._lost.add(name)
         self._news.append(News("WARN", "line", f"{name}: line lost for {seconds:.1f} s: {error}"))
 
-    def _feed_others(self, name: str) -> None:
-        """Keep the watchdogs of other instruments from expiring."""
-        for other, device in self._rig.actuators.items():
-            # That of a servo only stops a motion, so it declares none.
-            if other != name:
-                # What is wrong with it the next reading finds.
-                with suppress(DeviceError):
-                    device.glance()
+    def _look_at_others(self) -> None:
+        """Judge what the devices that are not away show by the interlocks; this feeds their watchdogs as well."""
+        readings = {}
+        for name, read in self._watching.items():
+            if name not in self._away:
+                # One that is silent as well is looked for once this one is back.
+                with suppress(DeviceConnectionError):
+                    readings[name] = read()
+        values = self._rig.assembled(readings)
+        self._note(self._core.judge(self.clock.now(), values, self._rig.setpoints))
+        self._raise_if_tripped()
 
     def _note(self, findings: tuple[InterlockFinding, ...]) -> None:
         if findings:

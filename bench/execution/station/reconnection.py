@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from bench.base import Clock, DeviceConnectionError
 from bench.devices import Device
+from bench.rig import LongestAbsence
 
 TRIES = 3
 """How often all devices are read at most, when a line is lost and comes back while they are read."""
@@ -23,8 +24,8 @@ class Absence:
         What it failed with.
     clock : Clock
         The clock of the run.
-    longest : float
-        How long it may be away, s; see `longest_away`.
+    longest : LongestAbsence
+        How long it may be away; see `longest_away`.
 
     Attributes
     ----------
@@ -39,7 +40,7 @@ class Absence:
         What it failed with, if its driver cannot open its line again.
     """
 
-    def __init__(self, device: Device, lost: DeviceConnectionError, clock: Clock, longest: float) -> None:
+    def __init__(self, device: Device, lost: DeviceConnectionError, clock: Clock, longest: LongestAbsence) -> None:
         if type(device).reconnect is Device.reconnect:
             raise lost
         self.lost = lost
@@ -62,9 +63,9 @@ class Absence:
             self._device.reconnect()
         except DeviceConnectionError:
             now = self._clock.now()
-            if now - self._since >= self._longest:
+            if now - self._since >= self._longest.seconds:
                 raise DeviceConnectionError(
-                    self.lost.device, f"{self.lost.text}; it was not back within {self._longest:g} s"
+                    self.lost.device, f"{self.lost.text}; it was not back within {self._longest}"
                 ) from None
             if self._clock.interrupted():
                 raise self.lost from None

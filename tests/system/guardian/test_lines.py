@@ -10,6 +10,7 @@ from cases import cases
 from bench.base import DeviceConnectionError, DeviceRestartedError, VirtualClock, WallClock
 from bench.devices import Device
 from bench.execution.guardian.lines import BENCH, LOOK, SAFE, LineThreads
+from bench.rig import LongestAbsence
 
 LONG = 60.0
 """Wall-clock time that a busy machine may take, s."""
@@ -55,7 +56,11 @@ class Bench:
         self.results = queue.SimpleQueue()
         self.news = []
         self.threads = LineThreads(
-            self.devices, lines, clock or VirtualClock(), lambda _: longest, lambda *news: self.news.append(news)
+            self.devices,
+            lines,
+            clock or VirtualClock(),
+            lambda _: LongestAbsence(longest),
+            lambda *news: self.news.append(news),
         )
 
     def submit(self, priority, device, call):

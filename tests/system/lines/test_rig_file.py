@@ -57,7 +57,17 @@ def test_the_address_stands_for_its_placeholder_everywhere():
         ),
         ("buses", {"lines.cells.party": '"E"'}, r"devices\.load1\.party: there is no such key"),
         ("buses", {"lines.cells.timeout": "0.5"}, r"lines\.cells\.timeout = 0\.5: .* timeout of 0\.429 s at most"),
-        ("buses", {"devices.load2.timeout": "3.0"}, r"devices\.load2\.timeout = 3: while load2 is silent"),
+        ("buses", {"devices.load2.timeout": "3.0"}, r"devices\.load2\.timeout = 3: when load2 falls silent"),
+        (
+            "buses",
+            {"lines.cells.timeout": "0.4", "safety.rate": "1.0"},
+            r"0\.4: .* not asked for 1\.4 s; allowed are 1 s with safety\.rate = 1, so .* 0\.286 s",
+        ),
+        (
+            "buses",
+            {"safety.rate": "0.4"},
+            r"allowed are 0 s with safety\.rate = 0\.4, so a safety\.rate of 2 Hz at least",
+        ),
         ("supply", {"devices.plate.address": '""'}, r"devices\.plate\.line = 'bus': needs the key address"),
         (
             "supply",

@@ -17,6 +17,7 @@ from bench.rig import (
     check_start,
     load_rig,
     packaged_rigs,
+    shortened_absences,
 )
 
 SUPPLY = Path(__file__).parents[3] / "examples" / "bench-supply.toml"
@@ -61,15 +62,23 @@ unit = "A"
 
 
 @pytest.fixture
-def check(tmp_path):
+def describe(tmp_path):
     path = tmp_path / "mine.toml"
     path.write_text('extends = "vo2"\n' + DERIVED)
     file = replace(load_rig(str(path)), path="mine.toml")
     found = (TEC.setpoint_signal, *TEC.signals, *PSD.signals, *signals(curvature="1/m", twice="A", excess="A"))
 
-    def check(*interlocks, devices=(TEC, PSD), interval=0.2, key="safety.rate", measurements=None, **safety):
+    def describe(*interlocks, devices=(TEC, PSD), **safety):
         guarded = replace(file, interlocks=interlocks, safety=SafetyTable(**safety))
-        description = RigDescription(guarded, {device.name: device for device in devices}, found)
+        return RigDescription(guarded, {device.name: device for device in devices}, found)
+
+    return describe
+
+
+@pytest.fixture
+def check(describe):
+    def check(*interlocks, interval=0.2, key="safety.rate", measurements=None, **keys):
+        description = describe(*interlocks, **keys)
         return check_start(description, interval=interval, interval_key=key, measurements=measurements)
 
     return check
@@ -116,12 +125,16 @@ class TestIntervals:
         assert check(devices=devices, interval=60.0) == ()
 
 
-def test_a_key_that_a_watchdog_cuts_short_is_said_with_the_time_that_counts(check):
+def test_a_key_that_is_cut_short_is_said_with_the_time_that_counts_and_the_cause(describe):
     devices = [TEC, replace(PSD, watchdog=None)]
-    (warning,) = check(HOT, devices=devices, reconnect=10.0)
-    assert warning.startswith("mine.toml: safety.reconnect = 10: the line of tec may be lost for 3 s at most")
-    assert warning.endswith("watchdog of 5 s")
-    assert check(HOT, devices=devices, reconnect=3.0) == check(HOT, devices=devices) == ()
+
+    def shortened(guarded, reconnect):
+        return shortened_absences(describe(HOT, devices=devices, reconnect=reconnect), guarded=guarded)
+
+    said = "safety.reconnect = 10: the line of tec may be lost for"
+    assert shortened(guarded=False, reconnect=10.0) == (f"{said} 3 s at most, 0.6 of the watchdog of tec, 5 s",)
+    assert shortened(guarded=True, reconnect=10.0) == (f"{said} 2 s at most, as an interlock needs its readings",)
+    assert shortened(guarded=False, reconnect=3.0) == shortened(guarded=True, reconnect=2.0) == ()
 
 
 class TestADeviceThatHeats:

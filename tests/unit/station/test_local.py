@@ -119,7 +119,8 @@ class TestReconnection:
             assert rig.devices["displacement"].watchdog is None
             longest = longest_away(rig.file, rig.devices)
             for name in ("displacement", "piezo"):
-                assert longest[name] == 0.6 * watchdog
+                assert longest[name].seconds == 0.6 * watchdog
+                assert "watchdog of piezo" in longest[name].reason
         finally:
             rig.close()
 

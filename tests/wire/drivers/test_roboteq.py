@@ -532,6 +532,7 @@ def test_errors_of_the_adapter_are_counted_and_named(script, supply):
     script.instead = [b"\a", b"\a\a", b""]
     with pytest.raises(DeviceConnectionError, match=r"the adapter reports an error \(3 BEL\)"):
         supply.measure()
+    supply.measure()
     script.silent = True
     with pytest.raises(DeviceConnectionError, match=r"3 requests; check"):
         supply.measure()
