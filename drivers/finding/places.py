@@ -84,7 +84,8 @@ def answers(file: RigFile, ports: Sequence[Port]) -> list[Answer]:
 
 def _asked(entries: Iterable[DeviceEntry], port: Port, *, others: bool = False) -> Iterator[Answer]:
     heard: list[DeviceEntry] = []
-    for entry in sorted(entries, key=lambda each: port_of(each.settings) not in (port.address, port.link)):
+    asked = filter(_tells_identity, entries)
+    for entry in sorted(asked, key=lambda each: port_of(each.settings) not in (port.address, port.link)):
         if port.in_network != (issubclass(entry.driver, T7Device) or port_of(entry.settings).startswith("tcp://")):
             continue
         # A line has one dialect: its equals, and those that share the line.
@@ -96,6 +97,11 @@ def _asked(entries: Iterable[DeviceEntry], port: Port, *, others: bool = False) 
                 heard.append(entry)
                 yield Answer(entry.name, port, identity, changed)
                 break
+
+
+def _tells_identity(entry: DeviceEntry) -> bool:
+    """Return whether an instrument can be asked who it is; a text instrument may have no question for it."""
+    return getattr(entry.settings, "identity_query", None) != ""
 
 
 def _may_share(one: DeviceEntry, other: DeviceEntry) -> bool:
@@ -187,6 +193,8 @@ def _wanted(entry: DeviceEntry) -> str:
 
 def _unplaced(entry: DeviceEntry, own: Sequence[Answer], fitting: Collection[str], alike: Sequence[str]) -> str:
     """Return why a device has no place; `own` are its answers, `alike` the devices that it may be taken for."""
+    if not _tells_identity(entry):
+        return "cannot be asked who it is: its identity_query is empty"
     if not own:
         return "nothing answers as it would: check power, cable, address and speed"
     heard = " and ".join(f"{each.identity.serial_number} at {each.port.name}" for each in own)

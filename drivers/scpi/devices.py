@@ -60,6 +60,10 @@ class _MeasuringLine(TextLine, TableLine):
         if not settings.identity_query:
             return Identity("unknown", "text instrument", "unknown", "unknown")
         answer, _ = self.ask(settings.identity_query, template(ANY_TEXT))
+        if answer == settings.identity_query and not settings.echo:
+            raise DeviceConnectionError(
+                self._device, f"{settings.port} hands back what is sent; set echo = true, and check that it has power"
+            )
         if template(settings.identity).match(answer) is None:
             raise DeviceConnectionError(
                 self._device,
