@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from cases import cases
 
-from bench.base import DeviceConnectionError, DeviceError, VirtualClock
+from bench.base import ConfigurationError, DeviceConnectionError, DeviceError, VirtualClock
 from bench.rig import Rig, load_rig
 from sim_devices import protocol_emulated
 from sim_devices.wire import WireServer
@@ -61,7 +61,8 @@ KEYSIGHT = {
     "*IDN?": "HEWLETT-PACKARD,E3632A,0,1.1-5.0-1.0",
     "SYST:ERR?": '+0,"No error"',
     "VOLT? MIN": "+0.00000000E+00",
-    "VOLT? MAX": "+3.08976000E+01",
+    # Page 88: of the selected range, which is that of 15 V at first.
+    "VOLT? MAX": "+1.54500000E+01",
     "MEAS:VOLT?": "+1.20012000E+00",
     "MEAS:CURR?": "+5.99870000E-02",
 }
@@ -84,6 +85,12 @@ def test_answers_as_the_manuals_print_them_are_read(connect, name, answers, seri
     assert device.identity.serial_number == serial_number
     assert device.measure() == pytest.approx(values, rel=1e-9)
     protocol_emulated.unregister("printed")
+
+
+def test_limits_beyond_the_selected_range_are_refused_on_connecting(connect):
+    (entry,) = load_rig(str(FOLDER / "keysight-e3632a.toml"), {"devices.supply.setpoint.limits": "[0, 20]"}).devices
+    with pytest.raises(ConfigurationError, match=r"limits = 0 to 20 V: the instrument takes 0 to 15\.45 V"):
+        connect("keysight-e3632a.toml", KEYSIGHT, setpoint=entry.settings.setpoint)
 
 
 @cases(
