@@ -444,6 +444,11 @@ class UncertainSignals:
             ) from None
         return scale * factor * component.uncertainty
 
+    def scatter(self, signal: str) -> float | None:
+        """Return by how much measurements of a signal scatter as it is stated, in its unit; None if no noise is."""
+        own = {name: each.acts for name, each in self._stated.get(signal, {}).items() if each.acts in OWN}
+        return math.hypot(*(self._sizes[signal, name] for name in own)) if "noise" in own.values() else None
+
     def stated(self, names: Sequence[str]) -> list[str]:
         """Return those of some signals whose uncertainty is stated, with that of all signals behind them."""
         return [name for name in names if self._is_stated(name)]

@@ -2,6 +2,7 @@
 
 import io
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -322,9 +323,18 @@ class TestDoctor:
         ("override", "place", "words"),
         [
             ("roles.drive.range=[0.0,120.0]", ("tec", "limits"), "0 and 120 beyond 15 to 95 °C"),
-            ("roles.drive.reset.noise=1e-6", ("tec", "tec_temperature"), "typical 1e-06"),
+            (
+                "roles.drive.reset.noise=1e-6",
+                ("tec", "tec_temperature"),
+                "quick readings (stated: 1e-06 K, roles.drive.reset.noise)",
+            ),
             ("devices.tec.temperature_limits=[-10,95]", ("tec", "error thresholds"), "0 to 105 °C of the object"),
             ("telemetry.period=0.01", ("", "time"), "every 0.01 s"),
+            (
+                "uncertainty.psd_position.noise.standard=1e-10",
+                ("psd", "psd_position"),
+                "measurements (stated: 0.1 nm, uncertainty.psd_position)",
+            ),
             ("devices.psd.calibration_due=2020-02-29", ("psd", "calibration"), "due on 2020-02-29, "),
         ],
     )
@@ -342,6 +352,20 @@ class TestDoctor:
         assert code == 1
         assert "2 s between two readings" in findings["tec", "watchdog"]["text"]
 
+    def test_every_reading_has_a_unit_and_every_actuator_says_whether_it_was_moved(self, bench, tmp_path):
+        file = tmp_path / "check.json"
+        bench("rig", "check", "sma", "--exercise", "--json", file)
+        texts = {
+            (check["device"], finding["subject"]): finding["text"]
+            for check in json.loads(file.read_text())["devices"]
+            for finding in check["findings"]
+        }
+        reading = r"[-\d.]+ µm, noise [\d.]+ µm of 20 quick readings, [\d.]+ µm of 5 measurements \(stated: [\d.]+ µm"
+        assert re.match(reading, texts["wire_end", "wire_end_position"])
+        assert "supply_voltage went from 0.000 V to 0.100 V" in texts["supply", "exercise"]
+        assert "100% of the way" in texts["supply", "exercise"]
+        assert "not moved" in texts["stage", "exercise"]
+
     def test_an_actuator_that_does_not_follow(self, bench, tmp_path):
         options = ["--exercise", "--override", "roles.drive.reading=tec_sink_temperature"]
         code, findings = self.findings(bench, tmp_path, "vo2", *options)
@@ -352,7 +376,11 @@ class TestDoctor:
         ("override", "subject", "words"),
         [
             ("emulation.signals.supply_voltage.expression=0.5 * supply_output", "scale", "50% of the way"),
-            ("interlocks=[{signal='supply_voltage', high=0.5}]", "interlock", "outside of -inf to 0.5"),
+            (
+                "interlocks=[{signal='supply_voltage', high=0.5}]",
+                "interlock",
+                "supply_voltage was 1.000 V meanwhile, allowed is ≤ 0.5 V",
+            ),
         ],
     )
     def test_an_actuator_that_arrives_elsewhere(self, bench, tmp_path, override, subject, words):

@@ -10,8 +10,8 @@ from datetime import date
 from functools import partial
 from itertools import pairwise
 
-from bench.base import BenchError, Clock, DeviceConnectionError, DeviceError, wall_time
-from bench.devices import Actuator, CheckFinding, Device, DeviceDescription, Limits, Status
+from bench.base import BenchError, Clock, DeviceConnectionError, DeviceError, difference_unit, prefixed, wall_time
+from bench.devices import Actuator, CheckFinding, Device, DeviceDescription, Limits, Signal, Status
 from bench.rig.calibration import Calibrated
 from bench.rig.file import RigFile
 from bench.rig.interlocks.config import Interlock
@@ -19,6 +19,7 @@ from bench.rig.maintenance.opening import Workplace
 from bench.rig.maintenance.safe_state import SAFE, make_safe
 from bench.rig.slots import RoleTable, reading_of
 from bench.rig.start_checks import SHARE_AWAY, SHARE_OF_WATCHDOG, has_watchdog_key
+from bench.rig.uncertainty import UncertainSignals
 
 GLANCES, MEASUREMENTS = 20, 5
 """How many of each are taken for noise and time."""
@@ -125,7 +126,11 @@ def check_up(place: Workplace, exercise: bool, keep_on: Callable[[], None]) -> l
                 of(name, partial(_watchdog, device, place.file))
         whole += _times(place.file, devices, ticks)
         if exercise:
-            for name, role in _exercised(place.file.roles, devices).items():
+            moving = _exercised(place.file.roles, devices)
+            for name, device in devices.items():
+                if isinstance(device, Actuator) and name not in moving:
+                    found[name].append(CheckFinding("exercise", "not moved, as no role gives it a rest"))
+            for name, role in moving.items():
                 if name not in failed:
                     of(name, partial(_exercise, devices, name, role, place, keep_on))
     finally:
@@ -173,23 +178,33 @@ def _readings(device: Device, place: Workplace, ticks: dict[str, float]) -> list
     glances, glance_time = _repeat(device.glance, GLANCES, place.clock)
     measurements, measure_time = _repeat(device.measure, MEASUREMENTS, place.clock)
     ticks[device.name] = glance_time
+    units = {signal.name: signal.unit for signal in device.signals}
+    known = {name: each for name, each in place.file.uncertainty.items() if name in units}
+    uncertain = UncertainSignals(known, {}, units, place.file.path)
     findings = []
     for signal in device.signals:
         quick = [values[signal.name] for values in glances]
         slow = [values[signal.name] for values in measurements]
-        value, noise = math.fsum(slow) / len(slow), deviation(quick)
-        text = (
-            f"{value:.6g} {signal.unit}, noise {noise:.2g} (of {GLANCES} quick readings), "
-            f"{deviation(slow):.2g} (of {MEASUREMENTS} measurements)"
-        )
-        typical, advice = _typical_noise(signal.name, place.file.roles, {device.name: device}), ""
-        if typical is not None:
-            text += f"; typical {typical:.2g}"
-            if noise > _MUCH_NOISE * typical:
-                advice = "look for a loose cable, a ground loop, or a load that is not at rest"
+        value, shown = math.fsum(slow) / len(slow), signal.display
+        parts, advice = [], ""
+        for readings, what, stated, key in (
+            (
+                quick,
+                f"{GLANCES} quick readings",
+                *_typical_noise(signal.name, place.file.roles, {device.name: device}),
+            ),
+            (slow, f"{MEASUREMENTS} measurements", uncertain.scatter(signal.name), f"uncertainty.{signal.name}"),
+        ):
+            noise = deviation(readings)
+            parts.append(f"{_size(noise, signal)} of {what}")
+            if stated is not None:
+                parts[-1] += f" (stated: {_size(stated, signal)}, {key})"
+                if noise > _MUCH_NOISE * stated:
+                    advice = "look for a loose cable, a ground loop, or a load that is not at rest"
+        text = f"{shown.text(value)}, noise {', '.join(parts)}"
         for lock in place.file.interlocks:
             if lock.signal == signal.name and not lock.minus and not lock.low <= value <= lock.high:
-                text += f"; outside of its interlock, {lock.low:g} to {lock.high:g} {signal.unit}"
+                text += f"; outside of its interlock, {shown.between(lock.low, lock.high)}"
                 advice = "bring it into the range of its interlock before a run"
         findings.append(CheckFinding(signal.name, text, advice))
     text = f"{1e3 * glance_time:.3g} ms a quick reading, {1e3 * measure_time:.3g} ms a measurement"
@@ -216,17 +231,24 @@ def deviation(values: list[float]) -> float:
     return math.sqrt(math.fsum((value - mean) ** 2 for value in values) / max(1, len(values) - 1))
 
 
-def _typical_noise(signal: str, roles: Mapping[str, RoleTable], devices: Mapping[str, Device]) -> float | None:
-    """Return what the rig file says that a signal varies by; None if it says nothing."""
-    for role in roles.values():
+def _size(noise: float, signal: Signal) -> str:
+    """Return the standard deviation of readings with its unit."""
+    return prefixed(noise, difference_unit(signal.unit), 3)
+
+
+def _typical_noise(
+    signal: str, roles: Mapping[str, RoleTable], devices: Mapping[str, Device]
+) -> tuple[float | None, str]:
+    """Return what the rig file says that quick readings of a signal vary by, None if nothing; and the key."""
+    for name, role in roles.items():
         if role.reset is None or role.reset.noise is None:
             continue
         watched = role.reset.signal or role.signal or role.reading
         if not watched and role.device in devices:
             watched = _reading(role, devices)
         if watched == signal:
-            return role.reset.noise
-    return None
+            return role.reset.noise, f"roles.{name}.reset.noise"
+    return None, ""
 
 
 def _reading(role: RoleTable, devices: Mapping[str, Device]) -> str:
@@ -278,7 +300,13 @@ def _watchdog(device: Actuator, file: RigFile) -> list[CheckFinding]:
             )
         ]
     longest = min(file.safety.reconnect, SHARE_AWAY * watchdog)
-    return [CheckFinding("watchdog", f"{text}; its line may be lost for {longest:g} s")]
+    cut = f", as safety.reconnect = {file.safety.reconnect:g} is cut to {SHARE_AWAY:g} of it"
+    return [
+        CheckFinding(
+            "watchdog",
+            f"{text}; its line may be lost for {longest:g} s{cut if longest < file.safety.reconnect else ''}",
+        )
+    ]
 
 
 def _times(file: RigFile, devices: Mapping[str, Device], ticks: Mapping[str, float]) -> list[CheckFinding]:
@@ -349,13 +377,16 @@ def _exercise(
         live, _ = _repeat(source.glance, GLANCES, clock)
     finally:
         device.safe()
+    moved, way = value - begin, target - begin
+    read = next(each for each in source.signals if each.name == signal)
+    is_same, setpoint = read.unit == device.limits.unit, device.setpoint_signal.display
+    part = f", {moved / way:.0%} of the way" if is_same and way else ""
     text = (
-        f"{signal} went from {begin:.6g} to {value:.6g} within {seconds:.2g} s of setting "
-        f"{target:g} {device.limits.unit}"
+        f"set to {setpoint.bare(target)} {setpoint.unit}: {signal} went from "
+        f"{read.display.text(begin)} to {read.display.text(value)} within {seconds:.2g} s{part}"
     )
     if problem is not None:
         return [CheckFinding("exercise", f"{text}: {problem}", "see that the output is connected and not blocked")]
-    moved, way = value - begin, target - begin
     follows = abs(way) <= near or (moved * way > 0 and abs(moved) > _SIGNIFICANT * noise)
     advice = "see that the output is connected, and the sensor on it"
     findings = [
@@ -363,17 +394,22 @@ def _exercise(
         if follows
         else CheckFinding("exercise", f"{text}, so it does not follow", advice)
     ]
-    unit = next(each.unit for each in source.signals if each.name == signal)
-    if follows and unit == device.limits.unit and abs(value - target) > near:
+    if follows and is_same and abs(value - target) > near:
         advice = "compare its scale, calibration and limits with the rig file, or wait longer: it may be slow"
-        findings.append(CheckFinding("scale", f"{moved / way:.0%} of the way after {seconds:.0f} s", advice))
+        findings.append(
+            CheckFinding("scale", f"{signal} came {moved / way:.0%} of the way in {seconds:.0f} s", advice)
+        )
     # Not while it is on its way.
     if abs(value - target) <= near and (on := _spread(live, signal)) > _MUCH_NOISE * max(noise, near / _SIGNIFICANT):
         advice = f"look for a ground loop between {name} and {source.name}, and for a shield that is open"
         findings.append(
-            CheckFinding("noise", f"{signal} varies by {on:.2g} while {name} is on, {noise:.2g} before", advice)
+            CheckFinding(
+                "noise",
+                f"{signal} varies by {_size(on, read)} while {name} is on, {_size(noise, read)} before",
+                advice,
+            )
         )
-    return findings + _beyond(place.file.interlocks, seen)
+    return findings + _beyond(place.file.interlocks, seen, (*device.signals, *source.signals))
 
 
 def _spread(readings: list[dict[str, float]], signal: str) -> float:
@@ -382,13 +418,18 @@ def _spread(readings: list[dict[str, float]], signal: str) -> float:
     return deviation([b - a for a, b in pairwise(values)]) / math.sqrt(2)
 
 
-def _beyond(locks: Iterable[Interlock], seen: Sequence[Mapping[str, float]]) -> list[CheckFinding]:
+def _beyond(
+    locks: Iterable[Interlock], seen: Sequence[Mapping[str, float]], signals: Iterable[Signal]
+) -> list[CheckFinding]:
     """Return the interlocks that a run would have tripped during an exercise."""
+    displays = {signal.name: signal.display for signal in signals}
     found = []
     for lock in locks:
         values = [values[lock.signal] for values in seen if lock.signal in values and not lock.minus]
         if beyond := [value for value in values if not lock.low <= value <= lock.high]:
-            text = f"{lock.signal} was {beyond[0]:.6g} meanwhile, outside of {lock.low:g} to {lock.high:g}"
+            shown = displays[lock.signal]
+            allowed = shown.between(lock.low, lock.high)
+            text = f"{lock.signal} was {shown.text(beyond[0])} meanwhile, allowed is {allowed}"
             found.append(
                 CheckFinding("interlock", text, "find out why, or correct the interlock, before a run trips it")
             )
