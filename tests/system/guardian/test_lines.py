@@ -207,6 +207,19 @@ def test_a_device_that_is_away_delays_its_neighbours_by_one_attempt():
     assert seconds == pytest.approx(20 * 0.7 + 19 * 0.2, abs=0.5)
 
 
+def test_a_neighbour_that_has_waited_for_a_request_in_vain_is_asked_before_the_first_attempt():
+    devices = {"a": Instrument("a", attempts=3), "b": Instrument("b")}
+    bench = Bench({"a": "line", "b": "line"}, longest=60.0, devices=devices)
+
+    def miss():
+        if not devices["a"].tried:
+            bench.submit(LOOK, "b", lambda: devices["a"].tried)
+        return devices["a"].measure()
+
+    bench.submit(BENCH, "a", miss)
+    assert [bench.result().value for _ in range(2)] == [0, {"a": 1.0}]
+
+
 def test_the_safe_state_of_a_neighbour_and_of_a_device_that_is_away_come_at_once():
     devices = {"a": Instrument("a", attempts=10**9), "b": Instrument("b")}
     bench = Bench({"a": "line", "b": "line"}, longest=1e9, devices=devices)
