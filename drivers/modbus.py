@@ -36,9 +36,6 @@ _EXCEPTIONS = {
 }
 
 
-EMULATED = "emulated://"
-"""Scheme of an instrument in this process."""
-
 READ, READ_INPUT, WRITE_ONE, WRITE, FEEDBACK = 3, 4, 6, 16, 76
 """Functions: read holding or input registers, write one, write several, and LabJack's own for both in one packet."""
 

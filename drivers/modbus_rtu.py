@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Generic, Literal, Self, TypeVar
 from pydantic import Field
 
 from bench.base import Clock, DeferredModule, DeviceConnectionError, DeviceError
+from bench.rig import EMULATED
 from drivers.device import other_answer, refuse_hiding
 from drivers.modbus import (
-    EMULATED,
     READ,
     NoReplyError,
     RefusedError,
@@ -23,7 +23,7 @@ from drivers.modbus import (
     UnexpectedReplyError,
     exception_text,
 )
-from drivers.serial_line import RESENDS, SerialSettings, claim, lost_line, no_answer, open_port
+from drivers.serial_line import RESENDS, RepeatingLine, SerialSettings, claim, lost_line, no_answer, open_port
 
 if TYPE_CHECKING:
     from drivers import pymodbus_client
@@ -94,7 +94,7 @@ def unpack_number(kind: Kind, data: bytes) -> float:
     return number
 
 
-class RtuLine:
+class RtuLine(RepeatingLine):
     """The serial line to one Modbus instrument: its registers, and sending again.
 
     Modbus RTU does not say which request a reply belongs to. After a reply that is missing or damaged the line asks
@@ -108,10 +108,6 @@ class RtuLine:
         Whether the line itself failed, so that it has to be opened again.
     longest_silence : float
         Longest time between two replies since the attribute was last set to zero, s.
-    repeats : int
-        Number of requests that were repeated.
-    resends : int
-        How often a request is sent again at most; 0 after one without an answer, until the next answer.
     reading : tuple of int
         Functions that read, taken in turn.
     first_of_echo : int
@@ -142,10 +138,8 @@ class RtuLine:
         self._in_step = True
         self._echoes = 0
         self._is_open = True
-        self.resends = RESENDS
         self.lost = False
         self.longest_silence = 0.0
-        self.repeats = 0
         self.port = open_port(name, settings, parity=settings.parity)
         self._client: RtuClient | pymodbus_client.SerialClient
         if settings.port.startswith(EMULATED):

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any
 import serial
 
 from bench.base import DeferredModule
-from drivers.modbus import EMULATED, ModbusClient, TcpClient
+from bench.rig import EMULATED
+from drivers.modbus import ModbusClient, TcpClient
 
 if TYPE_CHECKING:
     from drivers import pymodbus_client

@@ -43,10 +43,9 @@ from bench.devices import (
     TargetTable,
     check_arrival,
     not_empty,
-    template,
 )
 from drivers.device import attempt
-from drivers.quantities import identity_of
+from drivers.quantities import expected_identity
 from drivers.table import SwitchedLine, TableActuator, TableLine, TableSensor
 
 _NOT_A_NUMBER = 9.9e37  # SCPI's infinity
@@ -241,12 +240,7 @@ class _MeasuringLine(TableLine):
         settings = self._settings
         if not hasattr(type(self.instrument), "id"):
             return Identity("unknown", settings.instrument.partition(":")[2], "unknown", "unknown")
-        answer = str(self.get("id")).strip()
-        if template(settings.identity).match(answer) is None:
-            raise DeviceConnectionError(
-                self._device, f"{settings.port} is {answer!r}, expected {settings.identity!r}; check the port"
-            )
-        return identity_of(answer)
+        return expected_identity(self._device, settings.port, str(self.get("id")).strip(), settings.identity)
 
     def start(self) -> None:
         self.act_all(self._settings.setup)

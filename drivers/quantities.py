@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from bench.base import Clock, DeviceError, DeviceRestartedError
-from bench.devices import Identity, QuantityTable, Signal, Status, TargetTable
+from bench.base import Clock, DeviceConnectionError, DeviceError, DeviceRestartedError
+from bench.devices import Identity, QuantityTable, Signal, Status, TargetTable, template
 
 _ARRIVAL_INTERVAL = 0.1  # s
 
@@ -76,3 +76,12 @@ def identity_of(answer: str) -> Identity:
     """Return the identity that an answer to `*IDN?` is: maker, model, serial number, firmware (IEEE 488.2, 10.14)."""
     fields = [field.strip() or "unknown" for field in answer.split(",", 3)]
     return Identity(*fields, *["unknown"] * (4 - len(fields)))
+
+
+def expected_identity(device: str, port: str, answer: str, form: str) -> Identity:
+    """Return the identity that an answer is; raise `DeviceConnectionError` if it has not the form of the rig file."""
+    if template(form).match(answer) is None:
+        raise DeviceConnectionError(
+            device, f"{port} is {answer!r}, expected {form!r}; check the port, the address and the key identity"
+        )
+    return identity_of(answer)

@@ -51,6 +51,21 @@ class SerialSettings(DriverSettings):
         return (1 + RESENDS) * self.timeout
 
 
+class RepeatingLine:
+    """A line to one instrument whose requests are sent again if no good answer comes.
+
+    Attributes
+    ----------
+    repeats : int
+        How many requests were sent again.
+    resends : int
+        How often a request is sent again at most; 0 after one without an answer, until the next answer.
+    """
+
+    repeats = 0
+    resends = RESENDS
+
+
 MOST_STRAY = 4096
 """Bytes that may come unasked before a serial line counts as unusable."""
 

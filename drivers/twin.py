@@ -10,12 +10,12 @@ from bench.devices import Actuator, Identity, Limits, Signal, Status
 from bench.specimen import DONE, END, GLANCE, IDENTITY, MEASURE, OFF, OUTPUT, SET, TwinSettings, number_text
 from drivers.device import LineActuator, LineDevice
 from drivers.quantities import identity_of
-from drivers.serial_line import RESENDS, SerialSettings, forget_received, lost_line, open_port
+from drivers.serial_line import RESENDS, RepeatingLine, SerialSettings, forget_received, lost_line, open_port
 
 _ARRIVAL_TIMEOUT = 600.0  # s
 
 
-class TwinLine:
+class TwinLine(RepeatingLine):
     """The line to a device of a twin.
 
     Raises `DeviceConnectionError` if it cannot be opened.
@@ -25,7 +25,6 @@ class TwinLine:
         self._device = device
         self._settings = SerialSettings(port=settings.port, baudrate=settings.baudrate, timeout=settings.timeout)
         self._port = open_port(device, self._settings)
-        self.resends = RESENDS
 
     def close(self) -> None:
         """Release the line."""

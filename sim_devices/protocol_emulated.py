@@ -17,12 +17,11 @@ import serial
 from serial.serialutil import PortNotOpenError, SerialBase, SerialException
 
 from bench.base import Clock
-from bench.rig import ECHO, JOIN
+from bench.rig import ECHO, EMULATED, JOIN
 from sim_devices.wire import Connection, Stream, TcpServer, WireServer
 from sim_devices.wire.modbus_tcp import FramingError
 from sim_devices.wire.shared import joined
 
-_SCHEME = "emulated://"
 _BITS_PER_BYTE = 10  # 8N1: a start and a stop bit
 
 
@@ -56,12 +55,12 @@ def register(name: str, server: WireServer | TcpServer, clock: Clock) -> str:
         number += 1
         free = f"{name}-{number}"
     _sockets[free] = _Socket(server, clock)
-    return f"{_SCHEME}{free}"
+    return f"{EMULATED}{free}"
 
 
 def unregister(address: str) -> None:
     """Take an instrument off its address; ports that are open to it go dead, as if it were unplugged."""
-    name = address.removeprefix(_SCHEME)
+    name = address.removeprefix(EMULATED)
     # With it go the lines that it shares with others.
     for each in [each for each in _sockets if each == name or name in each.split(JOIN)]:
         _sockets.pop(each).taken = False
@@ -94,12 +93,12 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
         """
         if self.is_open:
             raise SerialException("Port is already open.")
-        self._name = str(self.portstr).removeprefix(_SCHEME)
+        self._name = str(self.portstr).removeprefix(EMULATED)
         if JOIN in self._name and self._name not in _sockets:
             _join(self._name)
         if self._name not in _sockets:
-            known = ", ".join(_SCHEME + other for other in sorted(_sockets)) or "none"
-            raise SerialException(f"no emulated instrument at {_SCHEME}{self._name}; there are: {known}")
+            known = ", ".join(EMULATED + other for other in sorted(_sockets)) or "none"
+            raise SerialException(f"no emulated instrument at {EMULATED}{self._name}; there are: {known}")
         self._received = bytearray()
         self._plug_in()
         self.is_open = True
@@ -112,7 +111,7 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
             try:
                 stream = self._connection = socket.server.connect()
             except ConnectionRefusedError as refusal:
-                raise SerialException(f"{_SCHEME}{self._name}: {refusal}") from None
+                raise SerialException(f"{EMULATED}{self._name}: {refusal}") from None
         else:
             stream = socket.server
         self._socket, self._stream = socket, stream
@@ -177,7 +176,7 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
             # What is overdue and has not come does not come.
             instant = min(end, due) if due > self._clock.now() else end
             if instant == math.inf:
-                raise SerialException(f"{_SCHEME}{self._name}: would wait for ever, as nothing can arrive unasked")
+                raise SerialException(f"{EMULATED}{self._name}: would wait for ever, as nothing can arrive unasked")
             self._clock.sleep_until(instant)
             self._hear()
             if instant == end or self._clock.now() < instant:
@@ -280,7 +279,7 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
         return answer
 
     def _ended(self, error: Exception) -> SerialException:
-        return SerialException(f"{_SCHEME}{self._name} ended the connection: {error}")
+        return SerialException(f"{EMULATED}{self._name} ended the connection: {error}")
 
     def flush(self) -> None:
         """Do nothing: what was written has arrived."""
@@ -303,7 +302,7 @@ class Serial(SerialBase):  # type: ignore[misc]  # pyserial ships no types
         if self._socket.taken:
             return
         if self._name not in _sockets or self._connection is not None:
-            raise SerialException(f"{_SCHEME}{self._name} was unplugged")
+            raise SerialException(f"{EMULATED}{self._name} was unplugged")
         # A serial line that is plugged in again goes on; a connection does not.
         self._plug_in()
 

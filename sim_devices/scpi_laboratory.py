@@ -36,14 +36,12 @@ from pydantic import Discriminator, Field, InstanceOf, Tag, ValidationInfo, fiel
 
 from bench.base import Clock
 from bench.devices import ActuatorTable, CommandTable, DriverSettings
-from bench.rig import JOIN, Expression, LaboratorySettings
+from bench.rig import EMULATED, JOIN, Expression, LaboratorySettings
 from sim_devices.instruments.scpi import EmulatedTextInstrument, Meter
 from sim_devices.laboratory import EmulatedLaboratory, TrueValue
 from sim_devices.plants.lag_network import Lag, LagNetwork
 from sim_devices.wire.text import TextServer
 from sim_devices.world import World
-
-_SCHEME = "emulated://"
 
 
 class PhysicsTable(LaboratorySettings):
@@ -95,8 +93,8 @@ class SCPILaboratorySettings(LaboratorySettings):
             others = [other for other, (same, _) in found.items() if same == port and other != name]
             if others:
                 raise ValueError(
-                    f"{name} and {others[0]} have the same port {_SCHEME}{port}; each needs its own, or all of a "
-                    f"line one that joins the names of its devices, such as {_SCHEME}{name}{JOIN}{others[0]}"
+                    f"{name} and {others[0]} have the same port {EMULATED}{port}; each needs its own, or all of a "
+                    f"line one that joins the names of its devices, such as {EMULATED}{name}{JOIN}{others[0]}"
                 )
         return devices
 
@@ -120,12 +118,12 @@ def tables(
     for name, settings in devices.items():
         table = settings if isinstance(settings, CommandTable) else instruments.get(name)
         port = getattr(settings, "port", "")
-        if table is not None and port.startswith(_SCHEME):
-            instrument = port.removeprefix(_SCHEME)
+        if table is not None and port.startswith(EMULATED):
+            instrument = port.removeprefix(EMULATED)
             # On a shared line each instrument has the name of its device.
             found[name] = (name if name in instrument.split(JOIN) else instrument, table)
     for name in instruments.keys() - found.keys():
-        raise ValueError(f"{name}: there is no such device on a port {_SCHEME}NAME; {_listed(devices)}")
+        raise ValueError(f"{name}: there is no such device on a port {EMULATED}NAME; {_listed(devices)}")
     return found
 
 

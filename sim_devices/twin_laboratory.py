@@ -13,13 +13,12 @@ from pydantic import Field, InstanceOf
 
 from bench.base import Clock, ConfigurationError
 from bench.devices import DriverSettings
-from bench.rig import LaboratorySettings
+from bench.rig import EMULATED, LaboratorySettings
 from bench.specimen import NoiseTable, Specimen, TwinSettings, TwinTable, rounded
 from sim_devices.instruments.twin import EmulatedTwin, TwinServer
 from sim_devices.laboratory import EmulatedLaboratory, TrueValue
 from sim_devices.world import World
 
-_SCHEME = "emulated://"
 _TOLERANCE = 0.05
 """Share by which what is set by hand may differ from what it was in the runs of the twin."""
 _BLOCK = 4096
@@ -142,7 +141,7 @@ class TwinLaboratory(EmulatedLaboratory):
             for signal in table.signals:
                 noise = settings.signals.get(signal.name, NoiseTable())
                 meters[signal.name] = (self._source(signal.name, noise), noise)
-            instruments[table.port.removeprefix(_SCHEME)] = EmulatedTwin(
+            instruments[table.port.removeprefix(EMULATED)] = EmulatedTwin(
                 name, world, table, meters, rng, partial(self._act, name)
             )
         super().__init__(

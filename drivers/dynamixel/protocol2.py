@@ -16,7 +16,16 @@ from pydantic import Field
 
 from bench.base import Clock, crc16_dynamixel as crc
 from drivers.device import other_answer
-from drivers.serial_line import RESENDS, SerialSettings, forget_received, lost_line, no_answer, open_port, patience_of
+from drivers.serial_line import (
+    RESENDS,
+    RepeatingLine,
+    SerialSettings,
+    forget_received,
+    lost_line,
+    no_answer,
+    open_port,
+    patience_of,
+)
 
 PING, READ, WRITE, REBOOT = 0x01, 0x02, 0x03, 0x08
 RANGE_ERROR = 4
@@ -68,7 +77,7 @@ class RefusedError(Exception):
         self.code = code
 
 
-class ServoLine:
+class ServoLine(RepeatingLine):
     """The serial line to one servo: packets, their CRC and stuffing, and sending again.
 
     A request that brings no answer, or a damaged one, is sent again, twice at most; all requests of the driver may
@@ -82,10 +91,6 @@ class ServoLine:
         Whether the last answer reported a hardware error.
     answered : bool
         Whether the servo has answered since the line was opened.
-    repeats : int
-        How many requests were sent again.
-    resends : int
-        How often a request is sent again at most; 0 after one without an answer, until the next answer.
     urgent : bool
         Whether requests are sent without waiting for what may still come.
     """
@@ -100,8 +105,6 @@ class ServoLine:
         self._quiet_at = -math.inf
         self._silence = f"no answer within {settings.timeout:g} s"
         self.alert = self.answered = self.urgent = False
-        self.repeats = 0
-        self.resends = RESENDS
         self.port = open_port(device, settings)
 
     def close(self) -> None:

@@ -9,6 +9,7 @@ from pydantic import Field, field_validator
 
 from bench.base import Clock
 from bench.devices import DriverSettings, Identity
+from bench.rig import EMULATED
 from drivers.device import LineDevice
 from drivers.labjack_t7.registers import LabJackT7
 
@@ -29,7 +30,7 @@ class T7ConnectionSettings(DriverSettings):
     @field_validator("port")
     @classmethod
     def _check_port(cls, value: str) -> str:
-        if value.startswith("emulated://"):
+        if value.startswith(EMULATED):
             return value
         match = _HOST.fullmatch(value.strip())
         number = int(match["port"] or DEFAULT_PORT) if match else 0

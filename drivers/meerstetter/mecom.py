@@ -18,7 +18,15 @@ from pydantic import Field
 
 from bench.base import DeviceError
 from drivers.device import other_answer
-from drivers.serial_line import RESENDS, SerialSettings, forget_received, lost_line, no_answer, open_port
+from drivers.serial_line import (
+    RESENDS,
+    RepeatingLine,
+    SerialSettings,
+    forget_received,
+    lost_line,
+    no_answer,
+    open_port,
+)
 
 _MOST_STALE_ANSWERS = 8
 _HASTE = 0.2  # s, longest wait for an answer where time is short
@@ -70,19 +78,12 @@ class RefusedError(Exception):
         self.code = code
 
 
-class TECLine:
+class TECLine(RepeatingLine):
     """The serial line to one device: frames, their CRC and sequence numbers, and sending again.
 
     A request that brings no answer, or a damaged one, is sent again with its own sequence number, twice at
     most (5117C). The device may carry it out again, so an order that must not be repeated is sent once. An answer
     with another sequence number is a late one to an earlier request, and is skipped.
-
-    Attributes
-    ----------
-    repeats : int
-        Number of requests that were sent again.
-    resends : int
-        How often a request is sent again at most; 0 after one without an answer, until the next answer.
     """
 
     def __init__(self, device: str, settings: TECLineSettings) -> None:
@@ -91,8 +92,6 @@ class TECLine:
         self._begin = f"#{settings.address:02X}"
         self._sequence = 0
         self._most_resends = RESENDS
-        self.repeats = 0
-        self.resends = RESENDS
         self._received = bytearray()
         self._strange = b""
         self._silence = f"no answer within {settings.timeout:g} s"

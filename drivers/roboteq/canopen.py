@@ -22,7 +22,7 @@ from pydantic import Field
 
 from bench.base import Clock, DeferredModule, DeviceConnectionError, DeviceError
 from drivers.device import other_answer
-from drivers.serial_line import RESENDS, SerialSettings, lost_line, no_answer
+from drivers.serial_line import RESENDS, RepeatingLine, SerialSettings, lost_line, no_answer
 
 if TYPE_CHECKING:
     import can
@@ -127,7 +127,7 @@ class MissedError(Exception):
     """A request was not sent, as it would have arrived too late."""
 
 
-class NodeLine:
+class NodeLine(RepeatingLine):
     """The service data objects of one node: requests, their answers, and the node's heartbeat.
 
     A request that brings no answer is sent again, twice at most; all of them may be carried out twice without
@@ -139,10 +139,6 @@ class NodeLine:
     ----------
     round_trip : float
         How long the last request that was answered took, s.
-    repeats : int
-        How many requests were sent again.
-    resends : int
-        How often a request is sent again at most; 0 after one without an answer, until the next answer.
     answered : bool
         Whether the node has answered since the line was opened.
     port : SlcanAdapter or NodePort
@@ -165,8 +161,6 @@ class NodeLine:
         self._heard: set[int] = set()
         self._quiet_at = -math.inf
         self.round_trip = 0.0
-        self.repeats = 0
-        self.resends = RESENDS
         self.answered = self.restarted = self.urgent = False
         try:
             self.port = self._adapter = slcan.open_adapter(device, settings, settings.bitrate, settings.node)

@@ -28,7 +28,7 @@ from bench.devices import (
     written_number,
 )
 from drivers.device import attempt
-from drivers.quantities import identity_of
+from drivers.quantities import expected_identity
 from drivers.scpi.line import LineTable, TextLine
 from drivers.serial_line import RESENDS
 from drivers.table import SwitchedLine, TableActuator, TableLine, TableSensor
@@ -64,13 +64,7 @@ class _MeasuringLine(TextLine, TableLine):
             raise DeviceConnectionError(
                 self._device, f"{settings.port} hands back what is sent; set echo = true, and check that it has power"
             )
-        if template(settings.identity).match(answer) is None:
-            raise DeviceConnectionError(
-                self._device,
-                f"{settings.port} is {answer!r}, expected {settings.identity!r}; "
-                "check the address and the key identity",
-            )
-        return identity_of(answer)
+        return expected_identity(self._device, settings.port, answer, settings.identity)
 
     def start(self) -> None:
         # What happened before is nobody's fault here.

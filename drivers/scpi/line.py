@@ -10,7 +10,7 @@ from bench.base import Clock, DeviceConnectionError, DeviceError
 from bench.devices import ANY_TEXT, CommandTable, Template, template
 from drivers.device import other_answer
 from drivers.scpi.transport import TextLineSettings, open_transport
-from drivers.serial_line import RESENDS
+from drivers.serial_line import RESENDS, RepeatingLine
 
 _MOST_ERRORS = 32
 """Errors that are read of a queue at once."""
@@ -26,7 +26,7 @@ class LineTable(TextLineSettings, CommandTable):
     """Where a text instrument is, and what it is told and asked."""
 
 
-class TextLine:
+class TextLine(RepeatingLine):
     """The line to one text instrument.
 
     An answer belongs to the question before it: what was received earlier is forgotten before a question is sent.
@@ -39,10 +39,6 @@ class TextLine:
     ----------
     lost : bool
         Whether the line itself failed, so that it has to be opened again.
-    repeats : int
-        Number of questions that were repeated.
-    resends : int
-        How often a question is sent again at most; 0 after one without an answer, until the next answer.
     port : Any
         The port, None of VISA.
 
@@ -59,8 +55,6 @@ class TextLine:
         self._free_at = clock.now()
         self._in_step = True
         self.lost = False
-        self.repeats = 0
-        self.resends = RESENDS
         self._end, self._encoding, self._delay = settings.write_terminator, settings.encoding, settings.delay
         self._transport = open_transport(device, settings, settings.read_terminator.encode(settings.encoding))
         self.port = getattr(self._transport, "port", None)

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from bench.base import ConfigurationError
-from bench.rig import JOIN, RigFile
+from bench.rig import EMULATED, JOIN, RigFile
 from sim_devices.faults.line import Cable
 from sim_devices.laboratory import EmulatedLaboratory, TrueValue
 from sim_devices.serving.clock import LONGEST_STEP, ServedClock
@@ -17,8 +17,6 @@ from sim_devices.serving.endpoints import HAS_PSEUDO_TERMINALS, Listener, Pseudo
 from sim_devices.serving.lines import Line, Watched
 from sim_devices.wire import TcpServer, WireServer
 from sim_devices.wire.shared import joined
-
-_SCHEME = "emulated://"
 
 
 @dataclass(frozen=True)
@@ -68,7 +66,7 @@ class ServedLaboratory:
         self.clock = clock
         servers = servers_by_line(file, laboratory)
         self._devices = {
-            name: [entry.name for entry in file.devices if getattr(entry.settings, "port", "") == _SCHEME + name]
+            name: [entry.name for entry in file.devices if getattr(entry.settings, "port", "") == EMULATED + name]
             for name in servers
         }
         speeds = {
@@ -80,7 +78,7 @@ class ServedLaboratory:
         self._protocols: dict[str, str] = {}
         with ExitStack() as opened:
             for name, server in servers.items():
-                speed = speeds.get(_SCHEME + name, math.inf) if serving.baud_time else math.inf
+                speed = speeds.get(EMULATED + name, math.inf) if serving.baud_time else math.inf
                 self.lines[name] = self._open(name, server, speed, serving)
                 opened.callback(self.lines[name].close)
             self._opened = opened.pop_all()
@@ -151,7 +149,7 @@ def servers_by_line(file: RigFile, laboratory: EmulatedLaboratory) -> dict[str, 
     """
     servers = dict(laboratory.servers)
     ports = dict.fromkeys(str(getattr(entry.settings, "port", "")) for entry in file.devices)
-    shared = [port.removeprefix(_SCHEME) for port in ports if port.startswith(_SCHEME) and JOIN in port]
+    shared = [port.removeprefix(EMULATED) for port in ports if port.startswith(EMULATED) and JOIN in port]
     for name in shared:
         try:
             servers[name] = joined(name, laboratory.servers)
