@@ -199,6 +199,7 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
         self._restarted = False
         self._configured: dict[Parameter, float] = {}
         """What the parameters are that `connect` has written, and a change of the mode."""
+        self._sent_in_vain = False
         self._measured = Block(settings.channel, _OBJECT_TEMPERATURE, _SINK_TEMPERATURE, _CURRENT, _VOLTAGE, _STATUS)
         self._names = tuple(signal.name for signal in self.signals)
         self._sent = Status.completed(name, clock)
@@ -254,10 +255,13 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
                 self._check_output(decode(self.name, _STATUS, status))
             self._looked = self._clock.now()
         repeats = self._line.repeats
+        # Whether the device has taken one that it does not acknowledge is not known.
+        self._sent_in_vain = True
         if self._mode is TECMode.TEMPERATURE:
             self._write(_LIVE_TARGET, value)
         else:
             self._write(_LIVE_CURRENT, self._polarity * value)
+        self._sent_in_vain = False
         self._setpoint = value
         if not self._on:
             self._switch_on(repeats)
@@ -471,7 +475,10 @@ class MeerstetterTEC(RecoverableDevice[TECSettings, TECLine], TECAmplifier):
 
     def _check_unchanged(self) -> None:
         """Raise `DeviceError` unless the device is as the driver left it: not restarted, without an error."""
-        self._check_settings(self._configured | (self._output_settings() if self._on else {}))
+        expected = self._configured | (self._output_settings() if self._on else {})
+        if self._sent_in_vain:
+            expected.pop(_LIVE_TARGET if self._mode is TECMode.TEMPERATURE else _LIVE_CURRENT, None)
+        self._check_settings(expected)
         self._check_output(self._read(_STATUS))
 
     def _check_settings(self, expected: Mapping[Parameter, float]) -> None:

@@ -425,7 +425,6 @@ def test_a_disturbed_line_gives_no_wrong_value_of_a_tec(stack):
     assert device.repeats == server.repeats > 100
     server.share = 0.0
     laboratory.clock.sleep(1.0)
-    device.set(0.1)
     device.reconnect()
     device.safe()
     assert laboratory.output() == 0.0

@@ -649,6 +649,22 @@ def test_a_parameter_that_changed_is_found_by_reconnecting(script, tec, number, 
         assert f"(parameter {number}) is {value:g}" in str(caught.value)
 
 
+@pytest.mark.parametrize("is_taken", [True, False])
+def test_a_set_point_whose_acknowledges_are_lost_is_nobody_elses(script, tec, is_taken):
+    tec.set(40.0)
+    script.instead = [None, *[b""] * 3]
+    with pytest.raises(DeviceConnectionError):
+        tec.set(45.0)
+    assert script.values[50012] == 45.0
+    if not is_taken:
+        script.values[50012] = 40.0
+    tec.reconnect()
+    tec.set(45.0)
+    script.values[50012] = 41.0
+    with pytest.raises(DeviceError, match="end the program that changed it"):
+        tec.reconnect()
+
+
 def test_device_that_restarted_is_told_each_time_and_nothing_is_written_to_its_flash(script, tec):
     tec.set(40.0)
     script.values |= {108: 0, 104: 1, 2010: 0, 50000: 0}
