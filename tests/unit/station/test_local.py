@@ -124,6 +124,17 @@ class TestReconnection:
         finally:
             rig.close()
 
+    def test_an_error_of_another_device_ends_the_run_while_a_line_is_away(self, vo2):
+        station, _, rig = vo2()
+        station.apply({"tec": 30.0})
+        rig.laboratory.inject("psd.unplug")
+        station.clock.after(0.5, lambda: rig.laboratory.inject("tec-over-temperature"))
+        since = station.clock.now()
+        with pytest.raises(DeviceError, match=r"^tec: "):
+            station.look(Look.GLANCE)
+        # Not after the ten seconds of `reconnect`.
+        assert station.clock.now() - since < 5.0
+
     def test_an_operator_who_ends_the_run_does_not_wait_for_the_line(self, vo2):
         station, tec, _ = vo2()
         tec.unplug()
