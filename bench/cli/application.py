@@ -131,7 +131,7 @@ def _carry_out(arguments: Sequence[str] | None) -> NoReturn:
     except (typer.Abort, KeyboardInterrupt):
         code = AbortError.exit_code
     except typer.TyperException as error:
-        _fail(ConfigurationError(_usage(error, words)))
+        _fail(ConfigurationError(_usage(error)))
     except OSError as error:
         if error.errno != errno.ENAMETOOLONG:
             raise
@@ -170,7 +170,7 @@ def _check_words(words: Sequence[str]) -> None:
             ) from None
 
 
-def _usage(error: Any, words: Sequence[str]) -> str:  # noqa: ANN401 - of typer
+def _usage(error: Any) -> str:  # noqa: ANN401 - of typer
     """Return what is wrong with the use of a command, in a line."""
     context = getattr(error, "ctx", None)
     if context is None:
@@ -180,8 +180,8 @@ def _usage(error: Any, words: Sequence[str]) -> str:  # noqa: ANN401 - of typer
         known = [option for each in parameters for option in (*each.opts, *each.secondary_opts) if option[0] == "-"]
         return f"{context.command_path}: there is no option {name}; {closest(name, known, _help_of(context))}"
     if hasattr(error, "param_type"):
-        # Of several that are missing, click names the first.
-        left = [each for each in parameters if each.required and not set(each.opts) & set(words)]
+        # Of several that are missing, click names the first; those that are given have come before it.
+        left = [each for each in parameters if each.required and context.params.get(each.name) is None]
         return f"{context.command_path}: missing: {', '.join(map(_spelled, left))}; see {_help_of(context)}"
     if (cause := getattr(error.__cause__, "errors", None)) is not None:
         from bench.base import explain

@@ -47,6 +47,7 @@ MISTAKES = [
     ("run --from loops.csv --seed 3", ["--from", "leave --seed out"]),
     ("rehearse", ["PROTOCOL and --rig", "bench list"]),
     ("predict", ["model.json, FILE, --input, --out", "bench predict --help"]),
+    ("predict model.json loops.csv", ["missing: --input, --out;"]),
     ("identify loops.csv", ["--input COLUMN and --output COLUMN", "voltage [V], displacement [um]"]),
     ("identify loops.csv --input voltag --output displacement", ["no column 'voltag'", "voltage [V]"]),
     (f"{LOOPS} preisch", ["no model 'preisch'", "did you mean preisach?"]),
