@@ -470,7 +470,9 @@ def _check_model(model: str, data: Dataset, options: FitOptions, own: Mapping[st
             raise ConfigurationError(str(error)) from None
         return
     if data.time is None:
-        raise ConfigurationError(f"model {model} needs the time of each row: give --time COLUMN")
+        raise ConfigurationError(
+            f"model {model} needs the time of each row: give --time COLUMN, or --format interval=TIME"
+        )
     if options.ridge or ((options.smoothing or options.cross_validated) and not _is_smoothed(model)):
         others = "-o ridge=WEIGHT" if _is_smoothed(model) else "--smoothing, -o ridge=WEIGHT or --cross-validate"
         raise ConfigurationError(f"model {model} takes no {others}")

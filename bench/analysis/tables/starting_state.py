@@ -110,5 +110,7 @@ def bind_times(file: ModelFile, times: Floats | None) -> Operator[Any] | TimedSe
     if not isinstance(model, TimedModel):
         return model
     if times is None:
-        raise ConfigurationError(f"model {file.name} needs the time of each row: give --time COLUMN")
+        raise ConfigurationError(
+            f"model {file.name} needs the time of each row: give --time COLUMN, or --format interval=TIME"
+        )
     return model.at(times)
