@@ -12,7 +12,7 @@ import numpy as np
 
 from bench.analysis.run_list import main_result
 from bench.analysis.tracking_errors import results_json, target_results
-from bench.base import fitting_prefix, format_duration, html_table
+from bench.base import fitting_prefix, format_duration, html_table, significant
 from bench.protocol import PARAMETER
 from bench.record import Difference, Record, Table, differences
 
@@ -92,7 +92,9 @@ class RunComparison:
         for kind in ("tracking", "following"):
             errors = [each.errors.get(kind, {}) for each in self.outcomes]
             for key in {**errors[0], **errors[1]}:
-                rows.append((f"{kind}, {key}", *(f"{each[key]:.4g}" if key in each else "–" for each in errors)))
+                rows.append(
+                    (f"{kind}, {key}", *(significant(each[key], 4) if key in each else "–" for each in errors))
+                )
         return [(name, first, second) for name, first, second in rows if first or second]
 
     def difference_rows(self) -> list[tuple[str, str, str]]:
@@ -106,7 +108,7 @@ class RunComparison:
         rows = []
         for name, apart in self.signals.items():
             factor, unit = fitting_prefix(apart.unit, apart.maximum)
-            numbers = [f"{factor * value:.3g}" for value in (apart.rms, apart.maximum)]
+            numbers = [significant(factor * value, 3) for value in (apart.rms, apart.maximum)]
             rows.append((name, *numbers, "" if unit == "1" else unit, str(apart.step)))
         return rows
 

@@ -135,6 +135,7 @@ from .units import (
     prefixed as prefixed,
     quantity as quantity,
     read_quantity as read_quantity,
+    significant as significant,
     unit_registry as unit_registry,
     with_unit as with_unit,
 )

@@ -38,10 +38,15 @@ def difference_unit(unit: str) -> str:
     return unit.replace("°C", "K")
 
 
+def significant(value: float, digits: int) -> str:
+    """Return a number with so many significant digits, without an exponent from 1e-4 to 1e6."""
+    return f"{float(f'{value:.{digits}g}'):g}"
+
+
 def prefixed(value: float, unit: str, digits: int = 4) -> str:
     """Return a value in `unit` with so many significant digits, its own prefix and its unit, as of an error."""
     factor, shown = fitting_prefix(unit, value)
-    return f"{factor * value:.{digits}g} {'' if shown == '1' else shown}".rstrip()
+    return f"{significant(factor * value, digits)} {'' if shown == '1' else shown}".rstrip()
 
 
 def format_numbers(numbers: Sequence[float | None], unit: str, precision: int) -> list[str]:

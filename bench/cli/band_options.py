@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bench.base import Floats, print_plain
+from bench.base import Floats, print_plain, significant
 from bench.cli.printing import console, print_rows, warn
 
 if TYPE_CHECKING:
@@ -66,7 +66,7 @@ def print_examined(found: Examined, name: str = "", *, bands: bool = True) -> No
     if found.recalibration is not None:
         rows = session_rows(found.recalibration, found.predicted.size, found.units)
         errors = found.errors()
-        after = f"max {errors.maximum:.4g}, RMS {errors.rms:.4g} {found.units[1]}".rstrip()
+        after = f"max {significant(errors.maximum, 4)}, RMS {significant(errors.rms, 4)} {found.units[1]}".rstrip()
         title = f"recalibration of {name}" if name else "recalibration"
         print_rows(title, [*rows, ("errors after it", after)])
     if bands and found.band is not None:

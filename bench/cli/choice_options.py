@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bench.base import fitting_prefix, prefixed, print_plain
+from bench.base import fitting_prefix, prefixed, print_plain, significant
 from bench.cli.model_options import ModelOptions
 from bench.cli.printing import console, print_rows, warn
 
@@ -116,11 +116,11 @@ def _print_table(found: SelectedModel) -> None:
             "*" if score is selection.chosen else "",
             _describe(score.candidate),
             f"{score.freedom:.1f}",
-            f"{factor * score.training:.3g}",
-            f"{factor * score.error:.4g}",
-            f"{100.0 * score.error / selection.span:.3g}",
-            f"{factor * score.blocks_rms:.3g}",
-            f"{factor * score.cycles_rms:.3g}" if score.cycles else "-",
+            significant(factor * score.training, 3),
+            significant(factor * score.error, 4),
+            significant(100.0 * score.error / selection.span, 3),
+            significant(factor * score.blocks_rms, 3),
+            significant(factor * score.cycles_rms, 3) if score.cycles else "-",
             str(score.rows),
             f"{score.seconds:.1f}",
         )
@@ -147,8 +147,11 @@ def _print_table(found: SelectedModel) -> None:
         )
     blocks = f"contiguous blocks of the {selection.rows} rows compared, with gaps of {selection.gap},"
     print_plain(console, f"left out: {'whole files' if of_runs else blocks} and whole kinds of cycles")
-    errors = f"error of the chosen model: {factor * selection.on_blocks:.3g} {unit} on blocks"
-    print_plain(console, f"{errors}, {factor * selection.on_runs:.3g} {unit} on another run" if of_runs else errors)
+    errors = f"error of the chosen model: {significant(factor * selection.on_blocks, 3)} {unit} on blocks"
+    print_plain(
+        console,
+        f"{errors}, {significant(factor * selection.on_runs, 3)} {unit} on another run" if of_runs else errors,
+    )
 
 
 def _on_bounded(found: SelectedModel) -> str:

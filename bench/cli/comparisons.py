@@ -10,7 +10,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from bench.base import percent, print_plain, show_patience, show_table
+from bench.base import percent, print_plain, show_patience, show_table, significant
 from bench.cli.band_options import BandsOption, Recalibrating, print_examined
 from bench.cli.command_support import JsonOption, check_outputs, write_json
 from bench.cli.data_options import FiguresOption, ReadingGroup, SkipOption, offer_groups, print_assumptions
@@ -85,8 +85,8 @@ def models_on_data(
     for name, entry in result.comparisons.items():
         raw, mended = entry.raw, entry.rezeroed
         table.add_row(
-            name, f"{raw.maximum:.4g}", f"{raw.rms:.4g}", percent(raw.rms_percent).removesuffix(" %"),
-            f"{entry.offset:+.4g}", f"{mended.maximum:.4g}", f"{mended.rms:.4g}",
+            name, significant(raw.maximum, 4), significant(raw.rms, 4), percent(raw.rms_percent).removesuffix(" %"),
+            f"{entry.offset:+.4g}", significant(mended.maximum, 4), significant(mended.rms, 4),
         )  # fmt: skip
     show_table(console, table)
     for name, examined in result.examined.items():
@@ -138,8 +138,8 @@ def _print_runs(found: RunComparison) -> None:
     _print_table(found.signals_title, SIGNAL_HEADS, found.signal_rows())
     for signal, deviation in found.reproducibility.items():
         console.print(
-            f"reproducibility of {signal}: {deviation:.2g} {found.signals[signal].unit}, standard deviation of what "
-            "two sessions reach at the same targets",
+            f"reproducibility of {signal}: {significant(deviation, 2)} {found.signals[signal].unit}, standard "
+            "deviation of what two sessions reach at the same targets",
             highlight=False,
         )
     same = [name for name, equal in found.equal.items() if equal]

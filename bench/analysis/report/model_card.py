@@ -14,7 +14,7 @@ import numpy as np
 from bench.analysis.model_service import IdentifiedFile, certificate_lines
 from bench.analysis.predictions import Predictions
 from bench.analysis.tables.data import Quantity
-from bench.base import DataError, percent, write_result
+from bench.base import DataError, percent, significant, write_result
 from bench.identification import Errors
 from bench.models import MemoryCurve, Operator, TimedModel
 from bench.record import Record
@@ -90,7 +90,7 @@ def model_card(
         "Limits of validity": _table(("", ""), _limits(found)),
     }
     if (band := found.band) is not None:
-        held_out = f"{band.band.held_out:.4g} {band.unit}".rstrip()
+        held_out = f"{significant(band.band.held_out, 4)} {band.unit}".rstrip()
         sections["Prediction band"] = _table(
             ("", ""), [*band.rows(), ("RMS error of the rows, each left out of the fit", held_out)]
         )
@@ -139,10 +139,10 @@ def _between(low: float, high: float, unit: str) -> str:
 def _errors(found: IdentifiedFile) -> list[tuple[str, str, str]]:
     errors: Errors = found.identification.errors
     return [
-        ("largest", f"{errors.maximum:.4g}", percent(errors.maximum_percent).removesuffix(" %")),
-        ("RMS", f"{errors.rms:.4g}", percent(errors.rms_percent).removesuffix(" %")),
-        ("mean absolute", f"{errors.average:.4g}", percent(errors.average_percent).removesuffix(" %")),
-        ("range of the output", f"{errors.span:.4g}", "100.00"),
+        ("largest", significant(errors.maximum, 4), percent(errors.maximum_percent).removesuffix(" %")),
+        ("RMS", significant(errors.rms, 4), percent(errors.rms_percent).removesuffix(" %")),
+        ("mean absolute", significant(errors.average, 4), percent(errors.average_percent).removesuffix(" %")),
+        ("range of the output", significant(errors.span, 4), "100.00"),
     ]
 
 
@@ -154,7 +154,7 @@ def _compared(table: Sequence[Mapping[str, Any]]) -> list[tuple[str, ...]]:
         (
             " ".join(filter(None, (row["model"], row["options"], row["initial"]))),
             *(
-                "" if row[name] is None else f"{row[name]:.3g}"
+                "" if row[name] is None else significant(row[name], 3)
                 for name in ("score", "score_percent", "held_out_rms", "units_rms")
             ),
             f"{row['free']:.1f}",
@@ -179,7 +179,8 @@ def _sampling(time: Quantity) -> str:
     steps = np.diff(time.values)
     low, middle, high = steps.min(), np.median(steps), steps.max()
     uneven = f"; uneven steps of {low:.4g} to {high:.4g} {time.unit}" if high - low > 1e-3 * middle else ""
-    return f"{1.0 / middle:.4g} Hz over {time.values[-1] - time.values[0]:.4g} {time.unit}{uneven}"
+    duration = significant(time.values[-1] - time.values[0], 4)
+    return f"{significant(1.0 / middle, 4)} Hz over {duration} {time.unit}{uneven}"
 
 
 def _memory(found: IdentifiedFile) -> str:

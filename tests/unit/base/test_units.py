@@ -3,7 +3,7 @@
 import pytest
 from cases import cases
 
-from bench.base import ConfigurationError, Display, in_si, percent, read_quantity
+from bench.base import ConfigurationError, Display, in_si, percent, read_quantity, significant
 from bench.devices import Limits
 from bench.operator import SetPoint, parse_command
 from bench.protocol import find_protocol
@@ -98,3 +98,12 @@ class TestShown:
 
     def test_a_small_percentage_is_not_zero(self):
         assert [percent(value) for value in (0.0, 12.3456, 0.0012)] == ["0.00 %", "12.35 %", "0.0012 %"]
+
+
+@cases(
+    ("value", "digits", "text"),
+    [(1887.2, 3, "1890"), (26.74, 3, "26.7"), (0.012345, 2, "0.012"), (123456.0, 2, "120000"), (3.0e7, 3, "3e+07")],
+)
+def test_significant_digits_without_an_exponent_for_what_people_read(value, digits, text):
+    assert significant(value, digits) == text
+    assert significant(-value, digits) == f"-{text}"

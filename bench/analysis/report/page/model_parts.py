@@ -14,7 +14,7 @@ from bench.analysis.models_on_run import ModelOnRun
 from bench.analysis.prediction_figures import errors_text
 from bench.analysis.report.page.elements import PageFigure, PagePart, PageSection, PageTable, PageText
 from bench.analysis.report.page.svg import inlined
-from bench.base import Floats, fitting_prefix, percent, with_unit
+from bench.base import Floats, fitting_prefix, percent, significant, with_unit
 from bench.identification import CoefficientUncertainties, ModelFile, coefficient_uncertainties
 from bench.models import MemoryCurve, TimedModel
 
@@ -62,7 +62,7 @@ def errors_parts(models: Sequence[ModelOnRun]) -> list[PageTable | PageText]:
         errors = model.errors
         numbers = (errors.maximum, errors.rms, errors.average)
         factor, unit = fitting_prefix(model.unit, *numbers, least=0.1)
-        cells = [f"{factor * number:.4g}" for number in numbers]
+        cells = [significant(factor * number, 4) for number in numbers]
         rows.append(
             (
                 model.file.name,
@@ -175,8 +175,8 @@ def _coefficients(model: ModelOnRun, found: CoefficientUncertainties, cells: int
     for k, value in enumerate(values.tolist()):
         if k < cells and value == 0.0:
             continue
-        sigma = "–" if found.sigmas is None or not np.isfinite(found.sigmas[k]) else f"{found.sigmas[k]:.2g}"
-        rows.append((_coefficient_name(model, k, cells), f"{value:.4g}", sigma))
+        sigma = "–" if found.sigmas is None or not np.isfinite(found.sigmas[k]) else significant(found.sigmas[k], 2)
+        rows.append((_coefficient_name(model, k, cells), significant(value, 4), sigma))
     shape = operator.shape_parameters()
     rows += [(name, f"{value:.6g}", "") for name, value in zip(shape.names, shape.values, strict=True)]
     zeros = int(np.count_nonzero(values[:cells] == 0.0))
