@@ -22,6 +22,7 @@ import numpy.typing as npt
 from rich.console import Console
 
 from bench.analysis import (
+    ALL,
     FEWEST_ROWS,
     PAGE_NAME,
     ColumnNames,
@@ -34,13 +35,17 @@ from bench.analysis import (
     RunFolder,
     RunTable,
     compare_runs,
+    identify_best,
     identify_model,
     invert_targets,
+    is_comparison,
     list_runs,
+    named_models,
     predict as predict_file,
     read_dataset,
     report_run,
     select_runs,
+    time_names,
 )
 from bench.base import BenchError, DeviceError, VirtualClock, show_patience, wall_time
 from bench.batch import published_of
@@ -171,7 +176,7 @@ def run(
 
 def identify(
     source: RunFolder | str | Path,
-    model: str,
+    model: str | None = None,
     *,
     input: str | None = None,  # noqa: A002 - the word of the command line
     output: str | None = None,
@@ -183,8 +188,9 @@ def identify(
     ----------
     source : RunFolder, str or Path
         A run, or a table of measurements: text, .gz, .mat, .h5, .tdms, .npz, .npy, .parquet or a spreadsheet.
-    model : str
-        Name of a registered model.
+    model : str, optional
+        Name of a registered model; several with commas between them, or all of one input if there is none, are
+        compared by what is left out of their fits, and one of them is chosen.
     input, output : str, optional
         Columns, by name or by number from 1; of a run, the reading of its slot `drive` and the signal of its slot
         `response` if not given.
@@ -223,10 +229,17 @@ def identify(
     reading = ReadingOptions(
         **{field.name: options.pop(field.name) for field in fields(ReadingOptions) if field.name in options}
     )
-    names = ColumnNames(input, output, options.pop("time_column", None), options.pop("weights_column", None))
+    time = options.pop("time_column", None)
+    model = model or ALL
+    is_compared = is_comparison(model)
+    times = time_names(folder) if is_compared and time is None else ()
+    names = ColumnNames(input, output, time, options.pop("weights_column", None), times)
     with show_patience(f"reading and fitting {folder.name}", Console(stderr=True)):
         data = read_dataset([folder], names, reading, at_least=FEWEST_ROWS)
-        return identify_model(data, model, FitOptions.of(options)).with_uncertainty()
+        if not is_compared:
+            return identify_model(data, model, FitOptions.of(options)).with_uncertainty()
+        data = data if time is not None else data.with_usable_times()
+        return identify_best(data, named_models(model), FitOptions.of(options))[0]
 
 
 def predict(

@@ -47,8 +47,9 @@ from .model_choice import (
     TestedModel as TestedModel,
     evaluate_on as evaluate_on,
     evaluate_on_rows as evaluate_on_rows,
+    identify_best as identify_best,
+    is_comparison as is_comparison,
     named_models as named_models,
-    select_model as select_model,
 )
 from .model_service import (
     FitOptions as FitOptions,

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.analysis.model_service import FitOptions, IdentifiedFile
+from bench.analysis.model_service import FitOptions, IdentifiedFile, identify_model
 from bench.analysis.tables.data import check_variation, write_csv
 from bench.analysis.tables.dataset import Dataset, check_rows, parse_rows
 from bench.analysis.tables.reading.table import FEWEST_ROWS
@@ -158,6 +158,11 @@ class SelectedModel:
         write_csv(path, COLUMNS, [[row[name] for row in rows] for name in COLUMNS])
 
 
+def is_comparison(model: str) -> bool:
+    """Return whether a name is `all`, or several names with commas between them."""
+    return model == ALL or "," in model
+
+
 def named_models(text: str) -> tuple[str, ...]:
     """Return the models of `all`, or of names with commas between them.
 
@@ -178,8 +183,10 @@ def named_models(text: str) -> tuple[str, ...]:
     return names
 
 
-def select_model(data: Dataset, models: Sequence[str], given: Given, options: FitOptions) -> SelectedModel:
-    """Compare models on measurements by what is left out of their fits; the progress goes to `say_share`.
+def identify_best(data: Dataset, models: Sequence[str], options: FitOptions) -> tuple[IdentifiedFile, SelectedModel]:
+    """Compare models on measurements by what is left out of their fits, and identify the chosen one.
+
+    The progress goes to `say_share`.
 
     Parameters
     ----------
@@ -188,18 +195,30 @@ def select_model(data: Dataset, models: Sequence[str], given: Given, options: Fi
         With the times of one file models with time take part.
     models : sequence of str
         Names of the models.
-    given : Given
-        Settings that are not to be chosen.
     options : FitOptions
-        Rows that are fitted and tested, and first rows that are neither.
+        Rows that are fitted, first rows that are neither fitted nor tested, and settings that are not to be chosen.
 
     Raises
     ------
     DataError
         If the measurements cannot be used.
     ConfigurationError
-        If no model can be fitted.
+        If no model can be fitted, or an option goes with one model only.
     """
+    if options.cross_validated or options.levels_to_try or data.weights is not None:
+        raise ConfigurationError("cross-validation and weights of the rows go with one model: name it")
+    own = dict(options.own)
+    initial, orientation = own.pop("initial", None), own.pop("orientation", "auto")
+    free = None if orientation == "auto" else orientation
+    given = Given(own, initial=initial, orientation=free, smoothing=options.smoothing, ridge=options.ridge)
+    selected = _selected(data, models, given, options)
+    # The chosen model may not have all options that were given.
+    settings = selected.settings(replace(options, own={"initial": initial, "orientation": orientation}))
+    found = identify_model(data if selected.is_timed else data.without_time(), selected.model, settings)
+    return selected.record_in(found.with_uncertainty()), selected
+
+
+def _selected(data: Dataset, models: Sequence[str], given: Given, options: FitOptions) -> SelectedModel:
     try:
         check_words(given.initial, given.orientation)
     except ValueError as error:

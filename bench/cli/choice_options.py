@@ -10,14 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from bench.base import fitting_prefix, prefixed, print_plain, significant
-from bench.cli.model_options import ModelOptions
 from bench.cli.printing import console, print_rows, warn
 
 if TYPE_CHECKING:
     from bench.analysis import (
         ColumnNames,
         Dataset,
-        FitOptions,
         IdentifiedFile,
         ReadingOptions,
         SelectedModel,
@@ -58,34 +56,6 @@ class Comparing:
         from bench.analysis import is_rows
 
         return () if self.test is None or is_rows(self.test) else (Path(self.test),)
-
-
-def is_comparison(model: str) -> bool:
-    """Return whether several models are asked for: `all`, or names with commas between them."""
-    from bench.analysis import ALL
-
-    return model == ALL or "," in model
-
-
-def choose_model(data: Dataset, model: str, options: ModelOptions, fit: FitOptions) -> SelectedModel:
-    """Compare models on measurements.
-
-    `model` is `all`, or names with commas between them.
-
-    Raises ConfigurationError if none can be fitted.
-    """
-    from bench.analysis import named_models, select_model
-    from bench.identification import Given
-
-    orientation = fit.own["orientation"]
-    given = Given(
-        {name: value for name, value in options.values.items() if name not in ("ridge", "orientation")},
-        initial=fit.own["initial"],
-        orientation=None if orientation == "auto" else orientation,
-        smoothing=fit.smoothing,
-        ridge=fit.ridge,
-    )
-    return select_model(data, named_models(model), given, fit)
 
 
 def print_choice(found: SelectedModel, comparing: Comparing) -> None:
@@ -167,8 +137,7 @@ def read_measured(
     Where nobody named a column of times and a model with time may use it, it is looked for. Not in several files, as
     times are those of one record. What is in the way of comparing models with time is printed.
     """
-    from bench.analysis import FEWEST_ROWS, NO_TIMES, read_dataset, time_names
-    from bench.base import DataError
+    from bench.analysis import FEWEST_ROWS, NO_TIMES, is_comparison, read_dataset, time_names
     from bench.models import timed_models
 
     several = is_comparison(model)
@@ -177,13 +146,8 @@ def read_measured(
         names, time=None if names.time == NO_TIMES else names.time, times=time_names(files[0]) if is_sought else ()
     )
     data = read_dataset(files, names, reading, at_least=FEWEST_ROWS)
-    if is_sought and several and data.time is not None:
-        try:
-            is_other = data.time.name not in (names.input, names.output) and data.times is not None
-        except DataError as error:
-            print_plain(console, f"{error}: time is left out")
-            is_other = False
-        data = data if is_other else data.without_time()
+    if is_sought and several:
+        data = data.with_usable_times()
     if not comparing.test_files:
         return data, None
     # Rows that are evenly sampled have no column of times.

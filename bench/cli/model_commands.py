@@ -13,8 +13,6 @@ from bench.base import ConfigurationError, DataError, counted, print_plain, show
 from bench.cli.band_options import BandOption, Recalibrating, print_band, print_examined
 from bench.cli.choice_options import (
     Comparing,
-    choose_model,
-    is_comparison,
     print_choice,
     print_test,
     read_measured,
@@ -130,14 +128,12 @@ class Fitting:
     ] = False
 
     def settings(self, comparing: Comparing, options: ModelOptions) -> FitOptions:
-        """Return the options of the fit; with several models without those of one."""
+        """Return the options of the fit."""
         from bench.analysis import FitOptions
 
         values = dict(options.values)
         ridge = values.pop("ridge", None)
-        own: dict[str, Any] = {"initial": self.initial, "orientation": values.pop("orientation", "auto")}
-        if not is_comparison(self.model):
-            own |= values
+        own = {"initial": self.initial, "orientation": "auto", **values}
         levels, train = options.levels_to_try, comparing.train_rows
         return FitOptions(self.smoothing, ridge, self.skip, self.cross_validate, levels, train, self.band, own)
 
@@ -150,6 +146,8 @@ class Fitting:
             raise ConfigurationError(
                 f"--input and --output are the same column, {self.input_column}; a model needs two"
             )
+        from bench.analysis import is_comparison
+
         if not is_comparison(self.model):
             if comparing.table_out is not None:
                 raise ConfigurationError("--table-out goes with --model all, or several models")
@@ -211,9 +209,12 @@ def identify_(
         ColumnNames,
         certificate_lines,
         fit_sentence,
+        identify_best,
         identify_model,
         input_and_output,
+        is_comparison,
         is_run,
+        named_models,
         whole_identification,
     )
     from bench.identification import ONE_RUN
@@ -235,12 +236,10 @@ def identify_(
     selected = None
     with show_patience(patience, console):
         if is_comparison(model):
-            selected = choose_model(data, model, options, fit)
-            model, fit = selected.model, selected.settings(fit)
-            data = data if selected.is_timed else data.without_time()
-        found = identify_model(data, model, fit).with_uncertainty()
-    if selected is not None:
-        found = selected.record_in(found)
+            found, selected = identify_best(data, named_models(model), fit)
+            model = selected.model
+        else:
+            found = identify_model(data, model, fit).with_uncertainty()
     # Before anything is printed: a terminal that fails must not cost the fit.
     if out is not None:
         found.file.save(out)

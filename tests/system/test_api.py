@@ -5,6 +5,7 @@ import re
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 import bench
@@ -89,6 +90,26 @@ def test_a_model_is_saved_loaded_and_reported(found, tmp_path, capsys):
     assert bench.predict(loaded, [40.0]) == bench.predict(tmp_path / "model.json", [40.0])
     assert bench.report(found, [model])["status"] == "completed"
     assert "polynomial" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("model", [None, "polynomial,polynomial-plays"])
+def test_of_several_models_the_same_is_chosen_as_by_the_command(request, tmp_path, model):
+    inputs = np.sin(np.linspace(0.0, 30.0, 60)) * np.linspace(1.0, 0.3, 60)
+    table = tmp_path / "table.csv"
+    table.write_text("t,u,y\n" + "".join(f"{-n},{u},{u**3}\n" for n, u in enumerate(inputs)))
+    found = bench.identify(table, model, input="u", output="y", smoothing=0.01)
+    assert "t does not increase in row 2" in found.data.assumptions
+    request.getfixturevalue("bench")(
+        "identify", table, "--input", "u", "--output", "y", "--smoothing", "0.01", "--out", tmp_path / "model.json",
+        *([] if model is None else ["--model", model]),
+    )  # fmt: skip
+    chosen = bench.load(tmp_path / "model.json")
+    assert (found.file.name, len(found.file.provenance["selection"]["table"])) == (
+        chosen.name, len(chosen.provenance["selection"]["table"]),
+    )  # fmt: skip
+    np.testing.assert_array_equal(bench.predict(found, inputs), bench.predict(chosen, inputs))
+    with pytest.raises(ConfigurationError, match="one model"):
+        bench.identify(table, model, input="u", output="y", cross_validated=True)
 
 
 def test_a_run_that_fails_raises_and_names_its_record(tmp_path):

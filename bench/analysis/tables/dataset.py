@@ -120,9 +120,19 @@ class Dataset:
         """
         return None if self.time is None else seconds_of(self.source, self.time)[0]
 
-    def without_time(self) -> Dataset:
-        """Return the same rows without their times."""
-        return replace(self, time=None)
+    def without_time(self, reason: str = "") -> Dataset:
+        """Return the same rows without their times; the assumptions say why, if a reason is given."""
+        return replace(self, time=None, assumptions=", ".join(filter(None, [self.assumptions, reason])))
+
+    def with_usable_times(self) -> Dataset:
+        """Return the same rows, without times that nobody asked for and that cannot be used."""
+        if self.time is None or self.time.name in (self.input.name, self.output and self.output.name):
+            return self.without_time()
+        try:
+            _ = self.times
+        except DataError as error:
+            return self.without_time(f"{error}: time is left out")
+        return self
 
     def check_units(self, model: ModelFile) -> None:
         """Check that input and output are in the units of a model; an unknown unit passes.
