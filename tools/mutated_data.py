@@ -257,6 +257,11 @@ def try_matlab(folder: Path, rng: random.Random) -> str:
     return _try_arrays(folder, rng, "m.mat", save)
 
 
+def try_numpy(folder: Path, rng: random.Random) -> str:
+    """Import a mutated NumPy file."""
+    return _try_arrays(folder, rng, "m.npz", lambda path, columns: np.savez(path, **columns))
+
+
 def try_hdf5(folder: Path, rng: random.Random) -> str:
     """Import a mutated HDF5 file."""
     import h5py
@@ -357,6 +362,6 @@ def try_parquet(folder: Path, rng: random.Random) -> str:
 
 
 KINDS = {
-    "text": try_text, "spreadsheet": try_spreadsheet, "matlab": try_matlab, "hdf5": try_hdf5, "tdms": try_tdms,
-    "parquet": try_parquet,
+    "text": try_text, "spreadsheet": try_spreadsheet, "matlab": try_matlab, "hdf5": try_hdf5, "numpy": try_numpy,
+    "tdms": try_tdms, "parquet": try_parquet,
 }  # fmt: skip
