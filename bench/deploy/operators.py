@@ -172,7 +172,7 @@ def _preisach(model: Preisach, starts: Starts, real: Real, prefix: str, base: st
         inverse, sign = inverse.opposite, "-"
     assert isinstance(inverse, PreisachInverse)
     operator = inverse.operator
-    lattice, (minus, plus, tolerance) = operator.lattice, inverse.ends
+    lattice = operator.lattice
     order, room = operator.order, max(_LEAST_ROOM, 2 * operator.order + 2)
     pieces: list[float] = []
     places, inputs = [], []
@@ -192,30 +192,34 @@ def _preisach(model: Preisach, starts: Starts, real: Real, prefix: str, base: st
         "offset": lattice.offset,
         "low": low,
         "high": high,
-        "minus": minus,
-        "plus": plus,
-        "tolerance": tolerance * _ROUNDING[real],
-        "fall": min(operator.steepest_fall(), _INFINITE),
+        "tolerance": inverse.tolerance * _ROUNDING[real],
         "INFINITE": _INFINITE,
+        "gains": inverse.gains,
+        "least": inverse.branches[:, 2].min(),
+        "greatest": inverse.branches[:, 3].max(),
         "pieces": np.array([*pieces, 0.0, 0.0]),
         "starts": np.array(places),
         "inputs": np.array(inputs),
     }
-    bits = max(order, room).bit_length() + 1
+    rises, points = operator.rises(), 0
+    # Of segments in one direction.
+    walked = order + room + lattice.breaks.size + 4
+    if not rises:
+        numbers |= {"branches": inverse.branches}
+        points = inverse.branches.shape[-1]
+    parts = parts_of("preisach.c.in")
     words = {
-        "order": order, "room": room, "breaks": lattice.breaks.size, "bits": bits,
-        "sign": sign, "plus": "-" if sign else "+",
+        "order": order, "room": room, "breaks": lattice.breaks.size, "points": points,
+        "bits": max(order, points).bit_length() + 1, "sign": sign, "plus": "-" if sign else "+",
     }  # fmt: skip
     width = 4 if real == "float" else 8
     state = -(-(width * (3 * room + 4) + 4) // width) * width
-    walked = order + room + lattice.breaks.size + 4
     bounds = (
         f"at most {room} pieces wiped out, and as many looked at where the memory is full; two cells read",
-        f"at most {bits} corners and {6 + 2 * bits} levels looked at, and some segments walked"
-        if operator.steepest_fall() == 0.0
-        else f"at most {4 * walked} segments walked",
+        f"at most {walked if rises else walked + room + 8} segments walked",
     )
-    return _compose("preisach.c.in", words, numbers, [], state, bounds, real, prefix, base)
+    rest = [parts["rising" if rises else "everywhere"], parts["invert"]]
+    return _compose("preisach.c.in", words, numbers, rest, state, bounds, real, prefix, base)
 
 
 def _centred(breaks: Floats, quadratics: Floats, span: tuple[float, float], real: Real) -> Floats:

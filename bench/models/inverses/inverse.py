@@ -30,10 +30,10 @@ if TYPE_CHECKING:
 S = TypeVar("S")
 Policy: TypeAlias = Literal["nearest", "paper"]
 
-# As the compiled walks take them, see `_inverse_kernels.Ends`.
-_Plane: TypeAlias = tuple[Floats, float, Floats]
-_Terms: TypeAlias = tuple[Floats, Floats]
-_Ends: TypeAlias = tuple[float, float, float, float, float, float, bool]
+# As the compiled walks take them, see `inverse_kernels`.
+_Operator: TypeAlias = tuple[tuple[Floats, float, Floats], Floats, float, tuple[Floats, Floats]]
+_Shape: TypeAlias = tuple[Floats, Floats]
+_Ends: TypeAlias = tuple[float, float, float, bool, bool]
 
 _TOLERANCE = 2e-13
 """Part of the output scale within which a target counts as met.
@@ -369,25 +369,68 @@ class PreisachInverse(Inverse[MemoryCurve]):
     operator: Preisach
 
     @cached_property
-    def ends(self) -> tuple[float, float, float]:
-        """Outputs at negative and positive saturation, and the tolerance, output units."""
+    def tolerance(self) -> float:
+        """Difference from a target that counts as none, output units."""
         operator = self.operator
-        low, high = float(operator.levels[0]), float(operator.levels[-1])
-        minus, plus = operator.evaluate([low, high], MemoryCurve.from_negative_saturation(low)).tolist()
         magnitude = float(np.abs(operator.density) @ operator.cell_areas()) + abs(operator.bias)
-        return minus, plus, _TOLERANCE * max(magnitude, abs(minus), abs(plus))
+        return _TOLERANCE * max(magnitude, *np.abs(self.branches[:, 1, 0]).tolist())
 
     @cached_property
-    def _fall(self) -> float:
-        """Steepest fall of the output with a rising input."""
-        return self.operator.steepest_fall()
+    def branches(self) -> Floats:
+        """The major branches, downwards from positive saturation and upwards from negative, shape (2, 4, N).
+
+        By rows: the inputs at the ends of the segments, from the end of the plane (repeated to fill the row) to that
+        of the operating range; the outputs there; the least and the greatest output up to there.
+        """
+        operator = self.operator
+        (low, high), (lowest, highest) = operator.input_range, operator.plane
+        ends = np.unique(np.clip([*operator.levels, *operator.lattice.breaks, low, high], low, high))
+        states = operator.saturated_state(1, highest), operator.saturated_state(-1, lowest)
+        found = np.empty((2, 4, ends.size))
+        for rows, inputs, state in zip(
+            found, (np.minimum(ends, highest)[::-1], np.maximum(ends, lowest)), states, strict=True
+        ):
+            middles = np.column_stack([0.5 * (inputs[:-1] + inputs[1:]), inputs[1:]]).ravel()
+            outputs = operator.evaluate(np.append(inputs[0], middles), state)
+            before, middle, after = outputs[:-1:2], outputs[1::2], outputs[2::2]
+            # The vertex of the quadratic through three outputs, if it is between them.
+            slope, bend = 0.5 * (after - before), 0.5 * (before + after) - middle
+            between = np.abs(slope) < 2.0 * np.abs(bend)
+            vertex = np.where(between, middle - 0.25 * slope**2 / np.where(between, bend, 1.0), after)
+            rows[:2] = inputs, outputs[::2]
+            rows[2] = np.minimum.accumulate(np.append(outputs[0], np.minimum(after, vertex)))
+            rows[3] = np.maximum.accumulate(np.append(outputs[0], np.maximum(after, vertex)))
+        return found
 
     @cached_property
-    def _constants(self) -> tuple[_Plane, Floats, float, _Terms, _Ends]:
-        t, (minus, plus, tolerance) = self.operator.lattice, self.ends
-        low, high = self.operator.input_range
-        ends = (low, high, minus, plus, tolerance, self._fall, self.policy == "nearest")
-        return t.plane, t.below, t.offset, t.terms, ends
+    def gains(self) -> Floats:
+        """Bounds on what a move through a cell adds to the output, whatever the memory, shape (2, 2, M), >= 0.
+
+        Of a falling (0) and a rising input (1), each for a falling (0) and a rising output (1); output units.
+        """
+        lattice, order = self.operator.lattice, self.operator.order
+        steps, density = np.diff(lattice.levels), lattice.table[:, :, 3]
+        # Slopes beside the triangle at the diagonal: a fall takes away the part of the cell's column above the
+        # triangle and below an edge; a rise adds the part of its row between an edge and the triangle.
+        columns = np.concatenate([lattice.table[1:, :, 2], lattice.table[-1:, :, 2] + density[-1:] * steps[-1]])
+        rows, within = lattice.table[:, :, 1], np.tri(order) > 0.0
+        parts = (
+            np.where(within, np.diag(columns) - columns, 0.0).T,
+            np.where(within, np.diag(rows)[:, None] - rows, 0.0),
+        )
+        slopes = self.operator.reversible_slopes(lattice.levels)
+        found = np.empty((2, 2, order))
+        for way, up in np.ndindex(2, 2):
+            sign, direction = 2 * up - 1, 2 * way - 1
+            beside = (sign * parts[way]).max(axis=1) + np.maximum(sign * direction * np.diag(density) * steps, 0.0)
+            found[way, up] = 2.0 * beside + (sign * direction * slopes).max(axis=0)
+        return np.maximum(found, 0.0) * steps
+
+    @cached_property
+    def _constants(self) -> tuple[_Operator, _Shape, _Ends]:
+        t = self.operator.lattice
+        ends = (*self.operator.input_range, self.tolerance, self.operator.rises(), self.policy == "nearest")
+        return (t.plane, t.below, t.offset, t.terms), (self.gains, self.branches), ends
 
     def invert(self, state: MemoryCurve, target: float) -> Inversion[MemoryCurve]:
         """Return the set-points that bring the output from `state` to `target`; see `Inverse.invert`."""
@@ -395,15 +438,14 @@ class PreisachInverse(Inverse[MemoryCurve]):
 
         if not math.isfinite(target):
             raise ValueError(f"target: expected a finite number, got {target}")
-        minus, plus, tolerance = self.ends
         start = self.operator._pieces(state)
         count, first, last, error, iterations = _kernels.invert_state(
             *self._constants, start, state.input, float(target)
         )
-        reach = Reach.of(abs(error) <= 2.0 * tolerance, -error)
+        reach = Reach.of(abs(error) <= 2.0 * self.tolerance, -error)
         if count == 1:
             return Inversion((last,), (target + error,), reach, iterations, state.step(last))
-        turned = plus if first > last else minus
+        turned = float(self.branches[0 if first > last else 1, 1, 0])
         final = state.step(first).step(last)
         return Inversion((first, last), (turned, target + error), reach, iterations, final)
 

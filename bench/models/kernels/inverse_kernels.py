@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
-from bench.base import IntegerTable, Table, inlined, inner, kernel
+from bench.base import Cube, IntegerTable, Table, inlined, inner, kernel
 from bench.models.kernels import memory_kernels as memory
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 
-Corners = tuple[Floats, Floats, int]  # left edges and heights of the pieces, and how many count
-# Ends of the operating range, outputs at negative and positive saturation (at the ends of the plane), tolerance,
-# steepest fall of the output with a rising input, whether the nearest answer is wanted.
-Ends = tuple[float, float, float, float, float, float, bool]
-Place = tuple[int, float, int, float]  # number of pieces, input within the plane, its cell, and the mass up to it
-
-# More segments than there are. Derivation: a quarter of the range of int64, so that sums do not overflow.
-_ALL = 2**62
-# Segments that are walked before a leap, and levels that a target is away for one at once.
-# Derivation: a leap is a search of some log₂ 200 segments; a smooth reference needs one or two steps.
-_NEAR = 8
-# Tries from which every other one halves the way.
-# Derivation: halves alone find one of 200 levels in eight tries; six that were in vain cost less than that again.
-_INTERPOLATED = 6
+# Plane, `below` and offset, and terms, as `memory.output_at` takes them.
+Operator = tuple[memory.Plane, Floats, float, memory.Terms]
+# Greatest rises by cell and major branches, see `PreisachInverse.gains` and `branches`.
+Shape = tuple[Cube, Cube]
+# Ends of the operating range, tolerance, whether the output rises with the input whatever the memory, and whether the
+# nearest answer is wanted.
+Ends = tuple[float, float, float, bool, bool]
+# Left edges, heights and masses to the left of the pieces, how many count, and the mass up to the input.
+Curve = tuple[Floats, Floats, Floats, int, float]
 
 
 @inlined
@@ -57,240 +54,213 @@ def _first_root(a: float, b: float, r: float, length: float, tolerance: float) -
 
 @inlined
 def walk(
-    plane: memory.Plane,
-    terms: memory.Terms,
+    operator: Operator,
+    gains: Cube,
+    tolerance: float,
     end: float,
-    corners: Corners,
+    curve: Curve,
     u: float,
     value: float,
     target: float,
-    tolerance: float,
+    closest: float,
     direction: int,
-    reach: float,
-    most: int,
-    edge: float,
 ) -> tuple[float, float, int]:
-    """Walk from input u in one direction until the output meets the target.
+    """Walk from input u in one direction to `end`, until the output meets the target.
 
-    The pieces are only read: what a monotone move wipes out is passed over. Upwards, `edge` is the left edge of what
-    rises, and the pieces are those to the left of it. Returns the input where the output met the target, or else
-    came closest to it, the error there (output - target), and the number of segments. Gives up beyond the distance
-    `reach`, and after the number of segments `most`.
+    Returns the input where the output met the target, or else came closest to it, the error there (output - target),
+    and the number of segments; the start if the output came no closer than the error `closest` < 0. The pieces are
+    only read: what a monotone move wipes out is passed over.
+
+    A move in the direction changes the output with the slope `constant` + `bend` (u - level) - `steep` (edge - start)
+    while u stays within one cell and one quadratic of the reversible part, and the edge of what the move changes
+    within one cell. A corner of the memory curve changes the edge only. Cells that cannot bring the output closer, by
+    their greatest rises, are passed over.
     """
-    left, height, n = corners
-    start = u
-    best, error = u, value - target
-    border = height[n - 1] if n > 0 else np.inf
-    steps = 0
-    while abs(error) > tolerance and steps < most and (u - start) * direction <= reach:
-        if direction > 0:
-            stop, a, b = memory.segment_up(plane, terms, end, edge, border, u)
-            length = stop - u
+    plane, below, offset, terms = operator
+    levels, inverse_step, table = plane
+    breaks, quadratics = terms
+    left, height, masses, n, mass = curve
+    count, rises, above = n, direction > 0, value < target
+    # The error is below 0 until the target is met; `most` is the greatest that it can be.
+    sign = 1.0 if above else -1.0
+    error = sign * (value - target)
+    best, off, steps = u, value - target, 0
+    if error >= -tolerance:
+        return best, off, steps
+    closest = max(closest, error)
+    most = error
+    low, high, final = levels[0], levels[-1], levels.size - 2
+    way, last, field, r = (1, final, 1, 0) if rises else (0, 0, 2, breaks.size)
+    upward = 1 if above else 0
+    cell = memory.locate(levels, inverse_step, u)
+    if not rises and u <= levels[cell] and cell > 0:
+        cell -= 1
+    inside = low <= u < high if rises else low < u <= high
+    edge, other, known, placed = max(u, low), 0, True, False
+    while (end - u) * direction > 0.0:
+        while inside and most + gains[way, upward, cell] <= closest:
+            most += gains[way, upward, cell]
+            u = levels[cell + way]
+            known = placed = False
+            if cell == last:
+                inside = False
+            else:
+                cell += direction
+        if not placed:
+            # Corners that were passed over, and the edge and its cell.
+            if rises:
+                while n > 0 and height[n - 1] <= u:
+                    n -= 1
+                if n < count:
+                    edge, mass = left[n], masses[n]
+            else:
+                while n > 0 and left[n - 1] >= u:
+                    n -= 1
+                edge = height[n - 1] if n > 0 else u
+            other = memory.locate(levels, inverse_step, edge)
+            placed = True
+        if not known:
+            if rises:
+                error = memory.row_mass(levels, table, edge, other, u, cell, u, cell, mass)
+            elif n > 0:
+                k = memory.locate(levels, inverse_step, left[n - 1])
+                error = memory.row_mass(levels, table, left[n - 1], k, u, cell, edge, other, masses[n - 1])
+            else:
+                error = 0.0
+            error = sign * (memory.output_at(plane, below, offset, terms, u, u, cell, error) - target)
+            most, known = error, True
+            if error > closest:
+                best, off, closest = u, sign * error, error
+                if error >= -tolerance:
+                    break
+            continue
+        # To the end of the cell, of the quadratic, or of the way.
+        if rises:
+            while r < breaks.size and u >= breaks[r]:
+                r += 1
+            stop = min(end, breaks[r]) if r < breaks.size else end
+            border = levels[cell + 1] if inside else low if u < low else end
         else:
-            while n > 0 and left[n - 1] >= u:
-                n -= 1
-            edge, border = (left[n - 1], height[n - 1]) if n > 0 else (u, u)
-            stop, a, b = memory.segment_down(plane, terms, end, edge, border, u)
-            length = u - stop
-        if length <= 0.0:
+            while r > 0 and u <= breaks[r - 1]:
+                r -= 1
+            stop = max(end, breaks[r - 1]) if r > 0 else end
+            border = levels[cell] if inside else high if u > high else end
+        crosses = (border - stop) * direction <= 0.0
+        if crosses:
+            stop = border
+        level = levels[cell] if inside else u
+        linear = sign * direction * (quadratics[r, 1] + 2.0 * quadratics[r, 2] * level)
+        curved = 2.0 * sign * direction * quadratics[r, 2]
+        constant, bend, start, steep = linear, curved, 0.0, 0.0
+        entered = more = inside
+        met = False
+        while True:
+            if entered:
+                row, column = (cell, other) if rises else (other, cell)
+                constant = linear + 2.0 * sign * (table[cell, cell, field] - table[row, column, field])
+                bend = curved + 2.0 * sign * table[cell, cell, 3]
+                start, steep = levels[other], 2.0 * sign * table[row, column, 3]
+                entered = False
+            corner = stop
+            if inside and n > 0:
+                corner = height[n - 1] if rises else left[n - 1]
+            more = (stop - corner) * direction > 0.0
+            if not more:
+                corner = stop
+            move = corner - u
+            length = direction * move
+            slope = constant + bend * (u - level) - steep * (edge - start)
+            half = 0.5 * bend * move
+            after = error + length * (slope + half)
+            steps += 1
+            if slope > 0.0 and slope + 2.0 * half < 0.0:
+                # The output comes closest inside the segment.
+                vertex = -0.5 * slope * length / half
+                peak = error + 0.5 * slope * vertex
+                if peak > closest:
+                    best, off, closest = u + direction * vertex, sign * peak, peak
+            if after > closest:
+                best, off, closest = corner, sign * after, after
+            if closest > -tolerance:
+                a = half / length
+                d = _first_root(a, slope, -error, length, tolerance)
+                if d >= 0.0:
+                    best, off = u + direction * d, sign * (error + d * (slope + a * d))
+                met = True
+                break
+            u, error = corner, after
+            if not more:
+                break
+            n -= 1
+            if rises:
+                edge, mass = left[n], masses[n]
+                while edge < levels[other]:
+                    other -= 1
+                    entered = True
+            else:
+                edge = height[n - 1] if n > 0 else u
+                while other < final and edge > levels[other + 1]:
+                    other += 1
+                    entered = True
+        if met:
             break
-        steps += 1
-        d = _first_root(a, b, target - value, length, tolerance)
-        if d >= 0.0:
-            return u + direction * d, value + d * (b + a * d) - target, steps
-        if a != 0.0:
-            # The output may come closest inside the segment.
-            vertex = -0.5 * b / a
-            if 0.0 < vertex < length and abs(value + 0.5 * b * vertex - target) < abs(error):
-                best, error = u + direction * vertex, value + 0.5 * b * vertex - target
-        value += length * (b + a * length)
-        u = stop
-        if abs(value - target) < abs(error):
-            best, error = u, value - target
-        if direction > 0:
-            while n > 0 and height[n - 1] <= u:
-                n -= 1
-                edge = left[n]
-            border = height[n - 1] if n > 0 else np.inf
-    return best, error, steps
+        most = error
+        if crosses:
+            if not inside:
+                inside = low <= u < high if rises else low < u <= high
+            elif cell == last:
+                inside = False
+            else:
+                cell += direction
+    return best, off, steps
 
 
 @inlined
-def _walk_on(
-    plane: memory.Plane,
-    terms: memory.Terms,
-    end: float,
-    corners: Corners,
-    u: float,
-    value: float,
-    target: float,
-    tolerance: float,
-    direction: int,
-    reach: float,
-    most: int,
+def _on_branch(
+    operator: Operator, shape: Shape, tolerance: float, end: float, which: int, target: float
 ) -> tuple[float, float, int]:
-    """Walk from a state; see `walk`."""
-    left, height, n = corners
-    edge = u
-    if direction > 0:
-        n, edge, _ = memory.rising_piece(plane[0], left, height, n, u)
-    return walk(plane, terms, end, (left, height, n), u, value, target, tolerance, direction, reach, most, edge)
-
-
-@inlined
-def _risen(
-    plane: memory.Plane,
-    below: Floats,
-    offset: float,
-    terms: memory.Terms,
-    piece: tuple[float, int, float],
-    x: float,
-) -> float:
-    """Return the output after a rise to x within the plane; by left edge of what rises, its column and mass left."""
-    levels, inverse_step, table = plane
-    edge, column, mass = piece
-    k = memory.locate(levels, inverse_step, x)
-    mass = memory.row_mass(levels, table, edge, column, x, k, x, k, mass)
-    return memory.output_at(plane, below, offset, terms, x, x, k, mass)
-
-
-@inlined
-def _fallen(
-    plane: memory.Plane,
-    below: Floats,
-    offset: float,
-    terms: memory.Terms,
-    pieces: memory.Pieces,
-    p: int,
-    x: float,
-) -> float:
-    """Return the output after a fall to x within the plane, into piece p; -1 for below all pieces."""
-    levels, inverse_step, table = plane
-    left, height, mass_left, column, row = pieces
-    k = memory.locate(levels, inverse_step, x)
-    mass = 0.0
-    if p >= 0:
-        mass = memory.row_mass(levels, table, left[p], column[p], x, k, height[p], row[p], mass_left[p])
-    return memory.output_at(plane, below, offset, terms, x, x, k, mass)
+    """Return what `walk` does, from saturation along a major branch: downwards (0) or upwards (1)."""
+    levels = operator[0][0]
+    gains, branches = shape
+    first, last = 0, branches.shape[2] - 1
+    wanted = min(max(target, branches[which, 2, last]), branches[which, 3, last])
+    while first < last:
+        middle = (first + last) // 2
+        if branches[which, 2, middle] <= wanted <= branches[which, 3, middle]:
+            last = middle
+        else:
+            first = middle + 1
+    before = max(first - 1, 0)
+    u, value = branches[which, 0, before], branches[which, 1, before]
+    # The first number of `below` is the mass to the left of the only piece, 0.
+    curve = levels, levels if which else levels[-1:], operator[1], 1, 0.0
+    x, e, steps = walk(operator, gains, tolerance, end, curve, u, value, wanted, -tolerance, 1 if which else -1)
+    return x, e + (wanted - target), steps
 
 
 @inner
-def _leap(
-    plane: memory.Plane,
-    below: Floats,
-    offset: float,
-    terms: memory.Terms,
+def _elsewhere(
+    operator: Operator,
+    shape: Shape,
     ends: Ends,
-    pieces: memory.Pieces,
-    place: Place,
-    value: float,
-    target: float,
-) -> tuple[float, float, int]:
-    """Return what `walk` does, of a monotone operator, from within the plane.
-
-    By bisection over the corners of the memory curve, and then by interpolation over the levels between two of them:
-    the output at each follows from the mass to the left of one piece.
-    """
-    levels, inverse_step, _ = plane
-    left, height, mass_left, column, _ = pieces
-    n, near, k, mass = place
-    low, high, minus, plus, tolerance, _, _ = ends
-    rises = target > value
-    edge = near
-    moved = near, k, mass
-    # The target lies between `near` and `far`. Of the pieces from `last` on, each is wiped out before it.
-    far, far_value = (levels[-1], plus) if rises else (levels[0], minus)
-    first, last = 0, n
-    while first < last:
-        p = (first + last) // 2
-        corner = height[p] if rises else left[p]
-        piece = left[p], column[p], mass_left[p]
-        if rises:
-            reached = _risen(plane, below, offset, terms, piece, corner)
-        else:
-            reached = memory.output_at(plane, below, offset, terms, corner, corner, column[p], mass_left[p])
-        if reached != target and (reached < target) == rises:
-            last, near, value = p, corner, reached
-            edge, moved = left[p], piece
-        else:
-            first, far, far_value = p + 1, corner, reached
-    if far_value != target and (far_value < target) == rises:
-        # Not within the plane.
-        near = far
-    tries = 0
-    while near != far:
-        share = 0.5
-        # Interpolation alone may creep.
-        if tries < _INTERPOLATED or tries % 2 == 0:
-            share = (target - value) / (far_value - value)
-        tries += 1
-        k = memory.locate(levels, inverse_step, near + share * (far - near))
-        level = levels[k] if rises else levels[k + 1]
-        if level == near or (level < near) == rises:
-            break
-        if rises:
-            reached = _risen(plane, below, offset, terms, moved, level)
-        else:
-            reached = _fallen(plane, below, offset, terms, pieces, last - 1, level)
-        if reached != target and (reached < target) == rises:
-            near, value = level, reached
-        else:
-            far, far_value = level, reached
-    if near == far:
-        value = far_value
-    direction, end = (1, high) if rises else (-1, low)
-    corners = left, height, last
-    return walk(plane, terms, end, corners, near, value, target, tolerance, direction, np.inf, _ALL, edge)
-
-
-@inlined
-def invert(
-    plane: memory.Plane,
-    below: Floats,
-    offset: float,
-    terms: memory.Terms,
-    ends: Ends,
-    pieces: memory.Pieces,
-    place: Place,
+    curve: Curve,
     u: float,
     value: float,
     target: float,
+    worth: float,
+    ahead: tuple[float, float],
 ) -> tuple[int, float, float, float, int]:
-    """Return number of set-points, the first, the last, the error at the last, and the segments walked.
-
-    If the output never falls with a rising input, whatever the memory, one walk finds all solutions.
-    """
-    low, high, minus, plus, tolerance, fall, nearest = ends
-    corners = pieces[0], pieces[1], place[0]
-    if fall == 0.0:
-        direction = 1 if target > value else -1
-        end = high if direction > 0 else low
-        levels = plane[0]
-        within = levels[0] <= u <= levels[-1]
-        if within and abs(target - value) * levels.size > _NEAR * (plus - minus):
-            x, e, steps = _leap(plane, below, offset, terms, ends, pieces, place, value, target)
-            return 1, x, x, e, steps
-        most = _NEAR if within else _ALL
-        x, e, steps = _walk_on(plane, terms, end, corners, u, value, target, tolerance, direction, np.inf, most)
-        if abs(e) > tolerance and steps == most:
-            x, e, further = _leap(plane, below, offset, terms, ends, pieces, place, value, target)
-            steps += further
-        return 1, x, x, e, steps
-    # The other way is walked no further than the way on which the target is met first.
-    first = 1 if target > value else -1
-    ahead, behind = (high, low) if first > 0 else (low, high)
-    x1, e1, steps = _walk_on(plane, terms, ahead, corners, u, value, target, tolerance, first, np.inf, _ALL)
-    met = abs(e1) <= tolerance
-    preferred = not nearest and ((first > 0 and target <= plus) or (first < 0 and target >= minus))
-    reach = abs(x1 - u) if met else np.inf
-    # The other way, no nearer target is met where the output cannot come that far.
-    alone = low <= u <= high and fall * reach < abs(target - value) - tolerance
-    if met and (x1 == u or preferred or alone):
-        return 1, x1, x1, e1, steps
-    x2, e2, k2 = _walk_on(plane, terms, behind, corners, u, value, target, tolerance, -first, reach, _ALL)
-    steps += k2
-    met2 = abs(e2) <= tolerance
-    if met2 and not (met and abs(x2 - u) >= abs(x1 - u)):
+    """Return what `invert` does, after the walk towards the target: its input and error are `ahead`."""
+    low, high, tolerance, _, _ = ends
+    x1, e1 = ahead
+    met, distance = abs(e1) <= tolerance, abs(x1 - u)
+    # No further than the input at which the target is met already.
+    if target > value:
+        direction, end = -1, max(low, u - distance) if met else low
+    else:
+        direction, end = 1, min(high, u + distance) if met else high
+    x2, e2, steps = walk(operator, shape[0], tolerance, end, curve, u, value, target, worth, direction)
+    if abs(e2) <= tolerance and not (met and abs(x2 - u) >= distance):
         return 1, x2, x2, e2, steps
     if met:
         return 1, x1, x1, e1, steps
@@ -298,49 +268,74 @@ def invert(
     if abs(e2) < abs(e1):
         s1, s2, error = x2, x2, e2
     # The two major branches, through saturation.
-    travel = np.inf
-    levels = plane[0]
-    full = levels[:1].copy()
-    crest = levels[-1:].copy()
-    for direction in (-1, 1):
-        turn, end, output = (levels[-1], low, plus) if direction < 0 else (levels[0], high, minus)
-        branch = full, crest, (1 if direction < 0 else 0)
-        x, e, k = _walk_on(plane, terms, end, branch, turn, output, target, tolerance, direction, np.inf, _ALL)
+    levels = operator[0][0]
+    travel = math.inf
+    for which in range(2):
+        turn, end = (levels[0], high) if which else (levels[-1], low)
+        x, e, k = _on_branch(operator, shape, tolerance, end, which, target)
         steps += k
-        distance = abs(turn - u) + abs(x - turn)
+        way = abs(turn - u) + abs(x - turn)
         better = abs(e) < abs(error) - tolerance
-        equal = count == 2 and abs(e) <= abs(error) + tolerance and distance < travel
+        equal = count == 2 and abs(e) <= abs(error) + tolerance and way < travel
         if better or equal:
-            count, s1, s2, error, travel = 2, turn, x, e, distance
+            count, s1, s2, error, travel = 2, turn, x, e, way
     return count, s1, s2, error, steps
+
+
+@inlined
+def invert(
+    operator: Operator,
+    shape: Shape,
+    ends: Ends,
+    curve: Curve,
+    u: float,
+    value: float,
+    target: float,
+) -> tuple[int, float, float, float, int]:
+    """Return number of set-points, the first, the last, the error at the last, and the segments walked.
+
+    If the output rises with the input, whatever the memory, one walk finds all solutions.
+    """
+    low, high, tolerance, rising, nearest = ends
+    gains, branches = shape
+    last = branches.shape[2] - 1
+    least = min(branches[0, 2, last], branches[1, 2, last])
+    greatest = max(branches[0, 3, last], branches[1, 3, last])
+    # The greatest error of a place that may be an answer: the major branches come as close.
+    worth = -tolerance - max(target - greatest, least - target, 0.0)
+    direction = 1 if target > value else -1
+    end = high if direction > 0 else low
+    x, e, steps = walk(operator, gains, tolerance, end, curve, u, value, target, worth, direction)
+    preferred = not nearest and (target <= branches[0, 1, 0] if direction > 0 else target >= branches[1, 1, 0])
+    if rising or (abs(e) <= tolerance and (x == u or preferred)):
+        return 1, x, x, e, steps
+    count, first, final, e, more = _elsewhere(operator, shape, ends, curve, u, value, target, worth, (x, e))
+    return count, first, final, e, steps + more
 
 
 @kernel
 def invert_state(
-    plane: memory.Plane,
-    below: Floats,
-    offset: float,
-    terms: memory.Terms,
+    operator: Operator,
+    shape: Shape,
     ends: Ends,
     start: memory.Start,
     u: float,
     target: float,
 ) -> tuple[int, float, float, float, int]:
     """Return what `invert` does, from a state whose output is not known yet."""
+    plane, below, offset, terms = operator
     left, height, present = start
     n = left.size
     pieces = left, height, np.empty(n), np.empty(n, np.int64), np.empty(n, np.int64)
     k, mass = memory.load(plane, pieces, n, present)
     value = memory.output_at(plane, below, offset, terms, u, present, k, mass)
-    return invert(plane, below, offset, terms, ends, pieces, (n, present, k, mass), u, value, target)
+    return invert(operator, shape, ends, (left, height, pieces[2], n, mass), u, value, target)
 
 
 @kernel
 def follow(
-    plane: memory.Plane,
-    below: Floats,
-    offset: float,
-    terms: memory.Terms,
+    operator: Operator,
+    shape: Shape,
     ends: Ends,
     start: memory.Start,
     raw: float,
@@ -357,8 +352,9 @@ def follow(
     `rooms` are for the pieces, shapes (3, size) and (2, size), and for extrema, of which there are `count` already.
     `found`, shape (3, N), is given the first set-points (NaN where one is enough), the last ones and the outputs.
     """
-    plane, terms, pieces = memory.borrow(plane, terms, rooms[0], rooms[1])
-    below, extrema = memory.borrowed(below), memory.borrowed(rooms[2])
+    plane, terms, pieces = memory.borrow(operator[0], operator[3], rooms[0], rooms[1])
+    below, offset, extrema = memory.borrowed(operator[1]), operator[2], memory.borrowed(rooms[2])
+    gains, branches = memory.borrowed(shape[0]), memory.borrowed(shape[1])
     left0, height0, present = start
     n = left0.size
     for p in range(n):
@@ -368,14 +364,14 @@ def follow(
     for t in range(targets.size):
         target = targets[t]
         value = memory.output_at(plane, below, offset, terms, raw, present, k, mass)
-        place = n, present, k, mass
+        curve = pieces[0], pieces[1], pieces[2], n, mass
         setpoints, s1, s2, error, steps[t] = invert(
-            plane, below, offset, terms, ends, pieces, place, raw, value, target
+            (plane, below, offset, terms), (gains, branches), ends, curve, raw, value, target
         )
         found[0, t] = s1 if setpoints == 2 else np.nan
         found[1, t] = s2
         found[2, t] = target + error
-        met[t] = abs(error) <= 2.0 * ends[4]
+        met[t] = abs(error) <= 2.0 * ends[2]
         for stage in range(2 - setpoints, 2):
             before, raw = raw, s1 if stage == 0 else s2
             count, rising = memory.step_extrema(extrema, count, rising, before, raw)

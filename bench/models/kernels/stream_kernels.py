@@ -27,14 +27,14 @@ Words = NDArray[np.int64]
 # Derivation: the count is that of the names.
 NUMBERS, LEVELS, TABLE, BELOW, BREAKS, QUADRATICS, EXTREMA, PIECES, INDICES = range(9)
 LEVEL_COUNT, BREAK_COUNT, ROOM, EXTREMUM_COUNT, PIECE_COUNT, CELL, SATURATION = range(9, 16)
-NEAREST, WALKED = range(16, 18)
-WORD_COUNT = 18
+RISING, NEAREST, WALKED, GAINS, BRANCHES, BRANCH_POINTS = range(16, 22)
+WORD_COUNT = 22
 # Its numbers. The input as it is and within the plane, the mass up to it, and the output; then of the inverse, see
 # `_inverse_kernels.Ends`, and what it found: set-points (the first is nan where one is enough) and error.
 # Derivation: the count is that of the names.
 INVERSE_STEP, OFFSET, INPUT, PRESENT, MASS, OUTPUT = range(6)
-LOW, HIGH, MINUS, PLUS, TOLERANCE, FALL, FIRST, LAST, ERROR = range(6, 15)
-NUMBER_COUNT = 15
+LOW, HIGH, TOLERANCE, FIRST, LAST, ERROR = range(6, 12)
+NUMBER_COUNT = 12
 
 # Words of a stream of plays. The single-valued maps: number of thresholds, -1 for none, and address of thresholds,
 # intercepts and slopes, one behind the other. Derivation: the counts are those of the names.
@@ -163,26 +163,14 @@ def step(address: int, value: float) -> float:
 
 @inlined
 def _find(words: Words, numbers: Floats, plane: memory.Plane, target: float) -> tuple[int, float, float]:
-    ends = (
-        numbers[LOW],
-        numbers[HIGH],
-        numbers[MINUS],
-        numbers[PLUS],
-        numbers[TOLERANCE],
-        numbers[FALL],
-        words[NEAREST] != 0,
-    )
+    operator = plane, _below(words), numbers[OFFSET], _terms(words)
+    gains = carray(pointer(words[GAINS]), (2, 2, words[LEVEL_COUNT] - 1), np.float64)
+    branches = carray(pointer(words[BRANCHES]), (2, 4, words[BRANCH_POINTS]), np.float64)
+    ends = numbers[LOW], numbers[HIGH], numbers[TOLERANCE], words[RISING] != 0, words[NEAREST] != 0
+    pieces = _pieces(words)
+    curve = pieces[0], pieces[1], pieces[2], words[PIECE_COUNT], numbers[MASS]
     count, first, last, error, walked = inverse.invert(
-        plane,
-        _below(words),
-        numbers[OFFSET],
-        _terms(words),
-        ends,
-        _pieces(words),
-        (words[PIECE_COUNT], numbers[PRESENT], words[CELL], numbers[MASS]),
-        numbers[INPUT],
-        numbers[OUTPUT],
-        target,
+        operator, (gains, branches), ends, curve, numbers[INPUT], numbers[OUTPUT], target
     )
     numbers[FIRST] = first if count == 2 else math.nan
     numbers[LAST] = last

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -348,25 +347,23 @@ class Preisach(Operator[MemoryCurve]):
 
     def rises(self) -> bool:
         """Return whether the output can only rise with the input, with every memory."""
-        return self.steepest_fall() == 0.0
+        least, _ = self.reversible_slopes(np.array(self.input_range))
+        return bool((self.density >= 0.0).all() and least.min() >= 0.0)
 
-    def steepest_fall(self) -> float:
-        """Return a bound on how much the output falls by unit of a rising input, within the operating range.
+    def reversible_slopes(self, bounds: Floats) -> Floats:
+        """Return the least and the greatest slope of the reversible part between increasing bounds, shape (2, N - 1).
 
-        That of the reversible part, >= 0, in output units by input unit; infinity if a density is negative.
+        Bounds in input units, shape (N,); slopes in output units by input unit.
         """
-        return float(-min(self._reversible_slopes())) if (self.density >= 0.0).all() else math.inf
-
-    def _reversible_slopes(self) -> list[float]:
-        """Return the slopes of the reversible part at the ends of its pieces, and 0."""
-        slopes = [0.0]
-        if self.reversible is not None:
-            breaks, quadratics = self.reversible.pieces()
-            low, high = self.input_range
-            bounds = [low, *np.clip(breaks, low, high).tolist(), high]
-            for (_, b, a), ends in zip(quadratics, pairwise(bounds), strict=True):
-                slopes += [b + 2.0 * a * end for end in ends]
-        return slopes
+        breaks, quadratics = self.lattice.breaks, self.lattice.quadratics
+        points = np.unique(np.clip([*bounds, *breaks], bounds[0], bounds[-1]))
+        ends = np.column_stack([points[:-1], points[1:]])
+        _, linear, quadratic = quadratics[np.searchsorted(breaks, ends.mean(axis=1))].T
+        slopes = linear[:, None] + 2.0 * quadratic[:, None] * ends
+        first = np.searchsorted(points, bounds[:-1])
+        return np.array(
+            [np.minimum.reduceat(slopes.min(axis=1), first), np.maximum.reduceat(slopes.max(axis=1), first)]
+        )
 
     def inverse(self, policy: Policy = "nearest") -> Inverse[MemoryCurve]:
         """Return the exact inverse."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 from bench.base import checks as _checks
 from bench.models.memory import MemoryCurve
 from bench.models.reach import Reach
-from bench.models.streams.stream import PreisachStream, compiled_step
+from bench.models.streams.stream import PreisachStream, address_of, compiled_step
 
 if TYPE_CHECKING:
     from bench.models.inverses.inverse import Inverse, PlayInverse, PreisachInverse
@@ -100,10 +100,13 @@ class PreisachInverseStream(InverseStream[MemoryCurve]):
         self._forward = forward = PreisachStream(inverse.operator, state)
         self._find, self._follow = compiled_step("find"), compiled_step("follow")
         self._address, self._numbers, self._places = forward._address, forward._numbers, forward._kernels
-        *ends, nearest = inverse._constants[-1]
-        self._numbers[self._places.LOW : self._places.LOW + len(ends)] = ends
-        self._numbers[self._places.FIRST : self._places.ERROR + 1] = math.nan
-        forward._words[self._places.NEAREST] = nearest
+        _, shape, (low, high, tolerance, rising, nearest) = inverse._constants
+        places, words = self._places, forward._words
+        self._numbers[places.LOW : places.TOLERANCE + 1] = low, high, tolerance
+        self._numbers[places.FIRST : places.ERROR + 1] = math.nan
+        words[places.RISING], words[places.NEAREST] = rising, nearest
+        words[places.GAINS], words[places.BRANCHES] = map(address_of, shape)
+        words[places.BRANCH_POINTS] = shape[1].shape[2]
         self._target = math.nan
 
     def find(self, target: float) -> float:

@@ -43,6 +43,16 @@ def plain(order=12, seed=0, zeros=0.3, term=None, signed=False):
     return Preisach(levels, density, 0.5, term, (-0.2, 1.3))
 
 
+def model_of(kind, seed):
+    return {
+        "plain": lambda: plain(seed=seed),
+        "film": lambda: film(seed=seed),
+        "term": lambda: plain(seed=seed, term=QuadraticTerm(-0.4, 0.3, 0.5)),
+        "polynomial": lambda: plain(seed=seed, term=PolynomialTerm((0.3, -0.2, 0.4), 0.0, 1.0, 16)),
+        "signed": lambda: plain(seed=seed, signed=True),
+    }[kind]()
+
+
 def random_state(rng, low, high):
     start = MemoryCurve((), low, -1) if rng.random() < 0.5 else MemoryCurve((), high, 1)
     return start.advance(rng.uniform(low, high, rng.integers(1, 14)))
@@ -217,13 +227,7 @@ def test_two_setpoints_above_positive_saturation():
 @given(st.integers(0, 10_000), st.sampled_from(["plain", "film", "term", "signed"]))
 def test_sequence_equals_single_inversions(seed, kind):
     rng = np.random.default_rng(seed)
-    operator = {
-        "plain": lambda: plain(seed=seed),
-        "film": lambda: film(seed=seed),
-        "term": lambda: plain(seed=seed, term=QuadraticTerm(-0.4, 0.3, 0.5)),
-        "polynomial": lambda: plain(seed=seed, term=PolynomialTerm((0.3, -0.2, 0.4), 0.0, 1.0, 16)),
-        "signed": lambda: plain(seed=seed, signed=True),
-    }[kind]()
+    operator = model_of(kind, seed)
     inverse = PreisachInverse(operator, "paper" if seed % 2 else "nearest")
     least, greatest = operator.output_range()
     margin = 0.1 * (greatest - least)
@@ -249,10 +253,48 @@ def test_signed_density_meets_what_either_direction_or_a_major_branch_meets(seed
     state = random_state(rng, *operator.input_range)
     target = rng.uniform(*operator.output_range())
     found = PreisachInverse(operator).invert(state, target)
+    crossings = [first_crossing(operator, state, d, target) for d in (-1, 1)]
+    distances = [abs(x - state.input) for x in crossings if x is not None]
     if found.reach is Reach.MET:
         assert operator.value(found.state) == pytest.approx(target, abs=1e-9)
     else:
-        assert all(first_crossing(operator, state, d, target) is None for d in (-1, 1))
+        assert not distances
+    if distances and len(found.setpoints) == 1:
+        assert abs(found.setpoints[0] - state.input) <= min(distances) + 1e-6
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 10_000), st.sampled_from(["film", "term", "polynomial", "signed"]))
+def test_no_move_through_a_cell_gains_more_than_its_bound(seed, kind):
+    rng, operator = np.random.default_rng(seed), model_of(kind, seed)
+    gains, levels = PreisachInverse(operator).gains, operator.levels
+    state = random_state(rng, levels[0], levels[-1])
+    for way in (0, 1):
+        cells = [
+            k for k in range(operator.order) if (levels[k] >= state.input if way else levels[k + 1] <= state.input)
+        ]
+        for k in cells[:: 2 * way - 1]:
+            moves = np.linspace(*(levels[k : k + 2] if way else levels[k : k + 2][::-1]), 40)
+            outputs = operator.evaluate(moves, state)
+            changes = outputs[:, None] - outputs
+            later = changes[np.tril_indices(40)]
+            assert later.max() <= gains[way, 1, k] + 1e-9
+            assert -later.min() <= gains[way, 0, k] + 1e-9
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 10_000), st.sampled_from(["plain", "film", "term", "polynomial", "signed"]))
+def test_major_branches_have_their_extremes(seed, kind):
+    operator = model_of(kind, seed)
+    (low, high), (lowest, highest) = operator.input_range, operator.plane
+    for way, start, end in ((0, highest, low), (1, lowest, high)):
+        inputs, outputs, least, greatest = PreisachInverse(operator).branches[way]
+        dense = operator.evaluate(np.linspace(start, end, 5000), operator.saturated_state(2 * way - 1))
+        assert outputs[0] == pytest.approx(dense[0])
+        assert (inputs[0], inputs[-1]) == (start, end)
+        assert (least[-1], greatest[-1]) == pytest.approx((dense.min(), dense.max()), abs=1e-2 * np.ptp(dense))
+        assert least[-1] <= dense.min() + 1e-9
+        assert greatest[-1] >= dense.max() - 1e-9
 
 
 def test_tracks_what_forward_evaluation_made():
