@@ -20,7 +20,8 @@ from bench.models import (
     Summed,
     TwoStage,
     bring_responses,
-    free_evolution,
+    passages,
+    split_delay,
 )
 
 _SAMPLES = 4.0
@@ -124,10 +125,9 @@ def hammerstein_source(model: Hammerstein, starts: Starts, real: Real, period: f
             f"--period {period:g}: too long for the linear part, which rises within {rise:.4g} s; take at most "
             f"{rise / _SAMPLES:.4g} s, or identify a model without time"
         )
-    late, part = _split(linear.delay, period)
-    lags = [linear.lag, *((float(time), 0.0) for time in linear.creep_times)]
-    strengths = np.concatenate([[1.0], linear.creep_strengths])
-    free = np.array([[_evolution(*lag, t, period) for lag in lags] for t in (part * period, period)])
+    late, part = split_delay(linear.delay, period)
+    times, periods = np.array([part * period, period]), np.full(2, period)
+    passed = np.stack([passages(lag, times, periods) for lag in linear.lags], axis=1)
     ahead, _ = model.ahead(model.initial_state())
     try:
         bring_responses(ahead.linear, np.array([0.0, period, 2.0 * period]), np.zeros(3), None, lambda value: value)
@@ -135,27 +135,16 @@ def hammerstein_source(model: Hammerstein, starts: Starts, real: Real, period: f
         raise ConfigurationError(f"--period {period:g}: {error}") from None
     operator = operator_source(model.static, starts, real, f"{name}_h", name)
     numbers = {
-        "free": free,
-        "strengths": strengths,
+        "passages": passed,
+        "strengths": linear.strengths,
         "bias": model.static.bias,
-        "gain": float(strengths.sum()),
-        "effect": float(free[1, :, 2] @ strengths),
+        "part": part,
+        "gain": linear.gain,
+        "effect": linear.gain - float(passed[1, :, 2] @ linear.strengths),
     }
     words = {"creep": linear.creep_times.size, "late": late, "period": f"{period:g}"}
-    reals = 2 * (len(lags) + 1) + late + 3
+    reals = 2 * (2 * len(linear.lags) + 1) + late + 3
     return _joined("hammerstein.c.in", "hammerstein.h.in", [operator], numbers, words, reals, real, name)
-
-
-def _evolution(first: float, second: float, time: float, period: float) -> list[float]:
-    """Return how 1 / (1 + first s + second s²) passes a time of a period in which its input rises evenly.
-
-    From the value and the rate before, and `off`, the value less the input before: value -= leave off, += turn rate,
-    += follow rise; rate = slope rise + pull off + hold rate. In this order: leave, turn, follow, slope, pull, hold.
-    """
-    keep, turn, pull, hold = free_evolution(first, second, np.array([time]))[0].tolist()
-    leave = -math.expm1(-time / first) if first > 0.0 and second == 0.0 else 1.0 - keep
-    follow = (time - first * leave - turn) / period
-    return [leave, turn, follow, (1.0 + pull * first - hold) / period, pull, hold]
 
 
 def _joined(
@@ -197,13 +186,6 @@ def _with_memory(operator: Operator[Any]) -> Operator[Any]:
         return operator
     low, high = operator.input_range
     return PolynomialPlays(operator.series, np.array([high - low]), np.zeros(1), (low, high), operator.bias)
-
-
-def _split(delay: float, period: float) -> tuple[int, float]:
-    """Return the whole periods of a delay, and the part of a period after a sample at which the output is taken."""
-    periods = delay / period
-    whole = math.floor(periods + 1e-9)
-    return whole, 1.0 - max(periods - whole, 0.0)
 
 
 def _rise_time(first: float, second: float) -> float:

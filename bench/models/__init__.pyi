@@ -27,8 +27,9 @@ from .dynamic.linear_inverse import (
 from .dynamic.linear_parts import (
     FilterState as FilterState,
     LinearPart as LinearPart,
-    free_evolution as free_evolution,
     logarithmic_creep as logarithmic_creep,
+    passages as passages,
+    split_delay as split_delay,
 )
 from .dynamic.model_with_time import (
     TimedModel as TimedModel,

@@ -114,65 +114,113 @@ class LinearPart(Document):
         -------
         ndarray, shape (N, K), and the tuple of values (K,), rates (K,) and crept values (n, K).
         """
+        from bench.models.kernels import dynamic_kernels as _kernels
+
         t = _checks.samples("times", times)
         values = np.ascontiguousarray(columns, dtype=np.float64)
         count = values.shape[1]
-        value = values[0].copy() if state is None else np.full(count, state.value)
+        first = np.zeros(count) if state is None else state.value - values[0]
         rate = np.full(count, 0.0 if state is None else state.rate)
-        result = self._filter(t, values, self.lag, value, rate)
-        crept = np.empty((self.creep_times.size, count))
-        for j, (time, strength) in enumerate(zip(self.creep_times, self.creep_strengths, strict=True)):
-            crept[j] = values[0] if state is None else state.crept[j]
-            result += strength * self._filter(t, values, (float(time), 0.0), crept[j], np.zeros(count))
-        return result, (value, rate, crept)
+        steps = durations(t)
+        rows, elapsed = self._moments(t, steps)
+        steps_after = np.append(steps, 1.0)[rows]
+        shares = elapsed / steps_after
+        result = np.asarray(_kernels.delayed(values, rows, shares, self.gain))
+        offs = np.empty((1 + self.creep_times.size, count))
+        for j, (lag, strength) in enumerate(zip(self.lags, self.strengths.tolist(), strict=True)):
+            offs[j] = first if state is None or j == 0 else state.crept[j - 1] - values[0]
+            passed, late = passages(lag, steps, steps), passages(lag, elapsed, steps_after)
+            rates = rate if j == 0 else np.zeros(count)
+            _kernels.respond(values, passed, rows, late, strength, offs[j], rates, result)
+        return result, (values[-1] + offs[0], rate, values[-1] + offs[1:])
 
-    def _filter(
-        self, times: Floats, columns: Floats, lag: tuple[float, float], value: Floats, rate: Floats
-    ) -> Floats:
-        """Return delayed responses of 1 / (1 + a1 s + a2 s²), with its last state in `value` and `rate`."""
-        from bench.models.kernels import dynamic_kernels as _kernels
+    @property
+    def lags(self) -> list[tuple[float, float]]:
+        """Coefficients a1, a2 of the fast dynamics, then of each creep element."""
+        return [self.lag, *((time, 0.0) for time in self.creep_times.tolist())]
 
-        steps = np.diff(times)
-        rows, offsets = self._moments(times)
-        late = np.ascontiguousarray(free_evolution(*lag, offsets)[:, :2])
-        return np.asarray(
-            _kernels.filtered(columns, steps, lag[0], free_evolution(*lag, steps), rows, offsets, late, value, rate)
-        )
+    @property
+    def strengths(self) -> Floats:
+        """Gain of the fast dynamics, 1, then of each creep element; shape (n + 1,)."""
+        return np.concatenate([[1.0], self.creep_strengths])
 
-    def _moments(self, times: Floats) -> tuple[np.ndarray[Any, np.dtype[np.int64]], Floats]:
+    @property
+    def gain(self) -> float:
+        """Response to an input that has stood for long, as part of it."""
+        return float(self.strengths.sum())
+
+    def _moments(self, times: Floats, steps: Floats) -> tuple[np.ndarray[Any, np.dtype[np.int64]], Floats]:
         """Return the last sample before each delayed moment, -1 where there is none, and the time since, s."""
+        samples = np.arange(times.size)
         if self.delay == 0.0:
-            return np.arange(times.size), np.zeros(times.size)
+            return samples, np.zeros(times.size)
+        if steps.size and (steps == steps[0]).all():
+            whole, part = split_delay(self.delay, float(steps[0]))
+            rows = samples - whole - (part < 1.0)
+            return np.maximum(rows, -1), np.where(rows < 0, 0.0, part % 1.0 * steps[0])
         moments = times - self.delay
         rows = np.searchsorted(times, moments, side="right") - 1
         return rows, np.where(rows < 0, 0.0, moments - times[np.maximum(rows, 0)])
 
 
-def free_evolution(first: float, second: float, durations: Floats) -> Floats:
-    """Return how value and rate of 1 / (1 + first s + second s²) evolve freely over durations, s.
+def durations(times: Floats) -> Floats:
+    """Return the steps between times, s; equal ones where they differ by no more than the rounding of the times."""
+    steps = np.diff(times)
+    if steps.size == 0:
+        return steps
+    mean = (times[-1] - times[0]) / steps.size
+    even = np.abs(steps - mean).max() <= 2.0 * np.spacing(np.abs(times).max())
+    return np.full(steps.size, mean) if even else steps
 
-    Rows of four: the matrix exponential, row by row; shape (N, 4).
+
+def split_delay(delay: float, period: float) -> tuple[int, float]:
+    """Return the whole periods of a delay, and the part of a period, in (0, 1], after which the output is taken.
+
+    The output at a sample is that of the input this part of a period after the sample before, whole periods ago.
     """
-    result = np.zeros((durations.size, 4))
+    periods = delay / period
+    whole = math.floor(periods + 1e-9)
+    return whole, 1.0 - max(periods - whole, 0.0)
+
+
+def passages(lag: tuple[float, float], elapsed: Floats, steps: Floats) -> Floats:
+    """Return how 1 / (1 + a1 s + a2 s²) passes times in steps during which its input rises evenly, shape (N, 6).
+
+    From `off`, the value less the input, and the rate at the begin of a step: off += turn rate - leave off -
+    behind rise, with `rise` that of the input within the step, and rate = slope rise + pull off + hold rate. In this
+    order: leave, turn, behind, slope, pull, hold. No small difference of great numbers is taken, however short the
+    steps are beside the lag.
+
+    Parameters
+    ----------
+    lag : tuple of float
+        a1 in s and a2 in s².
+    elapsed, steps : ndarray, shape (N,)
+        Time since the begin of a step, and the whole step, s.
+    """
+    first, second = lag
+    result = np.zeros((elapsed.size, 6))
+    leave, turn, _, slope, pull, hold = result.T
     if second == 0.0:
-        if first > 0.0:
-            result[:, 0] = np.exp(-durations / first)
-        return result
-    decay = 0.5 * first / second
-    difference = decay**2 - 1.0 / second
-    if difference < 0.0:
-        turn = math.sqrt(-difference)
-        envelope = np.exp(-decay * durations)
-        impulse = envelope * np.sin(turn * durations) / turn
-        level = envelope * np.cos(turn * durations) + decay * impulse
+        leave[:] = -np.expm1(-elapsed / first) if first > 0.0 else 1.0
     else:
-        root = math.sqrt(difference)
-        slow = -1.0 / second / (decay + root)
-        slowly = np.exp(slow * durations)
-        impulse = slowly * (-np.expm1(-2.0 * root * durations) / (2.0 * root) if root > 0.0 else durations)
-        level = slowly - slow * impulse
-    result[:, 0], result[:, 1] = level, impulse
-    result[:, 2], result[:, 3] = -impulse / second, level - impulse * first / second
+        decay = 0.5 * first / second
+        difference = decay**2 - 1.0 / second
+        if difference < 0.0:
+            frequency = math.sqrt(-difference)
+            envelope = np.exp(-decay * elapsed)
+            turn[:] = envelope * np.sin(frequency * elapsed) / frequency
+            level = envelope * np.cos(frequency * elapsed) + decay * turn
+        else:
+            root = math.sqrt(difference)
+            slow = -1.0 / second / (decay + root)
+            slowly = np.exp(slow * elapsed)
+            turn[:] = slowly * (-np.expm1(-2.0 * root * elapsed) / (2.0 * root) if root > 0.0 else elapsed)
+            level = slowly - slow * turn
+        leave[:] = 1.0 - level
+        pull[:], hold[:] = -turn / second, level - turn * first / second
+    result[:, 2] = (first * leave + turn) / steps
+    slope[:] = leave / steps
     return result
 
 

@@ -13,65 +13,88 @@ Integers = NDArray[np.int64]
 
 
 @kernel
-def filtered(
-    columns: Table,
-    steps: Floats,
-    lag: float,
-    free: Table,
-    rows: Integers,
-    offsets: Floats,
-    late: Table,
-    value: Floats,
-    rate: Floats,
-) -> Floats:
-    """Return columns behind 1 / (1 + lag s + a2 s²), exact for inputs that are linear between samples.
-
-    On a ramp of slope m the forced part is v - lag m; what is left decays freely. `value` and `rate`, shape (K,), are
-    the filter's state at the first sample, and at the last on return.
+def delayed(columns: Table, rows: Integers, shares: Floats, gain: float) -> Floats:
+    """Return `gain` times columns at delayed moments, shape (P, K), as straight lines between samples.
 
     Parameters
     ----------
     columns : ndarray, shape (N, K)
         One column an input.
-    steps : ndarray, shape (N - 1,)
-        s.
-    lag : float
-        s.
-    free : ndarray, shape (N - 1, 4)
-        Free evolution of (value, rate) over each step, row by row.
     rows : ndarray of int64, shape (P,)
-        The sample after which an output is wanted, in increasing order; -1 before the first.
-    offsets : ndarray, shape (P,)
-        How long after that sample, s.
-    late : ndarray, shape (P, 2)
-        First row of the free evolution over each offset.
-    value, rate : ndarray, shape (K,)
-        State, input units and input units / s.
+        The sample before each moment; -1 before the first.
+    shares : ndarray, shape (P,)
+        Part of the step after that sample.
     """
     samples, count = columns.shape
     result = np.empty((rows.size, count))
+    for p in range(rows.size):
+        before = max(rows[p], 0)
+        after = min(rows[p] + 1, samples - 1)
+        for k in range(count):
+            result[p, k] = gain * (columns[before, k] + shares[p] * (columns[after, k] - columns[before, k]))
+    return result
+
+
+@kernel
+def respond(
+    columns: Table,
+    passages: Table,
+    rows: Integers,
+    late: Table,
+    strength: float,
+    off: Floats,
+    rate: Floats,
+    result: Table,
+) -> None:
+    """Add by how much columns behind 1 / (1 + a1 s + a2 s²) are off their inputs, `strength` times.
+
+    Exact for inputs that are linear between samples. The sums over the steps are compensated (Kahan, Commun. ACM 8,
+    40, 1965), as slow creep moves by little in a step.
+
+    Parameters
+    ----------
+    columns : ndarray, shape (N, K)
+        One column an input.
+    passages : ndarray, shape (N - 1, 6)
+        How each step is passed, see `linear_parts.passages`.
+    rows : ndarray of int64, shape (P,)
+        The sample before each moment at which an output is wanted, in increasing order; -1 before the first.
+    late : ndarray, shape (P, 6)
+        How the time since that sample is passed.
+    strength : float
+        Factor.
+    off, rate : ndarray, shape (K,)
+        State at the first sample, and at the last on return: value less input, and rate.
+    result : ndarray, shape (P, K)
+        To which it is added.
+    """
+    samples, count = columns.shape
+    lost = np.zeros(count)
     wanted = 0
     while wanted < rows.size and rows[wanted] < 0:
         for k in range(count):
-            result[wanted, k] = value[k]
+            result[wanted, k] += strength * off[k]
         wanted += 1
     for n in range(samples):
         last = n == samples - 1
         while wanted < rows.size and rows[wanted] == n:
+            leave, turn, behind = late[wanted, 0], late[wanted, 1], late[wanted, 2]
             for k in range(count):
-                slope = 0.0 if last else (columns[n + 1, k] - columns[n, k]) / steps[n]
-                left = value[k] - columns[n, k] + lag * slope
-                forced = columns[n, k] + slope * (offsets[wanted] - lag)
-                result[wanted, k] = forced + late[wanted, 0] * left + late[wanted, 1] * (rate[k] - slope)
+                rise = 0.0 if last else columns[n + 1, k] - columns[n, k]
+                turned = turn * rate[k] - leave * off[k] - behind * rise - lost[k]
+                result[wanted, k] += strength * (off[k] + turned)
             wanted += 1
         if last:
             break
+        leave, turn, behind = passages[n, 0], passages[n, 1], passages[n, 2]
+        slope, pull, hold = passages[n, 3], passages[n, 4], passages[n, 5]
         for k in range(count):
-            slope = (columns[n + 1, k] - columns[n, k]) / steps[n]
-            left, more = value[k] - columns[n, k] + lag * slope, rate[k] - slope
-            value[k] = columns[n + 1, k] - lag * slope + free[n, 0] * left + free[n, 1] * more
-            rate[k] = slope + free[n, 2] * left + free[n, 3] * more
-    return result
+            rise = columns[n + 1, k] - columns[n, k]
+            before = off[k]
+            turned = turn * rate[k] - leave * before - behind * rise - lost[k]
+            rate[k] = slope * rise + pull * before + hold * rate[k]
+            off[k] = before + turned
+            lost[k] = (off[k] - before) - turned
 
 
 @kernel
