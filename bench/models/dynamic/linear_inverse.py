@@ -2,8 +2,8 @@
 
 The input is a straight line between samples, so that the response at a sample is a + b (z - z0), where z is the input
 there, z0 that before, and a follows from the state before. With first-order lag and creep this recursion is stable
-for every step. That of a resonance is not for steps short beside its period: the sampled system then has zeros outside
-of the unit circle (Åström, Hagander and Sternby, "Zeros of sampled systems", Automatica 20, 31-38, 1984).
+for every step. That of a resonance is not for steps short beside its period: the sampled system then has zeros
+outside of the unit circle (Åström, Hagander and Sternby, "Zeros of sampled systems", Automatica 20, 31-38, 1984).
 """
 
 from __future__ import annotations
