@@ -27,7 +27,7 @@ from deployed import (  # type: ignore[import-not-found]
     shrinking,
 )
 
-from bench.deploy import deploy
+from bench.deployment import deploy
 from bench.identification import ModelFile
 
 

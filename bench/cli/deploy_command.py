@@ -58,7 +58,7 @@ def deploy_(
     The functions are `NAME_init`, `NAME_step` (input to output), `NAME_invert` (target to input, and whether it
     can be met), `NAME_save` and `NAME_restore`. They allocate nothing, and every loop has a bound.
     """
-    from bench.deploy import controller_of_rig, deploy, write_fmu
+    from bench.deployment import controller_of_rig, deploy, write_fmu
     from bench.identification import load_model
 
     if c is None and fmu is None:

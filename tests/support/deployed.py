@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bench.base import Floats
-from bench.deploy import Controller, Real, deploy
+from bench.deployment import Controller, Real, deploy
 from bench.identification import ModelFile
 from bench.models import (
     BoucWen,

@@ -17,7 +17,7 @@ from deployed import (
 )
 
 from bench.base import ConfigurationError, DataError
-from bench.deploy import deploy
+from bench.deployment import deploy
 from bench.identification import ModelFile
 from bench.models import (
     Hammerstein,

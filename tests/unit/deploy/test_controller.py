@@ -6,7 +6,7 @@ from deployed import Compiled, plane
 
 from bench.base import ConfigurationError, DataError
 from bench.control import ControllerSetup, make_controller
-from bench.deploy import CONTROLLERS, Controller, controller_of_rig, deploy
+from bench.deployment import CONTROLLERS, Controller, controller_of_rig, deploy
 from bench.identification import ModelFile
 from bench.models import TwoStage
 

@@ -8,7 +8,7 @@ from fmpy.validation import validate_fmu
 
 from bench.analysis import predict
 from bench.base import ConfigurationError
-from bench.deploy import write_fmu
+from bench.deployment import write_fmu
 from bench.identification import ModelFile
 from bench.models import Hammerstein, LinearPart, TwoStage
 from sim_devices.plants.fmu import FMUPlant

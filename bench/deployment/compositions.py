@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from bench.base import ConfigurationError, DataError
-from bench.deploy.c_source import Real, Source, constants, parts_of, rendered
-from bench.deploy.operators import Starts, operator_source
+from bench.deployment.c_source import Real, Source, constants, parts_of, rendered
+from bench.deployment.operators import Starts, operator_source
 from bench.models import (
     Hammerstein,
     Linear,

@@ -12,10 +12,10 @@ from typing import Any
 import numpy as np
 
 from bench.base import ConfigurationError, DataError, json_text
-from bench.deploy.c_source import Real, Source, parts_of, rendered
-from bench.deploy.compositions import COUPLED, hammerstein_source
-from bench.deploy.controller import Controller, controller_source
-from bench.deploy.operators import Starts, operator_source, why_not
+from bench.deployment.c_source import Real, Source, parts_of, rendered
+from bench.deployment.compositions import COUPLED, hammerstein_source
+from bench.deployment.controller import Controller, controller_source
+from bench.deployment.operators import Starts, operator_source, why_not
 from bench.identification import ModelFile
 from bench.models import Coupled, Hammerstein, Operator
 

@@ -9,7 +9,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from bench.base import DataError, Floats
-from bench.deploy.c_source import Real, Source, Value, constants, parts_of, rendered
+from bench.deployment.c_source import Real, Source, Value, constants, parts_of, rendered
 from bench.models import (
     BoucWen,
     BranchInverse,

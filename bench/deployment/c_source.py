@@ -50,7 +50,7 @@ class Source:
 
 def parts_of(template: str) -> dict[str, str]:
     """Return the parts of a template of the runtime, by the names after their dashes; the first is `head`."""
-    text = files("bench.deploy").joinpath("runtime", template).read_text(encoding="utf-8")
+    text = files("bench.deployment").joinpath("runtime", template).read_text(encoding="utf-8")
     pieces = re.split(r"^/\*--- (\w+) ---\*/\n", text, flags=re.MULTILINE)
     return {"head": pieces[0], **dict(zip(pieces[1::2], pieces[2::2], strict=True))}
 

@@ -14,8 +14,8 @@ from typing import Any, Literal, TypeAlias
 from xml.sax.saxutils import quoteattr
 
 from bench.base import ConfigurationError, DataError
-from bench.deploy.c_source import parts_of, rendered
-from bench.deploy.export import deploy, ranges_of
+from bench.deployment.c_source import parts_of, rendered
+from bench.deployment.export import deploy, ranges_of
 from bench.identification import ModelFile
 from bench.models import Coupled, Hammerstein
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from bench.base import ConfigurationError, DataError
 from bench.control import FollowingParameters, Spans, load_tuning, tuned, widened
-from bench.deploy.c_source import Real, constants, parts_of, rendered
+from bench.deployment.c_source import Real, constants, parts_of, rendered
 from bench.identification import ModelFile
 from bench.models import Operator
 from bench.rig import load_rig
