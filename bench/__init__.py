@@ -16,10 +16,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from bench.api import compare, identify, invert, load, open_rig, predict, rehearse, report, run, runs
+    from bench.api import compare, deploy, identify, invert, load, open_rig, predict, rehearse, report, run, runs
 
 __all__ = [
-    "compare", "identify", "invert", "load", "open_rig", "predict", "rehearse", "report", "run", "runs",
+    "compare", "deploy", "identify", "invert", "load", "open_rig", "predict", "rehearse", "report", "run", "runs",
 ]  # fmt: skip
 
 

@@ -47,8 +47,9 @@ from bench.analysis import (
     select_runs,
     time_names,
 )
-from bench.base import BenchError, DeviceError, VirtualClock, show_patience, wall_time
+from bench.base import BenchError, ConfigurationError, DeviceError, VirtualClock, show_patience, wall_time
 from bench.batch import published_of
+from bench.deployment import Deployment, Real, controller_of_rig, deploy as export_model
 from bench.execution import Rehearsal, Run, carry_out, foresee
 from bench.identification import ModelFile, load_model
 from bench.protocol import ProtocolDefinition, find_protocol
@@ -305,6 +306,67 @@ def invert(
     values = np.asarray(targets, dtype=np.float64)
     moments = None if times is None else np.asarray(times, dtype=np.float64)
     return invert_targets(_model(model), values, initial=initial, continue_memory=continue_memory, times=moments)
+
+
+def deploy(
+    model: Model,
+    folder: Path | str,
+    *,
+    name: str = "model",
+    real: Real = "float",
+    period: float | None = None,
+    max_bytes: int | None = None,
+    controller: str | None = None,
+    rig: str | Path | None = None,
+    tuning: Path | str | None = None,
+) -> Deployment:
+    """Write a model, its inverse and its memory as C99 into a folder, which is made; return what was written.
+
+    Parameters
+    ----------
+    model : IdentifiedFile, ModelFile, Path or str
+        The model.
+    folder : Path or str
+        Where header, source, example and README are written.
+    name : str
+        Prefix of the functions, and name of the files; an identifier of C.
+    real : {"float", "double"}
+        Type of the numbers.
+    period : float, optional
+        Time of a step, s, of a controller or a model with time.
+    max_bytes : int, optional
+        Most bytes of code and constants.
+    controller : str, optional
+        Controller of `following` to write too: `closed-loop-inverse` or `open-loop-inverse`. It needs a rig.
+    rig : str or Path, optional
+        Name or file of the rig whose limits and rest set-point the controller has.
+    tuning : Path or str, optional
+        Tuning file of the controller.
+
+    Raises
+    ------
+    ConfigurationError
+        If an argument does not suit the model or the controller, or more bytes are needed.
+    DataError
+        If the model cannot be read or exported, or the folder not be written.
+
+    Examples
+    --------
+    >>> from bench.models import Preisach
+    >>> film = ModelFile("film", Preisach([20.0, 45.0, 70.0], [1.0, 0.5, 2.0]))
+    >>> written = deploy(film, getfixture("tmp_path") / "firmware", name="film")
+    >>> sorted(written.files), written.state < 1024
+    (['README.md', 'film.c', 'film.h', 'main.c'], True)
+    """
+    if (controller is None) != (rig is None) or (tuning is not None and controller is None):
+        raise ConfigurationError("controller and rig belong together, and tuning to them")
+    follower = None
+    if controller is not None and rig is not None:
+        follower = controller_of_rig(controller, str(rig), period, None if tuning is None else Path(tuning))
+        period = None
+    found = export_model(_model(model), name=name, real=real, period=period, max_bytes=max_bytes, controller=follower)
+    found.write(Path(folder))
+    return found
 
 
 def load(path: str | Path) -> RunFolder | ModelFile:

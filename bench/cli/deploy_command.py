@@ -58,29 +58,30 @@ def deploy_(
     The functions are `NAME_init`, `NAME_step` (input to output), `NAME_invert` (target to input, and whether it
     can be met), `NAME_save` and `NAME_restore`. They allocate nothing, and every loop has a bound.
     """
-    from bench.deployment import controller_of_rig, deploy, write_fmu
+    from bench.api import deploy
+    from bench.deployment import write_fmu
     from bench.identification import load_model
 
     if c is None and fmu is None:
         raise ConfigurationError("bench model deploy: say what to write, by --c FOLDER or --fmu FILE.fmu")
-    if (controller is None) != (rig is None) or (tuning is not None and controller is None):
-        raise ConfigurationError("--controller and --rig belong together, and --tuning to them")
+    if c is None and controller is not None:
+        raise ConfigurationError("--controller: a controller is written as C; say where, by --c FOLDER")
+    if fmu is not None and fmu.suffix != ".fmu":
+        raise ConfigurationError(f"--fmu {fmu}: expected a name that ends with .fmu")
     check_outputs(folder=c, json_file=json_file, read=[model])
     file = load_model(model)
+    said: dict[str, object] = {}
+    if c is not None:
+        found = deploy(
+            file, c, name=name, real=real, period=period, max_bytes=max_bytes, controller=controller, rig=rig,
+            tuning=tuning,
+        )  # fmt: skip
+        rows = {"constants": found.constants, "code": found.code, "state": found.state}
+        print_rows(f"{model.name} in {real}", [(what, f"{count} bytes") for what, count in rows.items()])
+        print_plain(console, f"C: {c}")
+        said |= {"folder": str(c), "files": sorted(found.files), "sha256": found.digest, **rows}
     if fmu is not None:
-        if fmu.suffix != ".fmu":
-            raise ConfigurationError(f"--fmu {fmu}: expected a name that ends with .fmu")
         write_fmu(file, fmu, what="inverse" if inverse else "operator", version=fmi, period=period)
         print_plain(console, f"FMU: {fmu}")
-    if c is None:
-        write_json(json_file, {"fmu": str(fmu), "fmi": fmi})
-        return
-    follower = None
-    if controller is not None and rig is not None:
-        follower, period = controller_of_rig(controller, rig, period, tuning), None
-    found = deploy(file, name=name, real=real, period=period, max_bytes=max_bytes, controller=follower)
-    found.write(c)
-    rows = {"constants": found.constants, "code": found.code, "state": found.state}
-    print_rows(f"{model.name} in {real}", [(what, f"{count} bytes") for what, count in rows.items()])
-    print_plain(console, f"C: {c}")
-    write_json(json_file, {"folder": str(c), "files": sorted(found.files), "sha256": found.digest, **rows})
+        said |= {"fmu": str(fmu), "fmi": fmi}
+    write_json(json_file, said)

@@ -14,7 +14,7 @@ from bench.base import BenchError, ConfigurationError, DataError, InterlockError
 from bench.identification import ModelFile
 
 
-@pytest.mark.parametrize("name", ["", "run", "identify"])
+@pytest.mark.parametrize("name", ["", "run", "identify", "deploy"])
 def test_examples(name, request, tmp_path):
     tested = getattr(bench.api, name) if name else bench.api
     names = {**vars(bench.api), "getfixture": request.getfixturevalue, "bench": bench}

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from deployed import plane, run
 
-from bench.api import load, predict
+from bench.api import deploy, load, predict
+from bench.base import ConfigurationError
 from bench.identification import ModelFile
 
 RIG = """
@@ -70,6 +71,23 @@ def test_the_example_meets_its_target(model, gcc, tmp_path, bench):
     assert ", met" in run(["./example"], folder)
 
 
+def test_the_function_writes_what_the_command_does(model, tmp_path, bench):
+    rig = tmp_path / "unit.toml"
+    rig.write_text(RIG.replace("FILE", "model.fmu"))
+    options = ["--controller", "closed-loop-inverse", "--rig", rig, "--period", "0.5", "--real", "double"]
+    code, _, err = bench("model", "deploy", model, "--c", tmp_path / "command", *options)
+    assert code == 0, err
+    found = deploy(
+        model, str(tmp_path / "function"), controller="closed-loop-inverse", rig=rig, period=0.5, real="double"
+    )
+    for name, text in found.files.items():
+        assert (tmp_path / "function" / name).read_text() == text
+        assert (tmp_path / "command" / name).read_text() == text
+    with pytest.raises(ConfigurationError, match="belong together"):
+        deploy(model, tmp_path / "other", rig="vo2")
+    assert not (tmp_path / "other").exists()
+
+
 def test_a_unit_is_characterized_as_a_specimen(model, gcc, tmp_path, bench):
     unit, rig = tmp_path / "model.fmu", tmp_path / "unit.toml"
     assert bench("model", "deploy", model, "--fmu", unit, "--fmi", "3.0")[0] == 0
@@ -93,6 +111,7 @@ def test_what_is_wrong_is_one_message_and_nothing_is_written(model, tmp_path, be
         (["--c", folder, "--controller", "integral", "--rig", "vo2", "--period", "0.5"], "closed-loop-inverse"),
         (["--c", folder, "--controller", "closed-loop-inverse"], "belong together"),
         (["--fmu", tmp_path / "model.zip"], ".fmu"),
+        (["--fmu", tmp_path / "model.fmu", "--controller", "open-loop-inverse", "--rig", "vo2"], "--c FOLDER"),
         ([], "--c FOLDER or --fmu"),
     ]
     for options, said in cases:
