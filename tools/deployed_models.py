@@ -2,12 +2,13 @@
 
 `compare` tries 200 random models of all families over 100 000 steps each, in `float` and `double`, and prints the
 greatest differences; `table` prints the instructions of the worst steps and inverses as Markdown, for
-docs/reference/deploy.md; `speed` the time of a step beside that of the compiled kernel in Python.
+docs/reference/deploy.md; `speed` the time of a step beside that of the compiled kernel in Python, by turns.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 import tempfile
 import time
@@ -80,23 +81,21 @@ def table(valgrind: str) -> None:
 
 
 def speed(steps: int) -> None:
-    """Print the time of a step in C and in the compiled kernel, both for this processor, the best of ten each."""
+    """Print the time of a step in C and in the compiled kernel, by turns, the best of ten; for this processor."""
     print(f"{'family':32}{'C, ns':>8}{'Python, ns':>12}{'ratio':>8}")
     for family in RANDOM:
         model = RANDOM[family](np.random.default_rng(5))
         inputs = random_sequence(*model.input_range, steps, 1)
         with tempfile.TemporaryDirectory() as folder:
             compiled = Compiled(ModelFile(family, model), Path(folder), "double", "gcc", "-O3", "-march=native")
-            taken = []
-            for run in (compiled.steps, model.evaluate):
-                run(inputs)
-                times = []
-                for _ in range(10):
+            taken = dict.fromkeys((compiled.steps, model.evaluate), math.inf)
+            for _ in range(10):
+                for run, best in taken.items():
                     begin = time.perf_counter()
                     run(inputs)
-                    times.append(time.perf_counter() - begin)
-                taken.append(1e9 * min(times) / steps)
-        print(f"{family:32}{taken[0]:8.1f}{taken[1]:12.1f}{taken[0] / taken[1]:8.2f}")
+                    taken[run] = min(best, 1e9 * (time.perf_counter() - begin) / steps)
+        ours, theirs = taken.values()
+        print(f"{family:32}{ours:8.1f}{theirs:12.1f}{ours / theirs:8.2f}")
 
 
 def main() -> None:

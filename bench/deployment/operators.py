@@ -213,7 +213,7 @@ def _preisach(model: Preisach, starts: Starts, real: Real, prefix: str, base: st
         "bits": max(order, points).bit_length() + 1, "sign": sign, "plus": "-" if sign else "+",
     }  # fmt: skip
     width = 4 if real == "float" else 8
-    state = -(-(width * (3 * room + 4) + 4) // width) * width
+    state = width * (3 * room + 4) + 8
     bounds = (
         f"at most {room} pieces wiped out, and as many looked at where the memory is full; two cells read",
         f"at most {walked if rises else walked + room + 8} segments walked",
@@ -274,7 +274,7 @@ def _generalized(model: GeneralizedPrandtlIshlinskii, starts: Starts, real: Real
         # Source: of bench.models, one rounding below 1.
         numbers["edge"] = 1.0 - 1e-16 if real == "double" else float(np.nextafter(np.float32(1), np.float32(0)))
     template = "generalized_prandtl_ishlinskii.c.in"
-    return _elements(model, starts, template, {}, numbers, rest, real, prefix, base)
+    return _elements(model, starts, template, {"crosses": int(not model.ordered)}, numbers, rest, real, prefix, base)
 
 
 def _maxwell(model: MaxwellSlip, starts: Starts, real: Real, prefix: str, base: str) -> Source:
