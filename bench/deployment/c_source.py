@@ -13,7 +13,7 @@ import numpy as np
 Real: TypeAlias = Literal["float", "double"]
 Value: TypeAlias = "float | int | np.ndarray"
 
-_FUNCTIONS = ("SQRT", "ATANH", "EXP", "EXPM1", "LOG1P", "POW", "CEIL", "LOG")
+_FUNCTIONS = ("SQRT", "TANH", "ATANH", "EXP", "EXPM1", "LOG1P", "POW", "CEIL", "LOG")
 _LITERAL = re.compile(r"(?<![\w.])(\d+\.\d*(?:e[+-]?\d+)?|\d+e[+-]?\d+)(?![\w.])")
 _COMMENT = re.compile(r"/\*.*?\*/", re.DOTALL)
 # Values in a line of an array. Derivation: eight floats with their commas stay within 118 characters.

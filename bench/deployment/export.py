@@ -21,7 +21,7 @@ from bench.models import Coupled, Hammerstein, Operator
 
 _RESOLVED = 2e-6
 """Greatest step of `float` as a part of a range. Derivation: five such roundings are the 1e-5 that float promises."""
-_MATH = re.compile(r"\b(sqrt|atanh|exp|expm1|log1p|pow|ceil)f?\(")
+_MATH = re.compile(r"\b(sqrt|tanh|atanh|exp|expm1|log1p|pow|ceil)f?\(")
 
 
 @dataclass(frozen=True)

@@ -94,8 +94,10 @@ def _exponential(z: float, path: float, loading: float, unloading: float) -> flo
 
 @inlined
 def _slope(z: float, loading: float, unloading: float, exponent: float) -> float:
-    slope: float = 1.0 - (loading if z > 0.0 else unloading) * abs(z) ** exponent
-    return slope
+    size = abs(z)
+    # A compiler of exported C takes a square for this power, which rounds otherwise.
+    power: float = size * size if exponent == 2.0 else size**exponent
+    return 1.0 - (loading if z > 0.0 else unloading) * power
 
 
 @inner
