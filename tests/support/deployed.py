@@ -162,9 +162,9 @@ class Compiled:
         return bool(self._library.model_restore(self._state, saved))
 
 
-def run(command: list[str], folder: Path) -> str:
+def run(command: list[str], folder: Path, given: str = "") -> str:
     """Run a compiler or a program; return what it prints. What it complains of is the message of the error."""
-    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    done = subprocess.run(command, cwd=folder, input=given, capture_output=True, text=True, check=False)
     assert done.returncode == 0, f"{' '.join(command)}: {done.stderr}"
     return done.stdout
 
@@ -174,51 +174,60 @@ def _pointer(array: np.ndarray) -> ctypes.c_void_p:
 
 
 _COUNTED = """
+#include <stdio.h>
 #include "model.h"
-int main(void);
-void probe(model_state *s, model_real value, int inverts);
-void probe(model_state *s, model_real value, int inverts) {
-    volatile model_real kept;
+volatile model_real kept;
+__attribute__((noinline)) static void probe(model_state *s, model_real value, int inverts) {
     if (inverts) kept = model_invert(s, value).setpoint;
     else kept = model_step(s, value);
-    (void)kept;
 }
 int main(void) {
-    static const model_real inputs[] = {INPUTS};
     model_state s;
-    unsigned i;
-    /* Not known to the compiler, so that it makes no other probe. */
-    volatile int inverts = INVERTS;
-    model_init(&s, model_NEGATIVE);
-    for (i = 0; i < sizeof inputs / sizeof inputs[0]; ++i) model_step(&s, inputs[i]);
-    probe(&s, VALUE, inverts);
+    int count, inverts;
+    double value;
+    while (scanf("%d %d", &inverts, &count) == 2) {
+        model_init(&s, model_NEGATIVE);
+        for (; scanf("%lf", &value) == 1 && count > 0; --count) model_step(&s, (model_real)value);
+        probe(&s, (model_real)value, inverts);
+    }
     return 0;
 }
 """
 
 
-def instructions(folder: Path, inputs: Sequence[float], value: float, *, inverts: bool, valgrind: str) -> int:
-    """Return the instructions of one step or inverse after a sequence from negative saturation, by Valgrind."""
-    words = {"INPUTS": ", ".join(map(repr, inputs)), "VALUE": repr(float(value)), "INVERTS": str(int(inverts))}
-    text = _COUNTED
-    for word, replacement in words.items():
-        text = text.replace(word, replacement)
-    (folder / "counted.c").write_text(text)
-    run(["gcc", "-std=c99", "-O2", "-g", "counted.c", "model.c", "-o", "counted", "-lm"], folder)
-    count = ["--tool=callgrind", "--toggle-collect=probe", "--callgrind-out-file=counted.out", "./counted"]
-    run([valgrind, *count], folder)
-    summary = re.search(r"^(?:summary|totals): (\d+)", (folder / "counted.out").read_text(), re.MULTILINE)
-    assert summary
-    return int(summary.group(1))
+class Probe(NamedTuple):
+    """A step or an inverse after a sequence from negative saturation."""
+
+    inputs: Sequence[float]
+    value: float
+    inverts: bool
+
+
+def instructions(folder: Path, probes: Sequence[Probe], valgrind: str) -> list[int]:
+    """Return the instructions of each probe of the model in a folder, by Valgrind."""
+    (folder / "counted.c").write_text(_COUNTED)
+    run(["gcc", "-std=gnu99", "-O2", "-g", "counted.c", "model.c", "-o", "counted", "-lm"], folder)
+    lines = [[int(each.inverts), len(each.inputs), *each.inputs, each.value] for each in probes]
+    text = "\n".join(" ".join(map(repr, line)) for line in lines)
+    count = ["--tool=callgrind", "--toggle-collect=probe", "--dump-after=probe", "--callgrind-out-file=counted.out"]
+    run([valgrind, *count, "./counted"], folder, text)
+    found = []
+    for number in range(1, len(probes) + 1):
+        totals = re.search(
+            r"^(?:summary|totals): (\d+)", (folder / f"counted.out.{number}").read_text(), re.MULTILINE
+        )
+        assert totals
+        found.append(int(totals.group(1)))
+    return found
 
 
 def plane(levels: int, kind: str = "") -> Preisach:
-    """Return a plane of so many levels with a random density, of both signs if `signed`, thermal if `thermal`."""
+    """Return a plane of so many levels with a random density; `thermal`, `signed` (30 % below 0) or `balanced`."""
     rng = np.random.default_rng(levels)
     order = levels - 1
     density = rng.exponential(1.0, order * (order + 1) // 2)
-    if kind == "signed":
-        density *= np.where(rng.random(density.size) < 0.3, -1.0, 1.0)
+    if kind in ("signed", "balanced"):
+        density *= np.where(rng.random(density.size) < (0.3 if kind == "signed" else 0.5), -1.0, 1.0)
     term = ThermalExpansion(10.0, 3.0, 2.0, 8.0, 0.0) if kind == "thermal" else None
     return Preisach(uniform_levels(0.0, 10.0, order), density, reversible=term)
 
@@ -227,6 +236,29 @@ def shrinking(low: float, high: float, reversals: int) -> list[float]:
     """Return an oscillation about the middle that shrinks evenly: each reversal is remembered."""
     middle, half = 0.5 * (low + high), 0.5 * (high - low)
     return [middle + half * (1.0 - k / (reversals + 1)) * (-1.0) ** k for k in range(reversals)]
+
+
+def probes_of(model: Preisach, count: int, seed: int) -> list[Probe]:
+    """Return random probes of a plane: with few corners and with more than there is room for, spread and close.
+
+    Targets of inverses are random, beyond the range, or just beyond what one direction reaches.
+    """
+    rng = np.random.default_rng(seed)
+    (low, high), (least, greatest) = model.input_range, model.output_range()
+    full, found = 4 * model.order + 5, []
+    for _ in range(count):
+        reversals = int(rng.choice([1, 2, 5, 20, 60, full - 1, full]))
+        ends = (low, high) if rng.random() < 0.5 else np.sort(rng.uniform(low, high, 2)).tolist()
+        inputs = [float(rng.choice([low, high])), *shrinking(*ends, reversals)]
+        if rng.random() < 0.25:
+            inputs = rng.uniform(low, high, reversals).tolist()
+        found.append(Probe(inputs, float(rng.uniform(low, high)), inverts=False))
+        state = model.initial_state().advance(inputs)
+        ways = [model.evaluate(np.linspace(state.input, end, 400), state) for end in (low, high)]
+        targets = [rng.uniform(least, greatest), least - 1.0, greatest + 1.0]
+        targets += [extreme + side * 1e-4 for way in ways for extreme, side in ((way.max(), 1.0), (way.min(), -1.0))]
+        found.append(Probe(inputs, float(rng.choice(targets)), inverts=True))
+    return found
 
 
 def random_sequence(low: float, high: float, count: int, seed: int, real: str = "double") -> np.ndarray:

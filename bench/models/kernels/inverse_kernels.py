@@ -20,8 +20,9 @@ Shape = tuple[Cube, Cube]
 # Ends of the operating range, tolerance, whether the output rises with the input whatever the memory, and whether the
 # nearest answer is wanted.
 Ends = tuple[float, float, float, bool, bool]
-# Left edges, heights and masses to the left of the pieces, how many count, and the mass up to the input.
-Curve = tuple[Floats, Floats, Floats, int, float]
+# Left edges, heights and masses to the left of the pieces, how many count, the mass up to the input, and the input
+# within the plane.
+Curve = tuple[Floats, Floats, Floats, int, float, float]
 
 
 @inlined
@@ -53,6 +54,23 @@ def _first_root(a: float, b: float, r: float, length: float, tolerance: float) -
 
 
 @inlined
+def _reached(operator: Operator, curve: Curve, n: int, u: float, cell: int, rises: bool) -> float:
+    """Return the output after a move in one direction to u within a cell, which leaves n pieces as they are."""
+    plane, below, offset, terms = operator
+    levels, inverse_step, table = plane
+    left, height, masses, count, total, present = curve
+    mass = 0.0
+    if rises:
+        edge, mass = (left[n], masses[n]) if n < count else (present, total)
+        mass = memory.row_mass(levels, table, edge, memory.locate(levels, inverse_step, edge), u, cell, u, cell, mass)
+    elif n > 0:
+        column = memory.locate(levels, inverse_step, left[n - 1])
+        row = memory.locate(levels, inverse_step, height[n - 1])
+        mass = memory.row_mass(levels, table, left[n - 1], column, u, cell, height[n - 1], row, masses[n - 1])
+    return memory.output_at(plane, below, offset, terms, u, u, cell, mass)
+
+
+@inlined
 def walk(
     operator: Operator,
     gains: Cube,
@@ -71,15 +89,13 @@ def walk(
     and the number of segments; the start if the output came no closer than the error `closest` < 0. The pieces are
     only read: what a monotone move wipes out is passed over.
 
-    A move in the direction changes the output with the slope `constant` + `bend` (u - level) - `steep` (edge - start)
-    while u stays within one cell and one quadratic of the reversible part, and the edge of what the move changes
-    within one cell. A corner of the memory curve changes the edge only. Cells that cannot bring the output closer, by
-    their greatest rises, are passed over.
+    While the input and the edge of what the move changes stay within their cells, and within one quadratic of the
+    reversible part, the slope rises by twice `halved` with the input, and falls by `steep` with the edge, which a
+    corner of the memory curve moves. Cells that cannot bring the output closer, by their greatest gains, are passed
+    over.
     """
-    plane, below, offset, terms = operator
-    levels, inverse_step, table = plane
-    breaks, quadratics = terms
-    left, height, masses, n, mass = curve
+    (levels, inverse_step, table), _, _, (breaks, quadratics) = operator
+    left, height, _, n, _, present = curve
     count, rises, above = n, direction > 0, value < target
     # The error is below 0 until the target is met; `most` is the greatest that it can be.
     sign = 1.0 if above else -1.0
@@ -96,7 +112,7 @@ def walk(
     if not rises and u <= levels[cell] and cell > 0:
         cell -= 1
     inside = low <= u < high if rises else low < u <= high
-    edge, other, known, placed = max(u, low), 0, True, False
+    edge, other, known, placed = u, 0, True, False
     while (end - u) * direction > 0.0:
         while inside and most + gains[way, upward, cell] <= closest:
             most += gains[way, upward, cell]
@@ -111,8 +127,7 @@ def walk(
             if rises:
                 while n > 0 and height[n - 1] <= u:
                     n -= 1
-                if n < count:
-                    edge, mass = left[n], masses[n]
+                edge = left[n] if n < count else present
             else:
                 while n > 0 and left[n - 1] >= u:
                     n -= 1
@@ -120,14 +135,7 @@ def walk(
             other = memory.locate(levels, inverse_step, edge)
             placed = True
         if not known:
-            if rises:
-                error = memory.row_mass(levels, table, edge, other, u, cell, u, cell, mass)
-            elif n > 0:
-                k = memory.locate(levels, inverse_step, left[n - 1])
-                error = memory.row_mass(levels, table, left[n - 1], k, u, cell, edge, other, masses[n - 1])
-            else:
-                error = 0.0
-            error = sign * (memory.output_at(plane, below, offset, terms, u, u, cell, error) - target)
+            error = sign * (_reached(operator, curve, n, u, cell, rises) - target)
             most, known = error, True
             if error > closest:
                 best, off, closest = u, sign * error, error
@@ -148,52 +156,57 @@ def walk(
         crosses = (border - stop) * direction <= 0.0
         if crosses:
             stop = border
-        level = levels[cell] if inside else u
-        linear = sign * direction * (quadratics[r, 1] + 2.0 * quadratics[r, 2] * level)
-        curved = 2.0 * sign * direction * quadratics[r, 2]
-        constant, bend, start, steep = linear, curved, 0.0, 0.0
-        entered = more = inside
-        met = False
+        slope = halved = steep = 0.0
+        entered, met = True, False
         while True:
             if entered:
-                row, column = (cell, other) if rises else (other, cell)
-                constant = linear + 2.0 * sign * (table[cell, cell, field] - table[row, column, field])
-                bend = curved + 2.0 * sign * table[cell, cell, 3]
-                start, steep = levels[other], 2.0 * sign * table[row, column, 3]
+                slope = sign * direction * (quadratics[r, 1] + 2.0 * quadratics[r, 2] * u)
+                halved = sign * direction * quadratics[r, 2]
+                if inside:
+                    row, column = (cell, other) if rises else (other, cell)
+                    own = table[cell, cell, 3]
+                    halved += sign * own
+                    steep = 2.0 * sign * table[row, column, 3]
+                    beside = table[cell, cell, field] - table[row, column, field]
+                    slope += 2.0 * sign * (beside + own * (u - levels[cell]))
+                    slope -= steep * (edge - levels[other])
                 entered = False
-            corner = stop
+            corner, more = stop, False
             if inside and n > 0:
-                corner = height[n - 1] if rises else left[n - 1]
-            more = (stop - corner) * direction > 0.0
-            if not more:
-                corner = stop
+                nearest = height[n - 1] if rises else left[n - 1]
+                more = (stop - nearest) * direction > 0.0
+                if more:
+                    corner = nearest
             move = corner - u
-            length = direction * move
-            slope = constant + bend * (u - level) - steep * (edge - start)
-            half = 0.5 * bend * move
-            after = error + length * (slope + half)
+            half = halved * move
+            middle = slope + half
+            after = error + direction * move * middle
             steps += 1
-            if slope > 0.0 and slope + 2.0 * half < 0.0:
-                # The output comes closest inside the segment.
-                vertex = -0.5 * slope * length / half
-                peak = error + 0.5 * slope * vertex
-                if peak > closest:
-                    best, off, closest = u + direction * vertex, sign * peak, peak
-            if after > closest:
-                best, off, closest = corner, sign * after, after
-            if closest > -tolerance:
-                a = half / length
-                d = _first_root(a, slope, -error, length, tolerance)
-                if d >= 0.0:
-                    best, off = u + direction * d, sign * (error + d * (slope + a * d))
-                met = True
-                break
+            turns = slope > 0.0 and middle + half < 0.0
+            if after > closest or turns:
+                length = direction * move
+                if after > closest:
+                    best, off, closest = corner, sign * after, after
+                if turns:
+                    # The output comes closest inside the segment.
+                    vertex = -0.5 * slope * length / half
+                    peak = error + 0.5 * slope * vertex
+                    if peak > closest:
+                        best, off, closest = u + direction * vertex, sign * peak, peak
+                if closest > -tolerance:
+                    a = half / length
+                    d = _first_root(a, slope, -error, length, tolerance)
+                    if d >= 0.0:
+                        best, off = u + direction * d, sign * (error + d * (slope + a * d))
+                    met = True
+                    break
             u, error = corner, after
             if not more:
                 break
             n -= 1
+            before = edge
             if rises:
-                edge, mass = left[n], masses[n]
+                edge = left[n]
                 while edge < levels[other]:
                     other -= 1
                     entered = True
@@ -202,6 +215,7 @@ def walk(
                 while other < final and edge > levels[other + 1]:
                     other += 1
                     entered = True
+            slope = middle + half - steep * (edge - before)
         if met:
             break
         most = error
@@ -233,9 +247,50 @@ def _on_branch(
     before = max(first - 1, 0)
     u, value = branches[which, 0, before], branches[which, 1, before]
     # The first number of `below` is the mass to the left of the only piece, 0.
-    curve = levels, levels if which else levels[-1:], operator[1], 1, 0.0
+    curve = levels, levels if which else levels[-1:], operator[1], 1, 0.0, levels[0]
     x, e, steps = walk(operator, gains, tolerance, end, curve, u, value, wanted, -tolerance, 1 if which else -1)
     return x, e + (wanted - target), steps
+
+
+@inlined
+def _approach(
+    operator: Operator, curve: Curve, tolerance: float, u: float, value: float, target: float, way: int
+) -> tuple[Curve, float, float]:
+    """Return the memory, the input and the output of a monotone operator at the last corner or level before a target.
+
+    A search by strides that double, and then by halves, finds the last corner before the target, and the last level
+    between it and the next corner.
+    """
+    levels, inverse_step, _ = operator[0]
+    left, height, masses, count, total, present = curve
+    rises, near, far, stride = way > 0, count, 0, 1
+    while far < near:
+        p = (far + near) // 2 if stride == 0 else max(near - stride, far)
+        corner = height[p] if rises else left[p]
+        reached = _reached(operator, curve, p, corner, memory.locate(levels, inverse_step, corner), rises)
+        if (target - reached) * way > tolerance:
+            near, u, value, stride = p, corner, reached, 2 * stride
+        else:
+            far, stride = p + 1, 0
+    cell = memory.locate(levels, inverse_step, u)
+    if not rises and u <= levels[cell] and cell > 0:
+        cell -= 1
+    corner = levels[-1] if rises else levels[0]
+    if near > 0:
+        corner = height[near - 1] if rises else left[near - 1]
+    end = memory.locate(levels, inverse_step, corner)
+    passed, far, stride = 0, (end - cell) * way, 1
+    while passed < far:
+        most = (passed + far + 1) // 2 if stride == 0 else min(passed + stride, far)
+        level = levels[cell + most] if rises else levels[cell + 1 - most]
+        reached = _reached(operator, curve, near, level, cell + way * most, rises)
+        if (target - reached) * way > tolerance:
+            passed, u, value, stride = most, level, reached, 2 * stride
+        else:
+            far, stride = most - 1, 0
+    if near < count:
+        count = near + 1 if rises else near
+    return (left, height, masses, count, total, present), u, value
 
 
 @inner
@@ -297,6 +352,7 @@ def invert(
     If the output rises with the input, whatever the memory, one walk finds all solutions.
     """
     low, high, tolerance, rising, nearest = ends
+    levels = operator[0][0]
     gains, branches = shape
     last = branches.shape[2] - 1
     least = min(branches[0, 2, last], branches[1, 2, last])
@@ -305,6 +361,8 @@ def invert(
     worth = -tolerance - max(target - greatest, least - target, 0.0)
     direction = 1 if target > value else -1
     end = high if direction > 0 else low
+    if rising and levels[0] <= u <= levels[-1]:
+        curve, u, value = _approach(operator, curve, tolerance, u, value, target, direction)
     x, e, steps = walk(operator, gains, tolerance, end, curve, u, value, target, worth, direction)
     preferred = not nearest and (target <= branches[0, 1, 0] if direction > 0 else target >= branches[1, 1, 0])
     if rising or (abs(e) <= tolerance and (x == u or preferred)):
@@ -329,7 +387,7 @@ def invert_state(
     pieces = left, height, np.empty(n), np.empty(n, np.int64), np.empty(n, np.int64)
     k, mass = memory.load(plane, pieces, n, present)
     value = memory.output_at(plane, below, offset, terms, u, present, k, mass)
-    return invert(operator, shape, ends, (left, height, pieces[2], n, mass), u, value, target)
+    return invert(operator, shape, ends, (left, height, pieces[2], n, mass, present), u, value, target)
 
 
 @kernel
@@ -364,7 +422,7 @@ def follow(
     for t in range(targets.size):
         target = targets[t]
         value = memory.output_at(plane, below, offset, terms, raw, present, k, mass)
-        curve = pieces[0], pieces[1], pieces[2], n, mass
+        curve = pieces[0], pieces[1], pieces[2], n, mass, present
         setpoints, s1, s2, error, steps[t] = invert(
             (plane, below, offset, terms), (gains, branches), ends, curve, raw, value, target
         )

@@ -168,7 +168,7 @@ def _find(words: Words, numbers: Floats, plane: memory.Plane, target: float) -> 
     branches = carray(pointer(words[BRANCHES]), (2, 4, words[BRANCH_POINTS]), np.float64)
     ends = numbers[LOW], numbers[HIGH], numbers[TOLERANCE], words[RISING] != 0, words[NEAREST] != 0
     pieces = _pieces(words)
-    curve = pieces[0], pieces[1], pieces[2], words[PIECE_COUNT], numbers[MASS]
+    curve = pieces[0], pieces[1], pieces[2], words[PIECE_COUNT], numbers[MASS], numbers[PRESENT]
     count, first, last, error, walked = inverse.invert(
         operator, (gains, branches), ends, curve, numbers[INPUT], numbers[OUTPUT], target
     )
