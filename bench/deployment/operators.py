@@ -202,21 +202,23 @@ def _preisach(model: Preisach, starts: Starts, real: Real, prefix: str, base: st
         "inputs": np.array(inputs),
     }
     rises, points = operator.rises(), 0
-    # Of segments in one direction.
-    walked = order + room + lattice.breaks.size + 4
     if not rises:
         numbers |= {"branches": inverse.branches}
         points = inverse.branches.shape[-1]
-    parts = parts_of("preisach.c.in")
+    parts, bits = parts_of("preisach.c.in"), max(order, room, points).bit_length() + 1
     words = {
         "order": order, "room": room, "breaks": lattice.breaks.size, "points": points,
-        "bits": max(order, points).bit_length() + 1, "sign": sign, "plus": "-" if sign else "+",
+        "bits": bits, "sign": sign, "plus": "-" if sign else "+",
     }  # fmt: skip
     width = 4 if real == "float" else 8
     state = width * (3 * room + 4) + 8
+    # Segments between levels and breaks, in both directions and on a major branch each.
+    cells = order + lattice.breaks.size + 8
     bounds = (
         f"at most {room} pieces wiped out, and as many looked at where the memory is full; two cells read",
-        f"at most {walked if rises else walked + room + 8} segments walked",
+        f"at most {4 * bits} corners and levels looked at, and {cells} segments walked"
+        if rises
+        else f"at most {cells + 2 * room} segments walked and as many cells passed over",
     )
     rest = [parts["rising" if rises else "everywhere"], parts["invert"]]
     return _compose("preisach.c.in", words, numbers, rest, state, bounds, real, prefix, base)
