@@ -70,7 +70,7 @@ def bring_responses(
         raise ValueError(f"a delay ({linear.delay:.4g} s) has no inverse from sample to sample")
     strengths, gain = linear.strengths, linear.gain
     steps = durations(times)
-    found = _Steps(*np.moveaxis([passages(lag, steps, steps) for lag in linear.lags], 2, 0).transpose(0, 2, 1))
+    found = _Steps(*np.stack([passages(lag, steps, steps) for lag in linear.lags], axis=1).transpose(2, 0, 1))
     effects = gain - found.behind @ strengths
     _check(steps, found, effects, strengths)
     wanted = responses.tolist()

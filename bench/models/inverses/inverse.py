@@ -373,7 +373,7 @@ class PreisachInverse(Inverse[MemoryCurve]):
         """Difference from a target that counts as none, output units."""
         operator = self.operator
         magnitude = float(np.abs(operator.density) @ operator.cell_areas()) + abs(operator.bias)
-        return _TOLERANCE * max(magnitude, *np.abs(self.branches[:, 1, 0]).tolist())
+        return _TOLERANCE * max(magnitude, float(np.abs(self.branches[:, 1, 0]).max()))
 
     @cached_property
     def branches(self) -> Floats:
