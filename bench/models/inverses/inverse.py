@@ -348,9 +348,10 @@ class PlayInverse(NumericalInverse["PlayState"]):
 class PreisachInverse(Inverse[MemoryCurve]):
     """The exact inverse of a Preisach operator, non-monotonic ones included.
 
-    From the present memory the output is followed upwards and downwards, segment by segment (Zhang et al.
-    2013, eq. 19), to the first input that meets the target. If neither way does, the two major branches are
-    tried through saturation. On a plateau the answer is the point nearest to the present input, which is the
+    From the present memory the output is followed upwards and downwards, segment by segment (Zhang et al. 2013, eq.
+    19), to the first input that meets the target. Cells that cannot bring the output there are passed over (`gains`);
+    of a monotone operator the segment is found by bisection. If neither way meets the target, the two major branches
+    are tried through saturation. On a plateau the answer is the point nearest to the present input, which is the
     present input itself if its output is the target already. Beyond the plane and up to the operating
     range the walk goes on with the reversible part alone. A target counts as met within 2e-13
     of the output scale, which is the sum of |density| * area plus |bias|, or an output at saturation if that
