@@ -25,7 +25,8 @@ def run_card(meta: Mapping[str, Any]) -> str:
 def card_rows(meta: Mapping[str, Any]) -> dict[str, str]:
     """Return what a run was, from its metadata: a text by its name.
 
-    `missing_rows` in the metadata, a text, says what its record lacks. Parameters without a value are left out.
+    `missing_rows` in the metadata, a text, says what its record lacks. What has no value is left out, as the
+    seed of a run that was imported.
     """
     units = meta.get("units", {})
     started = datetime.fromisoformat(meta["epoch"]).isoformat(sep=" ", timespec="seconds")
@@ -35,14 +36,14 @@ def card_rows(meta: Mapping[str, Any]) -> dict[str, str]:
         "operator": meta["operator"],
         "started": f"{started} ({meta['clock']} clock)",
         **_expected(meta),
-        "seed": str(meta["seed"]),
+        **({} if meta["seed"] is None else {"seed": str(meta["seed"])}),
         **{f"device {name}": identity for name, identity in meta["devices"].items()},
         **{
             f"parameter {name}": _shown(value, units.get(name, ""))
             for name, value in meta["parameters"].items()
             if value not in (None, "") and name not in meta.get("without_slot", ())
         },
-        "git": str(meta["git"]),
+        **({"git": str(meta["git"])} if meta["git"] else {}),
     }
 
 

@@ -1,6 +1,7 @@
 """A file of measurements of another program becomes a run that reports and models take."""
 
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -53,6 +54,8 @@ def test_it_is_a_run_for_the_other_commands(imported, bench, tmp_path):
     assert code == 0, err
     code, out, err = bench("report", imported, "--model", tmp_path / "model.json")
     assert code == 0, err
+    # An imported run has neither.
+    assert not re.search(r"^ *(seed|git)\b", out, re.MULTILINE)
     assert "models on this run" in out
     code, out, _ = bench("runs", tmp_path / "runs")
     assert code == 0
