@@ -315,9 +315,10 @@ def _bouc_wen(model: BoucWen, starts: Starts, real: Real, prefix: str, base: str
         numbers["INFINITE"] = _INFINITE
     else:
         # Source: the tolerances of bench.models, in float as much more as its rounding.
-        allowed, rest_rate = (1e-10, 1e-13) if real == "double" else (1e-7, 1e-6)
-        numbers |= {"exponent": model.exponent, "allowed": allowed, "rest": rest_rate}
-    words = {"steps": _STEPS, "solution": parts["exponential" if exact else "integrated"]}
+        allowed, rest_rate = (1e-11, 1e-13) if real == "double" else (1e-7, 1e-6)
+        numbers |= {"exponent": model.exponent, "allowed": allowed, "rest": rest_rate, "near": 1e-4, "left": 2e-4}
+    # Source: the order of the series of bench.models.
+    words = {"steps": _STEPS, "order": 10, "solution": parts["exponential" if exact else "integrated"]}
     step = "two exponentials" if exact else f"at most {_STEPS} steps of integration"
     return _elements(model, starts, "bouc_wen.c.in", words, numbers, rest, real, prefix, base, step=step)
 
