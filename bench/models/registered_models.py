@@ -71,13 +71,11 @@ def find_model(name: str) -> ModelSpec:
     ConfigurationError
         If its entry cannot be imported.
     """
-    known = identifiable_models()
-    if name not in known and name in registry.entries("models"):
-        # This says why it cannot be imported, if that is the reason.
-        registry.load("models", name)
-    if name not in known:
-        raise ValueError(f"model_name: expected one of {', '.join(sorted(known))}, got {name!r}")
-    return known[name]
+    if name in registry.entries("models"):
+        spec: ModelSpec = registry.load("models", name)
+        if spec.template is not None:
+            return spec
+    raise ValueError(f"model_name: expected one of {', '.join(sorted(identifiable_models()))}, got {name!r}")
 
 
 def _specs() -> dict[str, ModelSpec]:
