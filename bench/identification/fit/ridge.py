@@ -47,38 +47,35 @@ def fit_ridge(
     if not (np.isfinite(ridge) and ridge >= 0.0):
         raise ValueError(f"ridge: expected a number >= 0, got {ridge}")
     w = counted_weights(regressor.shape[0], weights, skip)
-    total = float(w.sum())
-    columns = regressor.extra
-    means = w @ columns / total
-    centred = columns - means
-    scales = np.sqrt(w @ centred**2 / total)
-    swept = scales > 1e-12 * np.maximum(np.abs(columns).max(axis=0), 1e-300)
-    scales = np.where(swept, scales, 1.0)
-    centred *= np.where(swept, 1.0 / scales, 0.0)
-    mean = float(w @ outputs / total)
-    target = outputs - mean
+    total, roots = float(w.sum()), np.sqrt(w)
+    means, mean = w @ regressor.extra / total, float(w @ outputs / total)
+    columns, target = roots[:, None] * (regressor.extra - means), roots * (outputs - mean)
+    scales = np.sqrt(np.einsum("ij,ij->j", columns, columns) / total)
+    swept = scales > 1e-12 * np.maximum(np.hypot(scales, means), 1e-300)
+    # Others become 0, and so do their coefficients.
+    scales[~swept] = np.inf
+    columns /= scales
     with one_thread():
-        values, directions = np.linalg.eigh(centred.T @ (w[:, None] * centred) / total)
-    values = np.maximum(values, 0.0)
+        values, directions = np.linalg.eigh(columns.T @ columns / total)
     kept = values > _RANK * max(float(values[-1]), 1e-300)
-    inverse = np.where(kept, 1.0 / (np.where(kept, values, 1.0) + ridge), 0.0)
-    slope = centred.T @ (w * target) / total
+    values, directions = values[kept], directions[:, kept]
+    inverse = 1.0 / (values + ridge)
+    slope = columns.T @ target / total
     standard = directions @ (inverse * (directions.T @ slope))
-    residual = target - centred @ standard
-    effective = float((inverse * values).sum())
+    residual = target - columns @ standard
+    effective = float(inverse @ values)
     spare = np.count_nonzero(w) - 1.0 - effective
-    variance = float(w @ residual**2) / total / spare if spare > 0.5 else np.nan
-    spread = np.sqrt(variance * np.sum(directions**2 * (inverse**2 * values), axis=1))
-    left = centred.T @ (w * residual) / total - ridge * standard
-    size = max(float(np.linalg.norm(slope)), 1e-300)
-    kkt = float(np.abs(directions[:, kept].T @ left).max(initial=0.0)) / size
-    rank = int(kept.sum())
+    variance = float(residual @ residual) / total / spare if spare > 0.5 else np.nan
+    spread = np.sqrt(variance * (directions**2 @ (inverse**2 * values)))
+    left = columns.T @ residual / total - ridge * standard
+    kkt = float(np.abs(directions.T @ left).max(initial=0.0)) / max(float(np.linalg.norm(slope)), 1e-300)
+    rank = values.size
     certificate = Certificate(
         kkt_residual=kkt,
         passive=rank,
         active=standard.size - rank,
         exchangeable=0 if ridge else max(int(swept.sum()) - rank, 0),
-        condition=float(np.sqrt((values[-1] + ridge) / (values[kept][0] + ridge))) if rank else 1.0,
+        condition=float(np.sqrt(inverse[0] / inverse[-1])) if rank else 1.0,
         swept=swept,
         iterations=1,
         converged=kkt <= 1e-8,
