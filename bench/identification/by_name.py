@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Generic, Literal, TypeAlias, TypeVar
 
+import numpy as np
 from numpy.typing import ArrayLike
 
 from bench.base import Floats, checks as _checks
@@ -21,7 +22,8 @@ from bench.identification.fit.orientation import (
     possible_signs,
 )
 from bench.identification.fit.regularization import Regularization, choose_regularization
-from bench.identification.fit.shape import fit_operator, fit_shape, undetermined_shape
+from bench.identification.fit.shape import fit_operator, undetermined_shape
+from bench.identification.fit.variable_projection import variable_projection
 from bench.identification.inspection import check_data
 from bench.identification.measures import Errors, measure_errors
 from bench.identification.options import check_options, template_of
@@ -31,6 +33,10 @@ from bench.models import ModelSpec, Operator, Regressor, TimedModel, find_model
 M = TypeVar("M", bound=Operator[Any] | TimedModel[Any])
 Initial: TypeAlias = Literal["negative", "positive", "skip", "estimate"]
 INITIALS: tuple[Initial, ...] = ("negative", "positive", "skip", "estimate")
+
+# Relative step of the differences by shape parameters. Derivation: the root of 1e-12, to which a constrained linear
+# fit is exact.
+_STEP = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -202,13 +208,18 @@ class FitProblem:
             return Regularization(smoothing, ridge)
         return choose_regularization(self.regressor, self.outputs, self.weights, self.skip, smoothing, ridge)
 
-    def fit(self, smoothing: float, weights: Floats | None = None, ridge: float = 0.0) -> Fit:
-        """Return the coefficients for the problem's weights or others."""
+    def fit(
+        self, smoothing: float, weights: Floats | None = None, ridge: float = 0.0, start: Fit | None = None
+    ) -> Fit:
+        """Return the coefficients for the problem's weights or others; a fit to start from saves time."""
         if self.known is not None and weights is None and self.known[0] == smoothing and not ridge:
             return self.known[1]
         w = self.weights if weights is None else weights
         y = self.outputs if self.orientation > 0 else -self.outputs
-        found = fit_operator(self.spec.constrained, self.template, self.regressor, y, w, self.skip, smoothing, ridge)
+        before = None if start is None else self.orientation * start.coefficients[: self.regressor.base.size]
+        found = fit_operator(
+            self.spec.constrained, self.template, self.regressor, y, w, self.skip, smoothing, ridge, before
+        )
         if self.orientation > 0:
             return found
         return replace(found, coefficients=0.0 - found.coefficients, bias=0.0 - found.bias)
@@ -221,10 +232,31 @@ class FitProblem:
             self, template=template, state=state, regressor=template.regressor(self.inputs, state), known=None
         )
 
+    def with_best_shape(self, smoothing: float, starts: Sequence[Sequence[float]] = ()) -> FitProblem:
+        """Return the problem with the shape parameters that fit best; itself if its operator has none.
+
+        They are searched by variable projection from the operator's own starts, or from others.
+        """
+        shape = self.template.shape_parameters()
+        if not shape.names:
+            return self
+
+        def residuals(values: Floats) -> Floats:
+            problem = self.with_shape(values.tolist())
+            return problem.residuals(problem.fit(smoothing))
+
+        points = [np.asarray(values, dtype=np.float64) for values in starts or self.template.shape_starts()]
+        bounds = np.array(shape.low), np.array(shape.high)
+        return self.with_shape(variable_projection(residuals, points, bounds, step=_STEP)[0].values.tolist())
+
+    def residuals(self, fit: Fit) -> Floats:
+        """Return the weighted errors that a fit leaves after the skipped samples, shape (N - skip,)."""
+        errors = self.outputs - fit.bias - self.regressor.product(fit.coefficients)
+        return np.asarray(np.sqrt(self.weights[self.skip :]) * errors[self.skip :])
+
     def cost(self, fit: Fit) -> float:
         """Return the weighted sum of squares that a fit leaves."""
-        errors = (self.outputs - fit.bias - self.regressor.product(fit.coefficients))[self.skip :]
-        return float(self.weights[self.skip :] @ errors**2)
+        return float(np.sum(self.residuals(fit) ** 2))
 
     def advice(self) -> tuple[Advice, ...]:
         """Return what is odd about the data or not covered by them."""
@@ -321,10 +353,7 @@ def _orient(
 
     if spec.refine is not None:
         template = spec.refine(template, inputs, measured, weights, skip, start(template))
-    if shape:
-        template = template.with_shape(shape)
-    else:
-        template = fit_shape(template, spec.constrained, start, inputs, measured, weights, skip, smoothing)
     before = start(template)
     regressor = template.regressor(inputs, before)
-    return FitProblem(spec, inputs, outputs, weights, skip, template, before, regressor, start, sign)
+    problem = FitProblem(spec, inputs, outputs, weights, skip, template, before, regressor, start, sign)
+    return problem.with_shape(shape) if shape else problem.with_best_shape(smoothing)

@@ -71,6 +71,17 @@ class Regressor:
             extra=self.extra,
         )
 
+    def keeping(self, kept: NDArray[np.bool_]) -> Regressor:
+        """Return the regressor with all columns at 0 but those kept, shape (K + q,)."""
+        cells = kept[: self.base.size]
+        return Regressor(
+            base=np.where(cells, self.base, 0.0),
+            starts=self.starts,
+            cells=self.cells,
+            changes=np.where(cells[self.cells], self.changes, 0.0),
+            extra=np.where(kept[self.base.size :], self.extra, 0.0),
+        )
+
     @property
     def shape(self) -> tuple[int, int]:
         """Samples and coefficients."""

@@ -29,7 +29,7 @@ from bench.identification.choose.splits import has_one_kind
 from bench.identification.fit.orientation import Orientation, has_orientation
 from bench.identification.options import UNITS, template_of
 from bench.identification.timed.hammerstein_fit import with_element
-from bench.models import ModelSpec, Operator, find_model, identifiable_models
+from bench.models import Operator, find_model, identifiable_models
 
 PLANE = "preisach"
 """The plane with signs, whose answer to other cycles is bounded."""
@@ -149,10 +149,10 @@ def select(
     ValueError
         If no model can be fitted: names each and why.
     """
-    search = _Search(measured.thinned(MOST_ROWS), given or Given())
+    search = _Search(measured.thinned(MOST_ROWS), given or Given(), models)
     steps = search.structures, search.penalties, search.memories, search.dynamics, search.once_more
     for search.step, step in enumerate(steps):
-        step(models)
+        step()
     usable = _usable(search.scores)
     if not usable:
         failed = (f"{score.candidate.model}: {score.failure}" for score in search.scores)
@@ -214,55 +214,46 @@ def _usable(scores: Sequence[Score]) -> list[Score]:
     return sorted((score for score in scores if not score.failure), key=lambda score: score.error)
 
 
-def _unshaped(candidate: Candidate) -> Candidate:
-    """Return a candidate whose shape is to be found: that of the operator alone anew, with dynamics from its own."""
-    return candidate if candidate.dynamics else replace(candidate, shape=())
-
-
 class _Search:
     """The candidates of the choice, step by step; `scores` are those evaluated so far."""
 
-    def __init__(self, measured: Measurements, given: Given) -> None:
-        self.measured, self.given = measured, given
+    def __init__(self, measured: Measurements, given: Given, models: Sequence[str]) -> None:
+        self.measured, self.given, self.models = measured, given, models
         self.scores: list[Score] = []
         self.made: dict[str, list[dict[str, Any]]] = {}
         self.step = 0
 
-    def structures(self, models: Sequence[str]) -> None:
+    def structures(self) -> None:
         """Try all structures of each model, from saturation or at rest, with the medium penalty."""
         batches = []
-        for model in models:
-            spec = find_model(model)
-            self.made[model] = self._structures(model, spec)
+        for model in self.models:
+            self.made[model] = self._structures(model)
             for options in self.made[model]:
-                template = self._template(spec, options)
-                smoothing, ridge = self._penalties(spec, template)
-                orientation: Orientation = self.given.orientation or "auto"
-                if not has_orientation(spec, template):
-                    orientation = "auto"
-                first = Candidate(model, options, orientation, None, smoothing[0], ridge[0])
+                template = self._template(model, options)
+                smoothing, ridge = self._penalties(model, template)
+                given = self.given.orientation if has_orientation(find_model(model), template) else None
+                first = Candidate(model, options, given or "auto", None, smoothing[0], ridge[0])
                 batches.append([replace(first, initial=memory) for memory in self._first_memories(template)])
         self._evaluate("structures", batches)
 
-    def penalties(self, models: Sequence[str]) -> None:
+    def penalties(self) -> None:
         """Try the best structure of each model with the other penalties."""
         batches = []
-        for best in self._best(models):
-            spec = find_model(best.candidate.model)
-            smoothing, ridge = self._penalties(spec, self._template(spec, best.candidate.options))
-            others = [replace(best.candidate, smoothing=s, ridge=r) for s, r in product(smoothing, ridge)]
-            batches.append([one for one in others if one != best.candidate])
+        for best in (score.candidate for score in self._best()):
+            smoothing, ridge = self._penalties(best.model, self._template(best.model, best.options))
+            others = [replace(best, smoothing=s, ridge=r) for s, r in product(smoothing, ridge)]
+            batches.append([one for one in others if one != best])
         self._evaluate("penalties", batches)
 
-    def memories(self, models: Sequence[str]) -> None:
+    def memories(self) -> None:
         """Try the best of each model from the initial memories that were not tried."""
-        batches = [self._other_memories(best.candidate) for best in self._best(models)]
+        batches = [self._other_memories(best.candidate) for best in self._best()]
         scores = self._evaluate("initial memories", batches)
         self._reshape("initial memories", [min(some, key=lambda score: score.error) for some in scores if some])
 
-    def dynamics(self, models: Sequence[str]) -> None:
+    def dynamics(self) -> None:
         """Try the best of each model with dynamic elements, one after the other as long as the score falls."""
-        going = self._best(models, _MOST_IN_TIME) if self.measured.times is not None else []
+        going = self._best(in_time=True) if self.measured.times is not None else []
         while going:
             batches = []
             for best in going:
@@ -275,12 +266,12 @@ class _Search:
             least = min((score.error for score in going), default=0.0)
             going = [score for score in going if score.error <= _BEHIND * least]
 
-    def once_more(self, models: Sequence[str]) -> None:
+    def once_more(self) -> None:
         """Try the other structures of the best of all, as its own was found before its memory, then its memories."""
         for others in (self._other_structures, self._other_memories):
-            best = min(self._best(models), key=lambda score: score.error, default=None)
+            best = min(self._best(), key=lambda score: score.error, default=None)
             if best is not None:
-                batches = [[_unshaped(one)] for one in others(best.candidate)]
+                batches = [[one] for one in others(best.candidate)]
                 self._evaluate("the best once more", batches, reshaped=True)
 
     def all_rows(self, measured: Measurements, order: Sequence[Score]) -> list[Score]:
@@ -296,23 +287,21 @@ class _Search:
         return usable
 
     def _other_structures(self, best: Candidate) -> list[Candidate]:
-        most = _MOST_IN_TIME if best.dynamics else None
         made = [replace(best, options=options, shape=()) for options in self.made[best.model]]
-        return self._untried(one for one in made if self._has_at_most(one, most))
+        return self._untried(one for one in made if not best.dynamics or self._is_small(one))
 
     def _other_memories(self, best: Candidate) -> list[Candidate]:
         """Return a candidate from the initial memories with which it was not tried yet."""
-        spec = find_model(best.model)
-        if self.given.initial is not None or self._template(spec, best.options).memoryless:
+        if self.given.initial is not None or self._template(best.model, best.options).memoryless:
             return []
         memories: list[Initial | None] = [None, "negative", "positive"]
         memories += ["skip"] if self.measured.may_skip else []
-        memories += ["estimate"] if spec.estimate_state is not None else []
+        memories += ["estimate"] if find_model(best.model).estimate_state is not None else []
         return self._untried(replace(best, initial=memory) for memory in memories)
 
     def _untried(self, made: Iterable[Candidate]) -> list[Candidate]:
-        done = {repr(replace(score.candidate, shape=())) for score in self.scores}
-        return [one for one in made if repr(replace(one, shape=())) not in done]
+        done = {repr(replace(score.candidate, shape=(), parameters={})) for score in self.scores}
+        return [one for one in made if repr(replace(one, shape=(), parameters={})) not in done]
 
     def _improve(self, what: str, before: Sequence[Score], batches: Sequence[Sequence[Candidate]]) -> list[Score]:
         """Return the best score of each batch that is better than the one before."""
@@ -324,8 +313,8 @@ class _Search:
         return self._reshape(what, better)
 
     def _reshape(self, what: str, found: Sequence[Score]) -> list[Score]:
-        """Return scores, each with the shape that is found for its own settings where that is better."""
-        shaped = [[_unshaped(one.candidate)] if one.candidate.shape else [] for one in found]
+        """Return scores, each with the shape that is best for its own settings where that is better."""
+        shaped = [[one.candidate] if one.candidate.shape else [] for one in found]
         again = self._evaluate(what, shaped, reshaped=True)
         return [min([one, *more], key=lambda score: score.error) for one, more in zip(found, again, strict=True)]
 
@@ -334,43 +323,40 @@ class _Search:
     ) -> list[list[Score]]:
         """Return the scores of batches of candidates."""
         found: list[list[Score]] = []
-        for batch in batches:
-            say = partial(self._say, what, len(found), len(batches))
+        for done, batch in enumerate(batches):
+            text = f"comparing models: {what}" + (f" {done + 1} of {len(batches)}" if len(batches) > 1 else "")
+            say = partial(self._say, text + self._best_so_far(), done / len(batches), 1.0 / len(batches))
             say(SCORING, 0.0)
             with shares_to(say):
                 found.append(evaluate(self.measured, batch, reshaped=reshaped))
             self.scores += found[-1]
         return found
 
-    def _say(self, what: str, done: int, count: int, inner: str, share: float) -> None:
-        if inner != SCORING:
-            return
-        text = f"comparing models: {what}" + (f" {done + 1} of {count}" if count > 1 else "")
-        best = min(self.scores, key=lambda score: score.error, default=None)
-        if best is not None and not best.failure:
-            percent = 100.0 * best.error / max(float(np.ptp(self.measured.outputs)), 1e-300)
-            text += f", best so far {' with '.join(filter(None, (best.candidate.model, best.candidate.dynamics)))}"
-            text += f" {percent:.2g} %"
-        say_share(text, (self.step + (done + share) / count) / _STEPS)
+    def _say(self, text: str, done: float, part: float, inner: str, share: float) -> None:
+        if inner == SCORING:
+            say_share(text, (self.step + done + part * share) / _STEPS)
 
-    def _has_at_most(self, candidate: Candidate, most: int | None) -> bool:
-        """Return whether a candidate has at most so many coefficients; any number if None."""
-        return (
-            most is None or self._template(find_model(candidate.model), candidate.options).coefficients.size <= most
-        )
+    def _best_so_far(self) -> str:
+        best = next(iter(_usable(self.scores)), None)
+        if best is None:
+            return ""
+        percent = 100.0 * best.error / max(float(np.ptp(self.measured.outputs)), 1e-300)
+        name = " with ".join(filter(None, (best.candidate.model, best.candidate.dynamics)))
+        return f", best so far {name} {percent:.2g} %"
 
-    def _best(self, models: Sequence[str], most: int | None = None) -> list[Score]:
-        """Return the best candidate of each model that could be evaluated, of so many coefficients at most."""
-        found = []
-        usable = [score for score in self.scores if not score.failure and self._has_at_most(score.candidate, most)]
-        for model in models:
-            scores = [score for score in usable if score.candidate.model == model]
-            if scores:
-                found.append(min(scores, key=lambda score: score.error))
-        return found
+    def _is_small(self, candidate: Candidate) -> bool:
+        """Return whether a candidate has so few coefficients that it is tried with dynamic elements."""
+        return self._template(candidate.model, candidate.options).coefficients.size <= _MOST_IN_TIME
 
-    def _structures(self, model: str, spec: ModelSpec) -> list[dict[str, Any]]:
+    def _best(self, *, in_time: bool = False) -> list[Score]:
+        """Return the best candidate of each model that could be evaluated, of small ones only if `in_time`."""
+        usable = [one for one in _usable(self.scores) if not in_time or self._is_small(one.candidate)]
+        found = [next((one for one in usable if one.candidate.model == model), None) for model in self.models]
+        return [one for one in found if one is not None]
+
+    def _structures(self, model: str) -> list[dict[str, Any]]:
         """Return the options of each structure of a model; those of more coefficients than rows only if alone."""
+        spec = find_model(model)
         assert spec.template is not None
         taken = {*inspect.signature(spec.template).parameters, *UNITS}
         fixed = {name: value for name, value in self.given.options.items() if name in taken}
@@ -379,31 +365,32 @@ class _Search:
         for choice in product(*varied.values()):
             options = fixed | dict(zip(varied, choice, strict=True))
             try:
-                counts.append(self._template(spec, options).coefficients.size)
+                counts.append(self._template(model, options).coefficients.size)
                 made.append(options)
             except (ValueError, TypeError) as error:
                 self.scores.append(Score(Candidate(model, options), failure=str(error)))
         most = max(int(self.measured.tested.sum()), min(counts, default=0))
         return [options for options, count in zip(made, counts, strict=True) if count <= most]
 
-    def _template(self, spec: ModelSpec, options: Mapping[str, Any]) -> Operator[Any]:
-        return template_of(spec, self.measured.inputs[self.measured.fitted], options)
+    def _template(self, model: str, options: Mapping[str, Any]) -> Operator[Any]:
+        return template_of(find_model(model), self.measured.inputs[self.measured.fitted], options)
 
     def _penalties(
-        self, spec: ModelSpec, template: Operator[Any]
+        self, model: str, template: Operator[Any]
     ) -> tuple[tuple[float | None, ...], tuple[float | None, ...]]:
         """Return the weights of smoothing and of ridge that are tried."""
+        constrained = find_model(model).constrained
         smoothing: tuple[float | None, ...] = (0.0,)
         ridge: tuple[float | None, ...] = (0.0,)
         if template.densities():
-            smoothing = SMOOTHING if spec.constrained else (None,)
-            ridge = (0.0,) if spec.constrained else (None,)
-        elif not spec.constrained and not template.shape_parameters().names:
+            smoothing = SMOOTHING if constrained else (None,)
+            ridge = (0.0,) if constrained else (None,)
+        elif not constrained and not template.shape_parameters().names:
             ridge = RIDGE
         given = self.given
         if given.smoothing is not None and template.densities():
             smoothing = (given.smoothing,)
-        if given.ridge is not None and not spec.constrained:
+        if given.ridge is not None and not constrained:
             ridge = (given.ridge,)
         return smoothing, ridge
 

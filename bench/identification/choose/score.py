@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -16,10 +16,10 @@ from bench.identification.branches import turning_points
 from bench.identification.by_name import FitProblem, Initial, set_up_problem
 from bench.identification.choose.splits import BLOCKS, GAP, Flags, Fold, block_folds, cycle_folds, run_folds
 from bench.identification.fit.least_squares import Fit, one_thread
-from bench.identification.fit.orientation import NAMES, Orientation, has_orientation
+from bench.identification.fit.orientation import NAMES, Orientation, Sign, has_orientation
 from bench.identification.timed.hammerstein_fit import reshape, set_up_search
 from bench.identification.timed.hammerstein_search import Search, find_best
-from bench.models import overwritten_from
+from bench.models import Regressor, overwritten_from
 
 # Turns smaller than this part of the range need not be kept when rows are left out.
 # Source: half of the noise of 1 % that turning points are told from, see `splits`.
@@ -57,6 +57,8 @@ class Candidate:
         What follows the operator in time, as `identify_hammerstein` takes it; empty for the operator alone.
     shape : tuple of float
         Shape parameters of the operator; empty if they are to be found.
+    parameters : mapping of str to float
+        Nonlinear parameters of what follows the operator from which their search starts; others have several starts.
     """
 
     model: str
@@ -67,6 +69,7 @@ class Candidate:
     ridge: float | None = 0.0
     dynamics: str = ""
     shape: tuple[float, ...] = ()
+    parameters: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def fitted(self) -> tuple[str, dict[str, Any]]:
@@ -241,88 +244,80 @@ def evaluate(measured: Measurements, candidates: Sequence[Candidate], *, reshape
 
     Candidates that differ in their penalties alone are set up once, and so is an operator with several dynamics.
     Shape parameters, time constants, the orientation and an estimated memory are found from all rows; coefficients
-    are fitted without each fold. If `reshaped`, the shape of a candidate with dynamics is where its search starts.
+    are fitted without each fold. If `reshaped`, the shape of a candidate is where the search for a better one starts.
     """
-    folds = measured.blocks, measured.cycles
     scores: list[Score] = []
-    fitters: dict[str, _Fitter | str] = {}
+    problems: dict[str, _Problem] = {}
     searches: dict[str, tuple[FitProblem, Search]] = {}
-    for candidate in candidates:
+    for place, candidate in enumerate(candidates):
         begin = time.process_time()
         # The search for what follows an operator depends on its penalties.
         key = repr(candidate if candidate.dynamics else replace(candidate, smoothing=None, ridge=None))
         try:
             with one_thread():
-                if key not in fitters:
-                    fitters[key] = (
+                if key not in problems:
+                    problems[key] = (
                         _set_up_in_time(measured, candidate, searches, reshaped=reshaped)
                         if candidate.dynamics
-                        else _set_up(measured, candidate)
+                        else _set_up(measured, candidate, reshaped=reshaped)
                     )
-                fitter = fitters[key]
-                if isinstance(fitter, str):
-                    scores.append(Score(candidate, failure=fitter))
-                    continue
-                scores.append(_score(measured, candidate, fitter, folds, begin, (len(scores), len(candidates))))
+                say = partial(_say, place, len(candidates))
+                score = _score(measured, candidate, problems[key], say)
         # A model of another package must not end the comparison of the others.
         except Exception as error:
             text = str(error) if isinstance(error, ValueError) else f"{type(error).__name__}: {error}"
-            fitters.setdefault(key, text)
-            scores.append(Score(candidate, failure=text, seconds=time.process_time() - begin))
+            score = Score(candidate, failure=text)
+        scores.append(replace(score, seconds=time.process_time() - begin))
     return scores
 
 
+def _say(place: int, count: int, share: float) -> None:
+    say_share(SCORING, (place + share) / count)
+
+
 @dataclass(frozen=True, eq=False)
-class _Fitter:
-    """Fits a candidate to some of the rows: columns of the linear least squares, and what was found beside them."""
+class _Problem:
+    """A candidate set up for fits to some of the rows."""
 
-    fit: Callable[[Floats, Candidate], Fit]
-    predict: Callable[[Fit], Floats]
+    found: Candidate  # with the orientation, shape and parameters that all rows suggest
+    regressor: Regressor
+    # Takes weights, shape (N,), a candidate with the penalties, and a fit to start from.
+    fit: Callable[[Floats, Candidate, Fit | None], Fit]
     skip: int
-    parameters: int
-    orientation: Orientation
-    shape: tuple[float, ...]
+    parameters: int  # number of nonlinear parameters
+    first: Fit | None = None  # fit to all rows, if there is one
 
 
-def _score(
-    measured: Measurements,
-    candidate: Candidate,
-    fitter: _Fitter,
-    folds: tuple[tuple[Fold, ...], tuple[Fold, ...]],
-    begin: float,
-    place: tuple[int, int],
-) -> Score:
-    errors: tuple[list[float], list[float]] = ([], [])
-    training: list[float] = []
-    freedom: list[float] = []
-    for found, part in zip(errors, folds, strict=True):
-        for fold in part:
-            weights = fold.trained.astype(np.float64)
-            fit = fitter.fit(weights, candidate)
-            squares = (measured.outputs - fitter.predict(fit)) ** 2
-            found.append(float(squares[fold.tested].mean()))
-            say_share(SCORING, (place[0] + len(training) / sum(map(len, folds))) / place[1])
-            weights[: fitter.skip] = 0.0
-            training.append(float(np.sqrt(weights @ squares / weights.sum())))
-            freedom.append(fit.certificate.effective + fitter.parameters)
+def _score(measured: Measurements, candidate: Candidate, problem: _Problem, say: Callable[[float], None]) -> Score:
+    folds = [*measured.blocks, *measured.cycles]
+    errors, training, freedom = [], [], []
+    fit = problem.first
+    for number, fold in enumerate(folds, start=1):
+        weights = fold.trained.astype(np.float64)
+        fit = problem.fit(weights, candidate, fit)
+        squares = (measured.outputs - fit.bias - problem.regressor.product(fit.coefficients)) ** 2
+        errors.append(float(squares[fold.tested].mean()))
+        weights[: problem.skip] = 0.0
+        training.append(float(np.sqrt(weights @ squares / weights.sum())))
+        freedom.append(fit.certificate.effective + problem.parameters)
+        say(number / len(folds))
+    blocks = len(measured.blocks)
     return Score(
-        replace(candidate, orientation=fitter.orientation, shape=fitter.shape),
-        tuple(errors[0]),
-        tuple(errors[1]),
+        replace(problem.found, smoothing=candidate.smoothing, ridge=candidate.ridge),
+        tuple(errors[:blocks]),
+        tuple(errors[blocks:]),
         float(np.mean(training)),
         float(np.mean(freedom)),
         int(measured.tested.sum()),
-        time.process_time() - begin,
     )
 
 
-def _set_up(measured: Measurements, candidate: Candidate) -> _Fitter:
-    weights = measured.fitted.astype(np.float64)
+def _set_up(measured: Measurements, candidate: Candidate, *, reshaped: bool) -> _Problem:
     problem = set_up_problem(
         candidate.model,
         measured.inputs,
         measured.outputs,
-        weights,
+        measured.fitted.astype(np.float64),
         0,
         candidate.smoothing or 0.0,
         candidate.initial,
@@ -331,27 +326,25 @@ def _set_up(measured: Measurements, candidate: Candidate) -> _Fitter:
         shape=candidate.shape,
     )
     _check_skipped(measured, problem)
+    if reshaped and candidate.shape:
+        problem = problem.with_best_shape(candidate.smoothing or 0.0, [candidate.shape])
     # Those that are not given are found from all rows.
     chosen = cache(problem.regularization)
 
-    def fit(weights: Floats, one: Candidate) -> Fit:
+    def fit(weights: Floats, one: Candidate, start: Fit | None) -> Fit:
         penalties = chosen(one.smoothing, one.ridge)
-        return problem.fit(penalties.smoothing, weights, penalties.ridge)
+        return problem.fit(penalties.smoothing, weights, penalties.ridge, start)
 
-    def predict(found: Fit) -> Floats:
-        return found.bias + problem.regressor.product(found.coefficients)
-
-    template = problem.template
-    orientation = NAMES[problem.orientation] if has_orientation(problem.spec, template) else "auto"
-    parameters, shape = template.count_beside_coefficients(), template.shape_parameters().values
-    return _Fitter(fit, predict, problem.skip, parameters, orientation, tuple(shape))
+    found = _found(candidate, problem, problem.orientation)
+    count, first = problem.template.count_beside_coefficients(), problem.known[1] if problem.known else None
+    return _Problem(found, problem.regressor, fit, problem.skip, count, first)
 
 
 def _set_up_in_time(
     measured: Measurements, candidate: Candidate, searches: dict[str, tuple[FitProblem, Search]], *, reshaped: bool
-) -> _Fitter:
+) -> _Problem:
     assert measured.times is not None
-    static = repr(replace(candidate, dynamics=""))
+    static = repr(replace(candidate, dynamics="", parameters={}))
     if static not in searches:
         searches[static] = set_up_search(
             measured.times,
@@ -369,23 +362,24 @@ def _set_up_in_time(
         )
     problem, search = searches[static]
     _check_skipped(measured, problem)
-    found = find_best(search, tuple(candidate.dynamics.split(",")), rounds=1)
+    elements = tuple(candidate.dynamics.split(","))
+    found = find_best(search, elements, candidate.parameters, rounds=1)
     if reshaped or not candidate.shape:
         search, found = reshape(search, found, _SHAPE)
-    columns, others = search.responses(found.elements, found.values)
-    together = np.column_stack([columns, others])
-    sign = search.sign(found.fit)
+    responses, sign = search.responses(found.elements, found.values), search.sign(found.fit)
 
-    def fit(weights: Floats, one: Candidate) -> Fit:
-        return search.fit_columns(columns, others, weights, sign, one.smoothing)
+    def fit(weights: Floats, one: Candidate, start: Fit | None) -> Fit:
+        return search.fit(responses, sign, weights, one.smoothing, start)
 
-    def predict(found: Fit) -> Floats:
-        return np.asarray(found.bias + together @ found.coefficients)
+    best = replace(_found(candidate, search.static, sign), parameters=search.named(found))
+    count = found.values.size + search.static.template.count_beside_coefficients()
+    return _Problem(best, responses.regressor, fit, problem.skip, count, found.fit)
 
-    template = search.static.template
-    orientation = NAMES[sign] if has_orientation(search.static.spec, template) else "auto"
-    parameters = found.values.size + template.count_beside_coefficients()
-    return _Fitter(fit, predict, problem.skip, parameters, orientation, tuple(template.shape_parameters().values))
+
+def _found(candidate: Candidate, problem: FitProblem, sign: Sign) -> Candidate:
+    """Return a candidate with the orientation and the shape that were found."""
+    orientation = NAMES[sign] if has_orientation(problem.spec, problem.template) else "auto"
+    return replace(candidate, orientation=orientation, shape=tuple(problem.template.shape_parameters().values))
 
 
 def _check_skipped(measured: Measurements, problem: FitProblem) -> None:

@@ -77,7 +77,7 @@ def run_folds(runs: NDArray[np.int64], usable: Flags) -> tuple[Fold, ...]:
     return tuple(_fold((runs == run) & usable, usable, 0) for run in np.unique(runs[usable]))
 
 
-def cycle_folds(inputs: Floats, usable: Flags, *, folds: int = FOLDS, gap: int = 0) -> tuple[Fold, ...]:
+def cycle_folds(inputs: Floats, usable: Flags, *, gap: int = 0) -> tuple[Fold, ...]:
     """Return folds of whole kinds of cycles; none if there are fewer than two kinds beside the major loop.
 
     A kind is what the input does between the same two turning points, however often and in either direction: a cycle
@@ -91,8 +91,6 @@ def cycle_folds(inputs: Floats, usable: Flags, *, folds: int = FOLDS, gap: int =
         The inputs.
     usable : ndarray of bool, shape (N,)
         Rows that may be fitted and tested.
-    folds : int
-        Number of folds, >= 2, or of kinds if these are fewer.
     gap : int
         Rows next to those left out that are left out of the fit as well.
     """
@@ -101,7 +99,7 @@ def cycle_folds(inputs: Floats, usable: Flags, *, folds: int = FOLDS, gap: int =
     if present.size < 2:
         return ()
     number = np.full(amplitudes.size, -1)
-    count = min(folds, present.size)
+    count = min(FOLDS, present.size)
     number[present[np.argsort(-amplitudes[present], kind="stable")]] = np.arange(present.size) % count
     made = tuple(_fold((number[kind] == k) & usable, usable, gap) for k in range(count))
     # Of short branches the gaps may take all.

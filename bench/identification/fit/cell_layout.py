@@ -69,8 +69,9 @@ class CellLayout:
         merged, parents = np.unique(self.layers * rows.size + i * (i + 1) // 2 + j, return_inverse=True)
         return CellLayout((self.order + 1) // 2, merged % rows.size, merged // rows.size), parents
 
+    @cached_property
     def roughness(self) -> csr_array:
-        """Return LᵀL of the discrete Laplacian L of the density on the plane, one row and column a column."""
+        """LᵀL of the discrete Laplacian L of the density on the plane, one row and column a column."""
         from scipy.sparse import csr_array, diags_array
 
         rows, columns = np.tril_indices(self.order)
@@ -122,8 +123,9 @@ class PlanesBeside(CellLayout):
         before = np.cumsum([0, *(plane.cells.size for plane in merged)])
         return self.of_planes(*merged), np.concatenate([each + n for each, n in zip(parents, before, strict=False)])
 
+    @cached_property
     def roughness(self) -> csr_array:
-        """Return LᵀL of the discrete Laplacians of the densities, each on its plane."""
+        """LᵀL of the discrete Laplacians of the densities, each on its plane."""
         from scipy.sparse import block_diag, csr_array
 
-        return csr_array(block_diag([plane.roughness() for plane in self.planes]))
+        return csr_array(block_diag([plane.roughness for plane in self.planes]))

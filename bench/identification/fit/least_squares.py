@@ -137,6 +137,7 @@ def fit(
     skip: int = 0,
     smoothing: float = 0.0,
     ridge: float = 0.0,
+    start: Floats | None = None,
 ) -> Fit:
     """Return bias b and coefficients x that minimise the sum of weight * (outputs - b - R x)².
 
@@ -162,6 +163,9 @@ def fit(
         a plane of half the order. See `cross_validate` for a choice of the weight.
     ridge : float
         Weight >= 0 of a penalty on the size: ridge * (mean squared column norm) * |density|².
+    start : ndarray, shape (K,), or None
+        Coefficients of the sparse columns to start from where there is a penalty, such as those for other weights.
+        They decide the time only.
 
     Raises
     ------
@@ -169,7 +173,7 @@ def fit(
         If a length does not fit, a number is not finite, a weight is negative, or nothing is left to fit.
     """
     layout = CellLayout.of(regressor.base.size)
-    return fit_cells(layout, regressor, outputs, nonnegative, weights, skip, smoothing, ridge)
+    return fit_cells(layout, regressor, outputs, nonnegative, weights, skip, smoothing, ridge, start)
 
 
 def fit_cells(
@@ -181,6 +185,7 @@ def fit_cells(
     skip: int = 0,
     smoothing: float = 0.0,
     ridge: float = 0.0,
+    start: Floats | None = None,
 ) -> Fit:
     """Return what `fit` does, for sparse columns whose places in the plane `layout` gives."""
     y, w = _cost(regressor, outputs, weights, skip)
@@ -191,8 +196,9 @@ def fit_cells(
         regressor, y, w, left = short.regressor, short.outputs, short.weights, short.left
     unit = unit_of_penalties(regressor, w) if smoothing or ridge else 1.0
     with one_thread():
-        state = _ActiveSet(regressor, y, w, constrained, layout, smoothing * unit, ridge * unit)
-        return state.solve(samples, left)
+        state = _ActiveSet(regressor, y, w, constrained, layout, smoothing * unit, ridge * unit, start=start)
+        state.minimise()
+        return state.result(samples, left)
 
 
 def fit_minimum_norm(
@@ -328,12 +334,13 @@ class _ActiveSet:
         smoothing: float,
         ridge: float,
         parents: Indices | None = None,
+        start: Floats | None = None,
     ) -> None:
         self.regressor, self.y, self.w, self.constrained, self.layout = regressor, y, w, constrained, layout
         self.smoothing, self.ridge, self.parents = smoothing, ridge, parents
         # Before the columns, which then take its place: the memory of both would count.
         coarser = smoothing + ridge > 0.0 and constrained.any() and layout.order >= _COARSEST
-        self.start = self.coarse_densities() if coarser else None
+        self.start = start if start is not None else self.coarse_densities() if coarser else None
         if parents is not None:
             regressor = regressor.merged(parents, layout.cells.size)
         self.cells = regressor.base.size
@@ -356,10 +363,8 @@ class _ActiveSet:
         if rough or (ridge > 0.0 and self.cells):
             from scipy.sparse import csr_array, eye_array
 
-            penalty = csr_array((self.cells, self.cells))
+            penalty = smoothing * layout.roughness if rough else csr_array((self.cells, self.cells))
             if rough:
-                penalty = layout.roughness()
-                penalty.data *= smoothing
                 self.usable[: self.cells] |= layout.layers == 0
             if self.ridge > 0.0:
                 penalty = csr_array(penalty + ridge * eye_array(self.cells))
@@ -516,11 +521,6 @@ class _ActiveSet:
             self.x[passive] = moved
             barred.append(self.leave(leave))
 
-    def solve(self, samples: int, left: float) -> Fit:
-        """Return the solution, of so many samples, with so much left of the outputs beside the residual sum."""
-        self.minimise()
-        return self.result(samples, left)
-
     def minimise(self) -> None:
         """Find the passive set and the coefficients."""
         free = np.flatnonzero(~self.constrained & self.usable)
@@ -666,6 +666,7 @@ class _ActiveSet:
         return self.columns.gram_product(x)[self.passive]
 
     def result(self, samples: int, left: float) -> Fit:
+        """Return the solution, of so many samples, with so much left of the outputs beside the residual sum."""
         passive = self.passive
         g = self.slope()
         held = np.ones(self.x.size, dtype=bool)

@@ -115,7 +115,7 @@ def choose_regularization(
     unit = unit_of_penalties(regressor, np.where(np.arange(weights.size) < skip, 0.0, weights))
     rough, plain = np.zeros_like(total), np.zeros_like(total)
     if layout.order:
-        rough[:cells, :cells] = factor * unit * layout.roughness().toarray()
+        rough[:cells, :cells] = factor * unit * layout.roughness.toarray()
     plain[range(cells), range(cells)] = unit * size
     tried = [
         (s, r)

@@ -90,7 +90,7 @@ def resolve(
             penalty = np.zeros_like(gram)
             layout = CellLayout.of(cells)
             if layout.order:
-                penalty[:cells, :cells] = smoothing * unit * layout.roughness().toarray()
+                penalty[:cells, :cells] = smoothing * unit * layout.roughness.toarray()
             penalty[range(cells), range(cells)] += ridge * unit
             diagonal = np.diagonal(np.linalg.lstsq(gram + penalty, gram, rcond=None)[0])
     return Resolution(int(kept.sum()), np.clip(diagonal, 0.0, 1.0))

@@ -1,8 +1,7 @@
-"""Fit of the coefficients of an operator, and of its shape parameters by variable projection."""
+"""Fit of the coefficients of an operator, and advice on its shape parameters."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,11 +10,8 @@ from bench.base import Floats
 from bench.identification.advice import Advice
 from bench.identification.fit.least_squares import Fit, fit, fit_minimum_norm
 from bench.identification.fit.ridge import fit_ridge
-from bench.identification.fit.variable_projection import variable_projection
 from bench.models import Operator, Regressor
 
-# Relative step of the differences. Derivation: the root of 1e-12, to which a constrained linear fit is exact.
-_STEP = 1e-6
 # Cells of a dense normal matrix. Derivation: 8 B of each pair of them take 0.5 GB.
 _MOST_CELLS = 8001
 
@@ -29,10 +25,11 @@ def fit_operator(
     skip: int,
     smoothing: float,
     ridge: float = 0.0,
+    start: Floats | None = None,
 ) -> Fit:
     """Return the coefficients of an operator, with its signs if constrained, and free ones of columns beside its own.
 
-    Free coefficients of a density without a penalty are those of the least norm.
+    Free coefficients of a density without a penalty are those of the least norm. `start` is as for `fit`.
     """
     if not regressor.base.size and not (constrained and operator.nonnegative().any()):
         return fit_ridge(regressor, outputs, ridge, weights=weights, skip=skip)
@@ -48,51 +45,7 @@ def fit_operator(
         own = operator.nonnegative()
         signs[: own.size] = own
     penalties = {"smoothing": smoothing, "ridge": ridge}
-    return fit(regressor, outputs, nonnegative=signs, weights=weights, skip=skip, **penalties)
-
-
-def fit_shape(
-    template: Operator[Any],
-    constrained: bool,
-    start: Callable[[Operator[Any]], Any],
-    inputs: Floats,
-    outputs: Floats,
-    weights: Floats,
-    skip: int,
-    smoothing: float,
-) -> Operator[Any]:
-    """Return the operator with the shape parameters that fit best; the operator itself if it has none.
-
-    Parameters
-    ----------
-    template : Operator
-        With the bounds of its shape parameters, and the values to start from.
-    constrained : bool
-        Whether the signs of the coefficients are constrained.
-    start : callable
-        Takes an operator; returns its state before the first sample.
-    inputs, outputs, weights : ndarray, shape (N,)
-        The measured sequence and the weight of each sample.
-    skip : int
-        Number of first samples left out of the cost.
-    smoothing : float
-        Weight of the roughness penalty.
-    """
-    shape = template.shape_parameters()
-    if not shape.names:
-        return template
-    low, high = np.array(shape.low), np.array(shape.high)
-    roots = np.sqrt(weights[skip:])
-
-    def residuals(values: Floats) -> Floats:
-        operator = template.with_shape(values.tolist())
-        regressor = operator.regressor(inputs, start(operator))
-        found = fit_operator(constrained, operator, regressor, outputs, weights, skip, smoothing)
-        return roots * (outputs - found.bias - regressor.product(found.coefficients))[skip:]
-
-    starts = [np.asarray(values, dtype=np.float64) for values in template.shape_starts()]
-    best = variable_projection(residuals, starts, (low, high), step=_STEP)[0]
-    return template.with_shape(best.values.tolist())
+    return fit(regressor, outputs, nonnegative=signs, weights=weights, skip=skip, start=start, **penalties)
 
 
 def undetermined_shape(operator: Operator[Any]) -> list[Advice]:

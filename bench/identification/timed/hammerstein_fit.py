@@ -26,10 +26,10 @@ from bench.identification.fit.regularization import Regularization
 from bench.identification.fit.variable_projection import Evidence, Stage, variable_projection
 from bench.identification.measures import measure_errors
 from bench.identification.options import OptionHelp
-from bench.identification.timed.hammerstein_search import FREE, Found, Search, beside, find_best, search_ends
+from bench.identification.timed.hammerstein_search import Found, Search, beside, find_best, search_ends
 from bench.identification.timed.parsimony import check_size, schwarz
 from bench.identification.trust import judge_fit
-from bench.models import Hammerstein, HammersteinState, Regressor, check_sequence
+from bench.models import Hammerstein, HammersteinState, check_sequence
 
 ELEMENTS = ("lag", "resonance", "delay", "creep", "kelvin-voigt", "drift", "fading-drift", "viscous", "friction")
 """What can follow the operator or stand beside it: see `identify_hammerstein`."""
@@ -43,10 +43,11 @@ _EXCLUSIVE = ({"lag", "resonance"}, {"creep", "kelvin-voigt"}, {"drift", "fading
 # step of its differences. Derivation: a regressor of that size takes 4 MB, and each step forms some; the step is the
 # root of 1e-12, to which a fit is exact.
 _RESHAPED, _STEP_OF_SHAPE = 500_000, 1e-6
-# Evaluations of a search that only chooses among elements, and of one for a shape: it and a lag stand for each other
-# along a valley, and 40 may leave three times the error on other inputs. Source: that measurement, and a fifth of the
-# usual number for what is only compared.
-_FEW, _EVALUATIONS = 8, 200
+# A search that only chooses among elements. Source: a choice; one start and a fifth of the usual evaluations.
+_PROMISE = Stage(starts=1, tolerance=1e-9, evaluations=8)
+# Evaluations of a search for a shape: it and a lag stand for each other along a valley. Source: measured; 40 may
+# leave three times the error on other inputs.
+_EVALUATIONS = 200
 
 
 def identify_hammerstein(
@@ -128,12 +129,12 @@ def identify_hammerstein(
     advice = list(problem.advice())
     penalties = Regularization(tried[0], 0.0) if any(tried) else None
     with one_thread():
-        search, found = choose_elements(search) if chosen is None else reshape(search, find_best(search, chosen))
+        search, found = choose_elements(search) if chosen is None else reshape(search, find_best(search, chosen, {}))
         if len(tried) > 1:
             best = _cross_validated(search, found, tried)
             penalties = Regularization(best.smoothing, 0.0, best.rms, best.spread, best.training_rms)
             search = replace(search, smoothing=best.smoothing)
-            found = find_best(search, found.elements, found)
+            found = find_best(search, found.elements, search.named(found))
     problem = search.static
     parameters = search.parameters(found.elements)
     for parameter, value, deviation in zip(parameters, found.values, found.deviations, strict=True):
@@ -239,14 +240,12 @@ def set_up_search(
 
 def _cross_validated(search: Search, found: Found, tried: Sequence[float]) -> SmoothingTrial:
     """Return the smoothing of the least error on blocks left out of the fit of the coefficients."""
-    columns, others = search.responses(found.elements, found.values)
-    sign = search.sign(found.fit)
+    responses, sign = search.responses(found.elements, found.values), search.sign(found.fit)
 
     def fitted(weight: float, weights: Floats) -> Fit:
-        return search.fit_columns(columns, others, weights, sign, weight)
+        return search.fit(responses, sign, weights, weight)
 
-    regressor = Regressor.of_columns(np.column_stack([columns, others]))
-    return compare_smoothing(fitted, regressor, search.static.outputs, search.roots**2, tried).best
+    return compare_smoothing(fitted, responses.regressor, search.static.outputs, search.roots**2, tried).best
 
 
 def choose_elements(search: Search) -> tuple[Search, Found]:
@@ -259,7 +258,7 @@ def choose_elements(search: Search) -> tuple[Search, Found]:
     def criterion(trial: Found) -> float:
         return schwarz(trial.cost, trial.values.size + len(beside(trial.elements)), used)
 
-    found = find_best(search, ())
+    found = search.alone
     shortest, longest = search.creep_span
     among = [name for name in CHOICE if name != "creep" or longest >= 10.0 * shortest]
     while found.cost > 0.0:
@@ -267,14 +266,14 @@ def choose_elements(search: Search) -> tuple[Search, Found]:
         for element in among:
             if element not in found.elements:
                 elements = with_element(found.elements, element)
-                trials += search_ends(search, elements, found, search.principal[:, :FREE], starts=1, evaluations=_FEW)
+                trials += search_ends(search, elements, search.named(found), _PROMISE)
         # Only the most promising is worth the constrained fit.
         least = min(trials, key=criterion)
-        reshaped, best = reshape(search, find_best(search, least.elements, found, rounds=1))
+        reshaped, best = reshape(search, find_best(search, least.elements, search.named(found), rounds=1))
         if criterion(best) >= criterion(found):
             break
         search, found = reshaped, best
-    return search, min(find_best(search, found.elements), found, key=lambda each: each.cost)
+    return search, min(find_best(search, found.elements, {}), found, key=lambda each: each.cost)
 
 
 def reshape(search: Search, found: Found, tolerance: float = 1e-10) -> tuple[Search, Found]:
@@ -297,11 +296,9 @@ def reshape(search: Search, found: Found, tolerance: float = 1e-10) -> tuple[Sea
     def at(values: Floats) -> tuple[FitProblem, Fit, Floats]:
         static = shaped(tuple(values[:count].tolist()))
         follows = search.linear(parameters, values[count:])
-        columns = follows.part.respond(search.times, static.regressor.dense())[0]
-        others = search.beside(found.elements, follows)
-        fitted = search.fit_columns(columns, others, search.static.weights, sign)
-        predicted = fitted.bias + np.column_stack([columns, others]) @ fitted.coefficients
-        return static, fitted, search.roots * (search.static.outputs - predicted)
+        responses = search.behind(follows, static.regressor.dense(), found.elements)
+        fitted = search.fit(responses, sign)
+        return static, fitted, search.roots * (search.static.outputs - responses.predict(fitted))
 
     def residuals(values: Floats) -> Floats:
         return at(values)[2]

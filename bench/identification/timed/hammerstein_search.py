@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 from typing import Literal, NamedTuple
 
@@ -13,28 +14,22 @@ import numpy as np
 from bench.base import Floats
 from bench.identification.by_name import FitProblem
 from bench.identification.fit.least_squares import Fit
-from bench.identification.fit.shape import fit_operator
 from bench.identification.fit.variable_projection import Evidence, Separable, Stage, variable_projection
 from bench.identification.timed.parsimony import moving
 from bench.models import LinearPart, Regressor, logarithmic_creep, velocities
 
-EVALUATIONS = 40
-"""Evaluations of a search. Source: a choice; each element has one or two parameters, and a search that is cut off
-goes on in the next round."""
-
-FREE = 30
-"""Principal columns of the operator in a first search. Source: a choice; the fit of all columns follows."""
+# Principal columns of the operator in a first search. Source: a choice; the fit of all columns follows.
+_FREE = 30
 
 # Rounds of search and constrained fit, and the relative gain of the cost at which they end. Derivation: a parameter
 # that means nothing gains more by chance, 2 log(N) / N, on records of fewer than a million rows.
 _ROUNDS, _GAIN = 4, 1e-5
-# Source: a choice; the deepest valley of the grid, and another.
-_STARTS = 2
-# Principal columns in the grid that a search starts from. Source: a choice; with the signal of the smaller model they
-# stand for the operator; the search then has more.
+# Principal columns in the grid that a search starts from. Source: a choice; with the signal of the operator alone
+# they stand for it; the search then has more.
 _COARSE = 6
-# Relative change at which a search ends. Derivation: a ten-thousandth of the gain at which rounds end.
-_TOLERANCE = 1e-9
+# A search. Source: a choice. Two starts are the deepest valley of the grid and another one. The tolerance is a
+# ten-thousandth of the gain at which the rounds end. A search that is cut off goes on in the next round.
+_STAGE = Stage(starts=2, tolerance=1e-9, evaluations=40)
 
 
 @dataclass(frozen=True)
@@ -54,10 +49,42 @@ class Following(NamedTuple):
     drift_time: float  # time constant of a drift that fades, s; 0 for another
     friction_speed: float  # of a friction, input units/s; 0 if there is none
 
+    def respond(self, times: Floats, columns: Floats) -> Floats:
+        """Return columns behind the linear part, shape (N, K): the same ones if nothing follows."""
+        part = self.part
+        is_static = not (part.delay or part.lag[0] or part.creep_times.size)
+        return columns if is_static else part.respond(times, columns)[0]
+
 
 def beside(elements: Sequence[str]) -> list[str]:
     """Return the elements that stand beside the operator, in the order of their columns."""
     return [name for name in ("drift", "fading-drift", "viscous", "friction") if name in elements]
+
+
+@dataclass(frozen=True, eq=False)
+class Responses:
+    """The columns of an operator behind what follows it, and those beside it."""
+
+    columns: Floats  # shape (N, K)
+    beside: Floats  # shape (N, q)
+    cells: int  # number of the first columns that are cells of a density
+
+    @cached_property
+    def regressor(self) -> Regressor:
+        """All columns, shape (N, K + q)."""
+        dense = np.column_stack([self.columns[:, self.cells :], self.beside])
+        return Regressor.of_cells(self.columns[:, : self.cells], dense)
+
+    def without_still(self, weights: Floats, skip: int) -> Regressor:
+        """Return all columns, with those of the operator at 0 that the rows fitted hardly move."""
+        moved = np.append(moving(self.columns, weights, skip), np.ones(self.beside.shape[1], dtype=bool))
+        return self.regressor if moved.all() else self.regressor.keeping(moved)
+
+    def predict(self, found: Fit) -> Floats:
+        """Return the outputs by a fit, shape (N,)."""
+        count = self.columns.shape[1]
+        operator, beside = found.coefficients[:count], found.coefficients[count:]
+        return np.asarray(found.bias + self.columns @ operator + self.beside @ beside)
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,19 +98,34 @@ class Search:
     signs: tuple[Literal[1, -1], ...]  # signs of the operator's coefficients that are tried
     smoothing: float = 0.0  # weight of the roughness penalty on the density of the operator, see `fit`
     ridge: float = 0.0  # weight of the penalty on the coefficients of an operator without a density, see `fit_ridge`
-    elapsed: Floats = field(init=False)  # shape (N,); since the first row, s
-    speeds: Floats = field(init=False)  # shape (N,); velocity of the input, input units/s
-    principal: Floats = field(init=False)  # shape (N, r); principal columns of the regressor
-    step: float = field(init=False)  # median step of time, s
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "elapsed", self.times - self.times[0])
-        object.__setattr__(self, "speeds", velocities(self.times, self.static.inputs))
-        object.__setattr__(self, "step", float(np.median(np.diff(self.times))))
+    @cached_property
+    def elapsed(self) -> Floats:
+        """Time since the first row, s, shape (N,)."""
+        return np.asarray(self.times - self.times[0])
+
+    @cached_property
+    def speeds(self) -> Floats:
+        """Velocity of the input, input units/s, shape (N,)."""
+        return velocities(self.times, self.static.inputs)
+
+    @cached_property
+    def step(self) -> float:
+        """Median step of time, s."""
+        return float(np.median(np.diff(self.times)))
+
+    @cached_property
+    def principal(self) -> Floats:
+        """Principal columns of the operator, the strongest first, shape (N, r)."""
         centred = self.columns - self.columns.mean(axis=0)
         strengths, directions = np.linalg.eigh(centred.T @ centred)
         kept = strengths > 1e-10 * strengths[-1]
-        object.__setattr__(self, "principal", np.ascontiguousarray(self.columns @ directions[:, kept][:, ::-1]))
+        return np.ascontiguousarray(self.columns @ directions[:, kept][:, ::-1])
+
+    @cached_property
+    def alone(self) -> Found:
+        """The operator with nothing behind or beside it."""
+        return self.fitted((), np.empty(0), np.empty(0))
 
     @property
     def span(self) -> float:
@@ -124,6 +166,11 @@ class Search:
                 found.append(_Parameter("friction", (top - 3.0, top - 1.5), top - 7.0, top + 1.0))
         return found
 
+    def named(self, found: Found) -> dict[str, float]:
+        """Return the nonlinear parameters that were found, by name."""
+        names = [parameter.name for parameter in self.parameters(found.elements)]
+        return dict(zip(names, found.values.tolist(), strict=True))
+
     def linear(self, parameters: Sequence[_Parameter], values: Floats) -> Following:
         """Return what follows the operator and stands beside it for given parameters."""
         x = {parameter.name: float(value) for parameter, value in zip(parameters, values, strict=True)}
@@ -153,41 +200,43 @@ class Search:
                 columns.append(self.elapsed if time == 0.0 else -np.expm1(-self.elapsed / time))
         return np.column_stack(columns) if columns else np.empty((self.times.size, 0))
 
-    def responses(self, elements: Sequence[str], values: Floats) -> tuple[Floats, Floats]:
-        """Return the filtered columns of the operator, shape (N, K), and those beside it for given parameters."""
-        follows = self.linear(self.parameters(elements), values)
-        return follows.part.respond(self.times, self.columns)[0], self.beside(elements, follows)
+    def behind(self, follows: Following, columns: Floats, elements: Sequence[str]) -> Responses:
+        """Return columns of the operator behind what follows it, shape (N, K), and those beside it."""
+        cells = self.static.regressor.base.size
+        return Responses(follows.respond(self.times, columns), self.beside(elements, follows), cells)
 
-    def fitted(self, elements: tuple[str, ...], values: Floats, deviations: Floats) -> Found:
+    def responses(self, elements: Sequence[str], values: Floats) -> Responses:
+        """Return the columns of elements for given parameters."""
+        follows = self.linear(self.parameters(elements), values)
+        return self.behind(follows, self.columns, elements)
+
+    def fitted(
+        self, elements: tuple[str, ...], values: Floats, deviations: Floats, start: Fit | None = None
+    ) -> Found:
         """Return parameters with the coefficients that belong to them, of the sign that fits better, and the cost."""
-        columns, others = self.responses(elements, values)
-        together, found = np.column_stack([columns, others]), []
+        responses, found = self.responses(elements, values), []
         for sign in self.signs:
-            fitted = self.fit_columns(columns, others, self.static.weights, sign)
-            rest = self.roots * (self.static.outputs - fitted.bias - together @ fitted.coefficients)
+            fitted = self.fit(responses, sign, start=start)
+            rest = self.roots * (self.static.outputs - responses.predict(fitted))
             found.append(Found(elements, values, fitted, float(rest @ rest), deviations))
         return min(found, key=lambda each: each.cost)
 
-    def fit_columns(
+    def fit(
         self,
-        columns: Floats,
-        others: Floats,
-        weights: Floats,
+        responses: Responses,
         sign: Literal[1, -1],
+        weights: Floats | None = None,
         smoothing: float | None = None,
+        start: Fit | None = None,
     ) -> Fit:
-        """Return the coefficients of filtered columns, those of the operator of one sign, and those beside them."""
-        problem, count = self.static, columns.shape[1]
-        cells, constrained = problem.regressor.base.size, problem.spec.constrained
-        columns = (sign if constrained else 1) * moving(columns, weights, problem.skip)
-        regressor = Regressor.of_cells(columns[:, :cells], np.column_stack([columns[:, cells:], others]))
-        smoothing = self.smoothing if smoothing is None else smoothing
-        found = fit_operator(
-            constrained, problem.template, regressor, problem.outputs, weights, problem.skip, smoothing, self.ridge
-        )
-        turned = found.coefficients.copy()
-        turned[:count] *= sign if constrained else 1
-        return replace(found, coefficients=turned)
+        """Return the coefficients of responses, those of the operator of one sign.
+
+        Weights and smoothing are those of the search unless others are given.
+        """
+        counted = self.static.weights if weights is None else weights
+        regressor = responses.without_still(counted, self.static.skip)
+        problem = replace(self.static, regressor=regressor, orientation=sign, known=None)
+        return problem.fit(self.smoothing if smoothing is None else smoothing, counted, self.ridge, start)
 
     def sign(self, found: Fit) -> Literal[1, -1]:
         """Return the sign of the operator's coefficients that are constrained."""
@@ -199,7 +248,7 @@ class Search:
         if self.smoothing:
             # All cells are free then, and together they would take what follows the operator for hysteresis.
             signal = self.columns @ found.coefficients[: self.columns.shape[1]]
-            return np.column_stack([signal, self.principal[:, :FREE]])
+            return np.column_stack([signal, self.principal[:, :_FREE]])
         if self.static.spec.constrained:
             used = found.coefficients[: self.columns.shape[1]] != 0.0
             return self.columns[:, used]
@@ -217,8 +266,8 @@ class Found:
     deviations: Floats
 
 
-class _Responses:
-    """The columns of a search: what follows a basis, and what stands beside it."""
+class _Projected:
+    """The problem of a search: what follows a basis of the operator's columns, and what stands beside it."""
 
     def __init__(self, search: Search, elements: Sequence[str], basis: Floats) -> None:
         self._search, self._elements, self._basis = search, elements, basis
@@ -231,20 +280,20 @@ class _Responses:
 
     def _columns(self, values: Floats) -> Floats:
         follows = self._search.linear(self._parameters, values)
-        return np.column_stack([self._respond(follows.part), self._search.beside(self._elements, follows)])
+        return np.column_stack([self._respond(follows), self._search.beside(self._elements, follows)])
 
     def _combine(self, values: Floats, coefficients: Floats) -> Floats:
         follows, count = self._search.linear(self._parameters, values), self._basis.shape[1]
         signal = (self._basis @ coefficients[:count])[:, None]
         others = self._search.beside(self._elements, follows) @ coefficients[count:]
-        return np.asarray(follows.part.respond(self._search.times, signal)[0][:, 0] + others)
+        return np.asarray(follows.respond(self._search.times, signal)[:, 0] + others)
 
-    def _respond(self, part: LinearPart) -> Floats:
+    def _respond(self, follows: Following) -> Floats:
         """Return the filtered basis; responses of the creep, whose times stay, are kept for the last delay."""
-        times, basis = self._search.times, self._basis
+        times, basis, part = self._search.times, self._basis, follows.part
         strengths = part.creep_strengths
         if not strengths.size:
-            return part.respond(times, basis)[0]
+            return follows.respond(times, basis)
         if part.delay not in self._creep:
             # Logarithmic creep has one strength for all.
             shared = [name for name in (p.name for p in self._parameters) if name == "creep"]
@@ -259,19 +308,26 @@ class _Responses:
         return result
 
 
-def find_best(search: Search, elements: tuple[str, ...], before: Found | None = None, rounds: int = _ROUNDS) -> Found:
-    """Return the parameters of elements that fit best, found from several starts; `before` is a smaller model."""
+def find_best(
+    search: Search,
+    elements: tuple[str, ...],
+    known: Mapping[str, float],
+    rounds: int = _ROUNDS,
+) -> Found:
+    """Return the parameters of elements that fit best.
+
+    They are searched from the values that are known by name, and from several starts of each other parameter.
+    """
     if not search.parameters(elements):
-        return search.fitted(elements, np.empty(0), np.empty(0))
-    first = find_best(search, ()) if before is None else before
-    trials = search_ends(search, elements, first, search.principal[:, :FREE])
+        return search.fitted(elements, np.empty(0), np.empty(0), search.alone.fit)
+    trials = search_ends(search, elements, known)
     best = min(
-        (search.fitted(elements, trial.values, trial.deviations) for trial in trials), key=lambda trial: trial.cost
+        (search.fitted(elements, trial.values, trial.deviations, trial.fit) for trial in trials),
+        key=lambda trial: trial.cost,
     )
     for _ in range(rounds):
-        basis, stage = search.basis(best.fit), Stage(1, _TOLERANCE, EVALUATIONS)
-        end = _ends(search, elements, best.fit, basis, [best.values], stage)[0]
-        moved = search.fitted(elements, end.values, end.deviations)
+        end = _ends(search, elements, best.fit, search.basis(best.fit), [best.values], _STAGE)[0]
+        moved = search.fitted(elements, end.values, end.deviations, best.fit)
         gained = best.cost - moved.cost
         if gained > 0.0:
             best = moved
@@ -281,24 +337,18 @@ def find_best(search: Search, elements: tuple[str, ...], before: Found | None = 
 
 
 def search_ends(
-    search: Search,
-    elements: tuple[str, ...],
-    before: Found,
-    basis: Floats,
-    starts: int = _STARTS,
-    evaluations: int = EVALUATIONS,
+    search: Search, elements: tuple[str, ...], known: Mapping[str, float], stage: Stage = _STAGE
 ) -> list[Found]:
-    """Return the ends of searches over the coefficients of a basis, with their costs and the smaller model's fit.
+    """Return the ends of searches over principal columns, with their costs and the fit of the operator alone.
 
-    They start from the best few of a grid, judged with the fit of the smaller model and the principal columns.
+    They start from the best few of a grid, judged with that fit and the principal columns.
     """
-    names = [parameter.name for parameter in search.parameters(before.elements)]
-    known = dict(zip(names, before.values.tolist(), strict=True))
     grids = [(known[p.name],) if p.name in known else p.starts for p in search.parameters(elements)]
-    signal = search.columns @ before.fit.coefficients[: search.columns.shape[1]]
-    screen = _Responses(search, elements, np.column_stack([signal, search.principal[:, :_COARSE]])).problem()
-    grid, stage = [np.array(values) for values in product(*grids)], Stage(starts, _TOLERANCE, evaluations)
-    return _ends(search, elements, before.fit, basis, grid, stage, screen)
+    before = search.alone.fit
+    signal = search.columns @ before.coefficients[: search.columns.shape[1]]
+    screen = _Projected(search, elements, np.column_stack([signal, search.principal[:, :_COARSE]])).problem()
+    grid = [np.array(point) for point in product(*grids)]
+    return _ends(search, elements, before, search.principal[:, :_FREE], grid, stage, screen)
 
 
 def _ends(
@@ -314,7 +364,7 @@ def _ends(
     parameters = search.parameters(elements)
     bounds = np.array([p.low for p in parameters]), np.array([p.high for p in parameters])
     ends = variable_projection(
-        _Responses(search, elements, basis).problem(),
+        _Projected(search, elements, basis).problem(),
         starts,
         bounds,
         stages=[stage],

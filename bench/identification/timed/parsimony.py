@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bench.base import Floats
 
@@ -24,13 +25,13 @@ def check_size(rows: int, count: int, fewer: str) -> None:
         )
 
 
-def moving(columns: Floats, weights: Floats, skip: int) -> Floats:
-    """Return columns, shape (N, K), with those at 0 that the rows fitted hardly move; weights, shape (N,), say which.
+def moving(columns: Floats, weights: Floats, skip: int) -> NDArray[np.bool_]:
+    """Return which columns, shape (N, K), the rows fitted move; weights, shape (N,), say which rows are.
 
     What relaxes leaves a trace of each move in all later rows, even if none of those fitted makes it.
     """
     fitted = columns[skip:][weights[skip:] > 0.0]
-    return np.where(np.ptp(fitted, axis=0) >= _MOVED * np.ptp(columns, axis=0), columns, 0.0)
+    return np.asarray(np.ptp(fitted, axis=0) >= _MOVED * np.ptp(columns, axis=0))
 
 
 def schwarz(cost: float, parameters: int, used: int) -> float:

@@ -116,7 +116,7 @@ class PlaysSearch:
         problem = self.static
         w = problem.weights if weights is None else weights
         # Plays stand still most of the time: as cells, without a place in a plane, they are quickly fitted.
-        cells = problem.orientation * moving(columns, w, problem.skip)
+        cells = problem.orientation * np.where(moving(columns, w, problem.skip), columns, 0.0)
         count = cells.shape[1]
         regressor = Regressor.of_cells(cells, np.empty((cells.shape[0], 0)))
         layout = CellLayout(0, np.arange(count), np.zeros(count, dtype=np.int64))

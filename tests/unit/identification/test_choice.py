@@ -118,6 +118,20 @@ def test_a_force_with_friction_and_viscosity_takes_the_velocity():
     assert found.chosen.error < 0.6 * without.chosen.error
 
 
+def test_what_starts_from_the_parameters_that_were_found_scores_the_same():
+    rng = np.random.default_rng(4)
+    times = 0.01 * np.arange(300)
+    inputs = random_reversals(rng, 300, 25)
+    outputs = settled(PLANTS["bouc-wen"], inputs) + 0.1 * np.tanh(np.gradient(inputs, times) / 2.0)
+    measured = Measurements.of(inputs, outputs + 0.01 * rng.standard_normal(300), times=times)
+    for dynamics in ("", "friction"):
+        (once,) = evaluate(measured, [Candidate("bouc-wen", dynamics=dynamics)])
+        (again,) = evaluate(measured, [once.candidate], reshaped=True)
+        assert len(once.candidate.shape) == 3
+        assert set(once.candidate.parameters) == ({dynamics} if dynamics else set())
+        assert again.error == pytest.approx(once.error, rel=1e-3)
+
+
 def test_settings_that_are_given_are_kept():
     rng = np.random.default_rng(1)
     inputs = random_reversals(rng, 200, 20)

@@ -206,6 +206,19 @@ def test_smoothing_from_a_coarser_plane_equals_that_from_scratch(order, smoothin
     np.testing.assert_allclose(found.coefficients, expected.coefficients, atol=1e-6)
 
 
+@cases("start", ["zeros", "ones", "other weights"])
+def test_smoothing_from_any_start_is_the_same(start):
+    operator, inputs, outputs = problem(order=10, noise=0.3)
+    regressor = operator.regressor(inputs)
+    expected = fit(regressor, outputs, smoothing=1e-3)
+    half = fit(regressor, outputs, weights=np.arange(outputs.size) % 2, smoothing=1e-3)
+    points = {"zeros": np.zeros(55), "ones": np.ones(55), "other weights": half.coefficients}
+    found = fit(regressor, outputs, smoothing=1e-3, start=points[start])
+    assert found.certificate.kkt_residual < 1e-10
+    np.testing.assert_allclose(found.coefficients, expected.coefficients, atol=1e-8 * expected.coefficients.max())
+    assert found.certificate.effective == pytest.approx(expected.certificate.effective, rel=1e-8)
+
+
 def condition_by_lapack(block):
     """The estimate of dpocon."""
     norm = np.abs(block).sum(axis=0).max(initial=0.0)

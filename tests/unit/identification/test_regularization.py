@@ -135,7 +135,7 @@ def test_penalised_fit_equals_stacked_least_squares(seed, order, smoothing, ridg
     b = root * (outputs - weights @ outputs / weights.sum())
     squares = (a**2).sum(axis=0)
     unit = squares[squares > 1e-20].mean()
-    values, vectors = np.linalg.eigh(CellLayout.of(matrix.shape[1]).roughness().toarray())
+    values, vectors = np.linalg.eigh(CellLayout.of(matrix.shape[1]).roughness.toarray())
     rough = (vectors * np.sqrt(np.maximum(values, 0.0))).T
     stacked = np.vstack([a, np.sqrt(smoothing * unit) * rough, np.sqrt(ridge * unit) * np.eye(a.shape[1])])
     bounds = (0.0 if nonnegative else -np.inf, np.inf)

@@ -201,9 +201,9 @@ def test_both_planes_of_a_summed_model_are_smoothed():
 def test_planes_beside_each_other_keep_their_neighbours():
     small, large = CellLayout.of(3), CellLayout.of(10)
     both = PlanesBeside.of_planes(small, large)
-    rough = both.roughness().toarray()
-    np.testing.assert_array_equal(rough[:3, :3], small.roughness().toarray())
-    np.testing.assert_array_equal(rough[3:, 3:], large.roughness().toarray())
+    rough = both.roughness.toarray()
+    np.testing.assert_array_equal(rough[:3, :3], small.roughness.toarray())
+    np.testing.assert_array_equal(rough[3:, 3:], large.roughness.toarray())
     assert not rough[:3, 3:].any()
     np.testing.assert_array_equal(both.neighbours[:3], small.neighbours)
     inside = large.neighbours >= 0
