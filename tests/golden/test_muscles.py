@@ -12,7 +12,7 @@ from rigs.muscles.identification import FORCE, LENGTH, MODELS, SAMPLE
 
 MUSCLES = ("mckibben", "coiled_polymer")
 SAMPLES = {"force-voltage": 37, "length-voltage": 185, "length-force": 138, "length-verification": 90}
-SHORT_SAMPLES = {"force-voltage": 37, "length-voltage": 65, "length-force": 54, "length-verification": 35}
+SHORT_SAMPLES = {"force-voltage": 37, "length-voltage": 65, "length-force": 36, "length-verification": 35}
 
 
 @pytest.mark.slow
@@ -23,7 +23,7 @@ def test_campaign(reproduce, seed, is_short):
     out, campaign = reproduce("muscles", seed, is_short=is_short)
     assert "McKibben muscle" in out
     assert "super-coiled polymer muscle" in out
-    assert campaign["laboratory_seconds"] > (3 if is_short else 8) * 3600
+    assert campaign["laboratory_seconds"] > (2 if is_short else 8) * 3600
     for muscle in MUSCLES:
         errors = campaign[muscle]
         assert errors["fv"]["two_stage"]["rms"] < 1.0

@@ -16,35 +16,57 @@ ERRORS = {"rms", "max", "median", "average", "settling", "seconds"}
 BAND = 1.5
 RECORDED_SEED = 0
 SHORT = {
-    "vo2": ("tracking.count=12", "following.duration=200"),
+    "vo2": (
+        "damped-oscillation.increment=0.5",
+        "damped-oscillation.dwell=5",
+        "random-validation.count=300",
+        "tracking.count=12",
+        "following.duration=200",
+    ),
     "sma": (
+        "force-voltage.dwell=20",
         "length-voltage.points=13",
+        "length-voltage.dwell=20",
         "length-verification.points=7",
+        "length-verification.dwell=20",
         "length-force.points=5",
         "length-force.voltages=0,1,2,3",
+        "length-force.dwell=20",
         "length-control.count=10",
         "force-control.count=10",
     ),
     "muscles": (
+        "force-voltage.dwell=20",
         "length-voltage.points=13",
-        "length-verification.points=7",
-        "length-force.points=5",
         "length-voltage.dwell=20",
+        "length-verification.points=7",
         "length-verification.dwell=20",
+        "length-force.points=5",
+        "length-force.voltages=0,1,2,3",
         "length-force.dwell=20",
-        "force-voltage.dwell=30",
     ),
     "hybrid": (
+        "current-sine.rate=0.25",
+        "current-sine.periods=2",
+        "current-steps.on=400",
+        "current-steps.off=500",
+        "current-steps.rate=0.5",
+        "thermomechanical.levels=7",
+        "piezo-step.duration=0.15",
+        "hybrid-excitation.duration=1000",
+        "hybrid-excitation.rate=1",
         "hybrid-control.positions=90e-6, -120e-6",
-        "hybrid-control.steps=2",
+        "hybrid-control.low=-10e-6",
+        "hybrid-control.high=10e-6",
+        "hybrid-control.steps=1",
         "hybrid-control.rate=100",
         "hybrid-control.record_rate=25",
         "hybrid-control.speed=3e-6",
-        "calibration-displacement.rate=4",
-        "fine-step.duration=0.08",
+        "calibration-displacement.rate=2",
+        "fine-step.duration=0.06",
     ),
 }
-"""Settings with which a study takes less time: fewer targets, points, moves and samples a second."""
+"""Settings with which a study takes less time: fewer and shorter steps, targets and moves."""
 
 
 def options_of(study):
