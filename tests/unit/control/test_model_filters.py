@@ -72,7 +72,7 @@ class TestBoth:
         [each if each in ("gain", "all") else pytest.param(each, marks=pytest.mark.seeds) for each in PERTURBED],
     )
     def test_a_specimen_that_moved_is_explained_after_sixty_readings(self, identified, name, changed):
-        found = readings(specimen(identified, **PERTURBED[changed]), 100)
+        found = readings(specimen(identified, **PERTURBED[changed]), 80)
         before = rms([output - identified.value(state) for state, output in found[60:]])
         after = rms(learnt(model_filter(name, identified), found)[60:])
         assert before > 3.0
@@ -85,17 +85,17 @@ class TestBoth:
 
     def test_a_sensor_that_jumps_changes_nothing_for_however_long(self, identified, name):
         adaptation = model_filter(name, identified)
-        found = readings(specimen(identified, gain=1.05), 160)
-        learnt(adaptation, found[:60])
+        found = readings(specimen(identified, gain=1.05), 100)
+        learnt(adaptation, found[:40])
         model = adaptation.model
-        learnt(adaptation, [(state, output + 0.3 * SPAN) for state, output in found[60:130]])
+        learnt(adaptation, [(state, output + 0.3 * SPAN) for state, output in found[40:80]])
         assert adaptation.model is model
-        assert adaptation.refused >= 65
-        assert rms(learnt(adaptation, found[130:])) < 3.0 * NOISE
+        assert adaptation.refused >= 36
+        assert rms(learnt(adaptation, found[80:])) < 3.0 * NOISE
 
     def test_a_first_reading_that_is_wrong_is_got_over(self, identified, name):
         adaptation = model_filter(name, identified)
-        found = readings(specimen(identified, gain=1.05), 80)
+        found = readings(specimen(identified, gain=1.05), 70)
         learnt(adaptation, [(state, output + 0.25 * SPAN) for state, output in found[:1]])
         assert rms(learnt(adaptation, found[1:])[50:]) < 5.0 * NOISE
 
@@ -113,7 +113,7 @@ class TestBoth:
     def test_readings_that_err_ten_times_as_much_as_expected_hardly_move_the_model(self, identified, name):
         rng = np.random.default_rng(7)
         adaptation = model_filter(name, identified)
-        found = readings(identified, 100)
+        found = readings(identified, 70)
         learnt(adaptation, [(state, output + 0.05 * SPAN * rng.normal()) for state, output in found])
         moved = [adaptation.model.value(state) - identified.value(state) for state, _ in found]
         assert rms(moved) < 0.015 * SPAN
@@ -184,10 +184,10 @@ def test_other_units_of_the_output_change_nothing_but_the_units(identified, name
 def test_refusals_that_lie_far_apart_do_not_begin_it_anew(identified):
     adaptation = SessionFilter(identified)
     moved = specimen(identified, offset=25.0)
-    learnt(adaptation, readings(moved, 60))
-    for k, (state, output) in enumerate(readings(moved, 90, seed=1)):
+    learnt(adaptation, readings(moved, 40))
+    for k, (state, output) in enumerate(readings(moved, 60, seed=1)):
         adaptation.update(state, identified.value(state) if k % 30 < 5 else output)
-    assert adaptation.refused >= 11
+    assert adaptation.refused >= 8
     assert adaptation.restarts == 0
     assert adaptation.estimates()["offset"].value == pytest.approx(25.0, abs=3.0)
 

@@ -145,9 +145,10 @@ class TestSecrets:
         assert code == 0
         assert "was not told of the end" in out + err
         (run,) = (tmp_path / "runs").iterdir()
-        for kind in ("csv", "bluesky"):
+        # What is made of a record does not depend on how its command was written.
+        for kind in () if equals else ("csv", "bluesky"):
             assert bench("runs", "export", run, "--format", kind, "--out", tmp_path / kind)[0] == 0
-        assert bench("report", run)[0] == 0
+        assert equals or bench("report", run)[0] == 0
         with Record(run) as record:
             assert record.meta["command"][-1].endswith("://127.0.0.1/…")
         texts = [out, err, *(path.read_bytes().decode(errors="replace") for path in tmp_path.rglob("*.*"))]
