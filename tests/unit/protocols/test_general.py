@@ -121,7 +121,7 @@ def test_from_characterization_to_report(run, bench, tmp_path, rig):
 def test_from_characterization_to_tracking_in_few_steps(run, bench, tmp_path, rig):
     case, model = CASES[rig], tmp_path / "model.json"
     low, high = load_rig(rig).roles["response"].range
-    few = {"half_cycles": 3, "increment": 3 * case.increment, "dwell": 0.5 * case.dwell}
+    few = {"half_cycles": 3, "increment": 3 * case.increment, "dwell": min(0.5 * case.dwell, 5.0)}
     characterization, _ = run("damped-oscillation", rig, **few)
     code, _, err = bench(
         *("identify", characterization, "--input", case.drive, "--output", case.response, *case.identify),

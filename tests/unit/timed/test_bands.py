@@ -61,7 +61,7 @@ def test_nine_of_ten_are_covered_at_the_rates_of_the_calibration(name, options, 
 
 def test_what_the_fit_chose_is_kept_without_a_block():
     rng = np.random.default_rng(0)
-    times, inputs = reversals(rng, 20, 400)
+    times, inputs = reversals(rng, 14, 280)
     outputs = lagging(times, inputs, rng)
     free = {"static": "prandtl-ishlinskii", "plays": 5}
     found, band = calibrated("hammerstein", times, inputs, outputs, **free)

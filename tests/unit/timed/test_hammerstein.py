@@ -135,10 +135,10 @@ def test_a_piezo_at_two_rates_is_predicted_at_the_faster():
     fast = slice(300, None)
 
     def held_out(**options):
-        found = identify_in_time("hammerstein", t, u, y, levels=8, **options)
+        found = identify_in_time("hammerstein", t, u, y, levels=6, **options)
         return measure_errors(truth[fast], found.model.evaluate(later, fresh)[fast]).rms_percent
 
-    static = identify("preisach", u, y, levels=8, reversible="linear").model
+    static = identify("preisach", u, y, levels=6, reversible="linear").model
     alone = measure_errors(truth[fast], static.evaluate(fresh)[fast]).rms_percent
     chosen = held_out()
     by_hand = min(held_out(dynamics=text) for text in ("lag", "resonance", "resonance,creep"))

@@ -281,14 +281,14 @@ class TestIdentifying:
     @pytest.mark.parametrize(
         ("protocol", "settings", "words"),
         [
-            ("current-steps", {"levels": "0"}, "the hybrid cannot be identified: "),
+            ("current-steps", {"levels": "0", "on": "30", "off": "30"}, "the hybrid cannot be identified: "),
             (
                 "thermomechanical",
-                {"coldest": "0", "hottest": "0", "levels": "2"},
+                {"coldest": "0", "hottest": "0", "levels": "2", "dwell": "10"},
                 "the hybrid cannot be identified: ",
             ),
             ("piezo-loops", {"amplitudes": "0"}, "voltages: expected values that vary"),
-            ("piezo-step", {"voltage": "0"}, "inputs: expected exactly one step, got 0"),
+            ("piezo-step", {"voltage": "0", "duration": "0.01"}, "inputs: expected exactly one step, got 0"),
         ],
     )
     def test_a_run_that_shows_nothing_is_refused(self, runs, tmp_path, protocol, settings, words):

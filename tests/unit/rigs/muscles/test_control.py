@@ -235,7 +235,8 @@ def rounds(inverse):
         low, high = output_range(load)
         for name, make in controllers(inverse, load).items():
             errors = []
-            for seed in SEEDS:
+            # The others lie far apart.
+            for seed in SEEDS if name == "closed-loop-inverse" else SEEDS[:1]:
                 bench, controller = Bench(seed, load), make()
                 targets = low + (high - low) * np.random.default_rng([seed, 5]).uniform(0.05, 0.95, 20)
                 errors += [bench.reach(controller, target) for target in targets.tolist()]

@@ -296,8 +296,8 @@ def identified(tmp_path_factory):
     folder = tmp_path_factory.mktemp("identified")
     runs = []
     for protocol, settings in (
-        ("force-voltage", {"points": 21, "dwell": 15}),
-        ("length-voltage", {"points": 21, "dwell": 10, "loads": "2.94, 4.9, 6.86"}),
+        ("force-voltage", {"points": 15, "dwell": 10}),
+        ("length-voltage", {"points": 15, "dwell": 10, "loads": "4.9, 6.86"}),
     ):
         result = folder / "run.json"
         with pytest.raises(SystemExit) as stopped:

@@ -60,7 +60,7 @@ KINDS = [
     ("line", "preisach"),
 ]
 # The pair that identification gives is tried most.
-COUNTS = {kinds: 400 if kinds == KINDS[0] else 150 for kinds in KINDS}
+COUNTS = {kinds: 200 if kinds == KINDS[0] else 80 for kinds in KINDS}
 
 
 @cache
