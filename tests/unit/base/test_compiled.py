@@ -1,7 +1,6 @@
 """Compiled functions with and without a way in from Python."""
 
 import os
-import subprocess
 import sys
 
 import pytest
@@ -49,9 +48,12 @@ SCALE = "FACTOR = {factor}\n"
 STEPS = "from bench.base import inner\nfrom loops.scale import FACTOR\n\n\n@inner\ndef step(x):\n    return {step}\n"
 USES = "from bench.base.compiled import kernel\nfrom loops import _steps_kernels as steps\n\nstep = steps.step\n\n\n"
 USES += "@kernel\ndef use(x):\n    return step(x)\n"
+# A warm process has loaded numba, with another cache.
+PROGRAM = "import sys\nfrom numba.core import config\nsys.dont_write_bytecode = True\nconfig.reload_config()\n"
+PROGRAM += "from loops._uses_kernels import use\nprint(use(3.0), *use.stats.cache_hits.values())\n"
 
 
-def test_a_change_of_another_file_that_is_compiled_in_counts(tmp_path):
+def test_a_change_of_another_file_that_is_compiled_in_counts(tmp_path, warm_process):
     loops = tmp_path / "loops"
     loops.mkdir()
     (loops / "__init__.py").touch()
@@ -64,11 +66,10 @@ def test_a_change_of_another_file_that_is_compiled_in_counts(tmp_path):
                 path.write_text(text)
                 # Whatever the resolution of the file system's times, and of Python's own files.
                 os.utime(path, (1e9 + 10 * number, 1e9 + 10 * number))
-        program = "from loops._uses_kernels import use; print(use(3.0), *use.stats.cache_hits.values())"
-        command = [sys.executable, "-B", "-c", program]
         place = {"PYTHONPATH": str(tmp_path), "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
-        found = subprocess.run(command, env=os.environ | place, check=True, capture_output=True, text=True).stdout
-        return found.split()
+        done = warm_process([sys.executable, "-c", PROGRAM], tmp_path, os.environ | place)
+        assert done.returncode == 0, done.stderr
+        return done.stdout.split()
 
     assert used(0, 2.0, "FACTOR * x") == ["6.0"]
     # Unchanged, it comes from the disk.
