@@ -73,8 +73,8 @@ def test_intervals_of_a_calibrated_length_contain_the_true_one():
     for seed in range(20):
         wire = Wire(seed)
         blocks = Characteristic(GAUGE_BLOCKS.specimen(seed, "gauge_blocks"), -REST, REST)
-        readings = [wire.read(blocks.value(place)) for place in places for _ in range(5)]
-        found = calibrate(readings, np.repeat(places, 5), **about)
+        readings = [wire.read(blocks.value(place)) for place in places for _ in range(10)]
+        found = calibrate(readings, np.repeat(places, 10), **about)
         length = Calibrated(kind="calibrated", source="wire_end_position", calibration=found)
         signals = UncertainSignals(stated, {"length": length}, {"wire_end_position": "m", "length": "m"}, "sma.toml")
         for true in wire.rng.uniform(-6e-3, 6e-3, 10):
