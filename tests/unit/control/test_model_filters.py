@@ -113,7 +113,7 @@ class TestBoth:
     def test_readings_that_err_ten_times_as_much_as_expected_hardly_move_the_model(self, identified, name):
         rng = np.random.default_rng(7)
         adaptation = model_filter(name, identified)
-        found = readings(identified, 70)
+        found = readings(identified, 100)
         learnt(adaptation, [(state, output + 0.05 * SPAN * rng.normal()) for state, output in found])
         moved = [adaptation.model.value(state) - identified.value(state) for state, _ in found]
         assert rms(moved) < 0.015 * SPAN
