@@ -64,8 +64,8 @@ def deploy_(
 
     if c is None and fmu is None:
         raise ConfigurationError("bench model deploy: say what to write, by --c FOLDER or --fmu FILE.fmu")
-    if c is None and controller is not None:
-        raise ConfigurationError("--controller: a controller is written as C; say where, by --c FOLDER")
+    if c is None and any(each is not None for each in (controller, rig, tuning)):
+        raise ConfigurationError("--controller, --rig and --tuning are for C; say where to write it, by --c FOLDER")
     if fmu is not None and fmu.suffix != ".fmu":
         raise ConfigurationError(f"--fmu {fmu}: expected a name that ends with .fmu")
     check_outputs(folder=c, json_file=json_file, read=[model])

@@ -112,6 +112,8 @@ def test_what_is_wrong_is_one_message_and_nothing_is_written(model, tmp_path, be
         (["--c", folder, "--controller", "closed-loop-inverse"], "belong together"),
         (["--fmu", tmp_path / "model.zip"], ".fmu"),
         (["--fmu", tmp_path / "model.fmu", "--controller", "open-loop-inverse", "--rig", "vo2"], "--c FOLDER"),
+        (["--fmu", tmp_path / "model.fmu", "--rig", "vo2"], "--c FOLDER"),
+        (["--fmu", tmp_path / "model.fmu", "--tuning", model], "--c FOLDER"),
         ([], "--c FOLDER or --fmu"),
     ]
     for options, said in cases:
