@@ -5,6 +5,7 @@ from .card import (
     card_rows as card_rows,
     expected_steps as expected_steps,
     run_card as run_card,
+    steps_of as steps_of,
 )
 from .ending import (
     BEGIN as BEGIN,

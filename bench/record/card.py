@@ -85,6 +85,12 @@ def _between(seconds: float, most: float | None) -> str:
     return least if most is None or most - seconds < 1.0 else f"{least} to {format_duration(most)}"
 
 
+def steps_of(meta: Mapping[str, Any], carried_out: int) -> str:
+    """Return how many steps a run has carried out, such as `3 of 4 steps` if their number was known before it."""
+    expected = expected_steps(meta)
+    return counted(carried_out, "step") if expected is None else f"{carried_out} of {counted(expected, 'step')}"
+
+
 def expected_steps(meta: Mapping[str, Any]) -> int | None:
     """Return how many steps a run was expected to have; None where that was not known before it."""
     if (rehearsal := meta.get("rehearsal")) is not None:

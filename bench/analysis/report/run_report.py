@@ -31,10 +31,10 @@ from bench.analysis.report.telemetry_summary import TelemetrySummary, summarize,
 from bench.analysis.report.uncertainty_tables import uncertainty_parts
 from bench.analysis.tracking_errors import results_json
 from bench.analysis.uncertain_results import RunUncertainty
-from bench.base import counted, format_duration, print_plain, show_rows, show_table, with_unit
+from bench.base import format_duration, print_plain, show_rows, show_table, with_unit
 from bench.identification import ModelFile, models_among
 from bench.models import MemoryCurve
-from bench.record import Record, Table, card_rows, expected_steps, lateness_lines
+from bench.record import Record, Table, card_rows, lateness_lines, steps_of
 
 PAGE_NAME = "report.html"
 """Usual file name of the page of a run."""
@@ -186,9 +186,7 @@ def _print_card(meta: Mapping[str, Any], console: Console) -> None:
 
 def _print_status(record: Record, steps: int, console: Console) -> None:
     style = {"completed": "green", "unfinished": "yellow"}.get(record.status, "red")
-    expected = expected_steps(record.meta)
-    carried_out = f"{steps} of {counted(expected, 'step')}" if expected is not None else counted(steps, "step")
-    console.print(f"[{style}]{record.status}[/] after {carried_out}", highlight=False)
+    console.print(f"[{style}]{record.status}[/] after {steps_of(record.meta, steps)}", highlight=False)
     if record.reason:
         console.print(f"  {record.reason}", highlight=False, markup=False)
     for device, state in record.safe_state.items():

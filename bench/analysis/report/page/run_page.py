@@ -35,7 +35,7 @@ from bench.analysis.tracking_errors import FollowingResult, following_result, ta
 from bench.base import Display, Floats, counted, format_duration, percent, with_unit
 from bench.devices import Signal
 from bench.identification import models_among
-from bench.record import Event, Record, Table, expected_steps
+from bench.record import Event, Record, Table, steps_of
 
 _STYLES = {"completed": "good", "unfinished": "open"}
 _LATENESS = "lateness"
@@ -112,8 +112,7 @@ def _lead(
         f"{meta['protocol_summary']}: protocol {meta['protocol']} on rig {meta['rig']}, started by "
         f"{meta['operator']} on {started} UTC{clock}."
     )
-    expected = expected_steps(meta)
-    carried_out = f"{steps} of {counted(expected, 'step')}" if expected is not None else counted(steps, "step")
+    carried_out = steps_of(meta, steps)
     lasted = f" and {format_duration(found[-1].end)} of laboratory time" if found else ""
     if record.status == "unfinished":
         second = (
