@@ -15,6 +15,16 @@ RECORDED = Path(__file__).parents[1] / "golden" / "recorded"
 ERRORS = {"rms", "max", "median", "average", "settling", "seconds"}
 BAND = 1.5
 RECORDED_SEED = 0
+_MODELS_OF_A_MUSCLE = (
+    "force-voltage.dwell=20",
+    "length-voltage.points=13",
+    "length-voltage.dwell=20",
+    "length-verification.points=7",
+    "length-verification.dwell=20",
+    "length-force.points=5",
+    "length-force.voltages=0,1,2,3",
+    "length-force.dwell=20",
+)
 SHORT = {
     "vo2": (
         "damped-oscillation.increment=0.5",
@@ -23,28 +33,8 @@ SHORT = {
         "tracking.count=12",
         "following.duration=200",
     ),
-    "sma": (
-        "force-voltage.dwell=20",
-        "length-voltage.points=13",
-        "length-voltage.dwell=20",
-        "length-verification.points=7",
-        "length-verification.dwell=20",
-        "length-force.points=5",
-        "length-force.voltages=0,1,2,3",
-        "length-force.dwell=20",
-        "length-control.count=10",
-        "force-control.count=10",
-    ),
-    "muscles": (
-        "force-voltage.dwell=20",
-        "length-voltage.points=13",
-        "length-voltage.dwell=20",
-        "length-verification.points=7",
-        "length-verification.dwell=20",
-        "length-force.points=5",
-        "length-force.voltages=0,1,2,3",
-        "length-force.dwell=20",
-    ),
+    "sma": (*_MODELS_OF_A_MUSCLE, "length-control.count=10", "force-control.count=10"),
+    "muscles": _MODELS_OF_A_MUSCLE,
     "hybrid": (
         "current-sine.rate=0.25",
         "current-sine.periods=2",
