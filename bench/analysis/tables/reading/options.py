@@ -6,6 +6,7 @@ import codecs
 import re
 from contextlib import suppress
 from dataclasses import dataclass, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -56,8 +57,8 @@ class ReadingOptions:
     time_unit : str, optional
         Unit of the column of times where its head has none: `d`, `h`, `min`, `s`, `ms`, `us` or `ns`.
     missing : str, optional
-        What stands for a missing value, such as `nan`, `--`, `-9999` or `empty`; several with `|` between them. A row
-        that has it in a column that is read is left out.
+        Text of a cell without a value, such as `nan`, `--`, `-9999` or `empty`; several with `|` between them. A row
+        with such a cell in a column that is read is left out.
 
     Raises
     ------
@@ -135,7 +136,7 @@ class ReadingOptions:
             )
         return float(match[1]) * SECONDS[unit]
 
-    @property
+    @cached_property
     def _missing(self) -> list[str]:
         return [] if self.missing is None else [text.strip().casefold() for text in self.missing.split("|")]
 
