@@ -1,4 +1,4 @@
-"""What messages say: counts, names that there are not, and files that cannot be read."""
+"""Texts for messages: counts, unknown names, and files that cannot be read."""
 
 from __future__ import annotations
 

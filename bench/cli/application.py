@@ -180,7 +180,7 @@ def _usage(error: Any) -> str:  # noqa: ANN401 - of typer
         known = [option for each in parameters for option in (*each.opts, *each.secondary_opts) if option[0] == "-"]
         return f"{context.command_path}: there is no option {name}; {closest(name, known, _help_of(context))}"
     if hasattr(error, "param_type"):
-        # Of several that are missing, click names the first; those that are given have come before it.
+        # click names the first missing parameter only. It has processed those that are given before.
         left = [each for each in parameters if each.required and context.params.get(each.name) is None]
         return f"{context.command_path}: missing: {', '.join(map(_spelled, left))}; see {_help_of(context)}"
     if (cause := getattr(error.__cause__, "errors", None)) is not None:

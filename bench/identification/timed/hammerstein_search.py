@@ -76,7 +76,7 @@ class Responses:
         return Regressor.of_cells(self.columns[:, : self.cells], dense)
 
     def without_still(self, weights: Floats, skip: int) -> Regressor:
-        """Return all columns, with those of the operator at 0 that the rows fitted hardly move."""
+        """Return all columns; those of the operator that hardly change in the fitted rows are 0."""
         moved = np.append(moving(self.columns, weights, skip), np.ones(self.beside.shape[1], dtype=bool))
         return self.regressor if moved.all() else self.regressor.keeping(moved)
 

@@ -102,7 +102,7 @@ def _check(times: Floats, steps: _Steps, effects: Floats, strengths: Floats) -> 
     least = int(np.abs(effects).argmin())
     if abs(effects[least]) < _LEAST_EFFECT * abs(strengths).sum():
         raise ValueError(
-            f"a step of {times[least]:.4g} s is too short for the inverse: hardly anything of an input has an "
+            f"a step of {times[least]:.4g} s is too short for the inverse: an input has hardly any "
             "effect within it; take longer steps"
         )
     median = int(np.argsort(times)[times.size // 2])

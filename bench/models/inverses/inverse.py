@@ -407,7 +407,8 @@ class PreisachInverse(Inverse[MemoryCurve]):
     def gains(self) -> Floats:
         """Bounds on what a move through a cell adds to the output, whatever the memory, shape (2, 2, M), >= 0.
 
-        Of a falling (0) and a rising input (1), each for a falling (0) and a rising output (1); output units.
+        The first axis is the direction of the input, falling (0) or rising (1), the second that of the output. In
+        output units.
         """
         lattice, order = self.operator.lattice, self.operator.order
         steps, density = np.diff(lattice.levels), lattice.table[:, :, 3]

@@ -22,7 +22,7 @@ DIALECTS = {
     "stage": ("baudrate",),
     "heater": ("baudrate", "parity"),
 }
-"""What can be set wrong of the line of each instrument: MeCom, slcan, Modbus RTU, Dynamixel, text."""
+"""Settings of the line that a test sets wrong, by instrument: MeCom, slcan, Modbus RTU, Dynamixel, text."""
 NEEDS_THE_KEY = {"load_cell", "heater"}
 """The others pass over their own echo: an answer of theirs does not look like a request."""
 
