@@ -45,6 +45,7 @@ from bench.identification import (
     measure_errors,
     model_options,
     once,
+    record_of,
     resolve,
     template_of,
 )
@@ -338,7 +339,7 @@ def identify_model(
         own["levels"] = options.levels_to_try[0]
     _check_model(model, data, options, own)
     fitted, advice = data.fitted_rows(options.train, options.skip)
-    inputs, outputs, times, measured = data.inputs, data.outputs, data.times, data.output
+    inputs, outputs, times, measured, record = data.inputs, data.outputs, data.times, data.output, record_of(fitted)
     assert measured is not None
     check_variation(data.source, measured)
     if not fitted.all():
@@ -376,7 +377,7 @@ def identify_model(
                 **own,
             )
             memory = found.model.advance(found.initial_state, inputs)
-            coverage = found.model.coverage(inputs, found.initial_state)
+            coverage = found.model.coverage(inputs[record], found.initial_state)
         penalties = found.regularization or Regularization(options.smoothing or 0.0, options.ridge or 0.0)
         band = calibrate(found, data, options.skip, penalties, own) if options.band else None
     except ValueError as error:
@@ -388,10 +389,13 @@ def identify_model(
         validity = replace(validity, moves=None)
     if not fitted.all():
         found = replace(found, errors=measure_errors(outputs[counted], (outputs - found.residuals)[counted]))
-    advice = (*advise_on_record(inputs, times, max(len(data.starts), 1), counted), *advice, *found.advice)
+    timed = None if times is None else times[record]
+    runs = max(len(data.starts), 1)
+    advice = (*advise_on_record(inputs[record], timed, runs, counted[record]), *advice, *found.advice)
     if times is not None:
         advice = (*advice, *_implausible_times(found.model, times))
-    tests = check_return_points(inputs, outputs), check_congruency(inputs, outputs)
+    known = inputs[record], outputs[record]
+    tests = check_return_points(*known), check_congruency(*known)
     if times is None:
         # A model with time takes neither for granted.
         advice += tuple(

@@ -35,6 +35,9 @@ from .choose.score import (
     Score as Score,
     evaluate as evaluate,
 )
+from .choose.splits import (
+    record_of as record_of,
+)
 from .design.continuation import (
     Continuation as Continuation,
     continue_design as continue_design,

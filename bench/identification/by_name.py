@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from bench.base import Floats, checks as _checks
 from bench.identification.advice import Advice
+from bench.identification.choose.splits import record_of
 from bench.identification.fit.least_squares import Certificate, Fit, counted_weights
 from bench.identification.fit.orientation import (
     NAMES,
@@ -260,8 +261,9 @@ class FitProblem:
 
     def advice(self) -> tuple[Advice, ...]:
         """Return what is odd about the data or not covered by them."""
-        found = check_data(self.inputs, self.outputs)
-        coverage = self.template.coverage(self.inputs, self.state)
+        record = record_of(self.weights)
+        found = check_data(self.inputs[record], self.outputs[record])
+        coverage = self.template.coverage(self.inputs[record], self.state)
         if coverage is not None and coverage.never.size:
             found.append(Advice("coverage", coverage.summary()))
         found += undetermined_shape(self.template)
@@ -295,11 +297,12 @@ def set_up_problem(
     check_options(model_name, options)
     # Its range is that of the rows that are fitted: nothing is known of the output beyond it.
     template = template_of(spec, sequence[w > 0.0], options)
+    record = record_of(w)
     if initial == "skip":
-        skip = max(skip, template.unknown_until(sequence))
-        check_skipped(sequence.size, skip, template.coefficients.size, spec.estimate_state is not None)
+        skip = max(skip, template.unknown_until(sequence[record]))
+        check_skipped(record.stop, skip, template.coefficients.size, spec.estimate_state is not None)
     counted = counted_weights(sequence.size, w, skip)
-    check_record(sequence, measured, skip)
+    check_record(sequence[record], measured[record], skip)
     signs = possible_signs(orientation, model_name, spec, template, sequence, measured, counted)
     problems = {
         sign: _orient(sign, spec, template, sequence, measured, w, skip, smoothing, initial, shape) for sign in signs

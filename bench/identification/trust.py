@@ -5,17 +5,19 @@ What passes may still be poor on other inputs: only samples that were left out o
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from bench.base import Floats
 from bench.identification.advice import Advice
+from bench.identification.choose.splits import record_of
+from bench.identification.fit.least_squares import Fit
 from bench.models import Operator
 
 if TYPE_CHECKING:
     from bench.identification.by_name import FitProblem
-    from bench.identification.fit.least_squares import Fit
 
 # Fewest samples, and least part of them, that an unknown initial memory must leave. Derivation: the standard
 # deviation of ten samples is known to a quarter of it; one part in twenty is a choice.
@@ -71,10 +73,10 @@ def check_interpolation(problem: FitProblem, found: Fit) -> None:
 
     Raises ValueError if it has not.
     """
-    left = problem.inputs.size - problem.skip
+    samples, left = (int(np.count_nonzero(problem.weights[first:])) for first in (0, problem.skip))
     if left <= found.certificate.determined + 1.0:
         estimable = problem.spec.estimate_state is not None
-        raise ValueError(f"{_too_few(problem.inputs.size, left, estimable)}; or fewer coefficients")
+        raise ValueError(f"{_too_few(samples, left, estimable)}; or fewer coefficients")
 
 
 def _too_few(samples: int, left: int, estimable: bool) -> str:
@@ -90,8 +92,12 @@ def judge_fit(
 ) -> list[Advice]:
     """Return why a fit should not be trusted; nothing if there is no reason.
 
-    `errors`, shape (N,), are the measured less the modelled outputs, output units; those of skipped samples too.
+    `errors`, shape (N,), are the measured less the modelled outputs, output units; those of skipped samples too. Rows
+    after the last that is fitted are not looked at.
     """
+    record = record_of(problem.weights)
+    errors, inputs, outputs = errors[record], problem.inputs[record], problem.outputs[record]
+    problem = replace(problem, inputs=inputs, outputs=outputs, weights=problem.weights[record])
     weights = problem.weights[problem.skip :]
     measured, left = problem.outputs[problem.skip :], errors[problem.skip :]
     mean = weights @ measured / weights.sum()

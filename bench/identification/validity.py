@@ -1,8 +1,8 @@
 """Where a model is valid: the inputs that were fitted, and how far others lie beyond them.
 
 A model with memory depends on the range of its input and on the moves from one turning point to the next, one with
-time on the speed of these moves too. An input beyond the range is always named. Of two records of one kind each has
-moves beyond those of the other, so moves are named where so many are no chance.
+time on the speed of these moves too. An input that exceeds the range by more than a hundredth is always named. Of two
+records of one kind each has moves beyond those of the other, so moves are named where so many are no chance.
 """
 
 from __future__ import annotations
@@ -20,8 +20,9 @@ from bench.identification.branches import NOISE, turning_points
 _CHANCE = 0.05
 """Probability below which moves beyond those fitted are no chance. Source: the usual level of a test."""
 
-_ROUNDING = 1e-9
-"""Part of an input that is rounding. Source: files have nine digits or more; no sensor tells less."""
+_SAME = 0.01
+"""Part of the range by which inputs may exceed it. Derivation: sampled turning points that are meant to be equal
+differ by this much, see `overwritten_from`; a model that is continued by its tangent errs there as at its ends."""
 
 Kind: TypeAlias = Literal["smaller", "larger", "slower", "faster"]
 
@@ -195,8 +196,7 @@ class Validity:
             **self._compared(("smaller", "larger"), self.moves, lengths, span),
             **self._compared(("slower", "faster"), self.rates, rates),
         }
-        # Inputs that were computed reach the ends of the range to rounding only.
-        distances[distances <= _ROUNDING * max(abs(self.low), abs(self.high))] = 0.0
+        distances[distances <= _SAME * span] = 0.0
         rows = np.flatnonzero(distances) + first + 1
         return Beyond(self, values.size, rows, float(distances.max()), moves, unit)
 

@@ -14,7 +14,17 @@ from numpy.typing import NDArray
 from bench.base import Floats, say_share
 from bench.identification.branches import turning_points
 from bench.identification.by_name import FitProblem, Initial, set_up_problem
-from bench.identification.choose.splits import BLOCKS, GAP, Flags, Fold, block_folds, cycle_folds, run_folds
+from bench.identification.choose.splits import (
+    BLOCKS,
+    GAP,
+    MAJOR,
+    Flags,
+    Fold,
+    block_folds,
+    cycle_folds,
+    record_of,
+    run_folds,
+)
 from bench.identification.fit.least_squares import Fit, one_thread
 from bench.identification.fit.orientation import NAMES, Orientation, Sign, has_orientation
 from bench.identification.timed.hammerstein_fit import reshape, set_up_search
@@ -115,12 +125,18 @@ class Measurements:
     ) -> Measurements:
         """Return measurements of which rows are tested from where the inputs have overwritten all memory they do.
 
-        If that leaves less than a quarter of those that may be fitted, all are tested.
+        All are tested if that leaves less than a quarter of those that may be fitted, or none that go through the
+        range once more: errors on a part of a loop tell nothing of the others. What follows the last of these is left
+        away.
         """
         rows = np.ones(inputs.size, dtype=bool) if fitted is None else fitted
+        to = record_of(rows)
+        inputs, outputs, rows = inputs[to], outputs[to], rows[to]
         until = overwritten_from(inputs)
-        left = int(rows[until:].sum())
-        return cls(inputs, outputs, rows, times, runs, until if left >= _KNOWN * int(rows.sum()) else 0)
+        later = inputs[until:][rows[until:]]
+        is_enough = later.size >= _KNOWN * rows.sum() and np.ptp(later) >= MAJOR * np.ptp(inputs)
+        times, runs = None if times is None else times[to], None if runs is None else runs[to]
+        return cls(inputs, outputs, rows, times, runs, until if is_enough else 0)
 
     def thinned(self, most: int) -> Measurements:
         """Return about `most` rows, evenly chosen, and the ends of the range that is fitted.
@@ -128,18 +144,18 @@ class Measurements:
         Turning points stay as rows that are not fitted: the memory of an operator that does not depend on the rate is
         the same with and without the rows between.
         """
-        if self.inputs.size <= most:
+        rows = np.flatnonzero(self.fitted)
+        if rows.size <= most:
             return self
         chosen = np.zeros(self.inputs.size, dtype=bool)
-        chosen[:: -(-self.inputs.size // most)] = True
-        rows = np.flatnonzero(self.fitted)
+        chosen[rows[:: -(-rows.size // most)]] = True
         chosen[rows[[self.inputs[rows].argmin(), self.inputs[rows].argmax()]]] = True
         kept = chosen.copy()
         kept[turning_points(self.inputs, _LEAST_MOVE * float(np.ptp(self.inputs)))] = True
         return Measurements(
             self.inputs[kept],
             self.outputs[kept],
-            (self.fitted & chosen)[kept],
+            chosen[kept],
             None if self.times is None else self.times[kept],
             None if self.runs is None else self.runs[kept],
             int(np.count_nonzero(kept[: self.known])),

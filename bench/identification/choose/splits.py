@@ -10,7 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from bench.base import Floats
 from bench.identification.branches import turns_beyond_noise
@@ -28,9 +28,9 @@ with which a trial on nine files did well."""
 
 # Turning points that are closer than this part of the range are the same. Source: a choice, above `NOISE`.
 _SAME = 0.05
-# Branches that span this part of the range form the major loop: what they sweep is swept nowhere else.
-# Source: by `_SAME`, two turning points at the ends of the range.
-_MAJOR = 1.0 - 2.0 * _SAME
+MAJOR = 1.0 - 2.0 * _SAME
+"""Branches that span this part of the range form the major loop: what they sweep is swept nowhere else. Source: by
+`_SAME`, two turning points at the ends of the range."""
 # Part of the rows that must be left to fit. Source: a choice.
 _LEAST_FITTED = 0.3
 
@@ -41,6 +41,11 @@ class Fold:
 
     tested: Flags  # shape (N,); rows left out of the fit and predicted
     trained: Flags  # shape (N,); rows of the fit
+
+
+def record_of(fitted: ArrayLike) -> slice:
+    """Return the rows up to the last of those that are fitted, shape (N,): later ones tell nothing of them."""
+    return slice(int(np.flatnonzero(fitted)[-1]) + 1)
 
 
 def near(chosen: Flags, distance: int) -> Flags:
@@ -116,7 +121,7 @@ def has_one_kind(inputs: Floats, usable: Flags) -> bool:
 
 def _minor(inputs: Floats, usable: Flags, kind: NDArray[np.int64], amplitudes: Floats) -> NDArray[np.intp]:
     counted = np.bincount(kind[usable], minlength=amplitudes.size) > 0
-    return np.flatnonzero((amplitudes < _MAJOR * float(np.ptp(inputs))) & counted)
+    return np.flatnonzero((amplitudes < MAJOR * float(np.ptp(inputs))) & counted)
 
 
 def _kinds(inputs: Floats) -> tuple[NDArray[np.int64], Floats]:

@@ -118,6 +118,15 @@ def test_a_force_with_friction_and_viscosity_takes_the_velocity():
     assert found.chosen.error < 0.6 * without.chosen.error
 
 
+@cases(("turns", "known"), [([0.0, 1.0, -1.0, 0.1], 0), ([0.0, 1.0, -1.0, 1.0], 60), ([0.0, *[1.0, -1.0] * 2], 60)])
+def test_rows_of_known_memory_are_tested_alone_if_they_go_through_the_range(turns, known):
+    inputs = np.append(ramps(turns, 0.05), [2.0, -2.0])
+    fitted = np.abs(inputs) <= 1.0
+    measured = Measurements.of(inputs, 2.0 * inputs, fitted, np.arange(float(inputs.size)))
+    assert measured.inputs.size == measured.times.size == fitted.sum() == measured.thinned(fitted.sum()).inputs.size
+    assert measured.known == known
+
+
 def test_what_starts_from_the_parameters_that_were_found_scores_the_same():
     rng = np.random.default_rng(4)
     times = 0.01 * np.arange(300)

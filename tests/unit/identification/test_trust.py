@@ -35,6 +35,17 @@ def test_good_data_give_no_warning(name, sign):
     assert identify(name, INPUTS, sign * measured(INPUTS)).warnings == ()
 
 
+@cases("name", ["preisach", "preisach-nonmonotonic", "polynomial"])
+def test_rows_after_the_last_that_is_fitted_give_no_warning(name):
+    later = 30.0 * np.sin(0.1 * np.arange(400.0)) ** 3
+    weights = np.append(np.ones(INPUTS.size), np.zeros(later.size))
+    for initial in ("negative", "skip"):
+        found = identify(
+            name, np.append(INPUTS, later), np.append(measured(INPUTS), 0.0 * later), weights=weights, initial=initial
+        )
+        assert found.warnings == ()
+
+
 @cases(
     "options",
     [{"smoothing": 1e-3}, {"reversible": "polynomial"}, {"initial": "skip"}, {"initial": "estimate"}, {"levels": 12}],
