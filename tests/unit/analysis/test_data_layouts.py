@@ -136,6 +136,8 @@ class TestHeads:
         ("head", "name", "unit"),
         [
             ("force (N)", "force", "N"),
+            ("Ch1,V", "Ch1", "V"),
+            ("x,y", "x,y", ""),
             ("a [b] [c]", "a [b]", "c"),
             ("[N]", "[N]", ""),
             ("force []", "force", ""),

@@ -32,12 +32,12 @@ SECONDS = {"d": 86400.0, "h": 3600.0, "min": 60.0, "s": 1.0, "ms": 1e-3, "µs": 
 _TIME_HEAD = re.compile(r"(t|\w*time|elapsed|timestamp)[_ ](d|days?|h|hours?|min|s|secs?|ms|us|µs|ns)", re.IGNORECASE)
 """Head of a column of times whose unit stands behind its name."""
 
-_BEHIND = re.compile(r"(.+?)(?:[ _](?=\w+_per_)|, | in )(?![\d-])(\S+)")
+_BEHIND = re.compile(r"(.+?)(?:[ _](?=\w+_per_)|, ?| in )(?![\d-])(\S+)")
 """A head whose unit is spelled out, or stands behind a comma or an `in`."""
 
 _BRACKETS = ("[", "]"), ("(", ")"), ("<", ">"), ("{", "}")
 
-_ADDED = re.compile(r"\s*[(\[<{][^()\[\]<>{}]*[)\]>}]$|\s*(?:,| in) \S+$")
+_ADDED = re.compile(r"\s*[(\[<{][^()\[\]<>{}]*[)\]>}]$|\s*(?:, ?| in )\S+$")
 """What stands behind the name of a column, with a unit that is known or not."""
 
 
