@@ -107,8 +107,10 @@ def _print_table(found: SelectedModel) -> None:
         print_plain(console, f"{cells[0]} {'  '.join(cells[1:])}".rstrip())
     more = len(selection.scores) - len(shown)
     print_plain(console, "* chosen: the fewest degrees of freedom within 2 % of the least score" + _on_bounded(found))
+    failed = len(selection.scores) - len(usable)
     if more > 0:
-        print_plain(console, f"{more} more were tried; --table-out FILE.csv writes all")
+        unfitted = f", of which {failed} could not be fitted" if failed else ""
+        print_plain(console, f"{more} more were tried{unfitted}; --table-out FILE.csv writes all")
     if decided:
         print_plain(
             console,

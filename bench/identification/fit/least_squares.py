@@ -29,6 +29,9 @@ else:
 # Part of the norm of the outputs up to which a gradient counts as 0. Derivation: the rounding of a sum of thousands
 # of products of numbers of 16 digits.
 _TOLERANCE = 1e-12
+# The same, up to which a fit has converged. Derivation: its square times that of the condition is left to gain at
+# most, with a condition of 1e4 a part of 1e-8 of the outputs' square.
+_CONVERGED = 1e-8
 # A part of the cost that is no gain but for rounding. Derivation: that of a sum of thousands of squares.
 _ROUNDED = 1e-12
 # A gradient that is zero but for rounding. Derivation: ten times the tolerance, so that what a solution leaves is no
@@ -253,7 +256,7 @@ def fit_minimum_norm(
         condition=float(singular[0] / singular[rank - 1]) if rank else 1.0,
         swept=swept,
         iterations=1,
-        converged=kkt <= 1e-8,
+        converged=kkt <= _CONVERGED,
         effective=float(rank),
     )
     return Fit(x, mean - float(means @ x), uncertainties, certificate)
@@ -691,7 +694,7 @@ class _ActiveSet:
             condition=condition,
             swept=self.swept,
             iterations=self.iterations,
-            converged=kkt <= 1e-10,
+            converged=kkt <= _CONVERGED,
             effective=effective,
         )
         return Fit(coefficients, self.mean - float(self.means @ coefficients), uncertainties, certificate)
