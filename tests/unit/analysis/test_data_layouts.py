@@ -138,6 +138,7 @@ class TestHeads:
             ("force (N)", "force", "N"),
             ("Ch1,V", "Ch1", "V"),
             ("x,y", "x,y", ""),
+            ("strain / µε", "strain", "µstrain"),
             ("a [b] [c]", "a [b]", "c"),
             ("[N]", "[N]", ""),
             ("force []", "force", ""),

@@ -12,7 +12,7 @@ from pathlib import Path
 from bench.base import DataError, closest
 
 _SYMBOL = (
-    r"(?:[yzafpnµμumcdhkMGTP]?(?:m|g|s|A|K|mol|cd|V|N|W|J|Pa|Hz|Ω|Ω|[Oo]hm|C|F|T|H|bar|eV|Oe|G|Wb|S|rad|l|L|strain)"
+    r"(?:[yzafpnµμumcdhkMGTP]?(?:m|g|s|A|K|mol|cd|V|N|W|J|Pa|Hz|Ω|Ω|[Oo]hm|C|F|T|H|bar|eV|Oe|G|Wb|S|rad|l|L|strain|ε)"
     r"|°C|ºC|°F|°|º|deg|degC|deg_?C|celsius|rpm|min|h|d|%|‰|psi|lbf|inch|in|mil|counts?|a\.u\.|arb\. ?u\."
     r"|[Vv]olts?|VOLT|[Dd]ays?|[Hh]ours?|hr|[Mm]inutes?|[Ss]ec(?:ond)?s?|msec|Am|emu)"
 )
@@ -20,7 +20,7 @@ _FACTOR = rf"{_SYMBOL}(?:\^?[-−]?[1-9]|[²³]|⁻[¹²³])?"
 _UNIT = rf"(?:1|{_FACTOR})(?:\s?[/*·⋅.]\s?\(?{_FACTOR}\)?|\s{_FACTOR})*|1|-"
 _SPELLINGS = {
     "degC": "°C", "deg_C": "°C", "ºC": "°C", "celsius": "°C", "º": "°", "us": "µs", "msec": "ms", "hr": "h",
-    **dict.fromkeys(("volt", "volts"), "V"),
+    "µε": "µstrain", "ε": "strain", **dict.fromkeys(("volt", "volts"), "V"),
     **dict.fromkeys(("sec", "secs", "second", "seconds"), "s"),
     **dict.fromkeys(("minute", "minutes"), "min"), **dict.fromkeys(("hour", "hours"), "h"),
     **dict.fromkeys(("day", "days"), "d"),
