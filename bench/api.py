@@ -337,7 +337,8 @@ def deploy(
     max_bytes : int, optional
         Most bytes of code and constants.
     controller : str, optional
-        Controller of `following` to write too: `closed-loop-inverse` or `open-loop-inverse`. It needs a rig.
+        Controller to write too: `follow.closed-loop-inverse` or `follow.open-loop-inverse` of `following`,
+        `target.closed-loop-inverse` or `target.open-loop-inverse` of `tracking`. It needs a rig.
     rig : str or Path, optional
         Name or file of the rig whose limits and rest set-point the controller has.
     tuning : Path or str, optional
@@ -360,11 +361,11 @@ def deploy(
     """
     if (controller is None) != (rig is None) or (tuning is not None and controller is None):
         raise ConfigurationError("controller and rig belong together, and tuning to them")
-    follower = None
+    exported = None
     if controller is not None and rig is not None:
-        follower = controller_of_rig(controller, str(rig), period, None if tuning is None else Path(tuning))
+        exported = controller_of_rig(controller, str(rig), period, None if tuning is None else Path(tuning))
         period = None
-    found = export_model(_model(model), name=name, real=real, period=period, max_bytes=max_bytes, controller=follower)
+    found = export_model(_model(model), name=name, real=real, period=period, max_bytes=max_bytes, controller=exported)
     found.write(Path(folder))
     return found
 

@@ -32,7 +32,8 @@ def deploy_(
         typer.Option(
             "--controller",
             metavar="NAME",
-            help="Write this controller of `following` too: closed-loop-inverse or open-loop-inverse.",
+            help="Write this controller too: follow.closed-loop-inverse or follow.open-loop-inverse of `following`, "
+            "target.closed-loop-inverse or target.open-loop-inverse of `tracking`.",
         ),
     ] = None,
     rig: Annotated[

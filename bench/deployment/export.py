@@ -14,7 +14,7 @@ import numpy as np
 from bench.base import ConfigurationError, DataError, json_text
 from bench.deployment.c_source import Real, Source, parts_of, rendered
 from bench.deployment.compositions import COUPLED, hammerstein_source
-from bench.deployment.controller import Controller, controller_source
+from bench.deployment.controller import Controller, with_controller
 from bench.deployment.operators import Starts, operator_source, why_not
 from bench.identification import ModelFile
 from bench.models import Coupled, Hammerstein, Operator
@@ -96,12 +96,11 @@ def deploy(
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         raise ConfigurationError(f"--name {name!r}: expected letters, digits and _, a letter first")
     source = _source(file, real, period, name)
-    header, code = "", ""
     if controller is not None:
-        header, code = controller_source(file, controller, real, name)
+        source = with_controller(source, file, controller, real, name)
     _check_size(file, source, real, max_bytes)
     digest = hashlib.sha256(json_text(file.model.to_json()).encode()).hexdigest()
-    words = _words(file, source, digest, name, real) | {"control": header}
+    words = _words(file, source, digest, name, real)
     parts = {
         template: rendered(parts_of(template)["head"], real, name, name, words)
         for template in ("model.h.in", "model.c.in", "saved.c.in", "main.c.in")
@@ -110,7 +109,7 @@ def deploy(
         name,
         {
             f"{name}.h": parts["model.h.in"],
-            f"{name}.c": parts["model.c.in"] + source.code + "\n" + code + parts["saved.c.in"],
+            f"{name}.c": parts["model.c.in"] + source.code + parts["saved.c.in"],
             "main.c": parts["main.c.in"],
             "README.md": _readme(file, source, words),
         },

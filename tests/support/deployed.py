@@ -62,12 +62,15 @@ void follow(model_state *s, const model_real *targets, const model_real *loads, 
 
 
 _CONTROLLED = """
-void control(model_controller *c, const model_real *readings, model_real *setpoints, long count);
-void control(model_controller *c, const model_real *readings, model_real *setpoints, long count) {
+void control(model_controller *c, const model_real *readings, model_real *setpoints, int *said, long count);
+void control(model_controller *c, const model_real *readings, model_real *setpoints, int *said, long count) {
     long i;
     model_controller_init(c, model_NEGATIVE);
-    for (i = 0; i < count; ++i, readings += 4)
+    for (i = 0; i < count; ++i, readings += 4) {
         setpoints[i] = model_control(c, readings[0], readings[1], readings[2], readings[3]);
+        said[2 * i] = c->reach;
+        said[2 * i + 1] = c->done;
+    }
 }
 unsigned long size_of_controller(void) { return (unsigned long)sizeof(model_controller); }
 """
@@ -143,13 +146,18 @@ class Compiled:
         count = 0 if sequences[0] is None else sequences[0].size
         return [np.ascontiguousarray(np.zeros(count) if each is None else each, self._dtype) for each in sequences]
 
-    def control(self, readings: Floats) -> Floats:
-        """Return the set-points to rows of time passed, measured input, output and reference, shape (N, 4)."""
+    def control(self, readings: Floats) -> tuple[Floats, np.ndarray]:
+        """Return set-points, and a row of reach and done each, to time passed, measured input, output and reference.
+
+        Readings have the shape (N, 4).
+        """
         rows, setpoints = np.ascontiguousarray(readings, self._dtype), np.empty(len(readings), self._dtype)
+        said = np.empty((len(rows), 2), np.int32)
         self._library.size_of_controller.restype = ctypes.c_ulong
         state = ctypes.create_string_buffer(self._library.size_of_controller())
-        self._library.control(state, _pointer(rows), _pointer(setpoints), ctypes.c_long(len(rows)))
-        return setpoints.astype(np.float64)
+        arrays = (_pointer(each) for each in (rows, setpoints, said))
+        self._library.control(state, *arrays, ctypes.c_long(len(rows)))
+        return setpoints.astype(np.float64), said
 
     def save(self) -> bytes:
         """Return the state as bytes."""

@@ -74,11 +74,11 @@ def test_the_example_meets_its_target(model, gcc, tmp_path, bench):
 def test_the_function_writes_what_the_command_does(model, tmp_path, bench):
     rig = tmp_path / "unit.toml"
     rig.write_text(RIG.replace("FILE", "model.fmu"))
-    options = ["--controller", "closed-loop-inverse", "--rig", rig, "--period", "0.5", "--real", "double"]
+    options = ["--controller", "follow.closed-loop-inverse", "--rig", rig, "--period", "0.5", "--real", "double"]
     code, _, err = bench("model", "deploy", model, "--c", tmp_path / "command", *options)
     assert code == 0, err
     found = deploy(
-        model, str(tmp_path / "function"), controller="closed-loop-inverse", rig=rig, period=0.5, real="double"
+        model, str(tmp_path / "function"), controller="follow.closed-loop-inverse", rig=rig, period=0.5, real="double"
     )
     for name, text in found.files.items():
         assert (tmp_path / "function" / name).read_text() == text
@@ -109,9 +109,9 @@ def test_what_is_wrong_is_one_message_and_nothing_is_written(model, tmp_path, be
         (["--c", folder, "--max-bytes", "5000"], "--max-bytes 5000"),
         (["--c", folder, "--period", "0.1"], "--period 0.1"),
         (["--c", folder, "--controller", "integral", "--rig", "vo2", "--period", "0.5"], "closed-loop-inverse"),
-        (["--c", folder, "--controller", "closed-loop-inverse"], "belong together"),
+        (["--c", folder, "--controller", "follow.closed-loop-inverse"], "belong together"),
         (["--fmu", tmp_path / "model.zip"], ".fmu"),
-        (["--fmu", tmp_path / "model.fmu", "--controller", "open-loop-inverse", "--rig", "vo2"], "--c FOLDER"),
+        (["--fmu", tmp_path / "model.fmu", "--controller", "follow.open-loop-inverse", "--rig", "vo2"], "--c FOLDER"),
         (["--fmu", tmp_path / "model.fmu", "--rig", "vo2"], "--c FOLDER"),
         (["--fmu", tmp_path / "model.fmu", "--tuning", model], "--c FOLDER"),
         ([], "--c FOLDER or --fmu"),
