@@ -14,9 +14,11 @@ from pydantic import Field, InstanceOf
 from bench.base import Clock, ConfigurationError
 from bench.devices import DriverSettings
 from bench.rig import EMULATED, LaboratorySettings
-from bench.specimen import NoiseTable, Specimen, TwinSettings, TwinTable, rounded
+from bench.specimen import BoardTable, NoiseTable, Specimen, TwinSettings, TwinTable, rounded
+from sim_devices.instruments.controller_board import ControllerBoard
 from sim_devices.instruments.twin import EmulatedTwin, TwinServer
 from sim_devices.laboratory import EmulatedLaboratory, TrueValue
+from sim_devices.wire import WireServer
 from sim_devices.world import World
 
 _TOLERANCE = 0.05
@@ -144,14 +146,12 @@ class TwinLaboratory(EmulatedLaboratory):
             instruments[table.port.removeprefix(EMULATED)] = EmulatedTwin(
                 name, world, table, meters, rng, partial(self._act, name)
             )
-        super().__init__(
-            self.title,
-            {port: TwinServer(instrument) for port, instrument in instruments.items()},
-            clock,
-            world=world,
-            instruments=MappingProxyType(instruments),
-            seed=seed,
-        )
+        servers: dict[str, WireServer] = {port: TwinServer(each) for port, each in instruments.items()}
+        known: dict[str, object] = {**instruments}
+        if settings.board is not None:
+            port, board = self._board(settings.board, world, reading_stream)
+            servers[port] = known[port] = board
+        super().__init__(self.title, servers, clock, world=world, instruments=MappingProxyType(known), seed=seed)
 
     def make_specimen(self, settings: TwinLaboratorySettings, rng: np.random.Generator) -> Actuated:
         """Return the specimen at rest."""
@@ -193,10 +193,30 @@ class TwinLaboratory(EmulatedLaboratory):
                 f"{level:.4g}; make a twin from runs at that value"
             )
 
+    def _board(self, table: BoardTable, world: World, rng: np.random.Generator) -> tuple[str, ControllerBoard]:
+        """Return the board that moves the drive, and the name of its port."""
+        device = self._settings.devices.get(table.device)
+        port = getattr(device, "port", "")
+        if not port.startswith(EMULATED):
+            raise ConfigurationError(f"emulation.board.device = {table.device!r}: there is no such emulated device")
+        drive, response = self._settings.drive.signal, self._settings.response.signal
+
+        def read() -> tuple[float, float]:
+            values = []
+            for signal in (drive, response):
+                noise = self._settings.signals.get(signal, NoiseTable())
+                values.append(self._source(signal, noise)() + noise.quick * float(rng.standard_normal()))
+            if self._conversion is not None:
+                outputs, shown = self._conversion
+                values[1] = float(np.interp(values[1], shown, outputs))
+            return values[0], values[1]
+
+        return port.removeprefix(EMULATED), ControllerBoard(world, table.firmware, read, self.plant.set)
+
     def _act(self, device: str, value: float) -> None:
         """Take what a device sets from now on; nan for one that is off."""
         self._outputs[device] = value
-        if device == self._settings.drive.device:
+        if device == self._settings.drive.device and self._settings.board is None:
             steps = self._settings.drive.resolution
             self.plant.set(self._at_rest if math.isnan(value) else rounded(value, steps))
 

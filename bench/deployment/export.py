@@ -105,14 +105,18 @@ def deploy(
         template: rendered(parts_of(template)["head"], real, name, name, words)
         for template in ("model.h.in", "model.c.in", "saved.c.in", "main.c.in")
     }
+    files = {
+        f"{name}.h": parts["model.h.in"],
+        f"{name}.c": parts["model.c.in"] + source.code + parts["saved.c.in"],
+        "main.c": parts["main.c.in"],
+        "README.md": _readme(file, source, words),
+    }
+    if controller is not None:
+        words |= {"controller": controller.name, "period": repr(controller.period)}
+        files["board.c"] = rendered(parts_of("board.c.in")["head"], "double", name, name, words)
     return Deployment(
         name,
-        {
-            f"{name}.h": parts["model.h.in"],
-            f"{name}.c": parts["model.c.in"] + source.code + parts["saved.c.in"],
-            "main.c": parts["main.c.in"],
-            "README.md": _readme(file, source, words),
-        },
+        files,
         source.constants,
         source.machine,
         source.state,

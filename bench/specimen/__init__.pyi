@@ -15,6 +15,7 @@ from .specimen import (
     Specimen as Specimen,
 )
 from .tables import (
+    BoardTable as BoardTable,
     NoiseTable as NoiseTable,
     SetUpTable as SetUpTable,
     TwinTable as TwinTable,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, Self
 
 from pydantic import Field, field_validator, model_validator
@@ -113,11 +114,19 @@ class ResponseTable(CheckedTable):
         return ResponseDynamics(self.lag, self.power, self.gain, self.shares, self.times)
 
 
+class BoardTable(CheckedTable):
+    """A controller board between the bench and the specimen: `[emulation.board]`."""
+
+    device: str = Field(description="device whose set-point is the target of the board")
+    firmware: Path = Field(description="folder that bench model deploy --controller has written")
+
+
 class SetUpTable(LaboratorySettings):
     """What `[emulation]` says of the devices around a specimen."""
 
     drive: DriveTable
     response: ResponseTable
+    board: BoardTable | None = Field(default=None, description="board that moves the drive in place of its device")
     session_offset: float = Field(
         default=0.0, ge=0, description="standard deviation of the response from session to session, output units"
     )

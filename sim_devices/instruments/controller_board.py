@@ -1,0 +1,103 @@
+"""A controller board whose firmware is the C that `bench model deploy --controller` writes, compiled here."""
+
+from __future__ import annotations
+
+import ctypes
+import shutil
+import subprocess
+import tempfile
+import weakref
+from collections.abc import Callable
+from pathlib import Path
+
+from bench.base import ConfigurationError
+from sim_devices.instruments.emulated import Pluggable
+from sim_devices.wire.text import LineServer
+from sim_devices.world import World
+
+_ANSWER = 80
+"""Bytes that an answer has room for."""
+
+
+class ControllerBoard(Pluggable, LineServer):
+    """A board that reads a specimen and sets its input each period; see `board.c` in the folder of its firmware.
+
+    Parameters
+    ----------
+    firmware : Path
+        The folder.
+    read : callable
+        Returns readings of input and output of the specimen.
+    drive : callable
+        Takes what the board sets the input to.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is no compiler of C, or the folder holds no firmware.
+    """
+
+    def __init__(
+        self,
+        world: World,
+        firmware: Path,
+        read: Callable[[], tuple[float, float]],
+        drive: Callable[[float], None],
+    ) -> None:
+        self.world = world
+        self._read, self._drive = read, drive
+        self._library = _compiled(self, firmware)
+        self._period: float = self._library.board_period()
+        self._due: float = world.time + self._period
+        self._library.board_init()
+        world.add(self)
+
+    def power_cycle(self) -> None:
+        """Switch the board off and on: the controller is off."""
+        with self.world.at_present():
+            self._library.board_init()
+
+    def deadline(self) -> float:
+        """Return the instant of the next set-point, s."""
+        return self._due
+
+    def expire(self) -> None:
+        """Read, and set the input."""
+        self._due += self._period
+        self._drive(self._library.board_tick(self._period, *self._read()))
+
+    def receive(self, data: bytes) -> bytes:
+        """Take bytes from the host, in pieces of any size; return what the board sends."""
+        with self.world.lock:
+            if not self.answering:
+                return b""
+            self.attend()
+            return super().receive(data)
+
+    def answer(self, message: str) -> str | None:
+        """Let the firmware obey a line."""
+        answer = ctypes.create_string_buffer(_ANSWER)
+        self._library.board_line(message.strip().encode("ascii", "replace"), answer, ctypes.c_size_t(_ANSWER))
+        return answer.value.decode("ascii") or None
+
+
+def _compiled(board: object, firmware: Path) -> ctypes.CDLL:
+    """Return the firmware as a library of its own, so that two boards share nothing."""
+    compiler = shutil.which("gcc") or shutil.which("clang")
+    if compiler is None:
+        raise ConfigurationError("a controller board needs a compiler of C; install the Debian package gcc")
+    sources = [str(each.resolve()) for each in sorted(firmware.glob("*.c")) if each.name != "main.c"]
+    if not (firmware / "board.c").is_file():
+        raise ConfigurationError(
+            f"firmware {firmware}: there is no board.c; expected a folder of bench model deploy --c --controller"
+        )
+    folder = tempfile.mkdtemp()
+    weakref.finalize(board, shutil.rmtree, folder, ignore_errors=True)
+    command = [compiler, "-std=c99", "-O2", "-fPIC", "-shared", "-o", f"{folder}/board.so", *sources, "-lm"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
+    if done.returncode:
+        raise ConfigurationError(f"firmware {firmware}: {compiler} failed: {done.stderr.strip()}")
+    library = ctypes.CDLL(f"{folder}/board.so")
+    library.board_period.restype = library.board_tick.restype = ctypes.c_double
+    library.board_tick.argtypes = [ctypes.c_double] * 3
+    return library
