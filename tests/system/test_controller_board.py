@@ -1,5 +1,7 @@
 """A controller board that runs exported code, as a drive of the bench."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from deployed import plane
@@ -24,7 +26,7 @@ setpoint = { name = "source_setpoint", unit = "V", limits = [0.0, 10.0] }
 [devices.sensor]
 driver = "twin-sensor"
 port = "emulated://sensor"
-signals = [{ name = "position", unit = "µm" }]
+signals = [{ name = "position", unit = "1/m" }]
 [roles.drive]
 device = "source"
 reading = "voltage"
@@ -35,59 +37,36 @@ dwell = 4.0
 increment = 1.0
 [roles.response]
 signal = "position"
-range = [50.0, 550.0]
+range = [200.0, 1500.0]
 [emulation]
 laboratory = "twin"
 step = 0.02
-drift = 0.1
+drift = 0.3
 model = '''MODEL'''
 drive = { device = "source", signal = "voltage", rest = 0.0, frequency = 4.0, damping = 0.7 }
 response = { signal = "position" }
 signals.voltage = { quick = 1e-3, reading = 1e-3 }
-signals.position = { quick = 0.2, reading = 0.1 }
+signals.position = { quick = 0.6, reading = 0.3 }
 """
-BOARD = """
-extends = "specimen.toml"
-without = ["roles.drive"]
-[rig]
-title = "a board"
-[devices.board]
-driver = "scpi-actuator"
-port = "emulated://board"
-identity = "bench,target.closed-loop-inverse,{any}"
-setpoint = { command = "TARGET {value:.4f}", query = "TARGET?", unit = "µm", limits = [-100.0, 1000.0] }
-output = { on = ["RUN"], off = ["STOP"], query = "RUN?" }
-signals.target = { query = "TARGET?", unit = "µm" }
-[roles.drive]
-device = "board"
-reading = "board_target"
-unit = "µm"
-range = [0.0, HIGH]
-rest = 0.0
-dwell = 4.0
-increment = 1.0
-[emulation]
-board = { device = "board", firmware = "FIRMWARE" }
-"""
+EXAMPLE = Path(__file__).parents[2] / "examples/controller-board.toml"
 
 
 def _plane(levels):
     model = plane(levels)
     low, high = model.output_range()
-    return Preisach(model.levels, 600.0 / (high - low) * model.density, input_unit="V", output_unit="µm", bias=300.0)
+    density = 1500.0 / (high - low) * model.density
+    return Preisach(model.levels, density, input_unit="V", output_unit="1/m", bias=850.0)
 
 
 @pytest.fixture
-def rigs(gcc, tmp_path):
+def rigs(gcc, tmp_path, monkeypatch):
     """Rig files of a specimen and of a board before it, and models of the specimen and of what the board does."""
-    low, high = _plane(14).output_range()
-    specimen, board = tmp_path / "specimen.toml", tmp_path / "board.toml"
+    monkeypatch.chdir(tmp_path)
+    specimen, board = tmp_path / "unit.toml", tmp_path / "board.toml"
     specimen.write_text(SPECIMEN.replace("MODEL", json_text(_plane(27).to_json())))
-    board.write_text(
-        BOARD.replace("FIRMWARE", str(tmp_path / "firmware")).replace("0.0, HIGH", f"{low:.0f}.0, {high:.0f}.0")
-    )
+    board.write_text(EXAMPLE.read_text())
     ModelFile("plane", _plane(14)).save(tmp_path / "plane.json")
-    line = Polynomial([0.5 * (high - low)], (low, high), 0.5 * (low + high), input_unit="µm", output_unit="µm")
+    line = Polynomial([850.0], (0.0, 1700.0), 850.0, input_unit="1/m", output_unit="1/m")
     ModelFile("line", line).save(tmp_path / "line.json")
     name, firmware = "target.closed-loop-inverse", tmp_path / "firmware"
     bench.deploy(tmp_path / "plane.json", firmware, controller=name, rig=specimen, period=0.1)
@@ -106,8 +85,8 @@ def test_it_errs_as_the_controller_of_the_bench_does(rigs, tmp_path):
     of_bench = _errors(specimen, tmp_path, model=str(tmp_path / "plane.json"))
     of_board = _errors(board, tmp_path, model=str(tmp_path / "line.json"), controller="polynomial")
     rms = [float(np.sqrt(np.mean(each**2))) for each in (of_bench, of_board)]
-    # Of a range of 500, by a model of another density.
-    assert 0.5 < rms[0] < 15.0
+    # Of a range of 1300, by a model of another density.
+    assert 1.0 < rms[0] < 40.0
     assert rms[1] < 1.5 * rms[0]
 
 
@@ -138,10 +117,10 @@ def test_its_firmware_obeys_lines_and_is_safe_when_off(rigs, tmp_path):
 
     assert ask("*IDN?").startswith("bench,target.closed-loop-inverse,")
     # Without a target it does not run, and a number that is none changes nothing.
-    assert [ask(text) for text in ("RUN", "RUN?", "TARGET 300x", "TARGET nan", "TARGET?")] == ["", "0", "", "", "0"]
-    assert [ask(text) for text in ("TARGET 300", "RUN", "RUN?", "DONE?")] == ["", "", "1", "0"]
+    assert [ask(text) for text in ("RUN", "RUN?", "TARGET 700x", "TARGET nan", "TARGET?")] == ["", "0", "", "", "0"]
+    assert [ask(text) for text in ("TARGET 700", "RUN", "RUN?", "DONE?")] == ["", "", "1", "0"]
     assert ask("DONE?", 3.0) == "1"
-    assert float(ask("OUTPUT?")) == pytest.approx(300.0, abs=2.0)
+    assert float(ask("OUTPUT?")) == pytest.approx(700.0, abs=4.0)
     assert float(ask("INPUT?")) == pytest.approx(plant.level)
     assert ask("REACH?") == "0"
     ask("TARGET 1e4")
