@@ -14,7 +14,10 @@ from bench.cli.printing import console, print_rows, show_compilation
 
 @show_compilation()
 def deploy_(
-    model: Annotated[Path, typer.Argument(metavar="MODEL", help="Model file.")],
+    model: Annotated[
+        Path,
+        typer.Argument(metavar="MODEL", help="Model file; with --fmu also the rig file of a twin, for its specimen."),
+    ],
     c: Annotated[
         Path | None, typer.Option("--c", metavar="FOLDER", help="Write a header, a C99 source, main.c and a README.")
     ] = None,
@@ -62,6 +65,8 @@ def deploy_(
     from bench.api import deploy
     from bench.deployment import write_fmu
     from bench.identification import load_model
+    from bench.rig import load_rig
+    from bench.specimen import TwinTable
 
     if c is None and fmu is None:
         raise ConfigurationError("bench model deploy: say what to write, by --c FOLDER or --fmu FILE.fmu")
@@ -70,6 +75,20 @@ def deploy_(
     if fmu is not None and fmu.suffix != ".fmu":
         raise ConfigurationError(f"--fmu {fmu}: expected a name that ends with .fmu")
     check_outputs(folder=c, json_file=json_file, read=[model])
+    if model.suffix == ".toml":
+        if c is not None or fmu is None or inverse or period is not None:
+            raise ConfigurationError(
+                f"{model}: of a twin only --fmu FILE.fmu is written, without --inverse or --period"
+            )
+        settings = load_rig(str(model)).laboratory_settings
+        if not isinstance(settings, TwinTable):
+            raise ConfigurationError(
+                f"{model}: expected a model file, or a rig file that bench model twin has written"
+            )
+        write_fmu(settings, fmu, version=fmi)
+        print_plain(console, f"FMU: {fmu}")
+        write_json(json_file, {"fmu": str(fmu), "fmi": fmi})
+        return
     file = load_model(model)
     said: dict[str, object] = {}
     if c is not None:

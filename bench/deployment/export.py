@@ -16,12 +16,14 @@ from bench.deployment.c_source import Real, Source, parts_of, rendered
 from bench.deployment.compositions import COUPLED, hammerstein_source
 from bench.deployment.controller import Controller, with_controller
 from bench.deployment.operators import Starts, operator_source, why_not
+from bench.deployment.specimen import specimen_source
 from bench.identification import ModelFile
 from bench.models import Coupled, Hammerstein, Operator
+from bench.specimen import TwinTable
 
 _RESOLVED = 2e-6
 """Greatest step of `float` as a part of a range. Derivation: five such roundings are the 1e-5 that float promises."""
-_MATH = re.compile(r"\b(sqrt|tanh|atanh|exp|expm1|log1p|pow|ceil)f?\(")
+_MATH = re.compile(r"\b(sqrt|tanh|atanh|exp|expm1|log1p|pow|ceil|log|cos|fabs)f?\(")
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,7 @@ def deploy(
     period: float | None = None,
     max_bytes: int | None = None,
     controller: Controller | None = None,
+    specimen: TwinTable | None = None,
 ) -> Deployment:
     """Return a model, its inverse and its memory as C99.
 
@@ -85,6 +88,8 @@ def deploy(
         Most bytes of code and constants.
     controller : Controller, optional
         What makes the output follow a reference, beside the model.
+    specimen : TwinTable, optional
+        The specimen of a twin, whose model it is, in the place of the model; in `double`.
 
     Raises
     ------
@@ -95,7 +100,7 @@ def deploy(
     """
     if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]*", name):
         raise ConfigurationError(f"--name {name!r}: expected letters, digits and _, a letter first")
-    source = _source(file, real, period, name)
+    source = _source(file, real, period, name) if specimen is None else specimen_source(specimen, name)
     if controller is not None:
         source = with_controller(source, file, controller, real, name)
     _check_size(file, source, real, max_bytes)
@@ -226,7 +231,7 @@ def _readme(file: ModelFile, source: Source, words: Mapping[str, object]) -> str
         ("code", f"about {source.machine} bytes (Cortex-M4, -O2, without the library of mathematics)"),
         ("state", f"{source.state} bytes; saved, 8 bytes more"),
         ("a step", source.step),
-        ("an inverse", source.inverse),
+        *([("an inverse", source.inverse)] if source.inverse else []),
         *(
             (f"fit: {key}", str(value))
             for key, value in file.provenance.items()

@@ -18,9 +18,10 @@ from bench.deployment.c_source import parts_of, rendered
 from bench.deployment.export import deploy, ranges_of
 from bench.identification import ModelFile
 from bench.models import Coupled, Hammerstein
+from bench.specimen import TwinTable
 
 Version: TypeAlias = Literal["2.0", "3.0"]
-What: TypeAlias = Literal["operator", "inverse"]
+What: TypeAlias = Literal["operator", "inverse", "specimen"]
 
 _KINDS = (
     "Float32",
@@ -62,22 +63,29 @@ class _Variable:
 
 
 def write_fmu(
-    file: ModelFile, path: Path, *, what: What = "operator", version: Version = "2.0", period: float | None = None
+    file: ModelFile | TwinTable,
+    path: Path,
+    *,
+    what: What = "operator",
+    version: Version = "2.0",
+    period: float | None = None,
 ) -> None:
-    """Write a model, or its inverse, as a functional mock-up unit for co-simulation.
+    """Write a model, its inverse, or the specimen of a twin as a functional mock-up unit for co-simulation.
 
     An operator has the input `u` and the output `y`; its inverse `target`, and `u`, `y` at `u` and `reach` (1 too
     high, -1 too low). A model from voltage and force to length has these names. The parameter `start` chooses the
     memory: 0 at the end of the fitted data, 1 before them (the default), 2 and 3 negative and positive saturation.
+    A specimen has the set-point `u`, and gives `drive` and `y`, without the noise of readings. Its parameter `seed`
+    chooses the session, and its communication steps are whole multiples of the step of the twin.
 
     Parameters
     ----------
-    file : ModelFile
-        The model.
+    file : ModelFile or TwinTable
+        The model; of a specimen what the rig file of the twin says in `[emulation]`.
     path : Path
         File to write, `.fmu`.
-    what : {"operator", "inverse"}
-        What of it.
+    what : {"operator", "inverse", "specimen"}
+        What of it; of a twin always the specimen.
     version : {"2.0", "3.0"}
         Version of FMI.
     period : float, optional
@@ -95,9 +103,15 @@ def write_fmu(
         raise ConfigurationError(
             "--fmu: no compiler of C was found, which makes the binary within; install the Debian package gcc"
         )
-    found = deploy(file, real="double", period=period)
+    specimen = None
+    if isinstance(file, TwinTable):
+        specimen, what = file, "specimen"
+        file = ModelFile(path.stem, specimen.operator)
+    found = deploy(file, real="double", period=period, specimen=specimen)
+    if specimen is not None:
+        period = specimen.step
     coupled = isinstance(file.model, Coupled)
-    variables = _variables(file, what)
+    variables = _variables(file, what, None if specimen is None else specimen.drive.rest)
     words = {
         "title": f"Model {file.name}, {what}",
         "identity": f"SHA-256 of the model: {found.digest}",
@@ -140,13 +154,16 @@ def _compiled(compiler: str, files: Mapping[str, str], fmi: str) -> bytes:
         return Path(folder, "model.so").read_bytes()
 
 
-def _variables(file: ModelFile, what: What) -> list[_Variable]:
+def _variables(file: ModelFile, what: What, rest: float | None) -> list[_Variable]:
     *inputs, (_, _, output) = ranges_of(file.model)
     coupled = isinstance(file.model, Coupled)
     first, last = ("voltage", "length") if coupled else ("u", "y")
     unit = inputs[0][2]
-    found = [_Variable("start", 5, "parameter", start=1, whole=True)]
-    if what == "operator":
+    found = [_Variable("start" if rest is None else "seed", 5, "parameter", start=1, whole=True)]
+    if rest is not None:
+        found += [_Variable("u", 0, "input", unit, rest), _Variable("drive", 2, "output", unit)]
+        found.append(_Variable("y", 3, "output", output))
+    elif what == "operator":
         found += [_Variable(first, 0, "input", unit, _begin(file)), _Variable(last, 2, "output", output)]
     else:
         target = 0.5 * sum(ranges_of(file.model)[-1][1])
@@ -173,7 +190,18 @@ def _actions(what: What, coupled: bool, period: float | None, variables: list[_V
     check = (
         "" if period is None else f"    if (step < {0.999 * period!r} || step > {1.001 * period!r}) return FAILED;\n"
     )
-    if what == "operator":
+    most = "3"
+    if what == "specimen":
+        # In whole steps of the grid.
+        check = f"    if (step < {0.999 * (period or 0.0)!r}) return FAILED;\n"
+        begin, most = "i->state.drive", "INT32_MAX"
+        advance = [
+            f"long left = (long)(step / {period!r} + 0.5);",
+            f"if (step - (double)left * {period!r} > 1e-6 || (double)left * {period!r} - step > 1e-6) return FAILED;",
+            "for (; left > 0; --left) i->outputs[1] = BASE_step(&i->state, u);",
+            "i->outputs[0] = i->state.drive;",
+        ]
+    elif what == "operator":
         begin, advance = "i->outputs[1]", [f"i->outputs[0] = i->outputs[1] = BASE_step(&i->state, u{load});"]
     else:
         given = ", i->inputs[1]" if coupled else ""
@@ -189,6 +217,7 @@ def _actions(what: What, coupled: bool, period: float | None, variables: list[_V
         ]
     return {
         "begin": begin,
+        "most": most,
         "check": check,
         "advance": "\n".join(f"    {line}" for line in advance),
         "inputs": f"{float(starts[0] or 0.0)!r}, {float(starts.get(1) or 0.0)!r}",

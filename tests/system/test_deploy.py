@@ -1,6 +1,7 @@
 """`bench model deploy`: what it writes, and what it refuses in one message."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from bench.api import deploy, load, predict
 from bench.base import ConfigurationError
 from bench.identification import ModelFile
 
+RIGS = Path(__file__).parents[2] / "rigs"
 RIG = """
 [rig]
 title = "a unit"
@@ -121,4 +123,8 @@ def test_what_is_wrong_is_one_message_and_nothing_is_written(model, tmp_path, be
         assert code == 2
         assert said in err
         assert err.count("error:") == 1
+    for options in (["--c", folder], ["--fmu", tmp_path / "model.fmu"]):
+        code, _, err = bench("model", "deploy", RIGS / "vo2/vo2.toml", *options)
+        assert code == 2
+        assert "twin" in err
     assert not folder.exists()

@@ -7,25 +7,28 @@ from fmpy import simulate_fmu
 from fmpy.validation import validate_fmu
 
 from bench.analysis import predict
-from bench.base import ConfigurationError
+from bench.base import ConfigurationError, json_text
 from bench.deployment import write_fmu
 from bench.identification import ModelFile
 from bench.models import Hammerstein, LinearPart, TwoStage
+from bench.specimen import Specimen, TwinTable
 from sim_devices.plants.fmu import FMUPlant
+from sim_devices.twin_laboratory import SpecimenPlant
 
 STEP = 0.01
 PLANE = ModelFile("plane", plane(20, "thermal"))
 
 
-def _simulated(path, **inputs):
+def _simulated(path, step=STEP, start_values=None, **inputs):
     count = len(next(iter(inputs.values())))
-    rows = list(zip(STEP * np.arange(count), *inputs.values(), strict=True))
+    rows = list(zip(step * np.arange(count), *inputs.values(), strict=True))
     signals = np.array(rows, dtype=[("time", float), *((name, float) for name in inputs)])
     result = simulate_fmu(
         str(path),
-        stop_time=count * STEP,
-        output_interval=STEP,
-        step_size=STEP,
+        stop_time=count * step,
+        output_interval=step,
+        step_size=step,
+        start_values=start_values or {},
         input=signals,
         fmi_type="CoSimulation",
     )
@@ -65,6 +68,44 @@ def test_units_of_models_with_time_and_of_two_inputs(gcc, tmp_path):
     forces = np.repeat(random_sequence(0.0, 4.0, 10, 3), 10)
     found = _simulated(path, voltage=inputs, force=forces)["length"]
     np.testing.assert_allclose(found, muscle.evaluate(inputs, forces), rtol=1e-12)
+
+
+def _twin(**noise):
+    drive = {"device": "d", "signal": "u", "rest": 0.0, "delay": 0.05, "frequency": 4.0, "damping": 0.6, "rate": 20.0}
+    response = {"signal": "y", "lag": 0.1, "power": 2.0, "gain": 0.9, "shares": (0.1,), "times": (3.0,)}
+    return TwinTable(
+        step=0.02,
+        model=json_text(PLANE.operator.to_json()),
+        drive=drive,
+        response=response,
+        **noise,
+    )
+
+
+def test_a_specimen_is_that_of_the_twin(gcc, tmp_path):
+    twin, path = _twin(), tmp_path / "specimen.fmu"
+    write_fmu(twin, path)
+    assert validate_fmu(str(path)) == []
+    plant = SpecimenPlant(Specimen(twin.operator, twin.dynamics, 0.0, np.random.default_rng(0)), 0.0)
+    unit = FMUPlant(path, "u", ["y", "drive"], 0.02, 0.0)
+    for setpoint in random_sequence(0.0, 10.0, 100, 4).tolist():
+        for each in (plant, unit):
+            each.set(setpoint)
+            each.advance(0.1)
+        assert unit.outputs == pytest.approx([plant.response, plant.drive], rel=1e-11)
+
+
+def test_a_session_of_a_specimen_wanders_by_its_seed(gcc, tmp_path):
+    twin, path = _twin(wander={"deviation": 0.1, "time": 1.0}), tmp_path / "specimen.fmu"
+    write_fmu(twin, path, version="3.0")
+    assert validate_fmu(str(path)) == []
+    inputs = np.full(2000, 5.0)
+    found = [_simulated(path, 0.02, start_values={"seed": seed}, u=inputs)["y"] for seed in (1, 1, 2)]
+    np.testing.assert_array_equal(found[0], found[1])
+    plant = Specimen(twin.operator, twin.dynamics, 0.0, np.random.default_rng(0))
+    deviations = [np.std(each[500:]) for each in (*found[1:], plant.advance(inputs)[1])]
+    assert found[2][-1] != found[1][-1]
+    assert max(deviations) < 1.7 * min(deviations)
 
 
 @pytest.mark.parametrize("version", ["2.0", "3.0"])
