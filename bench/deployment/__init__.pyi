@@ -1,5 +1,6 @@
 from .c_source import (
     Real as Real,
+    compile_library as compile_library,
 )
 from .controller import (
     CONTROLLERS as CONTROLLERS,

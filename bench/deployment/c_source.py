@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
+import shutil
+import subprocess
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from importlib.resources import files
+from pathlib import Path
 from typing import Literal, TypeAlias
 
 import numpy as np
+
+from bench.base import ConfigurationError, DataError
 
 Real: TypeAlias = Literal["float", "double"]
 Value: TypeAlias = "float | int | np.ndarray"
@@ -85,6 +90,47 @@ def constants(values: Mapping[str, Value], real: Real) -> tuple[str, int]:
         places = "".join(f"[{count}]" for count in numbers.shape)
         lines.append(f"static const {kind} OP_{name}{places} = {_text(numbers, real)};")
     return "\n".join(lines) + "\n", size
+
+
+def compile_library(what: str, sources: Sequence[Path], library: Path, *options: str) -> None:
+    """Compile C99 to a shared library.
+
+    Parameters
+    ----------
+    what : str
+        Who needs it, for the message.
+    sources : sequence of Path
+        The files.
+    library : Path
+        The file to write.
+    options : str
+        Further options of the compiler.
+
+    Raises
+    ------
+    ConfigurationError
+        If there is no compiler of C.
+    DataError
+        If it fails.
+    """
+    compiler = shutil.which("gcc") or shutil.which("clang")
+    if compiler is None:
+        raise ConfigurationError(f"{what}: no compiler of C was found; install the Debian package gcc")
+    command = [
+        compiler,
+        "-std=c99",
+        "-O2",
+        "-fPIC",
+        "-shared",
+        *options,
+        "-o",
+        str(library),
+        *map(str, sources),
+        "-lm",
+    ]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
+    if done.returncode:
+        raise DataError(f"{what}: {compiler} failed: {done.stderr.strip()}")
 
 
 def _text(numbers: np.ndarray, real: Real) -> str:

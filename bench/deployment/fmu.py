@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import importlib.metadata
-import shutil
-import subprocess
 import tempfile
 import zipfile
 from collections.abc import Mapping
@@ -13,8 +11,8 @@ from pathlib import Path
 from typing import Any, Literal, TypeAlias
 from xml.sax.saxutils import quoteattr
 
-from bench.base import ConfigurationError, DataError
-from bench.deployment.c_source import parts_of, rendered
+from bench.base import DataError
+from bench.deployment.c_source import compile_library, parts_of, rendered
 from bench.deployment.export import deploy, ranges_of
 from bench.identification import ModelFile
 from bench.models import Coupled, Hammerstein
@@ -98,11 +96,6 @@ def write_fmu(
     DataError
         If the model cannot be exported, or the file not written.
     """
-    compiler = shutil.which("gcc") or shutil.which("clang")
-    if compiler is None:
-        raise ConfigurationError(
-            "--fmu: no compiler of C was found, which makes the binary within; install the Debian package gcc"
-        )
     specimen = None
     if isinstance(file, TwinTable):
         specimen, what = file, "specimen"
@@ -132,7 +125,7 @@ def write_fmu(
     content["documentation/README.md"] = found.files["README.md"].encode()
     if version == "3.0":
         content["sources/buildDescription.xml"] = _build_description(sorted(files)).encode()
-    content[f"{binary}/model.so"] = _compiled(compiler, files, fmi)
+    content[f"{binary}/model.so"] = _compiled(files)
     try:
         with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
             for name, data in content.items():
@@ -142,16 +135,14 @@ def write_fmu(
         raise DataError(f"--fmu {path} cannot be written: {error.strerror}") from None
 
 
-def _compiled(compiler: str, files: Mapping[str, str], fmi: str) -> bytes:
+def _compiled(files: Mapping[str, str]) -> bytes:
     with tempfile.TemporaryDirectory() as folder:
-        for name, text in files.items():
-            Path(folder, name).write_text(text, encoding="utf-8")
-        options = ["-std=c99", "-O2", "-fPIC", "-shared", "-fvisibility=hidden", "-o", "model.so"]
-        command = [compiler, *options, "model.c", f"{fmi}.c", "-lm"]
-        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)  # noqa: S603
-        if done.returncode:
-            raise DataError(f"--fmu: {compiler} failed: {done.stderr.strip()}")
-        return Path(folder, "model.so").read_bytes()
+        paths = [Path(folder, name) for name in files]
+        for path, text in zip(paths, files.values(), strict=True):
+            path.write_text(text, encoding="utf-8")
+        library, sources = Path(folder, "model.so"), [path for path in paths if path.suffix == ".c"]
+        compile_library("--fmu", sources, library, "-fvisibility=hidden")
+        return library.read_bytes()
 
 
 def _variables(file: ModelFile, what: What, rest: float | None) -> list[_Variable]:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import ctypes
 import shutil
-import subprocess
 import tempfile
 import weakref
 from collections.abc import Callable
 from pathlib import Path
 
 from bench.base import ConfigurationError
+from bench.deployment import compile_library
 from sim_devices.instruments.emulated import Pluggable
 from sim_devices.wire.text import LineServer
 from sim_devices.world import World
@@ -35,6 +35,8 @@ class ControllerBoard(Pluggable, LineServer):
     ------
     ConfigurationError
         If there is no compiler of C, or the folder holds no firmware.
+    DataError
+        If the firmware cannot be compiled.
     """
 
     def __init__(
@@ -83,21 +85,17 @@ class ControllerBoard(Pluggable, LineServer):
 
 def _compiled(board: object, firmware: Path) -> ctypes.CDLL:
     """Return the firmware as a library of its own, so that two boards share nothing."""
-    compiler = shutil.which("gcc") or shutil.which("clang")
-    if compiler is None:
-        raise ConfigurationError("a controller board needs a compiler of C; install the Debian package gcc")
-    sources = [str(each.resolve()) for each in sorted(firmware.glob("*.c")) if each.name != "main.c"]
     if not (firmware / "board.c").is_file():
         raise ConfigurationError(
             f"firmware {firmware}: there is no board.c; expected a folder of bench model deploy --c --controller"
         )
     folder = tempfile.mkdtemp()
     weakref.finalize(board, shutil.rmtree, folder, ignore_errors=True)
-    command = [compiler, "-std=c99", "-O2", "-fPIC", "-shared", "-o", f"{folder}/board.so", *sources, "-lm"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)  # noqa: S603
-    if done.returncode:
-        raise ConfigurationError(f"firmware {firmware}: {compiler} failed: {done.stderr.strip()}")
-    library = ctypes.CDLL(f"{folder}/board.so")
+    file = Path(folder, "board.so")
+    compile_library(
+        f"firmware {firmware}", [each for each in sorted(firmware.glob("*.c")) if each.name != "main.c"], file
+    )
+    library = ctypes.CDLL(str(file))
     library.board_period.restype = library.board_tick.restype = ctypes.c_double
     library.board_tick.argtypes = [ctypes.c_double] * 3
     return library

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from deployed import plane
+from deployed import STRICT, plane, run
 
 import bench
 from bench.analysis import target_results
@@ -103,7 +103,8 @@ class Plant:
         self.level = value
 
 
-def test_its_firmware_obeys_lines_and_is_safe_when_off(rigs, tmp_path):
+def test_its_firmware_obeys_lines_and_is_safe_when_off(rigs, gcc, tmp_path):
+    run([gcc, *STRICT, "-c", "board.c"], tmp_path / "firmware")
     clock, plant = VirtualClock(), Plant()
     specimen = _plane(14).stream()
     world = World(plant, clock)
