@@ -94,7 +94,7 @@ class LineDevice(Device, Generic[SettingsT, LineT]):
 
     @classmethod
     def identify_at(cls, name: str, settings: SettingsT, clock: Clock) -> Identity:
-        """Return which instrument answers at the line of the settings; it is only asked, and the line is released.
+        """Return which instrument answers at the line of the settings; it is asked once, and the line is released.
 
         Raises
         ------
@@ -103,7 +103,8 @@ class LineDevice(Device, Generic[SettingsT, LineT]):
         DeviceError
             If it reports an error.
         """
-        line = cls._open_line(name, settings, clock)
+        line: Any = cls._open_line(name, settings, clock)
+        line.resends = 0
         try:
             return cls(name, settings, clock, line)._identify()
         finally:

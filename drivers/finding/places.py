@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import product
 from typing import Any
 
+import serial
 from pydantic import ValidationError
 
 from bench.base import BenchError, WallClock
-from bench.devices import DriverSettings, Identity
+from bench.devices import Identity
 from bench.rig import DeviceEntry, RigFile, port_of
 from drivers.device import LineDevice
 from drivers.finding.ports import Port
@@ -19,9 +21,14 @@ from drivers.labjack_t7.device import T7Device
 
 _HASTE, _HASTE_IN_NETWORK = 0.15, 0.5
 """Longest wait for an answer, s. Derivation: 100 bytes at 9600 Bd take 0.1 s, and a USB adapter 16 ms."""
+_EMPTY_LINE, _HEED = b"\r\n", 0.05
+"""What ends whatever an instrument has received of other questions, and the wait for what it says to it, s.
+
+Derivation: two bytes at 9600 Bd take 2 ms, and a USB adapter 16 ms, each way.
+"""
 _SPEEDS = (9600, 19200, 38400, 57600, 115200, 1000000)
 """Tried where nothing answers, Bd: what instruments are delivered with."""
-_PARITIES = ("N", "E")
+_PARITIES = ("N", "E", "O")
 
 
 @dataclass(frozen=True)
@@ -70,33 +77,60 @@ def answers(file: RigFile, ports: Sequence[Port]) -> list[Answer]:
 
     Ports at which nothing answers are asked with other speeds and parities for the devices that were not found.
     """
-    entries = askable(file)
+    entries = [entry for entry in askable(file) if _tells_identity(entry)]
     open_ports = [port for port in ports if not port.problem]
     if not open_ports:
         return []
     with ThreadPoolExecutor(len(open_ports)) as pool:
-        found = [each for some in pool.map(lambda port: [*_asked(entries, port)], open_ports) for each in some]
+        echoes = [*pool.map(_echoes, open_ports)]
+        firsts = pool.map(lambda port, echo: _asked(entries, port, {"echo": echo}), open_ports, echoes)
+        found = [each for some in firsts for each in some]
         lost = [entry for entry in entries if entry.name not in {each.device for each in found}]
-        silent = [port for port in open_ports if port not in [each.port for each in found] and not port.in_network]
-        more = pool.map(lambda port: [*_asked(lost, port, others=True)], silent)
+        heard = [each.port for each in found]
+        silent = [(port, echo) for port, echo in zip(open_ports, echoes, strict=True) if port not in heard]
+        more = pool.map(lambda line: _asked_otherwise(lost, *line), silent)
         return found + [each for some in more for each in some]
 
 
-def _asked(entries: Iterable[DeviceEntry], port: Port, *, others: bool = False) -> Iterator[Answer]:
+def _asked(entries: Iterable[DeviceEntry], port: Port, line: Mapping[str, Any]) -> list[Answer]:
+    """Ask at a port for devices, with the settings of a line instead of those of the rig file."""
+    found: list[Answer] = []
     heard: list[DeviceEntry] = []
-    asked = filter(_tells_identity, entries)
-    for entry in sorted(asked, key=lambda each: port_of(each.settings) not in (port.address, port.link)):
+    for entry in sorted(entries, key=lambda each: port_of(each.settings) not in (port.address, port.link)):
         if port.in_network != (issubclass(entry.driver, T7Device) or port_of(entry.settings).startswith("tcp://")):
             continue
         # A line has one dialect: its equals, and those that share the line.
         if heard and not any(_may_share(entry, other) for other in heard):
             continue
-        for changed in _others(entry.settings) if others else [{}]:
-            identity = _identity(entry, port, changed)
-            if identity is not None:
-                heard.append(entry)
-                yield Answer(entry.name, port, identity, changed)
-                break
+        known = entry.settings.model_dump()
+        changed = {key: value for key, value in line.items() if key in known and value != known[key]}
+        if "identity_query" in known:
+            _heed(port, known | changed)
+        identity = _identity(entry, port, changed)
+        if identity is not None:
+            heard.append(entry)
+            found.append(Answer(entry.name, port, identity, changed))
+    return found
+
+
+def _asked_otherwise(entries: Iterable[DeviceEntry], port: Port, echo: bool) -> list[Answer]:
+    """Ask at a port with each other speed and parity that its line may have until a device answers."""
+    asked = [(entry, known) for entry in entries if "baudrate" in (known := entry.settings.model_dump())]
+    for parity, speed in product(_PARITIES, _SPEEDS):
+        able = [
+            entry
+            for entry, known in asked
+            if (parity == "N" or "parity" in known)
+            and (parity, speed) != (known.get("parity", "N"), known["baudrate"])
+        ]
+        if found := _asked(able, port, {"echo": echo, "parity": parity, "baudrate": speed}):
+            return found
+    return []
+
+
+def _echoes(port: Port) -> bool:
+    """Return whether the adapter at a port hands back what is sent, which it does at any speed and parity."""
+    return _heed(port, {}) == _EMPTY_LINE
 
 
 def _tells_identity(entry: DeviceEntry) -> bool:
@@ -112,15 +146,23 @@ def _may_share(one: DeviceEntry, other: DeviceEntry) -> bool:
     )
 
 
-def _others(settings: DriverSettings) -> Iterator[dict[str, Any]]:
-    """Yield what a line may be set to otherwise: an adapter's echo, speed and parity."""
-    known = settings.model_dump()
-    choices = {"echo": (False, True), "parity": _PARITIES, "baudrate": _SPEEDS}
-    keys = [key for key in choices if key in known]
-    for values in product(*(choices[key] for key in keys)):
-        changed = {key: value for key, value in zip(keys, values, strict=True) if value != known[key]}
-        if changed:
-            yield changed
+def _heed(port: Port, line: Mapping[str, Any]) -> bytes:
+    """Send an empty line at the speed and parity of a line, and return what comes."""
+    with (
+        # pyserial passes on the errors of termios.
+        suppress(Exception),
+        serial.serial_for_url(
+            port.address,
+            line.get("baudrate", _SPEEDS[0]),
+            parity=line.get("parity", "N"),
+            timeout=_HEED,
+            write_timeout=_HASTE,
+            exclusive=True,
+        ) as opened,
+    ):
+        opened.write(_EMPTY_LINE)
+        return bytes(opened.read(256))
+    return b""
 
 
 def _identity(entry: DeviceEntry, port: Port, changed: Mapping[str, Any]) -> Identity | None:
