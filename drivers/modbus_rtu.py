@@ -220,7 +220,7 @@ class RtuLine(RepeatingLine):
             raise RefusalError(self._name, error.code, doing.format(number)) from error
         except OSError as error:
             self.lost = True
-            raise lost_line(self._name, self._settings, error, ", then connect again") from error
+            raise lost_line(self._name, self._settings.port, error, ", then connect again") from error
         self.resends = 0
         if isinstance(problem, UnexpectedReplyError):
             raise DeviceConnectionError(

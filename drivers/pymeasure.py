@@ -46,6 +46,7 @@ from bench.devices import (
 )
 from drivers.device import attempt
 from drivers.quantities import expected_identity
+from drivers.serial_line import lost_line, open_locked
 from drivers.table import SwitchedLine, TableActuator, TableLine, TableSensor
 
 _NOT_A_NUMBER = 9.9e37  # SCPI's infinity
@@ -228,9 +229,11 @@ class _MeasuringLine(TableLine):
         try:
             kind = instrument_class(settings.instrument)
             if "://" in settings.port:
-                self.instrument = kind(_serial_adapter(settings.port, **settings.options))
+                self.instrument = kind(_serial_adapter(device, settings.port, **settings.options))
             else:
                 self.instrument = kind(settings.port, **settings.options)
+        except DeviceConnectionError:
+            raise
         except Exception as error:
             raise DeviceConnectionError(
                 device, f"cannot open {settings.port}: {type(error).__name__}: {error}"
@@ -295,13 +298,21 @@ class _MeasuringLine(TableLine):
             yield
         # The library passes on the errors of each of its adapters, and those of its validators.
         except Exception as error:
-            kind = DeviceConnectionError if _is_of_the_line(error) else DeviceError
-            self.lost = self.lost or kind is DeviceConnectionError
-            raise kind(self._device, f"{doing}: {type(error).__name__}: {error}") from None
+            problem = f"{doing}: {type(error).__name__}: {error}"
+            if not _is_of_the_line(error):
+                raise DeviceError(self._device, problem) from None
+            self.lost = True
+            raise lost_line(self._device, self._settings.port, problem) from None
 
 
 def _serial_adapter(
-    url: str, *, read_termination: str = "\n", write_termination: str = "\n", timeout: float = 1.0, **options: object
+    device: str,
+    url: str,
+    *,
+    read_termination: str = "\n",
+    write_termination: str = "\n",
+    timeout: float = 1.0,
+    **options: object,
 ) -> object:
     """Return PyMeasure's adapter on a line of pyserial; an answer that does not come is an error of the line."""
     import serial
@@ -314,7 +325,7 @@ def _serial_adapter(
                 raise serial.SerialException(f"no answer within {timeout:g} s")
             return str(answer.decode().removesuffix(read_termination))
 
-    return Adapter(serial.serial_for_url(url, timeout=timeout, **options), write_termination, read_termination)
+    return Adapter(open_locked(device, url, timeout=timeout, **options), write_termination, read_termination)
 
 
 def _is_of_the_line(error: Exception) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
@@ -404,28 +404,34 @@ def open_port(device: str, settings: SerialSettings, **options: object) -> Any: 
     if settings.line:
 
         def open_it() -> tuple[Any, Callable[[], object]]:
-            port = _opened(device, settings, options)
+            port = open_serial(device, settings, **options)
             return port, port.close
 
         return LinePort(shared_port(settings.port, device, open_it), device, settings)
-    port = _opened(device, settings, options)
+    port = open_serial(device, settings, **options)
     return LinePort(OpenPort(port, port.close), device, settings) if settings.echo else patient(port, settings)
 
 
-def _opened(device: str, settings: SerialSettings, options: Mapping[str, object]) -> Any:  # noqa: ANN401
+def open_serial(device: str, settings: SerialSettings, **options: object) -> Any:  # noqa: ANN401
+    """Open the port of every driver, which is locked, and in which no call waits for longer than the time-out."""
+    return open_locked(device, settings.port, timeout=settings.timeout, baudrate=settings.baudrate, **options)
+
+
+def open_locked(device: str, port: str, *, timeout: float, **options: object) -> Any:  # noqa: ANN401
+    """Open a port of pyserial of any kind; see `open_serial`."""
     try:
-        return serial.serial_for_url(
-            settings.port,
-            baudrate=settings.baudrate,
-            timeout=settings.timeout,
-            write_timeout=settings.timeout,
-            exclusive=True,
-            **options,
-        )
+        given = {"timeout": timeout, "write_timeout": timeout, "exclusive": True, **options}
+        return serial.serial_for_url(port, **given)
     except Exception as error:  # pyserial passes on system errors that are no OSError
-        if getattr(error, "errno", None) in _HELD:
-            raise DeviceConnectionError(device, f"cannot open {settings.port}: {_use_of(settings.port)}") from None
-        raise DeviceConnectionError(device, f"cannot open {settings.port}: {error}") from None
+        raise cannot_open(device, port, error) from None
+
+
+def cannot_open(device: str, port: str, error: BaseException) -> DeviceConnectionError:
+    """Return the error for a port that could not be opened; a library's own error gives its cause."""
+    while error.__cause__ is not None:
+        error = error.__cause__
+    why = _use_of(port) if getattr(error, "errno", None) in _HELD else error
+    return DeviceConnectionError(device, f"cannot open {port}: {why}")
 
 
 def holder_of(port: str) -> tuple[int, str] | None:
@@ -477,9 +483,9 @@ def settle_line(port: Any, silence: float) -> None:  # noqa: ANN401 - pyserial i
     raise OSError("the line does not fall silent")
 
 
-def lost_line(device: str, settings: SerialSettings, error: object, advice: str = "") -> DeviceConnectionError:
+def lost_line(device: str, port: str, error: object, advice: str = "") -> DeviceConnectionError:
     """Return the error for a line that failed while it was in use."""
-    return DeviceConnectionError(device, f"lost the line {settings.port} ({error}); check the cable{advice}")
+    return DeviceConnectionError(device, f"lost the line {port} ({error}); check the cable and its adapter{advice}")
 
 
 def no_answer(

@@ -42,7 +42,7 @@ class TwinLine(RepeatingLine):
                 self._port.write(request.encode() + END)
                 answer: bytes = self._port.read_until(END)
             except OSError as error:  # pyserial's errors among them
-                raise lost_line(self._device, self._settings, error) from None
+                raise lost_line(self._device, self._settings.port, error) from None
             if answer.endswith(END):
                 return answer[: -len(END)].decode("ascii", "replace")
         self.resends = 0

@@ -137,7 +137,7 @@ class ServoLine(RepeatingLine):
             self.port.write(frame(self._settings.id, instruction, parameters))
             self._expect_late()
         except (serial.SerialException, OSError) as error:
-            raise lost_line(self._device, self._settings, error) from None
+            raise lost_line(self._device, self._settings.port, error) from None
 
     def _exchange(self, request: bytes, length: int) -> bytes:
         problem = self._silence
@@ -164,7 +164,7 @@ class ServoLine(RepeatingLine):
                     return answer[1:]
             self._expect_late()
         except (serial.SerialException, OSError) as error:
-            raise lost_line(self._device, self._settings, error) from None
+            raise lost_line(self._device, self._settings.port, error) from None
         self.resends = 0
         found = "" if _HEADER in self._heard else other_answer(self._heard)
         raise no_answer(self._device, self._settings, problem, "id", self._settings.id, found, resends=resends)

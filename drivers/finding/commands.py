@@ -48,7 +48,8 @@ def find(
 
     At each port that nobody holds the devices of the rig are asked for in turn, each in its own dialect, and for
     nothing but its identity: nothing is configured and nothing moves. An empty line shows whether an adapter echoes.
-    Where nothing answers, other speeds and parities are tried. Equal instruments are told apart by the key serial_number.
+    Where nothing answers, other speeds and parities are tried. Equal instruments are told apart by the key
+    serial_number.
 
     Exit codes: 0 every device was found, or there is no rig; 1 some were not, or are interchangeable; 2 the rig file
     is wrong.

@@ -170,7 +170,7 @@ class TECLine(RepeatingLine):
                     self._received.clear()
                     forget_received(self.port)
         except (serial.SerialException, OSError) as error:
-            raise lost_line(self._device, self._settings, error) from None
+            raise lost_line(self._device, self._settings.port, error) from None
         self.resends = 0
         found, address = other_answer(self._strange), self._settings.address
         raise no_answer(self._device, self._settings, problem, "address", address, found, resends=resends)

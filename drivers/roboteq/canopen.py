@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import TYPE_CHECKING, ClassVar, Literal
 
-import serial
 from pydantic import Field
 
 from bench.base import Clock, DeferredModule, DeviceConnectionError, DeviceError
@@ -25,11 +24,8 @@ from drivers.device import other_answer
 from drivers.serial_line import RESENDS, RepeatingLine, SerialSettings, lost_line, no_answer
 
 if TYPE_CHECKING:
-    import can
-
     from drivers.roboteq import slcan
 else:
-    can = DeferredModule("can")
     slcan = DeferredModule("drivers.roboteq.slcan")
 
 _MOST_DOWNLOADS = 64  # that are kept; a voltage that is held is commanded again and again
@@ -162,10 +158,7 @@ class NodeLine(RepeatingLine):
         self._quiet_at = -math.inf
         self.round_trip = 0.0
         self.answered = self.restarted = self.urgent = False
-        try:
-            self.port = self._adapter = slcan.open_adapter(device, settings, settings.bitrate, settings.node)
-        except (can.CanError, serial.SerialException, OSError, ValueError) as error:
-            raise DeviceConnectionError(device, f"cannot open {settings.port}: {_cause(error)}") from None
+        self.port = self._adapter = slcan.open_adapter(device, settings, settings.bitrate, settings.node)
         self._heard_at = clock.now()
 
     def close(self) -> None:
@@ -187,7 +180,7 @@ class NodeLine(RepeatingLine):
                 line = self._adapter.line()
                 if line is not None:
                     self._notice(line)
-        except (can.CanError, serial.SerialException, OSError) as error:
+        except OSError as error:
             raise self._lost(error) from None
 
     def read(self, item: Entry, sub: int) -> int:
@@ -242,7 +235,7 @@ class NodeLine(RepeatingLine):
         """Send a line; raises `DeviceConnectionError` if the line is lost."""
         try:
             self._adapter.transmit(line)
-        except (can.CanError, serial.SerialException, OSError) as error:
+        except OSError as error:
             raise self._lost(error) from None
 
     def synchronize(self, heads: tuple[bytes, ...], before: bytes = b"") -> Sequence[bytes]:
@@ -294,7 +287,7 @@ class NodeLine(RepeatingLine):
                     self._notice(line)
                 if clock.now() >= sent_at + adapter.patience:
                     break
-        except (can.CanError, serial.SerialException, OSError) as error:
+        except OSError as error:
             raise self._lost(error) from None
         return []
 
@@ -317,7 +310,7 @@ class NodeLine(RepeatingLine):
                 segment = self._exchange(self._request(bytes((0x60 | toggle,))))
             except DeviceConnectionError:
                 # CiA 301: the client ends a transfer that has stopped. The answer may still come.
-                with suppress(serial.SerialException, OSError):
+                with suppress(OSError):
                     self._adapter.transmit(self._request(b"\x80" + multiplexer + struct.pack("<I", _TIMED_OUT)))
                 raise
             if segment[0] & 0x10 != toggle:
@@ -358,7 +351,7 @@ class NodeLine(RepeatingLine):
                         raise AbortedError(int.from_bytes(answer[4:], "little"))
                     return answer
             self._quiet_at = sent_at + _LATEST * self._adapter.patience
-        except (can.CanError, serial.SerialException, OSError) as error:
+        except OSError as error:
             raise self._lost(error) from None
         self.resends = 0
         raise self._silence(adapter.refusals - refusals, adapter.strange, resends)
@@ -408,7 +401,7 @@ class NodeLine(RepeatingLine):
             self.restarted = self.restarted or state[0] == _BOOT_UP
 
     def _lost(self, error: BaseException) -> DeviceConnectionError:
-        return lost_line(self._device, self._settings, _cause(error))
+        return lost_line(self._device, self._settings.port, error)
 
     def _silence(self, refusals: int, strange: bytes, resends: int) -> DeviceConnectionError:
         settings = self._settings
@@ -430,10 +423,3 @@ def _set_of(heads: tuple[bytes, ...]) -> re.Pattern[bytes]:
 def described(item: Entry, sub: int) -> str:
     """Describe an object for messages."""
     return f"{item.title} (object 0x{item.index:04X}:{sub})"
-
-
-def _cause(error: BaseException) -> BaseException:
-    """Return the original cause of an error of python-can."""
-    while error.__cause__ is not None:
-        error = error.__cause__
-    return error

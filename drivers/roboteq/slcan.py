@@ -12,11 +12,10 @@ from collections import deque
 from collections.abc import Callable
 from contextlib import suppress
 
-import serial
 from can import CanError
 from can.interfaces.slcan import slcanBus
 
-from drivers.serial_line import OpenPort, SerialSettings, Share, patience_of, patient, shared_port
+from drivers.serial_line import OpenPort, SerialSettings, Share, cannot_open, patience_of, patient, shared_port
 
 _MOST_READS = 4096
 _LONGEST_LINE = 64
@@ -33,6 +32,8 @@ class SlcanAdapter(slcanBus):
     empty read means silence for the whole wait. Adapters differ in how they acknowledge a line: by a carriage
     return, by a line feed, or not at all. So an acknowledgement is not waited for.
 
+    Raises `DeviceConnectionError` if it cannot be opened.
+
     Attributes
     ----------
     refusals : int
@@ -47,12 +48,13 @@ class SlcanAdapter(slcanBus):
 
     transmit: Callable[[bytes], object]
 
-    def __init__(self, settings: SerialSettings, bitrate: int) -> None:
+    def __init__(self, device: str, settings: SerialSettings, bitrate: int) -> None:
         self.refusals = 0
         self.strange = b""
         self.inboxes: dict[int, deque[bytes]] = {}
         self._lines: deque[bytes] = deque()
         self._rest = b""
+        self._settings = settings
         try:
             super().__init__(
                 settings.port,
@@ -61,14 +63,14 @@ class SlcanAdapter(slcanBus):
                 sleep_after_open=0,
                 timeout=settings.timeout,
             )
-            self.serialPortOrig.write_timeout = settings.timeout
-            # An echo is a frame of the host's, which is nobody's here.
-            self._port = patient(self.serialPortOrig, settings)
-            self._settings = settings
-            self.transmit = self._port.write
-        except BaseException:
+        except BaseException as error:
             self._abandon()
+            if isinstance(error, CanError | OSError | ValueError):
+                raise cannot_open(device, settings.port, error) from None
             raise
+        # An echo is a frame of the host's, which is nobody's here.
+        self._port = patient(self.serialPortOrig, settings)
+        self.transmit = self._port.write
 
     @property
     def patience(self) -> float:
@@ -81,7 +83,7 @@ class SlcanAdapter(slcanBus):
         for _ in range(_MOST_READS):
             if lines:
                 return lines.popleft()
-            received = self._port.read_all() or self._port.read(1)
+            received = self._arrived() or self._port.read(1)
             if not received:
                 return None
             self._take(received)
@@ -89,7 +91,7 @@ class SlcanAdapter(slcanBus):
 
     def lines(self) -> list[bytes]:
         """Return the lines with a standard data frame that have arrived, without their ends."""
-        received = self._port.read_all()
+        received = self._arrived()
         if received and (self._rest or received not in _ACKNOWLEDGEMENTS):
             self._take(received)
         if not self._lines:
@@ -102,7 +104,7 @@ class SlcanAdapter(slcanBus):
         """Return the groups of all that has arrived, if it has this form; none otherwise, and `line` returns it."""
         if self._lines or self._rest:
             return ()
-        received = self._port.read_all()
+        received = self._arrived()
         found = pattern.fullmatch(received)
         if found is not None:
             return found.groups()
@@ -111,9 +113,30 @@ class SlcanAdapter(slcanBus):
 
     def release(self) -> None:
         """Close the channel and the port, in any state."""
-        with suppress(CanError, serial.SerialException, OSError):
+        with suppress(CanError, OSError):
             self.shutdown()
         self._abandon()
+
+    def _write(self, string: str) -> None:
+        """Send a line within the time-out; python-can's own waits for the last byte, however long it takes."""
+        port = self.serialPortOrig
+        if port.write_timeout is None:
+            port.write_timeout, port.exclusive = self._settings.timeout, True
+        port.write(string.encode() + self.LINE_TERMINATOR)
+
+    def _abandon(self) -> None:
+        port = getattr(self, "serialPortOrig", None)
+        if port is not None:
+            port.close()
+
+    def _arrived(self) -> bytes:
+        try:
+            received: bytes = self._port.read_all()
+        except OSError:
+            raise
+        except Exception as error:  # pyserial passes on those of a port that is closed
+            raise OSError(str(error)) from error
+        return received
 
     def _take(self, received: bytes) -> None:
         """Divide what has come into lines, and keep those with a frame."""
@@ -127,11 +150,6 @@ class SlcanAdapter(slcanBus):
         self._rest = rest if len(rest) <= _LONGEST_LINE else b""
         self._lines.extend([line for line in lines if line[:1] == b"t"])
         self.strange = next((line for line in lines if line[:1] not in _BEGINNINGS), self.strange)
-
-    def _abandon(self) -> None:
-        port = getattr(self, "serialPortOrig", None)
-        if port is not None:
-            port.close()
 
 
 class NodePort(Share):
@@ -204,12 +222,12 @@ class NodePort(Share):
 
 
 def open_adapter(device: str, settings: SerialSettings, bitrate: int, node: int) -> SlcanAdapter | NodePort:
-    """Open the adapter of a node, or join those that share it; raises what python-can and pyserial raise."""
+    """Open the adapter of a node, or join those that share it; raises what `SlcanAdapter` raises."""
     if not settings.line:
-        return SlcanAdapter(settings, bitrate)
+        return SlcanAdapter(device, settings, bitrate)
 
     def open_it() -> tuple[SlcanAdapter, Callable[[], object]]:
-        adapter = SlcanAdapter(settings, bitrate)
+        adapter = SlcanAdapter(device, settings, bitrate)
         return adapter, adapter.release
 
     return NodePort(shared_port(settings.port, device, open_it), device, node)

@@ -158,14 +158,14 @@ class SerialTransport:
         try:
             self.port.write(message)
         except OSError as error:  # pyserial's errors among them
-            raise lost_line(self._device, self._settings, error) from None
+            raise lost_line(self._device, self._settings.port, error) from None
 
     def read(self) -> bytes | None:
         """Return the next answer without its terminator, or None when none has come within the time-out."""
         try:
             answer: bytes = self.port.read_until(self._terminator, LONGEST_ANSWER)
         except OSError as error:
-            raise lost_line(self._device, self._settings, error) from None
+            raise lost_line(self._device, self._settings.port, error) from None
         if answer.endswith(self._terminator):
             self.unfinished = b""
             return answer.removesuffix(self._terminator)
@@ -177,7 +177,7 @@ class SerialTransport:
         try:
             forget_received(self.port)
         except OSError as error:
-            raise lost_line(self._device, self._settings, error) from None
+            raise lost_line(self._device, self._settings.port, error) from None
 
     def leave(self) -> None:
         """Wait until no late answer can come, so that a neighbour on the line does not take it for its own."""
@@ -185,7 +185,7 @@ class SerialTransport:
             try:
                 settle_line(self.port, (LATEST - 1) * self._settings.timeout)
             except OSError as error:
-                raise lost_line(self._device, self._settings, error) from None
+                raise lost_line(self._device, self._settings.port, error) from None
 
     def close(self) -> None:
         """Release the line."""
@@ -240,7 +240,7 @@ class VisaTransport:
         try:
             self._resource.write_raw(message)
         except self._errors as error:
-            raise lost_line(self._device, self._settings, error) from None
+            raise lost_line(self._device, self._settings.port, error) from None
 
     def read(self) -> bytes | None:
         """Return the next answer without its terminator, or None when none has come within the time-out."""
@@ -249,7 +249,7 @@ class VisaTransport:
         except self._errors as error:
             if getattr(error, "error_code", None) == self._timed_out:
                 return None
-            raise lost_line(self._device, self._settings, error) from None
+            raise lost_line(self._device, self._settings.port, error) from None
         return answer.removesuffix(self._terminator)
 
     def discard(self) -> None:

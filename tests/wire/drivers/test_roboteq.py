@@ -3,6 +3,7 @@
 import math
 
 import pytest
+import serial
 from cases import cases
 from faulty_line import InPieces
 from hypothesis import given, strategies as st
@@ -1228,10 +1229,8 @@ def test_zero_goes_to_the_own_channel_alone_after_a_command_of_zero(script, conn
 
 
 def test_adapter_that_could_not_be_opened_releases_its_port(script, connect, monkeypatch):
-    from can.interfaces import slcan
-
-    ports, usual = [], slcan.serial.serial_for_url
-    monkeypatch.setattr(slcan.serial, "serial_for_url", lambda *a, **k: ports.append(usual(*a, **k)) or ports[-1])
+    ports, usual = [], serial.serial_for_url
+    monkeypatch.setattr(serial, "serial_for_url", lambda *a, **k: ports.append(usual(*a, **k)) or ports[-1])
 
     def receive(_data):
         raise OSError("gone")
