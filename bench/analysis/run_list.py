@@ -10,7 +10,7 @@ from typing import Any
 
 from bench.base import ConfigurationError, DataError
 from bench.record import Record, file_name, find_journals
-from bench.rig import is_in_use
+from bench.rig import SAFE, is_in_use
 
 DAMAGED, RUNNING = "damaged", "running"
 _RESULT = re.compile(r"\b(RMS|error|spread)\b")
@@ -38,7 +38,8 @@ class ListedRun:
     steps : int
         Finished steps.
     result : str
-        The last note of the protocol that states an error, or why the run did not complete.
+        The devices that did not confirm their safe state at its end, else the last note of the protocol that states
+        an error, or why the run did not complete.
     changed : mapping
         Parameters that differ from their defaults, and values of the rig file that were replaced.
     values : mapping
@@ -126,6 +127,8 @@ def _listed(path: Path) -> ListedRun:
             status = RUNNING if record.status == "unfinished" and is_in_use(folder) else record.status
             damage = "" if status == RUNNING else record.damage()
             counted = "counts" in meta or damage
+            unsafe = ", ".join(name for name, state in record.safe_state.items() if state != SAFE)
+            result = main_result(record) if status == "completed" else record.reason
             return ListedRun(
                 folder,
                 DAMAGED if damage else status,
@@ -134,7 +137,7 @@ def _listed(path: Path) -> ListedRun:
                 str(meta["host"]["started"]),
                 meta.get("finished"),
                 int(meta.get("counts", {}).get("steps", 0)) if counted else len(record.steps()),
-                damage or (main_result(record) if status == "completed" else record.reason),
+                damage or "; ".join(filter(None, (unsafe and f"NOT in its safe state: {unsafe}", result))),
                 meta.get("changed", {}) | meta["overrides"],
                 {
                     **meta["parameters"],

@@ -128,7 +128,7 @@ class Group(_PlainParameters, TyperGroup):
         asks_for_help = any(word in HELP_OPTIONS["help_option_names"] for word in args[:1])
         is_meant = not self.no_args_is_help and not ctx.resilient_parsing if not args else not asks_for_help
         names = self.list_commands(ctx)
-        if self.otherwise and is_meant and args[:1] not in [[name] for name in names]:
+        if self.otherwise and is_meant and args[:1] not in [[name] for name in (*names, self.otherwise)]:
             word = args[0] if args else "-"
             if word[0] != "-" and not Path(word).exists() and (near := get_close_matches(word, names)):
                 raise ConfigurationError(f"{ctx.command_path}: there is no {word}; did you mean {near[0]}?")

@@ -12,13 +12,14 @@ from bench.dashboard.rerun_recording import RerunRecording, times
 from bench.record import Event, StepRecord
 
 _RUNNING = "running"
-_NOT_SETTLED = "not settled"
+_NOT_SETTLED, _NOT_SAFE = "not settled", "not safe"
 # Source: traffic lights: green goes on, amber waits, red is the end; blue is safe.
 _STATES: Mapping[str, Colour] = {
     _RUNNING: (66, 140, 92),
     "paused": (190, 146, 44),
     "interlock": (206, 62, 58),
     "safe": (64, 112, 176),
+    _NOT_SAFE: (206, 62, 58),
     "completed": (66, 140, 92),
     "aborted": (190, 146, 44),
     "failed": (206, 62, 58),
@@ -109,6 +110,8 @@ def _write_events(recording: RerunRecording, events: Sequence[tuple[int, Event]]
 
 def _state_after(event: Event) -> str | None:
     """Return the state of the run after an event; None if it changes nothing."""
+    if event.kind == "safe-state" and event.level == "ERROR":
+        return _NOT_SAFE
     return event.text if event.kind == "end" else _STATE_OF_EVENT.get(event.kind)
 
 

@@ -408,7 +408,8 @@ class Engine:
                 self._run.event("INFO" if ok else "ERROR", "safe-state", f"{name}: {state}")
             if pace is not None:
                 self._run.event("INFO", "clock", str(pace))
-            self._run.event("INFO" if error is None else "WARN", "end", status)
+            is_well = error is None and all(state == SAFE for state in safe_state.values())
+            self._run.event("INFO" if is_well else "WARN", "end", status)
             self._run.finish_messages()
             self._journal.finish(
                 status=status, reason=reason, finished=finished, safe_state=safe_state, lateness=late

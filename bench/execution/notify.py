@@ -168,7 +168,7 @@ class Notifier:
         self.is_told: Callable[[], bool] = lambda: False
         """Whether another process has told already that the run has failed; nobody is told twice."""
         self._values: Sequence[float] = ()
-        self._reason = ""
+        self._reasons: dict[str, None] = {}
         self._is_finished = False
 
     def start(self) -> None:
@@ -196,7 +196,7 @@ class Notifier:
     def event(self, event: Event) -> None:
         """Send a message, if it is an occasion for one."""
         if event.level == "ERROR":
-            self._reason = event.text
+            self._reasons[event.text] = None
         occasion = _OCCASIONS.get(event.kind)
         if occasion is None or (event.level == "INFO" and occasion not in ("prompt", "end")):
             return
@@ -204,10 +204,11 @@ class Notifier:
             occasion = "warning"  # of an interlock that does not end the run
         if occasion == "end" and event.level != "INFO" and self.is_told():
             return
+        reasons = "; ".join(self._reasons) if occasion == "end" else ""
         values = dict(zip(self.signals, self._values, strict=False))
         facts = {
             "event": occasion,
-            "text": f"{event.text}: {self._reason}" if occasion == "end" and self._reason else event.text,
+            "text": f"{event.text}: {reasons}" if reasons else event.text,
             "level": event.level,
             "t": event.t,
             "time": wall_time().isoformat(timespec="seconds"),

@@ -474,19 +474,16 @@ class Guardian:
             self._lines.end()
             self._stages = stages(self._rig)
             self._ending = now
-            self._next_try = now + _SAFE_WITHIN
-            self._next_stage()
+            self._next_stage(now, _SAFE_WITHIN)
             cause = self._core.cause
             self._box.note("safe", cause=None if cause is None else str(cause))
             if self._core.late and self._writes_stacks:
                 # It writes the stacks of its threads (`faulthandler`) into the folder of the run.
                 self._process.send(STACKS)
-        if not self._pending and self._stages:
-            self._next_stage()
+        if self._stages and (not self._pending or now >= self._next_try):
+            self._next_stage(now, self._ending + _SAFE_WITHIN - now)
         complete = not self._pending and not self._stages
         if self._safe is None and (complete or now - self._ending >= _SAFE_WITHIN):
-            while self._stages:
-                self._next_stage()
             self._report_safe()
             self._next_try = now + _TRY_AGAIN
         if self._safe is not None:
@@ -497,9 +494,10 @@ class Guardian:
             self._speak_for_bench(now)
             self._end_bench(now)
 
-    def _next_stage(self) -> None:
-        self._make_safe(self._stages[0])
-        del self._stages[0]
+    def _next_stage(self, now: float, left: float) -> None:
+        # One that is silent leaves time to those after it.
+        self._next_try = now + left / len(self._stages)
+        self._make_safe(self._stages.pop(0))
 
     def _make_safe(self, names: list[str]) -> None:
         for name in names:

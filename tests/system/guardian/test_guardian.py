@@ -272,6 +272,15 @@ class TestInterlocks:
 
 
 class TestReconnection:
+    def test_one_that_falls_silent_at_the_end_leaves_time_to_those_after_it(self, station, vo2):
+        made = station(safety__order='["tec", "psd"]', devices__tec__timeout="2.0")
+        vo2.control.hang("tec")
+        # A look at the interlocks waits for its answer then.
+        vo2.control.wait(vo2.control.time() + 0.5)
+        states = made.end()
+        assert states["tec"] != "safe"
+        assert states["psd"] == "safe"
+
     def test_a_line_that_comes_back_is_a_late_reply_and_news(self, station, vo2):
         it = station(devices__tec__watchdog="100", safety__reconnect="60")
         # It is lost after three requests of 0.2 s, and may be away for 2 s more. A guardian on a busy machine waits
