@@ -88,6 +88,11 @@ from .report.model_card import (
 from .report.page.comparison_page import (
     comparison_page as comparison_page,
 )
+from .report.page.elements import (
+    Page as Page,
+    PageSection as PageSection,
+    PageTable as PageTable,
+)
 from .report.page.render import (
     write_page as write_page,
 )

@@ -65,6 +65,7 @@ class BenchCommands(Group):
         "doctor": "bench rig check",
         "calibrate": "bench rig calibrate",
         "emulate": "bench rig emulate",
+        "shakedown": "bench rig check RIG --exercise",
         "find": "bench rig find",
         "torture": "bench rig torture",
         "design": "bench model design",

@@ -6,18 +6,20 @@ import math
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
+from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.markup import escape
 from rich.table import Table
 
-from bench.base import AbortError, ConfigurationError, DeviceError, show_table
+from bench.base import AbortError, ConfigurationError, DeviceError, show_table, wall_time
 from bench.cli.command_support import (
     UNSAFE_EXIT_CODE,
     AttachOption,
     JsonOption,
     OverrideOption,
+    check_outputs,
     complete_rig,
     parse_assignments,
     write_json,
@@ -152,38 +154,45 @@ def check(
     ] = False,
     attach: AttachOption = None,
     overrides: OverrideOption = None,
+    html: Annotated[
+        Path | None, typer.Option(metavar="FILE.html", help="Page of what was found, in one file.")
+    ] = None,
     json_file: JsonOption = None,
 ) -> None:
     """Check the instruments of a rig, and the rig file against them, before a run.
 
     Opens every line; identifies instruments and firmware; compares limits, ranges, watchdogs and interlocks; measures
     noise, and the time of a reading beside telemetry and watchdogs. Outputs are switched off; nothing moves without
-    `--exercise`. An emulated rig is checked in process.
+    `--exercise`, which looks at sign, scale, noise, settling and interlocks. An emulated rig is checked in process.
 
     Exit codes: 0 all is well; 1 something should be mended; 2 the rig file is wrong, or the rig is in use; 4 a device
     cannot be connected, is in error or fails to read; 7 at least one device did not confirm its safe state at the
     end. The highest counts.
     """
     from bench.base import Interrupts
+    from bench.devices import CheckFinding
     from bench.rig import check_up, load_rig, opened
 
     def keep_on() -> None:
         if interrupts.pause_requested or interrupts.abort_requested():
             raise AbortError("the check-up was ended; every device was brought into its safe state")
 
+    check_outputs(html=html, json_file=json_file)
     file = load_rig(rig, parse_assignments("--override", overrides or []))
     with Interrupts() as interrupts, opened(file, attach, "bench rig check") as place:
         place.clock.interrupted = lambda: interrupts.pause_requested or interrupts.abort_requested()
         checks = check_up(place, exercise, keep_on)
         name = place.file.name
-    table = Table("device", "what", "found", "what to do", box=None, padding=(0, 2))
-    for check in checks:
-        if check.identity:
-            table.add_row(f"[bold]{escape(check.device)}[/]", "instrument", escape(check.identity), "")
-        for finding in check.findings:
-            style = "yellow" if finding.advice else "default"
-            device, text, advice = map(escape, (check.device or f"rig {name}", finding.text, finding.advice))
-            table.add_row(f"[bold]{device}[/]", escape(finding.subject), f"[{style}]{text}[/]", advice)
+    heads = ("device", "what", "found", "what to do")
+    rows = [
+        (check.device or f"rig {name}", finding.subject, finding.text, finding.advice)
+        for check in checks
+        for finding in (*([CheckFinding("instrument", check.identity)] if check.identity else ()), *check.findings)
+    ]
+    table = Table(*heads, box=None, padding=(0, 2))
+    for row in rows:
+        device, what, text, advice = map(escape, row)
+        table.add_row(f"[bold]{device}[/]", what, f"[{'yellow' if advice else 'default'}]{text}[/]", advice)
     show_table(console, table)
     code = 0
     if any(finding.advice for check in checks for finding in check.findings):
@@ -193,7 +202,14 @@ def check(
     if any(check.unsafe for check in checks):
         code = UNSAFE_EXIT_CODE
     count = sum(bool(finding.advice) for check in checks for finding in check.findings)
-    console.print(f"{count} to look at" if count else "all is well", highlight=False)
+    verdict = f"{count} to look at" if count else "all is well"
+    console.print(verdict, highlight=False)
+    if html is not None:
+        from bench.analysis import Page, PageSection, PageTable, write_page
+
+        sections = [PageSection("Findings", [PageTable(heads, rows)])]
+        when = wall_time().isoformat(" ", "seconds")
+        write_page(html, Page(f"Check of rig {name}", when, verdict, "bad" if code else "good", (), sections))
     write_json(json_file, {"rig": name, "exit_code": code, "devices": [asdict(check) for check in checks]})
     if code:
         sys.exit(code)

@@ -86,6 +86,8 @@ def find_protocol(name: str) -> ProtocolDefinition:
         return _protocol_from_file(Path(path), wanted)
     packaged = packaged_protocols()
     if name not in packaged.protocols:
+        if name == "shakedown":
+            raise ConfigurationError("there is no protocol 'shakedown'; did you mean bench rig check RIG --exercise?")
         left_out = "".join(f"\n{problem}" for problem in packaged.problems)
         raise ConfigurationError(
             f"there is no protocol {name!r}; {closest(name, packaged.protocols, '`bench list`')} "

@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 from contextlib import ExitStack, contextmanager
+from html import unescape
 from pathlib import Path
 
 import pytest
@@ -363,8 +364,22 @@ class TestDoctor:
         reading = r"[-\d.]+ µm, noise [\d.]+ µm of 20 quick readings, [\d.]+ µm of 5 measurements \(stated: [\d.]+ µm"
         assert re.match(reading, texts["wire_end", "wire_end_position"])
         assert "supply_voltage went from 0.000 V to 0.100 V" in texts["supply", "exercise"]
-        assert "100% of the way" in texts["supply", "exercise"]
+        assert "100% of the way; noise " in texts["supply", "exercise"]
+        assert "2 interlocks looked at" in texts["supply", "exercise"]
         assert "not moved" in texts["stage", "exercise"]
+
+    def test_a_page_has_all_that_was_found(self, bench, tmp_path):
+        html = tmp_path / "check.html"
+        self.findings(bench, tmp_path, "vo2", "--exercise", "--html", html)
+        page = html.read_text()
+        for check in json.loads((tmp_path / "check.json").read_text())["devices"]:
+            assert all(unescape(page).count(finding["text"]) for finding in check["findings"])
+
+    def test_the_name_of_the_protocol_that_others_know_leads_there(self, bench):
+        for words in (["shakedown"], ["run", "shakedown", "--rig", "vo2"]):
+            code, _, err = bench(*words)
+            assert code == 2
+            assert "bench rig check RIG --exercise" in err
 
     def test_an_actuator_that_does_not_follow(self, bench, tmp_path):
         options = ["--exercise", "--override", "roles.drive.reading=tec_sink_temperature"]
@@ -376,6 +391,8 @@ class TestDoctor:
         ("override", "subject", "words"),
         [
             ("emulation.signals.supply_voltage.expression=0.5 * supply_output", "scale", "50% of the way"),
+            ("emulation.signals.supply_voltage.expression=-1.0 * supply_output", "exercise", "does not follow"),
+            ("roles.drive.dwell=0.01", "settling", "the dwell of its role is 0.01 s"),
             (
                 "interlocks=[{signal='supply_voltage', high=0.5}]",
                 "interlock",

@@ -10,7 +10,16 @@ from datetime import date
 from functools import partial
 from itertools import pairwise
 
-from bench.base import BenchError, Clock, DeviceConnectionError, DeviceError, difference_unit, prefixed, wall_time
+from bench.base import (
+    BenchError,
+    Clock,
+    DeviceConnectionError,
+    DeviceError,
+    counted,
+    difference_unit,
+    prefixed,
+    wall_time,
+)
 from bench.devices import Actuator, CheckFinding, Device, DeviceDescription, Limits, Signal, Status
 from bench.rig.calibration import Calibrated
 from bench.rig.file import RigFile
@@ -359,15 +368,22 @@ def _exercise(
     source = next((each for each in devices.values() if signal in (s.name for s in each.signals)), None)
     if source is None:
         return [CheckFinding("exercise", f"{signal} cannot be read, so {name} was not moved", "connect its device")]
+    read = next(each for each in source.signals if each.name == signal)
     quick, _ = _repeat(source.glance, GLANCES, clock)
     noise = deviation([values[signal] for values in quick])
     begin, target = quick[-1][signal], exercise_setpoint(role, device.limits)
-    near = max(_SIGNIFICANT * noise, _NEAR * abs(target - begin))
+    # Of a reading in another unit only that it moves is known.
+    way = target - begin if read.unit == device.limits.unit else math.nan
+    near = max(_SIGNIFICANT * noise, _NEAR * abs(way)) if way == way else 0.0
     start, value = clock.now(), begin
     seen: list[dict[str, float]] = []
+
+    def is_there() -> bool:
+        return abs(value - target) <= near if way == way else abs(value - begin) > _SIGNIFICANT * noise
+
     try:
         status = device.set(target)
-        while abs(value - target) > near and clock.now() - start < _PATIENCE and not _has_failed(status):
+        while not is_there() and clock.now() - start < _PATIENCE and not _has_failed(status):
             keep_on()
             clock.sleep(_LOOK)
             # Also what feeds a watchdog.
@@ -377,30 +393,36 @@ def _exercise(
         live, _ = _repeat(source.glance, GLANCES, clock)
     finally:
         device.safe()
-    moved, way = value - begin, target - begin
-    read = next(each for each in source.signals if each.name == signal)
-    is_same, setpoint = read.unit == device.limits.unit, device.setpoint_signal.display
-    part = f", {moved / way:.0%} of the way" if is_same and way else ""
+    moved, on = value - begin, _spread(live, signal)
+    setpoint = device.setpoint_signal.display
+    part = f", {moved / way:.0%} of the way" if way and way == way else ""
+    locks = [
+        each for each in place.file.interlocks if not each.minus and any(each.signal in values for values in seen)
+    ]
     text = (
-        f"set to {setpoint.bare(target)} {setpoint.unit}: {signal} went from "
-        f"{read.display.text(begin)} to {read.display.text(value)} within {seconds:.2g} s{part}"
+        f"set to {setpoint.bare(target)} {setpoint.unit}: {signal} went from {read.display.text(begin)} to "
+        f"{read.display.text(value)} within {seconds:.2g} s{part}; noise {_size(on, read)} then, "
+        f"{_size(noise, read)} before; {counted(len(locks), 'interlock')} looked at"
     )
     if problem is not None:
         return [CheckFinding("exercise", f"{text}: {problem}", "see that the output is connected and not blocked")]
-    follows = abs(way) <= near or (moved * way > 0 and abs(moved) > _SIGNIFICANT * noise)
+    follows = abs(way) <= near or (not moved * way <= 0.0 and abs(moved) > _SIGNIFICANT * noise)
     advice = "see that the output is connected, and the sensor on it"
     findings = [
         CheckFinding("exercise", text)
         if follows
         else CheckFinding("exercise", f"{text}, so it does not follow", advice)
     ]
-    if follows and is_same and abs(value - target) > near:
+    if follows and not is_there():
         advice = "compare its scale, calibration and limits with the rig file, or wait longer: it may be slow"
         findings.append(
             CheckFinding("scale", f"{signal} came {moved / way:.0%} of the way in {seconds:.0f} s", advice)
         )
+    if is_there() and seconds > (role.dwell or math.inf):
+        text = f"{signal} took {seconds:.2g} s for one increment; the dwell of its role is {role.dwell:g} s"
+        findings.append(CheckFinding("settling", text, "lengthen the dwell, or compare the load of the output"))
     # Not while it is on its way.
-    if abs(value - target) <= near and (on := _spread(live, signal)) > _MUCH_NOISE * max(noise, near / _SIGNIFICANT):
+    if is_there() and on > _MUCH_NOISE * max(noise, near / _SIGNIFICANT):
         advice = f"look for a ground loop between {name} and {source.name}, and for a shield that is open"
         findings.append(
             CheckFinding(
@@ -409,7 +431,7 @@ def _exercise(
                 advice,
             )
         )
-    return findings + _beyond(place.file.interlocks, seen, (*device.signals, *source.signals))
+    return findings + _beyond(locks, seen, (*device.signals, *source.signals))
 
 
 def _spread(readings: list[dict[str, float]], signal: str) -> float:
@@ -425,7 +447,7 @@ def _beyond(
     displays = {signal.name: signal.display for signal in signals}
     found = []
     for lock in locks:
-        values = [values[lock.signal] for values in seen if lock.signal in values and not lock.minus]
+        values = [values[lock.signal] for values in seen if lock.signal in values]
         if beyond := [value for value in values if not lock.low <= value <= lock.high]:
             shown = displays[lock.signal]
             allowed = shown.between(lock.low, lock.high)
