@@ -42,6 +42,7 @@ _NOT_A_NUMBER = 9.9e37
 """From here on a number of SCPI stands for infinity or for no number."""
 
 _LETTER = r"(?:[^\W\d_]|[°%/])"
+_THOUSANDS = re.compile(r"[0-9][.,'\s][0-9]{3}(?![0-9])")
 _EXPONENT = r"[eE][-+]?[0-9]"
 _NO_UNITS: Mapping[str, str] = MappingProxyType({})
 
@@ -182,8 +183,11 @@ class Template:
                 return str(error)
             return ""
         signs: tuple[Decimal, ...] = (".", ",")
-        if self.decimal is None and any(template(self.text, sign).match(message, units) for sign in signs):
-            return 'its comma may be a decimal sign: set the key decimal to "." or ","'
+        if any(template(self.text, other).match(message, units) for other in signs if other != self.decimal):
+            sign = "point" if self.decimal == "," else "comma"
+            return f'its {sign} may be a decimal sign: set the key decimal to "." or ","'
+        if _THOUSANDS.search(message):
+            return "thousands that are separated are not read: have the instrument send plain numbers"
         if self._compiled(guarded=False).fullmatch(message):
             return "{any} may stand for a part of the number, or for its unit: write {unit}, or the text itself"
         return ""

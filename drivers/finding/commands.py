@@ -100,5 +100,9 @@ def _write(path: Path, found: Iterable[Mapping[tuple[str, str], Mapping[str, Any
             if keys:
                 tables_of_kind = document.setdefault(kind, tomlkit.table(is_super_table=True))
                 tables_of_kind.setdefault(name, tomlkit.table()).update(keys)
+            # What the devices of a line say themselves may not stand in its table as well.
+            for device in document.get("devices", {}).values() if kind == "lines" else ():
+                for key in keys.keys() & device.keys() if device.get("line") == name else ():
+                    del device[key]
     write_whole(path, tomlkit.dumps(document))
     console.print(f"written: {path}", highlight=False)

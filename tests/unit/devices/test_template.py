@@ -152,6 +152,9 @@ def test_units_as_instruments_send_them(sent, wanted, value):
         ("{value}{any}", "500.0 mV", "{unit}"),
         ("{value}{unit}", "5 MV", "mV"),
         ("{value}{unit}", "5 A", "'A'"),
+        ("{value}", "1,5", "decimal"),
+        ("{value}", "1.234,5", "thousands"),
+        ("{value} {unit}", "12 345.5 mV", "thousands"),
         ("{value}", "OL", ""),
     ],
 )

@@ -113,7 +113,9 @@ def test_what_is_found_is_written_with_the_comments_kept(desk, bench, tmp_path):
 def test_instruments_on_a_shared_line_are_found_and_their_port_is_that_of_the_line(bench, tmp_path):
     with serve(str(SHARED), clock="x1") as rig:
         mine = tmp_path / "mine.toml"
-        mine.write_text(f'extends = {json.dumps(str(SHARED))}\nwithout = ["emulation"]\n')
+        # Each device says what is of the line, and wrongly.
+        text = SHARED.read_text().partition("\n[emulation")[0]
+        mine.write_text(text.replace("\naddress = ", "\necho = true  # perhaps\naddress = "))
         (port,) = {each.port for each in rig.instruments.values()}
         endpoints = json.loads(rig.endpoints_file.read_text())
         (tmp_path / "ports.json").write_text(json.dumps(endpoints | {"rig": "mine"}))
@@ -121,6 +123,7 @@ def test_instruments_on_a_shared_line_are_found_and_their_port_is_that_of_the_li
         assert code == 0, out + err
     written = load_rig(str(mine))
     assert {each.settings.port for each in written.devices} == {port}
+    assert {each.settings.echo for each in written.devices} == {False}
     assert tomllib.loads(mine.read_text())["lines"]["bus"]["port"] == port
 
 
