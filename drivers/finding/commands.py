@@ -46,33 +46,37 @@ def find(
 ) -> None:
     """List serial ports and LabJack T7s, and find out which device of a rig is at which of them.
 
-    At each port that nobody holds the devices of the rig are asked for in turn, each in its own dialect, and for
-    nothing but its identity: nothing is configured and nothing moves. An empty line shows whether an adapter echoes.
-    Where nothing answers, other speeds and parities are tried. Equal instruments are told apart by the key
-    serial_number.
+    At each port that nobody holds, those of the rig file among them, the devices of the rig are asked for in turn,
+    each in its own dialect, and for nothing but its identity: nothing is configured and nothing moves. An empty line
+    shows whether an adapter echoes. Where nothing answers, other speeds and parities are tried. Equal instruments
+    are told apart by the key serial_number.
 
     Exit codes: 0 every device was found, or there is no rig; 1 some were not, or are interchangeable; 2 the rig file
     is wrong.
     """
-    from bench.rig import load_rig, read_endpoints
+    from bench.rig import EMULATED, load_rig, port_of, read_endpoints
     from drivers.finding.places import answers, askable, keys_of, placements
     from drivers.finding.ports import ports
 
-    served: list[str] = []
+    asked: list[str] = []
+    if write and not (rig or "").endswith(".toml"):
+        why = f"{rig} is a packaged rig; copy its file, and give the path of the copy" if rig else "needs a rig file"
+        raise ConfigurationError(f"--write: {why}")
+    file = None if rig is None else load_rig(rig, parse_assignments("--override", overrides or []))
     if attach is not None:
         rigs = read_endpoints(attach).served.values()
-        served = [each.port for one in rigs for each in one.instruments.values()]
-    known = ports([*(further or []), *served], hosts or [], search=not served)
+        asked = [each.port for one in rigs for each in one.instruments.values()]
+    elif file is not None:
+        own = (port_of(entry.settings) for entry in askable(file))
+        asked = [port for port in own if not port.startswith((EMULATED, "visa://"))]
+    known = ports([*(further or []), *asked], hosts or [], search=attach is None)
     table = Table("port", "description", "USB serial number", "remark", box=None, padding=(0, 2))
     for each in known:
         table.add_row(*map(escape, (each.name, each.description, each.serial_number, each.problem)))
     show_table(console, table)
-    if rig is None:
+    if rig is None or file is None:
         write_json(json_file, {"ports": [asdict(each) for each in known], "devices": {}})
         return
-    if write and not rig.endswith(".toml"):
-        raise ConfigurationError(f"--write: {rig} is a packaged rig; copy its file, and give the path of the copy")
-    file = load_rig(rig, parse_assignments("--override", overrides or []))
     placed = placements(file, answers(file, known), known)
     table = Table("device", "port", "instrument", "remark", box=None, padding=(0, 2))
     for one in placed:

@@ -42,7 +42,7 @@ class Port:
     serial_number : str
         Of the USB adapter; empty if it has none.
     problem : str
-        Who holds it, or what permission is missing and how to get it; empty if it can be opened.
+        Who holds it, what permission is missing and how to get it, or that nothing is there; empty if it is free.
     """
 
     address: str
@@ -81,18 +81,27 @@ def ports(further: Iterable[str] = (), hosts: Iterable[str] = (), *, search: boo
         )
         for each in list_ports.comports()
     }
-    found |= {address: Port(address, problem=problem(address)) for address in further if address not in found}
-    for host in [*hosts, *(_t7s() if search else ())]:
-        address = f"tcp://{host if ':' in host else f'{host}:{T7_PORT}'}"
-        found[address] = Port(address, description="LabJack T7")
+    discovered = [f"tcp://{host}:{T7_PORT}" for host in (_t7s() if search else ())]
+    found |= {address: Port(address, description="LabJack T7") for address in discovered}
+    given = [f"tcp://{host if ':' in host else f'{host}:{T7_PORT}'}" for host in hosts]
+    for address in dict.fromkeys((*given, *further)):
+        if address not in found and os.path.realpath(address) not in found:
+            found[address] = Port(address, problem=problem(address))
     return list(found.values())
 
 
 def problem(address: str) -> str:
-    """Return why a serial port cannot be opened, and what to do; empty if nothing is known against it."""
+    """Return why a port or an address cannot be opened, and what to do; empty if nothing is known against it."""
+    if address.startswith("tcp://"):
+        host, _, number = address.removeprefix("tcp://").rpartition(":")
+        try:
+            socket.create_connection((host.strip("[]"), int(number)), _REPLIES).close()
+        except (OSError, ValueError, OverflowError) as error:
+            return f"cannot be reached ({error}): check address, cable and power"
+        return ""
     node = Path(address)
     if not node.exists():
-        return ""
+        return "" if "://" in address or os.name == "nt" else "there is no such port: check its name, cable and power"
     if not os.access(node, os.R_OK | os.W_OK):
         group = "dialout"
         with suppress(KeyError, OSError, NotImplementedError):

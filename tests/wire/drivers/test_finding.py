@@ -3,6 +3,7 @@
 import json
 import os
 import random
+import socket
 import threading
 import tomllib
 import tty
@@ -176,6 +177,29 @@ def test_a_port_that_is_held_is_named_and_not_asked(desk, bench):
     code, out, _ = bench("rig", "find", "--port", port)
     assert code == 0
     assert port in out
+
+
+def test_the_ports_of_the_rig_file_are_asked_although_no_system_lists_them(desk, bench, tmp_path):
+    file, rig = desk
+    mine = tmp_path / "mine.toml"
+    left_out = [f"devices.{each.name}" for each in load_rig(str(file)).devices if each.name not in ("tec_a", "psd")]
+    mine.write_text(
+        f"extends = {json.dumps(str(file))}\nwithout = {json.dumps(['emulation', *left_out])}\n"
+        f"devices.tec_a.port = {json.dumps(rig.port('tec_a'))}\ndevices.psd.port = {json.dumps(rig.port('t7_a'))}\n"
+    )
+    code, out, err = bench("rig", "find", mine, "--json", tmp_path / "found.json")
+    assert code == 0, out + err
+    found = json.loads((tmp_path / "found.json").read_text())["devices"]
+    assert {name: each["remark"] for name, each in found.items()} == {"tec_a": "", "psd": ""}
+
+
+def test_where_nothing_is_is_said_before_it_is_asked():
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        host = f"127.0.0.1:{listener.getsockname()[1]}"
+    for found in ports(["/dev/no-such-port"], [host, "127.0.0.1:99999"]):
+        if found.name.endswith(("no-such-port", host, ":99999")):
+            assert "check" in found.problem
+            assert "LabJack" not in found.description
 
 
 def test_a_missing_permission_says_what_to_do(tmp_path, monkeypatch):
