@@ -387,6 +387,19 @@ class TestDoctor:
         assert code == 1
         assert "does not follow" in findings["tec", "exercise"]["text"]
 
+    @cases(("factor", "code"), [(4, 0), (0, 1)])
+    def test_of_a_reading_in_another_unit_only_that_it_moves_is_known(self, bench, tmp_path, factor, code):
+        rig = Path(__file__).parents[2] / "examples/bench-supply.toml"
+        overrides = (
+            "roles.drive.reading=meter_temperature",
+            'roles.drive.unit="°C"',
+            f"emulation.signals.meter_temperature.constants.thermal_resistance={factor}00 K/W",
+        )
+        _, findings = self.findings(
+            bench, tmp_path, rig, "--exercise", *(word for each in overrides for word in ("--override", each))
+        )
+        assert [*findings] == [("supply", "watchdog"), *([("supply", "exercise")] if code else [])]
+
     @cases(
         ("override", "subject", "words"),
         [

@@ -371,15 +371,15 @@ def _exercise(
     read = next(each for each in source.signals if each.name == signal)
     quick, _ = _repeat(source.glance, GLANCES, clock)
     noise = deviation([values[signal] for values in quick])
-    begin, target = quick[-1][signal], exercise_setpoint(role, device.limits)
-    # Of a reading in another unit only that it moves is known.
+    begin, target = _mean(quick, signal), exercise_setpoint(role, device.limits)
+    # Of a reading in another unit only that it moves is known, which is looked at in the end.
     way = target - begin if read.unit == device.limits.unit else math.nan
-    near = max(_SIGNIFICANT * noise, _NEAR * abs(way)) if way == way else 0.0
+    near = max(_SIGNIFICANT * noise, _NEAR * abs(way)) if way == way else -1.0
     start, value = clock.now(), begin
     seen: list[dict[str, float]] = []
 
     def is_there() -> bool:
-        return abs(value - target) <= near if way == way else abs(value - begin) > _SIGNIFICANT * noise
+        return abs(value - target) <= near
 
     try:
         status = device.set(target)
@@ -393,6 +393,8 @@ def _exercise(
         live, _ = _repeat(source.glance, GLANCES, clock)
     finally:
         device.safe()
+    if way != way:
+        value = _mean(live, signal)
     moved, on = value - begin, _spread(live, signal)
     setpoint = device.setpoint_signal.display
     part = f", {moved / way:.0%} of the way" if way and way == way else ""
@@ -413,7 +415,7 @@ def _exercise(
         if follows
         else CheckFinding("exercise", f"{text}, so it does not follow", advice)
     ]
-    if follows and not is_there():
+    if follows and way == way and not is_there():
         advice = "compare its scale, calibration and limits with the rig file, or wait longer: it may be slow"
         findings.append(
             CheckFinding("scale", f"{signal} came {moved / way:.0%} of the way in {seconds:.0f} s", advice)
@@ -432,6 +434,10 @@ def _exercise(
             )
         )
     return findings + _beyond(locks, seen, (*device.signals, *source.signals))
+
+
+def _mean(readings: list[dict[str, float]], signal: str) -> float:
+    return math.fsum(each[signal] for each in readings) / len(readings)
 
 
 def _spread(readings: list[dict[str, float]], signal: str) -> float:
