@@ -1,3 +1,14 @@
+from .applied import (
+    Applied as Applied,
+    apply_model as apply_model,
+    compare_models as compare_models,
+    load_models as load_models,
+    predict as predict,
+    rows_table as rows_table,
+)
+from .applied_figures import (
+    errors_text as errors_text,
+)
 from .band_columns import (
     BandedPrediction as BandedPrediction,
     invert_band as invert_band,
@@ -6,13 +17,6 @@ from .designs import (
     assess_designs as assess_designs,
     continue_file as continue_file,
     write_sequence as write_sequence,
-)
-from .examined import (
-    Examined as Examined,
-    compare_models as compare_models,
-    examine as examine,
-    load_models as load_models,
-    predict as predict,
 )
 from .export.run_export import (
     export_run as export_run,
@@ -75,12 +79,6 @@ from .notebook import (
 )
 from .picture import (
     Picture as Picture,
-)
-from .prediction_figures import (
-    errors_text as errors_text,
-)
-from .predictions import (
-    Predictions as Predictions,
 )
 from .report.model_card import (
     write_card as write_card,

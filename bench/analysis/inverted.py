@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from bench.analysis.predictions import check_finite
+from bench.analysis.applied import check_finite
 from bench.analysis.tables.starting_state import bind_times, starting_state
 from bench.base import ConfigurationError, DataError, Floats
 from bench.identification import Beyond, ModelFile

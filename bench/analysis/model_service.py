@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from bench.analysis.applied import Applied
 from bench.analysis.band_columns import BandedPrediction, band_of, calibrate
 from bench.analysis.picture import Picture
-from bench.analysis.predictions import Predictions
 from bench.analysis.tables.data import check_variation, is_run
 from bench.analysis.tables.dataset import Dataset, digest
 from bench.analysis.transients.transient_dynamics import (
@@ -167,9 +167,9 @@ class IdentifiedFile:
 
         Raises DataError if the measurements cannot be read again.
         """
-        from bench.analysis.prediction_figures import draw_predictions
+        from bench.analysis.applied_figures import draw_in
 
-        return Picture.drawn_by(lambda folder: draw_predictions(self.predictions(), folder, self.file.name)[0])
+        return Picture.drawn_by(lambda folder: draw_in(folder, "fit", {self.file.name: self.applied()})[0])
 
     def _repr_html_(self) -> str:
         lines = certificate_lines(self, verbose=False)
@@ -233,11 +233,10 @@ class IdentifiedFile:
         """The prediction band; None if none was calibrated."""
         return band_of(self.file)
 
-    def predictions(self) -> Predictions:
+    def applied(self) -> Applied:
         """Return the outputs of the model beside the measurements, as the fit has them."""
-        name, found = self.file.name, self.identification
-        predicted = {name: self.outputs - found.residuals}
-        return Predictions.of(self.file, self.data, predicted, found.skip, {name: self.band})
+        found = self.identification
+        return Applied.to(self.data, self.file, self.outputs - found.residuals, found.skip, found.initial_state)
 
     def summary(self) -> dict[str, Any]:
         """Return the result for programs."""

@@ -11,7 +11,7 @@ from bench.base import Floats, print_plain, significant
 from bench.cli.printing import console, print_rows, warn
 
 if TYPE_CHECKING:
-    from bench.analysis import BandedPrediction, Examined, Session
+    from bench.analysis import Applied, BandedPrediction, Session
 
 BandOption = Annotated[
     bool,
@@ -57,19 +57,19 @@ def print_band(found: BandedPrediction, residuals: Floats | None = None, name: s
     print_plain(console, (f"{name}: " if name else "") + found.text(residuals))
 
 
-def print_examined(found: Examined, name: str = "", *, bands: bool = True) -> None:
+def print_applied(found: Applied, name: str = "", *, bands: bool = True) -> None:
     """Print what was estimated of a session, and the band unless it is unwanted; `name` is that of the model."""
     from bench.analysis import session_rows
 
     for text in found.warnings():
         warn(f"{name}: {text}" if name else text)
     if found.recalibration is not None:
-        rows = session_rows(found.recalibration, found.predicted.size, found.units)
+        rows = session_rows(found.recalibration, found.predicted.size, (found.input.unit, found.unit))
         errors = found.errors()
-        after = f"max {significant(errors.maximum, 4)}, RMS {significant(errors.rms, 4)} {found.units[1]}".rstrip()
+        after = f"max {significant(errors.maximum, 4)}, RMS {significant(errors.rms, 4)} {found.unit}".rstrip()
         title = f"recalibration of {name}" if name else "recalibration"
         print_rows(title, [*rows, ("errors after it", after)])
     if bands and found.band is not None:
-        print_band(found.band, found.residuals, name)
+        print_band(found.band, found.counted, name)
     elif bands and name:
         warn(f"{name} has no prediction band; `bench identify --band` calibrates one")

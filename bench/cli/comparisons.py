@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from bench.base import percent, print_plain, show_patience, show_table, significant
-from bench.cli.band_options import BandsOption, Recalibrating, print_examined
+from bench.cli.band_options import BandsOption, Recalibrating, print_applied
 from bench.cli.command_support import JsonOption, check_outputs, write_json
 from bench.cli.data_options import FiguresOption, ReadingGroup, SkipOption, offer_groups, print_assumptions
 from bench.cli.model_commands import InitialOption
@@ -89,10 +89,10 @@ def models_on_data(
             f"{entry.offset:+.4g}", significant(mended.maximum, 4), significant(mended.rms, 4),
         )  # fmt: skip
     show_table(console, table)
-    for name, examined in result.examined.items():
-        print_examined(examined, name, bands=bands)
+    for name, applied in result.applied.items():
+        print_applied(applied, name, bands=bands)
     if out is not None:
-        write_rows(out, result.predictions)
+        write_rows(out, result.applied)
     if figures is not None:
         from bench.analysis import draw_comparison
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from bench.base import ConfigurationError, DataError, counted, print_plain, show_patience
-from bench.cli.band_options import BandOption, Recalibrating, print_band, print_examined
+from bench.cli.band_options import BandOption, Recalibrating, print_applied, print_band
 from bench.cli.choice_options import (
     Comparing,
     print_choice,
@@ -344,9 +344,8 @@ def predict_(
     """
     from bench.analysis import (
         ColumnNames,
-        Predictions,
+        apply_model,
         error_lines,
-        examine,
         foreign_drift,
         read_for,
         starting_state,
@@ -364,26 +363,24 @@ def predict_(
     if session is None and (warning := foreign_drift(model, inputs)):
         warn(warning)
     start = starting_state(model, inputs, initial=initial, skip=skip, continue_memory=continue_memory)
-    found = examine(model, data, state=start.state, session=session, skip=start.skip)
-    unit = model.response.output_unit
-    rows = Predictions.of(model, data, {model.name: found.predicted}, found.first, {model.name: found.band})
+    found = apply_model(model, data, state=start.state, session=session, skip=start.skip)
     result: dict[str, Any] = {"model": model.name, "samples": int(inputs.size), "out": str(out), **found.to_json()}
-    print_examined(found)
+    print_applied(found)
     if data.output is not None:
-        errors = rows.errors()[model.name]
+        errors = found.errors()
         result |= {**errors.to_json(), "skipped": found.first}
         print_rows(
             f"{model.name} on {file.name}",
             (
                 ("samples", f"{inputs.size - found.first} (skipped: {found.first})"),
-                *error_lines(errors, unit),
+                *error_lines(errors, found.unit),
             ),
         )
-    write_rows(out, rows)
+    write_rows(out, {model.name: found})
     if figures is not None:
         from bench.analysis import draw_predicted
 
-        print_figures(draw_predicted(rows, figures))
+        print_figures(draw_predicted(found, figures))
     write_json(json_file, result)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -10,7 +10,7 @@ from bench.base import counted, print_plain
 from bench.cli.printing import console
 
 if TYPE_CHECKING:
-    from bench.analysis import Predictions
+    from bench.analysis import Applied
 
 
 def print_figures(paths: Iterable[Path]) -> None:
@@ -19,13 +19,13 @@ def print_figures(paths: Iterable[Path]) -> None:
         print_plain(console, f"figure: {path}")
 
 
-def write_rows(path: Path, found: Predictions) -> None:
+def write_rows(path: Path, found: Mapping[str, Applied]) -> None:
     """Write models beside measurements as CSV, and print where.
 
     Raises DataError if the file cannot be written.
     """
-    from bench.analysis import write_csv
+    from bench.analysis import rows_table, write_csv
 
-    table = found.table()
+    table = rows_table(found)
     write_csv(path, [head for head, _ in table], [values for _, values in table])
-    print_plain(console, f"{counted(found.input.values.size, 'row')}: {path}")
+    print_plain(console, f"{counted(len(table[0][1]), 'row')}: {path}")

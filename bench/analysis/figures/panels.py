@@ -74,7 +74,7 @@ def plot_panels(
 def time_axis(seconds: float) -> tuple[float, str]:
     """Return the factor from s to the unit of a time axis of this length, and its label."""
     factor, unit = next((1.0 / each, unit) for each, unit, most in _TIMES if seconds <= most)
-    return factor, f"laboratory time / {unit}"
+    return factor, f"time / {unit}"
 
 
 _TIMES = ((1.0, "s", 600.0), (60.0, "min", 4 * 3600.0), (3600.0, "h", math.inf))

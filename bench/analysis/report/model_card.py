@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from bench.analysis.applied import Applied
 from bench.analysis.model_service import IdentifiedFile, certificate_lines
-from bench.analysis.predictions import Predictions
 from bench.analysis.tables.data import Quantity
 from bench.base import DataError, percent, significant, write_result
 from bench.identification import Errors
@@ -80,7 +80,7 @@ def model_card(
     `source` and `digest` are the name of the data and their SHA-256 digest; `model` is the name of the model file,
     empty if there is none.
     """
-    rows = found.predictions()
+    rows = found.applied()
     measured = rows.measured
     assert measured is not None
     sections = {
@@ -112,9 +112,7 @@ def model_card(
     return "\n\n".join(parts) + "\n"
 
 
-def _data(
-    found: IdentifiedFile, rows: Predictions, outputs: Quantity, source: str, digest: str
-) -> list[tuple[str, str]]:
+def _data(found: IdentifiedFile, rows: Applied, outputs: Quantity, source: str, digest: str) -> list[tuple[str, str]]:
     skip = found.identification.skip
     first = f", of which the first {skip} drive the memory and count in no error" if skip else ""
     return [

@@ -11,15 +11,13 @@ from rich.console import Console
 from rich.table import Table as Columns
 from rich.text import Text
 
-from bench.analysis.examined import ComparedModels
+from bench.analysis.applied import Applied, ComparedModels, apply_to_run, models_of
+from bench.analysis.applied_figures import draw_in
 from bench.analysis.export.run_export import make_folder
 from bench.analysis.figures.canvas import check_matplotlib
 from bench.analysis.figures.fits import plot_errors
 from bench.analysis.figures.planes import plot_coverage, plot_densities
 from bench.analysis.model_service import IdentifiedFile
-from bench.analysis.models_on_run import ModelOnRun, apply_models, models_of
-from bench.analysis.prediction_figures import draw_predictions
-from bench.analysis.predictions import Predictions
 from bench.analysis.report.page.elements import PagePart, PageTable, PageText
 from bench.analysis.report.page.model_parts import errors_parts
 from bench.analysis.report.page.render import write_page
@@ -98,12 +96,12 @@ def report_run(
             print_plain(console, line)
         figures = _draw_run(record, steps, summary, folder, figure_format)
         compared = [*models_of(record), *_given_with_band(record), *models]
-        applied = apply_models(record, steps, compared) if len(steps) else []
+        applied = apply_to_run(record, steps, compared) if len(steps) else []
         comparison = {
             each.file.name: {
-                **each.errors.to_json(),
+                **each.errors().to_json(),
                 "unit": each.unit,
-                "skipped": each.skip,
+                "skipped": each.first,
                 "beyond": each.beyond.to_json(),
             }
             for each in applied
@@ -145,16 +143,16 @@ def draw_comparison(result: ComparedModels, out: Path) -> list[Path]:
     path = folder / "residuals.png"
     plot_errors(
         path,
-        result.predictions.residuals(),
+        {name: each.residuals for name, each in result.applied.items()},
         error_label=with_unit("error", result.unit),
         skip=result.skip,
     )
-    return [path, *draw_predictions(result.predictions, folder, "models")]
+    return [path, *draw_in(folder, "models", result.applied)]
 
 
-def draw_predicted(found: Predictions, out: Path) -> list[Path]:
+def draw_predicted(found: Applied, out: Path) -> list[Path]:
     """Draw the outputs of one model; return the files."""
-    return draw_predictions(found, make_folder(out), next(iter(found.predicted)))
+    return draw_in(make_folder(out), found.file.name, {found.file.name: found})
 
 
 def draw_identification(found: IdentifiedFile, out: Path) -> list[Path]:
@@ -162,7 +160,7 @@ def draw_identification(found: IdentifiedFile, out: Path) -> list[Path]:
     folder = make_folder(out)
     operator = found.file.response
     name = found.file.name
-    paths = draw_predictions(found.predictions(), folder, name)
+    paths = draw_in(folder, name, {name: found.applied()})
     for density in operator.densities():
         paths.append(folder / f"{name}-density.png")
         # What the samples of the fit swept; the coverage is that of all.
@@ -247,7 +245,7 @@ def _given_with_band(record: Record) -> list[ModelFile]:
     ]
 
 
-def _draw_errors(models: Sequence[ModelOnRun], folder: Path, figure_format: str) -> list[Path]:
+def _draw_errors(models: Sequence[Applied], folder: Path, figure_format: str) -> list[Path]:
     if not models:
         return []
     path = folder / f"errors.{figure_format}"
@@ -256,7 +254,7 @@ def _draw_errors(models: Sequence[ModelOnRun], folder: Path, figure_format: str)
         path,
         residuals,
         error_label=with_unit("error", models[0].unit),
-        skip=models[0].skip,
+        skip=models[0].first,
         bands={each.file.name: (each.band.label, each.band.half_width) for each in models if each.band is not None},
     )
     return [path]

@@ -7,14 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from bench.analysis.figures.fits import plot_fit
-from bench.analysis.figures.panels import time_axis
+from bench.analysis.applied import Applied
+from bench.analysis.applied_figures import draw_applied
 from bench.analysis.figures.planes import plot_coverage, plot_densities
-from bench.analysis.models_on_run import ModelOnRun
-from bench.analysis.prediction_figures import errors_text
 from bench.analysis.report.page.elements import PageFigure, PagePart, PageSection, PageTable, PageText
 from bench.analysis.report.page.svg import inlined
-from bench.base import Floats, fitting_prefix, percent, significant, with_unit
+from bench.base import Floats, fitting_prefix, percent, significant
 from bench.identification import CoefficientUncertainties, ModelFile, coefficient_uncertainties
 from bench.models import MemoryCurve, TimedModel
 
@@ -22,7 +20,7 @@ _FEW_COEFFICIENTS = 30
 """So many coefficients are listed one by one without being asked for."""
 
 
-def models_section(models: Sequence[ModelOnRun], times: Floats, scratch: Path) -> PageSection:
+def models_section(models: Sequence[Applied], times: Floats, scratch: Path) -> PageSection:
     """Return loops and residuals of models, their errors, bands and coefficients.
 
     There is one model at least. `times`, shape (N,), has the laboratory time of each reading, s.
@@ -55,11 +53,11 @@ def given_section(files: Sequence[tuple[str, ModelFile]], scratch: Path) -> Page
     return PageSection("Models that the run was given", (PageTable(heads, rows), *figures))
 
 
-def errors_parts(models: Sequence[ModelOnRun]) -> list[PageTable | PageText]:
+def errors_parts(models: Sequence[Applied]) -> list[PageTable | PageText]:
     """Return the errors of models, one at least, and what a reader should know of them."""
     rows = []
     for model in models:
-        errors = model.errors
+        errors = model.errors()
         numbers = (errors.maximum, errors.rms, errors.average)
         factor, unit = fitting_prefix(model.unit, *numbers, least=0.1)
         cells = [significant(factor * number, 4) for number in numbers]
@@ -74,69 +72,45 @@ def errors_parts(models: Sequence[ModelOnRun]) -> list[PageTable | PageText]:
         )
     heads = ("model", "kind", "max", "RMS", "mean absolute", "unit", "RMS / % of range")
     table = PageTable(heads, rows, title="models on this run", numbers_from=2)
-    skip = models[0].skip
+    skip = models[0].first
     skipped = [f"readings 1 to {skip} drive the memory of the models and count in no error"] if skip else []
     remarks = [f"{model.file.name}: {text}" for model in models if (text := model.beyond.text())]
     return [table, *map(PageText, [*skipped, *remarks])]
 
 
-def _by_signals(models: Sequence[ModelOnRun]) -> list[list[ModelOnRun]]:
-    groups: dict[tuple[str, str], list[ModelOnRun]] = {}
+def _by_signals(models: Sequence[Applied]) -> list[list[Applied]]:
+    groups: dict[tuple[str, str], list[Applied]] = {}
     for model in models:
-        groups.setdefault((model.inputs.name, model.measured.name), []).append(model)
+        assert model.measured is not None
+        groups.setdefault((model.input.name, model.measured.name), []).append(model)
     return list(groups.values())
 
 
-def _fits(models: Sequence[ModelOnRun], times: Floats, scratch: Path, number: int) -> Iterator[PageFigure]:
-    first = models[0]
-    names = [model.file.name for model in models]
-    titles = {model.file.name: f"{model.file.name}: {errors_text(model.errors, model.unit)}" for model in models}
-    factor, unit = fitting_prefix(first.unit, float(np.abs(first.measured.values).max(initial=0.0)))
-    input_factor, input_unit = fitting_prefix(first.inputs.unit, float(np.abs(first.inputs.values).max(initial=0.0)))
-    per_second, time_label = time_axis(float(times.max(initial=0.0)))
-    for kind, horizontal, label in (
-        ("loops", input_factor * first.inputs.values, with_unit(first.inputs.title, input_unit)),
-        ("time", per_second * times, time_label),
-    ):
-        path = scratch / f"{kind}-{number}.svg"
-        plot_fit(
-            path,
-            horizontal,
-            factor * first.measured.values,
-            {model.file.name: factor * model.predicted for model in models},
-            horizontal_label=label,
-            output_label=with_unit(first.measured.title, unit),
-            error_label=with_unit("residual", unit),
-            titles=titles,
-            skip=first.skip,
-            bands={
-                model.file.name: (model.band.label, factor * model.band.half_width)
-                for model in models
-                if model.band is not None
-            },
-        )
-        over = first.inputs.title if kind == "loops" else "time"
+def _fits(models: Sequence[Applied], times: Floats, scratch: Path, number: int) -> Iterator[PageFigure]:
+    first, by_name = models[0], {model.file.name: model for model in models}
+    assert first.measured is not None
+    paths = draw_applied(by_name, scratch / f"loops-{number}.svg", scratch / f"time-{number}.svg", times)
+    shaded = " Shaded: prediction bands." if any(model.band for model in models) else ""
+    for path, over in zip(paths, (first.input.title, "time"), strict=True):
         caption = (
-            f"{first.measured.title} over {over}: measured (points) and {', '.join(names)} (lines); below, what each "
-            "leaves, on one scale."
+            f"{first.measured.title} over {over}: measured (points) and {', '.join(by_name)} (lines); below, what "
+            f"each leaves, on one scale.{shaded}"
         )
-        if any(model.band is not None for model in models):
-            caption += " Shaded: prediction bands."
         yield PageFigure(inlined(path, caption), caption)
 
 
-def _bands(model: ModelOnRun) -> Iterator[PageTable | PageText]:
+def _bands(model: Applied) -> Iterator[PageTable | PageText]:
     if model.band is None:
         return
-    covered = model.band.coverage(model.residuals[model.skip :])
+    covered = model.band.coverage(model.residuals[model.first :])
     rows = [*model.band.rows(), ("covers of the readings", f"{100.0 * covered:.1f} %")]
     yield PageTable(("", ""), rows, title=f"prediction band of {model.file.name}")
 
 
-def _details(model: ModelOnRun, scratch: Path, number: int) -> Iterator[PagePart]:
+def _details(model: Applied, scratch: Path, number: int) -> Iterator[PagePart]:
     operator, name = model.file.operator, model.file.name
-    inputs = model.inputs.values
-    found = coefficient_uncertainties(operator, inputs, model.residuals, model.state, model.skip)
+    inputs = model.input.values
+    found = coefficient_uncertainties(operator, inputs, model.residuals, model.state, model.first)
     coverage = operator.coverage(inputs, model.state)
     cells = 0 if coverage is None else coverage.swept.size
     for i, density in enumerate(operator.densities()):
@@ -157,7 +131,7 @@ def _details(model: ModelOnRun, scratch: Path, number: int) -> Iterator[PagePart
     yield _coefficients(model, found, cells)
 
 
-def _details_in_time(model: ModelOnRun, scratch: Path, number: int) -> Iterator[PageFigure | PageTable]:
+def _details_in_time(model: Applied, scratch: Path, number: int) -> Iterator[PageFigure | PageTable]:
     for i, density in enumerate(model.file.model.densities()):
         path = scratch / f"density-{number}-{i}.svg"
         plot_densities(path, [density])
@@ -168,7 +142,7 @@ def _details_in_time(model: ModelOnRun, scratch: Path, number: int) -> Iterator[
     yield PageTable(heads, rows, title=f"parameters of {model.file.name}", numbers_from=1)
 
 
-def _coefficients(model: ModelOnRun, found: CoefficientUncertainties, cells: int) -> PageTable:
+def _coefficients(model: Applied, found: CoefficientUncertainties, cells: int) -> PageTable:
     operator = model.file.operator
     values = operator.coefficients
     rows = [("bias", f"{operator.bias:.6g}", "")]
@@ -192,13 +166,13 @@ def _coefficients(model: ModelOnRun, found: CoefficientUncertainties, cells: int
     )
 
 
-def _is_one_plane(model: ModelOnRun, cells: int) -> bool:
+def _is_one_plane(model: Applied, cells: int) -> bool:
     """Return whether the first coefficients of a model are the cells of its only density."""
     densities = model.file.operator.densities()
     return len(densities) == 1 and cells == np.tril_indices(len(densities[0].values))[0].size
 
 
-def _coefficient_name(model: ModelOnRun, k: int, cells: int) -> str:
+def _coefficient_name(model: Applied, k: int, cells: int) -> str:
     if k < cells and _is_one_plane(model, cells):
         levels = model.file.operator.densities()[0].levels
         i, j = (int(index[k]) for index in np.tril_indices(levels.size - 1))

@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from bench.analysis.applied import Applied
 from bench.analysis.figures.panels import plot_histogram
 from bench.analysis.figures.targets import plot_tracking
-from bench.analysis.models_on_run import ModelOnRun
 from bench.analysis.report.page.elements import Page, PageFigure, PagePart, PageSection, PageTable
 from bench.analysis.report.page.model_parts import given_section, models_section
 from bench.analysis.report.page.run_parts import (
@@ -46,7 +46,7 @@ def run_page(
     record: Record,
     steps: Table,
     summary: TelemetrySummary,
-    models: Sequence[ModelOnRun],
+    models: Sequence[Applied],
     result: Mapping[str, Any],
     published: Sequence[Published] = (),
 ) -> Page:
@@ -100,7 +100,7 @@ def _lead(
     record: Record,
     steps: int,
     found: Sequence[Phase],
-    models: Sequence[ModelOnRun],
+    models: Sequence[Applied],
     result: Mapping[str, Any],
     events: Sequence[Event],
 ) -> list[str]:
@@ -139,7 +139,8 @@ def _lead(
                 f"{controlled} was {words} with an error of {_errors_in_words(record, controlled, result[key])}."
             )
     for model in models:
-        errors = model.errors
+        assert model.measured is not None
+        errors = model.errors()
         display = _signal(record, model.measured.name).display
         lead.append(
             f"Model {model.file.name} is off by at most {display.text(errors.maximum)}, RMS "
