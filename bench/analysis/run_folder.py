@@ -86,18 +86,16 @@ class RunFolder:
         DataError
             If there is nothing to draw, or the journal cannot be read.
         """
-        from bench.analysis.report.run_figures import draw_loops, draw_signals, phases
-        from bench.analysis.report.telemetry_summary import summarize
+        from bench.analysis.report.recorded_run import RecordedRun
+        from bench.analysis.report.run_figures import draw_loops, draw_signals
 
         def draw(folder: Path) -> Path:
             with Record(self.folder) as record:
-                steps, summary = record.steps(), summarize(record)
-                known = record, steps, summary, phases(record, steps, record.events())
+                run, path = RecordedRun.of(record), folder / "signals.png"
                 if kind == "loops":
-                    drawn = next((path for path, _ in draw_loops(folder, "png", *known)), None)
+                    drawn = next((path for path, _ in draw_loops(folder, "png", run)), None)
                 else:
-                    path = folder / "signals.png"
-                    drawn = path if draw_signals(path, *known) else None
+                    drawn = path if draw_signals(path, run) else None
             if drawn is None:
                 raise DataError(f"{self.folder}: there are no {kind} to draw")
             return drawn

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +10,7 @@ from rich.console import Console
 from rich.table import Table as Columns
 from rich.text import Text
 
-from bench.analysis.applied import Applied, ComparedModels, apply_to_run, models_of
+from bench.analysis.applied import Applied, ComparedModels
 from bench.analysis.applied_figures import draw_in
 from bench.analysis.export.run_export import make_folder
 from bench.analysis.figures.canvas import check_matplotlib
@@ -21,18 +20,15 @@ from bench.analysis.model_service import IdentifiedFile
 from bench.analysis.report.page.elements import PagePart, PageTable, PageText
 from bench.analysis.report.page.model_parts import errors_parts
 from bench.analysis.report.page.render import write_page
-from bench.analysis.report.page.run_page import run_page
-from bench.analysis.report.page.run_parts import signals_table, watched_pairs
+from bench.analysis.report.page.run_page import run_page, signals_table
 from bench.analysis.report.published import Published
-from bench.analysis.report.run_figures import draw_loops, draw_signals, phases
-from bench.analysis.report.telemetry_summary import TelemetrySummary, summarize, wider, without_priors
+from bench.analysis.report.recorded_run import RecordedRun
+from bench.analysis.report.run_figures import draw_loops, draw_signals
 from bench.analysis.report.uncertainty_tables import uncertainty_parts
-from bench.analysis.tracking_errors import results_json
-from bench.analysis.uncertain_results import RunUncertainty
 from bench.base import format_duration, print_plain, show_rows, show_table, with_unit
-from bench.identification import ModelFile, models_among
+from bench.identification import ModelFile
 from bench.models import MemoryCurve
-from bench.record import Record, Table, card_rows, lateness_lines, steps_of
+from bench.record import Event, Record, card_rows, lateness_lines, steps_of
 
 PAGE_NAME = "report.html"
 """Usual file name of the page of a run."""
@@ -78,61 +74,27 @@ def report_run(
     with Record(run) as record:
         folder = make_folder(out or record.path.parent / "report")
         _print_card(record.meta, console)
-        steps = record.steps()
-        without_priors(record, steps)
+        found = RecordedRun.of(record, models)
         if remark := record.remark():
             print_plain(console, remark)
-        _print_status(record, len(steps), console)
-        summary = summarize(record, watched_pairs(record))
-        extremes = _extremes(record, steps, summary)
-        # A record that does not say what its limits allow has the range that was seen.
-        record.signals = tuple(
-            signal if signal.extent else replace(signal, extent=_greatest(extremes[signal.name]))
-            for signal in record.signals
-        )
-        _print_parts([signals_table(record, extremes)], console)
-        _print_events(record, console)
+        _print_status(record, len(found.steps), console)
+        _print_parts([signals_table(found)], console)
+        _print_events(found.events, console)
         for line in lateness_lines(record.meta.get("lateness", {})):
             print_plain(console, line)
-        figures = _draw_run(record, steps, summary, folder, figure_format)
-        compared = [*models_of(record), *_given_with_band(record), *models]
-        applied = apply_to_run(record, steps, compared) if len(steps) else []
-        comparison = {
-            each.file.name: {
-                **each.errors().to_json(),
-                "unit": each.unit,
-                "skipped": each.first,
-                "beyond": each.beyond.to_json(),
-            }
-            for each in applied
-        }
-        more = _draw_errors(applied, folder, figure_format)
-        controlled = str(record.meta.get("controls", ""))
-        control = results_json(record, controlled) if controlled else {}
-        _print_control(control, record, controlled, console)
-        uncertainty = RunUncertainty.of(record, steps)
-        _print_parts(uncertainty_parts(uncertainty), console)
-        _print_parts(errors_parts(applied) if applied else [], console)
-        found = {"extremes": extremes, "models": comparison, "uncertainty": uncertainty, **control}
+        figures = _draw(found, folder, figure_format)
+        _print_control(found, console)
+        _print_parts([*uncertainty_parts(found.uncertainty), *errors_parts(found.applied)], console)
+        result = found.result
         if page is not None:
-            write_page(page, run_page(record, steps, summary, applied, found, published))
-    for path in [*figures, *more]:
+            write_page(page, run_page(found, published))
+    for path in figures:
         print_plain(console, f"figure: {path}")
     if page is not None:
         print_plain(console, f"page: {page}")
     return {
-        "run": record.meta["run"],
-        "status": record.status,
-        "reason": record.reason,
-        "steps": len(steps),
-        "laboratory_seconds": record.meta.get("finished"),
-        "safe_state": record.safe_state,
-        "extremes": extremes,
-        "models": comparison,
-        "lateness": record.meta.get("lateness", {}),
-        "uncertainty": uncertainty.to_json(),
-        **control,
-        "figures": [str(path) for path in [*figures, *more]],
+        **result,
+        "figures": [str(path) for path in figures],
         "page": None if page is None else str(page),
     }
 
@@ -191,19 +153,6 @@ def _print_status(record: Record, steps: int, console: Console) -> None:
         console.print(f"  {device}: {state}", highlight=False, markup=False)
 
 
-def _extremes(record: Record, steps: Table, summary: TelemetrySummary) -> dict[str, dict[str, Any]]:
-    extremes: dict[str, dict[str, Any]] = {}
-    for signal in record.signals:
-        low, high = wider(summary.extremes[signal.name], steps[signal.name])
-        extremes[signal.name] = {"low": low, "high": high, "unit": signal.unit}
-    return extremes
-
-
-def _greatest(extremes: Mapping[str, Any]) -> float | None:
-    low, high = extremes["low"], extremes["high"]
-    return None if low is None else max(abs(low), abs(high)) or None
-
-
 def _print_parts(parts: Sequence[PagePart], console: Console) -> None:
     """Print tables and texts of the page."""
     for part in parts:
@@ -216,57 +165,35 @@ def _print_parts(parts: Sequence[PagePart], console: Console) -> None:
             print_plain(console, part.text)
 
 
-def _print_events(record: Record, console: Console) -> None:
-    for event in record.events():
+def _print_events(events: Sequence[Event], console: Console) -> None:
+    for event in events:
         if event.level != "INFO" or event.kind == "note":
-            console.print(
-                f"{format_duration(event.t):>10}  {event.kind}: {event.text}", highlight=False, markup=False
-            )
+            print_plain(console, f"{format_duration(event.t):>10}  {event.kind}: {event.text}")
 
 
-def _draw_run(
-    record: Record, steps: Table, summary: TelemetrySummary, folder: Path, figure_format: str
-) -> list[Path]:
-    if len(steps) == 0:
+def _draw(run: RecordedRun, folder: Path, figure_format: str) -> list[Path]:
+    """Draw signals and loops, and the errors of models, as far as there are readings; return the files."""
+    if not len(run.steps):
         return []
-    found = phases(record, steps, record.events())
     path = folder / f"signals.{figure_format}"
-    paths = [path] if draw_signals(path, record, steps, summary, found) else []
-    return [*paths, *(path for path, _ in draw_loops(folder, figure_format, record, steps, summary, found))]
+    paths = [path] if draw_signals(path, run) else []
+    paths += (path for path, _ in draw_loops(folder, figure_format, run))
+    if models := run.applied:
+        paths.append(folder / f"errors.{figure_format}")
+        plot_errors(
+            paths[-1],
+            {each.file.name: each.residuals for each in models},
+            error_label=with_unit("error", models[0].unit),
+            skip=models[0].first,
+            bands={each.file.name: (each.band.label, each.band.half_width) for each in models if each.band},
+        )
+    return paths
 
 
-def _given_with_band(record: Record) -> list[ModelFile]:
-    """Return the models that a run was given which have a prediction band, for the signals of the run."""
-    names = {signal.name for signal in record.signals}
-    return [
-        file
-        for file in models_among(record.files(), str(record.path)).values()
-        if file.band is not None and {file.provenance.get("input"), file.provenance.get("output")} <= names
-    ]
-
-
-def _draw_errors(models: Sequence[Applied], folder: Path, figure_format: str) -> list[Path]:
-    if not models:
-        return []
-    path = folder / f"errors.{figure_format}"
-    residuals = {each.file.name: each.residuals for each in models}
-    plot_errors(
-        path,
-        residuals,
-        error_label=with_unit("error", models[0].unit),
-        skip=models[0].first,
-        bands={each.file.name: (each.band.label, each.band.half_width) for each in models if each.band is not None},
-    )
-    return [path]
-
-
-def _print_control(
-    results: Mapping[str, Mapping[str, float]], record: Record, controlled: str, console: Console
-) -> None:
-    for name, entry in results.items():
-        keys = [key for key in ("max", "rms", "median") if key in entry]
-        shown = next(signal.display for signal in record.signals if signal.name == controlled)
-        parts = [f"error {key} {shown.text(entry[key])}" for key in keys]
+def _print_control(run: RecordedRun, console: Console) -> None:
+    for name, entry in run.control.items():
+        shown = run.signal(run.controlled).display
+        parts = [f"error {key} {shown.text(entry[key])}" for key in ("max", "rms", "median") if key in entry]
         if "seconds_per_target" in entry:
             parts.append(f"{entry['seconds_per_target']:.1f} s a target")
-        console.print(f"{name}: {', '.join(parts)}", highlight=False)
+        print_plain(console, f"{name}: {', '.join(parts)}")

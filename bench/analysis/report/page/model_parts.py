@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +10,7 @@ import numpy as np
 from bench.analysis.applied import Applied
 from bench.analysis.applied_figures import draw_applied
 from bench.analysis.figures.planes import plot_coverage, plot_densities
-from bench.analysis.report.page.elements import PageFigure, PagePart, PageSection, PageTable, PageText
+from bench.analysis.report.page.elements import PageFigure, PagePart, PageTable, PageText
 from bench.analysis.report.page.svg import inlined
 from bench.base import Floats, fitting_prefix, percent, significant
 from bench.identification import CoefficientUncertainties, ModelFile, coefficient_uncertainties
@@ -20,7 +20,7 @@ _FEW_COEFFICIENTS = 30
 """So many coefficients are listed one by one without being asked for."""
 
 
-def models_section(models: Sequence[Applied], times: Floats, scratch: Path) -> PageSection:
+def models_parts(models: Sequence[Applied], times: Floats, scratch: Path) -> list[PagePart]:
     """Return loops and residuals of models, their errors, bands and coefficients.
 
     There is one model at least. `times`, shape (N,), has the laboratory time of each reading, s.
@@ -32,14 +32,14 @@ def models_section(models: Sequence[Applied], times: Floats, scratch: Path) -> P
     for i, model in enumerate(models):
         has_time = isinstance(model.file.model, TimedModel)
         parts += _details_in_time(model, scratch, i) if has_time else _details(model, scratch, i)
-    return PageSection("Loops and models", parts)
+    return parts
 
 
-def given_section(files: Sequence[tuple[str, ModelFile]], scratch: Path) -> PageSection:
+def given_parts(files: Mapping[str, ModelFile], scratch: Path) -> list[PagePart]:
     """Return the models that a run was given, by the parameter that names each, with their densities."""
     rows = []
     figures = []
-    for i, (parameter, file) in enumerate(files):
+    for i, (parameter, file) in enumerate(files.items()):
         source = file.provenance.get("source") or ", ".join(file.provenance.get("sources", ()))
         band = "none" if file.band is None else f"{100.0 * file.band.level:g} %"
         known = "" if file.validity is None else file.validity.text(file.response.input_unit)
@@ -50,11 +50,13 @@ def given_section(files: Sequence[tuple[str, ModelFile]], scratch: Path) -> Page
             caption = f"Density of {file.name} {density.title}".rstrip()
             figures.append(PageFigure(inlined(path, caption), f"{caption}, as the run was given it.", is_map=True))
     heads = ("parameter", "model", "kind", "identified from", "valid for inputs", "prediction band")
-    return PageSection("Models that the run was given", (PageTable(heads, rows), *figures))
+    return [PageTable(heads, rows), *figures] if rows else []
 
 
 def errors_parts(models: Sequence[Applied]) -> list[PageTable | PageText]:
-    """Return the errors of models, one at least, and what a reader should know of them."""
+    """Return the errors of models, and what a reader should know of them."""
+    if not models:
+        return []
     rows = []
     for model in models:
         errors = model.errors()
