@@ -27,7 +27,6 @@ from .figures.canvas import (
 from .figures.fits import (
     plot_errors as plot_errors,
     plot_fit as plot_fit,
-    plot_sequence_and_errors as plot_sequence_and_errors,
 )
 from .figures.panels import (
     Curve as Curve,

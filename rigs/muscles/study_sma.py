@@ -21,7 +21,6 @@ from bench.analysis import (
     plot_densities,
     plot_errors,
     plot_panels,
-    plot_sequence_and_errors,
     plot_tracking,
 )
 from bench.batch import ResultTable, RunSeries, Study, StudyResult, reached_targets, true_errors
@@ -345,8 +344,7 @@ def _draw(campaign: RunSeries, measured: Characterization) -> list[Path]:
     paths.append(
         campaign.draw(
             "figure-11-verification",
-            plot_sequence_and_errors,
-            np.concatenate([s.voltages for s in measured.verification]),
+            plot_errors,
             {
                 TITLES[which]: np.concatenate(
                     [s.lengths - predict_series(found.model, s) for s in measured.verification]
@@ -354,8 +352,8 @@ def _draw(campaign: RunSeries, measured: Characterization) -> list[Path]:
                 * 1e3
                 for which, found in models.items()
             },
-            input_label="voltage / V",
             error_label="error / mm",
+            inputs=(np.concatenate([s.voltages for s in measured.verification]), "voltage / V"),
             names=names,
         )
     )

@@ -31,7 +31,6 @@ from bench.analysis import (
     plot_densities,
     plot_errors,
     plot_fit,
-    plot_sequence_and_errors,
     plot_tracking,
     predict,
     read_dataset,
@@ -519,15 +518,14 @@ def _draw_models(
     paths.append(
         campaign.draw(
             "figure-10-validation",
-            plot_sequence_and_errors,
-            inputs,
+            plot_errors,
             {
                 MODELS[key].title: outputs - predicted
                 for key, predicted in predictions.items()
                 if MODELS[key].validation is not None
             },
-            input_label=temperature,
             error_label=error,
+            inputs=(inputs, temperature),
             names=names,
             published=_published(MODELS, "validation"),
         )

@@ -66,6 +66,7 @@ def plot_errors(
     errors: Mapping[str, Floats],
     *,
     error_label: str,
+    inputs: tuple[Floats, str] | None = None,
     skip: int = 0,
     names: Mapping[str, str] | None = None,
     published: Mapping[str, float] | None = None,
@@ -77,6 +78,8 @@ def plot_errors(
     ----------
     errors : mapping of str to ndarray
         By the title of the model.
+    inputs : (ndarray of shape (N,), str), optional
+        Input sequence that is drawn above the errors, and its label.
     skip : int
         First samples: drawn in grey, and not counted in the title.
     names : mapping of str to str, optional
@@ -86,9 +89,16 @@ def plot_errors(
     bands : mapping of str to (str, float), optional
         As in `plot_fit`, by the titles.
     """
-    with drawn(path, (6.0, 1.0 + 1.7 * len(errors))) as figure:
-        panels = figure.subplots(len(errors), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
-        for axes, (title, error) in zip(panels, errors.items(), strict=True):
+    above, count = int(inputs is not None), len(errors)
+    with drawn(path, (6.0, 1.0 + 1.6 * above + 1.7 * count)) as figure:
+        ratios = (*[1.6] * above, *[1.0] * count)
+        panels = figure.subplots(above + count, 1, sharex=True, squeeze=False, height_ratios=ratios)[:, 0]
+        if inputs is not None:
+            draw_measured(panels[0], np.arange(inputs[0].size, dtype=np.float64), inputs[0])
+            panels[0].set_ylabel(inputs[1])
+        for axes in panels[above + 1 :]:
+            axes.sharey(panels[above])
+        for axes, (title, error) in zip(panels[above:], errors.items(), strict=True):
             indices = np.arange(error.size, dtype=np.float64)
             axes.axhline(0.0, color="black", linewidth=0.5)
             color = color_of((names or {}).get(title, title))
@@ -209,32 +219,3 @@ def draw_residuals(axes: Axes, horizontal: Floats, residuals: Floats, color: str
 
 def _draw_band(axes: Axes, label: str, width: float, color: str) -> None:
     axes.axhspan(-width, width, color=color, alpha=0.15, linewidth=0.0, label=label, zorder=1.0)
-
-
-def plot_sequence_and_errors(
-    path: Path,
-    inputs: Floats,
-    errors: Mapping[str, Floats],
-    *,
-    input_label: str,
-    error_label: str,
-    names: Mapping[str, str] | None = None,
-    published: Mapping[str, float] | None = None,
-) -> None:
-    """Draw an input sequence, one sample a step, and below it the errors of several models; as in `plot_errors`."""
-    with drawn(path, (6.0, 2.6 + 1.4 * len(errors))) as figure:
-        panels = figure.subplots(1 + len(errors), 1, sharex=True, height_ratios=(1.6, *[1.0] * len(errors)))
-        top = panels[0]
-        draw_measured(top, np.arange(inputs.size, dtype=np.float64), inputs)
-        top.set_ylabel(input_label)
-        for axes, (title, error) in zip(panels[1:], errors.items(), strict=True):
-            if axes is not panels[1]:
-                axes.sharey(panels[1])
-            color = color_of((names or {}).get(title, title))
-            axes.axhline(0.0, color="black", linewidth=0.5)
-            axes.plot(*outline(np.arange(error.size, dtype=np.float64), error), color=color, linewidth=0.8)
-            rms = float(np.sqrt(np.mean(error**2)))
-            axes.set_title(f"{title}: max {np.abs(error).max():.3g}, RMS {rms:.3g}", fontsize=9, loc="left")
-            axes.set_ylabel(error_label)
-            draw_published(axes, (published or {}).get(title), color)
-        panels[-1].set_xlabel("index of the set-point")
