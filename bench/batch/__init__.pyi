@@ -5,7 +5,6 @@ from .campaign.cluster import (
 from .campaign.execution import (
     Executor as Executor,
     WorkersExecutor as WorkersExecutor,
-    all_carried_out as all_carried_out,
     carry_out_tasks as carry_out_tasks,
     done_before as done_before,
     holder as holder,
@@ -19,22 +18,7 @@ from .campaign.file import (
     read_campaign as read_campaign,
 )
 from .campaign.results import (
-    ResultsTable as ResultsTable,
-    comparisons_table as comparisons_table,
-    in_one_cell as in_one_cell,
-    over_runs as over_runs,
-    over_seeds as over_seeds,
-    runs_table as runs_table,
-    shown_columns as shown_columns,
-    studies_of as studies_of,
-    studies_table as studies_table,
-    study_values as study_values,
-    together as together,
-    write_tables as write_tables,
-)
-from .campaign.study_tables import (
-    MARKDOWN_NAME as MARKDOWN_NAME,
-    print_over_seeds as print_over_seeds,
+    show_results as show_results,
 )
 from .campaign.tasks import (
     UNFINISHED as UNFINISHED,

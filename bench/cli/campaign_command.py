@@ -12,14 +12,14 @@ from typing import TYPE_CHECKING, Annotated, Self
 
 import typer
 
-from bench.base import AbortError, print_plain, write_result
+from bench.base import AbortError, print_plain
 from bench.cli.command_support import JsonOption, check_outputs, write_json
 from bench.cli.printing import console, error_console, show_compilation
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from bench.batch import CampaignTask, Done, Executor, Expansion
+    from bench.batch import CampaignTask, Done, Executor
 
 SAID_EVERY = 10.0
 """Wall-clock seconds between two lines about a campaign whose output is no terminal."""
@@ -59,13 +59,13 @@ def campaign(
     from bench.batch import (
         UNFINISHED,
         WorkersExecutor,
-        all_carried_out,
         carry_out_tasks,
         done_before,
         expand,
         holder,
         opened_folder,
         read_campaign,
+        show_results,
     )
     from bench.rig import Locks
 
@@ -78,9 +78,11 @@ def campaign(
 
         check_address(scheduler)
     before = done_before(expansion.tasks, folder)
-    _announce(expansion, before.done, 1 if scheduler else workers or available_cores())
+    cores = 1 if scheduler else workers or available_cores()
+    console.print(expansion.announcement(before.done, cores), highlight=False)
     if dry_run:
-        _list(expansion, before.done)
+        for line in expansion.listing(before.done):
+            print_plain(console, line)
         write_json(json_file, {name: task.describe() for name, task in expansion.tasks.items()})
         return
     with ExitStack() as stack:
@@ -103,16 +105,14 @@ def campaign(
             executor = stack.enter_context(SayingExecutor(executor, left, console))
         done = carry_out_tasks(expansion.tasks, before.done, executor)
         shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
-    files = _show(expansion, done, folder)
+    files = show_results(expansion, done, folder, console)
     failed = {name: each for name, each in done.items() if not each.carried_out}
     for name, each in failed.items():
         print_plain(error_console, f"{each.status}: {name}: {each.reason}")
-    console.print(
+    print_plain(
+        console,
         f"{len(done) - len(failed)} of {len(done)} carried out, {len(before.done)} of them before, "
         f"in {stopwatch.seconds():.1f} s: {folder}",
-        highlight=False,
-        markup=False,
-        soft_wrap=True,
     )
     write_json(
         json_file,
@@ -125,7 +125,7 @@ def campaign(
             },
         },
     )
-    if not all_carried_out([*done.values()]):
+    if failed:
         sys.exit(1)
 
 
@@ -174,81 +174,3 @@ def _saying_how_to_go_on(folder: Path) -> Iterator[None]:
         yield
     except AbortError as error:
         raise AbortError(f"{error}; what is done is in {folder}, and the same command goes on from there") from None
-
-
-def _announce(expansion: Expansion, before: dict[str, Done], cores: int) -> None:
-    left = [name for name in expansion.tasks if name not in before]
-    estimate = expansion.estimate(left)
-    counts = dict.fromkeys(("run", "model", "comparison", "study"), 0)
-    for name in left:
-        counts[expansion.tasks[name].kind] += 1
-    plural = {"run": "runs", "model": "models", "comparison": "comparisons", "study": "studies"}
-    text = ", ".join(f"{count} {kind if count == 1 else plural[kind]}" for kind, count in counts.items() if count)
-    line = f"{text or 'nothing'} to do" + (f", {len(before)} done before" if before else "")
-    if estimate.laboratory_seconds:
-        on = "1 core" if cores == 1 else f"{cores} cores"
-        hours, wall = estimate.laboratory_seconds / 3600, _duration(estimate.wall_seconds / cores)
-        line += f"; {hours:.1f} h of laboratory time, {wall} on {on}"
-        if estimate.unknown:
-            line += f", and {estimate.unknown} tasks of unknown length"
-    console.print(line, highlight=False)
-
-
-def _duration(seconds: float) -> str:
-    # The pace of the plant alone is known: what a run takes besides counts among short ones.
-    if seconds < 60:
-        return "less than a minute"
-    return f"about {seconds / 60:.0f} min" if seconds < 5400 else f"about {seconds / 3600:.1f} h"
-
-
-def _list(expansion: Expansion, before: dict[str, Done]) -> None:
-    for name in expansion.tasks:
-        planned = expansion.plans.get(name)
-        parts = [name, f"{planned[0]:.0f} s" if planned else "", before[name].status if name in before else ""]
-        print_plain(console, ", ".join(filter(None, parts)))
-
-
-def _show(expansion: Expansion, done: dict[str, Done], folder: Path) -> list[Path]:
-    """Print the tables and write them to files; return these."""
-    from bench.batch import (
-        MARKDOWN_NAME,
-        ResultsTable,
-        comparisons_table,
-        in_one_cell,
-        over_runs,
-        over_seeds,
-        print_over_seeds,
-        runs_table,
-        shown_columns,
-        studies_of,
-        studies_table,
-        study_values,
-        together,
-        write_tables,
-    )
-
-    summaries: dict[str, ResultsTable] = {}
-    tables = {name: runs_table(expansion, done, name) for name in expansion.varying}
-    for name, table in tables.items():
-        shown_columns(table, expansion.varying[name]).print(name, console)
-        if "seed" in expansion.varying[name]:
-            summaries[name] = over_seeds(table, expansion.varying[name])
-            in_one_cell(summaries[name]).print(f"{name}: median / worst over the seeds", console)
-    files = {"results": together(tables.values())} if tables else {}
-    if summaries:
-        files["summary"] = together(summaries.values())
-    comparisons = comparisons_table(expansion, done)
-    if len(comparisons):
-        compared = over_runs(comparisons)
-        compared.print("comparisons, over the runs", console)
-        files |= {"comparisons": comparisons, "comparisons-summary": compared}
-    studies = studies_table(expansion, done)
-    if len(studies):
-        texts = [
-            print_over_seeds(name, [folder / task for task in tasks], console)
-            for name, tasks in studies_of(expansion, done).items()
-        ]
-        write_result(folder / MARKDOWN_NAME, "\n\n".join(texts) + "\n")
-        print_plain(console, f"every number: {folder / 'studies.csv'}")
-        files |= {"studies": studies, "study-values": study_values(expansion, done)}
-    return write_tables(files, folder, console)

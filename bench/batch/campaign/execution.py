@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
@@ -169,8 +169,3 @@ def carry_out_tasks(
                 elif not missing[user]:
                     ready.append(user)
     return {name: done[name] for name in tasks}
-
-
-def all_carried_out(done: Sequence[Done]) -> bool:
-    """Return whether all that was asked for was carried out; a run that has failed was."""
-    return all(each.carried_out for each in done)

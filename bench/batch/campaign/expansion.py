@@ -5,7 +5,8 @@ from __future__ import annotations
 import itertools
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections import Counter
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeGuard, TypeVar
@@ -13,7 +14,7 @@ from typing import Any, TypeGuard, TypeVar
 import numpy as np
 
 from bench.analysis import WholeIdentification, check_template, option_names, whole_identification, whole_models
-from bench.base import BenchError, ConfigurationError, closest, registry, toml_value
+from bench.base import BenchError, ConfigurationError, closest, counted, registry, toml_value
 from bench.batch.campaign.file import (
     REFERENCE,
     CampaignFile,
@@ -29,6 +30,7 @@ from bench.batch.campaign.tasks import (
     SHOWN_DIGITS,
     CampaignTask,
     ComparisonTask,
+    Done,
     ModelTask,
     RunTask,
     StudyTask,
@@ -45,16 +47,6 @@ _UNSAFE = re.compile(r"[^A-Za-z0-9_.=+,-]+")
 
 Axis = Mapping[str, Any]
 T = TypeVar("T")
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """What a campaign will take, by the plans of its runs."""
-
-    laboratory_seconds: float = 0.0  # of the runs whose plan is known, s
-    wall_seconds: float = 0.0  # the same on one core of this machine, s
-    # Number of tasks that are in neither: studies, identifications, and runs that need a model of the campaign.
-    unknown: int = 0
 
 
 @dataclass(frozen=True)
@@ -81,10 +73,34 @@ class Expansion:
     units: Mapping[tuple[str, str], str]
     kernels: tuple[str, ...]
 
-    def estimate(self, names: Sequence[str]) -> Estimate:
-        """Return what these tasks will take."""
-        known = [self.plans[name] for name in names if name in self.plans]
-        return Estimate(sum(lab for lab, _ in known), sum(wall for _, wall in known), len(names) - len(known))
+    def announcement(self, before: Collection[str], cores: int) -> str:
+        """Return in a line what is left to do after the tasks `before`, and what it will take on so many cores."""
+        left = [name for name in self.tasks if name not in before]
+        counts = Counter(self.tasks[name].kind for name in left)
+        plural = {"run": "runs", "model": "models", "comparison": "comparisons", "study": "studies"}
+        texts = [f"{n} {kind if n == 1 else many}" for kind, many in plural.items() if (n := counts[kind])]
+        line = f"{', '.join(texts) or 'nothing'} to do" + (f", {len(before)} done before" if before else "")
+        known = [self.plans[name] for name in left if name in self.plans]
+        if known:
+            hours, wall = sum(lab for lab, _ in known) / 3600, sum(wall for _, wall in known) / cores
+            line += f"; {hours:.1f} h of laboratory time, {_in_words(wall)} on {counted(cores, 'core')}"
+            # Studies, identifications, and runs that need a model of the campaign.
+            if unknown := len(left) - len(known):
+                line += f", and {unknown} tasks of unknown length"
+        return line
+
+    def listing(self, before: Mapping[str, Done]) -> Iterator[str]:
+        """Yield a line for each task: name, planned laboratory time, and how it ended before."""
+        for name in self.tasks:
+            planned = f"{self.plans[name][0]:.0f} s" if name in self.plans else ""
+            yield ", ".join(filter(None, [name, planned, before[name].status if name in before else ""]))
+
+
+def _in_words(seconds: float) -> str:
+    # The pace of the plant alone is known: what a run takes besides counts among short ones.
+    if seconds < 60:
+        return "less than a minute"
+    return f"about {seconds / 60:.0f} min" if seconds < 5400 else f"about {seconds / 3600:.1f} h"
 
 
 def expand(file: CampaignFile) -> Expansion:

@@ -14,8 +14,9 @@ from rich.table import Table
 from rich.text import Text
 
 from bench.analysis import write_csv
-from bench.base import MissingExtraError, header_with_unit, needed_for, print_plain
+from bench.base import MissingExtraError, header_with_unit, needed_for, print_plain, write_result
 from bench.batch.campaign.expansion import Expansion
+from bench.batch.campaign.study_tables import MARKDOWN_NAME, print_over_seeds
 from bench.batch.campaign.tasks import ComparisonTask, Done, ModelTask, RunTask, StudyTask
 
 Cell: TypeAlias = float | int | str | None
@@ -247,6 +248,35 @@ def study_values(expansion: Expansion, done: Mapping[str, Done]) -> ResultsTable
             for name, (value, _) in done[task.name].results.items()
         ]
     )
+
+
+def show_results(expansion: Expansion, done: Mapping[str, Done], folder: Path, console: Console) -> list[Path]:
+    """Print the tables of a campaign and write them to files in its folder; return these."""
+    summaries: dict[str, ResultsTable] = {}
+    tables = {name: runs_table(expansion, done, name) for name in expansion.varying}
+    for name, table in tables.items():
+        shown_columns(table, expansion.varying[name]).print(name, console)
+        if "seed" in expansion.varying[name]:
+            summaries[name] = over_seeds(table, expansion.varying[name])
+            in_one_cell(summaries[name]).print(f"{name}: median / worst over the seeds", console)
+    files = {"results": together(tables.values())} if tables else {}
+    if summaries:
+        files["summary"] = together(summaries.values())
+    comparisons = comparisons_table(expansion, done)
+    if len(comparisons):
+        compared = over_runs(comparisons)
+        compared.print("comparisons, over the runs", console)
+        files |= {"comparisons": comparisons, "comparisons-summary": compared}
+    studies = studies_table(expansion, done)
+    if len(studies):
+        texts = [
+            print_over_seeds(name, [folder / task for task in tasks], console)
+            for name, tasks in studies_of(expansion, done).items()
+        ]
+        write_result(folder / MARKDOWN_NAME, "\n\n".join(texts) + "\n")
+        print_plain(console, f"every number: {folder / 'studies.csv'}")
+        files |= {"studies": studies, "study-values": study_values(expansion, done)}
+    return write_tables(files, folder, console)
 
 
 def write_tables(tables: Mapping[str, ResultsTable], folder: Path, console: Console) -> list[Path]:
