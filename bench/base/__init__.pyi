@@ -102,6 +102,7 @@ from .printing import (
     PlainConsole as PlainConsole,
     html_table as html_table,
     print_plain as print_plain,
+    print_table as print_table,
     show_rows as show_rows,
     show_table as show_table,
 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Sequence
 from html import escape
+from typing import Any
 
 from rich.console import Console, ConsoleOptions, RenderableType
 from rich.segment import Segment
@@ -72,6 +73,25 @@ def show_table(console: Console, table: Table) -> None:
         console.print(table.title, highlight=False, soft_wrap=True, style="table.title")
     for row in zip(*columns, strict=True):
         _print_block(console, [head.plain for head in heads], row, table.columns)
+
+
+def print_table(
+    console: Console,
+    heads: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    title: str = "",
+    *,
+    numbers_from: int = 99,
+    framed: bool = True,
+) -> None:
+    """Print a table of plain texts, see `show_table`; the columns from `numbers_from` on are aligned right."""
+    look: dict[str, Any] = {} if framed else {"box": None, "padding": (0, 2)}
+    table = Table(title=title and Text(title), title_justify="left", **look)
+    for i, head in enumerate(heads):
+        table.add_column(Text(head), justify="left" if i < numbers_from else "right")
+    for row in rows:
+        table.add_row(*map(Text, row))
+    show_table(console, table)
 
 
 def show_rows(console: Console, title: str, rows: Iterable[tuple[str, str | Text]]) -> None:

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.table import Table
-from rich.text import Text
 
-from bench.base import percent, print_plain, show_patience, show_table, significant
+from bench.base import percent, print_plain, print_table, show_patience, significant
 from bench.cli.band_options import BandsOption, Recalibrating, print_applied
 from bench.cli.command_support import JsonOption, check_outputs, write_json
 from bench.cli.data_options import FiguresOption, ReadingGroup, SkipOption, offer_groups, print_assumptions
@@ -78,17 +75,17 @@ def models_on_data(
         warn(warning)
     if result.skip:
         console.print(f"rows 1 to {result.skip} are left out of the errors", highlight=False)
-    table = Table(title=f"models on {data.name}, errors in {result.unit or 'output units'}", title_justify="left")
-    table.add_column("model")
-    for column in ("max", "RMS", "RMS / %", "offset", "max, offset removed", "RMS, offset removed"):
-        table.add_column(column, justify="right")
-    for name, entry in result.comparisons.items():
-        raw, mended = entry.raw, entry.rezeroed
-        table.add_row(
+    heads = ("model", "max", "RMS", "RMS / %", "offset", "max, offset removed", "RMS, offset removed")
+    rows = [
+        (
             name, significant(raw.maximum, 4), significant(raw.rms, 4), percent(raw.rms_percent).removesuffix(" %"),
             f"{entry.offset:+.4g}", significant(mended.maximum, 4), significant(mended.rms, 4),
-        )  # fmt: skip
-    show_table(console, table)
+        )
+        for name, entry in result.comparisons.items()
+        for raw, mended in [(entry.raw, entry.rezeroed)]
+    ]  # fmt: skip
+    title = f"models on {data.name}, errors in {result.unit or 'output units'}"
+    print_table(console, heads, rows, title, numbers_from=1)
     for name, applied in result.applied.items():
         print_applied(applied, name, bands=bands)
     if out is not None:
@@ -130,24 +127,17 @@ def compare(
 def _print_runs(found: RunComparison) -> None:
     from bench.analysis import SIGNAL_HEADS
 
-    _print_table("outcome", ("", "first", "second"), found.outcome_rows())
+    print_table(console, ("", "first", "second"), found.outcome_rows(), "outcome")
     if found.differences:
-        _print_table("what differs", ("key", "first", "second"), found.difference_rows())
+        print_table(console, ("key", "first", "second"), found.difference_rows(), "what differs")
     else:
         console.print("nothing differs in what they were given", highlight=False)
-    _print_table(found.signals_title, SIGNAL_HEADS, found.signal_rows())
+    print_table(console, SIGNAL_HEADS, found.signal_rows(), found.signals_title)
     for signal, deviation in found.reproducibility.items():
-        console.print(
+        print_plain(
+            console,
             f"reproducibility of {signal}: {significant(deviation, 2)} {found.signals[signal].unit}, standard "
             "deviation of what two sessions reach at the same targets",
-            highlight=False,
         )
     same = [name for name, equal in found.equal.items() if equal]
     console.print(f"equal to the last bit: {', '.join(same) or 'nothing'}", highlight=False)
-
-
-def _print_table(title: str, heads: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    table = Table(*heads, title=title, title_justify="left")
-    for row in rows:
-        table.add_row(*map(Text, row))
-    show_table(console, table)

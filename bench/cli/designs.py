@@ -6,10 +6,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.table import Table
 
 from bench.analysis import ReadingOptions
-from bench.base import ConfigurationError, closest, show_patience, show_table
+from bench.base import ConfigurationError, closest, print_plain, print_table, show_patience
 from bench.cli.command_support import JsonOption, check_outputs, write_json
 from bench.cli.data_options import ReadingGroup, offer_groups
 from bench.cli.printing import console, print_rows, show_compilation
@@ -112,22 +111,16 @@ def design(
         known = closest(sequence, found)
         raise ConfigurationError(f"--sequence {sequence!r}: there is no such sequence; {known}")
     result = {name: each.assessment for name, each in found.items()}
-    table = Table(title=f"excitation of {levels * (levels + 1) // 2} cells", title_justify="left")
-    table.add_column("sequence", no_wrap=True)
-    for column in ("set-points", "cells", "rank", "condition", "log det / h", "variance", "time"):
-        table.add_column(column, justify="right")
-    for name, entry in result.items():
-        table.add_row(
-            name,
-            str(entry.setpoints),
-            f"{entry.covered}/{entry.cells}",
-            f"{entry.rank}/{entry.coefficients}",
-            f"{entry.condition:.2g}",
-            f"{entry.log_determinant:.3f}",
-            f"{entry.prediction_variance:.2g}",
-            f"{entry.time / 3600:.2f} h",
+    heads = ("sequence", "set-points", "cells", "rank", "condition", "log det / h", "variance", "time")
+    rows = [
+        (
+            name, str(each.setpoints), f"{each.covered}/{each.cells}", f"{each.rank}/{each.coefficients}",
+            f"{each.condition:.2g}", f"{each.log_determinant:.3f}", f"{each.prediction_variance:.2g}",
+            f"{each.time / 3600:.2f} h",
         )
-    show_table(console, table)
+        for name, each in result.items()
+    ]  # fmt: skip
+    print_table(console, heads, rows, f"excitation of {levels * (levels + 1) // 2} cells", numbers_from=1)
     if sequence is not None and out is not None:
         write_sequence(out, found[sequence].setpoints, unit=unit, dwell=dwell)
         _print_sequence(out, found[sequence].setpoints.size)
@@ -197,9 +190,4 @@ def _continuation_lines(found: Continuation, unit: str) -> list[tuple[str, str]]
 
 
 def _print_sequence(path: Path, count: int) -> None:
-    console.print(
-        f"{count} set-points: {path}; bench run sequence --rig RIG --set setpoints={path}",
-        highlight=False,
-        markup=False,
-        soft_wrap=True,
-    )
+    print_plain(console, f"{count} set-points: {path}; bench run sequence --rig RIG --set setpoints={path}")

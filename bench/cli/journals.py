@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.table import Table
 
-from bench.base import RecordError, print_plain, show_table
+from bench.base import RecordError, print_plain, print_table
 from bench.cli.command_support import JsonOption, check_outputs, write_json
 from bench.cli.printing import console
 from bench.cli.run_names import NEWEST, RunArgument
@@ -41,11 +40,11 @@ def repair(
 
     check_outputs(json_file=json_file, read=[journal, *(second or [])])
     found = recover(journal, second or [], out)
-    table = Table("table", "good", "from a second file", "lost", "first bad row", box=None, padding=(0, 2))
-    for name, state in found.tables.items():
-        numbers = (state.good, state.added, state.missing)
-        table.add_row(name, *(str(number) if number else "-" for number in numbers), state.first_bad or "-")
-    show_table(console, table)
+    rows = [
+        (name, *(str(cell or "-") for cell in (state.good, state.added, state.missing, state.first_bad)))
+        for name, state in found.tables.items()
+    ]
+    print_table(console, ("table", "good", "from a second file", "lost", "first bad row"), rows, framed=False)
     said = [f"status: {found.status}"]
     if found.problem:
         said.append(f"SQLite finds: {found.problem}")

@@ -8,9 +8,8 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.table import Table
 
-from bench.base import ConfigurationError
+from bench.base import ConfigurationError, print_table
 from bench.cli.command_support import parse_assignments
 from bench.cli.printing import console, print_rows
 
@@ -124,8 +123,8 @@ def print_model(spec: ModelSpec) -> None:
 
 def print_models(specs: dict[str, ModelSpec]) -> None:
     """Print a table of models with their options and their inverse."""
-    table = Table("model", "options with their defaults", "inverse", title="models", title_justify="left")
-    for name, spec in specs.items():
-        options = ", ".join(f"{option} ({each['default']})" for option, each in options_json(spec).items())
-        table.add_row(name, options, inverse_of(spec))
-    console.print(table)
+    rows = [
+        (name, ", ".join(f"{key} ({each['default']})" for key, each in options_json(spec).items()), inverse_of(spec))
+        for name, spec in specs.items()
+    ]
+    print_table(console, ("model", "options with their defaults", "inverse"), rows, "models")

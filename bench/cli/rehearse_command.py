@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from rich.markup import escape
 from rich.table import Column, Table
 
-from bench.base import ConfigurationError, show_table
+from bench.base import ConfigurationError, print_plain, show_table
 from bench.cli.command_support import (
     JsonOption,
     OverrideOption,
@@ -103,7 +103,7 @@ def _print(rehearsal: Rehearsal) -> None:
             soft_wrap=True,
         )
     for text in rehearsal.shortened:
-        console.print(text, highlight=False, markup=False, soft_wrap=True)
+        print_plain(console, text)
     if rehearsal.status == "completed":
         console.print("nothing would trip" if not rehearsal.findings else "it would complete", highlight=False)
 

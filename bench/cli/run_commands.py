@@ -9,10 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.markup import escape
-from rich.table import Table
 
-from bench.base import BenchError, ConfigurationError, counted, format_duration, print_plain, show_table
+from bench.base import BenchError, ConfigurationError, counted, format_duration, print_plain, print_table
 from bench.cli.command_support import (
     UNSAFE_EXIT_CODE,
     AttachOption,
@@ -29,7 +27,7 @@ from bench.cli.command_support import (
     parse_assignments,
     write_json,
 )
-from bench.cli.printing import console, error_console, print_error, show_compilation, warn
+from bench.cli.printing import console, print_error, show_compilation, warn
 from bench.cli.rehearse_command import show_rehearsal
 from bench.cli.run_names import find_run
 
@@ -258,12 +256,7 @@ def print_result(
     )
     for name, state in outcome.safe_state.items():
         if state != SAFE:
-            error_console.print(
-                "[bold red]error:[/]",
-                escape(f"{name} is NOT in its safe state: {state}"),
-                highlight=False,
-                soft_wrap=True,
-            )
+            print_error(BenchError(f"{name} is NOT in its safe state: {state}"))
     if outcome.error is not None:
         if not isinstance(outcome.error, BenchError):
             raise outcome.error
@@ -284,7 +277,6 @@ def print_protocol(definition: Any, rig: str | None = None) -> None:  # noqa: AN
     file = load_rig(rig) if rig is not None else None
     console.print(Markdown(f"**{definition.name}**: {definition.description}"))
     console.print()
-    table = Table("--set", "default", "unit", "allowed", "what it does", title="parameters", title_justify="left")
-    for entry in definition.help(file.roles, file.protocols.get(definition.name)) if file else definition.help():
-        table.add_row(entry.name, entry.default, entry.unit, entry.allowed, entry.text)
-    show_table(console, table)
+    entries = definition.help(file.roles, file.protocols.get(definition.name)) if file else definition.help()
+    rows = [(entry.name, entry.default, entry.unit, entry.allowed, entry.text) for entry in entries]
+    print_table(console, ("--set", "default", "unit", "allowed", "what it does"), rows, "parameters")

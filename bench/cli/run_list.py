@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import typer
 from rich.text import Text
 
-from bench.base import ConfigurationError, format_duration
+from bench.base import ConfigurationError, counted, format_duration
 from bench.cli.command_support import JsonOption, parse_assignments, write_json
 from bench.cli.printing import console
 
@@ -58,7 +58,7 @@ def runs_(
         rig=rig,
     )
     _print_runs(folder, found)
-    console.print(f"{len(found)} {'run' if len(found) == 1 else 'runs'}", highlight=False)
+    console.print(counted(len(found), "run"), highlight=False)
     write_json(json_file, [run.to_json() for run in found])
 
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table as Columns
 from rich.text import Text
 
 from bench.analysis.applied import Applied, ComparedModels
@@ -25,7 +24,7 @@ from bench.analysis.report.published import Published
 from bench.analysis.report.recorded_run import RecordedRun
 from bench.analysis.report.run_figures import draw_loops, draw_signals
 from bench.analysis.report.uncertainty_tables import uncertainty_parts
-from bench.base import format_duration, print_plain, show_rows, show_table, with_unit
+from bench.base import format_duration, print_plain, print_table, show_rows, with_unit
 from bench.identification import ModelFile
 from bench.models import MemoryCurve
 from bench.record import Event, Record, card_rows, lateness_lines, steps_of
@@ -147,20 +146,15 @@ def _print_card(meta: Mapping[str, Any], console: Console) -> None:
 def _print_status(record: Record, steps: int, console: Console) -> None:
     style = {"completed": "green", "unfinished": "yellow"}.get(record.status, "red")
     console.print(f"[{style}]{record.status}[/] after {steps_of(record.meta, steps)}", highlight=False)
-    if record.reason:
-        console.print(f"  {record.reason}", highlight=False, markup=False)
-    for device, state in record.safe_state.items():
-        console.print(f"  {device}: {state}", highlight=False, markup=False)
+    for text in filter(None, [record.reason, *(f"{name}: {state}" for name, state in record.safe_state.items())]):
+        print_plain(console, f"  {text}")
 
 
 def _print_parts(parts: Sequence[PagePart], console: Console) -> None:
     """Print tables and texts of the page."""
     for part in parts:
         if isinstance(part, PageTable):
-            table = Columns(*part.heads, title=part.title, title_justify="left")
-            for row in part.rows:
-                table.add_row(*map(Text, row))
-            show_table(console, table)
+            print_table(console, part.heads, part.rows, part.title, numbers_from=part.numbers_from)
         elif isinstance(part, PageText):
             print_plain(console, part.text)
 
