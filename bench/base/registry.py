@@ -158,6 +158,33 @@ def load(group: Group, name: str) -> Any:  # noqa: ANN401 - each group has a typ
     return known[name].load()
 
 
+def _tops() -> set[str]:
+    """Return the top modules of the packages that register a part."""
+    parts = (entry for group in GROUPS for entry in entries(group).values())
+    return {entry.reference.partition(":")[0].partition(".")[0] for entry in parts}
+
+
+def _places(top: str) -> list[str]:
+    """Return the folders of a package, or the file of a module; none if it cannot be found."""
+    try:
+        spec = importlib.util.find_spec(top)
+    except (ImportError, ValueError):
+        # What runs as a script has none.
+        spec = None
+    return [*(spec.submodule_search_locations or filter(None, [spec.origin]))] if spec else []
+
+
+def files_of_parts(suffixes: tuple[str, ...]) -> dict[str, Path]:
+    """Return the files of the packages that register a part, those with these suffixes, by `PACKAGE/PATH/IN/IT`."""
+    found: dict[str, Path] = {}
+    for top in {"bench"} | _tops():
+        for place in map(Path, _places(top)):
+            names = [f"{folder}{os.sep}{name}" for folder, _, names in os.walk(place) for name in names]
+            files = [Path(name) for name in names or [str(place)] if name.endswith(suffixes)]
+            found |= {f"{top}/{file.relative_to(place).as_posix()}": file for file in files}
+    return dict(sorted(found.items()))
+
+
 def check_own_packages() -> None:
     """Check that the bench's own folders are not hidden by others of the same name on the import path.
 
@@ -165,9 +192,8 @@ def check_own_packages() -> None:
     """
     home = Path(__file__).resolve().parents[2]
     for name in _OWN_FOLDERS:
-        spec = importlib.util.find_spec(name)
         # A folder, with or without `__init__.py`, or a single file.
-        places = [*(spec.submodule_search_locations or filter(None, [spec.origin]))] if spec else []
+        places = _places(name)
         if (home / name).is_dir() and places and Path(places[0]).resolve() != home / name:
             raise ConfigurationError(
                 f"{Path(places[0]).resolve()} hides the bench's own package {name!r} ({home / name}); "
@@ -222,23 +248,12 @@ def check_import(module: str) -> None:
     top = module.partition(".")[0]
     if not top or module in sys.modules or top in _OWN:
         return
-    try:
-        spec = importlib.util.find_spec(top)
-    except ValueError:
-        # What runs as a script has none.
-        spec = None
-    # Without one there is nothing to import, and the import says so.
-    if spec is None:
+    # Without a place there is nothing to import, and the import says so.
+    places = _places(top)
+    if not places or Path(places[0]).resolve().parent in _beside or top in _tops():
         return
-    places = [*(spec.submodule_search_locations or filter(None, [spec.origin]))]
-    if places and Path(places[0]).resolve().parent in _beside:
-        return
-    parts = (entry for group in GROUPS for entry in entries(group).values())
-    if top in {entry.reference.partition(":")[0].partition(".")[0] for entry in parts}:
-        return
-    where = places[0] if places else spec.origin
     raise ConfigurationError(
-        f"module {module} ({where}) may not be imported, as it is neither of the bench, "
+        f"module {module} ({places[0]}) may not be imported, as it is neither of the bench, "
         "nor of a package that registers a part, nor beside the rig file; move it there, or register it in the "
         f"""pyproject.toml of its package: [project.entry-points."bench.devices"] NAME = "{module}:CLASS\""""
     )

@@ -6,7 +6,6 @@ To say it again, every rig, protocol, model and driver is imported: half a secon
 from __future__ import annotations
 
 import hashlib
-import importlib.util
 import os
 import sys
 from collections.abc import Iterator
@@ -70,32 +69,10 @@ def _places() -> Iterator[str]:
 
 def _files() -> Iterator[str]:
     """Yield the entries, and the files of the packages that they name."""
-    packages = {"bench"}
     for group in registry.GROUPS:
         for entry in registry.entries(group).values():
             yield f"{group} {entry.name} {entry.package} {entry.reference}"
-            packages.add(entry.reference.partition(":")[0].partition(".")[0])
-    for package in sorted(packages):
-        with suppress(ImportError, ValueError):
-            spec = importlib.util.find_spec(package)
-            if spec is None:
-                continue
-            if spec.origin:
-                yield from _file(spec.origin)
-            for folder in spec.submodule_search_locations or ():
-                yield from _below(folder)
-
-
-def _below(folder: str) -> Iterator[str]:
-    with suppress(OSError), os.scandir(folder) as entries:
-        for entry in sorted(entries, key=lambda entry: entry.name):
-            if entry.name.endswith((".py", ".toml")):
-                yield from _file(entry.path)
-            elif entry.name != "__pycache__" and entry.is_dir():
-                yield from _below(entry.path)
-
-
-def _file(path: str) -> Iterator[str]:
-    with suppress(OSError):
-        found = Path(path).stat()
-        yield f"{path} {found.st_mtime_ns} {found.st_size}"
+    for path in registry.files_of_parts((".py", ".toml")).values():
+        with suppress(OSError):
+            found = path.stat()
+            yield f"{path} {found.st_mtime_ns} {found.st_size}"

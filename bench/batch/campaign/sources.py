@@ -3,12 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-import importlib.util
 import json
 from collections.abc import Collection
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 from bench.base import ConfigurationError, registry
 from bench.record import version_of
@@ -29,23 +27,9 @@ def digest(content: object) -> str:
 @cache
 def code_digest() -> str:
     """Return the hash of the programs: the bench, the packages that register parts, the versions of libraries."""
-    tops = {"bench"} | {
-        entry.reference.partition(":")[0].partition(".")[0]
-        for group in registry.GROUPS
-        for entry in registry.entries(group).values()
-    }
-    found: dict[str, Any] = {name: version_of(name) for name in _LIBRARIES}
-    for top in sorted(tops):
-        spec = importlib.util.find_spec(top)
-        places = [*(spec.submodule_search_locations or filter(None, [spec.origin]))] if spec else []
-        for place in map(Path, places):
-            files = sorted(place.rglob("*")) if place.is_dir() else [place]
-            found |= {
-                f"{top}/{file.relative_to(place).as_posix()}": hashlib.sha256(file.read_bytes()).hexdigest()
-                for file in files
-                if file.suffix in PROGRAMS_AND_RIGS and file.is_file()
-            }
-    return digest(found)
+    versions = {name: version_of(name) for name in _LIBRARIES}
+    files = registry.files_of_parts(PROGRAMS_AND_RIGS).items()
+    return digest(versions | {name: hashlib.sha256(file.read_bytes()).hexdigest() for name, file in files})
 
 
 def content_of(path: Path, beside: Collection[str] = ()) -> dict[str, bytes]:
