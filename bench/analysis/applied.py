@@ -23,12 +23,11 @@ from bench.identification import (
     Errors,
     ModelFile,
     Recalibration,
-    compare,
     load_model,
     measure_errors,
     parse_model,
 )
-from bench.models import Operator, TimedModel, TimedSequence
+from bench.models import Operator, TimedModel
 from bench.record import Record, Table
 
 # Derivation: of a hundred rows a tenth is ten, beside which one stray reading does not count; random errors of ninety
@@ -329,18 +328,22 @@ def compare_models(
     ConfigurationError
         If `skip` leaves nothing, there is no such initial state, or times are missing.
     """
-    inputs, outputs = data.inputs, data.outputs
+    inputs = data.inputs
     for file in models.values():
         data.check_units(file)
-    operators: dict[str, Operator[Any] | TimedSequence] = {n: bind_times(f, data.times) for n, f in models.items()}
     starts = {name: starting_state(file, inputs, initial=initial, skip=skip) for name, file in models.items()}
-    states = {name: start.state for name, start in starts.items()}
     most = max(start.skip for start in starts.values())
-    applied = {
-        name: apply_model(file, data, state=states[name], session=session, skip=most) for name, file in models.items()
-    }
+
+    def all_applied(session: Session | None, skip: int) -> dict[str, Applied]:
+        return {
+            name: apply_model(file, data, state=starts[name].state, session=session, skip=skip)
+            for name, file in models.items()
+        }
+
+    applied = all_applied(session, most)
     first = next(iter(applied.values()))
-    comparisons = compare(operators, inputs, outputs, states=states, skip=first.first)
+    plain = applied if session is None else all_applied(None, first.first)
+    comparisons = {name: Comparison.of(data.outputs, each.predicted, first.first) for name, each in plain.items()}
     drifts = () if session is not None else (foreign_drift(each, inputs) for each in models.values())
     return ComparedModels(comparisons, applied, first.unit, first.first, tuple(filter(None, drifts)))
 

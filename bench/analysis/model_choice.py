@@ -23,9 +23,7 @@ from bench.identification import (
     Score,
     Selection,
     check_words,
-    compare,
     compared_models,
-    measure_errors,
     model_options,
     once,
     select,
@@ -285,12 +283,9 @@ def evaluate_on_rows(found: IdentifiedFile, test: str) -> TestedModel:
     measured, predicted = outputs[rows], (outputs - found.identification.residuals)[rows]
     if not measured.size:
         raise ConfigurationError(f"--test {test}: there are {outputs.size} rows")
-    residuals = measured - predicted
-    offset = float(residuals.mean())
-    raw, rezeroed = measure_errors(measured, predicted), measure_errors(measured, predicted + offset)
     times = None if found.data.times is None else found.data.times[rows]
     beyond = found.file.beyond(found.inputs[rows], times, first=rows.indices(outputs.size)[0])
-    return TestedModel(f"rows {test}", Comparison(raw, rezeroed, offset, residuals), 0, beyond)
+    return TestedModel(f"rows {test}", Comparison.of(measured, predicted), 0, beyond)
 
 
 def evaluate_on(found: IdentifiedFile, data: Dataset) -> TestedModel:
@@ -301,6 +296,6 @@ def evaluate_on(found: IdentifiedFile, data: Dataset) -> TestedModel:
     inputs, times = data.inputs, data.times if isinstance(found.file.response, TimedModel) else None
     model = bind_times(found.file, times)
     skip = 0 if isinstance(model, Operator) and model.memoryless else left_out(overwritten_from(inputs), inputs.size)
-    states = {"model": found.identification.initial_state}
-    compared = compare({"model": model}, inputs, data.outputs, states=states, skip=skip)["model"]
+    predicted = model.evaluate(inputs, found.identification.initial_state)
+    compared = Comparison.of(data.outputs, predicted, skip)
     return TestedModel(data.name, compared, skip, found.file.beyond(inputs, times))

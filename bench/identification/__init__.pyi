@@ -103,7 +103,6 @@ from .inspection import (
 from .measures import (
     Comparison as Comparison,
     Errors as Errors,
-    compare as compare,
     measure_errors as measure_errors,
 )
 from .memory_tests import (

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from bench.base import Floats, checks as _checks
-from bench.models import Operator, TimedSequence
 
 
 @dataclass(frozen=True)
@@ -101,59 +99,22 @@ class Comparison:
     offset: float
     residuals: Floats
 
+    @classmethod
+    def of(cls, measured: Floats, predicted: Floats, skip: int = 0) -> Comparison:
+        """Return how well predicted outputs, shape (N,), are those measured.
+
+        Between sessions the offset of a sensor moves: the error with and without it are two different numbers. The
+        first `skip` samples count neither in errors nor in the offset.
+
+        Raises ValueError if nothing is left after `skip`.
+        """
+        if not 0 <= skip < measured.size:
+            raise ValueError(f"skip: expected 0 <= skip < {measured.size}, got {skip}")
+        residuals = measured - predicted
+        offset = float(residuals[skip:].mean())
+        raw, rezeroed = (measure_errors(measured[skip:], predicted[skip:] + shift) for shift in (0.0, offset))
+        return cls(raw, rezeroed, offset, residuals)
+
     def to_json(self) -> dict[str, Any]:
         """Return errors and offset for programs."""
         return {"raw": self.raw.to_json(), "rezeroed": self.rezeroed.to_json(), "offset": self.offset}
-
-
-def compare(
-    models: Mapping[str, Operator[Any] | TimedSequence],
-    inputs: ArrayLike,
-    outputs: ArrayLike,
-    *,
-    states: Mapping[str, Any] | None = None,
-    skip: int = 0,
-) -> dict[str, Comparison]:
-    """Return how well each of several models predicts one measured sequence.
-
-    Between sessions the offset of a sensor moves: the error with and without it are two different numbers.
-
-    Parameters
-    ----------
-    models : mapping of str to Operator
-        The models by name.
-    inputs, outputs : array_like, shape (N,)
-        The measured sequence.
-    states : mapping of str to state, or None
-        State before the first sample for models that shall not start from their initial state.
-    skip : int
-        Number of first samples left out of errors and offset.
-
-    Raises
-    ------
-    ValueError
-        If there is no model, a state belongs to none, the lengths differ, a sequence is empty or not finite, or
-        nothing is left after `skip`.
-    """
-    sequence = _checks.samples("inputs", inputs)
-    measured = _checks.counted("outputs", outputs, sequence.size, "values, one for each input")
-    if not models:
-        raise ValueError("models: expected at least one, got none")
-    if not 0 <= skip < sequence.size:
-        raise ValueError(f"skip: expected 0 <= skip < {sequence.size}, got {skip}")
-    starts = {} if states is None else states
-    strangers = sorted(set(starts) - set(models))
-    if strangers:
-        raise ValueError(f"states: expected names of models, got {', '.join(strangers)}")
-    result = {}
-    for name, model in models.items():
-        predicted = model.evaluate(sequence, starts.get(name))
-        residuals = measured - predicted
-        offset = float(residuals[skip:].mean())
-        result[name] = Comparison(
-            raw=measure_errors(measured[skip:], predicted[skip:]),
-            rezeroed=measure_errors(measured[skip:], predicted[skip:] + offset),
-            offset=offset,
-            residuals=residuals,
-        )
-    return result

@@ -154,7 +154,7 @@ def _print_parts(parts: Sequence[PagePart], console: Console) -> None:
     """Print tables and texts of the page."""
     for part in parts:
         if isinstance(part, PageTable):
-            print_table(console, part.heads, part.rows, part.title, numbers_from=part.numbers_from)
+            print_table(console, part.heads, part.rows, part.title)
         elif isinstance(part, PageText):
             print_plain(console, part.text)
 
