@@ -11,7 +11,7 @@ from .applied_figures import (
 )
 from .band_columns import (
     BandedPrediction as BandedPrediction,
-    invert_band as invert_band,
+    setpoint_half_widths as setpoint_half_widths,
 )
 from .designs import (
     assess_designs as assess_designs,
@@ -39,8 +39,6 @@ from .figures.targets import (
     plot_tracking as plot_tracking,
 )
 from .inverted import (
-    NEAR as NEAR,
-    TOO_EARLY as TOO_EARLY,
     InvertedTargets as InvertedTargets,
     invert_targets as invert_targets,
 )
@@ -194,7 +192,6 @@ from .uncertain_models import (
     propagated as propagated,
     quantities_of as quantities_of,
     quantity_text as quantity_text,
-    setpoint_uncertainty as setpoint_uncertainty,
     spread_row as spread_row,
 )
 from .uncertain_results import (

@@ -20,6 +20,7 @@ from bench.identification import (
     input_half_widths,
     set_up_problem,
 )
+from bench.models import Operator
 
 
 @dataclass(frozen=True)
@@ -91,39 +92,17 @@ def band_of(model: ModelFile) -> BandedPrediction | None:
     return BandedPrediction(model.band, model.response.output_unit, model.valid.text(model.response.input_unit))
 
 
-@dataclass(frozen=True)
-class BandedTargets:
-    """The band at inverted set-points."""
-
-    outputs: BandedPrediction  # the band of the output at each set-point
-    # Shape (N,); half-width about each set-point within which the target is met: that of the output over the local
-    # slope, in input units; nan where that is more than the operating range, as the output hardly moves with the
-    # input. None of a model with time, whose output depends on more than the last set-point.
-    setpoints: Floats | None
-
-    def columns(self, setpoints: Floats, predicted: Floats, unit: str) -> list[tuple[str, Floats | list[object]]]:
-        """Return heads and values of both bands, the set-points in `unit`; empty cells where there is no slope."""
-
-        def shown(values: Floats) -> list[object]:
-            return ["" if value != value else value for value in values.tolist()]
-
-        if self.setpoints is None:
-            return [*self.outputs.columns(predicted)]
-        return [
-            (header_with_unit("setpoint lower", unit), shown(setpoints - self.setpoints)),
-            (header_with_unit("setpoint upper", unit), shown(setpoints + self.setpoints)),
-            *self.outputs.columns(predicted),
-        ]
-
-
-def invert_band(
+def setpoint_half_widths(
     model: ModelFile,
     setpoints: Floats,
     passing: Floats,
     state: Any = None,  # noqa: ANN401 - each operator has its own
-    times: Floats | None = None,
-) -> BandedTargets | None:
-    """Return the band at set-points that an inverse found; None if the model's file has none.
+) -> Floats | None:
+    """Return the half-width about each set-point that an inverse found within which the target is met, shape (N,).
+
+    It is that of the band of the output over the local slope, in input units; nan where that is more than the
+    operating range, as the output hardly moves with the input. None without a band, and of a model with time, whose
+    output depends on more than the last set-point.
 
     Parameters
     ----------
@@ -135,18 +114,13 @@ def invert_band(
         Set-point to pass before each; nan where there is none.
     state : object
         State before the first target; None is the initial one.
-    times : ndarray, shape (N,), or None
-        s, for a model with time.
     """
-    found = band_of(model)
-    if found is None:
+    if model.band is None or not isinstance(model.model, Operator):
         return None
-    if times is not None:
-        return BandedTargets(found, None)
     both = np.column_stack([passing, setpoints]).ravel()
     taken = np.isfinite(both)
     places = (np.cumsum(taken) - 1)[1::2]
-    return BandedTargets(found, input_half_widths(model.operator, both[taken], found.half_width, state)[places])
+    return np.asarray(input_half_widths(model.model, both[taken], model.band.half_width, state)[places])
 
 
 def calibrate(

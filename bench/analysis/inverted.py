@@ -9,8 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from bench.analysis.applied import check_finite
+from bench.analysis.band_columns import BandedPrediction, band_of, setpoint_half_widths
 from bench.analysis.tables.starting_state import bind_times, starting_state
-from bench.base import ConfigurationError, DataError, Floats
+from bench.analysis.uncertain_models import setpoint_uncertainty
+from bench.base import ConfigurationError, DataError, Floats, header_with_unit
 from bench.identification import Beyond, ModelFile
 from bench.models import Policy, Reach, TimedSequence
 
@@ -28,6 +30,10 @@ class InvertedTargets:
 
     Attributes
     ----------
+    file : ModelFile
+        The model.
+    state : object
+        Its state before the first target.
     targets : ndarray, shape (N,)
         Output units.
     setpoints : ndarray, shape (N,)
@@ -50,6 +56,8 @@ class InvertedTargets:
         Number of last set-points without an effect on any target, which repeat the one before.
     """
 
+    file: ModelFile
+    state: Any
     targets: Floats
     setpoints: Floats
     passing: Floats
@@ -59,6 +67,52 @@ class InvertedTargets:
     times: Floats | None = None
     delay: float = 0.0
     held: int = 0
+
+    @property
+    def band(self) -> BandedPrediction | None:
+        """The band about the predictions, if the model's file has one."""
+        return band_of(self.file)
+
+    @property
+    def through_saturation(self) -> int:
+        """Number of targets that are met only after another set-point."""
+        return int(np.isfinite(self.passing).sum())
+
+    def counts(self) -> dict[str, int]:
+        """Return how many targets have each flag."""
+        kinds = ("met", "too high", "too low", *((NEAR, TOO_EARLY) if self.delay else ()))
+        return {flag: self.flags.count(flag) for flag in kinds}
+
+    def table(self) -> list[tuple[str, Floats | list[object]]]:
+        """Return the columns of a file with their heads; cells are empty where there is no value."""
+        response = self.file.response
+        driven, output = response.input_unit, response.output_unit
+        widths = setpoint_half_widths(self.file, self.setpoints, self.passing, self.state)
+        ends = [] if widths is None else [("lower", self.setpoints - widths), ("upper", self.setpoints + widths)]
+        return [
+            *([] if self.times is None else [(header_with_unit("time", "s"), self.times)]),
+            (header_with_unit("target", output), self.targets),
+            (header_with_unit("passing", driven), _cells(self.passing)),
+            (header_with_unit("setpoint", driven), self.setpoints),
+            (header_with_unit("predicted", output), self.predicted),
+            ("flag", list(self.flags)),
+            *setpoint_uncertainty(self.file, self.setpoints, self.predicted, self.state),
+            *((header_with_unit(f"setpoint {end}", driven), _cells(values)) for end, values in ends),
+            *(self.band.columns(self.predicted) if self.band else ()),
+        ]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what was found for programs."""
+        met = np.array([flag == Reach.MET.value for flag in self.flags])
+        return {
+            "model": self.file.name,
+            "targets": len(self.flags),
+            **{flag.replace(" ", "_"): count for flag, count in self.counts().items()},
+            "through_saturation": self.through_saturation,
+            "largest_residual": float(np.abs(self.predicted - self.targets)[met].max()) if met.any() else None,
+            "beyond": self.beyond.to_json(),
+            **({"band": self.band.to_json()} if self.band else {}),
+        }
 
     def warnings(self) -> list[str]:
         """Return what a person should know: set-points beyond the inputs fitted; over time misses and ringing."""
@@ -175,7 +229,7 @@ def _inverted(
         raise DataError(f"model {model.name} cannot be inverted: {error}") from None
     flags = tuple(_flags(found.met, targets, found.outputs))
     beyond = model.beyond(found.setpoints)
-    return InvertedTargets(targets, found.setpoints, found.saturating, found.outputs, flags, beyond)
+    return InvertedTargets(model, state, targets, found.setpoints, found.saturating, found.outputs, flags, beyond)
 
 
 def _invert_in_time(
@@ -209,7 +263,13 @@ def _invert_in_time(
                 flags[row] = NEAR
     held = times.size - effective
     beyond, passing = file.beyond(setpoints, times), np.full(times.size, np.nan)
-    return InvertedTargets(targets, setpoints, passing, predicted, tuple(flags), beyond, times, delay, held)
+    return InvertedTargets(
+        file, state, targets, setpoints, passing, predicted, tuple(flags), beyond, times, delay, held
+    )
+
+
+def _cells(values: Floats) -> list[object]:
+    return ["" if value != value else value for value in values.tolist()]
 
 
 def _are_equal(outputs: Floats, targets: Floats) -> npt.NDArray[np.bool_]:

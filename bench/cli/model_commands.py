@@ -23,7 +23,7 @@ from bench.cli.data_options import FiguresOption, ReadingGroup, SkipOption, offe
 from bench.cli.model_options import ModelOptions
 from bench.cli.printing import console, print_rows, show_compilation, warn
 from bench.cli.run_names import NEWEST, complete_run, find_run
-from bench.cli.written import print_figures, write_rows
+from bench.cli.written import print_figures, write_rows, write_table
 
 if TYPE_CHECKING:
     from bench.analysis import FitOptions, WholeIdentification
@@ -417,19 +417,7 @@ def invert(
     Behind a delay set-points are for the targets that come so much later, and flags also `near` (met but for
     targets between the rows) and `too early` (before any set-point has an effect).
     """
-    from bench.analysis import (
-        NEAR,
-        TOO_EARLY,
-        ColumnNames,
-        check_unit,
-        invert_band,
-        invert_targets,
-        read_for,
-        setpoint_uncertainty,
-        starting_state,
-        write_csv,
-    )
-    from bench.base import header_with_unit
+    from bench.analysis import ColumnNames, check_unit, invert_targets, read_for
     from bench.identification import load_model
 
     check_outputs(out=out, json_file=json_file, read=(model_path, file))
@@ -437,8 +425,7 @@ def invert(
     with show_patience(f"reading {file.name}", console):
         data = read_for([model], file, ColumnNames(column, time=time_column), reading)
     print_assumptions(file.name, data.assumptions)
-    units = (model.response.input_unit, model.response.output_unit)
-    check_unit(units[1], data.input)
+    check_unit(model.response.output_unit, data.input)
     found = invert_targets(
         model,
         data.inputs,
@@ -449,43 +436,10 @@ def invert(
     )
     for warning in found.warnings():
         warn(warning)
-    start = starting_state(model, initial=initial, continue_memory=continue_memory)
-    banded = invert_band(model, found.setpoints, found.passing, start.state, found.times)
-    bands = banded.columns(found.setpoints, found.predicted, units[0]) if banded else []
-    passing = ["" if value != value else value for value in found.passing.tolist()]
-    written: list[tuple[str, Any]] = [
-        *([] if found.times is None else [(header_with_unit("time", "s"), found.times)]),
-        (header_with_unit("target", units[1]), found.targets),
-        (header_with_unit("passing", units[0]), passing),
-        (header_with_unit("setpoint", units[0]), found.setpoints),
-        (header_with_unit("predicted", units[1]), found.predicted),
-        ("flag", list(found.flags)),
-        *setpoint_uncertainty(model, found.setpoints, found.predicted, start.state),
-        *bands,
-    ]
-    write_csv(out, [head for head, _ in written], [values for _, values in written])
-    if banded is not None:
-        print_band(banded.outputs)
-    kinds = ("met", "too high", "too low", *((NEAR, TOO_EARLY) if found.delay else ()))
-    counts = {flag: found.flags.count(flag) for flag in kinds}
-    two = sum(value != "" for value in passing)
-    console.print(
-        f"{counted(len(found.flags), 'target')}: {', '.join(f'{count} {flag}' for flag, count in counts.items())}; "
-        f"{two} by way of saturation: {out}",
-        highlight=False,
-        soft_wrap=True,
-    )
-    met = [abs(p - t) for p, t, f in zip(found.predicted, found.targets, found.flags, strict=True) if f == "met"]
-    write_json(
-        json_file,
-        {
-            "model": model.name,
-            "targets": len(found.flags),
-            **{flag.replace(" ", "_"): count for flag, count in counts.items()},
-            "through_saturation": two,
-            "largest_residual": float(max(met)) if met else None,
-            "beyond": found.beyond.to_json(),
-            "out": str(out),
-            **({"band": banded.outputs.to_json()} if banded else {}),
-        },
-    )
+    write_table(out, found.table())
+    if found.band is not None:
+        print_band(found.band)
+    counts = ", ".join(f"{count} {flag}" for flag, count in found.counts().items())
+    via = f"{found.through_saturation} by way of saturation: {out}"
+    print_plain(console, f"{counted(len(found.flags), 'target')}: {counts}; {via}")
+    write_json(json_file, {**found.to_json(), "out": str(out)})

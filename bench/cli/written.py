@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from bench.base import counted, print_plain
 from bench.cli.printing import console
@@ -19,13 +19,20 @@ def print_figures(paths: Iterable[Path]) -> None:
         print_plain(console, f"figure: {path}")
 
 
+def write_table(path: Path, table: Sequence[tuple[str, Any]]) -> None:
+    """Write columns behind their heads as CSV. Raises DataError if the file cannot be written."""
+    from bench.analysis import write_csv
+
+    write_csv(path, [head for head, _ in table], [values for _, values in table])
+
+
 def write_rows(path: Path, found: Mapping[str, Applied]) -> None:
     """Write models beside measurements as CSV, and print where.
 
     Raises DataError if the file cannot be written.
     """
-    from bench.analysis import rows_table, write_csv
+    from bench.analysis import rows_table
 
     table = rows_table(found)
-    write_csv(path, [head for head, _ in table], [values for _, values in table])
+    write_table(path, table)
     print_plain(console, f"{counted(len(table[0][1]), 'row')}: {path}")

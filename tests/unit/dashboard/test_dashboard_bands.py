@@ -8,7 +8,7 @@ from other_plants import measured, random_reversals
 from rerun.chunk import RrdReader
 
 import bench as bench_functions
-from bench.analysis import invert_band
+from bench.analysis import setpoint_half_widths
 from bench.dashboard.entries import End, Tick
 from bench.dashboard.writer import Writer
 from bench.devices import Signal
@@ -179,13 +179,13 @@ def test_the_band_about_the_setpoints_is_that_of_invert(tmp_path, model):
     found = written(tmp_path / "run.rrd", controlled(inputs, np.zeros(inputs.size)), [model])
     path = inputs[np.append(True, np.diff(inputs) != 0.0)]
     state = model.operator.advance(model.operator.initial_state(), [0.8])
-    expected = invert_band(model, path, np.full(path.size, np.nan), state)
+    expected = setpoint_half_widths(model, path, np.full(path.size, np.nan), state)
     lower, upper, _ = merged(found[SETPOINT_BAND][ticks_of(found[SETPOINT_BAND], inputs)])
     # Each is there until the next, a hole where the output hardly moves with the input.
     moves = np.cumsum(np.append(False, np.diff(inputs) != 0.0))
-    np.testing.assert_allclose(0.5 * (upper - lower), np.delete(expected.setpoints[moves], 7), rtol=1e-6)
-    assert np.isfinite(expected.setpoints).mean() > 0.7
-    assert np.nanmedian(expected.setpoints) < 0.2
+    np.testing.assert_allclose(0.5 * (upper - lower), np.delete(expected[moves], 7), rtol=1e-6)
+    assert np.isfinite(expected).mean() > 0.7
+    assert np.nanmedian(expected) < 0.2
 
 
 @pytest.mark.parametrize("batch", [1, 7, 83])
