@@ -9,7 +9,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeGuard, TypeVar
+from typing import Any, NamedTuple, TypeGuard, TypeVar
 
 import numpy as np
 
@@ -111,6 +111,15 @@ def expand(file: CampaignFile) -> Expansion:
     return _Expander(file).expansion()
 
 
+class _Run(NamedTuple):
+    """A task of a run, with the rig as the file names it, the same as it was found, and the protocol."""
+
+    task: RunTask
+    rig: str
+    known: KnownRig
+    definition: ProtocolDefinition
+
+
 class _Expander:
     """Carries what was looked up already: a thousand runs of ten rigs connect ten."""
 
@@ -122,11 +131,9 @@ class _Expander:
         self._plans: dict[str, Plan | None] = {}
         self._digests: dict[str, str] = {}
         self._tasks: dict[str, CampaignTask] = {}
-        self._runs: dict[str, list[RunTask]] = {}
+        self._runs: dict[str, list[_Run]] = {}
         self._models: dict[str, dict[tuple[str, int], list[ModelTask]]] = {}
         self._several: dict[str, bool] = {}
-        self._rig_of: dict[str, KnownRig] = {}
-        self._definition_of: dict[str, ProtocolDefinition] = {}
         self._found_plans: dict[str, tuple[float, float]] = {}
         self._varying: dict[str, tuple[str, ...]] = {}
         self._units: dict[tuple[str, str], str] = {}
@@ -304,9 +311,7 @@ class _Expander:
                     model_labels=labels,
                 )
                 self._add(task)
-                self._runs[table.label].append(task)
-                self._rig_of[task.name] = known
-                self._definition_of[task.name] = definition
+                self._runs[table.label].append(_Run(task, rig, known, definition))
                 if planned is not None and planned.complete:
                     self._found_plans[task.name] = (planned.seconds, planned.seconds * known.pace)
 
@@ -334,39 +339,34 @@ class _Expander:
 
     def _add_models(self, where: str, table: ModelsTable) -> None:
         self._models[table.name] = {}
-        runs = [
-            (self._rig_as_given(label, run), run)
-            for label in table.runs
-            for run in self._runs[label]
-            if table.seed in (None, run.seed)
-        ]
+        runs = [run for label in table.runs for run in self._runs[label] if table.seed in (None, run.task.seed)]
         if (whole := whole_identification(table.model)) is not None:
             self._several[table.name] = False
-            for key in dict.fromkeys((rig, run.seed) for rig, run in runs):
-                together = [run for rig, run in runs if (rig, run.seed) == key]
+            for key in dict.fromkeys((run.rig, run.task.seed) for run in runs):
+                together = [run for run in runs if (run.rig, run.task.seed) == key]
                 self._check_whole(where, whole, *key, together)
                 self._add_model(table, key, together, f"{Path(key[0]).stem}-seed={key[1]}", table.name)
             return
         (table_of_runs,) = table.runs
         varying = [key for key in self._varying[table_of_runs] if key not in ("rig", "seed")]
         self._several[table.name] = bool(varying)
-        for rig, run in runs:
+        for run in runs:
             self._check_identification(where, table, run)
-            label = " ".join([table.name, *(f"{key}={_setting(run, key)}" for key in varying)])
-            self._add_model(table, (rig, run.seed), [run], run.name.rpartition("/")[2].rpartition("-")[0], label)
+            label = " ".join([table.name, *(f"{key}={_shown(run.task.setting(key))}" for key in varying)])
+            self._add_model(table, (run.rig, run.task.seed), [run], run.task.base, label)
 
     def _add_model(
-        self, table: ModelsTable, key: tuple[str, int], runs: Sequence[RunTask], base: str, label: str
+        self, table: ModelsTable, key: tuple[str, int], runs: Sequence[_Run], base: str, label: str
     ) -> None:
         """Add the identification of a model of a rig and seed from runs."""
         identity = digest(
-            {"runs": [run.identity for run in runs], **table.model_dump(exclude={"name", "runs", "seed"})}
+            {"runs": [run.task.identity for run in runs], **table.model_dump(exclude={"name", "runs", "seed"})}
         )
         task = ModelTask(
             name=_folder(table.name, base, identity),
             identity=identity,
             table=table.name,
-            sources=tuple(run.name for run in runs),
+            sources=tuple(run.task.name for run in runs),
             model=table.model,
             input=table.input,
             output=table.output,
@@ -376,25 +376,23 @@ class _Expander:
         self._add(task)
         self._models[table.name].setdefault(key, []).append(task)
 
-    def _check_whole(
-        self, where: str, whole: WholeIdentification, rig: str, seed: int, runs: Sequence[RunTask]
-    ) -> None:
+    def _check_whole(self, where: str, whole: WholeIdentification, rig: str, seed: int, runs: Sequence[_Run]) -> None:
         """Check that a model of several runs gets one of each protocol that it needs."""
-        found = [self._definition_of[run.name].name for run in runs]
+        found = [run.definition.name for run in runs]
         if sorted(found) != sorted(whole.protocols):
             raise ConfigurationError(
                 f"{where}: runs: expected one run each of {', '.join(whole.protocols)} on a rig and seed; on {rig} "
                 f"with seed {seed} there are: {', '.join(found)}"
             )
 
-    def _check_identification(self, where: str, table: ModelsTable, run: RunTask) -> None:
+    def _check_identification(self, where: str, table: ModelsTable, run: _Run) -> None:
         """Check columns and options of an identification from a run."""
-        known = self._rig_of[run.name]
-        slots = known.description.slots(self._definition_of[run.name])
+        known = run.known
+        slots = known.description.slots(run.definition)
         columns = {"input": (table.input, "drive"), "output": (table.output, "response")}
         for key, (column, slot) in columns.items():
             if not column and slot not in slots:
-                raise ConfigurationError(f"{where}: {key} is missing, as {run.protocol} has no slot {slot!r}")
+                raise ConfigurationError(f"{where}: {key} is missing, as {run.task.protocol} has no slot {slot!r}")
             if column and column not in known.description.by_name:
                 signals = closest(column, known.description.by_name)
                 raise ConfigurationError(f"{where}: {key} = {column!r}: there is no such signal; {signals}")
@@ -424,8 +422,7 @@ class _Expander:
         if len(columns) > 1:
             raise ConfigurationError(f"{where}: models: their columns differ; expected one input and one output")
         ((input_column, output_column),) = columns
-        for run in self._runs[table.runs]:
-            rig = self._rig_as_given(table.runs, run)
+        for run, rig, *_ in self._runs[table.runs]:
             found = {
                 task.label: task
                 for name in table.models
@@ -433,10 +430,9 @@ class _Expander:
             }
             content = table.model_dump(exclude={"name", "runs", "models"})
             identity = digest({"run": run.identity, **content, "models": {k: t.identity for k, t in found.items()}})
-            base = run.name.rpartition("/")[2].rpartition("-")[0]
             self._add(
                 ComparisonTask(
-                    name=_folder(table.name, base, identity),
+                    name=_folder(table.name, run.base, identity),
                     identity=identity,
                     table=table.name,
                     source=run.name,
@@ -447,10 +443,6 @@ class _Expander:
                     recalibrate_rows=table.recalibrate_rows,
                 )
             )
-
-    def _rig_as_given(self, label: str, run: RunTask) -> str:
-        table = next(each for each in self._file.runs if each.label == label)
-        return next(rig for rig in table.rigs if run.rig in (rig, self._file.beside(rig)))
 
     def _add_studies(self, number: int, table: Any) -> None:  # noqa: ANN401 - a StudiesTable
         where = self._file.where("studies", number)
@@ -568,12 +560,6 @@ def _unit(definition: ProtocolDefinition, file: RigFile, key: str) -> str:
 
 def _shown(value: object) -> str:
     return Path(value).stem if isinstance(value, str) and "/" in value else str(value)
-
-
-def _setting(run: RunTask, key: str) -> str:
-    """Return what a run has on an axis, as it is shown."""
-    own = {"protocol": run.protocol, "faults": run.faults or "none"}
-    return _shown({**own, **run.overrides, **run.parameters, **run.model_labels}[key])
 
 
 def _name(table: str, values: Mapping[str, Any], varying: Sequence[str], identity: str) -> str:

@@ -7,7 +7,7 @@ import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 from rich.console import Console
 from rich.table import Table
@@ -115,7 +115,9 @@ def runs_table(expansion: Expansion, done: Mapping[str, Done], table: str) -> Re
         row = _without_units(table=table, protocol=Path(task.protocol).name, rig=Path(task.rig).stem)
         for key in expansion.varying[table]:
             if key not in ("protocol", "rig", "seed", "faults"):
-                row[(key, expansion.units.get((table, key), ""))] = _setting(task, key)
+                value = task.setting(key)
+                plain = isinstance(value, (int, float, str)) and not isinstance(value, bool)
+                row[(key, expansion.units.get((table, key), ""))] = value if plain else str(value)
         row |= _without_units(faults=Path(task.faults).stem, seed=task.seed, status=found.status, reason=found.reason)
         row |= {(name, unit): value for name, (value, unit) in found.results.items()}
         for model in models.get(task.name, ()):
@@ -321,14 +323,6 @@ def _statistics(name: str, unit: str, cells: Iterable[Cell]) -> Row:
         (f"{name} {WORST}", unit): max(values) if values else None,
         (f"{name} {SPREAD}", unit): max(values) - min(values) if values else None,
     }
-
-
-def _setting(task: RunTask, key: str) -> Cell:
-    value: Any
-    if key in task.models:
-        return task.model_labels[key]
-    value = task.parameters.get(key, task.overrides.get(key))
-    return value if isinstance(value, (int, float, str)) and not isinstance(value, bool) else str(value)
 
 
 def _is_numeric(cells: Sequence[Cell]) -> bool:

@@ -239,6 +239,16 @@ class RunTask(CampaignTask):
             },
         )
 
+    @property
+    def base(self) -> str:
+        """Its name without the table and its identity."""
+        return self.name.rpartition("/")[2].rpartition("-")[0]
+
+    def setting(self, key: str) -> Any:  # noqa: ANN401 - of a parameter, an override, or the label of a model
+        """Return what it has on an axis of its table."""
+        own = {"protocol": self.protocol, "faults": self.faults or "none"}
+        return {**own, **self.overrides, **self.parameters, **self.model_labels}[key]
+
     def run(self, campaign: Path, folder: Path) -> Run:
         """Return the run that it carries out; its record goes below `folder`."""
         models = {key: str(campaign / name / MODEL_NAME) for key, name in self.models.items()}
