@@ -99,10 +99,10 @@ from .report.run_report import (
     draw_comparison as draw_comparison,
     draw_identification as draw_identification,
     draw_predicted as draw_predicted,
+    print_parts as print_parts,
     report_run as report_run,
 )
 from .run_comparison import (
-    SIGNAL_HEADS as SIGNAL_HEADS,
     RunComparison as RunComparison,
     compare_runs as compare_runs,
 )

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from bench.analysis.report.page.elements import PagePart, PageTable, PageText
 from bench.analysis.run_list import main_result
 from bench.analysis.tracking_errors import results_json, target_results
 from bench.base import fitting_prefix, format_duration, html_table, significant
@@ -18,9 +19,6 @@ from bench.record import Difference, Record, Table, differences
 
 _OF_THE_WALL_CLOCK = ("clock", "observer", "suspended", "notify", "pause", "resume", "remark", PARAMETER)
 """Kinds of events that say how fast a machine was, and when an operator did something."""
-
-
-SIGNAL_HEADS = ("signal", "RMS", "max", "unit", "at step")
 
 
 @dataclass(frozen=True)
@@ -81,8 +79,38 @@ class RunComparison:
         """Return it for programs."""
         return asdict(self)
 
-    def outcome_rows(self) -> list[tuple[str, str, str]]:
-        """Return how both ended: name, first and second of each row of a table."""
+    def sections(self) -> dict[str, list[PagePart]]:
+        """Return the comparison by title, for the terminal, a notebook and a page."""
+        differences = [
+            (each.key, *("none" if value is None else str(value) for value in (each.first, each.second)))
+            for each in self.differences
+        ]
+        signals = []
+        for name, apart in self.signals.items():
+            factor, unit = fitting_prefix(apart.unit, apart.maximum)
+            numbers = [significant(factor * value, 3) for value in (apart.rms, apart.maximum)]
+            signals.append((name, *numbers, "" if unit == "1" else unit, str(apart.step)))
+        said = [
+            f"reproducibility of {signal}: {significant(deviation, 2)} {self.signals[signal].unit}, standard "
+            "deviation of what two sessions reach at the same targets"
+            for signal, deviation in self.reproducibility.items()
+        ]
+        same = [name for name, equal in self.equal.items() if equal]
+        title = f"second less first, {self.common_steps} common steps"
+        return {
+            "Outcome": [PageTable(("", "first", "second"), self._outcome_rows())],
+            "What differs": [
+                PageTable(("key", "first", "second"), differences)
+                if differences
+                else PageText("nothing differs in what they were given")
+            ],
+            "Signals": [
+                PageTable(("signal", "RMS", "max", "unit", "at step"), signals, title=title, numbers_from=1),
+                *map(PageText, [*said, f"equal to the last bit: {', '.join(same) or 'nothing'}"]),
+            ],
+        }
+
+    def _outcome_rows(self) -> list[tuple[str, str, str]]:
         rows = [
             (name, *("" if value is None else str(value) for value in map(attrgetter(name), self.outcomes)))
             for name in ("run", "status", "reason", "steps", "result")
@@ -97,30 +125,13 @@ class RunComparison:
                 )
         return [(name, first, second) for name, first, second in rows if first or second]
 
-    def difference_rows(self) -> list[tuple[str, str, str]]:
-        """Return what differs: key, first and second of each row of a table."""
-        shown = {each.key: ["none" if v is None else str(v) for v in (each.first, each.second)]
-                 for each in self.differences}  # fmt: skip
-        return [(key, first, second) for key, (first, second) in shown.items()]
-
-    def signal_rows(self) -> list[tuple[str, ...]]:
-        """Return how far signals are apart: signal, RMS, maximum, unit and step of each row of a table."""
-        rows = []
-        for name, apart in self.signals.items():
-            factor, unit = fitting_prefix(apart.unit, apart.maximum)
-            numbers = [significant(factor * value, 3) for value in (apart.rms, apart.maximum)]
-            rows.append((name, *numbers, "" if unit == "1" else unit, str(apart.step)))
-        return rows
-
-    @property
-    def signals_title(self) -> str:
-        """Title of the table of signals."""
-        return f"second less first, {self.common_steps} common steps"
-
     def _repr_html_(self) -> str:
-        outcomes = html_table(("", "first", "second"), self.outcome_rows())
-        apart = html_table(SIGNAL_HEADS, self.signal_rows(), self.signals_title)
-        return outcomes + html_table(("differs", "first", "second"), self.difference_rows()) + apart
+        tables = {title: parts[0] for title, parts in self.sections().items()}
+        return "".join(
+            html_table(table.heads, table.rows, table.title or title.lower())
+            for title, table in tables.items()
+            if isinstance(table, PageTable)
+        )
 
 
 def compare_runs(first: Record, second: Record) -> RunComparison:

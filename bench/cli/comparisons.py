@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -15,9 +15,6 @@ from bench.cli.model_commands import InitialOption
 from bench.cli.printing import console, show_compilation, warn
 from bench.cli.run_names import BEFORE, NEWEST, RunArgument, find_run
 from bench.cli.written import print_figures, write_rows
-
-if TYPE_CHECKING:
-    from bench.analysis import RunComparison
 
 
 @offer_groups
@@ -109,35 +106,17 @@ def compare(
 
     Shown is what differs in parameters, rig, instruments, versions and files.
     """
-    from bench.analysis import compare_runs
+    from bench.analysis import compare_runs, print_parts
     from bench.record import Record
 
     check_outputs(html=html, json_file=json_file, read=[first_run, second_run])
     with Record(first_run) as first, Record(second_run) as second:
         found = compare_runs(first, second)
-        _print_runs(found)
+        for title, parts in found.sections().items():
+            print_parts(parts, console, title.lower())
         if html is not None:
             from bench.analysis import comparison_page, write_page
 
             write_page(html, comparison_page(first, second, found))
             print_plain(console, f"page: {html}")
     write_json(json_file, found.to_json())
-
-
-def _print_runs(found: RunComparison) -> None:
-    from bench.analysis import SIGNAL_HEADS
-
-    print_table(console, ("", "first", "second"), found.outcome_rows(), "outcome")
-    if found.differences:
-        print_table(console, ("key", "first", "second"), found.difference_rows(), "what differs")
-    else:
-        console.print("nothing differs in what they were given", highlight=False)
-    print_table(console, SIGNAL_HEADS, found.signal_rows(), found.signals_title)
-    for signal, deviation in found.reproducibility.items():
-        print_plain(
-            console,
-            f"reproducibility of {signal}: {significant(deviation, 2)} {found.signals[signal].unit}, standard "
-            "deviation of what two sessions reach at the same targets",
-        )
-    same = [name for name, equal in found.equal.items() if equal]
-    console.print(f"equal to the last bit: {', '.join(same) or 'nothing'}", highlight=False)

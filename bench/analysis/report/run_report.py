@@ -77,13 +77,13 @@ def report_run(
         if remark := record.remark():
             print_plain(console, remark)
         _print_status(record, len(found.steps), console)
-        _print_parts([signals_table(found)], console)
+        print_parts([signals_table(found)], console)
         _print_events(found.events, console)
         for line in lateness_lines(record.meta.get("lateness", {})):
             print_plain(console, line)
         figures = _draw(found, folder, figure_format)
         _print_control(found, console)
-        _print_parts([*uncertainty_parts(found.uncertainty), *errors_parts(found.applied)], console)
+        print_parts([*uncertainty_parts(found.uncertainty), *errors_parts(found.applied)], console)
         result = found.result
         if page is not None:
             write_page(page, run_page(found, published))
@@ -150,11 +150,11 @@ def _print_status(record: Record, steps: int, console: Console) -> None:
         print_plain(console, f"  {text}")
 
 
-def _print_parts(parts: Sequence[PagePart], console: Console) -> None:
-    """Print tables and texts of the page."""
+def print_parts(parts: Sequence[PagePart], console: Console, title: str = "") -> None:
+    """Print tables and texts of a page; a table without a title has that of its section."""
     for part in parts:
         if isinstance(part, PageTable):
-            print_table(console, part.heads, part.rows, part.title)
+            print_table(console, part.heads, part.rows, part.title or title)
         elif isinstance(part, PageText):
             print_plain(console, part.text)
 
