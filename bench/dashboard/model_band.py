@@ -20,8 +20,8 @@ from bench.control import widened
 from bench.dashboard.drawing import CAUTION, Colour
 from bench.dashboard.entries import Part, Tick, Ticks, single
 from bench.dashboard.rerun_recording import RerunRecording, times
-from bench.devices import Settled, Signal
-from bench.identification import Band, ModelFile, Validity, input_half_widths
+from bench.devices import Settled
+from bench.identification import ModelFile, input_half_widths
 from bench.models import Operator
 from bench.record import StepRecord
 
@@ -69,66 +69,23 @@ class ModelBand:
 
     def __init__(
         self,
-        name: str,
-        operator: Operator[Any],
-        band: Band,
-        validity: Validity,
-        state: Any,  # noqa: ANN401 - each operator has its own
+        file: ModelFile,
         *,
         drive: int,
         response: Plotted,
         setpoint: Plotted | None = None,
         reference: int | None = None,
     ) -> None:
-        self._name, self._operator, self._band, self._validity = name, operator, band, validity
+        assert file.band is not None
+        self._name, self._operator, self._band, self._validity = file.name, file.operator, file.band, file.valid
         self._drive, self._response, self._setpoint, self._reference = drive, response, setpoint, reference
-        self._plausible = widened(*operator.input_range)
-        self._state = self._set_state = state
+        self._plausible = widened(*self._operator.input_range)
+        self._state: Any = self._operator.initial_state() if file.initial is None else file.initial
+        self._set_state = self._state
         self._set, self._set_width = math.nan, math.nan
         self._begun, self._last_reference = reference is None, 0.0
         self._standings: list[_Standing] = []
         self._drawn: list[tuple[str, list[rr.TimeColumn], Floats]] = []
-
-    @classmethod
-    def of(
-        cls,
-        models: Sequence[ModelFile],
-        signals: Sequence[Signal],
-        *,
-        drive: int,
-        response: Plotted,
-        setpoint: Plotted | None,
-        reference: int | None,
-    ) -> ModelBand | None:
-        """Return the band of a model of these signals; None if no model has one.
-
-        Under control it is that of the first such model, which the run was given; otherwise of the last one, which
-        was identified from the run.
-        """
-        ends = signals[drive], signals[response.column]
-        fitting = [
-            file
-            for file in models
-            if file.band is not None
-            and isinstance(file.model, Operator)
-            and (file.model.input_unit, file.model.output_unit) == tuple(signal.unit for signal in ends)
-        ]
-        if not fitting:
-            return None
-        file = fitting[-1 if reference is None else 0]
-        assert file.band is not None
-        state = file.operator.initial_state() if file.initial is None else file.initial
-        return cls(
-            file.name,
-            file.operator,
-            file.band,
-            file.valid,
-            state,
-            drive=drive,
-            response=response,
-            setpoint=setpoint,
-            reference=reference,
-        )
 
     def draw(self, recording: RerunRecording) -> None:
         """Write how the lines look."""
@@ -245,3 +202,18 @@ class ModelBand:
 def _parted(middle: Floats, widths: Floats | float, beyond: npt.NDArray[np.bool_]) -> list[Floats]:
     """Return lower and upper ends, each shape (N,), within the inputs that were fitted, then beyond them."""
     return [np.where(where, middle + sign * widths, np.nan) for where in (~beyond, beyond) for sign in (-1.0, 1.0)]
+
+
+def banded_model(models: Sequence[ModelFile], units: tuple[str, str], *, is_controlled: bool) -> ModelFile | None:
+    """Return the model whose band is shown, of those with a band and with these units of input and output, if any.
+
+    Under control it is the first, which the run was given; otherwise the last, which was identified from the run.
+    """
+    fitting = [
+        file
+        for file in models
+        if file.band is not None
+        and isinstance(file.model, Operator)
+        and (file.model.input_unit, file.model.output_unit) == units
+    ]
+    return fitting[0 if is_controlled else -1] if fitting else None

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import rerun as rr
 
+from bench.base import format_duration
 from bench.dashboard.drawing import Colour
 from bench.dashboard.entries import Part, Ticks
 from bench.dashboard.rerun_recording import RerunRecording, times
@@ -102,7 +103,7 @@ def _write_events(recording: RerunRecording, events: Sequence[tuple[int, Event]]
         return
     columns = rr.TextLog.columns(
         # The viewer leaves its own time column too narrow to read.
-        text=[f"{_clock_face(event.t)}  {event.text}" for _, event in events],
+        text=[f"{format_duration(max(event.t, 0.0))}  {event.text}" for _, event in events],
         level=[event.level for _, event in events],
     )
     recording.send("events", times([event.t for _, event in events], [step for step, _ in events]), columns)
@@ -113,8 +114,3 @@ def _state_after(event: Event) -> str | None:
     if event.kind == "safe-state" and event.level == "ERROR":
         return _NOT_SAFE
     return event.text if event.kind == "end" else _STATE_OF_EVENT.get(event.kind)
-
-
-def _clock_face(t: float) -> str:
-    minutes, seconds = divmod(max(int(t), 0), 60)
-    return f"{minutes // 60}:{minutes % 60:02d}:{seconds:02d}"

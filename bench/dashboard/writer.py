@@ -15,12 +15,12 @@ import rerun.blueprint as rrb
 from pydantic import ValidationError
 
 from bench.base import ConfigurationError, problems
-from bench.dashboard.arrangement import Arranged, blueprint, seldom
+from bench.dashboard.arrangement import View, blueprint, seldom
 from bench.dashboard.bounds import BoundLines, bounds_of
 from bench.dashboard.controlled_run import TRACE_NAMES, WITNESS, ControlPlots, ErrorPlot
 from bench.dashboard.entries import End, Entry, ModelDensity, Part, Ticks, densities_of, in_parts
 from bench.dashboard.lateness_plot import LatenessPlot
-from bench.dashboard.model_band import ModelBand, Plotted
+from bench.dashboard.model_band import ModelBand, Plotted, banded_model
 from bench.dashboard.numbers import LIVE_SECONDS, Numbers
 from bench.dashboard.planes import Planes
 from bench.dashboard.rerun_recording import RerunRecording, times
@@ -192,7 +192,11 @@ class Writer:
             response = Plotted(output, "control/error", self._control.error_factor)
             reference = self._control.traces[0]
         setpoint = places.get(self._commanded.get(drive, -1))
-        return ModelBand.of(models, signals, drive=drive, response=response, setpoint=setpoint, reference=reference)
+        units = signals[drive].unit, signals[output].unit
+        file = banded_model(models, units, is_controlled=reference is not None)
+        if file is None:
+            return None
+        return ModelBand(file, drive=drive, response=response, setpoint=setpoint, reference=reference)
 
     def _note(self, name: str, values: npt.NDArray[Any]) -> None:
         """Note whether a plot has something to show: numbers that are not all zero."""
@@ -237,23 +241,18 @@ class Writer:
         control = (
             [] if self._control is None else self._control.views(filled, error_range, banded=self._band is not None)
         )
+        drawn: list[View] = []
+        if self._plots is not None and self._planes is not None:
+            drawn += [*self._plots.views(bright), *self._planes.views(has_moved=self._plots.has_first_moved)]
         return blueprint(
-            Arranged(
-                control=[view for view, _ in control],
-                control_shares=[share for _, share in control],
-                over_time=over_time,
-                others=others,
-                plots=[] if self._plots is None else self._plots.views(bright),
-                planes=[]
-                if self._planes is None
-                else self._planes.views(has_moved=self._plots is not None and self._plots.has_first_moved),
-                lateness=self._lateness.view(),
-                state=state,
-                # What is over does not run: its lane would say so up to the end.
-                lanes=["/state/phase", "/state/run"]
-                if state in ("running", "paused") or eventful
-                else ["/state/phase"],
-            )
+            control=control,
+            over_time=over_time,
+            others=others,
+            drawn=drawn,
+            lateness=self._lateness.view(),
+            state=state,
+            # What is over does not run: its lane would say so up to the end.
+            lanes=["/state/phase", *["/state/run"] * (state in ("running", "paused") or eventful)],
         )
 
 
