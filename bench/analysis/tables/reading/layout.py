@@ -81,6 +81,7 @@ class Layout:
     numbers: tuple[int, ...] = ()
     figures: tuple[int, ...] = ()
     comments: int = 0  # number of lines of comment above the data
+    fit: int = 1  # how well the heads fit: 2; 1 where there are none; 0 if they do not
 
     @property
     def marks(self) -> tuple[str, ...]:
@@ -94,22 +95,6 @@ class Row:
 
     line: int
     cells: list[str]
-
-
-@dataclass(frozen=True)
-class Header:
-    """What stands above the data: the heads, and how well they fit (2; 1 where there are none; 0 if they do not).
-
-    Of the columns also what they hold, as in `Layout`.
-    """
-
-    start: int
-    heads: tuple[Head, ...]
-    columns: int
-    fit: int
-    notes: tuple[str, ...]
-    numbers: tuple[int, ...] = ()
-    figures: tuple[int, ...] = ()
 
 
 def delimited(delimiter: str) -> str:
@@ -190,18 +175,14 @@ def find_layout(path: Path, lines: Sequence[str], options: ReadingOptions, first
             if delimiter == " " and any(rank[0] and other.columns == header.columns for rank, other in found):
                 continue
             if not header.heads and header.fit == 1:
-                header = _header_in_comment(lines, first, header, delimiter)
+                header = _header_in_comment(lines, first, header)
             data = [row.cells for row in rows if row.line > header.start]
             filled = [cell for cells in data for cell in cells if cell.strip()]
             numbers = [cell for cell in filled if is_number(cell, decimal)]
-            comments = sum(is_comment(line, comment_marks(delimiter)) for line in lines[: header.start - first])
-            notes = _notes(lines[: header.start - first], comments, header, delimiter, decimal)
-            if any("d" in cell.lower() for cell in numbers):
-                notes = (*notes, D_EXPONENTS)
-            layout = Layout(
-                delimiter, decimal, header.start, header.heads, header.columns, notes,
-                header.numbers, header.figures, comments,
-            )  # fmt: skip
+            above = lines[: header.start - first]
+            comments = sum(is_comment(line, header.marks) for line in above)
+            notes = (*_notes(above, comments, header), *[D_EXPONENTS] * any("d" in cell.lower() for cell in numbers))
+            layout = replace(header, notes=notes, comments=comments)
             share = len(numbers) / len(filled)
             signs.append(((share >= _MOSTLY, header.fit, len(numbers), share), layout))
         # The decimal sign is the one with which more are numbers, whether or not a header fits.
@@ -258,7 +239,7 @@ def other_heads(above: Sequence[Row], layout: Layout) -> Iterator[Layout]:
             yield replace(layout, heads=make_heads(row.cells), notes=(*layout.notes, f"heads from line {row.line}"))
 
 
-def find_header(rows: Sequence[Row], decimal: str, delimiter: str = ",", *, in_order: bool = False) -> Header | None:
+def find_header(rows: Sequence[Row], decimal: str, delimiter: str = ",", *, in_order: bool = False) -> Layout | None:
     """Find where the data begin, and the heads and units above them; None if no row has a number.
 
     In order, the data are those of the first table; otherwise names and values above a much longer one are no table.
@@ -278,9 +259,10 @@ def find_header(rows: Sequence[Row], decimal: str, delimiter: str = ",", *, in_o
 
 def _find_heads(
     rows: Sequence[Row], masks: Sequence[Mask], begin: int, pattern: Mask, decimal: str, delimiter: str
-) -> Header:
+) -> Layout:
     """Return the heads and units above the data, which begin in a row and have a pattern."""
     columns, notes = len(pattern), list[str]()
+    layout = Layout(delimiter, decimal, rows[0].line - 1, (), columns, ())
     if (
         begin == 0
         and len(rows) > 1
@@ -291,8 +273,8 @@ def _find_heads(
         begin = 1
         notes.append(f"heads from line {rows[0].line}, some of them numbers")
     if begin == 0:
-        return Header(rows[0].line - 1, (), columns, 1, ())
-    start = rows[begin - 1].line
+        return layout
+    layout = replace(layout, start=rows[begin - 1].line)
     texts, units = rows[begin - 1].cells, list[str]()
     # As of two channels, heads may be numbers but for the first.
     above = rows[begin - 2].cells if begin > 1 and masks[begin - 2][0] is False else []
@@ -309,17 +291,17 @@ def _find_heads(
     other = "," if decimal == "." else "."
     if any(is_number(text, other) and not is_number(text, decimal) for text in texts):
         # Numbers with the other decimal sign.
-        return Header(start, (), columns, 0, ())
+        return replace(layout, fit=0)
     heads = _matched(texts, columns, delimiter)
     aligned = _aligned(rows[:begin], columns) if len(heads) == 1 < columns else []
     if aligned and not any(is_number(text, sign) for text in aligned for sign in ".,"):
-        return Header(start, make_heads(aligned), columns, 2, ("heads aligned by blanks",))
+        return replace(layout, heads=make_heads(aligned), fit=2, notes=("heads aligned by blanks",))
     if len(heads) == 1 < columns and begin > 1:
         # A title, perhaps between the heads and the data.
         found = _find_heads(rows, masks, begin - 1, pattern, decimal, delimiter) if len(above) == columns else None
-        return replace(found, start=start) if found else Header(start, (), columns, 1, ())
+        return replace(found, start=layout.start) if found else layout
     fit = 2 if len(heads) == columns or (len(heads) > columns and delimiter != " ") else 0
-    return Header(start, make_heads(heads, units) if fit else (), columns, fit, tuple(notes))
+    return replace(layout, heads=make_heads(heads, units) if fit else (), fit=fit, notes=tuple(notes))
 
 
 def _aligned(above: Sequence[Row], columns: int) -> list[str]:
@@ -414,10 +396,10 @@ def _unit_row(cells: Sequence[str]) -> bool:
     return all(is_unit(cell) or is_unit(bare_unit(cell)) for cell in filled)
 
 
-def _header_in_comment(lines: Sequence[str], first: int, header: Header, delimiter: str) -> Header:
+def _header_in_comment(lines: Sequence[str], first: int, header: Layout) -> Layout:
     """Return the header with the heads of the last comments above the data, as numpy writes them, if they fit."""
-    marks = comment_marks(delimiter)
-    comments = [line.strip() for line in lines[: header.start - first] if is_comment(line, marks)]
+    delimiter = header.delimiter
+    comments = [line.strip() for line in lines[: header.start - first] if is_comment(line, header.marks)]
     texts = [comment.lstrip("#%/; \t") for comment in comments]
     rows = [row.cells for text in texts[-2:] for row in split_rows([text], delimiter)]
     if not rows:
@@ -430,23 +412,18 @@ def _header_in_comment(lines: Sequence[str], first: int, header: Header, delimit
     return replace(header, heads=make_heads(heads, units), fit=2, notes=notes)
 
 
-def _notes(above: Sequence[str], comments: int, header: Header, delimiter: str, decimal: str) -> tuple[str, ...]:
+def _notes(above: Sequence[str], comments: int, header: Layout) -> tuple[str, ...]:
     used = 0 if not header.heads or "header from a comment" in header.notes else 1
     used += "units from a row" in header.notes and "header from a comment" not in header.notes
     others = sum(not line.isspace() for line in above) - comments - used
     return (
-        "one column" if header.columns == 1 else delimited(delimiter),
-        *(["decimal comma"] if decimal == "," else []),
-        *([count_lines(others, "above the header")] if others > 0 else []),
+        "one column" if header.columns == 1 else delimited(header.delimiter),
+        *(["decimal comma"] if header.decimal == "," else []),
+        *([f"{counted(others, 'line')} above the header"] if others > 0 else []),
         *(["no header"] if header.fit == 1 and not header.heads else []),
         *(["heads that do not fit the columns"] if header.fit == 0 else []),
         *header.notes,
     )
-
-
-def count_lines(number: int, what: str) -> str:
-    """Return a count of lines for people."""
-    return f"{counted(number, 'line')} {what}"
 
 
 def _quoted(rows: Sequence[Row], lines: Sequence[str], options: ReadingOptions) -> bool:

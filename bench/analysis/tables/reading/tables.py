@@ -11,7 +11,6 @@ from bench.analysis.tables.reading.layout import (
     SAMPLE_CHARACTERS,
     SAMPLE_LINES,
     Layout,
-    count_lines,
     find_layout,
     is_comment,
     is_number,
@@ -96,7 +95,7 @@ def choose_tables(file: TextFile, tables: Sequence[Table]) -> tuple[list[Table],
     many = f"{len(equal)} of {len(tables)} tables, of equal columns, joined in order"
     note = many if len(equal) > 1 else f"the longest of {len(tables)} tables"
     chosen = [replace(table, layout=replace(table.layout, heads=heads)) for table in equal]
-    return chosen, f"{note}, {count_lines(others, 'beside them')} left out" if others else note
+    return chosen, f"{note}, {counted(others, 'line')} beside them left out" if others else note
 
 
 def _is_like(table: Table, other: Table) -> bool:
@@ -185,7 +184,7 @@ def note_rest(file: TextFile, options: ReadingOptions, layout: Layout, ending: E
         return None
     lines = file.lines(ending.end, ending.rest if another else None)
     rest = sum(not line.isspace() and not is_comment(line, layout.marks) for line in lines)
-    return (f"{count_lines(rest, 'below the table')} left out",) if rest else ()
+    return (f"{counted(rest, 'line')} below the table left out",) if rest else ()
 
 
 def list_tables(tables: Sequence[Table]) -> str:

@@ -19,7 +19,6 @@ from bench.analysis.tables.reading.layout import (
     D_EXPONENTS,
     Layout,
     closes_its_quotes,
-    count_lines,
     delimited,
     find_layout,
     header_only,
@@ -44,7 +43,7 @@ from bench.analysis.tables.reading.tables import (
     walk_tables,
 )
 from bench.analysis.tables.reading.text import TextFile, open_text
-from bench.base import ConfigurationError, DataError, Floats
+from bench.base import ConfigurationError, DataError, Floats, counted
 
 _LETTER = re.compile(r"[^\x00-@E\[-`e{-\x7f]")
 """A letter but for that of an exponent."""
@@ -161,7 +160,7 @@ def _read_table(
         *([encoding.upper() if encoding.startswith("utf") else encoding] if encoding != "utf-8" else []),
         *([f"table {int(options.table)}"] if options.table else []),
         *layout.notes,
-        *([count_lines(comments, "of comment")] if comments else []),
+        *([f"{counted(comments, 'line')} of comment"] if comments else []),
         *(text_note(body.ending.within) if body.ending else []),
         *(after or ()),
     )
