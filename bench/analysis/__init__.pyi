@@ -11,7 +11,6 @@ from .applied_figures import (
 )
 from .band_columns import (
     BandedPrediction as BandedPrediction,
-    setpoint_half_widths as setpoint_half_widths,
 )
 from .designs import (
     assess_designs as assess_designs,
@@ -164,12 +163,9 @@ from .tracking_errors import (
     target_results as target_results,
 )
 from .transients.actuator import (
-    MEDIAN_OF_DIFFERENCES as MEDIAN_OF_DIFFERENCES,
     IdentifiedActuator as IdentifiedActuator,
-    at_rows as at_rows,
     grid_step as grid_step,
     identify_actuator as identify_actuator,
-    latency as latency,
 )
 from .transients.recorded_transients import (
     TransientRecording as TransientRecording,
@@ -187,17 +183,11 @@ from .transients.transient_dynamics import (
     read_transients as read_transients,
 )
 from .uncertain_models import (
-    ModelUncertainty as ModelUncertainty,
-    identified_uncertainty as identified_uncertainty,
     propagated as propagated,
-    quantities_of as quantities_of,
     quantity_text as quantity_text,
     spread_row as spread_row,
 )
 from .uncertain_results import (
-    ControlUncertainty as ControlUncertainty,
-    RunUncertainty as RunUncertainty,
     control_uncertainties as control_uncertainties,
-    signal_budgets as signal_budgets,
     uncertain_signals as uncertain_signals,
 )

@@ -94,8 +94,6 @@ from .parsing import (
     write_json_file as write_json_file,
 )
 from .patience import (
-    PATIENCE as PATIENCE,
-    PatienceDisplay as PatienceDisplay,
     show_patience as show_patience,
 )
 from .printing import (

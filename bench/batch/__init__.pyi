@@ -11,7 +11,6 @@ from .campaign.execution import (
     opened_folder as opened_folder,
 )
 from .campaign.expansion import (
-    Expansion as Expansion,
     expand as expand,
 )
 from .campaign.file import (
@@ -30,7 +29,6 @@ from .study import (
     RunSeries as RunSeries,
     Study as Study,
     StudyResult as StudyResult,
-    prepare as prepare,
     published_of as published_of,
     reached_targets as reached_targets,
     reproduce as reproduce,

@@ -15,6 +15,5 @@ from .command_support import (
 )
 from .printing import (
     console as console,
-    print_rows as print_rows,
     warn as warn,
 )

@@ -7,7 +7,8 @@ import numpy as np
 from rich.console import Console
 
 from bench.analysis import read_columns
-from bench.base import PatienceDisplay, say_share, shares_to
+from bench.base import say_share, shares_to
+from bench.base.patience import PatienceDisplay
 from bench.identification import damped_oscillation, identify
 
 

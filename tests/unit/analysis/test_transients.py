@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 from cases import cases
 
-from bench.analysis import TransientRecording, at_rows, identify_dynamics, identify_transients, noise_of
+from bench.analysis import TransientRecording, identify_dynamics, identify_transients, noise_of
+from bench.analysis.transients.actuator import at_rows
 from bench.base import DataError
 from bench.identification import ModelFile, parse_model
 from bench.models import ActuatorDynamics, IdentifiedDynamics, Preisach, ResponseDynamics, uniform_levels

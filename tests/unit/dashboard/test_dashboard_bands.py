@@ -8,7 +8,7 @@ from other_plants import measured, random_reversals
 from rerun.chunk import RrdReader
 
 import bench as bench_functions
-from bench.analysis import setpoint_half_widths
+from bench.analysis.band_columns import setpoint_half_widths
 from bench.dashboard.entries import End, Tick
 from bench.dashboard.writer import Writer
 from bench.devices import Signal
