@@ -39,13 +39,13 @@ class BenchCommands(Group):
 
     panel = _EXTEND
     own: ClassVar[Mapping[str, Command]] = {
-        "rehearse": Command("Say what a run would do, before anything moves.", "rehearse_command:rehearse", _RUN),
+        "rehearse": Command("Say what a run would do, before anything moves.", "run_commands:rehearse", _RUN),
         "run": Command("Carry a protocol out on a rig, and record it.", "run_commands:run", _RUN, has_help=True),
-        "resume": Command("Go on with a run that was ended or died.", "resume_command:resume", _RUN),
+        "resume": Command("Go on with a run that was ended or died.", "run_commands:resume", _RUN),
         "panel": Command("Move a rig by hand, or answer a run in progress.", "panel_command:panel", _RUN),
-        "safe": Command("Bring every device of a rig into its safe state.", "maintenance_commands:safe", _RUN),
-        "list": Command("List rigs, protocols, models, controllers, studies.", "list_commands:list_", _LOOK),
-        "show": Command("Show one of these in full.", "list_commands:show", _LOOK),
+        "safe": Command("Bring every device of a rig into its safe state.", "rig_commands:safe", _RUN),
+        "list": Command("List rigs, protocols, models, controllers, studies.", "part_commands:list_", _LOOK),
+        "show": Command("Show one of these in full.", "part_commands:show", _LOOK),
         "runs": Command("List, export, import, repair and compare runs.", "groups:RunsGroup", _LOOK),
         "view": Command("Show a run in a viewer, live or once more.", "view:view", _LOOK),
         "report": Command("Make tables, figures and a page of a run.", "record_commands:report", _LOOK),
@@ -55,7 +55,7 @@ class BenchCommands(Group):
         "model": Command("Test models, design experiments, make twins, tune, deploy.", "groups:ModelGroup", _MODEL),
         "study": Command("Carry out a study or a campaign on emulated rigs.", "groups:StudyGroup", _MODEL),
         "rig": Command("Check, clear, calibrate and emulate instruments.", "groups:RigGroup", _EXTEND),
-        "new": Command("Write the skeleton of a device, protocol, model, rig.", "new:new", _EXTEND),
+        "new": Command("Write the skeleton of a device, protocol, model, rig.", "part_commands:new", _EXTEND),
     }
     former: ClassVar[Mapping[str, str]] = {
         "repeat": "bench run --from RUN",

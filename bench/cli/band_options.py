@@ -7,11 +7,12 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from bench.base import Floats, print_plain, significant
+from bench.base import print_plain, significant
 from bench.cli.printing import console, print_rows, warn
 
 if TYPE_CHECKING:
     from bench.analysis import Applied, BandedPrediction, Session
+    from bench.base import Floats
 
 BandOption = Annotated[
     bool,

@@ -7,13 +7,15 @@ import inspect
 from collections.abc import Callable
 from dataclasses import is_dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from bench.analysis import ReadingOptions
 from bench.base import print_plain
 from bench.cli.printing import console
+
+if TYPE_CHECKING:
+    from bench.analysis import ReadingOptions
 
 
 def _layout(
@@ -27,12 +29,14 @@ def _layout(
             "time-unit=ms, missing=nan (rows with it are left out).",
         ),
     ] = None,
-) -> ReadingOptions:
+) -> Any:  # noqa: ANN401 - ReadingOptions, which help does without
     """Return the options of the layout of a file; its signature is that of the option."""
+    from bench.analysis import ReadingOptions
+
     return ReadingOptions.parse(",".join(format_ or ()))
 
 
-ReadingGroup = Annotated[ReadingOptions, _layout]
+ReadingGroup = Annotated["ReadingOptions", _layout]
 """The options of the layout of a file."""
 
 
@@ -77,6 +81,7 @@ def offer_groups(command: Callable[..., None]) -> Callable[..., None]:
 
     keywords = [parameter.replace(kind=inspect.Parameter.KEYWORD_ONLY) for parameter in offered]
     grouped.__signature__ = own.replace(parameters=keywords)  # type: ignore[attr-defined]
+    grouped.__annotations__ = {parameter.name: parameter.annotation for parameter in keywords}
     return grouped
 
 

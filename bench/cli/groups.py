@@ -168,11 +168,11 @@ class RunsGroup(Group):
     """
 
     own: ClassVar[Mapping[str, Command]] = {
-        "list": Command("List runs: how they ended, what was set, what came out.", "run_list:runs_"),
+        "list": Command("List runs: how they ended, what was set, what came out.", "record_commands:runs_"),
         "export": Command("Write a run as csv, parquet, bluesky, rrd or png.", "record_commands:export"),
-        "import": Command("Make a run of a file of measurements.", "imports:import_"),
-        "repair": Command("Say how far a journal is good; write a repaired copy.", "journals:repair"),
-        "compare": Command("Compare two runs with each other.", "comparisons:compare"),
+        "import": Command("Make a run of a file of measurements.", "record_commands:import_"),
+        "repair": Command("Say how far a journal is good; write a repaired copy.", "record_commands:repair"),
+        "compare": Command("Compare two runs with each other.", "record_commands:compare"),
     }
     others = "runs."
     otherwise = "list"
@@ -182,9 +182,9 @@ class RigGroup(Group):
     """Look after the instruments of a rig, and emulate them."""
 
     own: ClassVar[Mapping[str, Command]] = {
-        "check": Command("Check instruments, and the rig file against them.", "maintenance_commands:check"),
-        "clear": Command("Clear the errors that a watchdog or a protection left.", "maintenance_commands:clear"),
-        "calibrate": Command("Calibrate a sensor from a run.", "calibrations:calibrate"),
+        "check": Command("Check instruments, and the rig file against them.", "rig_commands:check"),
+        "clear": Command("Clear the errors that a watchdog or a protection left.", "rig_commands:clear"),
+        "calibrate": Command("Calibrate a sensor from a run.", "rig_commands:calibrate"),
     }
     others = "rig."
 
@@ -193,11 +193,11 @@ class ModelGroup(Group):
     """Test models, design experiments for them, and use them: emulated twins, tuned controllers, exports."""
 
     own: ClassVar[Mapping[str, Command]] = {
-        "test": Command("Compare models on measurements.", "comparisons:models_on_data"),
-        "design": Command("Compare excitation sequences, and write one.", "designs:design"),
-        "twin": Command("Make an emulated twin of the present specimen.", "twin_command:twin_"),
-        "tune": Command("Tune a controller on the emulated twin.", "tune_command:tune_"),
-        "deploy": Command("Export a model for a controller that runs elsewhere.", "deploy_command:deploy_"),
+        "test": Command("Compare models on measurements.", "model_group:models_on_data"),
+        "design": Command("Compare excitation sequences, and write one.", "model_group:design"),
+        "twin": Command("Make an emulated twin of the present specimen.", "model_group:twin_"),
+        "tune": Command("Tune a controller on the emulated twin.", "model_group:tune_"),
+        "deploy": Command("Export a model for a controller that runs elsewhere.", "model_group:deploy_"),
     }
     others = "model."
 
@@ -209,9 +209,7 @@ class StudyGroup(Group):
     parameters, seeds and faults; `bench study FILE --help` shows its options.
     """
 
-    own: ClassVar[Mapping[str, Command]] = {
-        "FILE": Command("Carry out a campaign file.", "campaign_command:campaign")
-    }
+    own: ClassVar[Mapping[str, Command]] = {"FILE": Command("Carry out a campaign file.", "study_commands:campaign")}
     otherwise = "FILE"
 
     def __init__(self, **settings: Any) -> None:  # noqa: ANN401 - those of click
@@ -223,7 +221,7 @@ class StudyGroup(Group):
 
     def make_callback(self, name: str, part: Any) -> Callable[..., None]:  # noqa: ANN401
         """Return a function that carries a study out."""
-        from bench.cli.study_command import command_of
+        from bench.cli.study_commands import command_of
 
         return command_of(name, part)
 

@@ -1,16 +1,20 @@
-"""`bench run`: carry a protocol out, or a recorded run once more."""
+"""The commands that carry a protocol out: run, rehearse and resume."""
 
 from __future__ import annotations
 
+import math
 import shlex
 import sys
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.markup import escape
+from rich.table import Column, Table
 
-from bench.base import BenchError, ConfigurationError, counted, format_duration, print_plain, print_table
+from bench.base import BenchError, ConfigurationError, counted, format_duration, print_plain, print_table, show_table
 from bench.cli.command_support import (
     UNSAFE_EXIT_CODE,
     AttachOption,
@@ -27,12 +31,11 @@ from bench.cli.command_support import (
     parse_assignments,
     write_json,
 )
-from bench.cli.printing import console, print_error, show_compilation, warn
-from bench.cli.rehearse_command import show_rehearsal
-from bench.cli.run_names import find_run
+from bench.cli.printing import console, print_error, print_rows, show_compilation, warn
+from bench.cli.run_names import NEWEST, RunArgument, find_run
 
 if TYPE_CHECKING:
-    from bench.execution import RunResult
+    from bench.execution import Extremes, Rehearsal, Run, RunResult
 
 
 def run(
@@ -280,3 +283,157 @@ def print_protocol(definition: Any, rig: str | None = None) -> None:  # noqa: AN
     entries = definition.help(file.roles, file.protocols.get(definition.name)) if file else definition.help()
     rows = [(entry.name, entry.default, entry.unit, entry.allowed, entry.text) for entry in entries]
     print_table(console, ("--set", "default", "unit", "allowed", "what it does"), rows, "parameters")
+
+
+def rehearse(
+    protocol: ProtocolArgument = None,
+    rig: RigOption = None,
+    settings: SettingsOption = None,
+    overrides: OverrideOption = None,
+    seed: SeedOption = 0,
+    json_file: JsonOption = None,
+) -> None:
+    """Carry a protocol out on the emulated twin of a rig, on the virtual clock, and say what a run would do.
+
+    Shown are the number of steps, the duration, how often the operator is asked to do something, the extremes of
+    every signal with their distance to the limits of the devices and to the interlocks, and what would trip. Nothing
+    moves and nothing is recorded. An emulated rig is its own twin; that of real instruments is the one that its file
+    names (`[rig] twin`) or extends. A rig without a twin is connected, to know its limits, and the set-points are
+    checked as far as no reading decides.
+    """
+    from bench.execution import Run
+    from bench.protocol import find_protocol
+
+    if protocol is None or rig is None:
+        raise ConfigurationError("PROTOCOL and --rig must be given; `bench list` shows both")
+    asked = Run(
+        protocol=find_protocol(protocol),
+        settings=parse_assignments("--set", settings or []),
+        rig=rig,
+        folder=Path(),
+        overrides=parse_assignments("--override", overrides or []),
+        seed=seed,
+    )
+    show_rehearsal(asked, json_file)
+
+
+def show_rehearsal(run: Run, json_file: Path | None) -> None:
+    """Print what a run would do and touch; raises ConfigurationError if it would not complete."""
+    from bench.base import Interrupts
+    from bench.execution import foresee, say_what_ctrl_c_does
+
+    with Interrupts(say_what_ctrl_c_does) as interrupts, show_compilation():
+        rehearsal = foresee(run, console, interrupts)
+    _print(rehearsal)
+    write_json(json_file, rehearsal.to_json())
+    rehearsal.raise_if_wrong()
+
+
+def _print(rehearsal: Rehearsal) -> None:
+    from bench.base import format_duration
+
+    on = f"rehearsed on {rehearsal.twin}" if rehearsal.twin else "planned"
+    least = "" if rehearsal.complete else "at least "
+    most = ""
+    if math.isfinite(rehearsal.at_most) and rehearsal.at_most - rehearsal.seconds >= 1.0:
+        most = f", at most {format_duration(rehearsal.at_most)}"
+    elif not rehearsal.twin and not rehearsal.complete:
+        most = "; the rest is unknown, as readings decide"
+    rows = [
+        ("steps", f"{least}{rehearsal.steps}"),
+        ("duration", f"{least}{format_duration(rehearsal.seconds)}{most}"),
+        ("prompts", f"{least}{rehearsal.prompts}"),
+    ]
+    console.print(f"{rehearsal.protocol} on {rehearsal.rig}, {on}", highlight=False)
+    print_rows("", rows)
+    table = Table(
+        Column("signal", no_wrap=True), "lowest", "highest", "unit", "allowed", "margin", box=None, padding=(0, 1)
+    )
+    for name, each in rehearsal.extremes.items():
+        table.add_row(escape(name), *_cells(each))
+    show_table(console, table)
+    for finding in rehearsal.findings:
+        console.print(
+            f"{format_duration(finding.t):>10}  step {finding.step}, {finding.kind}: {finding.text}",
+            style={"ERROR": "bold red"}.get(finding.level, "yellow"),
+            highlight=False,
+            markup=False,
+            soft_wrap=True,
+        )
+    for text in rehearsal.shortened:
+        print_plain(console, text)
+    if rehearsal.status == "completed":
+        console.print("nothing would trip" if not rehearsal.findings else "it would complete", highlight=False)
+
+
+def _cells(extremes: Extremes) -> tuple[str, ...]:
+    shown = extremes.display
+    plain = replace(shown, unit="")
+    allowed = ", ".join(f"{plain.between(each.low, each.high)} ({each.by})" for each in extremes.bounds)
+    margin = shown.number(extremes.margin) if math.isfinite(extremes.margin) else ""
+    style = "[bold red]" if extremes.margin < 0 else ""
+    return shown.number(extremes.low), shown.number(extremes.high), shown.unit, allowed, style + margin
+
+
+def resume(
+    run: RunArgument = NEWEST,
+    sigmas: Annotated[
+        float,
+        typer.Option(min=0.1, max=1000, help="Standard deviations by which the specimen may differ from the record."),
+    ] = 5.0,
+    accept_changes: Annotated[
+        bool,
+        typer.Option(
+            "--accept-changes",
+            help="Go on although the protocol's source, the content of the rig or a version has changed; what has "
+            "changed is recorded. A protocol that does other than the record says is refused all the same.",
+        ),
+    ] = False,
+    accept_disagreement: Annotated[
+        bool,
+        typer.Option("--accept-disagreement", help="Go on although the specimen is not as the record left it."),
+    ] = False,
+    rig: Annotated[
+        str | None,
+        typer.Option("--rig", metavar="RIG", help="Where the rig file is now, if it was moved."),
+    ] = None,
+    attach: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Endpoints file of `bench rig emulate --json`, if the run was attached."),
+    ] = None,
+    notify: NotifyOption = None,
+    live: LiveOption = False,
+    json_file: JsonOption = None,
+) -> None:
+    """Go on with a run that was killed, aborted or failed, from its last finished step, in its own record.
+
+    The protocol is started again with its recorded parameters, and the recorded readings are fed back to it: nothing
+    is sent, and no time passes. What it yields has to be what the record says. Errors that watchdogs left in the
+    instruments when the run died are cleared, no others (see `bench rig clear`). Then the specimen is brought to
+    where it was by the corners of the set-points that it still remembers, and its signals are compared with the last
+    readings. The step that had not finished is done again, and the run goes on: same record, same numbers of steps,
+    same zero of time.
+
+    A run without a finished step, or one that goes on or is completed, is refused; so is one whose protocol, rig or
+    versions have changed. docs/reference/resume.md says how the specimen is brought back, and what is refused.
+
+    Exit codes: those of `bench run`; 9 the specimen is not as the record left it, and every device is safe.
+    """
+    from bench.base import Interrupts, say_at_once
+    from bench.execution import Resume, resume as resume_run
+
+    check_outputs(json_file=json_file, read=[run])
+    asked = Resume(
+        folder=run,
+        rig=rig,
+        attach=attach,
+        sigmas=sigmas,
+        accept_changes=accept_changes,
+        accept_disagreement=accept_disagreement,
+        live=live,
+        notify=tuple(notify or ()),
+    )
+    with Interrupts(say_at_once) as interrupts:
+        with show_compilation():
+            result = resume_run(asked, console, interrupts)
+        print_result(result, json_file)

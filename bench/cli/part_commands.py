@@ -1,17 +1,19 @@
-"""`bench list` and `bench show`: what is installed."""
+"""The commands about what is installed: list, show and new."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.padding import Padding
 
-from bench.base import ConfigurationError, closest
+from bench.base import ConfigurationError, closest, print_plain
 from bench.cli.command_support import JsonOption, write_json
 from bench.cli.listing import listing
 from bench.cli.printing import console, print_rows, warn
+from bench.cli.skeletons import Part
 
 
 def list_(json_file: JsonOption = None) -> None:
@@ -93,3 +95,25 @@ def _print_listing(listed: Mapping[str, Any]) -> None:
     console.print()
     for problem in listed["problems"]:
         warn(f"left out: {problem}")
+
+
+def new(
+    part: Annotated[Part, typer.Argument(metavar="PART", help="What it is: device, protocol, model or rig.")],
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="Its name, in lower case with hyphens, such as micro-balance.")
+    ],
+    out: Annotated[
+        Path, typer.Option(metavar="DIR", help="Folder in which the folder NAME is made; this one if not given.")
+    ] = Path(),
+) -> None:
+    """Write a working skeleton of a device, a protocol, a model or a rig, with tests that pass.
+
+    The folder is a package of its own. Installed, its part is known to the bench by its name; nothing of the bench
+    is changed.
+    """
+    from bench.cli.skeletons import write_skeleton
+
+    for file in write_skeleton(part, name, out):
+        print_plain(console, str(file))
+    folder = out / name
+    print_plain(console, f"next: python -m pip install -e {folder} && python -m pytest {folder}")
