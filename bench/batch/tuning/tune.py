@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -125,17 +125,7 @@ def tune(
         if best.failed:
             raise BenchError(f"the controller fails with all numbers that were tried: {runs.failures[0]}")
         unseen = [
-            TuningRuns(
-                task,
-                on,
-                file,
-                folder / f"check-{seed}",
-                pool,
-                given,
-                first_seed=seed,
-                scale=runs.scale,
-                time_weight=time_weight,
-            )
+            replace(runs, folder=folder / f"check-{seed}", seeds=1, first_seed=seed)
             for seed in range(seeds, seeds + checks)
         ]
         first, best = confirm(trials, unseen)
