@@ -37,13 +37,6 @@ ALL = "all"
 _TRIED = ("few-free", "unexplained", "few-samples", "condition", "initial-memory", "more-cells", "congruency")
 _TRIED_IN_TIME = ("return-point-memory",)
 
-COLUMNS = (
-    "model", "options", "orientation", "initial", "smoothing", "ridge", "free", "training_rms", "score",
-    "score_percent", "held_out_rms", "held_out_spread", "held_out_percent", "units_rms", "units_percent", "rows",
-    "seconds", "note",
-)  # fmt: skip
-"""Columns of the table."""
-
 
 @dataclass(frozen=True)
 class SelectedModel:
@@ -89,7 +82,7 @@ class SelectedModel:
         return replace(given, smoothing=chosen.smoothing, ridge=chosen.ridge, own=own)
 
     def rows(self) -> list[dict[str, Any]]:
-        """Return the table: `COLUMNS` by name, errors in output units."""
+        """Return the table: a row a score by the names of its columns, errors in output units."""
         return [self._row(each) for each in self.selection.scores]
 
     def _row(self, score: Score) -> dict[str, Any]:
@@ -100,31 +93,29 @@ class SelectedModel:
         elif score is self.selection.best:
             note = "least error"
         model, options = one.fitted
-        values = (
-            model,
-            " ".join(f"{name}={value}" for name, value in options.items()),
-            one.orientation,
-            one.initial or "",
-            one.smoothing,
-            one.ridge,
-            score.freedom,
-            score.training,
-            score.error,
-            100.0 * score.error / span,
-            score.blocks_rms,
-            score.spread,
-            100.0 * score.blocks_rms / span,
-            score.cycles_rms,
-            100.0 * score.cycles_rms / span,
-            score.rows,
-            score.seconds,
-            note,
-        )
-        # JSON knows no nan.
-        return {
-            name: None if isinstance(value, float) and not np.isfinite(value) else value
-            for name, value in zip(COLUMNS, values, strict=True)
+        found: dict[str, Any] = {
+            "model": model,
+            "options": " ".join(f"{name}={value}" for name, value in options.items()),
+            "orientation": one.orientation,
+            "initial": one.initial or "",
+            "smoothing": one.smoothing,
+            "ridge": one.ridge,
+            "free": score.freedom,
+            "training_rms": score.training,
+            "score": score.error,
+            "score_percent": 100.0 * score.error / span,
+            "held_out_rms": score.blocks_rms,
+            "held_out_spread": score.spread,
+            "held_out_percent": 100.0 * score.blocks_rms / span,
+            "units_rms": score.cycles_rms,
+            "units_percent": 100.0 * score.cycles_rms / span,
+            "rows": score.rows,
+            "seconds": score.seconds,
+            "note": note,
         }
+        # JSON knows no nan.
+        finite = (not isinstance(value, float) or np.isfinite(value) for value in found.values())
+        return {name: found[name] if known else None for name, known in zip(found, finite, strict=True)}
 
     def to_json(self) -> dict[str, Any]:
         """Return the choice for programs."""
@@ -153,7 +144,7 @@ class SelectedModel:
         Raises DataError if it cannot be written.
         """
         rows = self.rows()
-        write_csv(path, COLUMNS, [[row[name] for row in rows] for name in COLUMNS])
+        write_csv(path, [*rows[0]], [[row[name] for row in rows] for name in rows[0]])
 
 
 def is_comparison(model: str) -> bool:
