@@ -6,6 +6,7 @@ Rich is imported by what prints only, so that help answers at once.
 from __future__ import annotations
 
 import os
+import shlex
 import warnings
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -204,13 +205,34 @@ def parse_numbers(option: str, texts: Sequence[str]) -> dict[str, int | float]:
     return numbers
 
 
+def given_parameters(context: typer.Context) -> list[Any]:
+    """Return the parameters that the command line gives, as typer describes them."""
+    sources = ((each, context.get_parameter_source(each.name or "")) for each in context.command.params)
+    return [each for each, source in sources if source is not None and source.name == "COMMANDLINE"]
+
+
 def check_given(context: typer.Context, taken: Collection[str], why: str) -> None:
     """Raise ConfigurationError if the command line gives a parameter that is not among those `taken`; says why."""
-    for parameter in context.command.params:
-        source = context.get_parameter_source(parameter.name or "")
-        if parameter.name not in taken and source is not None and source.name == "COMMANDLINE":
+    for parameter in given_parameters(context):
+        if parameter.name not in taken:
             given = max(parameter.opts, key=len) if parameter.param_type_name == "option" else parameter.name.upper()
             raise ConfigurationError(f"{why}; leave {given} out")
+
+
+def command_line(context: typer.Context) -> str:
+    """Return a command with all that was set, as a shell takes it; what was left at its default is left out."""
+    options: list[str] = []
+    arguments: list[str] = []
+    for each in given_parameters(context):
+        value = context.params[each.name]
+        if each.param_type_name != "option":
+            arguments += map(str, value if each.nargs != 1 else [value])
+        elif each.is_flag:
+            options.append((each.opts if value else each.secondary_opts)[0])
+        else:
+            for one in value if each.multiple else [value]:
+                options += [each.opts[0], *map(str, one if each.nargs != 1 else [one])]
+    return shlex.join(["bench", context.info_name or "", *arguments, *options])
 
 
 def check_outputs(

@@ -17,8 +17,7 @@ from bench.cli.choice_options import (
     print_test,
     read_measured,
 )
-from bench.cli.command_line import command_line
-from bench.cli.command_support import JsonOption, check_given, check_outputs, write_json
+from bench.cli.command_support import JsonOption, check_given, check_outputs, command_line, write_json
 from bench.cli.data_options import FiguresOption, ReadingGroup, SkipOption, offer_groups, print_assumptions
 from bench.cli.model_options import ModelOptions
 from bench.cli.printing import console, print_rows, show_compilation, warn

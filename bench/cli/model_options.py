@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Annotated, Any
@@ -71,22 +70,13 @@ class ModelOptions:
 def _level_counts(text: str | None) -> tuple[int, ...]:
     if text is None:
         return ()
-    counts = []
-    for number in _numbers("--levels", text):
-        if number != int(number) or not _FEWEST_LEVELS <= number <= _MOST_LEVELS:
-            raise ConfigurationError(
-                f"--levels {text}: expected whole numbers from {_FEWEST_LEVELS} to {_MOST_LEVELS}, such as 20 or "
-                "10,20,40; -o levels=VALUE,VALUE,... takes the levels themselves"
-            )
-        counts.append(int(number))
-    return tuple(counts)
-
-
-def _numbers(option: str, text: str) -> Sequence[float]:
-    try:
-        return [float(part) for part in text.split(",")]
-    except ValueError:
-        raise ConfigurationError(f"{option} {text}: expected numbers with commas between them") from None
+    counts = tuple(map(_value, text.split(",")))
+    if not all(isinstance(count, int) and _FEWEST_LEVELS <= count <= _MOST_LEVELS for count in counts):
+        raise ConfigurationError(
+            f"--levels {text}: expected whole numbers from {_FEWEST_LEVELS} to {_MOST_LEVELS}, such as 20 or "
+            "10,20,40; -o levels=VALUE,VALUE,... takes the levels themselves"
+        )
+    return counts
 
 
 def _value(text: str) -> Any:  # noqa: ANN401 - a number, numbers or a word
