@@ -143,42 +143,42 @@ class _Expander:
         """Return all tasks, those of runs in an order in which their models come before them."""
         file = self._file
         self._check_number()
-        for number, models in enumerate(file.models):
+        for number, models in enumerate(file.tables.models):
             self._check_models(number, models)
         # A table of models comes after its runs, and before those that use it.
-        waiting = list(file.models)
-        for number, table in enumerate(file.runs):
+        waiting = list(file.tables.models)
+        for number, table in enumerate(file.tables.runs):
             self._add_runs(number, table)
             for models in [each for each in waiting if self._runs.keys() >= set(each.runs)]:
-                self._add_models(file.where("models", file.models.index(models)), models)
+                self._add_models(file.where("models", file.tables.models.index(models)), models)
                 waiting.remove(models)
-        for number, comparisons in enumerate(file.comparisons):
+        for number, comparisons in enumerate(file.tables.comparisons):
             self._add_comparisons(file.where("comparisons", number), comparisons)
-        for number, study in enumerate(file.studies):
+        for number, study in enumerate(file.tables.studies):
             self._add_studies(number, study)
-        if len(self._tasks) > 2 * file.most_runs:
+        if len(self._tasks) > 2 * file.tables.most_runs:
             raise ConfigurationError(
                 f"{file.path}: {len(self._tasks)} runs, models and studies; expected at most twice most_runs = "
-                f"{file.most_runs}"
+                f"{file.tables.most_runs}"
             )
         return Expansion(self._tasks, self._varying, self._found_plans, self._units, tuple(self._kernels))
 
     def _check_number(self) -> None:
         """Check the number of runs before any list of them is made."""
         total = 0
-        for number, table in enumerate(self._file.runs):
+        for number, table in enumerate(self._file.tables.runs):
             grid = [*axes(table.parameters).values(), *axes(dotted(table.overrides)).values()]
             lengths = [len(table.protocol), len(table.rigs), len(table.seeds), len(table.faults), *map(len, grid)]
             total += math.prod(lengths)
-            if total > self._file.most_runs:
+            if total > self._file.tables.most_runs:
                 raise ConfigurationError(
                     f"{self._file.where('runs', number)}: {' × '.join(map(str, lengths))} runs make {total} with "
-                    f"those before; most_runs = {self._file.most_runs} are allowed"
+                    f"those before; most_runs = {self._file.tables.most_runs} are allowed"
                 )
 
     def _check_models(self, number: int, table: ModelsTable) -> None:
         where = self._file.where("models", number)
-        known = {runs.label: runs for runs in self._file.runs}
+        known = {runs.label: runs for runs in self._file.tables.runs}
         for name in table.runs:
             if name not in known:
                 raise ConfigurationError(
@@ -328,7 +328,7 @@ class _Expander:
 
     def _models_of(self, where: str, name: str, rig: str, seed: int) -> list[ModelTask]:
         """Return the models of a table for a rig and a seed; raise ConfigurationError if there are none."""
-        table = next(each for each in self._file.models if each.name == name)
+        table = next(each for each in self._file.tables.models if each.name == name)
         wanted = seed if table.seed is None else table.seed
         if not (found := self._models[name].get((rig, wanted), [])):
             raise ConfigurationError(
@@ -417,7 +417,7 @@ class _Expander:
                     raise ConfigurationError(
                         f"{where}: {key} = {name!r}: there is no table of {key} of this name; {closest(name, known)}"
                     )
-        tables = {models.name: models for models in self._file.models}
+        tables = {models.name: models for models in self._file.tables.models}
         columns = {(tables[name].input, tables[name].output) for name in table.models}
         if len(columns) > 1:
             raise ConfigurationError(f"{where}: models: their columns differ; expected one input and one output")

@@ -196,7 +196,9 @@ class StudiesTable(CheckedTable):
         return self
 
 
-class _Content(CheckedTable):
+class CampaignTables(CheckedTable):
+    """The tables of a campaign file, in their order."""
+
     most_runs: int = Field(default=10_000, ge=1, le=1_000_000, description="most runs that the file may ask for")
     runs: tuple[RunsTable, ...] = ()
     models: tuple[ModelsTable, ...] = ()
@@ -209,22 +211,11 @@ class CampaignFile:
     """A campaign file that was read; names in it were not looked up yet."""
 
     path: Path  # where it was read from
-    most_runs: int  # most runs that it may ask for
-    # Its tables, in their order.
-    runs: tuple[RunsTable, ...]
-    models: tuple[ModelsTable, ...]
-    comparisons: tuple[ComparisonsTable, ...]
-    studies: tuple[StudiesTable, ...]
+    tables: CampaignTables
 
     def where(self, kind: str, number: int) -> str:
         """Return the place of a table for messages, such as `night.toml: runs.0 (characterize)`."""
-        tables: Mapping[str, tuple[Any, ...]] = {
-            "runs": self.runs,
-            "models": self.models,
-            "comparisons": self.comparisons,
-            "studies": self.studies,
-        }
-        table = tables[kind][number]
+        table = getattr(self.tables, kind)[number]
         return f"{self.path}: {kind}.{number} ({table.label if isinstance(table, RunsTable) else table.name})"
 
     def beside(self, name: str) -> str:
@@ -244,17 +235,17 @@ def read_campaign(path: Path) -> CampaignFile:
     except ValueError as error:
         raise ConfigurationError(f"{path}: not valid TOML: {error}") from None
     try:
-        tables = _Content.model_validate(content)
+        tables = CampaignTables.model_validate(content)
     except ValidationError as error:
-        raise ConfigurationError("\n".join(f"{path}: {line}" for line in problems(error, _Content))) from None
-    file = CampaignFile(path, tables.most_runs, tables.runs, tables.models, tables.comparisons, tables.studies)
-    if not file.runs and not file.studies:
+        raise ConfigurationError("\n".join(f"{path}: {line}" for line in problems(error, CampaignTables))) from None
+    file = CampaignFile(path, tables)
+    if not tables.runs and not tables.studies:
         raise ConfigurationError(f"{path}: asks for nothing; expected tables [[runs]] or [[studies]]")
     for kind, names in (
-        ("runs", [table.label for table in file.runs]),
-        ("models", [table.name for table in file.models]),
-        ("comparisons", [table.name for table in file.comparisons]),
-        ("studies", [table.name for table in file.studies]),
+        ("runs", [table.label for table in tables.runs]),
+        ("models", [table.name for table in tables.models]),
+        ("comparisons", [table.name for table in tables.comparisons]),
+        ("studies", [table.name for table in tables.studies]),
     ):
         for i, name in enumerate(names):
             if name in names[:i]:

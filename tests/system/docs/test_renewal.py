@@ -11,7 +11,7 @@ from bench.batch.campaign.file import axes, dotted
 
 ROOT = Path(__file__).parents[3]
 ROBUSTNESS = read_campaign(ROOT / "examples" / "campaign-robustness.toml")
-CONTROLLED = {table.name: table for table in ROBUSTNESS.runs if "model" in table.parameters}
+CONTROLLED = {table.name: table for table in ROBUSTNESS.tables.runs if "model" in table.parameters}
 
 
 @pytest.fixture(scope="module")

@@ -38,9 +38,13 @@ def first_of_each_axis(table, parameters=None, plants=1):
     )
 
 
+def with_tables(file, **tables):
+    return replace(file, tables=file.tables.model_copy(update=tables))
+
+
 def test_each_rig_has_its_model_and_each_controller_runs_with_it():
     file = read_campaign(FILE)
-    tasks = expand(replace(file, runs=tuple(map(first_of_each_axis, file.runs)))).tasks.values()
+    tasks = expand(with_tables(file, runs=tuple(map(first_of_each_axis, file.tables.runs)))).tasks.values()
     models = {task.table: task for task in tasks if isinstance(task, ModelTask)}
     runs = {name: len(task.sources) for name, task in models.items()}
     assert runs == {"density": 1, "wire-model": 3, "braid-model": 3, "coil-model": 3, "beam-model": 4}
@@ -49,7 +53,7 @@ def test_each_rig_has_its_model_and_each_controller_runs_with_it():
 
 
 def test_nominal_comes_first_on_each_axis_of_perturbations():
-    for table in read_campaign(FILE).runs:
+    for table in read_campaign(FILE).tables.runs:
         for perturbed in axes(table.overrides.get("emulation", {})).values():
             assert len(perturbed) == 1 or perturbed[0] == {}
 
@@ -58,9 +62,10 @@ def test_nominal_comes_first_on_each_axis_of_perturbations():
 def minute(tmp_path_factory):
     """Status, reason and results by table, controller and plant."""
     file, out = read_campaign(FILE), tmp_path_factory.mktemp("robustness")
-    chosen = tuple(first_of_each_axis(table, *MINUTE[table.name]) for table in file.runs if table.name in MINUTE)
-    models = tuple(model for model in file.models if MINUTE.keys() >= set(model.runs))
-    tasks = expand(replace(file, runs=chosen, models=models)).tasks
+    wanted = (table for table in file.tables.runs if table.name in MINUTE)
+    chosen = tuple(first_of_each_axis(table, *MINUTE[table.name]) for table in wanted)
+    models = tuple(model for model in file.tables.models if MINUTE.keys() >= set(model.runs))
+    tasks = expand(with_tables(file, runs=chosen, models=models)).tasks
     with Workers(1) as workers:
         done = carry_out_tasks(tasks, {}, WorkersExecutor(workers, out))
     return {
