@@ -82,12 +82,10 @@ from .report.model_card import (
 from .report.page.comparison_page import (
     comparison_page as comparison_page,
 )
-from .report.page.elements import (
+from .report.page.pages import (
     Page as Page,
     PageSection as PageSection,
     PageTable as PageTable,
-)
-from .report.page.render import (
     write_page as write_page,
 )
 from .report.published import (
@@ -106,10 +104,8 @@ from .run_comparison import (
     compare_runs as compare_runs,
 )
 from .run_folder import (
-    RunFolder as RunFolder,
-)
-from .run_list import (
     ListedRun as ListedRun,
+    RunFolder as RunFolder,
     list_runs as list_runs,
     select_runs as select_runs,
 )

@@ -7,8 +7,7 @@ from html import escape
 from pathlib import Path
 from typing import Any
 
-from bench.analysis.run_folder import RunFolder
-from bench.analysis.run_list import ListedRun
+from bench.analysis.run_folder import ListedRun, RunFolder
 from bench.base import format_duration, html_table
 
 _HEIGHT = 700

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from bench.analysis.report.page.elements import PagePart, PageTable, PageText
-from bench.analysis.run_list import main_result
+from bench.analysis.report.page.pages import PagePart, PageTable, PageText
+from bench.analysis.run_folder import main_result
 from bench.analysis.tracking_errors import results_json, target_results
 from bench.base import fitting_prefix, format_duration, html_table, significant
 from bench.protocol import PARAMETER

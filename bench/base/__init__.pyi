@@ -94,6 +94,8 @@ from .parsing import (
     write_json_file as write_json_file,
 )
 from .patience import (
+    say_share as say_share,
+    shares_to as shares_to,
     show_patience as show_patience,
 )
 from .printing import (
@@ -113,10 +115,6 @@ from .remaining_time import (
     Expectation as Expectation,
     Remaining as Remaining,
     RemainingTime as RemainingTime,
-)
-from .shares import (
-    say_share as say_share,
-    shares_to as shares_to,
 )
 from .units import (
     Display as Display,

@@ -20,9 +20,8 @@ from bench.cli.choice_options import (
 from bench.cli.command_support import JsonOption, check_given, check_outputs, command_line, write_json
 from bench.cli.data_options import FiguresOption, ReadingGroup, SkipOption, offer_groups, print_assumptions
 from bench.cli.model_options import ModelOptions
-from bench.cli.printing import console, print_rows, show_compilation, warn
+from bench.cli.printing import console, print_figures, print_rows, show_compilation, warn, write_rows, write_table
 from bench.cli.run_names import NEWEST, complete_run, find_run
-from bench.cli.written import print_figures, write_rows, write_table
 
 if TYPE_CHECKING:
     from bench.analysis import FitOptions, WholeIdentification

@@ -21,9 +21,8 @@ from bench.cli.band_options import BandsOption, Recalibrating, print_applied
 from bench.cli.command_support import JsonOption, check_outputs, parse_assignments, write_json
 from bench.cli.data_options import FiguresOption, ReadingGroup, SkipOption, offer_groups, print_assumptions
 from bench.cli.model_commands import InitialOption
-from bench.cli.printing import console, print_rows, show_compilation, warn
+from bench.cli.printing import console, print_figures, print_rows, show_compilation, warn, write_rows
 from bench.cli.run_names import find_run
-from bench.cli.written import print_figures, write_rows
 
 if TYPE_CHECKING:
     from bench.identification import Continuation

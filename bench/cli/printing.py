@@ -1,15 +1,22 @@
-"""Printing of errors, warnings and tables on the two consoles of the commands."""
+"""Printing of errors, warnings, tables and files on the two consoles of the commands."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from rich.markup import escape
 
-from bench.base import BenchError, PlainConsole, show_rows
+from bench.base import BenchError, PlainConsole, counted, print_plain, show_rows
+
+if TYPE_CHECKING:
+    from bench.analysis import Applied
+
 
 console = PlainConsole()
+
 error_console = PlainConsole(stderr=True)
 
 
@@ -37,3 +44,28 @@ def show_compilation() -> Iterator[None]:
 def print_rows(title: str, rows: Iterable[tuple[str, str]]) -> None:
     """Print (name, text) pairs under a title."""
     show_rows(console, title, rows)
+
+
+def print_figures(paths: Iterable[Path]) -> None:
+    """Print where figures are."""
+    for path in paths:
+        print_plain(console, f"figure: {path}")
+
+
+def write_table(path: Path, table: Sequence[tuple[str, Any]]) -> None:
+    """Write columns behind their heads as CSV. Raises DataError if the file cannot be written."""
+    from bench.analysis import write_csv
+
+    write_csv(path, [head for head, _ in table], [values for _, values in table])
+
+
+def write_rows(path: Path, found: Mapping[str, Applied]) -> None:
+    """Write models beside measurements as CSV, and print where.
+
+    Raises DataError if the file cannot be written.
+    """
+    from bench.analysis import rows_table
+
+    table = rows_table(found)
+    write_table(path, table)
+    print_plain(console, f"{counted(len(table[0][1]), 'row')}: {path}")

@@ -14,7 +14,7 @@ from written_run import META, SIGNALS, write_run
 
 from bench.analysis import export_run, write_csv
 from bench.analysis.export.bluesky_documents import documents
-from bench.analysis.report.telemetry_summary import summarize
+from bench.analysis.report.recorded_run import summarize
 from bench.devices import Settled
 from bench.record import FILE_NAME, Event, Journal, Record, StepRecord, recover
 

@@ -16,9 +16,8 @@ from bench.analysis.figures.canvas import check_matplotlib
 from bench.analysis.figures.fits import plot_errors
 from bench.analysis.figures.planes import plot_coverage, plot_densities
 from bench.analysis.model_service import IdentifiedFile
-from bench.analysis.report.page.elements import PagePart, PageTable, PageText
 from bench.analysis.report.page.model_parts import errors_parts
-from bench.analysis.report.page.render import write_page
+from bench.analysis.report.page.pages import PagePart, PageTable, PageText, write_page
 from bench.analysis.report.page.run_page import run_page, signals_table
 from bench.analysis.report.published import Published
 from bench.analysis.report.recorded_run import RecordedRun

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from bench.analysis.report.page.elements import PageTable, PageText
+from bench.analysis.report.page.pages import PageTable, PageText
 from bench.analysis.uncertain_results import ControlUncertainty, RunUncertainty, rounded, two_digits
 from bench.base import fitting_prefix
 from bench.rig import Budget

@@ -9,8 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.analysis.figures.panels import Curve, plot_panels, plot_signals
-from bench.analysis.report.page.elements import Page, PageFigure, PageSection
-from bench.analysis.report.page.svg import inlined
+from bench.analysis.report.page.pages import Page, PageFigure, PageSection, inlined
 from bench.analysis.run_comparison import RunComparison
 from bench.base import fitting_prefix, with_unit
 from bench.record import Record, Table

@@ -10,8 +10,7 @@ import numpy as np
 from bench.analysis.applied import Applied
 from bench.analysis.applied_figures import draw_applied
 from bench.analysis.figures.planes import plot_coverage, plot_densities
-from bench.analysis.report.page.elements import PageFigure, PagePart, PageTable, PageText
-from bench.analysis.report.page.svg import inlined
+from bench.analysis.report.page.pages import PageFigure, PagePart, PageTable, PageText, inlined
 from bench.base import Floats, fitting_prefix, percent, significant
 from bench.identification import CoefficientUncertainties, ModelFile, coefficient_uncertainties
 from bench.models import MemoryCurve, TimedModel

@@ -17,13 +17,11 @@ from pydantic import ValidationError
 
 from bench.analysis.figures.panels import plot_histogram
 from bench.analysis.figures.targets import plot_tracking
-from bench.analysis.report.page.elements import Page, PageFigure, PagePart, PageSection, PageTable, PageText
 from bench.analysis.report.page.model_parts import given_parts, models_parts
-from bench.analysis.report.page.svg import inlined
+from bench.analysis.report.page.pages import Page, PageFigure, PagePart, PageSection, PageTable, PageText, inlined
 from bench.analysis.report.published import Published, concerning
-from bench.analysis.report.recorded_run import RecordedRun, interlocks_of
+from bench.analysis.report.recorded_run import RecordedRun, interlocks_of, wider
 from bench.analysis.report.run_figures import draw_loops, draw_signals
-from bench.analysis.report.telemetry_summary import wider
 from bench.analysis.report.uncertainty_tables import uncertainty_parts
 from bench.analysis.tracking_errors import FollowingResult, following_result, target_results, ticks_with
 from bench.base import BenchError, Display, Floats, counted, format_duration, percent, with_unit

@@ -31,15 +31,16 @@ from bench.analysis.tables.reading.moments import moment_in, since_first, with_m
 from bench.analysis.tables.reading.options import ReadingOptions
 from bench.analysis.tables.reading.remedies import cell_remedy, is_cut_off, missing_column
 from bench.analysis.tables.reading.reshaped import StampedFile, split_stamps, turn_rows
-from bench.analysis.tables.reading.summary_rows import is_label, text_note
 from bench.analysis.tables.reading.table import ReadColumns, finite_number
 from bench.analysis.tables.reading.tables import (
     Ending,
     choose_tables,
     find_end,
+    is_label,
     list_tables,
     note_rest,
     read_sample,
+    text_note,
     walk_tables,
 )
 from bench.analysis.tables.reading.text import TextFile, open_text
