@@ -17,7 +17,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from bench.analysis import Published, TargetResults, target_results
+from bench.analysis import Published, RunFolder, TargetResults, target_results
 from bench.base import (
     BenchError,
     ConfigurationError,
@@ -132,11 +132,11 @@ class RunSeries:
             " ".join([protocol, *telling]),
             _carry_out,
             protocol,
-            settings,
-            rig or self.rig,
-            dict(overrides or {}),
-            next(self._seeds),
-            self.folder,
+            settings=settings,
+            rig=rig or self.rig,
+            overrides=dict(overrides or {}),
+            seed=next(self._seeds),
+            folder=self.folder,
             live=self.live,
         )
         self.started.append(run)
@@ -215,38 +215,17 @@ class RunSeries:
         return path
 
 
-def _carry_out(
-    protocol: str,
-    settings: Mapping[str, str],
-    rig: str,
-    overrides: Mapping[str, str],
-    seed: int,
-    folder: Path,
-    *,
-    live: bool,
-) -> RunResult:
-    """Carry one run of a campaign out."""
+def _carry_out(protocol: str, **asked: Any) -> RunResult:  # noqa: ANN401 - fields of `Run`
+    """Carry one run of a series out."""
     # Here, as they take a while to load and `bench list` reads the studies' names.
     from bench.base import CompilationDisplay, task_console
     from bench.execution import Run, carry_out
 
     console = task_console()
+    # The recording is made from the journal afterwards, when the density is known and can be drawn with it.
+    run = Run(protocol=find_protocol(protocol), clock="virtual", recording=False, **asked)
     with CompilationDisplay(console, console):
-        result = carry_out(
-            Run(
-                protocol=find_protocol(protocol),
-                settings=settings,
-                rig=rig,
-                overrides=overrides,
-                seed=seed,
-                clock="virtual",
-                folder=folder,
-                live=live,
-                # Made from the journal afterwards, when the density is known and can be drawn with it.
-                recording=False,
-            ),
-            console,
-        )
+        result = carry_out(run, console)
     if result.outcome.error is not None:
         raise result.outcome.error
     if not result.outcome.is_safe:
@@ -439,7 +418,8 @@ def reproduce(
             campaign = RunSeries(on, folder, seed, live, pool, figure_format, recorded, settings)
             found = study.carry_out(campaign)
             recordings = campaign.recordings()
-    for protocol in settings.keys() - {_protocol_of(run) for run in campaign.runs if settings}:
+    carried_out = {RunFolder(run.folder).meta["protocol"] for run in campaign.runs if settings}
+    for protocol in settings.keys() - carried_out:
         print_plain(console, f"note: parameters of {protocol} are set, but the study has no run of it")
     values = {
         "seed": seed,
@@ -455,11 +435,6 @@ def reproduce(
         console.print()
     _print_end(found.verdict, values, console)
     return values
-
-
-def _protocol_of(run: RunResult) -> str:
-    with Record(run.folder) as record:
-        return str(record.meta["protocol"])
 
 
 def reached_targets(run: RunResult, signal: str) -> TargetResults:

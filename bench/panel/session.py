@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping
-from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -39,31 +38,10 @@ def protocol_of(desk: Desk) -> ProtocolDefinition:
     return by_hand
 
 
-def carry_out_by_hand(
-    desk: Desk,
-    *,
-    rig: str,
-    overrides: Mapping[str, str],
-    seed: int,
-    clock: str,
-    attach: Path | None,
-    folder: Path,
-    interrupts: Interrupts,
-) -> RunResult:
+def carry_out_by_hand(desk: Desk, interrupts: Interrupts, **asked: Any) -> RunResult:  # noqa: ANN401 - of `Run`
     """Connect a rig, carry the commands of a desk out, and leave every device in its safe state.
 
-    Raises what `bench.execution.run.carry_out` does before anything moves.
+    `asked` are fields of a `Run`. Raises what `bench.execution.carry_out` does before anything moves.
     """
-    run = Run(
-        protocol=protocol_of(desk),
-        settings={},
-        rig=rig,
-        folder=folder,
-        overrides=overrides,
-        seed=seed,
-        clock=clock,
-        recording=False,
-        attach=attach,
-        rehearse=False,
-    )
+    run = Run(protocol=protocol_of(desk), settings={}, recording=False, rehearse=False, **asked)
     return carry_out(run, Console(file=_Log(desk), width=200), interrupts)
