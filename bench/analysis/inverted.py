@@ -197,39 +197,29 @@ def invert_targets(
     ConfigurationError
         If a model with time has no times or another one has, or it has no inverse at these times.
     """
+    state = starting_state(model, initial=initial, continue_memory=continue_memory).state
+    bound = bind_times(model, times)
     with np.errstate(over="ignore", invalid="ignore"):
-        found = _inverted(model, targets, policy, initial, times, continue_memory=continue_memory)
+        if isinstance(bound, TimedSequence):
+            try:
+                found = _invert_in_time(model, bound, targets, state, policy)
+            except ValueError as error:
+                raise ConfigurationError(f"model {model.name} cannot be inverted: {error}") from None
+        elif times is not None:
+            raise ConfigurationError(f"--time: {model.name} is a model without time")
+        else:
+            try:
+                path = bound.inverse(policy).follow(targets, state)
+            except (ValueError, ArithmeticError) as error:
+                raise DataError(f"model {model.name} cannot be inverted: {error}") from None
+            flags, beyond = tuple(_flags(path.met, targets, path.outputs)), model.beyond(path.setpoints)
+            found = InvertedTargets(
+                model, state, targets, path.setpoints, path.saturating, path.outputs, flags, beyond
+            )
     units = model.response.input_unit, model.response.output_unit
     check_finite(model.name, "set-point", found.setpoints, units[0], targets, "target", units[1])
     check_finite(model.name, "output", found.predicted, units[1], found.setpoints, "set-point", units[0])
     return found
-
-
-def _inverted(
-    model: ModelFile,
-    targets: Floats,
-    policy: Policy,
-    initial: str | None,
-    times: Floats | None,
-    *,
-    continue_memory: bool,
-) -> InvertedTargets:
-    state = starting_state(model, initial=initial, continue_memory=continue_memory).state
-    bound = bind_times(model, times)
-    if isinstance(bound, TimedSequence):
-        try:
-            return _invert_in_time(model, bound, targets, state, policy)
-        except ValueError as error:
-            raise ConfigurationError(f"model {model.name} cannot be inverted: {error}") from None
-    if times is not None:
-        raise ConfigurationError(f"--time: {model.name} is a model without time")
-    try:
-        found = bound.inverse(policy).follow(targets, state)
-    except (ValueError, ArithmeticError) as error:
-        raise DataError(f"model {model.name} cannot be inverted: {error}") from None
-    flags = tuple(_flags(found.met, targets, found.outputs))
-    beyond = model.beyond(found.setpoints)
-    return InvertedTargets(model, state, targets, found.setpoints, found.saturating, found.outputs, flags, beyond)
 
 
 def _invert_in_time(

@@ -197,19 +197,11 @@ def import_(
     `bench report`, `bench identify` and `bench runs` then take its folder as that of any run. The file is kept in the
     record. Without times or --format interval=TIME, rows are 1 s apart; the time of day is that of the file.
     """
-    from bench.analysis import import_file
+    from bench.analysis import ColumnNames, import_file
 
     check_outputs(json_file=json_file, folder=out, read=[file])
-    found = import_file(
-        file,
-        input_column=input_column,
-        output_column=output_column,
-        others=others or (),
-        time_column=time_column,
-        title=title,
-        out=out,
-        reading=reading,
-    )
+    names = ColumnNames(input_column, output_column, time_column, others=tuple(others or ()))
+    found = import_file(file, names, title=title, out=out, reading=reading)
     print_assumptions(file.name, found.assumptions)
     console.print(counted(found.rows, "reading"), highlight=False)
     print_plain(console, f"run: {found.folder}")

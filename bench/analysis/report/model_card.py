@@ -46,45 +46,11 @@ def write_card(
     DataError
         If the file cannot be written, or the data not read again.
     """
-    text = model_card(
-        found,
-        found.data.paths[0].name,
-        sha256_of(found.data.paths[0]),
-        command=command,
-        model="" if model is None else model.name,
-        figures=[Path(os.path.relpath(each, path.parent)).as_posix() for each in figures],
-    )
-    write_result(path, text)
-
-
-def sha256_of(data: Path) -> str:
-    """Return the SHA-256 digest of a file of measurements, or of the journal of a run, in hexadecimal.
-
-    Raises DataError if it cannot be read.
-    """
-    if data.is_dir():
-        with Record(data) as record:
-            data = record.path
-    try:
-        with data.open("rb") as file:
-            return hashlib.file_digest(file, "sha256").hexdigest()
-    except OSError as error:
-        raise DataError(f"{data} cannot be read: {error.strerror}") from None
-
-
-def model_card(
-    found: IdentifiedFile, source: str, digest: str, *, command: str, model: str = "", figures: Iterable[str] = ()
-) -> str:
-    """Return the card of an identified model as Markdown.
-
-    `source` and `digest` are the name of the data and their SHA-256 digest; `model` is the name of the model file,
-    empty if there is none.
-    """
     rows = found.applied()
     measured = rows.measured
     assert measured is not None
     sections = {
-        "Data": _table(("", ""), _data(found, rows, measured, source, digest)),
+        "Data": _table(("", ""), _data(found, rows, measured)),
         "Errors": _table(("error", measured.unit or "output units", "% of the range"), _errors(found)),
         "Certificate": _table(("", ""), certificate_lines(found)),
         "Limits of validity": _table(("", ""), _limits(found)),
@@ -103,21 +69,37 @@ def model_card(
     if found.warnings:
         sections["Warnings"] = "\n".join(f"- {warning}" for warning in found.warnings)
     sections["Reproduce"] = _fenced(command) + f"\n\nactuator-bench {importlib.metadata.version('actuator-bench')}."
-    if links := list(figures):
+    if links := [Path(os.path.relpath(each, path.parent)).as_posix() for each in figures]:
         sections["Figures"] = "\n".join(f"![{Path(link).stem}](<{link}>)" for link in links)
     unit = f" in {rows.unit}" if rows.unit else ""
-    head = f"# Model {found.file.name}\n\n{measured.title}{unit} from {rows.input.title}, identified from {source}"
-    parts = [f"{head}{f', in the file {model}' if model else ''}."]
+    of = f"{measured.title}{unit} from {rows.input.title}, identified from {found.data.paths[0].name}"
+    head = f"# Model {found.file.name}\n\n{of}"
+    parts = [f"{head}{f', in the file {model.name}' if model else ''}."]
     parts += [f"## {title}\n\n{text}" for title, text in sections.items()]
-    return "\n\n".join(parts) + "\n"
+    write_result(path, "\n\n".join(parts) + "\n")
 
 
-def _data(found: IdentifiedFile, rows: Applied, outputs: Quantity, source: str, digest: str) -> list[tuple[str, str]]:
+def sha256_of(data: Path) -> str:
+    """Return the SHA-256 digest of a file of measurements, or of the journal of a run, in hexadecimal.
+
+    Raises DataError if it cannot be read.
+    """
+    if data.is_dir():
+        with Record(data) as record:
+            data = record.path
+    try:
+        with data.open("rb") as file:
+            return hashlib.file_digest(file, "sha256").hexdigest()
+    except OSError as error:
+        raise DataError(f"{data} cannot be read: {error.strerror}") from None
+
+
+def _data(found: IdentifiedFile, rows: Applied, outputs: Quantity) -> list[tuple[str, str]]:
     skip = found.identification.skip
     first = f", of which the first {skip} drive the memory and count in no error" if skip else ""
     return [
-        ("source", source),
-        ("SHA-256", digest),
+        ("source", found.data.paths[0].name),
+        ("SHA-256", sha256_of(found.data.paths[0])),
         *([("layout", found.data.assumptions)] if found.data.assumptions else []),
         ("rows", f"{found.inputs.size}{first}"),
         *([] if rows.time is None else [("sampling rate", _sampling(rows.time))]),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -35,11 +35,8 @@ class ImportedRun:
 
 def import_file(
     path: Path,
+    names: ColumnNames,
     *,
-    input_column: str,
-    output_column: str,
-    others: Sequence[str] = (),
-    time_column: str | None = None,
     title: str = "",
     out: Path = Path("recordings"),
     reading: ReadingOptions | None = None,
@@ -50,12 +47,8 @@ def import_file(
     ----------
     path : Path
         A file that `read_columns` reads.
-    input_column, output_column : str
-        Columns of the input and the output of the specimen, by name or by number from 1.
-    others : sequence of str
-        Further columns.
-    time_column : str, optional
-        Column of times; if not given, one that by its name holds times. Without one, rows are 1 s apart.
+    names : ColumnNames
+        Columns of input, output and others, and of times; without one, rows are 1 s apart.
     title : str
         Of the rig, for heads; the name of the file if empty.
     out : Path
@@ -72,11 +65,10 @@ def import_file(
     """
     if is_run(path):
         raise DataError(f"{path} is a run already")
-    wanted = [input_column, output_column, *others]
+    wanted = [names.input, *filter(None, [names.output]), *names.others]
     if len(set(wanted)) < len(wanted):
         raise ConfigurationError(f"columns {', '.join(wanted)}: one of them is asked for twice")
-    sought = () if time_column else time_names(path)
-    names = ColumnNames(input_column, output_column, time=time_column, times=sought, others=tuple(others))
+    names = replace(names, times=() if names.time else time_names(path))
     data = read_dataset([path], names, reading)
     assert data.output is not None
     remark = "rows are 1 s apart" if data.time is None else ""
