@@ -134,6 +134,5 @@ def write_sequence(path: Path, setpoints: Floats, *, unit: str, dwell: float) ->
         If the file cannot be written.
     """
     dwells = np.full(setpoints.size, dwell)
-    write_csv(
-        path, ["time [s]", header_with_unit("input", unit), "dwell [s]"], [np.cumsum(dwells), setpoints, dwells]
-    )
+    head = header_with_unit("input", unit)
+    write_csv(path, [("time [s]", np.cumsum(dwells)), (head, setpoints), ("dwell [s]", dwells)])

@@ -144,7 +144,7 @@ class SelectedModel:
         Raises DataError if it cannot be written.
         """
         rows = self.rows()
-        write_csv(path, [*rows[0]], [[row[name] for row in rows] for name in rows[0]])
+        write_csv(path, [(name, [row[name] for row in rows]) for name in rows[0]])
 
 
 def is_comparison(model: str) -> bool:

@@ -20,7 +20,7 @@ from bench.cli.choice_options import (
 from bench.cli.command_support import JsonOption, check_given, check_outputs, command_line, write_json
 from bench.cli.data_options import FiguresOption, ReadingGroup, SkipOption, offer_groups, print_assumptions
 from bench.cli.model_options import ModelOptions
-from bench.cli.printing import console, print_figures, print_rows, show_compilation, warn, write_rows, write_table
+from bench.cli.printing import console, print_figures, print_rows, show_compilation, warn, write_rows
 from bench.cli.run_names import NEWEST, complete_run, find_run
 
 if TYPE_CHECKING:
@@ -415,7 +415,7 @@ def invert(
     Behind a delay set-points are for the targets that come so much later, and flags also `near` (met but for
     targets between the rows) and `too early` (before any set-point has an effect).
     """
-    from bench.analysis import ColumnNames, check_unit, invert_targets, read_for
+    from bench.analysis import ColumnNames, check_unit, invert_targets, read_for, write_csv
     from bench.identification import load_model
 
     check_outputs(out=out, json_file=json_file, read=(model_path, file))
@@ -434,7 +434,7 @@ def invert(
     )
     for warning in found.warnings():
         warn(warning)
-    write_table(out, found.table())
+    write_csv(out, found.table())
     if found.band is not None:
         print_band(found.band)
     counts = ", ".join(f"{count} {flag}" for flag, count in found.counts().items())

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from rich.markup import escape
 
@@ -52,20 +52,13 @@ def print_figures(paths: Iterable[Path]) -> None:
         print_plain(console, f"figure: {path}")
 
 
-def write_table(path: Path, table: Sequence[tuple[str, Any]]) -> None:
-    """Write columns behind their heads as CSV. Raises DataError if the file cannot be written."""
-    from bench.analysis import write_csv
-
-    write_csv(path, [head for head, _ in table], [values for _, values in table])
-
-
 def write_rows(path: Path, found: Mapping[str, Applied]) -> None:
     """Write models beside measurements as CSV, and print where.
 
     Raises DataError if the file cannot be written.
     """
-    from bench.analysis import rows_table
+    from bench.analysis import rows_table, write_csv
 
     table = rows_table(found)
-    write_table(path, table)
+    write_csv(path, table)
     print_plain(console, f"{counted(len(table[0][1]), 'row')}: {path}")

@@ -28,7 +28,7 @@ def measured(tmp_path_factory):
         play = min(max(play, value - 6.0), value + 6.0)
         outputs.append(play)
     outputs = np.array(outputs) + 0.1 * np.random.default_rng(0).standard_normal(inputs.size)
-    write_csv(folder / "data.csv", ["tec [°C]", "curvature [1/m]"], [inputs, outputs])
+    write_csv(folder / "data.csv", [("tec [°C]", inputs), ("curvature [1/m]", outputs)])
     found = identify(folder / "data.csv", "preisach", input="tec", output="curvature", levels=10)
     found.file.save(folder / "model.json")
     return folder

@@ -169,7 +169,7 @@ class TestFormulas:
         assert self.rows(tmp_path, "events")[0]["text"] == self.FORMULA
 
     def test_of_a_name_in_a_head_is_one_too(self, tmp_path):
-        write_csv(tmp_path / "a.csv", ["=1+1", "b"], [[1.0], [-2.0]])
+        write_csv(tmp_path / "a.csv", [("=1+1", [1.0]), ("b", [-2.0])])
         assert (tmp_path / "a.csv").read_text().splitlines() == ["'=1+1,b", "1.0,-2.0"]
 
 

@@ -116,7 +116,7 @@ class TestOverflow:
     @pytest.fixture
     def model(self, tmp_path, bench):
         inputs = np.tile([0.0, 1.0, 2.0, 3.0, 2.0, 1.0], 5)
-        write_csv(tmp_path / "loop.csv", ["u", "y"], [inputs, inputs + inputs**2])
+        write_csv(tmp_path / "loop.csv", [("u", inputs), ("y", inputs + inputs**2)])
         model = tmp_path / "model.json"
         words = ("--model", "polynomial", "--input", "u", "--output", "y", "--out", model)
         assert bench("identify", tmp_path / "loop.csv", *words)[0] == 0

@@ -217,12 +217,12 @@ def check_variation(source: str, column: Quantity) -> None:
         )
 
 
-def write_csv(path: Path, header: Sequence[str], columns: Sequence[Floats | Sequence[object]]) -> None:
-    """Write columns of equal length as CSV, numbers with all their digits and formulas as texts; see `write_blocks`.
+def write_csv(path: Path, table: Sequence[tuple[str, Floats | Sequence[object]]]) -> None:
+    """Write columns of equal length behind their heads as CSV, numbers with all their digits, formulas as texts.
 
     Raises DataError if the file cannot be written.
     """
-    write_blocks(path, header, [columns])
+    write_blocks(path, [head for head, _ in table], [[values for _, values in table]])
 
 
 def write_blocks(

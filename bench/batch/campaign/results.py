@@ -7,7 +7,7 @@ import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 from rich.console import Console
 from rich.table import Table
@@ -61,9 +61,8 @@ class ResultsTable:
 
     def write_csv(self, path: Path) -> None:
         """Write it as CSV; raises DataError if that fails."""
-        write_csv(
-            path, self.heads, [["" if cell is None else cell for cell in each] for each in self.columns.values()]
-        )
+        columns = [["" if cell is None else cell for cell in cells] for cells in self.columns.values()]
+        write_csv(path, list(zip(self.heads, columns, strict=True)))
 
     def write_parquet(self, path: Path) -> None:
         """Write it as Parquet, with the unit of each column in its metadata; raises MissingExtraError."""
@@ -83,10 +82,10 @@ class ResultsTable:
     def print(self, title: str, console: Console, most: int = MOST_ROWS) -> None:
         """Print its first rows."""
         table = Table(title=title, title_justify="left")
-        for (_, cells), head in zip(self.columns.items(), self.heads, strict=True):
-            numeric = all(isinstance(cell, (int, float)) or cell is None for cell in cells)
+        for cells, head in zip(self.columns.values(), self.heads, strict=True):
             # Units stand in brackets, which are no markup; a head breaks between words.
-            table.add_column(Text(head.replace("_", " ")), justify="right" if numeric else "left", overflow="fold")
+            justify: Literal["right", "left"] = "right" if _is_numeric(cells) else "left"
+            table.add_column(Text(head.replace("_", " ")), justify=justify, overflow="fold")
         for row in list(zip(*self.columns.values(), strict=True))[:most]:
             table.add_row(*(Text(shown(cell)) for cell in row))
         console.print(table)

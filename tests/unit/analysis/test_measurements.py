@@ -47,14 +47,14 @@ class TestRight:
     def test_what_is_written_is_read_to_the_last_digit(self, tmp_path_factory, rows):
         path = tmp_path_factory.getbasetemp() / "written.csv"
         array = np.array(rows)
-        write_csv(path, ["a, b [m]", "c"], [array[:, 0], array[:, 1]])
+        write_csv(path, [("a, b [m]", array[:, 0]), ("c", array[:, 1])])
         columns = read_columns(path, ["a, b", "c"])
         np.testing.assert_array_equal(columns.values["a, b"], array[:, 0])
         np.testing.assert_array_equal(columns.values["c"], array[:, 1])
 
     def test_writing_where_it_cannot(self, tmp_path):
         with pytest.raises(DataError, match="cannot be written"):
-            write_csv(tmp_path / "absent" / "a.csv", ["a"], [[1.0]])
+            write_csv(tmp_path / "absent" / "a.csv", [("a", [1.0])])
 
 
 class TestTrouble:
