@@ -38,7 +38,7 @@ def panel(
     check_extra("bench panel", "textual", "panel")
     if clock == "virtual":
         raise ConfigurationError("--clock virtual: nobody can follow it by hand; expected wall or xN")
-    from bench.panel import HandsOnRig, RunInProgress
+    from bench.panel import HandsOnRig, RunInProgress, carry_out_by_hand
 
     with needed_for("bench panel", "panel"):
         from bench.panel import Panel
@@ -48,7 +48,6 @@ def panel(
 
     from bench.base import Interrupts
     from bench.operator import Desk
-    from bench.panel import carry_out_by_hand
 
     desk = Desk()
     with Interrupts() as interrupts:

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import io
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from bench.base import BenchError, ConfigurationError, DataError, format_duration
+from rich.console import Console
+
+from bench.base import BenchError, ConfigurationError, DataError, Interrupts, format_duration
+from bench.execution import Run, RunResult, carry_out
 from bench.operator import END, PAUSE, SYNTAX, Desk, Leave, PanelMailbox, Shown, parse_command
+from bench.protocol import ByHand, Messages, ProtocolParameters, protocol
 from bench.record import Record
 from bench.rig import is_in_use, rig_of_content
 
@@ -149,6 +154,35 @@ class HandsOnRig:
             self.result = self.work()
         except BenchError as error:
             self.error = error
+
+
+class _Log(io.StringIO):
+    """Takes what a run prints for the log of the panel."""
+
+    def __init__(self, desk: Desk) -> None:
+        super().__init__()
+        self._desk = desk
+
+    def write(self, text: str) -> int:
+        for line in text.splitlines():
+            if line.strip():
+                self._desk.say(line.rstrip())
+        return len(text)
+
+
+def carry_out_by_hand(desk: Desk, interrupts: Interrupts, **asked: Any) -> RunResult:  # noqa: ANN401 - of `Run`
+    """Connect a rig, carry the commands of a desk out as a run, and leave every device in its safe state.
+
+    `asked` are fields of a `Run`. Raises what `bench.execution.carry_out` does before anything moves.
+    """
+
+    @protocol(needs=())
+    def by_hand(parameters: ProtocolParameters) -> Messages:  # noqa: ARG001 - of this form
+        """Let an operator move the rig by hand."""
+        yield ByHand(desk=desk)
+
+    run = Run(protocol=by_hand, settings={}, recording=False, rehearse=False, **asked)
+    return carry_out(run, Console(file=_Log(desk), width=200), interrupts)
 
 
 class RunInProgress:
