@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from bench.analysis.applied import Applied
-from bench.analysis.figures.fits import plot_fit, plot_loops
+from bench.analysis.figures.fits import plot_errors, plot_fit, plot_loops
 from bench.analysis.figures.panels import time_axis
 from bench.analysis.tables.data import Quantity
 from bench.base import Floats, fitting_prefix, percent, prefixed, with_unit
@@ -55,6 +55,18 @@ def draw_applied(
 def draw_in(folder: Path, prefix: str, models: Mapping[str, Applied]) -> list[Path]:
     """Draw `PREFIX-loops.png` and `PREFIX-errors.png` in a folder, which exists; see `draw_applied`."""
     return draw_applied(models, folder / f"{prefix}-loops.png", folder / f"{prefix}-errors.png")
+
+
+def draw_residuals(path: Path, models: Mapping[str, Applied]) -> None:
+    """Draw what each model leaves of the same measurements over the rows, with the bands of those that have one."""
+    first = next(iter(models.values()))
+    plot_errors(
+        path,
+        {name: each.residuals for name, each in models.items()},
+        error_label=with_unit("error", first.unit),
+        skip=first.first,
+        bands={name: (each.band.label, each.band.half_width) for name, each in models.items() if each.band},
+    )
 
 
 def errors_text(errors: Errors, unit: str) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -52,8 +52,3 @@ class Published:
         for key in self.path:
             found = found.get(key) if isinstance(found, Mapping) else None
         return self.scale * float(found) if self.path and isinstance(found, int | float) else None
-
-
-def concerning(published: Sequence[Published], meta: Mapping[str, Any]) -> list[Published]:
-    """Return those that are to be shown beside a run with these metadata."""
-    return [each for each in published if each.concerns(meta)]

@@ -10,10 +10,9 @@ from rich.console import Console
 from rich.text import Text
 
 from bench.analysis.applied import Applied, ComparedModels
-from bench.analysis.applied_figures import draw_in
+from bench.analysis.applied_figures import draw_in, draw_residuals
 from bench.analysis.export.run_export import make_folder
 from bench.analysis.figures.canvas import check_matplotlib
-from bench.analysis.figures.fits import plot_errors
 from bench.analysis.figures.planes import plot_coverage, plot_densities
 from bench.analysis.model_service import IdentifiedFile
 from bench.analysis.report.page.model_parts import errors_parts
@@ -23,7 +22,7 @@ from bench.analysis.report.published import Published
 from bench.analysis.report.recorded_run import RecordedRun
 from bench.analysis.report.run_figures import draw_loops, draw_signals
 from bench.analysis.report.uncertainty_tables import uncertainty_parts
-from bench.base import format_duration, print_plain, print_table, show_rows, with_unit
+from bench.base import format_duration, print_plain, print_table, show_rows
 from bench.identification import ModelFile
 from bench.models import MemoryCurve
 from bench.record import Event, Record, card_rows, lateness_lines, steps_of
@@ -101,12 +100,7 @@ def draw_comparison(result: ComparedModels, out: Path) -> list[Path]:
     """Draw the residuals of compared models, their outputs and loops; return the files."""
     folder = make_folder(out)
     path = folder / "residuals.png"
-    plot_errors(
-        path,
-        {name: each.residuals for name, each in result.applied.items()},
-        error_label=with_unit("error", result.unit),
-        skip=result.skip,
-    )
+    draw_residuals(path, result.applied)
     return [path, *draw_in(folder, "models", result.applied)]
 
 
@@ -171,15 +165,9 @@ def _draw(run: RecordedRun, folder: Path, figure_format: str) -> list[Path]:
     path = folder / f"signals.{figure_format}"
     paths = [path] if draw_signals(path, run) else []
     paths += (path for path, _ in draw_loops(folder, figure_format, run))
-    if models := run.applied:
+    if run.applied:
         paths.append(folder / f"errors.{figure_format}")
-        plot_errors(
-            paths[-1],
-            {each.file.name: each.residuals for each in models},
-            error_label=with_unit("error", models[0].unit),
-            skip=models[0].first,
-            bands={each.file.name: (each.band.label, each.band.half_width) for each in models if each.band},
-        )
+        draw_residuals(paths[-1], {each.file.name: each for each in run.applied})
     return paths
 
 

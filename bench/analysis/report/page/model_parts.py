@@ -44,12 +44,16 @@ def given_parts(files: Mapping[str, ModelFile], scratch: Path) -> list[PagePart]
         known = "" if file.validity is None else file.validity.text(file.response.input_unit)
         rows.append((parameter, file.name, file.model.kind, str(source), known, band))
         for k, density in enumerate(file.model.densities()):
-            path = scratch / f"given-{i}-{k}.svg"
-            plot_densities(path, [density])
             caption = f"Density of {file.name} {density.title}".rstrip()
-            figures.append(PageFigure(inlined(path, caption), f"{caption}, as the run was given it.", is_map=True))
+            plot_densities(path := scratch / f"given-{i}-{k}.svg", [density])
+            figures.append(_map(path, caption, ", as the run was given it"))
     heads = ("parameter", "model", "kind", "identified from", "valid for inputs", "prediction band")
     return [PageTable(heads, rows), *figures] if rows else []
+
+
+def _map(path: Path, caption: str, more: str = "") -> PageFigure:
+    """Return a figure whose colours are values."""
+    return PageFigure(inlined(path, caption), f"{caption}{more}.", is_map=True)
 
 
 def errors_parts(models: Sequence[Applied]) -> list[PageTable | PageText]:
@@ -123,21 +127,20 @@ def _details(model: Applied, scratch: Path, number: int) -> Iterator[PagePart]:
             caption += f"; {coverage.summary()} by this run"
         if sigma is not None:
             caption += "; beside it its standard uncertainty"
-        yield PageFigure(inlined(path, caption), f"{caption}.", is_map=True)
+        yield _map(path, caption)
         if coverage is not None and isinstance(memory := model.file.memory, MemoryCurve):
             path = scratch / f"coverage-{number}-{i}.svg"
             plot_coverage(path, density, coverage.swept, memory)
-            caption = f"What this run swept of the plane of {name}, and the memory at the end of the model's data"
-            yield PageFigure(inlined(path, caption), f"{caption}.", is_map=True)
+            yield _map(
+                path, f"What this run swept of the plane of {name}, and the memory at the end of the model's data"
+            )
     yield _coefficients(model, found, cells)
 
 
 def _details_in_time(model: Applied, scratch: Path, number: int) -> Iterator[PageFigure | PageTable]:
     for i, density in enumerate(model.file.model.densities()):
-        path = scratch / f"density-{number}-{i}.svg"
-        plot_densities(path, [density])
-        caption = f"Density of {model.file.name}"
-        yield PageFigure(inlined(path, caption), f"{caption}.", is_map=True)
+        plot_densities(path := scratch / f"density-{number}-{i}.svg", [density])
+        yield _map(path, f"Density of {model.file.name}")
     rows = [(name, f"{value:.6g}", unit) for name, (value, unit) in model.file.model.parameters().items()]
     heads = ("parameter", "value", "unit")
     yield PageTable(heads, rows, title=f"parameters of {model.file.name}", numbers_from=1)

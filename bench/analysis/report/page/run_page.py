@@ -19,7 +19,7 @@ from bench.analysis.figures.panels import plot_histogram
 from bench.analysis.figures.targets import plot_tracking
 from bench.analysis.report.page.model_parts import given_parts, models_parts
 from bench.analysis.report.page.pages import Page, PageFigure, PagePart, PageSection, PageTable, PageText, inlined
-from bench.analysis.report.published import Published, concerning
+from bench.analysis.report.published import Published
 from bench.analysis.report.recorded_run import RecordedRun, interlocks_of, wider
 from bench.analysis.report.run_figures import draw_loops, draw_signals
 from bench.analysis.report.uncertainty_tables import uncertainty_parts
@@ -45,7 +45,7 @@ def run_page(run: RecordedRun, published: Sequence[Published] = ()) -> Page:
     Of the numbers of papers those are shown that concern the run.
     """
     meta, record = run.meta, run.record
-    stated = concerning(published, meta)
+    stated = [each for each in published if each.concerns(meta)]
     with tempfile.TemporaryDirectory() as folder:
         scratch = Path(folder)
         models, times = run.applied, run.steps["finished"]
