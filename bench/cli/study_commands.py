@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from threading import Event, Thread
-from typing import TYPE_CHECKING, Annotated, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -24,9 +24,7 @@ from bench.cli.command_support import (
 from bench.cli.printing import console, error_console, show_compilation
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
-    from bench.batch import CampaignTask, Done, Executor
+    from bench.batch import Executor
 
 
 def command_of(name: str, study: Any) -> Callable[..., None]:  # noqa: ANN401 - as `bench.batch.Study`
@@ -165,10 +163,11 @@ def campaign(
         else:
             pool = Workers(workers, console, file.stem, kernels=expansion.kernels)
             executor = WorkersExecutor(stack.enter_context(pool), folder)
+        done = dict(before.done)
         if not console.is_terminal:
-            left = len(expansion.tasks) - len(before.done)
-            executor = stack.enter_context(SayingExecutor(executor, left, console))
-        done = carry_out_tasks(expansion.tasks, before.done, executor)
+            already = len(before.done)
+            stack.enter_context(_saying_how_far(lambda: len(done) - already, len(expansion.tasks) - already))
+        done = carry_out_tasks(expansion.tasks, done, executor)
         shutil.rmtree(folder / UNFINISHED, ignore_errors=True)
     files = show_results(expansion, done, folder, console)
     failed = {name: each for name, each in done.items() if not each.carried_out}
@@ -194,43 +193,24 @@ def campaign(
         sys.exit(1)
 
 
-class SayingExecutor:
-    """An executor that prints a line now and then: how many tasks are done, where no terminal draws it.
+@contextmanager
+def _saying_how_far(count: Callable[[], int], tasks: int) -> Iterator[None]:
+    """Print a line now and then: how many tasks are done, where no terminal draws it."""
+    from bench.base import Stopwatch, format_duration
 
-    `every` is the wall-clock time between two lines, s.
-    """
+    over, since = Event(), Stopwatch()
 
-    def __init__(self, executor: Executor, tasks: int, console: Console, every: float = SAID_EVERY) -> None:
-        self._executor, self._tasks, self._console, self._every = executor, tasks, console, every
-        self._done = 0
-        self._over = Event()
-        self._thread = Thread(target=self._say, name="progress", daemon=True)
+    def say() -> None:
+        while not over.wait(SAID_EVERY):
+            print_plain(console, f"{format_duration(since.seconds()):>10}  {count()} of {tasks} done")
 
-    def __enter__(self) -> Self:
-        self._thread.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._over.set()
-        self._thread.join()
-
-    def submit(self, task: CampaignTask) -> None:
-        """Have a task carried out."""
-        self._executor.submit(task)
-
-    def next_done(self) -> tuple[CampaignTask, Done]:
-        """Wait for the next task that is done; return it with what it has left."""
-        found = self._executor.next_done()
-        self._done += 1
-        return found
-
-    def _say(self) -> None:
-        from bench.base import Stopwatch, format_duration
-
-        since = Stopwatch()
-        while not self._over.wait(self._every):
-            text = f"{format_duration(since.seconds()):>10}  {self._done} of {self._tasks} done"
-            print_plain(self._console, text)
+    thread = Thread(target=say, name="progress", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
 
 
 @contextmanager

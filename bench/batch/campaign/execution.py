@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from graphlib import TopologicalSorter
 from pathlib import Path
 from typing import Protocol
 
@@ -133,39 +134,28 @@ def done_before(tasks: Mapping[str, CampaignTask], campaign: Path) -> Before:
     return Before({name: done[name] for name in tasks if name in done}, places, lost)
 
 
-def carry_out_tasks(
-    tasks: Mapping[str, CampaignTask], before: Mapping[str, Done], executor: Executor
-) -> dict[str, Done]:
+def carry_out_tasks(tasks: Mapping[str, CampaignTask], done: dict[str, Done], executor: Executor) -> dict[str, Done]:
     """Carry out all tasks that were not done before; return what each has left, by name, in the order of `tasks`.
 
-    A task whose needs could not be carried out is refused.
+    A task whose needs could not be carried out is refused. What is done meanwhile is added to what was `done` before.
     """
-    done: dict[str, Done] = dict(before)
-    missing = {name: {need for need in task.needs if need not in done} for name, task in tasks.items()}
-    users: dict[str, list[str]] = {}
-    for name, needs in missing.items():
-        for need in needs:
-            users.setdefault(need, []).append(name)
-    ready = [name for name, needs in missing.items() if name not in done and not needs]
+    order = TopologicalSorter({name: task.needs for name, task in tasks.items()})
+    order.prepare()
     going = 0
-    while ready or going:
-        for name in ready:
-            executor.submit(tasks[name])
-        going += len(ready)
-        task, result = executor.next_done()
-        going -= 1
-        ready = []
-        finished = [(task.name, result)]
-        while finished:
-            name, result = finished.pop()
-            done[name] = result
-            for user in users.get(name, ()):
-                missing[user].discard(name)
-                if user in done:
-                    continue
-                if not result.carried_out:
-                    reason = f"needs {name}, which was not carried out: {result.reason}"
-                    finished.append((user, Done(tasks[user].identity, "refused", reason)))
-                elif not missing[user]:
-                    ready.append(user)
+    while order.is_active():
+        for name in order.get_ready():
+            task = tasks[name]
+            wrong = next((need for need in task.needs if not done[need].carried_out), None)
+            if name not in done and wrong is None:
+                executor.submit(task)
+                going += 1
+                continue
+            if name not in done:
+                reason = f"needs {wrong}, which was not carried out: {done[str(wrong)].reason}"
+                done[name] = Done(task.identity, "refused", reason)
+            order.done(name)
+        if going:
+            task, done[task.name] = executor.next_done()
+            going -= 1
+            order.done(task.name)
     return {name: done[name] for name in tasks}
