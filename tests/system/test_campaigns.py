@@ -402,7 +402,7 @@ def test_a_killed_worker_is_replaced_and_its_run_equals_one_alone(campaign, tmp_
 
         def kill_one():
             # Once its journal is there a run is going on, for a second at least.
-            while not any(out.glob(f"{UNFINISHED}/*/*/journal.sqlite")):
+            while not any(out.glob(f"{UNFINISHED}/*/*/*/journal.sqlite")):
                 if over.wait(0.01):
                     return
             process = next(iter(workers._processes))

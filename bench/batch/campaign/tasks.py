@@ -16,10 +16,10 @@ from bench.analysis import (
     FEWEST_ROWS,
     ColumnNames,
     FitOptions,
-    RunFolder,
     Session,
     compare_models,
     identify_model,
+    input_and_output,
     load_models,
     read_dataset,
     read_for,
@@ -125,9 +125,9 @@ class CampaignTask(ABC):
         """
         scratch = campaign / UNFINISHED / self.scratch
         shutil.rmtree(scratch, ignore_errors=True)
-        scratch.mkdir(parents=True)
+        (scratch / "made").mkdir(parents=True)
         try:
-            made, done = self._work(campaign, scratch)
+            made, done = self._work(campaign, scratch / "made")
         except AbortError:
             # The operator ends the campaign; the next start does this task again.
             raise
@@ -178,8 +178,8 @@ class CampaignTask(ABC):
         return {"kind": self.kind, **{key: value for key, value in asdict(self).items() if key not in left_out}}
 
     @abstractmethod
-    def _work(self, campaign: Path, scratch: Path) -> tuple[Path, Done]:
-        """Do it below `scratch`; return the folder that it has made there."""
+    def _work(self, campaign: Path, made: Path) -> tuple[Path, Done]:
+        """Do it in the folder `made`; return the folder of what it has made, that or one in it."""
 
 
 @dataclass(frozen=True)
@@ -265,8 +265,8 @@ class RunTask(CampaignTask):
             faults=Path(self.faults) if self.faults else None,
         )
 
-    def _work(self, campaign: Path, scratch: Path) -> tuple[Path, Done]:
-        result = carry_out(self.run(campaign, scratch), Console(quiet=True))
+    def _work(self, campaign: Path, made: Path) -> tuple[Path, Done]:
+        result = carry_out(self.run(campaign, made), Console(quiet=True))
         outcome = result.outcome
         if isinstance(outcome.error, AbortError):
             raise outcome.error
@@ -311,17 +311,15 @@ class ModelTask(CampaignTask):
         """The model."""
         return (MODEL_NAME,)
 
-    def _work(self, campaign: Path, scratch: Path) -> tuple[Path, Done]:
-        made = scratch / "made"
-        made.mkdir()
+    def _work(self, campaign: Path, made: Path) -> tuple[Path, Done]:
         runs = [completed_run(campaign, name) for name in self.sources]
         whole = whole_identification(self.model)
         if whole is not None:
-            whole.of_runs([run.folder for run in runs], None, {}).file.save(made / MODEL_NAME)
+            whole.of_runs(runs, None, {}).file.save(made / MODEL_NAME)
             return made, Done(self.identity, "completed")
         (source,) = runs
-        names = ColumnNames(self.input or source.signal_of("drive"), self.output or source.signal_of("response"))
-        data = read_dataset([source.folder], names, at_least=FEWEST_ROWS)
+        names = ColumnNames(*input_and_output(source, (self.input, self.output)))
+        data = read_dataset([source], names, at_least=FEWEST_ROWS)
         found = identify_model(data, self.model, FitOptions.of(identification_options(self.options)))
         found.file.save(made / MODEL_NAME)
         summary, unit = found.summary(), found.file.operator.output_unit or "1"
@@ -350,20 +348,18 @@ class ComparisonTask(CampaignTask):
         """The run and the identifications."""
         return (self.source, *self.models.values())
 
-    def _work(self, campaign: Path, scratch: Path) -> tuple[Path, Done]:
+    def _work(self, campaign: Path, made: Path) -> tuple[Path, Done]:
         source = completed_run(campaign, self.source)
         session = Session.parse(self.recalibrate or None, self.recalibrate_rows)
         results: dict[str, tuple[float, str]] = {}
-        names = ColumnNames(self.input or source.signal_of("drive"), self.output or source.signal_of("response"))
+        names = ColumnNames(*input_and_output(source, (self.input, self.output)))
         for name, task in self.models.items():
             models = load_models([campaign / task / MODEL_NAME])
-            found = compare_models(models, read_for([*models.values()], source.folder, names), session=session)
+            found = compare_models(models, read_for([*models.values()], source, names), session=session)
             (compared,) = found.comparisons
             errors = found.recalibrated(compared) or found.comparisons[compared].raw
             unit = found.unit or "1"
             results |= {f"{name}_max": (errors.maximum, unit), f"{name}_rms": (errors.rms, unit)}
-        made = scratch / "made"
-        made.mkdir()
         return made, Done(self.identity, "completed", "", results)
 
 
@@ -382,10 +378,9 @@ class StudyTask(CampaignTask):
         """Values and tables."""
         return (STUDY_NAME,)
 
-    def _work(self, campaign: Path, scratch: Path) -> tuple[Path, Done]:
+    def _work(self, campaign: Path, made: Path) -> tuple[Path, Done]:
         del campaign
         study: Study = registry.load("studies", self.study)
-        made = scratch / "made"
         # The cores are shared by the tasks of the campaign.
         with Workers(1) as workers:
             found = study.carry_out(RunSeries(self.rig or study.rig or "", made, self.seed, False, workers))
@@ -393,12 +388,12 @@ class StudyTask(CampaignTask):
         return made, Done(self.identity, "completed", "", dict(flat_numbers(found.values)))
 
 
-def completed_run(campaign: Path, name: str) -> RunFolder:
-    """Return the run of a task; raises DataError if it was not completed."""
-    run = RunFolder(campaign / name)
-    if run.status != "completed":
-        raise DataError(f"the run {name} was not completed")
-    return run
+def completed_run(campaign: Path, name: str) -> Path:
+    """Return the folder of the run of a task; raises DataError if it was not completed."""
+    with Record(campaign / name) as record:
+        if record.status != "completed":
+            raise DataError(f"the run {name} was not completed")
+    return campaign / name
 
 
 def identification_options(options: Mapping[str, Any]) -> dict[str, Any]:
