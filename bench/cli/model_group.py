@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
 
@@ -25,6 +25,7 @@ from bench.cli.printing import console, print_figures, print_rows, show_compilat
 from bench.cli.run_names import find_run
 
 if TYPE_CHECKING:
+    from bench.base import Floats
     from bench.identification import Continuation
 
 
@@ -167,7 +168,8 @@ def design(
     tails, each where it tells most per second. Each tail visits its first maximum again: outputs that differ there by
     more than the noise say that the specimen has no return-point memory, so that no Preisach model fits it.
     """
-    from bench.analysis import ReadingOptions, assess_designs, write_sequence
+    from bench.analysis import ReadingOptions, assess_designs, continue_file
+    from bench.identification import load_model
 
     check_outputs(out=out, json_file=json_file, read=[path for path in (model, data) if path is not None])
     unit = ""
@@ -185,7 +187,16 @@ def design(
             raise ConfigurationError("to go on, give --model, --data, --continue, and --dwell or --rig")
         if sequence is not None:
             raise ConfigurationError("--sequence is of the table; --continue makes a sequence of its own")
-        _continue(model, data, input_column, hours, dwell, out, json_file, reading)
+        to_go_on = load_model(model)
+        unit = to_go_on.operator.input_unit
+        with show_patience(f"designing {hours:g} h of measurements", console):
+            further = continue_file(
+                to_go_on, data, input_column=input_column, seconds=3600.0 * hours, dwell=dwell, reading=reading
+            )
+        print_rows(f"continuation of {data.name} for {model.name}", _continuation_lines(further, unit))
+        if out is not None:
+            _write_sequence(out, further.setpoints, unit, dwell)
+        write_json(json_file, _continuation_json(further))
         return
     if input_column is not None or reading != ReadingOptions():
         raise ConfigurationError("--input and how a file is read are for --model, --data and --continue")
@@ -209,46 +220,21 @@ def design(
     ]  # fmt: skip
     print_table(console, heads, rows, f"excitation of {levels * (levels + 1) // 2} cells", numbers_from=1)
     if sequence is not None and out is not None:
-        write_sequence(out, found[sequence].setpoints, unit=unit, dwell=dwell)
-        _print_sequence(out, found[sequence].setpoints.size)
+        _write_sequence(out, found[sequence].setpoints, unit, dwell)
     write_json(json_file, {name: vars(entry) for name, entry in result.items()})
 
 
-def _continue(
-    path: Path,
-    data: Path,
-    input_column: str | None,
-    hours: float,
-    dwell: float,
-    out: Path | None,
-    json_file: Path | None,
-    reading: ReadingGroup,
-) -> None:
-    from bench.analysis import continue_file, write_sequence
-    from bench.identification import load_model
-
-    model = load_model(path)
-    with show_patience(f"designing {hours:g} h of measurements", console):
-        found = continue_file(
-            model, data, input_column=input_column, seconds=3600.0 * hours, dwell=dwell, reading=reading
-        )
-    print_rows(f"continuation of {data.name} for {path.name}", _continuation_lines(found, model.operator.input_unit))
-    if out is not None:
-        write_sequence(out, found.setpoints, unit=model.operator.input_unit, dwell=dwell)
-        _print_sequence(out, found.setpoints.size)
-    write_json(
-        json_file,
-        {
-            "setpoints": int(found.setpoints.size),
-            "time": found.time,
-            "tails": [{"center": tail.center, "reach": tail.reach} for tail in found.tails],
-            "visits": [list(pair) for pair in found.visits],
-            "log_determinant": {"before": found.before, "after": found.after, "repeated": found.repeated},
-            "prediction_variance": {
-                "before": found.variance_before, "after": found.variance_after, "repeated": found.variance_repeated
-            },
+def _continuation_json(found: Continuation) -> dict[str, Any]:
+    return {
+        "setpoints": int(found.setpoints.size),
+        "time": found.time,
+        "tails": [{"center": tail.center, "reach": tail.reach} for tail in found.tails],
+        "visits": [list(pair) for pair in found.visits],
+        "log_determinant": {"before": found.before, "after": found.after, "repeated": found.repeated},
+        "prediction_variance": {
+            "before": found.variance_before, "after": found.variance_after, "repeated": found.variance_repeated
         },
-    )  # fmt: skip
+    }  # fmt: skip
 
 
 def _continuation_lines(found: Continuation, unit: str) -> list[tuple[str, str]]:
@@ -276,8 +262,11 @@ def _continuation_lines(found: Continuation, unit: str) -> list[tuple[str, str]]
     ]
 
 
-def _print_sequence(path: Path, count: int) -> None:
-    print_plain(console, f"{count} set-points: {path}; bench run sequence --rig RIG --set setpoints={path}")
+def _write_sequence(path: Path, setpoints: Floats, unit: str, dwell: float) -> None:
+    from bench.analysis import write_sequence
+
+    write_sequence(path, setpoints, unit=unit, dwell=dwell)
+    print_plain(console, f"{setpoints.size} set-points: {path}; bench run sequence --rig RIG --set setpoints={path}")
 
 
 @show_compilation()
