@@ -121,6 +121,12 @@ class Frame:
         )
 
 
+def pale(colour: Colour, part: float, grey: int) -> Colour:
+    """Return a colour of which only a part is left; the rest is grey, 0 to 255."""
+    red, green, blue = (round(part * each + (1 - part) * grey) for each in colour[:3])
+    return red, green, blue
+
+
 def lines(strips: Any, colour: Colour | Sequence[Colour], points: float, order: float) -> rr.LineStrips2D:  # noqa: ANN401
     """Return lines of a width in points of the screen."""
     return rr.LineStrips2D(strips, colors=colour, radii=rr.Radius.ui_points(points), draw_order=order)

@@ -204,9 +204,7 @@ class Dashboard:
                 due = self._written_at + min(_FILE_SECONDS, max(_BATCH_SECONDS, _PART_OF_RUN * now))
                 if len(self._for_file) >= CHUNK_ROWS or now >= due:
                     self._write_file(self._file)
-            if (missing := self.dropped - self._reported) > 0:
-                self._warn(f"{missing} entries are missing: Rerun did not take them; the journal has them")
-                self._reported += missing
+            self._warn_of_missing()
         if self._recording_stops and self._file is not None:
             self._complete_file(self._file)
 
@@ -219,9 +217,7 @@ class Dashboard:
     def _complete_file(self, writer: Writer) -> None:
         if writer.recording.is_written:
             self._write_file(writer)
-            if (missing := self.dropped - self._reported) > 0:
-                self._warn(f"{missing} entries are missing: Rerun did not take them; the journal has them")
-                self._reported += missing
+            self._warn_of_missing()
             writer.arrange()
             writer.recording.close()
             self._is_complete = True
@@ -232,6 +228,11 @@ class Dashboard:
         # After any failure in the view, the run goes on, and so does the rest of the view.
         except Exception:
             self._not_written += len(entries)
+
+    def _warn_of_missing(self) -> None:
+        if (missing := self.dropped - self._reported) > 0:
+            self._warn(f"{missing} entries are missing: Rerun did not take them; the journal has them")
+            self._reported += missing
 
     def _warn(self, text: str) -> None:
         for writer in (self._file, self._view):

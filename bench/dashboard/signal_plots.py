@@ -10,7 +10,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from bench.base import ConfigurationError, Floats, closest
-from bench.dashboard.drawing import Colour, time_view
+from bench.dashboard.drawing import Colour, pale, time_view
 from bench.devices import Signal
 from bench.rig import SETPOINT
 
@@ -135,21 +135,16 @@ def _colour(signals: Sequence[Signal], column: int) -> Colour:
     colour = _PALETTE[_follower(signals, column) % len(_PALETTE)]
     if not signals[column].name.endswith(SETPOINT):
         return colour
-    red, green, blue = (round(_SETPOINT_PART * part + (1 - _SETPOINT_PART) * 150) for part in colour[:3])
-    return red, green, blue
+    return pale(colour, _SETPOINT_PART, 150)
 
 
 def _follower(signals: Sequence[Signal], column: int) -> int:
     """Return the column of what follows a set-point; that of another signal itself."""
-    name = signals[column].name
-    if not name.endswith(SETPOINT):
-        return column
-    device, unit = name.removesuffix(SETPOINT), signals[column].unit
-    return next(
-        (
-            i
-            for i, signal in enumerate(signals)
-            if i != column and signal.name.startswith(f"{device}_") and signal.unit == unit
-        ),
-        column,
-    )
+    return next((i for i, signal in enumerate(signals) if follows(signal, signals[column])), column)
+
+
+def follows(signal: Signal, setpoint: Signal) -> bool:
+    """Return whether a signal is what the device of a set-point makes of it; nothing follows another signal."""
+    device = setpoint.name.removesuffix(SETPOINT)
+    is_of_it = device != setpoint.name != signal.name and signal.name.startswith(f"{device}_")
+    return is_of_it and signal.unit == setpoint.unit

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,14 +24,14 @@ from bench.dashboard.model_band import ModelBand, Plotted, banded_model
 from bench.dashboard.numbers import LIVE_SECONDS, Numbers
 from bench.dashboard.planes import Planes
 from bench.dashboard.rerun_recording import RerunRecording, times
-from bench.dashboard.signal_plots import plots_by_unit
+from bench.dashboard.signal_plots import follows, plots_by_unit
 from bench.dashboard.timeline import Timeline
 from bench.dashboard.xy_plots import Points, XYPlots
 from bench.devices import Signal
 from bench.identification import ModelFile
 from bench.protocol import LATENESS
 from bench.record import StepRecord, lateness_lines, run_card
-from bench.rig import SETPOINT, DashboardLayout
+from bench.rig import DashboardLayout
 
 
 class Writer:
@@ -77,7 +77,13 @@ class Writer:
         }
         names = [signal.name for signal in signals]
         self._lateness_column = names.index(LATENESS.name) if LATENESS.name in names else None
-        self._commanded = {} if self._plots is None else _commanded(signals, self._plots.inputs)
+        # The set-points that the inputs of the plots follow.
+        self._commanded = {
+            column: place
+            for column in (() if self._plots is None else self._plots.inputs)
+            for place, setpoint in enumerate(signals)
+            if follows(signals[column], setpoint)
+        }
         self._over_time = {names.index(name) for name in meta.get("over_time") or () if name in names}
         self._band = self._band_of(models, signals)
         shown = [self._control.output] if self._control else list(self._plots.columns[::-1] if self._plots else ())
@@ -259,19 +265,6 @@ class Writer:
 def _readings_of(record: StepRecord) -> Ticks:
     """Return the readings of a step, at its end."""
     return Ticks(np.array([record.finished]), np.array([record.step]), np.array([record.values], dtype=np.float64))
-
-
-def _commanded(signals: Sequence[Signal], columns: Collection[int]) -> dict[int, int]:
-    """Return the columns of the set-points that signals of actuators follow, by the columns of these."""
-    setpoints = {
-        signal.name.removesuffix(SETPOINT): i for i, signal in enumerate(signals) if signal.name.endswith(SETPOINT)
-    }
-    return {
-        column: setpoint
-        for column in columns
-        for device, setpoint in setpoints.items()
-        if signals[column].name.startswith(f"{device}_") and signals[column].unit == signals[setpoint].unit
-    }
 
 
 def _layout_of(meta: Mapping[str, Any]) -> DashboardLayout | None:

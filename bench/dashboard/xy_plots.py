@@ -20,7 +20,7 @@ import rerun.blueprint as rrb
 
 from bench.base import Floats
 from bench.dashboard.bounds import Bound
-from bench.dashboard.drawing import Colour, Frame, line_style, lines, point_style, strips_at_once, xy_view
+from bench.dashboard.drawing import Colour, Frame, line_style, lines, pale, point_style, strips_at_once, xy_view
 from bench.dashboard.entries import Ticks
 from bench.dashboard.rerun_recording import RerunRecording, times
 from bench.dashboard.signal_plots import find_column
@@ -175,12 +175,7 @@ class XYPlots:
         return past | {f"/{path}/data/recent": bright} if self._fades else past
 
 
-def _pale(colour: Colour) -> Colour:
-    red, green, blue = (round(_PALE * part + (1 - _PALE) * 128) for part in colour[:3])
-    return red, green, blue
-
-
-_FADED = {colour: _pale(colour) for colour in (_RISING, _FALLING)}
+_FADED = {colour: pale(colour, _PALE, 128) for colour in (_RISING, _FALLING)}
 
 
 class _Track:
