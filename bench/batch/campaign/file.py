@@ -43,7 +43,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import AfterValidator, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from bench.analysis import Session
 from bench.base import CheckedTable, ConfigurationError, parse_toml, problems, reason
@@ -81,10 +81,11 @@ def _each_once(values: tuple[Any, ...]) -> tuple[Any, ...]:
     return values
 
 
-Names = Annotated[tuple[str, ...], BeforeValidator(_listed)]
+Names = Annotated[tuple[str, ...], BeforeValidator(_listed), AfterValidator(_each_once)]
 Seeds = Annotated[
     tuple[Annotated[int, Field(ge=0, le=2**31 - 1)], ...],
     BeforeValidator(_seeds),
+    AfterValidator(_each_once),
     Field(description="seeds of the laboratory: a list, or a range such as '0..9'"),
 ]
 
@@ -116,9 +117,7 @@ class RunsTable(CheckedTable):
     )
 
     @model_validator(mode="after")
-    def _has_axes(self) -> Self:
-        for values in (self.protocol, self.rigs, self.seeds, self.faults):
-            _each_once(values)
+    def _has_name(self) -> Self:
         if not self.name and (len(self.protocol) > 1 or ".py" in self.protocol[0]):
             raise ValueError("name is missing; a table with several protocols, or one from a file, needs one")
         return self
@@ -148,11 +147,6 @@ class ModelsTable(CheckedTable):
         description="seed of its run; that of the run that uses the model if not given",
     )
 
-    @model_validator(mode="after")
-    def _has_runs(self) -> Self:
-        _each_once(self.runs)
-        return self
-
     @property
     def options(self) -> dict[str, Any]:
         """The options of the identification, by name."""
@@ -172,14 +166,8 @@ class ComparisonsTable(CheckedTable):
 
     @model_validator(mode="after")
     def _can_be_read(self) -> Self:
-        _each_once(self.models)
         Session.parse(self.recalibrate or None, self.recalibrate_rows)
         return self
-
-    @property
-    def session(self) -> Session | None:
-        """What is estimated of each session; None for nothing."""
-        return Session.parse(self.recalibrate or None, self.recalibrate_rows)
 
 
 class StudiesTable(CheckedTable):
@@ -188,12 +176,6 @@ class StudiesTable(CheckedTable):
     name: str = Field(min_length=1, description="study, as `bench list` names it")
     rigs: Names = Field(default=("",), description="rigs, an axis of the grid; '' is that of the study")
     seeds: Seeds = (0,)
-
-    @model_validator(mode="after")
-    def _has_axes(self) -> Self:
-        for values in (self.rigs, self.seeds):
-            _each_once(values)
-        return self
 
 
 class CampaignTables(CheckedTable):
