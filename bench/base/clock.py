@@ -21,7 +21,6 @@ from bench.base.errors import ConfigurationError
 VIRTUAL_EPOCH = datetime(2000, 1, 1, tzinfo=UTC)
 """Where every virtual clock begins, so that runs with one seed carry the same time stamps."""
 
-_FOREVER = math.inf
 _LONGEST_NAP = 0.2
 """Longest single wait in seconds, so that a signal to the process is noticed soon."""
 
@@ -279,8 +278,8 @@ class VirtualClock(Clock):
 
     def sleep(self, seconds: float) -> None:
         """Jump ahead."""
-        if 0.0 < seconds < _FOREVER:
-            self._now += seconds
+        if 0.0 < seconds < math.inf:
+            self._pass_until(self._now + seconds)
         else:
             _check_finite(seconds)
 
@@ -289,7 +288,11 @@ class VirtualClock(Clock):
         if not -math.inf < instant < math.inf:
             _check_finite(instant)
         if instant > self._now:
-            self._now = instant
+            self._pass_until(instant)
+
+    def _pass_until(self, instant: float) -> None:
+        """Let laboratory time pass up to an instant that is to come, s."""
+        self._now = instant
 
 
 @dataclass(frozen=True)
@@ -361,19 +364,8 @@ class PacedClock(VirtualClock):
         passed = time.monotonic() - wall
         return Pace(self.factor, (self._now - laboratory) / passed if passed > 0 else self.factor)
 
-    def sleep(self, seconds: float) -> None:
-        """Wait until the wall clock has caught up with the end of the sleep, then let laboratory time pass."""
-        _check_finite(seconds)
-        if seconds > 0:
-            self._pass_until(self._now + seconds)
-
-    def sleep_until(self, instant: float) -> None:
-        """Wait until the wall clock has caught up with `instant`, then let laboratory time pass up to it exactly."""
-        _check_finite(instant)
-        if instant > self._now:
-            self._pass_until(instant)
-
     def _pass_until(self, instant: float) -> None:
+        """Wait until the wall clock has caught up, then let laboratory time pass."""
         due = self._origin + instant / self.factor
         while (left := due - time.monotonic()) >= _SHORTEST_NAP:
             if self.interrupted():

@@ -53,34 +53,25 @@ def problems(error: ValidationError, model: type[BaseModel], prefix: str = "") -
         # The model itself has no key: its message names one.
         key = (prefix + ".".join(str(part) for part in location)).rstrip(".")
         owner, field = _find(model, location)
+        meaning = f" ({field.description})" if field and field.description else ""
         if problem["type"] == "extra_forbidden":
-            known = closest(str(location[-1]), owner.model_fields if owner else ())
-            yield f"{key}: there is no such key; {known}"
+            yield f"{key}: there is no such key; {closest(str(location[-1]), owner.model_fields)}"
         elif problem["type"] == "missing":
-            meaning = f" ({field.description})" if field and field.description else ""
             yield f"{key}: is missing{meaning}"
         else:
-            meaning = f" ({field.description})" if field and field.description else ""
             value = problem["input"]
             shown = f"{key or 'file'} = {value!r}: " if not isinstance(value, dict) else key and f"{key}: "
             yield f"{shown}{explain(problem)}{meaning}{comma_remark(value)}"
 
 
-def _find(model: type[BaseModel], location: Sequence[Any]) -> tuple[type[BaseModel] | None, FieldInfo | None]:
-    owner: type[BaseModel] | None = model
+def _find(owner: type[BaseModel], location: Sequence[Any]) -> tuple[type[BaseModel], FieldInfo | None]:
+    """Return the innermost table of a location below a table, and the innermost field, which has the description."""
     field: FieldInfo | None = None
     for part in location:
-        if owner is None:
-            break
         if part in owner.model_fields:
             field = owner.model_fields[part]
-            nested = _models_in(field.annotation)
-            if nested:
-                # The innermost key that is found carries the description.
-                owner_next: type[BaseModel] | None = nested[0]
-                if part == location[-1]:
-                    break
-                owner = owner_next
+            if part != location[-1] and (nested := _models_in(field.annotation)):
+                owner = nested[0]
     return owner, field
 
 
