@@ -14,7 +14,8 @@ from bench.base import Floats
 from bench.dashboard.drawing import ALARM, CAUTION, LIMIT, Colour
 from bench.dashboard.rerun_recording import Ints, RerunRecording, times
 from bench.devices import Signal
-from bench.rig import SETPOINT, Interlock, Level
+from bench.record import interlocks_of
+from bench.rig import SETPOINT, Level
 
 
 @dataclass(frozen=True)
@@ -42,8 +43,7 @@ def bounds_of(meta: Mapping[str, Any], signals: Sequence[Signal]) -> tuple[Bound
     for device, (low, high) in (meta.get("limits") or {}).items():
         if (column := columns.get(f"{device}{SETPOINT}")) is not None:
             found += _pair(column, signals[column], low, high, "limit", LIMIT)
-    for table in (meta.get("rig_content") or {}).get("interlocks", ()):
-        interlock = Interlock.model_validate(table)
+    for interlock in interlocks_of(meta):
         if interlock.minus or (column := columns.get(interlock.signal)) is None:
             continue
         kind, colour = ("warning", CAUTION) if interlock.level is Level.WARN else ("interlock", ALARM)

@@ -4,6 +4,7 @@ from . import (
 from .card import (
     card_rows as card_rows,
     expected_steps as expected_steps,
+    interlocks_of as interlocks_of,
     run_card as run_card,
     steps_of as steps_of,
 )

@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from datetime import datetime
 from typing import Any
 
+from pydantic import ValidationError
+
 from bench.base import counted, format_duration, prefixed
+from bench.rig import Interlock
 
 
 def run_card(meta: Mapping[str, Any]) -> str:
@@ -97,3 +101,12 @@ def expected_steps(meta: Mapping[str, Any]) -> int | None:
         return int(rehearsal["steps"])
     planned = meta["plan"]
     return int(planned["steps"]) if planned.get("complete", True) else None
+
+
+def interlocks_of(meta: Mapping[str, Any]) -> list[Interlock]:
+    """Return the interlocks that watched a run; none where the record does not say, or of another version."""
+    found = []
+    for table in (meta.get("rig_content") or {}).get("interlocks", ()):
+        with suppress(ValidationError):
+            found.append(Interlock.model_validate(table))
+    return found

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from pydantic import ValidationError
 
 from bench.analysis.applied import Applied, apply_to_run, models_of
 from bench.analysis.tracking_errors import results_json
@@ -18,8 +16,7 @@ from bench.base import Floats
 from bench.devices import Signal
 from bench.identification import ModelFile, models_among
 from bench.protocol import TRACES
-from bench.record import Event, Record, Table
-from bench.rig import Interlock
+from bench.record import Event, Record, Table, interlocks_of
 
 Extremes = tuple[float | None, float | None]
 
@@ -143,7 +140,7 @@ class RecordedRun:
         """Read a record, which stays open. Raises DataError if it is damaged."""
         steps, names = record.steps(), {signal.name for signal in record.signals}
         without_priors(record, steps)
-        watched = (each for each in interlocks_of(record) if {each.signal, each.minus} <= names)
+        watched = (each for each in interlocks_of(record.meta) if {each.signal, each.minus} <= names)
         summary = summarize(record, [(each.signal, each.minus) for each in watched])
         found = cls(record, steps, record.events(), summary, models)
         # A record that does not say what its limits allow has the range that was seen.
@@ -245,15 +242,6 @@ class RecordedRun:
             "uncertainty": self.uncertainty.to_json(),
             **self.control,
         }
-
-
-def interlocks_of(record: Record) -> list[Interlock]:
-    """Return the interlocks that watched a run; none where the record does not say."""
-    found = []
-    for table in (record.meta.get("rig_content") or {}).get("interlocks", ()):
-        with suppress(ValidationError):
-            found.append(Interlock.model_validate(table))
-    return found
 
 
 def _greatest(extremes: Mapping[str, Any]) -> float | None:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from bench.base import DataError, DeferredModule, Floats
 from bench.devices import Signal
 from bench.record import Record, StepRecord
+from bench.rig import SETPOINT
 
 if TYPE_CHECKING:
     from bench.models import actuator_kernels as _kernels
@@ -148,7 +149,7 @@ def recording_of(path: Path, record: Record, device: str, drive: str, response: 
     """
     signals = record.signals
     names = {signal.name for signal in signals}
-    for name in (drive, response, f"{device}_setpoint"):
+    for name in (drive, response, f"{device}{SETPOINT}"):
         if name not in names:
             raise DataError(f"{path}: has no signal {name!r}; it has: {', '.join(sorted(names))}")
     steps = tuple(record.step_records())
@@ -166,7 +167,7 @@ def recording_of(path: Path, record: Record, device: str, drive: str, response: 
     known = np.isfinite(columns[drive]) & np.isfinite(columns[response])
     columns = {name: values[known] for name, values in columns.items()}
     times, is_reading, number = times[known], is_reading[known], number[known]
-    setpoint = columns[f"{device}_setpoint"]
+    setpoint = columns[f"{device}{SETPOINT}"]
     changed = np.flatnonzero(np.diff(setpoint, prepend=np.nan) != 0)
     changed = changed[np.isfinite(setpoint[changed])]
     started = np.append(table["started"], np.inf)[np.minimum(number[changed], len(steps))]

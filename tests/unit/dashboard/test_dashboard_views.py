@@ -197,6 +197,11 @@ def test_bounds_are_drawn_as_far_as_the_data_go(tmp_path: Path) -> None:
     assert (found.name, found.margin(80.0)) == ("tec_temperature < 100 °C", 20.0)
 
 
+def test_an_interlock_of_another_version_has_no_bounds() -> None:
+    meta = {"rig_content": {"interlocks": [{"signal": "tec_temperature", "above": 100.0}]}}
+    assert bounds_of(meta, SIGNALS) == ()
+
+
 def test_a_frame_grows_with_the_data() -> None:
     frame = Frame((0.0, 8.0), (0.0, 1.0), "x", "y", 1.0, 1.0)
     assert frame.grown((0.0, 8.0), (0.2, 0.8)) is frame

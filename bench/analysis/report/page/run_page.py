@@ -20,18 +20,16 @@ from bench.analysis.figures.targets import plot_tracking
 from bench.analysis.report.page.model_parts import given_parts, models_parts
 from bench.analysis.report.page.pages import Page, PageFigure, PagePart, PageSection, PageTable, PageText, inlined
 from bench.analysis.report.published import Published
-from bench.analysis.report.recorded_run import RecordedRun, interlocks_of, wider
+from bench.analysis.report.recorded_run import RecordedRun, wider
 from bench.analysis.report.run_figures import draw_loops, draw_signals
 from bench.analysis.report.uncertainty_tables import uncertainty_parts
 from bench.analysis.tracking_errors import FollowingResult, following_result, target_results, ticks_with
 from bench.base import BenchError, Display, Floats, counted, format_duration, percent, with_unit
-from bench.protocol import ParameterHelp, find_protocol
-from bench.record import Event, bins_of, headline_of, steps_of
+from bench.protocol import LATENESS, ParameterHelp, find_protocol
+from bench.record import Event, bins_of, headline_of, interlocks_of, steps_of
 from bench.rig import SETPOINT, Interlock, RoleTable
 
 _STYLES = {"completed": "good", "unfinished": "open"}
-_LATENESS = "lateness"
-"""Signal of the loops at a fixed rate: time by which a sample came too late, s."""
 _MOST_EVENTS = 1000
 """Events that a page lists; a record of a long run may have more."""
 _IDENTITY_OF_LINES = ("port", "baudrate", "timeout", "address")
@@ -219,9 +217,9 @@ def _lateness(run: RecordedRun, scratch: Path) -> Iterator[PagePart]:
     for label, each in run.meta.get("lateness", {}).items():
         rows = [(name, str(count)) for name, count in bins_of(each) if count]
         yield PageTable(("late by", "samples"), rows, title=headline_of(label, each), numbers_from=0)
-    ticks = ticks_with(run.record, _LATENESS)
+    ticks = ticks_with(run.record, LATENESS.name)
     if ticks is not None and len(ticks):
-        late = ticks[_LATENESS]
+        late = ticks[LATENESS.name]
         path = scratch / "lateness.svg"
         plot_histogram(path, 1e3 * late, label="lateness / ms")
         shares = np.percentile(late, [50, 95, 99, 100]) * 1e3
@@ -340,7 +338,7 @@ def _bounds(run: RecordedRun) -> dict[str, list[tuple[float, float]]]:
     bounds: dict[str, list[tuple[float, float]]] = {}
     for name, (low, high) in run.meta.get("limits", {}).items():
         bounds.setdefault(f"{name}{SETPOINT}", []).append((float(low), float(high)))
-    for each in interlocks_of(run.record):
+    for each in interlocks_of(run.meta):
         if not each.minus:
             bounds.setdefault(each.signal, []).append((each.low, each.high))
     return bounds
@@ -357,7 +355,7 @@ def _margin(extremes: Mapping[str, Any], bounds: Sequence[tuple[float, float]]) 
 def _interlocks(run: RecordedRun) -> list[PagePart]:
     """Return each interlock with what it allows, what was seen, the margin, and how often it acted."""
     rows = []
-    for each in interlocks_of(run.record):
+    for each in interlocks_of(run.meta):
         if each.signal not in run.extremes:
             continue
         shown = run.signal(each.signal).display
