@@ -24,7 +24,6 @@ from rich.console import Console
 from bench.analysis import (
     ALL,
     FEWEST_ROWS,
-    PAGE_NAME,
     ColumnNames,
     FitOptions,
     IdentifiedFile,
@@ -402,10 +401,9 @@ def report(source: RunFolder | str | Path, models: Sequence[Model] = ()) -> Repo
     """
     folder = _folder(source)
     published = published_of(folder)
-    page = (folder if folder.is_dir() else folder.parent) / PAGE_NAME
     console = Console()
     console.quiet = console.is_jupyter
-    found = report_run(folder, [_model(model) for model in models], None, console, page=page, published=published)
+    found = report_run(folder, [_model(model) for model in models], None, console, published=published)
     return Report(found)
 
 

@@ -92,7 +92,6 @@ from .report.published import (
     Published as Published,
 )
 from .report.run_report import (
-    PAGE_NAME as PAGE_NAME,
     draw_comparison as draw_comparison,
     draw_identification as draw_identification,
     draw_predicted as draw_predicted,

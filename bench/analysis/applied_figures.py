@@ -57,7 +57,7 @@ def draw_in(folder: Path, prefix: str, models: Mapping[str, Applied]) -> list[Pa
     return draw_applied(models, folder / f"{prefix}-loops.png", folder / f"{prefix}-errors.png")
 
 
-def draw_residuals(path: Path, models: Mapping[str, Applied]) -> None:
+def draw_errors(path: Path, models: Mapping[str, Applied]) -> None:
     """Draw what each model leaves of the same measurements over the rows, with the bands of those that have one."""
     first = next(iter(models.values()))
     plot_errors(

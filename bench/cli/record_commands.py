@@ -44,14 +44,12 @@ def report(
     run are compared without being named: those of `bench identify` without --out, and what the run itself corrected.
     Works while the run goes on; the page then says so.
     """
-    from bench.analysis import PAGE_NAME, report_run
+    from bench.analysis import report_run
     from bench.batch import published_of
     from bench.identification import load_model
 
     files = [load_model(path) for path in models or []]
-    published = published_of(run)
-    page = (out or (run if run.is_dir() else run.parent)) / PAGE_NAME
-    result = report_run(run, files, out, console, page=page, figure_format=figures, published=published)
+    result = report_run(run, files, out, console, figure_format=figures, published=published_of(run))
     write_json(json_file, result)
 
 

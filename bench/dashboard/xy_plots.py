@@ -35,9 +35,9 @@ _VISIBLE = 0.002
 _MOVED = 5.0 * _VISIBLE
 """Part of its axis by which the input of a plot has to move for the plot to be shown. Derivation: five pixels."""
 
-_PALE = 0.35
-"""Part of their colour in that of the lines to old targets; the rest is grey. Derivation: of a contrast of 3.7 to 1
-to a nearly black and a nearly white background."""
+_PALE, _GREY = 0.35, 128
+"""Part of their colour in that of the lines to old targets, and the grey that is the rest. Derivation: of a contrast
+of 3.7 to 1 to a nearly black and a nearly white background."""
 
 # Source: the palette of `signal_plots`, its first two.
 _RISING: Colour = (236, 100, 46)
@@ -175,7 +175,7 @@ class XYPlots:
         return past | {f"/{path}/data/recent": bright} if self._fades else past
 
 
-_FADED = {colour: pale(colour, _PALE, 128) for colour in (_RISING, _FALLING)}
+_FADED = {colour: pale(colour, _PALE, _GREY) for colour in (_RISING, _FALLING)}
 
 
 class _Track:

@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from written_run import META, SIGNALS, write_run
 
-from bench.analysis import PAGE_NAME, report_run
+from bench.analysis import report_run
 from bench.api import identify
 from bench.devices import Settled, Signal
 from bench.protocol import TRACES
@@ -72,12 +72,12 @@ def write_tracking(folder):
 def test_of_a_run_under_control(tmp_path, drawn):
     folder = write_tracking(tmp_path / "run")
     console = Console(file=io.StringIO(), width=160)
-    result = report_run(folder, (), None, console, page=folder / PAGE_NAME)
+    result = report_run(folder, (), None, console)
     assert {"signals.png", "loop.png", "signals.svg", "loop.svg"} <= set(drawn)
     assert {name: problems for name, problems in drawn.items() if problems} == {}
     # The prior of the filter is no uncertainty, and what never moves needs no room.
     assert result["extremes"]["disturbance_uncertainty"]["high"] == pytest.approx(1e-7)
-    page = (folder / PAGE_NAME).read_text(encoding="utf-8")
+    page = (folder / "report.html").read_text(encoding="utf-8")
     assert "Constant: " in page
     assert "fan 0" in page
     assert "Resets are left out." in page
@@ -88,6 +88,6 @@ def test_of_models_on_a_run(tmp_path, drawn):
     found = identify(folder, input="plate", output="tip", model="preisach", levels=8, band=True)
     for name in ("preisach", "a model with a name that is longer than any legend has room for in one line"):
         add_model(folder, name, 1.0, found.file.to_json())
-    report_run(folder, (), None, Console(file=io.StringIO()), page=folder / PAGE_NAME)
+    report_run(folder, (), None, Console(file=io.StringIO()))
     assert len(drawn) > 4
     assert {name: problems for name, problems in drawn.items() if problems} == {}

@@ -8,7 +8,7 @@ from cases import cases
 from rich.console import Console
 from written_run import HOSTILE, META, write_run
 
-from bench.analysis import PAGE_NAME, Published, report_run
+from bench.analysis import Published, report_run
 from bench.api import identify
 from bench.record import add_model
 
@@ -46,15 +46,13 @@ def reported(tmp_path_factory):
     add_model(folder, "preisach", 1.0, found.file.to_json())
     published = Published("loops", "largest error", "1.5", "µm", "Fig. 3", ("models", "preisach", "max"), scale=1e6)
     other = Published("tracking", "of another protocol", "1", "", "Fig. 9")
-    result = report_run(
-        folder, (), None, Console(file=io.StringIO()), page=folder / PAGE_NAME, published=(published, other)
-    )
+    result = report_run(folder, (), None, Console(file=io.StringIO()), published=(published, other))
     return folder, result
 
 
 @pytest.fixture(scope="module")
 def page(reported, opened):
-    sections, page = opened(reported[0] / PAGE_NAME)
+    sections, page = opened(reported[0] / "report.html")
     yield sections, page
     page.close()
 
@@ -114,9 +112,9 @@ class TestPageOfARun:
 def test_an_unfinished_run_is_what_there_is_and_marked(tmp_path, opened):
     folder = write_run(tmp_path / "run", steps=20, finished=False)
     console = Console(file=io.StringIO(), width=200)
-    result = report_run(folder, (), None, console, page=folder / PAGE_NAME)
+    result = report_run(folder, (), None, console)
     assert result["status"] == "unfinished"
-    sections, page = opened(folder / PAGE_NAME)
+    sections, page = opened(folder / "report.html")
     assert page.query_selector(".badge").inner_text() == "unfinished"
     assert "UNFINISHED" in sections["summary"]
     assert "20 of 4000 steps" in sections["summary"]
@@ -125,8 +123,8 @@ def test_an_unfinished_run_is_what_there_is_and_marked(tmp_path, opened):
 
 def test_a_run_without_a_step_has_a_page(tmp_path):
     folder = write_run(tmp_path / "run", steps=0, finished=False)
-    report_run(folder, (), None, Console(file=io.StringIO()), page=folder / PAGE_NAME)
-    assert "0 of 4000 steps" in (folder / PAGE_NAME).read_text()
+    report_run(folder, (), None, Console(file=io.StringIO()))
+    assert "0 of 4000 steps" in (folder / "report.html").read_text()
 
 
 def test_two_runs_have_a_page(tmp_path, opened, bench):

@@ -41,7 +41,7 @@ STRAIN = Signal("strain", "1", "strain", 6)
 def report(tmp_path):
     """Report a run that was off its two targets, or its moving reference, by given errors; return JSON and text."""
 
-    def make(output, errors, *, moving=False, controlled=True, models=(), page=None):
+    def make(output, errors, *, moving=False, controlled=True, models=()):
         traces = tuple(replace(trace, unit=output.unit, precision=output.precision) for trace in TRACES)
         journal = Journal(
             tmp_path / FILE_NAME,
@@ -64,7 +64,7 @@ def report(tmp_path):
         for model in models:
             add_model(tmp_path, model.name, 40.0, model.to_json())
         console = Console(file=io.StringIO(), width=200)
-        return report_run(tmp_path, (), None, console, page=page), console.file.getvalue()
+        return report_run(tmp_path, (), None, console), console.file.getvalue()
 
     return make
 
@@ -131,11 +131,11 @@ def test_a_model_with_time_at_the_times_of_the_steps(report, tmp_path):
     # Of drives 1 and 2 V it gives 1 and 2 mm, and a drift of 0.1 mm in the 20 s between the readings.
     line = Polynomial(np.array([1.5e-3]), (0.0, 3.0), 1.5e-3, "V", "m")
     model = ModelFile("drifting", Hammerstein(line, LinearPart(), 5e-6), None, {"input": "drive", "output": "length"})
-    content, text = report(LENGTH, (1e-3, 0.0), controlled=False, models=(model,), page=tmp_path / "run.html")
+    content, text = report(LENGTH, (1e-3, 0.0), controlled=False, models=(model,))
     # Measured are 11 and 20 mm.
     assert content["models"]["drifting"]["max"] == pytest.approx(20e-3 - 2.1e-3)
     assert "drifting" in text
-    page = (tmp_path / "run.html").read_text(encoding="utf-8")
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert "parameters of drifting" in page
     assert "hammerstein" in page
 

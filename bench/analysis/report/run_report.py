@@ -10,7 +10,7 @@ from rich.console import Console
 from rich.text import Text
 
 from bench.analysis.applied import Applied, ComparedModels
-from bench.analysis.applied_figures import draw_in, draw_residuals
+from bench.analysis.applied_figures import draw_errors, draw_in
 from bench.analysis.export.run_export import make_folder
 from bench.analysis.figures.canvas import check_matplotlib
 from bench.analysis.figures.planes import plot_coverage, plot_densities
@@ -37,7 +37,6 @@ def report_run(
     out: Path | None,
     console: Console,
     *,
-    page: Path | None = None,
     figure_format: str = "png",
     published: Sequence[Published] = (),
 ) -> dict[str, Any]:
@@ -50,11 +49,9 @@ def report_run(
     models : sequence of ModelFile
         Models to compare, besides those that were identified from the run.
     out : Path or None
-        Folder of the figures; `report` beside the journal if None.
+        Folder of the figures and of the page `report.html`; if None, `report` beside the journal, where the page is.
     console : Console
         Console to print on.
-    page : Path or None
-        HTML file to write; none if None.
     figure_format : {"png", "pdf", "svg"}
         Format of the figures.
     published : sequence of Published
@@ -83,24 +80,19 @@ def report_run(
         _print_control(found, console)
         print_parts([*uncertainty_parts(found.uncertainty), *errors_parts(found.applied)], console)
         result = found.result
-        if page is not None:
-            write_page(page, run_page(found, published))
+        page = (out or record.path.parent) / PAGE_NAME
+        write_page(page, run_page(found, published))
     for path in figures:
         print_plain(console, f"figure: {path}")
-    if page is not None:
-        print_plain(console, f"page: {page}")
-    return {
-        **result,
-        "figures": [str(path) for path in figures],
-        "page": None if page is None else str(page),
-    }
+    print_plain(console, f"page: {page}")
+    return {**result, "figures": [str(path) for path in figures], "page": str(page)}
 
 
 def draw_comparison(result: ComparedModels, out: Path) -> list[Path]:
     """Draw the residuals of compared models, their outputs and loops; return the files."""
     folder = make_folder(out)
     path = folder / "residuals.png"
-    draw_residuals(path, result.applied)
+    draw_errors(path, result.applied)
     return [path, *draw_in(folder, "models", result.applied)]
 
 
@@ -167,7 +159,7 @@ def _draw(run: RecordedRun, folder: Path, figure_format: str) -> list[Path]:
     paths += (path for path, _ in draw_loops(folder, figure_format, run))
     if run.applied:
         paths.append(folder / f"errors.{figure_format}")
-        draw_residuals(paths[-1], {each.file.name: each for each in run.applied})
+        draw_errors(paths[-1], {each.file.name: each for each in run.applied})
     return paths
 
 
