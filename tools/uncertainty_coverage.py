@@ -38,6 +38,7 @@ from bench.analysis import (
     target_results,
     transients_of,
 )
+from bench.base import DataError
 from bench.record import Record
 from bench.rig import Budget, load_rig
 from rigs.hybrid.identification import network_of, network_uncertainty
@@ -260,7 +261,12 @@ class Identified:
 
     def compare(self, session: int, found: Found) -> None:
         """Identify them in a session, beside the truth."""
-        for name, budget in self.quantities(session, specimens(self._trial, session)).items():
+        try:
+            quantities = self.quantities(session, specimens(self._trial, session))
+        except DataError as error:
+            print(f"session {session} is left out: {error}")
+            return
+        for name, budget in quantities.items():
             if budget.rows:
                 found[name].append((budget.value - self.truth[name], budget.expanded))
 

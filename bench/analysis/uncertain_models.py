@@ -1,9 +1,11 @@
 """What was identified from a run, with its uncertainty: quantities of a model, its predictions, its set-points.
 
 A component that is common to all readings, such as the gain of a sensor, is propagated by a second fit of readings
-that it has moved by its standard uncertainty. What the noise of the readings leaves open is found by fits of readings
-with other noise: differences of neighbouring residuals with random signs. What neighbours have in common is what the
-model cannot follow: it is the same in each session, and stands beside the model as its error.
+that it has moved by its standard uncertainty; a drift with a time by fits of readings that it has moved as it may.
+What the noise of the readings leaves open is found by fits of readings with other noise: of input and output as the
+rig file states it of both, otherwise differences of neighbouring residuals of the output with random signs. The
+latter have something of what the model cannot follow, which is the same in each session and stands beside the model
+as its error.
 
 Sources: JCGM 100:2008 (GUM), 5.1.3, note 2; J. von Neumann, Annals of Mathematical Statistics 12 (1941), 153, for
 noise from differences; C. F. J. Wu, Annals of Statistics 14 (1986), 1261, for random signs.
@@ -12,7 +14,7 @@ noise from differences; C. F. J. Wu, Annals of Statistics 14 (1986), 1261, for r
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,10 +25,10 @@ from bench.base import Floats, difference_unit, header_with_unit
 from bench.identification import ModelFile, input_half_widths
 from bench.models import Operator
 from bench.record import Record
-from bench.rig import Budget, BudgetRow, UncertainSignals, effective_freedom
+from bench.rig import OWN, Budget, BudgetRow, UncertainSignals, effective_freedom
 
 _FITS = 20
-"""Fits with other noise. Derivation: their deviation has 19 degrees of freedom, and k is 2.09 instead of 1.96."""
+"""Fits with other noise. Derivation: their deviation has 20 degrees of freedom, and k is 2.09 instead of 1.96."""
 _PLACES = 33
 """Values of a signal at which the contributions of its components are computed; between them they are straight."""
 PROVENANCE = "uncertainty"
@@ -111,9 +113,10 @@ Quantities = Mapping[str, tuple[float, str]]
 def propagated(
     signals: UncertainSignals,
     columns: Mapping[str, Floats],
+    times: Floats,
     nominal: Quantities,
-    spreads: Mapping[str, BudgetRow],
-    refit: Callable[[Mapping[str, Floats]], Quantities],
+    spreads: Mapping[str, Sequence[BudgetRow]],
+    refits: Callable[[Sequence[Mapping[str, Floats]]], Sequence[Quantities]],
 ) -> dict[str, Budget]:
     """Return the budgets of quantities that were identified from readings.
 
@@ -123,25 +126,28 @@ def propagated(
         The signals of the run.
     columns : mapping of str to ndarray
         Readings by signal, shape (N,) each.
+    times : ndarray, shape (N,)
+        When they were taken, s.
     nominal : mapping
         What was identified from them.
-    spreads : mapping of str to BudgetRow
-        What the fit itself leaves open of each quantity.
-    refit : callable
-        Identifies the same from other readings.
+    spreads : mapping of str to sequence of BudgetRow
+        What else leaves each quantity open: the fit, and what acts on the specimen.
+    refits : callable
+        Identifies the same from other readings, from each of several.
     """
+    rng = np.random.default_rng(1)
     rows: dict[str, dict[tuple[str, str], list[BudgetRow]]] = {name: {} for name in nominal}
     for column in signals.stated([*columns]):
-        for row, moved in _moved(signals, column, columns[column]):
-            for name, (value, _) in refit({**columns, column: moved}).items():
-                contribution = abs(value - nominal[name][0])
+        for row, size in _sizes(signals, column, columns[column], shared=True):
+            others = refits([{**columns, column: each} for each in _moved(columns[column], times, row, size, rng)])
+            for name, contribution in _deviations(nominal, others).items():
                 found = rows[name].setdefault((row.signal, row.component), [])
                 found.append(replace(row, contribution=contribution))
     budgets = {}
     for name, (value, unit) in nominal.items():
         # A wave is its sine and its cosine.
         parts = [replace(each[0], contribution=_together(each)) for each in rows[name].values()]
-        ordered = sorted([spreads[name], *parts], key=lambda row: -row.contribution)
+        ordered = sorted([*spreads[name], *parts], key=lambda row: -row.contribution)
         kept = tuple(row for row in ordered if row.contribution)
         budgets[name] = Budget(name, unit, value, kept, effective_freedom(kept))
     return budgets
@@ -180,37 +186,78 @@ def identified_uncertainty(
     if not signals.stated([names[1]]):
         return None
     nominal = quantities_of(model)
+    columns = dict(zip(names, (inputs, outputs), strict=True))
+    # The rows of a run are spread over it.
+    times = np.linspace(0.0, np.ptp(record.steps()["finished"]), inputs.size)
     rng = np.random.default_rng(0)
-    others = [fit(inputs, outputs + _noise(residuals, rng)) for _ in range(_FITS)]
-    squares = np.var([other.coefficients for other in others], axis=0, ddof=1)
-    deviations = np.std([[value for value, _ in quantities_of(other).values()] for other in others], axis=0, ddof=1)
+    squares = np.zeros(model.coefficients.size)
 
-    def refit(columns: Mapping[str, Floats]) -> Quantities:
+    def refits(others: Sequence[Mapping[str, Floats]]) -> list[Quantities]:
         nonlocal squares
-        other = fit(columns[names[0]], columns[names[1]])
-        squares = squares + (other.coefficients - model.coefficients) ** 2
-        return quantities_of(other)
+        found = [fit(*(other[name] for name in names)) for other in others]
+        squares = squares + np.mean([(other.coefficients - model.coefficients) ** 2 for other in found], axis=0)
+        return [quantities_of(other) for other in found]
 
+    own = {
+        name: [each for each in _sizes(signals, name, columns[name]) if each[0].acts in OWN]
+        for name in signals.stated(names)
+    }
+    if all("noise" in [row.acts for row, _ in own.get(name, [])] for name in names):
+        noisy = [
+            {
+                name: values + sum(size * rng.standard_normal(size.size) for _, size in own[name])
+                for name, values in columns.items()
+            }
+            for _ in range(_FITS)
+        ]
+    else:
+        noisy = [{**columns, names[1]: outputs + _noise(residuals, rng)} for _ in range(_FITS)]
     how = f"{_FITS} fits with other noise"
     spreads = {
-        name: spread_row(deviation, unit, _FITS - 1.0, how)
-        for (name, (_, unit)), deviation in zip(nominal.items(), deviations.tolist(), strict=True)
+        name: [spread_row(deviation, nominal[name][1], _FITS, how)]
+        for name, deviation in _deviations(nominal, refits(noisy)).items()
     }
-    quantities = propagated(signals, {names[0]: inputs, names[1]: outputs}, nominal, spreads, refit)
+    for name, values in columns.items():
+        if (room := signals.room([name])) is not None:
+            size = np.full(values.size, room.contribution)
+            others = refits([{**columns, name: each} for each in _moved(values, times, room, size, rng)])
+            for quantity, deviation in _deviations(nominal, others).items():
+                spreads[quantity].append(replace(room, contribution=deviation))
+    quantities = propagated(signals, columns, times, nominal, spreads, refits)
     places = np.linspace(outputs.min(), outputs.max(), _PLACES)
     shared = [signals.at(names[1], value).contributions(shared=True) for value in places.tolist()]
     standard = np.array([math.hypot(*(contribution for _, contribution in each)) for each in shared])
     return ModelUncertainty(quantities, np.sqrt(squares), places, standard)
 
 
-def _moved(signals: UncertainSignals, name: str, values: Floats) -> list[tuple[BudgetRow, Floats]]:
-    """Return readings that each component common to all of them has moved by its standard uncertainty."""
+def _sizes(
+    signals: UncertainSignals, name: str, values: Floats, *, shared: bool = False
+) -> list[tuple[BudgetRow, Floats]]:
+    """Return the contribution of each component at readings, or of each that they share."""
     places = np.linspace(values.min(), values.max(), _PLACES)
-    table = [signals.at(name, value).contributions(shared=True) for value in places.tolist()]
+    table = [signals.at(name, value).contributions(shared=shared) for value in places.tolist()]
     return [
-        (part.row, values + np.interp(values, places, [row[i][1] for row in table]))
-        for i, (part, _) in enumerate(table[0])
+        (part.row, np.interp(values, places, [row[i][1] for row in table])) for i, (part, _) in enumerate(table[0])
     ]
+
+
+def _moved(values: Floats, times: Floats, row: BudgetRow, size: Floats, rng: np.random.Generator) -> list[Floats]:
+    """Return readings that a component has moved by its standard uncertainty, in several ways if it has a time."""
+    if row.time is None:
+        return [values + size]
+    left = np.exp(-np.diff(times) / row.time)
+    courses = rng.standard_normal((values.size, _FITS))
+    for k, each in enumerate(left, 1):
+        courses[k] = each * courses[k - 1] + math.sqrt(1.0 - each**2) * courses[k]
+    return [values + size * course for course in courses.T]
+
+
+def _deviations(nominal: Quantities, others: Sequence[Quantities]) -> dict[str, float]:
+    """Return the RMS deviations of quantities that were identified from other readings."""
+    return {
+        name: math.sqrt(math.fsum((other[name][0] - value) ** 2 for other in others) / len(others))
+        for name, (value, _) in nominal.items()
+    }
 
 
 def _together(rows: list[BudgetRow]) -> float:

@@ -110,6 +110,7 @@ from .start_checks import (
 )
 from .uncertainty import (
     LEVEL as LEVEL,
+    OWN as OWN,
     Budget as Budget,
     BudgetRow as BudgetRow,
     Component as Component,

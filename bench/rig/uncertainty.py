@@ -47,6 +47,8 @@ Uncertain = Any
 """An uncertain number of the library's, which is not typed."""
 Distribution = Literal["normal", "rectangular", "triangular", "U"]
 
+ROOM = "room"
+"""How one acts that is no error of a reading: the quantity follows the room, and what is identified with it."""
 _REMEDIES = {
     **dict.fromkeys(("gain", "offset", "nonlinearity"), "calibrate the sensor"),
     "drift": "calibrate more often, or correct for it",
@@ -55,6 +57,7 @@ _REMEDIES = {
     "calibration": "take more readings in the calibration",
     "reference": "take a better reference",
     "fit": "take more readings",
+    ROOM: "keep the room steadier, or measure longer",
 }
 """What reduces a component, by how it acts."""
 LEVEL = 0.95
@@ -88,7 +91,7 @@ class Component(CheckedTable):
 
     acts: str = Field(
         min_length=1,
-        description=f"{', '.join((*SHARED, *OWN))}, or a key or constant of a derived signal",
+        description=f"{', '.join((*SHARED, *OWN))}, {ROOM}, or a key or constant of a derived signal",
     )
     standard: float | None = Field(default=None, gt=0, description="standard uncertainty, of a normal distribution")
     half_width: float | None = Field(default=None, gt=0, description="half-width of any other distribution")
@@ -100,6 +103,11 @@ class Component(CheckedTable):
     source: str = Field(min_length=1, description="document and place, or how it was found")
     freedom: float | None = Field(default=None, gt=0, description="degrees of freedom; infinite if not given")
     range: Range | None = Field(default=None, description="readings over which a nonlinearity is stated")
+    time: float | None = Field(
+        default=None,
+        gt=0,
+        description="time after which the autocorrelation of a room or drift is 1/e, s; constant if not given",
+    )
 
     @model_validator(mode="before")
     @classmethod
@@ -119,6 +127,8 @@ class Component(CheckedTable):
             )
         if (self.range is None) == (self.acts == "nonlinearity"):
             raise ValueError("range: expected for a nonlinearity, and for nothing else")
+        if self.time is not None and self.acts not in (ROOM, "drift"):
+            raise ValueError("time: expected for a room or a drift only")
         return self
 
     @property
@@ -156,6 +166,8 @@ class BudgetRow:
         What it contributes to the standard uncertainty of the signal, in the unit of the budget.
     source : str
         What it rests on.
+    time : float or None
+        Time after which the autocorrelation of a room or a drift is 1/e, s; None of what does not change.
     """
 
     signal: str
@@ -168,6 +180,7 @@ class BudgetRow:
     freedom: float
     contribution: float
     source: str
+    time: float | None = None
 
     @property
     def sensitivity(self) -> float:
@@ -424,13 +437,13 @@ class UncertainSignals:
         if acts == "gain":
             wanted = "%"
             scale = 0.01
-        elif acts in SHARED + OWN:
+        elif acts in (*SHARED, *OWN, ROOM):
             wanted = self._units[signal]
         else:
             keys = {} if kind is None else kind.quantities()
             if acts not in keys:
                 more = f", or {', '.join(keys)}" if keys else ""
-                raise ValueError(f"acts = {acts!r}: expected one of {', '.join(SHARED + OWN)}{more}")
+                raise ValueError(f"acts = {acts!r}: expected one of {', '.join((*SHARED, *OWN, ROOM))}{more}")
             value, wanted = keys[acts]
             if unit == "%":
                 wanted, scale = unit, 0.01 * abs(value)
@@ -449,13 +462,24 @@ class UncertainSignals:
         own = {name: each.acts for name, each in self._stated.get(signal, {}).items() if each.acts in OWN}
         return math.hypot(*(self._sizes[signal, name] for name in own)) if "noise" in own.values() else None
 
+    def room(self, signals: Sequence[str]) -> BudgetRow | None:
+        """Return by how much one of some signals follows the room, as its contribution; None if none states it."""
+        for signal in signals:
+            for name, each in self._stated.get(signal, {}).items():
+                if each.acts == ROOM:
+                    return replace(_row(signal, name, each), contribution=self._sizes[signal, name])
+        return None
+
+    def _of_readings(self, signal: str) -> dict[str, Component]:
+        return {name: each for name, each in self._stated.get(signal, {}).items() if each.acts != ROOM}
+
     def stated(self, names: Sequence[str]) -> list[str]:
         """Return those of some signals whose uncertainty is stated, with that of all signals behind them."""
         return [name for name in names if self._is_stated(name)]
 
     def _is_stated(self, signal: str) -> bool:
         kind = self._derived.get(signal)
-        return signal in self._stated if kind is None else all(map(self._is_stated, kind.sources))
+        return bool(self._of_readings(signal)) if kind is None else all(map(self._is_stated, kind.sources))
 
     def reading(self, signal: str, values: Mapping[str, float], *, noise: bool = True) -> UncertainReading:
         """Return a reading of a signal as an uncertain number.
@@ -508,12 +532,12 @@ class UncertainSignals:
     ) -> Uncertain:
         components = {
             name: each
-            for name, each in self._stated.get(signal, {}).items()
+            for name, each in self._of_readings(signal).items()
             if (noise or each.acts != "noise") and not (calibrated and each.acts in _CALIBRATED)
         }
         kind = self._derived.get(signal)
         if kind is None:
-            if signal not in self._stated:
+            if not self._is_stated(signal):
                 missing.append(signal)
             number: Uncertain = GTC.constant(values[signal])
         else:
@@ -551,18 +575,7 @@ class UncertainSignals:
         component = self._stated[signal][name]
         found = self._shared.get((signal, name))
         if found is None or component.acts in OWN:
-            row = BudgetRow(
-                signal=signal,
-                component=name,
-                acts=component.acts,
-                type="A" if component.basis == "measured" else "B",
-                distribution=component.distribution,
-                standard=component.uncertainty,
-                unit=component.unit,
-                freedom=component.freedom or math.inf,
-                contribution=0.0,
-                source=f"{component.basis}: {component.source}",
-            )
+            row = _row(signal, name, component)
             # A wave of any phase: its sine and its cosine.
             angles = (0.0, 0.5 * math.pi) if component.acts == "nonlinearity" else (None,)
             found = [Part(row, GTC.ureal(0.0, self._sizes[signal, name], row.freedom), angle) for angle in angles]
@@ -582,6 +595,23 @@ class UncertainSignals:
             number = number + size * first.number
             parts.append(replace(first, row=row))
         return number
+
+
+def _row(signal: str, name: str, component: Component) -> BudgetRow:
+    """Return the row of a component, whose contribution is open."""
+    return BudgetRow(
+        signal=signal,
+        component=name,
+        acts=component.acts,
+        type="A" if component.basis == "measured" else "B",
+        distribution=component.distribution,
+        standard=component.uncertainty,
+        unit=component.unit,
+        freedom=component.freedom or math.inf,
+        contribution=0.0,
+        source=f"{component.basis}: {component.source}",
+        time=component.time,
+    )
 
 
 def _components_of(record: Calibration, at: float) -> list[tuple[str, str, str, float, float]]:

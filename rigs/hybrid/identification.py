@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +31,7 @@ from bench.protocol import LATENESS
 from bench.record import Record, Table
 from bench.rig import Budget
 from rigs.hybrid.model import HybridModel, OrderChoice, choose_order, identify_pi, identify_polynomial
-from rigs.hybrid.network_identification import NetworkIdentification, identify_network
+from rigs.hybrid.network_identification import NetworkIdentification, identify_network, room_influence
 
 Floats = npt.NDArray[np.float64]
 
@@ -256,9 +256,11 @@ def network_uncertainty(steps: Path, found: NetworkIdentification) -> dict[str, 
     alike = max(float(np.sum(found.residuals[1:] * found.residuals[:-1]) / np.sum(found.residuals**2)), 0.0)
     wider = math.sqrt((1.0 + alike) / (1.0 - min(alike, _MOST_ALIKE)))
 
+    with Record(steps) as record:
+        signals = uncertain_signals(record)
     nominal = {name: (float(getattr(found.network, name)), _UNITS[name]) for name in fitted}
 
-    def refit(columns: Mapping[str, Floats]) -> dict[str, tuple[float, str]]:
+    def refit(columns: Mapping[str, Floats]) -> Mapping[str, tuple[float, str]]:
         moved = np.column_stack([columns[base] - samples[BASE], columns[tip] - samples[TIP]])
         logarithms = np.tensordot(found.moves, moved, 2).tolist()
         return {
@@ -266,13 +268,17 @@ def network_uncertainty(steps: Path, found: NetworkIdentification) -> dict[str, 
         }
 
     spreads = {
-        name: spread_row(wider * found.uncertainties[name], _UNITS[name], freedom, "covariance of the fit")
+        name: [spread_row(wider * found.uncertainties[name], _UNITS[name], freedom, "covariance of the fit")]
         for name in fitted
     }
-    with Record(steps) as record:
-        signals = uncertain_signals(record)
+    if (room := signals.room((base, tip))) is not None:
+        shares = room.contribution * room_influence(found, samples[CURRENT], samples.period, room.time or math.inf)
+        for name, share in zip(fitted, shares.tolist(), strict=True):
+            spreads[name].append(replace(room, contribution=share * nominal[name][0]))
     columns = {base: samples[BASE], tip: samples[TIP]}
-    return propagated(signals, columns, nominal, spreads, refit)
+    return propagated(
+        signals, columns, samples.times, nominal, spreads, lambda others: [refit(each) for each in others]
+    )
 
 
 def _check_protocol(run: Path, protocol: str) -> None:

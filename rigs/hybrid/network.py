@@ -297,6 +297,37 @@ class ThermalNetwork:
             now = path[-1]
         return result
 
+    def air_weights(self, currents: ArrayLike, dt: float, weights: ArrayLike) -> Floats:
+        """Return by how much weighted sums of the temperatures change with the air's at each sample, shape (n, N).
+
+        The air is held for dt each, as in `simulate`, and all nodes have its temperature at the first sample.
+
+        Parameters
+        ----------
+        currents : array_like, shape (N,)
+            A, positive heats.
+        dt : float
+            Time step, s, > 0.
+        weights : array_like, shape (n, N, 4)
+            Of each temperature in each of n sums.
+
+        Raises
+        ------
+        ValueError
+            If the currents are no finite numbers, or dt is not positive.
+        """
+        i, weight = _checks.samples("currents", currents), np.asarray(weights, dtype=np.float64)
+        levels, at = np.unique(i, return_inverse=True)
+        steps = np.array([*self._transitions(tuple(levels.tolist()), _checks.positive("dt", dt)).values()])
+        nodes, air = steps[:, :4, :4], 1.0 - steps[:, :4, :4].sum(axis=2) + steps[:, :4, 5]
+        found, behind = np.empty(weight.shape[:2]), np.zeros((len(weight), 4))
+        # From the last sample to the first: each temperature acts on all later ones.
+        for k in range(i.size - 1, -1, -1):
+            found[:, k] = behind @ air[at[k]]
+            behind = behind @ nodes[at[k]] + weight[:, k]
+        found[:, 0] += behind.sum(axis=1)
+        return found
+
     def _transitions(self, currents: Sequence[float], dt: float) -> dict[float, Floats]:
         """Return the exact step by dt of the rises, a 1 and the air's absolute temperature, (6, 6), by current."""
         from scipy.linalg import expm

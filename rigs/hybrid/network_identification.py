@@ -90,7 +90,7 @@ def identify_network(
     sides), and that of the cantilever's end face (1.7 % of its loss). The others need steps of both signs, since
     alpha acts oddly in the current and R_p evenly, held until the block is warm (about 7 min), and sampled faster
     than the lag of the tip (about 2 s). The block shows as a slow share of a few kelvin: a room that drifts meanwhile
-    shifts the common factor by more than the stated uncertainties, but not temperatures and bandwidth.
+    shifts the common factor (see `room_influence`), but not temperatures and bandwidth.
 
     Parameters
     ----------
@@ -172,3 +172,29 @@ def identify_network(
         gradient=float(evidence.cosines.max()),
         moves=np.asarray(-np.linalg.pinv(found.jacobian)[:-1], dtype=np.float64).reshape(len(free), -1, 2),
     )
+
+
+def room_influence(found: NetworkIdentification, currents: ArrayLike, dt: float, time: float) -> Floats:
+    """Return the standard deviations of the logarithms of the fitted parameters for a room that wanders by 1 K rms.
+
+    Derivation: to first order a logarithm moves by Σ w_j a_j for air that is off by a_j at sample j, where w follows
+    from the moves of the fit and the network. If a room's autocorrelation falls as exp(-t/time), the variance is
+    Σ w_j w_k exp(-|j - k| dt/time), which a recursion of first order sums up.
+
+    Parameters
+    ----------
+    found : NetworkIdentification
+        The network.
+    currents : array_like, shape (N,)
+        Those from which it was identified, A.
+    dt, time : float
+        Sampling time, and time after which the autocorrelation has fallen to 1/e, s.
+    """
+    from scipy.signal import lfilter
+
+    weights = np.zeros((*found.moves.shape[:2], len(NODES)))
+    weights[..., _MEASURED] = found.moves
+    moved = found.network.air_weights(currents, dt, weights)
+    passed = lfilter([1.0], [1.0, -math.exp(-dt / time)], moved)
+    # Of air that hardly changes nothing but rounding is left.
+    return np.asarray(np.sqrt(np.maximum((moved * (2.0 * passed - moved)).sum(axis=1), 0.0)))

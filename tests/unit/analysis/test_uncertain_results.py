@@ -73,7 +73,8 @@ def test_a_model_of_a_run_has_the_uncertainty_of_its_sensor(run):
     # A gain moves a fit that is linear in the outputs by its share of them.
     lever = 0.005 / np.sqrt(3.0) * highest.value
     assert rows["lever"] == pytest.approx(lever, rel=0.1)
-    assert rows["fit"] > 0.0
+    # Noise of input and output, and a drift that changes within the run.
+    assert min(rows[name] for name in ("fit", "laser")) > 0.0
     standard = predicted_uncertainty(found.file, np.array([100.0, 1500.0]))
     assert standard is not None
     assert (standard > found.file.provenance["rms"]).all()

@@ -167,6 +167,17 @@ def test_what_is_not_stated_is_named():
     assert "other" in budget.advice()
 
 
+def test_how_a_quantity_follows_the_room_is_no_error_of_its_readings():
+    room = {"acts": "room", "standard": 2.0, "unit": "µm", "time": 400.0}
+    plain, found = signals(spot=PSD), signals(spot={**PSD, "room": room})
+    assert found.reading("spot", {"spot": 5e-5}).standard == plain.reading("spot", {"spot": 5e-5}).standard
+    assert plain.room(["spot"]) is None
+    stated = found.room(["curvature", "spot"])
+    assert (stated.contribution, stated.time) == (pytest.approx(2e-6), 400.0)
+    # Alone it does not say how well a reading is known.
+    assert signals(spot={"room": room}).stated(["spot", "curvature"]) == []
+
+
 @cases(
     "change, problem",
     [
@@ -177,6 +188,7 @@ def test_what_is_not_stated_is_named():
         ({"freedom": 0.0}, "freedom"),
         ({"source": ""}, "source"),
         ({"range": [0.0, 1.0]}, "nonlinearity"),
+        ({"time": 60.0}, "room or a drift"),
         ({"sigma": 1.0}, "sigma"),
     ],
 )

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 
 from rigs.hybrid.design import Design, Geometry, Materials, Tec
 from rigs.hybrid.network import NODES, ThermalNetwork
-from rigs.hybrid.network_identification import FREE_PARAMETERS, identify_network
+from rigs.hybrid.network_identification import FREE_PARAMETERS, identify_network, room_influence
 
 KELVIN = 273.15
 NETWORK = Design().network()
@@ -181,6 +181,31 @@ def test_simulation_equals_a_numerical_integration():
             atol=1e-10,
         )
         now = solution.y[:, -1]
+
+
+def test_weights_of_the_air_are_what_a_simulation_with_other_air_makes_of_the_sums():
+    rng = np.random.default_rng(3)
+    currents = np.repeat([0.0, -0.1, 0.05], 40)
+    weights = rng.standard_normal((2, currents.size, len(NODES)))
+    air, changed = np.full((2, currents.size), 22.0)
+    changed[:70] += rng.standard_normal(70)
+    moved = NETWORK.simulate(currents, 3.0, changed) - NETWORK.simulate(currents, 3.0, air)
+    found = NETWORK.air_weights(currents, 3.0, weights) @ (changed - air)
+    assert found == pytest.approx(np.tensordot(weights, moved, 2), rel=1e-9)
+
+
+def test_the_influence_of_a_room_is_the_fit_times_the_covariance_of_its_temperatures():
+    currents = np.repeat([-0.1, 0.0, 0.1, 0.0], 200)
+    step, time = 3.0, 300.0
+    clean = NETWORK.simulate(currents, step)[:, 2:]
+    found = identify_network(currents, *clean.T, step, start=NETWORK)
+    apart = np.abs(np.subtract.outer(np.arange(currents.size), np.arange(currents.size)))
+    weights = np.concatenate([np.zeros_like(found.moves), found.moves], axis=2)
+    moved = NETWORK.air_weights(currents, step, weights)
+    variances = np.einsum("pi,ij,pj->p", moved, np.exp(-apart * step / time), moved)
+    assert room_influence(found, currents, step, time) == pytest.approx(np.sqrt(variances), rel=1e-3)
+    # Air that stays as it is has hardly an effect on what is relative to it.
+    assert (room_influence(found, currents, step, math.inf) < 0.1 * np.sqrt(variances)).all()
 
 
 def test_json():
