@@ -95,7 +95,7 @@ class Component(CheckedTable):
     )
     standard: float | None = Field(default=None, gt=0, description="standard uncertainty, of a normal distribution")
     half_width: float | None = Field(default=None, gt=0, description="half-width of any other distribution")
-    unit: str = Field(description="its unit; % for a share, as of a gain")
+    unit: str = Field(min_length=1, description="its unit; % for a share, as of a gain")
     distribution: Distribution = Field(
         default="rectangular", description="normal where standard is given, otherwise rectangular, triangular or U"
     )
@@ -574,13 +574,16 @@ class UncertainSignals:
         """Return the elementary numbers of a component, which join `parts`."""
         component = self._stated[signal][name]
         found = self._shared.get((signal, name))
-        if found is None or component.acts in OWN:
+        if component.acts in OWN:
+            # What a derived signal uses twice was read once.
+            found = [each for each in parts if (each.row.signal, each.row.component) == (signal, name)]
+        if not found:
             row = _row(signal, name, component)
             # A wave of any phase: its sine and its cosine.
             angles = (0.0, 0.5 * math.pi) if component.acts == "nonlinearity" else (None,)
             found = [Part(row, GTC.ureal(0.0, self._sizes[signal, name], row.freedom), angle) for angle in angles]
             self._shared[signal, name] = found
-        parts.extend(found)
+        _add(parts, found)
         return found
 
     def _of_calibration(self, signal: str, record: Calibration, at: float, parts: list[Part]) -> Uncertain:
@@ -591,10 +594,17 @@ class UncertainSignals:
                 continue
             source = f"certificate: {record.reference}"
             row = BudgetRow(signal, name, acts, type_, "normal", size, self._units[signal], freedom, 0.0, source)
-            (first,) = self._shared.setdefault((signal, name), [Part(row, GTC.ureal(0.0, 1.0, freedom))])
+            # Sensors that were compared with one reference have its error in common.
+            of = f"{record.reference}, {record.reference_unit}" if acts == "reference" else f"calibrated {signal}"
+            (first,) = self._shared.setdefault((of, name), [Part(row, GTC.ureal(0.0, 1.0, freedom))])
             number = number + size * first.number
-            parts.append(replace(first, row=row))
+            _add(parts, [replace(first, row=row)])
         return number
+
+
+def _add(parts: list[Part], found: Sequence[Part]) -> None:
+    """Add elementary numbers, but not twice."""
+    parts.extend(part for part in found if all(part.number is not each.number for each in parts))
 
 
 def _row(signal: str, name: str, component: Component) -> BudgetRow:

@@ -8,7 +8,8 @@ from cases import cases
 from pydantic import ValidationError
 
 from bench.base import ConfigurationError
-from bench.rig import BudgetRow, Component, DerivedSignal, Expression, UncertainSignals, coverage_factor
+from bench.rig import BudgetRow, Calibration, Component, DerivedSignal, Expression, UncertainSignals, coverage_factor
+from bench.rig.calibration import Calibrated
 from rigs.vo2.curvature import CantileverCurvature, deflection_to_curvature
 
 ABOUT = {"basis": "estimate", "source": "a test"}
@@ -151,6 +152,39 @@ def test_an_expression_of_uncertain_numbers_has_the_derivatives_that_differences
     assert rows["length"] == pytest.approx(abs(slope) * 0.02 / math.sqrt(3), rel=1e-6)
 
 
+def test_what_a_derived_signal_uses_twice_has_one_error():
+    units = {"spot": "m", "double": "m", "triple": "m"}
+    double, triple = (Expression(expression=text, unit="m") for text in ("2 * spot", "double + spot"))
+    reading = signals({"double": double, "triple": triple}, units, spot=PSD).reading("triple", {"spot": 5e-5})
+    alone = signals({}, units, spot=PSD).reading("spot", {"spot": 5e-5})
+    budget = reading.budget()
+    assert budget.standard == pytest.approx(reading.standard) == pytest.approx(3.0 * alone.standard)
+    assert [row.contribution for row in budget.rows] == pytest.approx(
+        [3.0 * row.contribution for row in alone.budget().rows]
+    )
+
+
+@cases("reference, share", [("goniometer 12", 0.0), ("goniometer 13", math.sqrt(2.0))])
+def test_sensors_that_were_compared_with_one_reference_have_its_error_in_common(reference, share):
+    about = {"unit": "m", "serial_number": "", "date": "2026-01-01", "interval_days": 365,
+             "reference_unit": "m", "reference_uncertainty": 0.1, "low": 0.0, "high": 1.0, "coefficients": (0.0,),
+             "covariance": ((0.0,),), "degrees_of_freedom": 9, "repeatability": 0.0, "readings": 10}  # fmt: skip
+    derived = {
+        name: Calibrated(
+            kind="calibrated",
+            source=source,
+            calibration=Calibration.model_validate({**about, "signal": source, "reference": of}),
+        )
+        for name, source, of in (("first", "a", "goniometer 12"), ("second", "b", reference))
+    }
+    derived["apart"] = Expression(expression="first - second", unit="m")
+    units = dict.fromkeys(("a", "b", *derived), "m")
+    zero = {"zero": {"acts": "offset", "half_width": 1.0, "unit": "m"}}
+    found = signals(derived, units, a=zero, b=zero).reading("apart", {"a": 0.5, "b": 0.5})
+    assert found.standard == pytest.approx(0.1 * share, abs=1e-12)
+    assert found.budget().standard == pytest.approx(0.1 * share, abs=1e-12)
+
+
 def test_a_value_is_the_same_whether_it_is_read_or_asked_for():
     found = signals(spot=PSD)
     read = found.reading("curvature", {"spot": 7e-5})
@@ -189,6 +223,7 @@ def test_how_a_quantity_follows_the_room_is_no_error_of_its_readings():
         ({"source": ""}, "source"),
         ({"range": [0.0, 1.0]}, "nonlinearity"),
         ({"time": 60.0}, "room or a drift"),
+        ({"unit": ""}, "unit"),
         ({"sigma": 1.0}, "sigma"),
     ],
 )
