@@ -609,8 +609,23 @@ def certificate_lines(identified: IdentifiedFile, *, verbose: bool = True) -> Se
         ("valid for inputs", identified.file.valid.text(operator.input_unit)),
         ("excitation", identified.coverage.summary() if identified.coverage else "no plane to be swept"),
         *[("assumption check", test.text) for test in tests if test.agrees and (verbose or test.holds)],
-        *([] if identified.uncertainty is None else identified.uncertainty.lines()),
+        *_uncertainty_lines(identified),
     )
+
+
+def _uncertainty_lines(identified: IdentifiedFile) -> list[tuple[str, str]]:
+    """Return the quantities of a model of runs with their uncertainty, or why it is not stated."""
+    data = identified.data
+    if identified.uncertainty is not None:
+        return identified.uncertainty.lines()
+    if data.output is None or not is_run(data.paths[0]):
+        return []
+    why = f"the rig file states none of {data.output.name}"
+    if identified.refit is None:
+        why = f"{identified.file.name} is a model with time"
+    elif len(data.paths) > 1:
+        why = "the model is of several runs"
+    return [("uncertainty", f"not stated, as {why}")]
 
 
 def error_lines(errors: Errors, unit: str, which: str = "") -> list[tuple[str, str]]:

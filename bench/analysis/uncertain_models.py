@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 
-from bench.analysis.uncertain_results import rounded, uncertain_signals
+from bench.analysis.uncertain_results import over_range, rounded, uncertain_signals
 from bench.base import Floats, difference_unit, header_with_unit
 from bench.identification import ModelFile, input_half_widths
 from bench.models import Operator
@@ -113,6 +113,7 @@ Quantities = Mapping[str, tuple[float, str]]
 def propagated(
     signals: UncertainSignals,
     columns: Mapping[str, Floats],
+    rows: Mapping[str, Floats],
     times: Floats,
     nominal: Quantities,
     spreads: Mapping[str, Sequence[BudgetRow]],
@@ -126,6 +127,8 @@ def propagated(
         The signals of the run.
     columns : mapping of str to ndarray
         Readings by signal, shape (N,) each.
+    rows : mapping of str to ndarray
+        Readings of the same run, with those of the signals that they are derived from.
     times : ndarray, shape (N,)
         When they were taken, s.
     nominal : mapping
@@ -136,18 +139,18 @@ def propagated(
         Identifies the same from other readings, from each of several.
     """
     rng = np.random.default_rng(1)
-    rows: dict[str, dict[tuple[str, str], list[BudgetRow]]] = {name: {} for name in nominal}
+    parts: dict[str, dict[tuple[str, str], list[BudgetRow]]] = {name: {} for name in nominal}
     for column in signals.stated([*columns]):
-        for row, size in _sizes(signals, column, columns[column], shared=True):
+        for row, size in _sizes(signals, column, rows, columns[column], shared=True):
             others = refits([{**columns, column: each} for each in _moved(columns[column], times, row, size, rng)])
             for name, contribution in _deviations(nominal, others).items():
-                found = rows[name].setdefault((row.signal, row.component), [])
+                found = parts[name].setdefault((row.signal, row.component), [])
                 found.append(replace(row, contribution=contribution))
     budgets = {}
     for name, (value, unit) in nominal.items():
         # A wave is its sine and its cosine.
-        parts = [replace(each[0], contribution=_together(each)) for each in rows[name].values()]
-        ordered = sorted([*spreads[name], *parts], key=lambda row: -row.contribution)
+        together = [replace(each[0], contribution=_together(each)) for each in parts[name].values()]
+        ordered = sorted([*spreads[name], *together], key=lambda row: -row.contribution)
         kept = tuple(row for row in ordered if row.contribution)
         budgets[name] = Budget(name, unit, value, kept, effective_freedom(kept))
     return budgets
@@ -187,8 +190,10 @@ def identified_uncertainty(
         return None
     nominal = quantities_of(model)
     columns = dict(zip(names, (inputs, outputs), strict=True))
+    table = record.steps() or record.telemetry()
+    rows = {each.name: table[each.name] for each in record.signals}
     # The rows of a run are spread over it.
-    times = np.linspace(0.0, np.ptp(record.steps()["finished"]), inputs.size)
+    times = np.linspace(0.0, np.ptp(table["finished" if "finished" in table.columns else "t"]), inputs.size)
     rng = np.random.default_rng(0)
     squares = np.zeros(model.coefficients.size)
 
@@ -199,7 +204,7 @@ def identified_uncertainty(
         return [quantities_of(other) for other in found]
 
     own = {
-        name: [each for each in _sizes(signals, name, columns[name]) if each[0].acts in OWN]
+        name: [each for each in _sizes(signals, name, rows, columns[name]) if each[0].acts in OWN]
         for name in signals.stated(names)
     }
     if all("noise" in [row.acts for row, _ in own.get(name, [])] for name in names):
@@ -223,21 +228,25 @@ def identified_uncertainty(
             others = refits([{**columns, name: each} for each in _moved(values, times, room, size, rng)])
             for quantity, deviation in _deviations(nominal, others).items():
                 spreads[quantity].append(replace(room, contribution=deviation))
-    quantities = propagated(signals, columns, times, nominal, spreads, refits)
+    quantities = propagated(signals, columns, rows, times, nominal, spreads, refits)
     places = np.linspace(outputs.min(), outputs.max(), _PLACES)
-    shared = [signals.at(names[1], value).contributions(shared=True) for value in places.tolist()]
-    standard = np.array([math.hypot(*(contribution for _, contribution in each)) for each in shared])
+    shared = [size for _, size in _sizes(signals, names[1], rows, places, shared=True)]
+    standard = np.sqrt(np.sum(np.square(shared), axis=0))
     return ModelUncertainty(quantities, np.sqrt(squares), places, standard)
 
 
 def _sizes(
-    signals: UncertainSignals, name: str, values: Floats, *, shared: bool = False
+    signals: UncertainSignals, name: str, rows: Mapping[str, Floats], values: Floats, *, shared: bool = False
 ) -> list[tuple[BudgetRow, Floats]]:
-    """Return the contribution of each component at readings, or of each that they share."""
-    places = np.linspace(values.min(), values.max(), _PLACES)
-    table = [signals.at(name, value).contributions(shared=shared) for value in places.tolist()]
+    """Return the contribution of each component at values of a signal as it has it in rows, or of each shared one."""
+    chosen = over_range(rows[name], _PLACES)
+    table = [
+        signals.reading(name, {key: float(column[k]) for key, column in rows.items()}).contributions(shared=shared)
+        for k in chosen.tolist()
+    ]
     return [
-        (part.row, np.interp(values, places, [row[i][1] for row in table])) for i, (part, _) in enumerate(table[0])
+        (part.row, np.interp(values, rows[name][chosen], [row[i][1] for row in table]))
+        for i, (part, _) in enumerate(table[0])
     ]
 
 

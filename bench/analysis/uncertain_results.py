@@ -208,7 +208,7 @@ def _of_samples(
     signals: UncertainSignals, record: Record, output: str, reference: Floats, outputs: Floats
 ) -> ControlUncertainty | None:
     """Return what is known of the errors of samples, or of 200 of them over the range of the output."""
-    chosen = _over_range(outputs)
+    chosen = over_range(outputs)
     try:
         readings = [signals.at(output, value) for value in outputs[chosen].tolist()]
     except ConfigurationError:
@@ -217,10 +217,10 @@ def _of_samples(
     return _control(readings, (outputs - reference)[chosen], record.unit(output))
 
 
-def _over_range(values: Floats) -> npt.NDArray[np.intp]:
-    """Return the numbers of up to 200 rows over the range of values, in their order."""
-    order = np.argsort(values, kind="stable")
-    return np.asarray(order[np.linspace(0, order.size - 1, min(order.size, _MOST_ROWS)).round().astype(np.intp)])
+def over_range(values: Floats, most: int = _MOST_ROWS) -> npt.NDArray[np.intp]:
+    """Return the numbers of so many rows at most over the range of values, in their order; of none that is nan."""
+    order = np.argsort(values, kind="stable")[: int(np.isfinite(values).sum())]
+    return np.asarray(order[np.linspace(0, order.size - 1, min(order.size, most)).round().astype(np.intp)])
 
 
 def _control(
@@ -302,9 +302,8 @@ def reading_uncertainties(record: Record) -> Callable[[Mapping[str, Floats]], di
         for name in stated:
             values = rows[name]
             uncertainties = np.full(values.size, np.nan)
-            known = np.flatnonzero(np.isfinite(values))
-            if known.size:
-                chosen = known[_over_range(values[known])]
+            chosen, known = over_range(values), np.isfinite(values)
+            if chosen.size:
                 each = [
                     signals.reading(name, {key: float(rows[key][row]) for key in names}).standard for row in chosen
                 ]

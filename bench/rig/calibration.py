@@ -104,14 +104,20 @@ class Calibration(CheckedTable):
         if not self.low < self.high:
             raise ValueError(f"low, high: expected low < high, got {self.low:g} and {self.high:g}")
         size, matrix = len(self.coefficients), np.array(self.covariance, dtype=np.float64, ndmin=2)
-        if matrix.shape != (size, size) or not np.allclose(matrix, matrix.T) or (np.diag(matrix) < 0.0).any():
-            raise ValueError(f"covariance: expected a symmetric matrix of {size} by {size}, no variance below 0")
+        # But for rounding.
+        least = -1e-9 * np.abs(matrix).max()
+        if matrix.shape != (size, size) or not np.allclose(matrix, matrix.T, atol=-least):
+            raise ValueError(f"covariance: expected a symmetric matrix of {size} by {size}")
+        if np.linalg.eigvalsh(matrix)[0] < least:
+            raise ValueError("covariance: expected no variance below 0, of no sum of the coefficients")
         return self
 
     @property
     def due(self) -> datetime.date:
         """Day from which a new calibration is due."""
-        return self.date + datetime.timedelta(days=self.interval_days)
+        return datetime.date.fromordinal(
+            min(self.date.toordinal() + self.interval_days, datetime.date.max.toordinal())
+        )
 
     @property
     def uncertainty(self) -> float:
@@ -135,7 +141,8 @@ class Calibration(CheckedTable):
         """Return the standard uncertainties of calibrated values by those of the coefficients."""
         scaled = self._scaled(np.asarray(readings, dtype=np.float64))
         columns = chebyshev.chebvander(scaled, len(self.coefficients) - 1)
-        return np.asarray(np.sqrt(np.einsum("...i,ij,...j->...", columns, np.array(self.covariance), columns)))
+        variances = np.einsum("...i,ij,...j->...", columns, np.array(self.covariance), columns)
+        return np.asarray(np.sqrt(np.maximum(variances, 0.0)))
 
     def save(self, path: Path) -> None:
         """Write the file; raise DataError if that fails."""

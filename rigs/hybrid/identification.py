@@ -277,8 +277,23 @@ def network_uncertainty(steps: Path, found: NetworkIdentification) -> dict[str, 
             spreads[name].append(replace(room, contribution=share * nominal[name][0]))
     columns = {base: samples[BASE], tip: samples[TIP]}
     return propagated(
-        signals, columns, samples.times, nominal, spreads, lambda others: [refit(each) for each in others]
+        signals, columns, columns, samples.times, nominal, spreads, lambda others: [refit(each) for each in others]
     )
+
+
+def dynamics_uncertainty(found: DynamicsIdentification) -> dict[str, Budget]:
+    """Return the budgets of poles and damping: gain and offset of a sensor have no influence on them."""
+    freedom = float(found.residuals.size - len(found.uncertainties))
+    return {
+        name: Budget(
+            name,
+            unit,
+            getattr(found.model, name),
+            (spread_row(found.uncertainties[name], unit, freedom, "covariance of the fit"),),
+            freedom,
+        )
+        for name, unit in (("real_pole", "rad/s"), ("frequency", "rad/s"), ("damping", ""))
+    }
 
 
 def _check_protocol(run: Path, protocol: str) -> None:
@@ -304,19 +319,13 @@ def identify_runs(runs: Mapping[str, Sequence[Path]], _: Path | None, options: M
         raise ConfigurationError(f"-o plays={plays}: expected a whole number from 1 to 200")
     found = identify_hybrid(*folders, plays=plays)
     network, dynamics, piezo = found.network, found.dynamics, found.piezo.errors
-    uncertain = network_uncertainty(folders[0], network)
+    uncertain = network_uncertainty(folders[0], network) | dynamics_uncertainty(dynamics)
     rows = (
         ("network, RMS of base and tip", f"{network.base.rms:.3f} and {network.tip.rms:.3f} K"),
         *((name.replace("_", " "), quantity_text(budget)) for name, budget in uncertain.items()),
         (f"polynomial of order {found.order.order}, RMS", f"{found.polynomial.errors.rms * 1e6:.3f} µm"),
         (f"{plays} plays, RMS", f"{piezo.rms_percent:.2f} % of {piezo.span * 1e6:.1f} µm"),
-        *(
-            (
-                name.replace("_", " "),
-                f"{getattr(dynamics.model, name):.5g} ± {dynamics.uncertainties[name]:.2g} {unit}",
-            )
-            for name, unit in (("real_pole", "rad/s"), ("frequency", "rad/s"), ("damping", ""))
-        ),
+        ("polynomial and plays", "uncertainty not stated"),
     )
     summary = {
         "network_rms_K": {"base": network.base.rms, "tip": network.tip.rms},

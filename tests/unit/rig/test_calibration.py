@@ -122,6 +122,8 @@ def test_a_file_keeps_it(tmp_path):
         ({"version": 1}, "version"),
         ({"coefficients": []}, "coefficients"),
         ({"covariance": [[-1.0, 0.0], [0.0, 1.0]]}, "no variance below 0"),
+        ({"covariance": [[1e-16, 2e-16], [2e-16, 1e-16]]}, "no variance below 0"),
+        ({"covariance": [[1e-16, 2e-17], [0.0, 1e-16]]}, "symmetric"),
         ({"extra": 1}, "extra"),
     ],
 )
