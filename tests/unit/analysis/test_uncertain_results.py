@@ -17,9 +17,14 @@ from bench.record import Record
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """A short run of the cantilever."""
+    """A short run of the cantilever, with a signal that is computed from two."""
     folder = tmp_path_factory.mktemp("run")
-    return bench.run("creep", "vo2", out=folder, hot=70.0, cool=50.0, duration=8.0).folder
+    rig = folder / "rig.toml"
+    rig.write_text(
+        'extends = "vo2"\n[derived.product]\nexpression = "curvature * tec_temperature / norm"\nunit = "1/m"\n'
+        'constants = { norm = "300 K" }\n'
+    )
+    return bench.run("creep", str(rig), out=folder, hot=70.0, cool=50.0, duration=8.0).folder
 
 
 def test_drawn_errors_have_the_standard_uncertainty_and_the_correlation_of_the_budgets(run):
@@ -38,7 +43,9 @@ def test_every_signal_of_a_run_has_a_budget_or_says_that_none_is_stated(run):
     with Record(run) as record:
         budgets = signal_budgets(record, record.steps())
         assert control_uncertainties(record, "curvature") == {}
-    assert {name for name, each in budgets.items() if each.stated} == {"psd_position", "curvature", "tec_temperature"}
+    assert {name for name, each in budgets.items() if each.stated} == {
+        "psd_position", "curvature", "product", "tec_temperature"
+    }  # fmt: skip
     assert budgets["tec_current"].not_stated == ("tec_current",)
 
 
@@ -78,6 +85,18 @@ def test_a_model_of_a_run_has_the_uncertainty_of_its_sensor(run):
     standard = predicted_uncertainty(found.file, np.array([100.0, 1500.0]))
     assert standard is not None
     assert (standard > found.file.provenance["rms"]).all()
+
+
+def test_a_model_of_a_computed_signal_has_the_uncertainty_of_all_behind_it(run):
+    data = {"input": "tec_temperature", "degree": 1}
+    product, curvature = (bench.identify(run, "polynomial", output=name, **data) for name in ("product", "curvature"))
+    rows = {each.component: each.contribution for each in product.uncertainty.quantities["highest output"].rows}
+    lever = 0.005 / np.sqrt(3.0) * product.uncertainty.quantities["highest output"].value
+    assert rows["lever"] == pytest.approx(lever, rel=0.1)
+    assert product.uncertainty.standard.shape == curvature.uncertainty.standard.shape
+    assert "not stated, as the rig file states none of tec_voltage" in repr(
+        bench.identify(run, "polynomial", output="tec_voltage", **data)
+    )
 
 
 @pytest.mark.parametrize(
