@@ -273,6 +273,8 @@ def network_uncertainty(steps: Path, found: NetworkIdentification) -> dict[str, 
     }
     if (room := signals.room((base, tip))) is not None:
         shares = room.contribution * room_influence(found, samples[CURRENT], samples.period, room.time or math.inf)
+        # Of what has a normal logarithm with that deviation.
+        shares = np.exp(0.5 * shares**2) * np.sqrt(np.expm1(shares**2))
         for name, share in zip(fitted, shares.tolist(), strict=True):
             spreads[name].append(replace(room, contribution=share * nominal[name][0]))
     columns = {base: samples[BASE], tip: samples[TIP]}
