@@ -159,7 +159,7 @@ def run(
             overrides=overrides or {},
             seed=seed,
             clock=clock,
-            accuracy="" if accuracy is None else str(accuracy),
+            accuracy=None if accuracy is None else str(accuracy),
             live=live,
             recording=recording,
         ),

@@ -95,13 +95,13 @@ def run(
         bool, typer.Option("--dry-run", help="Only say what the run would do and touch, as `bench rehearse` does.")
     ] = False,
     accuracy: Annotated[
-        str,
+        str | None,
         typer.Option(
             metavar="U",
             help="Refuse the run, before anything moves, unless the uncertainty budget of the controlled signal "
             "supports this: largest expanded uncertainty (95 %) in its unit, or with one, such as 2 or '20 µm'.",
         ),
-    ] = "",
+    ] = None,
     notify: NotifyOption = None,
     out: Annotated[Path, typer.Option(metavar="DIR", help="Parent of the run's folder.")] = Path("recordings"),
     live: LiveOption = False,

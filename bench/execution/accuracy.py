@@ -39,7 +39,7 @@ def check_accuracy(
         If it is no positive number with a unit of the signal, the protocol controls nothing, the uncertainty is not
         stated, or it is larger; names the component that limits it.
     """
-    option = f"accuracy {asked}"
+    option = f"accuracy {asked or repr(asked)}"
     signal = definition.controlled(slots)
     if not signal:
         raise ConfigurationError(f"{option}: protocol {definition.name} controls no signal; leave it out")
@@ -59,7 +59,7 @@ def check_accuracy(
     if worst.expanded > wanted:
         raise ConfigurationError(
             f"{option}: the budget of {signal} supports {worst.expanded:.2g} {unit} ({100.0 * LEVEL:.0f} %) at "
-            f"{worst.value:.4g} {unit}; it is limited by {worst.rows[0].label}. {worst.advice()}"
+            f"{worst.value:.4g} {unit}. {worst.advice()}"
         )
     return {"signal": signal, "unit": unit, "asked": wanted, "supported": worst.expanded, "level": LEVEL}
 

@@ -134,9 +134,9 @@ class Run:
     notify : tuple of str
         Who is sent messages at a pause, a prompt, a warning, a trip and the end, also that of a bench which hung or
         died; see `bench.execution.notify`.
-    accuracy : str
+    accuracy : str or None
         Largest expanded uncertainty (95 %) of the controlled signal that is accepted, in its unit or with one: a run
-        whose budget does not support it is refused. Empty for any.
+        whose budget does not support it is refused. None for any.
     changes : tuple of ParameterChange
         Parameters that are changed on the way, as in the run that is repeated.
     rig_file : RigFile, optional
@@ -158,7 +158,7 @@ class Run:
     original: Original | None = None
     rehearse: bool = True
     notify: tuple[str, ...] = ()
-    accuracy: str = ""
+    accuracy: str | None = None
     changes: tuple[ParameterChange, ...] = ()
     rig_file: RigFile | None = None
 
@@ -260,7 +260,7 @@ class RunContext(ExitStack):
             guarded=self.guardian is not None,
             attended=self._is_attended,
         )
-        if self.run.accuracy:
+        if self.run.accuracy is not None:
             self._accuracy = check_accuracy(
                 self.run.accuracy, self.run.protocol, self.parameters, description, self._slots
             )

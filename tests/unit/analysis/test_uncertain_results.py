@@ -105,6 +105,7 @@ def test_a_model_of_a_computed_signal_has_the_uncertainty_of_all_behind_it(run):
         ("tracking", "2", "linearity of psd_position"),
         ("tracking", "2 K", "expected a number in 1/m"),
         ("tracking", "-2", "above 0"),
+        ("tracking", "", "expected a number in 1/m"),
         ("creep", "2", "controls no signal"),
     ],
 )
