@@ -149,7 +149,10 @@ def propagated(
     budgets = {}
     for name, (value, unit) in nominal.items():
         # A wave is its sine and its cosine.
-        together = [replace(each[0], contribution=_together(each)) for each in parts[name].values()]
+        together = [
+            replace(each[0], contribution=math.hypot(*(row.contribution for row in each)))
+            for each in parts[name].values()
+        ]
         ordered = sorted([*spreads[name], *together], key=lambda row: -row.contribution)
         kept = tuple(row for row in ordered if row.contribution)
         budgets[name] = Budget(name, unit, value, kept, effective_freedom(kept))
@@ -267,10 +270,6 @@ def _deviations(nominal: Quantities, others: Sequence[Quantities]) -> dict[str, 
         name: math.sqrt(math.fsum((other[name][0] - value) ** 2 for other in others) / len(others))
         for name, (value, _) in nominal.items()
     }
-
-
-def _together(rows: list[BudgetRow]) -> float:
-    return math.hypot(*(row.contribution for row in rows))
 
 
 def _noise(residuals: Floats, rng: np.random.Generator) -> Floats:
