@@ -25,7 +25,7 @@ from bench.base import Floats, difference_unit, header_with_unit
 from bench.identification import ModelFile, input_half_widths
 from bench.models import Operator
 from bench.record import Record
-from bench.rig import OWN, Budget, BudgetRow, UncertainSignals, effective_freedom
+from bench.rig import OWN, Budget, BudgetRow, Part, UncertainSignals, effective_freedom
 
 _FITS = 20
 """Fits with other noise. Derivation: their deviation has 20 degrees of freedom, and k is 2.09 instead of 1.96."""
@@ -140,20 +140,23 @@ def propagated(
     """
     rng = np.random.default_rng(1)
     parts: dict[str, dict[tuple[str, str], list[BudgetRow]]] = {name: {} for name in nominal}
+    # An error that input and output share moves both.
+    together: dict[int, tuple[BudgetRow, dict[str, Floats]]] = {}
     for column in signals.stated([*columns]):
-        for row, size in _sizes(signals, column, rows, columns[column], shared=True):
-            others = refits([{**columns, column: each} for each in _moved(columns[column], times, row, size, rng)])
-            for name, contribution in _deviations(nominal, others).items():
-                found = parts[name].setdefault((row.signal, row.component), [])
-                found.append(replace(row, contribution=contribution))
+        for part, size in _sizes(signals, column, rows, columns[column], shared=True):
+            together.setdefault(id(part.number), (part.row, {}))[1][column] = size
+    for row, sizes in together.values():
+        for name, contribution in _deviations(nominal, refits(_moved(columns, times, row, sizes, rng))).items():
+            found = parts[name].setdefault((row.signal, row.component), [])
+            found.append(replace(row, contribution=contribution))
     budgets = {}
     for name, (value, unit) in nominal.items():
         # A wave is its sine and its cosine.
-        together = [
+        waves = [
             replace(each[0], contribution=math.hypot(*(row.contribution for row in each)))
             for each in parts[name].values()
         ]
-        ordered = sorted([*spreads[name], *together], key=lambda row: -row.contribution)
+        ordered = sorted([*spreads[name], *waves], key=lambda row: -row.contribution)
         kept = tuple(row for row in ordered if row.contribution)
         budgets[name] = Budget(name, unit, value, kept, effective_freedom(kept))
     return budgets
@@ -207,10 +210,10 @@ def identified_uncertainty(
         return [quantities_of(other) for other in found]
 
     own = {
-        name: [each for each in _sizes(signals, name, rows, columns[name]) if each[0].acts in OWN]
+        name: [each for each in _sizes(signals, name, rows, columns[name]) if each[0].row.acts in OWN]
         for name in signals.stated(names)
     }
-    if all("noise" in [row.acts for row, _ in own.get(name, [])] for name in names):
+    if all("noise" in [part.row.acts for part, _ in own.get(name, [])] for name in names):
         noisy = [
             {
                 name: values + sum(size * rng.standard_normal(size.size) for _, size in own[name])
@@ -227,8 +230,7 @@ def identified_uncertainty(
     }
     for name, values in columns.items():
         if (room := signals.room([name])) is not None:
-            size = np.full(values.size, room.contribution)
-            others = refits([{**columns, name: each} for each in _moved(values, times, room, size, rng)])
+            others = refits(_moved(columns, times, room, {name: np.full(values.size, room.contribution)}, rng))
             for quantity, deviation in _deviations(nominal, others).items():
                 spreads[quantity].append(replace(room, contribution=deviation))
     quantities = propagated(signals, columns, rows, times, nominal, spreads, refits)
@@ -240,7 +242,7 @@ def identified_uncertainty(
 
 def _sizes(
     signals: UncertainSignals, name: str, rows: Mapping[str, Floats], values: Floats, *, shared: bool = False
-) -> list[tuple[BudgetRow, Floats]]:
+) -> list[tuple[Part, Floats]]:
     """Return the contribution of each component at values of a signal as it has it in rows, or of each shared one."""
     chosen = over_range(rows[name], _PLACES)
     table = [
@@ -248,20 +250,28 @@ def _sizes(
         for k in chosen.tolist()
     ]
     return [
-        (part.row, np.interp(values, rows[name][chosen], [row[i][1] for row in table]))
+        (part, np.interp(values, rows[name][chosen], [row[i][1] for row in table]))
         for i, (part, _) in enumerate(table[0])
     ]
 
 
-def _moved(values: Floats, times: Floats, row: BudgetRow, size: Floats, rng: np.random.Generator) -> list[Floats]:
+def _moved(
+    columns: Mapping[str, Floats],
+    times: Floats,
+    row: BudgetRow,
+    sizes: Mapping[str, Floats],
+    rng: np.random.Generator,
+) -> list[Mapping[str, Floats]]:
     """Return readings that a component has moved by its standard uncertainty, in several ways if it has a time."""
-    if row.time is None:
-        return [values + size]
-    left = np.exp(-np.diff(times) / row.time)
-    courses = rng.standard_normal((values.size, _FITS))
-    for k, each in enumerate(left, 1):
-        courses[k] = each * courses[k - 1] + math.sqrt(1.0 - each**2) * courses[k]
-    return [values + size * course for course in courses.T]
+    courses = np.ones((1, times.size))
+    if row.time is not None:
+        left = np.exp(-np.diff(times) / row.time)
+        courses = rng.standard_normal((_FITS, times.size))
+        for k, each in enumerate(left, 1):
+            courses[:, k] = each * courses[:, k - 1] + math.sqrt(1.0 - each**2) * courses[:, k]
+    return [
+        {**columns, **{name: columns[name] + size * course for name, size in sizes.items()}} for course in courses
+    ]
 
 
 def _deviations(nominal: Quantities, others: Sequence[Quantities]) -> dict[str, float]:

@@ -8,7 +8,7 @@ from typer.testing import CliRunner
 
 import bench
 from bench.analysis import export_run
-from bench.analysis.uncertain_models import predicted_uncertainty
+from bench.analysis.uncertain_models import predicted_uncertainty, propagated
 from bench.analysis.uncertain_results import control_uncertainties, draw_errors, signal_budgets, uncertain_signals
 from bench.base import ConfigurationError
 from bench.cli import app
@@ -97,6 +97,23 @@ def test_a_model_of_a_computed_signal_has_the_uncertainty_of_all_behind_it(run):
     assert "not stated, as the rig file states none of tec_voltage" in repr(
         bench.identify(run, "polynomial", output="tec_voltage", **data)
     )
+
+
+def test_an_error_that_input_and_output_share_moves_both(run):
+    with Record(run) as record:
+        signals, table = uncertain_signals(record), record.steps()
+        rows = {each.name: table[each.name] for each in record.signals}
+    columns = {name: rows[name] for name in ("psd_position", "curvature")}
+
+    def slopes(others):
+        return [{"slope": (float(np.polyfit(*each.values(), 1)[0]), "1/m²")} for each in others]
+
+    (nominal,) = slopes([columns])
+    budget = propagated(signals, columns, rows, table["finished"], nominal, {"slope": []}, slopes)["slope"]
+    parts = {row.component: row.contribution / budget.value for row in budget.rows}
+    # The curvature is in proportion to the deflection, with the square of the length.
+    assert parts["length"] == pytest.approx(2.0 * 1e-3 / np.sqrt(3.0), rel=0.1)
+    assert parts["lever"] < 0.1 * 5e-3 / np.sqrt(3.0)
 
 
 @pytest.mark.parametrize(
